@@ -94,7 +94,7 @@ def compare_exposure(film, steps, seed):
     for name, spec in (("without codes", plain_spec), ("with codes", coded_spec)):
         model, state, seconds = trained(spec, capture, seed)
         renderer = evaluation.Renderer(model, capture.size)
-        drawn[name] = evaluation.score(renderer, state, capture, rows).colour
+        drawn[name] = evaluation.score(renderer, state, capture, rows).color
         figures[f"{name}: seconds"] = seconds
         key = "without codes" if name == "without codes" else "codes of neighbours"
         figures[f"{key}: PSNR (dB)"] = _right_psnr(drawn[name], capture.images[rows])
@@ -123,7 +123,7 @@ def compare_transient(film, steps, seed):
         left_out = () if spec.transient is None else ("transient",)
         static = variants.without_effects(*model.spec, left_out, False)
         renderer = evaluation.Renderer(static, capture.size)
-        drawn[name] = evaluation.score(renderer, state, clean, rows).colour
+        drawn[name] = evaluation.score(renderer, state, clean, rows).color
         held_out = evaluation.score(renderer, state, clean, clean.heldout)
         figures[f"{name}: seconds"] = seconds
         for place, where in (("where it stood", masks), ("elsewhere", ~masks)):
@@ -131,7 +131,7 @@ def compare_transient(film, steps, seed):
             figures[f"{name}: PSNR {place} (dB)"] = psnr
         figures[f"{name}: PSNR held out (dB)"] = float(held_out.psnr.mean())
     whole = evaluation.Renderer(model, capture.size)
-    drawn["with the transient"] = evaluation.score(whole, state, capture, rows).colour
+    drawn["with the transient"] = evaluation.score(whole, state, capture, rows).color
     figures["transient rendered: PSNR where it stood (dB)"] = _psnr(
         drawn["with the transient"], capture.images[rows], masks
     )
@@ -156,17 +156,17 @@ def trained(spec, capture, seed):
     return model, result.state, result.seconds
 
 
-def _psnr(colour, truth, where):
+def _psnr(color, truth, where):
     """Decibels over all chosen pixels together, not a mean over frames."""
-    error = np.round(colour * 255) - truth.astype(np.float32)
+    error = np.round(color * 255) - truth.astype(np.float32)
     return float(-10 * np.log10(np.mean((error[where] / 255) ** 2)))
 
 
-def _right_psnr(colour, truth):
+def _right_psnr(color, truth):
     """Mean over the frames of the PSNR of their right halves."""
-    half = colour.shape[2] // 2
-    where = np.ones(colour[0, :, half:].shape[:2], bool)
-    pairs = zip(colour[:, :, half:], truth[:, :, half:], strict=True)
+    half = color.shape[2] // 2
+    where = np.ones(color[0, :, half:].shape[:2], bool)
+    pairs = zip(color[:, :, half:], truth[:, :, half:], strict=True)
     return float(np.mean([_psnr(one, true, where) for one, true in pairs]))
 
 

@@ -289,10 +289,10 @@ def draw(path: pathlib.Path, compared, count: int, effects=()) -> None:
     for place, row in enumerate(scored[0].rows):
         truth = capture.images[row]
         filmed = None if capture.valid is None else capture.valid[row][..., None]
-        drawn = [evaluation.as_picture(each.colour[place]) for each in scored]
+        drawn = [evaluation.as_picture(each.color[place]) for each in scored]
         if filmed is not None:  # what was not filmed is no error
             truth, drawn = truth * filmed, [picture * filmed for picture in drawn]
-        errors = [pictures.colour_error(x, truth, LARGEST_ERROR).picture for x in drawn]
+        errors = [pictures.color_error(x, truth, LARGEST_ERROR).picture for x in drawn]
         blank = truth * 0 + 255
         panels += [truth, *drawn, blank, *errors]
         captions += [capture.ids[row]]

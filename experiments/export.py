@@ -11,7 +11,7 @@ python -m experiments.export RUN nerfies
 python -m experiments.export RUN path --path stabilised  # camera_path.json, with times
 python -m experiments.export RUN nerfies-path --path sway --frames 48
 python -m experiments.export RUN tracks --points 500     # what is seen, followed
-python -m experiments.export RUN exr --path stabilised   # colour, alpha, depth, flow
+python -m experiments.export RUN exr --path stabilised   # color, alpha, depth, flow
 """
 
 import dataclasses
@@ -285,7 +285,7 @@ def _exr(args: Export, run: Any) -> str:
         args.overwrite,
     )
     flow = "without flow, since nothing moves points" if move is None else "and flow"
-    return f"{len(planned.times)} pictures: colour, alpha, depth {flow}"
+    return f"{len(planned.times)} pictures: color, alpha, depth {flow}"
 
 
 WRITERS = {

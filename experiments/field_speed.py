@@ -18,7 +18,7 @@ decibels are of the difference between the two. Over several seeds the table has
 and beside a PSNR its standard deviation. What is in `--out` already is not measured
 again: an interrupted run goes on, and more `--seeds` add those that it lacks. Rows of
 `nerf-small`, `nerfies-small+tracks` and `d-nerf-grid-small` are of before a template's
-bottleneck met the first layer of its colour; with it their steps are shorter. Rows of
+bottleneck met the first layer of its color; with it their steps are shorter. Rows of
 120 s alone are of today, with an elastic penalty at one step of five; others are older.
 """
 
@@ -192,7 +192,7 @@ def drawn(model, state, capture, size: tuple[int, int]) -> dict:
     record, pictures = {}, {}
     for name, one in (("skipped", model), ("full", model._replace(surveyed=None))):
         renderer = evaluation.Renderer(one, size)
-        pictures[name] = [renderer(state, view).colour for view in views]
+        pictures[name] = [renderer(state, view).color for view in views]
         ms = 1e3 * np.asarray(renderer.cpu_seconds)
         record[f"{name}_ms"] = float(np.median(ms[1:]))
         if name == "skipped":

@@ -104,7 +104,7 @@ def arms(args: FrequencyGates) -> list[GateSetting]:
 
 
 def picture(pixels: int) -> np.ndarray:
-    """Slow colours, a striped disc, a ring, a fine plaid and grain; in [0, 1]."""
+    """Slow colors, a striped disc, a ring, a fine plaid and grain; in [0, 1]."""
     axis = (np.arange(pixels) + 0.5) / pixels * 2 - 1
     y, x = np.meshgrid(axis, axis, indexing="ij")
     slow = [0.5 + 0.3 * x, 0.5 + 0.25 * np.sin(3 * y + x), 0.45 + 0.2 * x * y]
@@ -179,12 +179,12 @@ def _network(args):
     places = jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32)
     waves = encoding.EncodingSpec(args.bands, times_pi=True)
     features = jax.vmap(lambda place: encoding.encode(waves, place, None))(places)
-    heads = (("colour", mlp.HeadSpec(3)),)
+    heads = (("color", mlp.HeadSpec(3)),)
     spec = mlp.MLPSpec(features.shape[1], 2, args.width, heads, init="he")
 
     def draw(params):
-        colour = 0.5 + mlp.apply(spec, params, features)["colour"]
-        return colour.reshape(args.pixels, args.pixels, 3)
+        color = 0.5 + mlp.apply(spec, params, features)["color"]
+        return color.reshape(args.pixels, args.pixels, 3)
 
     return draw, lambda key: mlp.init(spec, key)
 
@@ -295,7 +295,7 @@ def draw_figure(fitted: dict[GateSetting, Fitted], path: pathlib.Path) -> None:
     size = 10, 1 + 3 * len(weights)
     figure = figures.new_figure(figsize=size, dpi=120, layout="constrained")
     axes = figure.subplots(len(weights), 2, squeeze=False)
-    colours = dict(
+    colors = dict(
         zip(RULES, [f"C{i}" for i in range(len(RULES))], strict=True), none="0.4"
     )
     for (gates, quality), most in zip(axes, weights, strict=True):
@@ -304,7 +304,7 @@ def draw_figure(fitted: dict[GateSetting, Fitted], path: pathlib.Path) -> None:
                 continue
             step = np.arange(fits.psnr.shape[1])
             style = dict(
-                color=colours[arm.rule],
+                color=colors[arm.rule],
                 label=arm.rule,
                 linestyle="--" if arm.rule in WARNINGS else "-",
             )

@@ -57,7 +57,7 @@ LARGE_SORT = 1_000_000
 SET_UP = """async ([source, size, time]) => {
   const header = JSON.parse(document.getElementById("header").textContent);
   const buffer = bytesOf(document.getElementById("data").textContent);
-  const count = header.arrays.colour.shape[0];
+  const count = header.arrays.color.shape[0];
   const first = viewOf(header.view);
   const viewAt = (k) => orbited(first, header.up, 0.1 * Math.sin(k), 0);
   const cameraAt = (k) => cameraOf(viewAt(k), header.view, size, size);
@@ -89,7 +89,7 @@ SET_UP = """async ([source, size, time]) => {
     now[name] = field.values.slice();
     pose(field, time, header.instants, now[name]);
   }
-  const color = decoded(header.arrays.colour, buffer);
+  const color = decoded(header.arrays.color, buffer);
   const colors = new Uint8Array(4 * count);
   for (let i = 0; i < count; i++) {
     for (let k = 0; k < 3; k++) {

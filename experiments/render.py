@@ -71,7 +71,7 @@ class Render:
     """Leave out the Gaussians that move farther than this, in scene units: the static
     scene. What was never filmed behind what moves is guessed where the motion started
     from tracks, and a hole elsewhere."""
-    show: Literal["colour", "depth", "flow"] = "colour"
+    show: Literal["color", "depth", "flow"] = "color"
     """What the png and mp4 pictures show; depth is bright near and dark far, flow is
     where what is seen goes up to the next picture: direction as hue, length as
     saturation."""
@@ -80,7 +80,7 @@ class Render:
     overwrite: bool = False
     """Replace an earlier render of other settings or of another step."""
     formats: tuple[Literal["png", "mp4", "exr"], ...] = ("png", "mp4")
-    """What to write: png pictures, one mp4, exr with linear colour, alpha and depth."""
+    """What to write: png pictures, one mp4, exr with linear color, alpha and depth."""
     max_side: int | None = None
     """Longest side of the pictures, in pixels (default: as trained)."""
     effect: cli.Effects = ()
@@ -328,15 +328,15 @@ class _Pictures:
         from nerfies_jax import evaluation
         from nerfies_jax.evaluation import pictures
 
-        if self.show == "colour":
-            return evaluation.as_picture(rendering.colour)
+        if self.show == "color":
+            return evaluation.as_picture(rendering.color)
         if self.show == "flow":
             return self._drawn_flow(rendering, place)
         known = rendering.alpha > 0.5
-        coloured = pictures.colour_depth(rendering.depth, known, self.limits)
+        colored = pictures.color_depth(rendering.depth, known, self.limits)
         if known.any():
-            self.limits = coloured.low, coloured.high
-        return coloured.picture
+            self.limits = colored.low, colored.high
+        return colored.picture
 
     def _drawn_flow(self, rendering, place):
         """To the next picture; the last one has none, and stands still."""
@@ -344,10 +344,10 @@ class _Pictures:
 
         here, there = self._views[place], self._views[place : place + 2][-1]
         flow = model_flow.picture_flow(self._move, self._state, here, there, rendering)
-        coloured = pictures.colour_flow(flow, self.limits)
+        colored = pictures.color_flow(flow, self.limits)
         if np.nanmax(np.abs(flow), initial=0) > 0:
-            self.limits = coloured.high
-        return coloured.picture
+            self.limits = colored.high
+        return colored.picture
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def name(args: Any) -> str:
         parts.append(f"static-threshold-{args.static_threshold:g}")
     if args.hide_moving is not None:
         parts.append(f"hide-moving-{args.hide_moving:g}")
-    if args.show != "colour":
+    if args.show != "color":
         parts.append(args.show)
     if {*args.formats} != {"png", "mp4"}:
         parts += sorted(args.formats)

@@ -103,10 +103,10 @@ def blend_gradient(
     """Add a chunk's part of the gradient of every table entry.
 
     `state` carries two rows: transmittance, and what is still to come of the loss
-    through this pixel, S = sum over the Gaussians not yet met of w (colour . g), plus
+    through this pixel, S = sum over the Gaussians not yet met of w (color . g), plus
     g_T times the final transmittance. With that, going front to back,
 
-        d loss / d alpha_i = T_i (colour_i . g) - S_i / (1 - alpha_i),
+        d loss / d alpha_i = T_i (color_i . g) - S_i / (1 - alpha_i),
 
     S_i being what remains behind Gaussian i. No image but the final one is needed.
     """

@@ -60,20 +60,20 @@ def first_state(
     tracked, hidden, capture = _from_tracks(spec, effects, capture, start_key)
     most = None if spec.densification is None else spec.densification.cap_max
     init = initialisation.of_start(spec.init, tracked is not None, most)
-    position, colour = initialisation.initial_points(init, capture, seed)
+    position, color = initialisation.initial_points(init, capture, seed)
     if hidden is not None and most is not None:
         hidden = _thinned(hidden, most - len(position) - len(tracked.position))
     guessed = slice(len(position), len(position))
     if hidden is not None:
         position = np.concatenate([position, hidden.position])
-        colour = np.concatenate([colour, hidden.colour / 255])
+        color = np.concatenate([color, hidden.color / 255])
         guessed = slice(guessed.start, len(position))
     if tracked is not None:
         position = np.concatenate([position, tracked.position])
-        colour = np.concatenate([colour, tracked.colour])
+        color = np.concatenate([color, tracked.color])
     rows = splats.from_points(
         position,
-        colour,
+        color,
         degree=spec.sh_degree,
         opacity=spec.init.opacity,
         scale=spec.init.scale,
@@ -128,7 +128,7 @@ def _thinned(points, most):
     """At most so many of them, evenly over their order."""
     count = min(max(most, 0), len(points.position))
     kept = np.linspace(0, len(points.position) - 1, count).round().astype(int)
-    return PointCloud(points.position[kept], points.colour[kept])
+    return PointCloud(points.position[kept], points.color[kept])
 
 
 def count_rows(effects: tuple[Effect, ...], state: TrainState) -> dict[str, int]:

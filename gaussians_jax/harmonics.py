@@ -1,4 +1,4 @@
-"""View-dependent colour: real spherical harmonics of degree 0 to 3."""
+"""View-dependent color: real spherical harmonics of degree 0 to 3."""
 
 import math
 
@@ -78,12 +78,12 @@ def basis(
     return tuple(terms)
 
 
-def colour_towards(
+def color_towards(
     coefficients: Float[Array, "*n coefficients 3"],
     mean: Float[Array, "*n 3"],
     camera_position: Float[Array, "3"],
 ) -> Float[Array, "*n 3"]:
-    """Colour of Gaussians at `mean` seen from `camera_position`: max(SH + 1/2, 0).
+    """Color of Gaussians at `mean` seen from `camera_position`: max(SH + 1/2, 0).
 
     The degree follows from the number of coefficients.
     """

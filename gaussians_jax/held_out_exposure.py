@@ -36,13 +36,13 @@ def score(
     renderer = evaluation.Renderer(model, capture.size)
 
     def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
-        drawn = renderer(state, view).colour[:, : left.shape[1]]
+        drawn = renderer(state, view).color[:, : left.shape[1]]
         return exposure.fitted(drawn, left.astype(np.float32) / 255, valid)
 
     def render(view: View, change: np.ndarray) -> Rendering:
         drawn = renderer(state, view)
-        picture = jnp.asarray(drawn.colour)
-        colour = exposure.changed(picture, jnp.asarray(change, picture.dtype))
-        return drawn._replace(colour=np.asarray(colour))
+        picture = jnp.asarray(drawn.color)
+        color = exposure.changed(picture, jnp.asarray(change, picture.dtype))
+        return drawn._replace(color=np.asarray(color))
 
     return evaluation.score_halves(fit_code, render, capture, rows)

@@ -114,7 +114,7 @@ def initial_count(spec: InitSpec, capture: Capture) -> int:
 
 
 def initial_points(spec: InitSpec, capture: Capture, seed: int):
-    """Positions and colours in [0, 1] of the first Gaussians; host side.
+    """Positions and colors in [0, 1] of the first Gaussians; host side.
 
     Random points alone lie between the capture's near and far, whatever points it has.
     """
@@ -123,13 +123,13 @@ def initial_points(spec: InitSpec, capture: Capture, seed: int):
     if not uses_capture_points(spec, capture):
         return _random_points(rng, capture, spec.random, (capture.near, capture.far))
     cloud = capture.points
-    position, colour = cloud.position, cloud.colour / 255
+    position, color = cloud.position, cloud.color / 255
     if len(position) > spec.points:
         kept = np.sort(rng.choice(len(position), spec.points, replace=False))
-        position, colour = position[kept], colour[kept]
+        position, color = position[kept], color[kept]
     span = filmed_depths(capture)
-    more, more_colour = _random_points(rng, capture, spec.extra_random, span)
-    return np.concatenate([position, more]), np.concatenate([colour, more_colour])
+    more, more_color = _random_points(rng, capture, spec.extra_random, span)
+    return np.concatenate([position, more]), np.concatenate([color, more_color])
 
 
 def filmed_box(

@@ -160,7 +160,7 @@ DYNMF = SplatScene(
 )
 
 # Spacetime Gaussians: cubic motion, opacity over time. Not here: features and a small
-# network for colours (this is its "lite" model), sampling guided by errors.
+# network for colors (this is its "lite" model), sampling guided by errors.
 SPACETIME = SplatScene(steps=30_000, motion=PolynomialMotionSpec())
 
 # The motion of SplineGS, from tracks as it starts there; its tracks and depths come
@@ -230,7 +230,7 @@ D_MISO = SplatScene(
 
 # ADC-GS, its code's numbers for HyperNeRF's chicken (other films grow from 0.0035 or
 # 0.005 on): ten Gaussians of an anchor, two views a step, a fifth of the loss half of
-# 1 - SSIM, one colour from everywhere, growth from step 9000 to 50,000, no resets. It
+# 1 - SSIM, one color from everywhere, growth from step 9000 to 50,000, no resets. It
 # rounds from step 10,000 on, where bits cost from 15,000; here both begin together. Its
 # price on features that differ between neighbours (0.01), a codec for the places of
 # anchors and a rate for each part of what an anchor makes are not here. All rates are

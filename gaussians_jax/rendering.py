@@ -1,4 +1,4 @@
-"""One frame of Gaussians from one camera: colour, alpha, depth, features."""
+"""One frame of Gaussians from one camera: color, alpha, depth, features."""
 
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ class Frame(NamedTuple):
 @checked
 def render(
     gaussians: Gaussians,
-    colours: Float[Array, "gaussians 3"],
+    colors: Float[Array, "gaussians 3"],
     camera: Camera,
     size: tuple[int, int],
     spec: RasterSpec = GSPLAT,
@@ -46,7 +46,7 @@ def render(
 
     Args:
       gaussians: N Gaussians in world coordinates.
-      colours: Colors [N, 3].
+      colors: Colors [N, 3].
       camera: One camera without lens distortion.
       size: (width, height) of the image in pixels.
       spec: Thresholds and tile sizes.
@@ -73,7 +73,7 @@ def render(
     drawn = footprints
     if mean2d_offset is not None:
         drawn = footprints._replace(mean_px=footprints.mean_px + mean2d_offset)
-    values = [widened(colours)]
+    values = [widened(colors)]
     if depth:
         values.append(footprints.depth[:, None])
     if features is not None:
@@ -81,12 +81,12 @@ def render(
     image, transmittance = raster.rasterize(
         drawn, jnp.concatenate(values, axis=1), size, spec
     )
-    colour, alpha = image[..., :3], 1 - transmittance
+    color, alpha = image[..., :3], 1 - transmittance
     if background is not None:
-        colour = colour + background * transmittance[..., None]
+        color = color + background * transmittance[..., None]
     expected = image[..., 3] / jnp.maximum(alpha, LEAST_ALPHA) if depth else None
     extras = None if features is None else image[..., 4 if depth else 3 :]
-    return Frame(Rendering(colour, alpha, expected), footprints, extras)
+    return Frame(Rendering(color, alpha, expected), footprints, extras)
 
 
 @checked
@@ -101,10 +101,10 @@ def render_harmonics(
     mean2d_offset: Float[Array, "gaussians 2"] | None = None,
     depth: bool = True,
 ) -> Frame:
-    """`render` with view-dependent colour from 1, 4, 9 or 16 SH coefficients."""
-    colours = harmonics.colour_towards(coefficients, gaussians.mean, camera.position)
+    """`render` with view-dependent color from 1, 4, 9 or 16 SH coefficients."""
+    colors = harmonics.color_towards(coefficients, gaussians.mean, camera.position)
     extras = background, features, mean2d_offset, depth
-    return render(gaussians, colours, camera, size, spec, *extras)
+    return render(gaussians, colors, camera, size, spec, *extras)
 
 
 def refuse_distortion(camera: Camera) -> None:

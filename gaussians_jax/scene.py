@@ -202,8 +202,8 @@ def _exposed(effects, params, drawn, view):
     for effect in effects:
         if effect.expose is not None:
             own = params.nets.get(effect.name)
-            colour = effect.expose(own, drawn.colour, view.appearance)
-            drawn = drawn._replace(colour=colour)
+            color = effect.expose(own, drawn.color, view.appearance)
+            drawn = drawn._replace(color=color)
     return drawn
 
 
@@ -311,9 +311,9 @@ def loss_of(
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The loss of one frame with what every effect adds, and numbers to log."""
     truth, valid = observation.truth, observation.valid
-    colour = observation.rendering.colour
+    color = observation.rendering.color
     photometric = losses.photometric(
-        colour, truth, valid, dssim_weight=spec.dssim_weight
+        color, truth, valid, dssim_weight=spec.dssim_weight
     )
     context = PenaltyContext(
         condition=condition,
@@ -327,7 +327,7 @@ def loss_of(
     if isinstance(spec.densification, MCMCStrategySpec):
         cost = mcmc.penalty(params.rows["splats"], spec.densification)
         terms["mcmc/penalty"] = Term(cost, 1.0)
-    metrics = {"mse": losses.mse(colour, truth, valid)} | values(terms)
+    metrics = {"mse": losses.mse(color, truth, valid)} | values(terms)
     return weighted_sum(terms, photometric), metrics
 
 

@@ -196,7 +196,7 @@ def pad_rows(params: Params, capacity: int) -> Params:
 
 def from_points(
     points: np.ndarray,
-    colours: np.ndarray,
+    colors: np.ndarray,
     *,
     degree: int = 3,
     opacity: float = 0.1,
@@ -206,7 +206,7 @@ def from_points(
 ) -> Splats:
     """One round Gaussian for each point; host side.
 
-    `points` [n, 3] in scene units and `colours` [n, 3] in [0, 1]. The standard
+    `points` [n, 3] in scene units and `colors` [n, 3] in [0, 1]. The standard
     deviation is `scale` times the root mean square distance to the three nearest points
     that lie elsewhere (Kerbl et al. 2023, section 5.1, says the mean distance; their
     code counts a duplicate as a neighbour at distance zero and floors the result at
@@ -215,17 +215,16 @@ def from_points(
     """
     refuse_half(dtype)
     points = np.asarray(points, np.float64)
-    colours = np.asarray(colours, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or points.shape != colours.shape:
+    colors = np.asarray(colors, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
         raise ValueError(
-            "points and colours are both [n, 3], got "
-            f"{points.shape} and {colours.shape}"
+            f"points and colors are both [n, 3], got {points.shape} and {colors.shape}"
         )
     if not len(points):
         raise ValueError("no points to start from; use `random_in_views` instead")
     if not 0 < opacity < 1:
         raise ValueError(f"the first opacity lies between 0 and 1, got {opacity}")
-    for name, values in (("point", points), ("colour", colours)):
+    for name, values in (("point", points), ("color", colors)):
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
             raise ValueError(
@@ -242,7 +241,7 @@ def from_points(
         log_scale=jnp.asarray(np.repeat(log_scale[:, None], 3, axis=1), dtype),
         quaternion=jnp.asarray(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)), dtype),
         opacity_logit=jnp.full(count, math.log(opacity / (1 - opacity)), dtype),
-        sh_dc=jnp.asarray((colours[:, None, :] - 0.5) / SH_DC, dtype),
+        sh_dc=jnp.asarray((colors[:, None, :] - 0.5) / SH_DC, dtype),
         sh_rest=jnp.zeros((count, rest, 3), dtype),
     )
 

@@ -2,7 +2,7 @@
 
 Each Gaussian moves on a cubic in time, turns by a quaternion linear in time, and is as
 opaque as a bell over time makes it, as in SpacetimeGaussians (Li et al. 2024,
-arXiv:2312.16812, equations 7 to 9); it has one colour from everywhere and keeps its
+arXiv:2312.16812, equations 7 to 9); it has one color from everywhere and keeps its
 size. What a run learned is fitted by that, and how well is told with the file.
 """
 
@@ -63,7 +63,7 @@ class Curves(NamedTuple):
     quaternion: np.ndarray  # [gaussians, 4] wxyz
     turning: np.ndarray  # [gaussians, 4]
     scale: np.ndarray  # [gaussians, 3]
-    colour: np.ndarray  # [gaussians, 3] in [0, 1]
+    color: np.ndarray  # [gaussians, 3] in [0, 1]
     opacity: np.ndarray  # [gaussians]
     centre: np.ndarray  # [gaussians]
     width: np.ndarray  # [gaussians]
@@ -100,7 +100,7 @@ def fit(instants: Instants) -> Curves:
         quaternion=turn[:, 0] + shift * turn[:, 1],
         turning=turn[:, 1],
         scale=np.exp(instants.log_scale.astype(np.float64).mean(axis=0)),
-        colour=np.clip(instants.colour, 0, 1).astype(np.float64),
+        color=np.clip(instants.color, 0, 1).astype(np.float64),
         opacity=opacity,
         centre=centre,
         width=width,
@@ -166,7 +166,7 @@ def encode(curves: Curves, capture: Capture) -> bytes:
     rows = np.zeros(-(-count // 1024) * 1024, _ROW)
     for name in ("position", "quaternion", "scale", "motion", "turning"):
         rows[name][:count] = getattr(curves, name)
-    rgba = np.concatenate([curves.colour, curves.opacity[:, None]], axis=1)
+    rgba = np.concatenate([curves.color, curves.opacity[:, None]], axis=1)
     rows["rgba"][:count] = np.round(255 * rgba)
     rows["bell"][:count] = np.stack([curves.centre, curves.width], axis=1)
     about = {
@@ -236,18 +236,18 @@ def measured(
     off = np.linalg.norm(fitted - instants.mean, axis=-1)
     off = np.where(instants.opacity > FAINTEST_SEEN, off, 0)
     background = jnp.asarray(capture.background or (0.0, 0.0, 0.0), jnp.float32)
-    colours = jnp.asarray(curves.colour, jnp.float32)
+    colors = jnp.asarray(curves.color, jnp.float32)
     pictured = jax.jit(
         lambda gaussians, camera: (
             rendering.render(
                 gaussians,
-                colours,
+                colors,
                 camera,
                 capture.size,
                 raster,
                 background,
                 depth=False,
-            ).rendering.colour
+            ).rendering.color
         )
     )
     rows = capture.heldout if len(capture.heldout) else capture.train
@@ -256,7 +256,7 @@ def measured(
         view = evaluation.view_of(capture, row)
         camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), view.camera)
         picture = pictured(at(curves, float(view.time)), camera)
-        own = jnp.clip(draw(state, view).colour, 0, 1)
+        own = jnp.clip(draw(state, view).color, 0, 1)
         scores.append(float(psnr(quantise(picture), quantise(own))))
     return Fit(
         rms=float(np.sqrt(np.mean(off**2))),

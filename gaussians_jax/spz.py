@@ -1,7 +1,7 @@
 """SPZ, the packed format of Niantic: versions 2 and 3 (gzip) and 4 (zstd).
 
 Layout and quantisation: github.com/nianticlabs/spz, README and headers. Fields follow
-one another for all Gaussians: 24-bit fixed-point means, opacities, colours, logarithms
+one another for all Gaussians: 24-bit fixed-point means, opacities, colors, logarithms
 of scales, rotations, harmonics. Its axes are right, up, back; ours, like those of the
 PLY files of 3D Gaussian splatting, are right, down, front.
 """
@@ -18,7 +18,7 @@ from gaussians_jax.splats import LOG_SCALE_RANGE
 from nerfies_jax.capture import extras
 
 MAGIC = b"NGSP"
-COLOUR_SCALE = 0.15  # of the constant harmonic's coefficient, to a byte from 0 to 1
+COLOR_SCALE = 0.15  # of the constant harmonic's coefficient, to a byte from 0 to 1
 FRACTION_BITS = 12  # of a mean: steps of 1/4096 scene unit, range +-2048
 # Neither deflate nor the reference reader allows more; a header that asks for more rows
 # than the file could hold is refused before anything is allocated.
@@ -55,7 +55,7 @@ def decode(data: bytes) -> Unpacked:
     else:
         header, parts = _open_gzip(data)
     version, count, degree, fraction_bits, flags = header
-    mean, opacity, colour, log_scale, turn, harmonics = parts
+    mean, opacity, color, log_scale, turn, harmonics = parts
     steps = mean.reshape(count, 3, 3).astype(np.int32) @ np.array(
         [1, 1 << 8, 1 << 16], np.int32
     )
@@ -69,7 +69,7 @@ def decode(data: bytes) -> Unpacked:
         quaternion=unpack(turn.reshape(count, -1)) * _TURN_SIGN,
         opacity_logit=logit_of_byte(opacity),
         sh_dc=(
-            (colour.reshape(count, 1, 3).astype(np.float32) / 255 - 0.5) / COLOUR_SCALE
+            (color.reshape(count, 1, 3).astype(np.float32) / 255 - 0.5) / COLOR_SCALE
         ).astype(np.float32),
         sh_rest=(sh - 128) / 128 * _SH_SIGN[:rest, None],
         notes=_notes(flags),
@@ -96,14 +96,14 @@ def encode(rows: Unpacked, version: int = 3) -> bytes:
     # Held before they are scaled, which float32 coefficients above 2e36 would overflow;
     # their bytes end at 1 and at 10 / 3.
     sh = np.rint(np.clip(rows.sh_rest, -1, 1) * _SH_SIGN[:rest, None] * 128) + 128
-    colour = np.clip(rows.sh_dc, -4, 4) * (COLOUR_SCALE * 255) + 127.5
+    color = np.clip(rows.sh_dc, -4, 4) * (COLOR_SCALE * 255) + 127.5
     # The reference keeps 5 bits of degree 1 and 4 of the others; the zeros compress.
     step = np.where(np.arange(rest) < 3, 8, 16)[:, None]
     logit = rows.opacity_logit.astype(np.float64)
     parts = [
         mean,
         _byte(255 / (1 + np.exp(-np.clip(logit, -700, 700)))),
-        _byte(colour),
+        _byte(color),
         _byte((np.clip(rows.log_scale, *LOG_SCALE_RANGE) + 10) * 16),
         pack(quaternion),
         _byte((sh + step // 2) // step * step),

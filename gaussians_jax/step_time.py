@@ -72,9 +72,9 @@ def _drawing(spec, metadata, effects, now, frames):
         )
         return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(frame.rendering))
 
-    def compare(colour):
+    def compare(color):
         return losses.photometric(
-            colour, observation.truth, observation.valid, dssim_weight=spec.dssim_weight
+            color, observation.truth, observation.valid, dssim_weight=spec.dssim_weight
         )
 
     rows, gaussians = now

@@ -34,7 +34,7 @@ class TrackStart(NamedTuple):
     """What a scene starts from; host side."""
 
     position: np.ndarray  # [moving, 3] canonical, scene units
-    colour: np.ndarray  # [moving, 3] in [0, 1]
+    color: np.ndarray  # [moving, 3] in [0, 1]
     rows: Any  # of the motion, a row for each; None where it keeps none
     nets: Any  # of the motion
     time: np.ndarray  # [moving] of the picture that each was lifted from, in films
@@ -90,7 +90,7 @@ def _seeds(effect, points, followed, evidence, views, times, unit, spec):
     places = jax.jit(lambda points, time: path_fit.places(effect, points, time))
     # Nothing of each: in no frame need there be tracks enough.
     none = np.zeros((0, 3), np.float32)
-    positions, colours, spans = [none], [none], [np.zeros((2, 0))]
+    positions, colors, spans = [none], [none], [np.zeros((2, 0))]
     rows = [] if own is None else [jax.tree.map(lambda leaf: leaf[:0], own)]
     # All frames share the programs: as many rows as the frame with most.
     most = int(np.bincount(frame).max()) if len(frame) else 0
@@ -122,17 +122,17 @@ def _seeds(effect, points, followed, evidence, views, times, unit, spec):
         positions.append(back[kept])
         here_for = np.full(int(kept.sum()), times[here])
         spans.append(np.stack([here_for, mixed(followed)[kept]]))
-        colours.append(views.image[here][pixel[kept, 1], pixel[kept, 0]] / 255)
+        colors.append(views.image[here][pixel[kept, 1], pixel[kept, 0]] / 255)
         if mine is not None:
             rows.append(jax.tree.map(lambda leaf, kept=kept: leaf[kept], mine))
-    position, colour = np.concatenate(positions), np.concatenate(colours)
+    position, color = np.concatenate(positions), np.concatenate(colors)
     chosen = np.sort(rng.permutation(len(position))[: spec.moving_points])
     every = None
     if rows:
         every = jax.tree.map(lambda *leaves: np.concatenate(leaves)[chosen], *rows)
     span = np.concatenate(spans, axis=1)[:, chosen]
     return TrackStart(
-        position[chosen], colour[chosen], every, points.nets, *span, points.resting
+        position[chosen], color[chosen], every, points.nets, *span, points.resting
     )
 
 

@@ -141,7 +141,7 @@ def draw(
         ray, cosine = field_ray_through(bound.metadata, camera, position)
         level = render_ray(bound, ray, condition, None, guide)[-1]
         depth = level.distance * cosine / bound.metadata.scale
-        return Rendering(level.colour, level.alpha, depth)
+        return Rendering(level.color, level.alpha, depth)
 
     width, height = size
     centres = rays.pixel_centres(size, camera.position.dtype).reshape(-1, 2)

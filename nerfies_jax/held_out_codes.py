@@ -54,7 +54,7 @@ def score(
     guided = spec.sampling.occupancy is not None
 
     @jax.jit
-    def solve(params, view, pixels, colours, step):
+    def solve(params, view, pixels, colors, step):
         # Samples lie where those of the picture do.
         guide = field.survey(params, step)[skipping.GUIDE] if guided else None
         codes = field.codes_at(params, view)
@@ -68,10 +68,10 @@ def score(
                         field_ray.field_ray_through(metadata, view.camera, pixel)[0],
                         condition,
                         guide=guide,
-                    )[-1].colour
+                    )[-1].color
                 )
             )
-            return losses.mse(seen(pixels), colours)
+            return losses.mse(seen(pixels), colors)
 
         start = {name: codes[name] for name in tables}
         solution = fit.fit_code(loss, start, max_steps=MOST_STEPS, tolerance=TOLERANCE)
@@ -84,8 +84,8 @@ def score(
         # With repeats: one shape, however little of the half was filmed.
         line, column = place[np.random.default_rng(0).integers(len(place), size=RAYS)].T
         pixels = in_default_precision(np.stack([column, line], axis=1) + 0.5)
-        colours = in_default_precision(left[line, column].astype(np.float32) / 255)
-        return solve(params, view, pixels, colours, step)
+        colors = in_default_precision(left[line, column].astype(np.float32) / 255)
+        return solve(params, view, pixels, colors, step)
 
     def render(view: View, codes: Any) -> Rendering:
         return draw(params, view.camera, view.time, codes, capture.size, step)

@@ -107,7 +107,7 @@ NERFIES = RadianceScene(
 )
 
 # Park et al. 2021, arXiv:2106.13228: six bands of warp, a bent slicing surface, no
-# elastic penalty. Colour reads an appearance code of each frame, as in Nerfies; the
+# elastic penalty. Color reads an appearance code of each frame, as in Nerfies; the
 # code's own configuration for the validation rig has one for each camera.
 HYPERNERF = dataclasses.replace(
     NERFIES,
@@ -140,7 +140,7 @@ NERF_DS = dataclasses.replace(
 # Not in its normalised device coordinates, which fit forward-facing captures alone, so
 # that the bound on the flow is one unit of the field. The kinetic term counts once; the
 # chain to frames two away and the rays drawn where the error is large are not there.
-# Flow and depth count where a capture has them; without, it trains on colours alone.
+# Flow and depth count where a capture has them; without, it trains on colors alone.
 NSFF = dataclasses.replace(
     NERF,
     steps=360_000,
@@ -158,7 +158,7 @@ NSFF = dataclasses.replace(
 # and begin as thin as there (1e-3 of opacity in a cell). The motion learns at the
 # common rate, there at 7e-4. Differences have the slope of there, 1e-5 / 4096 rays / 6
 # * 160 / 128; from step 10 000 on, there only where a step touched them. Losses of
-# samples' colours and the last transmittance, rest points, camera codes: not there.
+# samples' colors and the last transmittance, rest points, camera codes: not there.
 TINEUVOX = RadianceScene(
     steps=20_000,
     rays=4096,
@@ -187,10 +187,10 @@ SMALL_NERF = RadianceScene(
     micro_batches=2,  # on a core each
     sampling=SamplingSpec(16, 16),
     template=TemplateSpec(
-        EncodingSpec(8), EncodingSpec(2), depth=4, width=96, skips=(), colour_width=48
+        EncodingSpec(8), EncodingSpec(2), depth=4, width=96, skips=(), color_width=48
     ),
     coarse=TemplateSpec(
-        EncodingSpec(6), None, depth=2, width=48, skips=(), colour_width=32
+        EncodingSpec(6), None, depth=2, width=48, skips=(), color_width=32
     ),
     learning_rate=5e-3,
     learning_rate_end=2e-4,
@@ -265,7 +265,7 @@ GRID_TEMPLATE = TemplateSpec(
     depth=1,
     width=32,
     skips=(),
-    colour_width=32,
+    color_width=32,
     density="exp",
 )
 SMALL_NERF_GRID = dataclasses.replace(
@@ -278,7 +278,7 @@ SMALL_NERF_GRID = dataclasses.replace(
         depth=1,
         width=16,
         skips=(),
-        colour_width=16,
+        color_width=16,
         density="exp",
     ),
     template_rate=6.0,

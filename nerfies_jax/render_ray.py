@@ -175,10 +175,10 @@ def render_ray(
     return coarse, level("fine", both, last, 1)
 
 
-def colour_offset(
+def color_offset(
     bound: Bound, name: str, direction: Vector, condition: FrameCondition
 ) -> Features:
-    """What the colour branch of one level makes of a ray (`template.colour_offset`)."""
+    """What the color branch of one level makes of a ray (`template.color_offset`)."""
     one, net = template_of(bound.spec, name), bound.params["template"][name]
     inputs = []
     if one.direction is not None:
@@ -189,7 +189,7 @@ def colour_offset(
         if effect.condition is not None
     ]
     read = jnp.concatenate([*inputs, jnp.zeros(0, direction.dtype)])
-    return template.colour_offset(one, net, read)
+    return template.color_offset(one, net, read)
 
 
 def radiance_at(
@@ -202,7 +202,7 @@ def radiance_at(
 ) -> template.Radiance:
     """What the template of one level says where it is asked, by `asked_at`.
 
-    `offset` is the `colour_offset` of the ray, `noise` is added to the raw density.
+    `offset` is the `color_offset` of the ray, `noise` is added to the raw density.
     """
     warped, lifted = place
     one, net = template_of(bound.spec, name), bound.params["template"][name]
@@ -210,14 +210,14 @@ def radiance_at(
     features = jnp.concatenate([encoded, *lifted])
     raw, hidden = template.raw_density(one, net, features)
     raw = raw if noise is None else raw + noise
-    return template.coloured(one, net, raw, hidden, offset)
+    return template.colored(one, net, raw, hidden, offset)
 
 
 def _radiance(bound, name, ray, condition, samples, noise):
     """What the template of one level says at the samples of one ray, and what surfaces
     there look like, by effect.
     """
-    offset = colour_offset(bound, name, ray.direction, condition)
+    offset = color_offset(bound, name, ray.direction, condition)
     surfaces = [effect for effect in bound.effects if effect.surface is not None]
 
     def ask(point, warped, lifted, noise):
@@ -263,7 +263,7 @@ def _surface_at(bound, name, surfaces, seen, condition, noise):
     }
     more = jnp.concatenate([look.features for look in looks.values()])
     raw = raw if noise is None else raw + noise
-    radiance = template.coloured(one, net, raw, hidden, offset, more)
+    radiance = template.colored(one, net, raw, hidden, offset, more)
     return radiance, {name: look.found for name, look in looks.items()}
 
 
@@ -297,14 +297,12 @@ def _composite(bound, ray, samples, radiance, media):
         others.append(depth)
     if media:
         depths = jnp.stack([static, *others])
-        colours = [radiance.colour, *(medium.colour for medium in media.values())]
+        colors = [radiance.color, *(medium.color for medium in media.values())]
         weights = compositing.media_weights(depths)
-        whole = compositing.composite_media(
-            depths, jnp.stack(colours), distance, behind
-        )
+        whole = compositing.composite_media(depths, jnp.stack(colors), distance, behind)
     else:
         weights = compositing.weights(static)[None]
-        whole = compositing.composite(weights[0], radiance.colour, distance, behind)
+        whole = compositing.composite(weights[0], radiance.color, distance, behind)
     media_weight = dict(zip(media, weights[1:], strict=True))
     return RayOutput(
         distances=distance,
@@ -313,7 +311,7 @@ def _composite(bound, ray, samples, radiance, media):
         static_weight=weights[0],
         media=media,
         media_weight=media_weight,
-        colour=whole.colour,
+        color=whole.color,
         alpha=whole.alpha,
         distance=whole.distance,
         median_distance=whole.median_distance,
@@ -326,7 +324,7 @@ def _composite(bound, ray, samples, radiance, media):
 def says_beta(
     effects: tuple[Effect, ...], media: Mapping[str, Medium]
 ) -> Effect | None:
-    """The one effect whose medium says how uncertain a ray's colour is, if any does.
+    """The one effect whose medium says how uncertain a ray's color is, if any does.
 
     ValueError where two say it, or one that has no `beta_min`.
     """
@@ -344,14 +342,14 @@ def says_beta(
         if said_by is not None:
             raise ValueError(
                 f"both {said_by.name!r} and {effect.name!r} say how uncertain a ray's "
-                "colour is; leave the beta of one medium None"
+                "color is; leave the beta of one medium None"
             )
         said_by = effect
     return said_by
 
 
 def _uncertainty(bound, media, media_weight):
-    """Of the ray's colour; None where no medium says it."""
+    """Of the ray's color; None where no medium says it."""
     effect = says_beta(bound.effects, media)
     if effect is None:
         return None

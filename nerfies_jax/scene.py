@@ -254,7 +254,7 @@ def learning_rates(
     if spec.table_rate != 1:
         tables = spec.table_rate * template
         template = {
-            name: net._replace(trunk=template, colour=template, tables=tables)
+            name: net._replace(trunk=template, color=template, tables=tables)
             for name, net in params["template"].items()
         }
     return rates | {"template": template}
@@ -270,15 +270,15 @@ def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     pixel = jnp.stack([column, line], axis=1).astype(camera.position.dtype) + 0.5
     ray = jax.vmap(rays.pixel_ray)(camera, pixel)
-    colour = frames.images[row, line, column].astype(pixel.dtype) / 255
+    color = frames.images[row, line, column].astype(pixel.dtype) / 255
     valid = ray.valid
     if frames.valid is not None:
         valid = valid & frames.valid[row, line, column]
     # Chosen here, once for all losses: what was not filmed may hold NaN, which stays
     # NaN under a weight of zero.
-    colour = jnp.where(valid[:, None], colour, 0)
+    color = jnp.where(valid[:, None], color, 0)
     cosine = jax.vmap(rays.depth_per_distance)(camera, ray.direction)
-    return Batch(row, pixel, ray.origin, ray.direction, cosine, colour, valid)
+    return Batch(row, pixel, ray.origin, ray.direction, cosine, color, valid)
 
 
 def loss_terms(
@@ -292,7 +292,7 @@ def loss_terms(
 ) -> dict[str, Term]:
     """Every term of the loss of one batch, by name; a `guide` as in `render_ray`.
 
-    "coarse" and "fine" are mean squared errors of colour; "colour" is NeRF-W's negative
+    "coarse" and "fine" are mean squared errors of color; "color" is NeRF-W's negative
     log-likelihood where a transient medium says how uncertain it is.
     """
     ray_key, penalty_key = jax.random.split(key)
@@ -327,26 +327,26 @@ def loss_terms(
         frames=frames,
         box=Box(centre, jnp.asarray(metadata.scale, batch.origin.dtype)),
     )
-    terms = _colour_terms(radiance.effects, levels, batch)
+    terms = _color_terms(radiance.effects, levels, batch)
     return terms | penalty_terms(radiance.effects, params, context, {})
 
 
-def _colour_terms(
+def _color_terms(
     effects: tuple[Effect, ...], levels: tuple[RayOutput, ...], batch: Batch
 ) -> dict[str, Term]:
     last = levels[-1]
-    mse = losses.mse(last.colour, batch.colour, batch.valid)
+    mse = losses.mse(last.color, batch.color, batch.valid)
     terms = {"fine": Term(mse, 1.0)}
     coarse_weight = 1.0
     uncertain = render_ray.says_beta(effects, last.media)
     if uncertain is not None:
         likelihood = transient.photometric(
-            last.colour, batch.colour, last.beta, batch.valid, uncertain.beta_power
+            last.color, batch.color, last.beta, batch.valid, uncertain.beta_power
         )
-        terms = {"fine": Term(mse, None), "colour": Term(likelihood, 1.0)}
+        terms = {"fine": Term(mse, None), "color": Term(likelihood, 1.0)}
         coarse_weight = 1.5  # as in NeRF-W: half of the sum over channels
     if len(levels) > 1:
-        coarse = losses.mse(levels[0].colour, batch.colour, batch.valid)
+        coarse = losses.mse(levels[0].color, batch.color, batch.valid)
         terms["coarse"] = Term(coarse, coarse_weight)
     return terms
 
@@ -376,7 +376,7 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
 
 def _width_of(one: TemplateSpec) -> int:
     """Floats that are kept of a sample: of its layers, and those read from planes."""
-    width, position = one.depth * one.width + one.colour_width, one.position
+    width, position = one.depth * one.width + one.color_width, one.position
     if not isinstance(position, PlanesSpec):
         return width  # of grids hardly any more: 0.77 to 1.02 of the estimate
     corners = 4 * (3 if position.moments is None else 6)

@@ -20,7 +20,7 @@ class SceneMetadata:
     far: float
     centre: tuple[float, float, float]  # of the filmed volume, scene units
     scale: float  # field = (scene - centre) * scale
-    background: tuple[float, float, float] | None  # colour behind everything, if known
+    background: tuple[float, float, float] | None  # color behind everything, if known
     times: tuple[float, ...]  # distinct times that are learnt from, rising
     # For each appearance id the rows of the table of codes it lies between, and where:
     # (left, right, progress). An exposure that is not learnt from lies between those

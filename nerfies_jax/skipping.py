@@ -26,7 +26,7 @@ from nerfies_jax.radiance import compositing, occupancy, sampling
 from nerfies_jax.render_ray import (
     Bound,
     asked_at,
-    colour_offset,
+    color_offset,
     is_moved,
     radiance_at,
 )
@@ -62,7 +62,7 @@ STAGES = 4  # in which a ray is followed; behind what is opaque no further one i
 def usable(spec, effects) -> bool:
     """Whether a field can be surveyed before its frames are drawn.
 
-    Not where a second medium shares its rays, where colour reads of surfaces, or where
+    Not where a second medium shares its rays, where color reads of surfaces, or where
     nothing says how large what was filmed is.
     """
     return (
@@ -94,7 +94,7 @@ def survey(
     names = tuple(bound.params["template"])
     dtype = jax.tree.leaves(bound.params["template"])[0].dtype
     direction = jnp.zeros(3, dtype).at[2].set(1)  # no density depends on it
-    offset = {n: colour_offset(bound, n, direction, condition) for n in names}
+    offset = {n: color_offset(bound, n, direction, condition) for n in names}
 
     def look(found, number):
         key = jax.random.fold_in(jax.random.key(0), number)
@@ -241,15 +241,15 @@ def _block(bound, occupied, camera, condition, position, columns):
             return every, jax.tree.map(among, asked)
 
         distance, before = jax.vmap(refined)(distance, depth, asked)
-    depth, colour, _ = ask("fine", distance, 4, before)
+    depth, color, _ = ask("fine", distance, 4, before)
     background = None if behind is None else jnp.asarray(behind, distance.dtype)
     whole = jax.vmap(
-        lambda depth, colour, distance: compositing.composite(
-            compositing.weights(depth), colour, distance, background
+        lambda depth, color, distance: compositing.composite(
+            compositing.weights(depth), color, distance, background
         )
-    )(depth, colour, distance)
+    )(depth, color, distance)
     z_depth = whole.distance * cosine / bound.metadata.scale
-    return Rendering(whole.colour, whole.alpha, z_depth)
+    return Rendering(whole.color, whole.alpha, z_depth)
 
 
 class _Asked(NamedTuple):
@@ -262,7 +262,7 @@ class _Asked(NamedTuple):
 def _ask(
     bound, name, occupied, ray, condition, distance, spacing, values, before, moved
 ):
-    """[rays, samples, values] density and, of four, colour; zero where skipped.
+    """[rays, samples, values] density and, of four, color; zero where skipped.
 
     Where a grid says what warps displace all samples by, it is `moved`. Else what warps
     and lifts said of samples `before` is not computed again; without it what they say
@@ -275,7 +275,7 @@ def _ask(
     wanted = occupancy.at(occupied, point, bound.spec.extent)
     if bound.metadata.background is None:
         wanted = wanted.at[:, -1].set(True)  # it stands for all behind it
-    offset = jax.vmap(lambda d: colour_offset(bound, name, d, condition))(ray.direction)
+    offset = jax.vmap(lambda d: color_offset(bound, name, d, condition))(ray.direction)
     width = -(-samples // STAGES)  # samples of a stage
 
     def staged(x):
@@ -289,7 +289,7 @@ def _ask(
 
     def said(index, place):
         radiance = radiance_at(bound, name, place, offset[index // width], condition)
-        every = jnp.concatenate([radiance.density[None], radiance.colour])
+        every = jnp.concatenate([radiance.density[None], radiance.color])
         return every[:values]
 
     def stage(passed, given):

@@ -102,7 +102,7 @@ def tiny_template(spec):
         depth=2,
         width=8,
         skips=(1,) if spec is not None and spec.skips else (),
-        colour_width=8,
+        color_width=8,
     )
 
 
@@ -206,8 +206,8 @@ def field_loss(spec, metadata, params, batch, key):
             end = jnp.maximum(far - distance[-1], 0)
         optical_depth = answers.density * compositing.intervals(distance, end)
         weights = compositing.weights(optical_depth)
-        whole = compositing.composite(weights, answers.colour, distance, behind)
-        return weights, whole.colour
+        whole = compositing.composite(weights, answers.color, distance, behind)
+        return weights, whole.color
 
     def ray(origin, direction, cosine, key):
         plan = spec.sampling
@@ -230,9 +230,9 @@ def field_loss(spec, metadata, params, batch, key):
 
     keys = jax.random.split(jax.random.split(key)[0], len(batch.origin))
     seen = jax.vmap(ray)(batch.origin, batch.direction, batch.cosine, keys)
-    terms = {"fine": losses.mse(seen[-1], batch.colour, batch.valid)}
+    terms = {"fine": losses.mse(seen[-1], batch.color, batch.valid)}
     if len(seen) > 1:
-        terms["coarse"] = losses.mse(seen[0], batch.colour, batch.valid)
+        terms["coarse"] = losses.mse(seen[0], batch.color, batch.valid)
     return sum(terms.values()), terms
 
 
@@ -269,12 +269,12 @@ def splat_step(spec, metadata, shuffled_row):
     def drawn(rows, offset, camera, size, degree):
         gaussians = splats.activate(rows)
         shown = splats.active_harmonics(rows, degree)
-        colour = harmonics.colour_towards(shown, gaussians.mean, camera.position)
+        color = harmonics.color_towards(shown, gaussians.mean, camera.position)
         seen = projection.project(gaussians, camera, size, spec.raster)
         placed = seen
         if offset is not None:  # whose gradient densification wants to know
             placed = seen._replace(mean_px=seen.mean_px + offset)
-        image, passing = raster.rasterize(placed, colour, size, spec.raster)
+        image, passing = raster.rasterize(placed, color, size, spec.raster)
         behind = jnp.asarray(metadata.background, image.dtype)
         return image + behind * passing[..., None], seen
 

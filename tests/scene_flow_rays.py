@@ -22,7 +22,7 @@ from tests.oracles import networks
 
 TINY = SceneFlowSpec(
     network=TemplateSpec(
-        EncodingSpec(2), EncodingSpec(1), depth=2, width=8, skips=(1,), colour_width=6
+        EncodingSpec(2), EncodingSpec(1), depth=2, width=8, skips=(1,), color_width=6
     ),
     time=EncodingSpec(1),
     flow_bound=0.3,
@@ -78,7 +78,7 @@ def frames_and_batch(rng, dtype):
         origin=filmed.position[row].astype(dtype),
         direction=direction.astype(dtype),
         cosine=cosine.astype(dtype),
-        colour=rng.uniform(size=(RAYS, 3)).astype(dtype),
+        color=rng.uniform(size=(RAYS, 3)).astype(dtype),
         valid=np.array([True, True, True, False, True, True]),
     )
     return jax.tree.map(jnp.asarray, (frames, batch))
@@ -89,7 +89,7 @@ def context_of(
 ):
     """The rays as the scene renders them, as far as the penalty reads it.
 
-    `behind` is the colour of a known background.
+    `behind` is the color of a known background.
     """
     end = jnp.full((RAYS, 1), 1e10, distance.dtype)
     if behind is not None:
@@ -116,7 +116,7 @@ def context_of(
         static_weight=jnp.zeros_like(weight),
         media={"scene_flow": media},
         media_weight={"scene_flow": weight},
-        colour=batch.colour,
+        color=batch.color,
         alpha=none,
         distance=none,
         median_distance=none,
@@ -161,19 +161,19 @@ def sigmoid(x):
 
 
 def dynamic(params, point, direction, time):
-    """Density, colour, flow [2, 3], disocclusion [2] by the published network."""
+    """Density, color, flow [2, 3], disocclusion [2] by the published network."""
     read = TINY.network
     places = networks.waves(read.position, point)
     inputs = np.concatenate([places, networks.waves(TINY.time, 2 * time - 1)])
-    trunk, colour = params.network.trunk, params.network.colour
+    trunk, color = params.network.trunk, params.network.color
     hidden = networks.trunk(trunk.hidden, inputs, read.skips)
     heads = {name: networks.affine(x, hidden) for name, x in trunk.heads.items()}
     seen = networks.waves(read.direction, direction)
-    shade = networks.heads(colour, np.concatenate([heads["bottleneck"], seen]))
+    shade = networks.heads(color, np.concatenate([heads["bottleneck"], seen]))
     flow = TINY.flow_bound * np.tanh(networks.affine(params.flow, hidden))
     hidden_share = networks.affine(params.disocclusion, hidden)
     density = np.log1p(np.exp(heads["density"][0]))
-    return density, sigmoid(shade["colour"]), flow.reshape(2, 3), sigmoid(hidden_share)
+    return density, sigmoid(shade["color"]), flow.reshape(2, 3), sigmoid(hidden_share)
 
 
 def composite(density, distance, behind):
@@ -214,9 +214,9 @@ def oracle(params, frames, batch, arrays, step, behind=None):
         mask = float(batch.valid[r])
         if step >= 100:
             mask *= blend_weight[r].sum()
-        colour = sum(w * h[1] for w, h in zip(weight, here, strict=True))
-        colour = colour + (1 - weight.sum()) * back
-        lists["dynamic"].append((np.mean((colour - batch.colour[r]) ** 2), mask))
+        color = sum(w * h[1] for w, h in zip(weight, here, strict=True))
+        color = color + (1 - weight.sum()) * back
+        lists["dynamic"].append((np.mean((color - batch.color[r]) ** 2), mask))
         column, line = int(batch.pixel[r, 0]), int(batch.pixel[r, 1])
         for s in range(SAMPLES):
             logit = features[r, s] @ params.blend.weight[:, 0] + params.blend.bias[0]
@@ -240,9 +240,9 @@ def oracle(params, frames, batch, arrays, step, behind=None):
             there = [dynamic(params, x, direction, later) for x in moved]
             w = composite([t[0] for t in there], distance, behind)
             seen = 1 - np.array([h[3][side] for h in here])
-            colour = sum(a * t[1] for a, t in zip(w, there, strict=True))
-            colour = colour + (1 - w.sum()) * back
-            error = np.mean((colour - batch.colour[r]) ** 2)
+            color = sum(a * t[1] for a, t in zip(w, there, strict=True))
+            color = color + (1 - w.sum()) * back
+            error = np.mean((color - batch.color[r]) ** 2)
             lists[f"warped{side}"].append((error, mask * (w @ seen)))
             for s in range(SAMPLES):
                 around = np.abs(flows[s, side] + there[s][2][1 - side]).mean()

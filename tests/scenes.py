@@ -84,7 +84,7 @@ TINY_MOBA = dataclasses.replace(
 TINY_FIELD = RadianceScene(
     steps=10,
     template=TemplateSpec(
-        EncodingSpec(2), EncodingSpec(1), depth=1, width=8, skips=(), colour_width=8
+        EncodingSpec(2), EncodingSpec(1), depth=1, width=8, skips=(), color_width=8
     ),
     sampling=SamplingSpec(4, 0),
     appearance=AppearanceSpec(width=3),

@@ -56,13 +56,13 @@ EXCUSED = {
     **dict.fromkeys(["splats.random_in_views", "splats.scene_extent"], "host"),
     **dict.fromkeys(["splats.capacity_for", "harmonics.degree_of"], "sizes"),
     **dict.fromkeys(["kan.spacing", "kan.width", "kan.centres"], "settings"),
-    **dict.fromkeys(["template.trunk_spec", "template.colour_spec"], "settings"),
+    **dict.fromkeys(["template.trunk_spec", "template.color_spec"], "settings"),
     **dict.fromkeys(["quaternion.identity", "rays.pixel_centres"], "constants"),
     **dict.fromkeys(["codes.init", "kan.init", "mlp.init", "mlp.init_layer"], "draws"),
     **dict.fromkeys(["template.init", "grids.init", "planes.init"], "draws"),
     "voxels.init": "zeros",
-    **dict.fromkeys(["template.raw_density", "template.coloured"], "template.apply"),
-    "template.colour_offset": "template.apply",
+    **dict.fromkeys(["template.raw_density", "template.colored"], "template.apply"),
+    "template.color_offset": "template.apply",
     "grids.variation_at_random": "draws",
     **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
     "splats.refuse_half": "types",
@@ -77,7 +77,7 @@ EXCUSED = {
 _MLP = MLPSpec(3, 2, 4, (("y", HeadSpec(2)),), skips=(1,))
 _KAN = KANSpec(3, (4,), out_features=2, kernels=4)
 _TEMPLATE = TemplateSpec(
-    EncodingSpec(2), EncodingSpec(1), depth=2, width=4, skips=(1,), colour_width=4
+    EncodingSpec(2), EncodingSpec(1), depth=2, width=4, skips=(1,), color_width=4
 )
 
 

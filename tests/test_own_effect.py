@@ -65,11 +65,11 @@ def fog(name="fog", beta_min=0.5, beta_power=0.0):
 @pytest.mark.full
 def test_a_medium_brings_its_own_least_uncertainty():
     """Of a field without a transient: what a ray's beta is at least, the loss shows."""
-    near, far = (of_field(fog(beta_min=b))["colour"] for b in (1e3, 1e4))
+    near, far = (of_field(fog(beta_min=b))["color"] for b in (1e3, 1e4))
     # log beta, where it is so large that the residual adds next to nothing
     np.testing.assert_allclose(near, np.log(1e3), atol=2e-3)
     np.testing.assert_allclose(far - near, np.log(10), atol=2e-3)
-    weighed = of_field(fog(beta_min=1e3, beta_power=1.0))["colour"]
+    weighed = of_field(fog(beta_min=1e3, beta_power=1.0))["color"]
     np.testing.assert_allclose(weighed / near, 1e3, rtol=1e-3)
 
 

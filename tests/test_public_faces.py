@@ -182,10 +182,10 @@ CASES = {
         "refused",
     ),
     "gj.render": Case(
-        lambda colours, background, **rows: gj.render(
-            gaussians(**rows), colours, CAMERA, (8, 8), background=background
+        lambda colors, background, **rows: gj.render(
+            gaussians(**rows), colors, CAMERA, (8, 8), background=background
         ),
-        {**ROWS, "colours": (5, 3), "background": (3,)},
+        {**ROWS, "colors": (5, 3), "background": (3,)},
         "refused",
     ),
     "gj.rasterize": Case(
@@ -298,8 +298,8 @@ def test_integers_are_refused_by_name_or_converted_as_images(name):
 
 @pytest.mark.parametrize("channels", [1, 4])
 def test_colors_of_gray_and_of_rgba_never_become_depth(channels):
-    message = refusal(CASES["gj.render"], shapes={"colours": (5, channels)})
-    assert f"`colours` has shape [5, {channels}], expected [gaussians, 3]" in message
+    message = refusal(CASES["gj.render"], shapes={"colors": (5, channels)})
+    assert f"`colors` has shape [5, {channels}], expected [gaussians, 3]" in message
 
 
 @pytest.mark.parametrize(

@@ -37,9 +37,9 @@ def own() -> nj.Effect:
     )
 
 
-def drawn(gaussians: gj.Gaussians, colours: jax.Array) -> jax.Array:
+def drawn(gaussians: gj.Gaussians, colors: jax.Array) -> jax.Array:
     camera = nj.look_at((0, 0, -5), (0, 0, 0), (0, 1, 0), focal_px=150, size=(160, 120))
-    return gj.render(gaussians, colours, camera, (160, 120)).rendering.colour
+    return gj.render(gaussians, colors, camera, (160, 120)).rendering.color
 
 
 def warped(twist: jax.Array, points: jax.Array) -> jax.Array:

@@ -129,10 +129,10 @@ renderer = nj.Renderer(run.model, run.capture.size)
 rows = run.capture.heldout
 scored = nj.score(renderer, outcome.result.state, run.capture, rows)
 figure, axes = plt.subplots(2, len(rows), figsize=(4 * len(rows), 6), squeeze=False)
-for column, (row, colour) in enumerate(zip(rows, scored.colour, strict=True)):
+for column, (row, color) in enumerate(zip(rows, scored.color, strict=True)):
     axes[0, column].imshow(run.capture.images[row])
     axes[0, column].set_title(f"frame {run.capture.ids[row]}")
-    axes[1, column].imshow(np.clip(colour, 0, 1))
+    axes[1, column].imshow(np.clip(color, 0, 1))
     axes[1, column].set_title(f"{scored.psnr[column]:.1f} dB")
 for axis in axes.flat:
     axis.axis("off")

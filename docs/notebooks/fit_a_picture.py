@@ -38,7 +38,7 @@ PICTURE = None  # a file of yours; None takes a frame of the built-in scene
 # %% [markdown]
 # ## The picture
 #
-# Colours lie in [0, 1]. `height, width, 3`, as everywhere in this library.
+# Colors lie in [0, 1]. `height, width, 3`, as everywhere in this library.
 
 # %%
 if PICTURE is None:
@@ -64,7 +64,7 @@ camera = nj.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), float(WIDTH), size)
 
 def scattered(key, count):
     """Random Gaussians over the picture, a few pixels wide and half transparent."""
-    place_key, depth_key, colour_key = jax.random.split(key, 3)
+    place_key, depth_key, color_key = jax.random.split(key, 3)
     reach = jnp.array([0.5, 0.5 * height / WIDTH])
     place = jax.random.uniform(place_key, (count, 2), minval=-reach, maxval=reach)
     depth = jax.random.uniform(depth_key, (count, 1), minval=0.98, maxval=1.02)
@@ -73,7 +73,7 @@ def scattered(key, count):
         "log_scale": jnp.full((count, 3), jnp.log(0.012)),
         "quaternion": jnp.tile(jnp.array([1.0, 0, 0, 0]), (count, 1)),
         "opacity_logit": jnp.zeros(count),
-        "colour_logit": 0.1 * jax.random.normal(colour_key, (count, 3)),
+        "color_logit": 0.1 * jax.random.normal(color_key, (count, 3)),
     }
 
 
@@ -84,9 +84,9 @@ def draw(params, spec=gj.RasterSpec()):
         scale=jnp.exp(params["log_scale"]),
         opacity=jax.nn.sigmoid(params["opacity_logit"]),
     )
-    colours = jax.nn.sigmoid(params["colour_logit"])
-    frame = gj.render(gaussians, colours, camera, size, spec, depth=False)
-    return frame.rendering.colour
+    colors = jax.nn.sigmoid(params["color_logit"])
+    frame = gj.render(gaussians, colors, camera, size, spec, depth=False)
+    return frame.rendering.color
 
 
 def loss(params, spec=gj.RasterSpec()):
@@ -145,7 +145,7 @@ rates = {
     "log_scale": 2e-2,
     "quaternion": 1e-2,
     "opacity_logit": 5e-2,
-    "colour_logit": 5e-2,
+    "color_logit": 5e-2,
 }
 optimiser = optax.multi_transform(
     {name: optax.adam(rate) for name, rate in rates.items()},
@@ -172,7 +172,7 @@ fitted, values = train(start)
 # ## Look at it
 #
 # The truth, what was begun with, what was fitted and where it is still wrong (five
-# times brighter). A flat picture of the mean colour is the least one can do; what was
+# times brighter). A flat picture of the mean color is the least one can do; what was
 # learnt has to beat it by far.
 
 # %%
@@ -191,7 +191,7 @@ plt.show()
 
 # %%
 flat = float(-10 * jnp.log10(jnp.mean((truth - truth.mean((0, 1))) ** 2)))
-print(f"mean colour {flat:.1f} dB, Gaussians {psnr(fitted):.1f} dB")
+print(f"mean color {flat:.1f} dB, Gaussians {psnr(fitted):.1f} dB")
 assert psnr(fitted) > flat + 1
 assert values[-1] < values[0]
 

@@ -159,7 +159,7 @@ scores, drawn = {}, {}
 for name, model in models.items():
     renderer = nj.Renderer(model, capture.size)
     scored = nj.score(renderer, states[name], capture, capture.heldout)
-    scores[name], drawn[name] = scored.psnr.mean(), scored.colour[0]
+    scores[name], drawn[name] = scored.psnr.mean(), scored.color[0]
 truth = capture.images[capture.heldout[0]] / 255
 figure, axes = plt.subplots(1, 3, figsize=(12, 3.4))
 panels = {"truth": truth} | {f"{n}, {scores[n]:.2f} dB": drawn[n] for n in drawn}

@@ -269,7 +269,7 @@ class Job:
             numbers["compile_seconds"] = float("nan")
         if len(self._built) > 1:  # what came before it counts, too
             numbers["peak_mb"] = float("nan")
-        arrays = {"colour": evaluation.as_picture(scored.colour), "depth": scored.depth}
+        arrays = {"color": evaluation.as_picture(scored.color), "depth": scored.depth}
         notes = {"steps": result.steps, "stopped_by": result.stopped_by}
         if followed is not None:
             arrays |= {"path": followed.path, "found": followed.found}

@@ -37,7 +37,7 @@ def shown_row(known: GroundTruth, capture: Capture) -> int:
 def draw(
     capture: Capture,
     known: GroundTruth,
-    colour: Mapping[str, np.ndarray],
+    color: Mapping[str, np.ndarray],
     depth: Mapping[str, np.ndarray],
     path: Mapping[str, np.ndarray | None],
     captions: Mapping[str, str],
@@ -45,37 +45,37 @@ def draw(
 ) -> np.ndarray:
     """The truth above, then render, error, depth and tracks of every arm in its row.
 
-    `colour` and `depth` are of the shown frame. White: where points are and were;
+    `color` and `depth` are of the shown frame. White: where points are and were;
     orange: where they are followed to; red: from one to the other. Of a real capture
     only the pictures are known, and depths are shown between the limits of the first.
     """
     row = int(known.rows[shown])
     if not known.exact:
-        return _draw_filmed(capture, row, colour, depth)
+        return _draw_filmed(capture, row, color, depth)
     truth, true_depth = capture.images[row], capture.depths[row]
-    coloured = pictures.colour_depth(true_depth)
-    limits = coloured.low, coloured.high
+    colored = pictures.color_depth(true_depth)
+    limits = colored.low, colored.high
     moving = np.where(capture.moving[row][..., None], truth, truth // 4)
-    panels = [truth, moving, coloured.picture]
+    panels = [truth, moving, colored.picture]
     panels = [_enlarged(panel) for panel in panels]
     panels.append(_tracks(capture, known, known.path, row))
     labels = [f"truth: {capture.ids[row]}", "what moves", "true depth", "true tracks"]
-    for arm, rendered in colour.items():
-        error = pictures.colour_error(rendered, truth, LARGEST_ERROR).picture
-        deep = pictures.colour_depth(depth[arm], limits=limits).picture
+    for arm, rendered in color.items():
+        error = pictures.color_error(rendered, truth, LARGEST_ERROR).picture
+        deep = pictures.color_depth(depth[arm], limits=limits).picture
         panels += [_enlarged(panel) for panel in (rendered, error, deep)]
         panels.append(_tracks(capture, known, path[arm], row))
         labels += [arm, f"error, to {LARGEST_ERROR:g}", "depth", captions[arm]]
     return pictures.contact_sheet(panels, labels)
 
 
-def _draw_filmed(capture, row, colour, depth):
+def _draw_filmed(capture, row, color, depth):
     truth, limits, panels, labels = capture.images[row], None, [], []
-    for arm, rendered in colour.items():
-        error = pictures.colour_error(rendered, truth, LARGEST_ERROR).picture
-        coloured = pictures.colour_depth(depth[arm], limits=limits)
-        limits = coloured.low, coloured.high
-        shown = (truth, rendered, error, coloured.picture)
+    for arm, rendered in color.items():
+        error = pictures.color_error(rendered, truth, LARGEST_ERROR).picture
+        colored = pictures.color_depth(depth[arm], limits=limits)
+        limits = colored.low, colored.high
+        shown = (truth, rendered, error, colored.picture)
         panels += [_enlarged(panel) for panel in shown]
         labels += [capture.ids[row], arm, f"error, to {LARGEST_ERROR:g}", "depth"]
     return pictures.contact_sheet(panels, labels)
@@ -109,9 +109,9 @@ def _tracks(capture, known, path, row):
             for points in (known.path, path)
         )
         # The truth last: a point that is followed well is white.
-        for points, colour in ((followed, FOUND), (true, TRUE)):
+        for points, color in ((followed, FOUND), (true, TRUE)):
             for line in points:
-                pen.line([tuple(p) for p in line.tolist()], fill=colour, width=1)
+                pen.line([tuple(p) for p in line.tolist()], fill=color, width=1)
         for there, here in zip(true[:, now], followed[:, now], strict=True):
             pen.line([*there.tolist(), *here.tolist()], fill=APART, width=2)
             _dot(pen, here.tolist(), FOUND)
@@ -119,9 +119,9 @@ def _tracks(capture, known, path, row):
     return np.asarray(image)
 
 
-def _dot(pen, place, colour, radius=3):
+def _dot(pen, place, color, radius=3):
     x, y = place
-    pen.ellipse([x - radius, y - radius, x + radius, y + radius], fill=colour)
+    pen.ellipse([x - radius, y - radius, x + radius, y + radius], fill=color)
 
 
 @jax.jit

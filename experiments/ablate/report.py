@@ -133,7 +133,7 @@ def _picture(job, finished, path):
         picture.draw(
             job.filmed,
             job.known,
-            {name: kept.arrays["colour"][shown] for name, kept in first.items()},
+            {name: kept.arrays["color"][shown] for name, kept in first.items()},
             {name: kept.arrays["depth"][shown] for name, kept in first.items()},
             {name: kept.arrays.get("path") for name, kept in first.items()},
             captions,

@@ -25,7 +25,7 @@ class ArmResult(NamedTuple):
     """What is left of one arm and seed when it is finished."""
 
     numbers: dict[str, float]
-    arrays: dict[str, Any]  # colour, depth, and path where points were followed
+    arrays: dict[str, Any]  # color, depth, and path where points were followed
     notes: dict[str, Any]  # steps, what stopped it, points that were ever lost
 
 

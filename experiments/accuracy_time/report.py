@@ -33,7 +33,7 @@ TITLES = {
     "peak_mb": "peak memory / MB",
     "parameters": "parameters (4 bytes each in the file)",
 }
-SPLAT_COLOUR, FIELD_COLOUR = "#0a5fb4", "#c4501b"
+SPLAT_COLOR, FIELD_COLOR = "#0a5fb4", "#c4501b"
 
 
 def write(job, args, finished) -> list[Metric]:
@@ -184,8 +184,8 @@ def _draw_front(panel, means, quality, cost):
     for row in means.values():
         if math.isfinite(row[cost]) and math.isfinite(row[quality]):
             splats = math.isfinite(row["gaussians"])
-            colour = SPLAT_COLOUR if splats else FIELD_COLOUR
-            panel.plot(row[cost], row[quality], "o", color=colour, markersize=4)
+            color = SPLAT_COLOR if splats else FIELD_COLOR
+            panel.plot(row[cost], row[quality], "o", color=color, markersize=4)
     names = front(means, quality, cost)
     for name in set(means) - set(names):
         row = means[name]

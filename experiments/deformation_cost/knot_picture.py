@@ -6,7 +6,7 @@ from experiments.deformation_cost.knot_curve import Curve
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evaluation import figures
 
-COLOURS = {"linear": "tab:orange", "cubic": "tab:blue"}
+COLORS = {"linear": "tab:orange", "cubic": "tab:blue"}
 
 
 def save(path: pathlib.Path, rows: list[dict], curve: Curve) -> None:
@@ -14,19 +14,19 @@ def save(path: pathlib.Path, rows: list[dict], curve: Curve) -> None:
     figure = figures.new_figure(figsize=(15, 5), layout="constrained")
     bars, errors, quality = figure.subplots(1, 3, width_ratios=(1.5, 1, 1))
     _bars(bars, rows)
-    for way, colour in COLOURS.items():
+    for way, color in COLORS.items():
         points = [point for point in curve.points if point.interpolation == way]
         knots = [point.knots for point in points]
         errors.loglog(
             *(knots, [p.largest for p in points], "--"),
-            color=colour,
+            color=color,
             label=f"{way}, largest",
         )
         errors.loglog(
-            *(knots, [p.rms for p in points], "o-"), color=colour, label=f"{way}, RMS"
+            *(knots, [p.rms for p in points], "o-"), color=color, label=f"{way}, RMS"
         )
         times = [point.cpu_ms for point in points]
-        quality.plot(times, [p.psnr for p in points], "o-", color=colour, label=way)
+        quality.plot(times, [p.psnr for p in points], "o-", color=color, label=way)
         for point in points:
             quality.annotate(
                 f"{point.knots}", (point.cpu_ms, point.psnr), (4, -10), fontsize=8,
@@ -59,7 +59,7 @@ def save(path: pathlib.Path, rows: list[dict], curve: Curve) -> None:
 
 def _bars(axes, rows):
     names = [row["name"] for row in rows]
-    for kind, shift, colour in (
+    for kind, shift, color in (
         ("forward", -0.2, "tab:green"),
         ("both", 0.2, "tab:grey"),
     ):
@@ -67,7 +67,7 @@ def _bars(axes, rows):
         values = [rows[k][f"{kind}_cpu_ms"] for k in there]
         label = "forward" if kind == "forward" else "and backward"
         bars = axes.barh(
-            [k + shift for k in there], values, 0.4, color=colour, label=label
+            [k + shift for k in there], values, 0.4, color=color, label=label
         )
         axes.bar_label(bars, fmt="%.3g", padding=3, fontsize=7)
     axes.set_yticks(range(len(names)), names, fontsize=8)

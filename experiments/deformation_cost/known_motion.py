@@ -29,7 +29,7 @@ class Moving(NamedTuple):
 
     name: str
     deform: Callable  # time -> Gaussians, compiled
-    draw: Callable  # (Gaussians, time) -> colour, compiled
+    draw: Callable  # (Gaussians, time) -> color, compiled
     active: np.ndarray  # [gaussians] bool
 
 
@@ -63,7 +63,7 @@ def of_model(
 
     @jax.jit
     def draw(params, gaussians, view, step):
-        return stages.draw(params, gaussians, view, size, step).colour
+        return stages.draw(params, gaussians, view, size, step).color
 
     return Moving(
         name,
@@ -97,7 +97,7 @@ def fitted(count: int, spec: MotionSpec, steps: int) -> Moving:
 
 
 def ball_and_wall(count: int) -> Splats:
-    """Round Gaussians, coloured by where they are."""
+    """Round Gaussians, colored by where they are."""
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(count - count // 2, 3))
     ball *= (
@@ -107,8 +107,8 @@ def ball_and_wall(count: int) -> Splats:
     )
     wall = rng.uniform((-1.4, -1.2, 1), (1.4, 1.2, 1.1), (count // 2, 3))
     points = np.concatenate([ball, wall])
-    colours = 0.5 + 0.5 * np.sin(9 * points + [0, 1, 2])
-    return splats.from_points(points, colours, degree=0, opacity=0.8)
+    colors = 0.5 + 0.5 * np.sin(9 * points + [0, 1, 2])
+    return splats.from_points(points, colors, degree=0, opacity=0.8)
 
 
 def analytic(points: Float[Array, "points 3"], time: Float[Array, ""]) -> Change:

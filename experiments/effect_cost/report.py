@@ -27,7 +27,7 @@ PAGE_HEADS += ("compile s", "step ms", "over bare")
 MILLIONS = ("flops", "matrix_flops", "bytes_accessed", "temporary_bytes")
 PAGE_KEYS = ("parameters", *(f"step.{x}" for x in MILLIONS))
 PAGE_KEYS += ("step.compile_seconds", "step.seconds", "step.over_bare")
-COLOURS = {"loss": "#8fb8de", "step": "#0a5fb4"}
+COLORS = {"loss": "#8fb8de", "step": "#0a5fb4"}
 WIDTHS = (21, 10, 8, 8, 9, 9, 8, 8, 8, 8, 7, 7, 8, 8)
 
 
@@ -180,7 +180,7 @@ def save_figure(path: pathlib.Path, rows) -> None:
         places = np.arange(len(scenes))
         for offset, name in ((-0.2, "loss"), (0.2, "step")):
             times = [1e3 * row.programs[name].seconds for row in scenes]
-            panel.barh(places + offset, times, 0.4, color=COLOURS[name], label=name)
+            panel.barh(places + offset, times, 0.4, color=COLORS[name], label=name)
         base = scenes[0].programs["step"].seconds
         for place, row in zip(places, scenes, strict=True):
             step = row.programs["step"].seconds

@@ -22,7 +22,7 @@ MOTION = ("motion.width=8", "motion.depth=2", "motion.skips=")
 FIELD = (
     *("rays=32", "sampling.coarse=4", "sampling.fine=4", "background=none"),
     *("template.skips=", "template.depth=1", "template.width=8"),
-    "template.colour_width=8",
+    "template.color_width=8",
 )
 SWEEP = (
     *("--suite", "league", "--arms", "splats-static-small", "splats-mcmc-small"),

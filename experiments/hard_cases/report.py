@@ -13,7 +13,7 @@ from nerfies_jax.measure.clock import Metric
 BEGIN = "<!-- begin: python -m experiments.hard_cases -->"
 END = "<!-- end: python -m experiments.hard_cases -->"
 LEAST, MOST = 1e-18, 1e6  # errors outside are drawn at the edge of a figure
-COLOURS = {"stable": "#0a5fb4", "textbook": "#c4501b"}
+COLORS = {"stable": "#0a5fb4", "textbook": "#c4501b"}
 LINES = {"float32": "-", "float64": "--", "bfloat16": ":"}
 
 
@@ -165,7 +165,7 @@ def save_figure(folder, row) -> None:
                         places,
                         shown,
                         LINES[dtype],
-                        color=COLOURS[form],
+                        color=COLORS[form],
                         marker=".",
                         label=f"{'ours' if form == 'stable' else form}, {dtype}",
                     )

@@ -218,7 +218,7 @@ def _against(contest, best, others):
 
 
 def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
-    """A panel for each film: PSNR of every row, a colour for each length."""
+    """A panel for each film: PSNR of every row, a color for each length."""
     contests = [
         one for one in map(standings.of_stored, stored["contests"]) if one.numbers
     ]
@@ -247,17 +247,17 @@ def _draw_film(panel, film, contests):
         latest |= {name: row["psnr"] for name, row in standings.means(contest).items()}
     order = sorted(latest, key=lambda name: standings.sortable(latest[name]))
     for number, contest in enumerate(contests):
-        colour = f"C{number}"
+        color = f"C{number}"
         for name in standings.means(contest):
             values = [
                 contest.numbers[name, seed]["psnr"]
                 for seed in standings.seeds_of(contest, name)
             ]
             height = order.index(name) + 0.22 * (number - (len(contests) - 1) / 2)
-            panel.plot(values, [height] * len(values), ".", color=colour, ms=4)
-            panel.plot(np.mean(values), height, "|", color=colour, ms=8)
+            panel.plot(values, [height] * len(values), ".", color=color, ms=4)
+            panel.plot(np.mean(values), height, "|", color=color, ms=8)
         label = contest.title.partition(", ")[2]
-        panel.plot([], [], ".", color=colour, label=label)
+        panel.plot([], [], ".", color=color, label=label)
     panel.set_yticks(range(len(order)), order, fontsize=7)
     panel.set_title(film)
     panel.legend(fontsize=7)

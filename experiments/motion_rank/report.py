@@ -10,7 +10,7 @@ from nerfies_jax.capture.json_files import replaced_file, write_json
 from nerfies_jax.evaluation import figures
 from nerfies_jax.measure import clock
 
-COLOURS = {
+COLORS = {
     "time basis": "C3",
     "separable": "C1",
     "moving basis": "C0",
@@ -216,21 +216,21 @@ def _draw_panel(panel, rows, part):
     panel.set_xscale("log", base=2)
     panel.set_yscale("log")
     panel.minorticks_off()
-    for model, colour in COLOURS.items():
+    for model, color in COLORS.items():
         own = [row for row in rows if row.model == model]
         error = np.array([getattr(row, part) for row in own])
         if model == "residual":
             for row in own:
                 level = np.mean(getattr(row, part))
-                panel.axhline(level, color=colour, label="residual, no basis")
+                panel.axhline(level, color=color, label="residual, no basis")
             continue
         counts = [row.count for row in own]
-        panel.plot(counts, error.mean(axis=1), "-o", color=colour, ms=4, label=model)
+        panel.plot(counts, error.mean(axis=1), "-o", color=color, ms=4, label=model)
         panel.fill_between(
-            counts, error.min(axis=1), error.max(axis=1), color=colour, alpha=0.15
+            counts, error.min(axis=1), error.max(axis=1), color=color, alpha=0.15
         )
         if part == "learnt" and own and own[0].floor:
             floor = [np.mean(row.floor) for row in own]
-            panel.plot(counts, floor, ":", color=colour, label=f"{model}: floor")
+            panel.plot(counts, floor, ":", color=color, label=f"{model}: floor")
     panel.grid(alpha=0.3)
     panel.spines[["top", "right"]].set_visible(False)

@@ -4,7 +4,7 @@
     python -m experiments.solver_table --fit poses
     python -m experiments.solver_table --out solvers.json --steps 5 20 80 --frames 6
 
-Codes: a network learns a few pictures of a moving, recoloured pattern, one code each;
+Codes: a network learns a few pictures of a moving, recolored pattern, one code each;
 then it is frozen, and every solver of `training.fit` fits codes to pictures in between,
 from the mean code, as the codes of held-out frames are fitted. Poses: points are seen
 with noise by a camera a few degrees and a tenth of a unit away from where it is thought
@@ -72,7 +72,7 @@ class SolverResult(NamedTuple):
     steps: float  # median of what it took
     seconds: float  # median wall time of one warm solve
     cpu_seconds: float
-    loss: float  # median, squared colour
+    loss: float  # median, squared color
     excess: float  # worst, over the best known loss of its frame
     # Worst, of what was found to the best known: units of code; rad and scene units.
     distance: float

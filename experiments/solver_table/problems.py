@@ -64,7 +64,7 @@ def drawn(spec, network, places, code):
     inputs = jnp.concatenate(
         [places, jnp.broadcast_to(code, (len(places), len(code)))], axis=1
     )
-    return mlp.apply(spec, network, inputs)["colour"]
+    return mlp.apply(spec, network, inputs)["color"]
 
 
 def code_problem(settings: Any) -> Problem:
@@ -84,7 +84,7 @@ def code_problem(settings: Any) -> Problem:
         inputs=places.shape[1] + settings.code_width,
         depth=3,
         width=settings.width,
-        heads=(("colour", mlp.HeadSpec(3)),),
+        heads=(("color", mlp.HeadSpec(3)),),
         activation="softplus",
     )
     network_key, code_key = jax.random.split(jax.random.key(0))

@@ -168,7 +168,7 @@ def page(stored) -> str:
 
 
 def draw_figure(results, waves, path) -> None:
-    """What is missing of each sinusoid: colour a network, dashes an encoding."""
+    """What is missing of each sinusoid: color a network, dashes an encoding."""
     size = 6 * len(results) + 1.5, 3.6 * len(waves)
     figure = figures.new_figure(figsize=size, dpi=120, layout="constrained")
     axes = figure.subplots(len(waves), len(results), squeeze=False, sharey="row")

@@ -1,7 +1,7 @@
 """Anchors with features, from which the Gaussians they carry and all motion are made.
 
 ADC-GS (Huang et al. 2025, IJCAI, arXiv:2505.08196, "Anchor-driven deformable and
-compressed Gaussian splatting"): an anchor has a place, scales, a turn and a colour, a
+compressed Gaussian splatting"): an anchor has a place, scales, a turn and a color, a
 reference feature, and a residual feature for each of the ten Gaussians it carries. A
 network makes these of the features, against the anchor; a coarse network of reference
 feature and time moves the anchor, a fine one of residual feature and time each of what
@@ -14,9 +14,9 @@ Half of a residual feature makes a Gaussian, half moves it, as in the code, whos
 stage is switched off; here it is on. The law of a reference feature is normal, with a
 mean and a deviation for each channel (there with a hyperprior), that of the residual
 ones is normal as a network makes it of the former. Places, scales, turns, opacities and
-colours of anchors are kept as they are, at 32 bits a number, where the code has a codec
-for points. Colours and opacities do not change over time; in the summary an anchor's
-colour does. Growth clones or splits anchors by the slopes of what they carry, each by
+colors of anchors are kept as they are, at 32 bits a number, where the code has a codec
+for points. Colors and opacities do not change over time; in the summary an anchor's
+color does. Growth clones or splits anchors by the slopes of what they carry, each by
 its share in what is to be seen of the anchor at the moments that were drawn
 (`significance`), where the code puts a new anchor at each carried Gaussian of a steep
 slope; how much anchors are seen over time beside each other counts for nothing more.

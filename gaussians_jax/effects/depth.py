@@ -27,7 +27,7 @@ FLATTEST = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class DepthSpec:
-    """What of the depths is compared, and how much it counts beside the colours.
+    """What of the depths is compared, and how much it counts beside the colors.
 
     "correlation" is 1 - r, Pearson's, blind to a positive scale and any offset. A
     least-squares scale and offset leave a share 1 - r^2 of the variance, which is as

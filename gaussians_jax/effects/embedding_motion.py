@@ -4,7 +4,7 @@ Bae et al. 2024, "Per-Gaussian embedding-based deformation", arXiv:2404.03613 (E
 with the sizes of its code. A network makes residuals of the codes (section 3.2,
 equation 4); there are a coarse and a fine one, which read the same table of codes over
 time (section 3.3, `motion_codes`), and their residuals of position, scale and rotation
-add. Equation 4 has residuals of opacity and colour as well, which the code switches off
+add. Equation 4 has residuals of opacity and color as well, which the code switches off
 for HyperNeRF's films; that the fine network reads ever more rows is from the code.
 """
 

@@ -1,9 +1,9 @@
-"""An affine change of colour for each exposure: what light and camera did to a frame.
+"""An affine change of color for each exposure: what light and camera did to a frame.
 
-The picture of a frame is `(1 + linear) colour + offset` of what the Gaussians show, as
+The picture of a frame is `(1 + linear) color + offset` of what the Gaussians show, as
 in the exposure compensation of 3D Gaussian splatting (Kerbl et al. 2023, in its code
 since 2024). What counts is by how much an exposure differs from the mean of all, or
-Gaussians could be of any colour.
+Gaussians could be of any color.
 """
 
 import dataclasses
@@ -67,7 +67,7 @@ def of_id(
 def changed(
     picture: Float[Array, "*pixels 3"], change: Float[Array, "3 4"]
 ) -> Float[Array, "*pixels 3"]:
-    """Colours after a change, sRGB; not clipped."""
+    """Colors after a change, sRGB; not clipped."""
     mixed = exact_product(picture, change[:, :3].T)
     return picture + mixed + change[:, 3]
 
@@ -99,7 +99,7 @@ def fitted(
     keep = np.ones(picture.shape[:2], bool) if valid is None else valid
     seen, truth = picture[keep].astype(np.float64), filmed[keep].astype(np.float64)
     inputs = np.concatenate([seen, np.ones((len(seen), 1))], axis=1)
-    # Where a picture has one colour only, what cannot be told stays as it is.
+    # Where a picture has one color only, what cannot be told stays as it is.
     held = HELD * max(len(seen), 1) * np.eye(4)
     squares = inputs.T @ inputs + held
     return np.linalg.solve(squares, inputs.T @ (truth - seen)).T

@@ -316,7 +316,7 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
     Position adds. The logarithm of the scale adds, as in E-D3DGS, held to the range of
     the scale's own. The paper's rotation has three numbers where a quaternion has four:
     a rotation vector, applied after the Gaussian's own turn, exp(turn) q / |q|, of unit
-    length whatever the network says. Opacity and colour stay.
+    length whatever the network says. Opacity and color stay.
     """
     if offsets.position is not None:
         gaussians = gaussians._replace(mean=gaussians.mean + offsets.position)

@@ -5,7 +5,7 @@ appendix A.1. Flow from one frame to the next is that of the camera, which the d
 depth and both cameras say (equations 4 to 6), and that of things, which is left
 (equation 7). The latter is held against the flow of the Gaussians (equation 8): where
 each goes in the next camera's picture between the two moments, with the ellipse that it
-is drawn as, blended as its colour is (equations 10 to 14). A Gaussian's flow is linear
+is drawn as, blended as its color is (equations 10 to 14). A Gaussian's flow is linear
 in the pixel, so that six channels are exact for all pixels.
 
 The paper also masks out what is at rest, as `FlowSpec.moving_only` does. In which
@@ -42,7 +42,7 @@ LEAST_SHARE = 1e-10  # of opacity that is divided by
 
 @dataclasses.dataclass(frozen=True)
 class FlowSpec:
-    """What the flow counts for beside the colours, and from which step on.
+    """What the flow counts for beside the colors, and from which step on.
 
     Weight and form are the paper's code's: absolute differences of flows in units of
     the picture's sides, each held to one side; 0.5 is for NeRF-DS, and for HyperNeRF

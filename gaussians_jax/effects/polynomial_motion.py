@@ -10,7 +10,7 @@ numbers are those of readers who quote it, the rest is as in its code
 
 The turn is a rotation vector, where the paper's quaternion grows linearly. The time of
 its own learns from motion as well, where the published code cuts that slope and lets
-opacity alone move it. Colours from features (there they too change with s) and sampling
+opacity alone move it. Colors from features (there they too change with s) and sampling
 where errors are large are not there.
 """
 

@@ -61,7 +61,7 @@ class WaveletSpec:
 
 @dataclasses.dataclass(frozen=True)
 class FourierSpec:
-    """Mean squared differences of amplitudes; the mean colour counts `dc_weight`."""
+    """Mean squared differences of amplitudes; the mean color counts `dc_weight`."""
 
     most: float = 0.1  # weight where the gate is fully open
     dc_weight: float = 1.0
@@ -71,7 +71,7 @@ class FourierSpec:
         if not (math.isfinite(self.dc_weight) and self.dc_weight >= 0):
             raise ValueError(
                 f"dc_weight={self.dc_weight} must be finite and not negative; "
-                "0 leaves the mean colour to the other losses"
+                "0 leaves the mean color to the other losses"
             )
 
 
@@ -332,7 +332,7 @@ def effect(spec: SpectralSpec, steps: int) -> Effect:
     def penalty(gates: Gates | None, context: PenaltyContext) -> dict[str, Term]:
         seen = context.observation
         weight = weights(spec, gates, context.step, steps)
-        return terms(spec, weight, seen.rendering.colour, seen.truth, seen.valid)
+        return terms(spec, weight, seen.rendering.color, seen.truth, seen.valid)
 
     return Effect(
         name=NAME,

@@ -16,7 +16,7 @@ from gaussians_jax.player.sampled import Instants
 # for the means, and what changes a picture by less than one of 255 for the others.
 STILL_PX = 0.1
 STILL = {"quaternion": 5e-3, "log_scale": 1e-2, "opacity": 4e-3}
-BRIGHTEST = 4.0  # of a colour, 1 being white
+BRIGHTEST = 4.0  # of a color, 1 being white
 OFFSET_TYPES = {
     "mean": np.int16,
     "quaternion": np.int8,  # 1/254 of how far the row turns: 0.2 degrees of 60
@@ -36,7 +36,7 @@ def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
     """The instants in bytes; a mean stands still within `still_distance` [gaussians].
 
     In scene units. Means at rest are float32, so that one Gaussian far away costs the
-    near ones nothing; 16 bits for rotations, scales and colours, 8 for opacity.
+    near ones nothing; 16 bits for rotations, scales and colors, 8 for opacity.
     """
     low, high = splats.LOG_SCALE_RANGE
     quantisers = {
@@ -47,8 +47,8 @@ def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
     }
     arrays = _Arrays()
     # A Gaussian may be brighter than white where others lie before it.
-    colour = np.round(np.minimum(instants.colour / BRIGHTEST, 1) * 65535)
-    arrays.add("colour", colour.astype(np.uint16), BRIGHTEST / 65535)
+    color = np.round(np.minimum(instants.color / BRIGHTEST, 1) * 65535)
+    arrays.add("color", color.astype(np.uint16), BRIGHTEST / 65535)
     for name, (kind, scale, shift) in quantisers.items():
         values = getattr(instants, name).astype(np.float64)
         values = values.reshape(*values.shape[:2], -1)

@@ -1,7 +1,7 @@
 """`player.html`: a trained moving scene in one file that any browser plays.
 
 Nothing is fetched: Gaussians, program and poster are inside. What is drawn has one
-colour from everywhere, the mean of what the training cameras see, and straight motion
+color from everywhere, the mean of what the training cameras see, and straight motion
 between the instants.
 """
 

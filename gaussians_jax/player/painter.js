@@ -180,7 +180,7 @@ function uniformsOf(gl, program) {
 const SAMPLERS = ["gaussians", "steps", "meanChange", "quaternionChange", "scaleChange"];
 
 function sceneTextures(gl, header, buffer) {
-  const count = header.arrays.colour.shape[0], { instants } = header;
+  const count = header.arrays.color.shape[0], { instants } = header;
   const fields = Object.keys(FIELDS).map((name) => fieldOf(name, header, buffer));
   const rowOf = new Int32Array(count).fill(-1);
   let movers = 0;
@@ -191,7 +191,7 @@ function sceneTextures(gl, header, buffer) {
   const gaussians = all(Float32Array, 4 * count), steps = all(Float32Array, movers);
   const changes = [Int16Array, Int8Array, Int8Array].map(
     (kind) => all(kind, instants * movers));
-  const color = decoded(header.arrays.colour, buffer);
+  const color = decoded(header.arrays.color, buffer);
   for (let i = 0; i < count; i++) {
     gaussians[16 * i + 11] = rowOf[i];
     for (let k = 0; k < 3; k++) gaussians[16 * i + 12 + k] = color[3 * i + k];
@@ -298,7 +298,7 @@ function painterOf(canvas, header, buffer) {
   gl.bindBuffer(gl.ARRAY_BUFFER, rows);
   gl.enableVertexAttribArray(0);
   gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-  const footprints = footprintBuffer(gl, quads, header.arrays.colour.shape[0]);
+  const footprints = footprintBuffer(gl, quads, header.arrays.color.shape[0]);
   const [format, type] = formatOf(gl);
   gl.activeTexture(gl.TEXTURE0 + unit);
   const texture = newTexture(gl);

@@ -17,7 +17,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry.camera import Camera
 
 LEAST_INSTANTS, MOST_INSTANTS = 24, 48
-MOST_VIEWS = 48  # training views that say what was seen, and in which colour
+MOST_VIEWS = 48  # training views that say what was seen, and in which color
 MOST_SIDE_PX = 320  # of them: larger pictures take long and say the same
 # Pixels' worth of picture, in the view that shows most of it: what shows less is left
 # out. Built-in scene, `splats-tracked-small`, 300 steps: this
@@ -36,7 +36,7 @@ class Instants(NamedTuple):
     quaternion: np.ndarray  # [instants, gaussians, 4] wxyz, unit length, sign steady
     log_scale: np.ndarray  # [instants, gaussians, 3]
     opacity: np.ndarray  # [instants, gaussians]
-    colour: np.ndarray  # [gaussians, 3] from 0, the same from everywhere
+    color: np.ndarray  # [gaussians, 3] from 0, the same from everywhere
     left_out: int  # Gaussians that no camera saw
 
 
@@ -44,7 +44,7 @@ class Seen(NamedTuple):
     """What the training views show of each Gaussian."""
 
     most: np.ndarray  # [gaussians] pixels, in the view that shows most of it
-    colour: np.ndarray  # [gaussians, 3], mean over the views by how much they show
+    color: np.ndarray  # [gaussians, 3], mean over the views by how much they show
 
 
 def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
@@ -68,7 +68,7 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
             *splats.LOG_SCALE_RANGE,
         ),
         opacity=stacked.opacity,
-        colour=seen.colour[kept],
+        color=seen.color[kept],
         left_out=int(splats.active_mask(rows).sum()) - kept.size,
     )
 
@@ -87,7 +87,7 @@ def seen_in_training(
     degree: Int[Array, ""],
     capture: Capture,
 ) -> Seen:
-    """How much of the training pictures each Gaussian makes up, and in which colour.
+    """How much of the training pictures each Gaussian makes up, and in which color.
 
     Each view counts as it is, and without what moves: then it shows what that hides.
     Where this process has two devices, each looks one way. `degree` is that of the
@@ -96,9 +96,9 @@ def seen_in_training(
     factor = math.ceil(max(capture.size) / MOST_SIDE_PX)
     size = (max(1, capture.size[0] // factor), max(1, capture.size[1] // factor))
     coefficients = splats.active_harmonics(rows, degree)
-    towards = jax.jit(harmonics.colour_towards)
+    towards = jax.jit(harmonics.color_towards)
     moves = _moves(at, capture)
-    most, total, colour = 0.0, 0.0, 0.0
+    most, total, color = 0.0, 0.0, 0.0
     for row in evaluation.spread(capture.train, MOST_VIEWS):
         view = evaluation.resized(evaluation.view_of(capture, row), capture.size, size)
         deformed = at(float(view.time))
@@ -110,24 +110,24 @@ def seen_in_training(
         weights = list(data_parallel.rows_on_devices(_shown, (size, raster), both))
         most = np.maximum(most, np.max(weights, axis=0) * factor**2)
         weight = np.sum(weights, axis=0)
-        colours = towards(coefficients, deformed.mean, view.camera.position)
+        colors = towards(coefficients, deformed.mean, view.camera.position)
         total = total + weight
-        colour = colour + weight[:, None] * jax.device_get(colours)
+        color = color + weight[:, None] * jax.device_get(colors)
     seen = np.maximum(total, np.finfo(np.float32).tiny)
-    return Seen(most, colour / seen[:, None])
+    return Seen(most, color / seen[:, None])
 
 
 def _shown(how, gaussians: Gaussians, camera: Camera):
     """[gaussians] how many pixels' worth of a picture each makes up.
 
-    A picture is a sum of colours with weights, so the weights of a Gaussian, summed
-    over the pixels, are the slope of the picture's sum in the Gaussian's colour.
+    A picture is a sum of colors with weights, so the weights of a Gaussian, summed
+    over the pixels, are the slope of the picture's sum in the Gaussian's color.
     """
     size, raster = how
 
-    def total(colours: Float[Array, "gaussians 3"]):
-        frame = rendering.render(gaussians, colours, camera, size, raster, depth=False)
-        return jnp.sum(frame.rendering.colour)
+    def total(colors: Float[Array, "gaussians 3"]):
+        frame = rendering.render(gaussians, colors, camera, size, raster, depth=False)
+        return jnp.sum(frame.rendering.color)
 
     return jax.grad(total)(jnp.zeros_like(gaussians.mean))[:, 0]
 

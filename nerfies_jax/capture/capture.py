@@ -25,7 +25,7 @@ class PointCloud(NamedTuple):
     """Static scene points, in scene units."""
 
     position: np.ndarray  # [points, 3] float32
-    colour: np.ndarray  # [points, 3] uint8 sRGB
+    color: np.ndarray  # [points, 3] uint8 sRGB
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,13 +147,13 @@ def _check_shapes(capture, where, frames):
             )
     points = capture.points
     if points is not None and (
-        points.position.shape != points.colour.shape
+        points.position.shape != points.color.shape
         or points.position.ndim != 2
         or points.position.shape[1] != 3
     ):
         raise CaptureError(
-            f"{where}: point positions {points.position.shape} and colours "
-            f"{points.colour.shape}; expected both [points, 3]"
+            f"{where}: point positions {points.position.shape} and colors "
+            f"{points.color.shape}; expected both [points, 3]"
         )
 
 
@@ -288,7 +288,7 @@ def downscale(capture: Capture, factor: int) -> Capture:
 
     What does not fill a block at the right and the bottom is trimmed. A block was
     filmed if all its pixels were, moves if any of them does, and its depth is the mean
-    of those that are known; its flow is the mean, in the larger pixels. Colours are
+    of those that are known; its flow is the mean, in the larger pixels. Colors are
     averaged as stored (sRGB), as every published evaluation of these captures does.
     """
     width, height = capture.size

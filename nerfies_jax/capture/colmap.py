@@ -30,7 +30,7 @@ class Model(NamedTuple):
     rotations: np.ndarray  # [frames, 3, 3] camera from world
     positions: np.ndarray  # [frames, 3]
     points: np.ndarray  # [points, 3]
-    colours: np.ndarray  # [points, 3] uint8
+    colors: np.ndarray  # [points, 3] uint8
     depths: np.ndarray  # z-depth of every kept observation
 
 
@@ -100,7 +100,7 @@ def read(
         valid=valid,
         moving=moving,
         points=PointCloud(
-            ((model.points - centre) * scale).astype(np.float32), model.colours
+            ((model.points - centre) * scale).astype(np.float32), model.colors
         ),
         scale=scale,
         centre=placement.centre,
@@ -196,7 +196,7 @@ def read_model(folder: pathlib.Path) -> Model:
         rotations=rotations,
         positions=positions,
         points=np.array([xyz for xyz, _ in kept]),
-        colours=np.array([colour for _, colour in kept], np.uint8),
+        colors=np.array([color for _, color in kept], np.uint8),
         depths=depths[depths > 0],
     )
 

@@ -123,14 +123,14 @@ def _image_lines(capture, units, of_cameras, seen, pixels):
 
 
 def _point_lines(capture, units, seen):
-    """A line for each point: place, colour, error, and frame and place of each view."""
+    """A line for each point: place, color, error, and frame and place of each view."""
     if capture.points is None:
         return
     positions = places_in(units, capture, capture.points.position)
     place = np.cumsum(seen, axis=1) - 1  # of a point in its frame's line
-    for number, colour in enumerate(capture.points.colour):
+    for number, color in enumerate(capture.points.color):
         rows = np.flatnonzero(seen[:, number])
         views = " ".join(f"{row + 1} {place[row, number]}" for row in rows)
-        shade = " ".join(str(int(part)) for part in colour)
+        shade = " ".join(str(int(part)) for part in color)
         # The error is that of the pixels listed: none but their rounding.
         yield f"{number + 1} {_text(positions[number])} {shade} 0.0 {views}"

@@ -1,4 +1,4 @@
-"""OpenEXR pictures: linear colour, alpha and depth as floats."""
+"""OpenEXR pictures: linear color, alpha and depth as floats."""
 
 import pathlib
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ _TYPES = (np.float16, np.float32, np.uint32)
 class ExrPicture(NamedTuple):
     """One EXR, every array [height, width] first. NaN and infinity are zeroed."""
 
-    colour: np.ndarray | None  # [height, width, 3] float32, linear light
+    color: np.ndarray | None  # [height, width, 3] float32, linear light
     alpha: np.ndarray | None  # [height, width] float32
     depth: np.ndarray | None  # [height, width] float32, channel Z
     extra: dict[str, np.ndarray]  # every other channel, float32 or uint32
@@ -30,7 +30,7 @@ class ExrPicture(NamedTuple):
 
 
 def read_exr(path: AnyPath) -> ExrPicture:
-    """The first part's data window. A luminance channel Y alone becomes grey colour."""
+    """The first part's data window. A luminance channel Y alone becomes grey color."""
     path = _existing(path)
     try:
         origin, (width, height), display_size = _windows(path)
@@ -90,7 +90,7 @@ def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
         return whole
 
     return ExrPicture(
-        colour=placed(picture.colour),
+        color=placed(picture.color),
         alpha=placed(picture.alpha),
         depth=placed(picture.depth),
         extra={name: placed(array) for name, array in picture.extra.items()},
@@ -164,37 +164,37 @@ def _picture(channels, origin, display_size):
         name: np.where(np.isfinite(array), array, array.dtype.type(0))
         for name, array in channels.items()
     }
-    colour = None
+    color = None
     if all(name in channels for name in "RGB"):
-        colour = np.stack([channels.pop(name) for name in "RGB"], axis=-1)
+        color = np.stack([channels.pop(name) for name in "RGB"], axis=-1)
     elif "Y" in channels:
-        colour = np.repeat(channels.pop("Y")[..., None], 3, axis=-1)
+        color = np.repeat(channels.pop("Y")[..., None], 3, axis=-1)
     alpha, depth = channels.pop("A", None), channels.pop("Z", None)
     return ExrPicture(
-        colour, alpha, depth, channels, finite, color_finite, origin, display_size
+        color, alpha, depth, channels, finite, color_finite, origin, display_size
     )
 
 
 def write_exr(
     path: AnyPath,
-    colour: np.ndarray | None = None,
+    color: np.ndarray | None = None,
     alpha: np.ndarray | None = None,
     depth: np.ndarray | None = None,
     extra: Mapping[str, np.ndarray] | None = None,
     half: bool = False,
     header: Mapping[str, Any] | None = None,
 ):
-    """Lossless (ZIP), atomically; `colour` [height, width, 3] is linear light.
+    """Lossless (ZIP), atomically; `color` [height, width, 3] is linear light.
 
     `header` are more attributes: numbers, texts, vectors and matrices of float32.
 
-    `half` stores colour and alpha in 16 bits; depth and the extra channels keep 32,
+    `half` stores color and alpha in 16 bits; depth and the extra channels keep 32,
     because a half has 11 bits and a depth map would fall into steps.
     """
     path = pathlib.Path(path)
     channels = {}
-    if colour is not None:
-        channels |= dict(zip("RGB", np.moveaxis(colour, -1, 0), strict=True))
+    if color is not None:
+        channels |= dict(zip("RGB", np.moveaxis(color, -1, 0), strict=True))
     if alpha is not None:
         channels["A"] = alpha
     kind = np.float16 if half else np.float32

@@ -109,9 +109,9 @@ def from_film(
     if sources is not None:
         sources = {row: sources[row] for row in rows}
         encoding = mask_files.find_encoding([*sources.values()], "upright")
-    colours = read_video(film, rows=set(rows), damaged="skip")
+    colors = read_video(film, rows=set(rows), damaged="skip")
     with events.stage("writing frames of the video", len(rows)) as stage:
-        for row, (_, frame) in zip(rows, colours, strict=True):
+        for row, (_, frame) in zip(rows, colors, strict=True):
             factor = _factor(frame.shape[1::-1], max_side)
             # The name keeps the time.
             names.append(f"ms{round(moments[row] * 1000):08d}.png")
@@ -188,17 +188,17 @@ def from_pictures(
         for file in taken:
             stage.advance()
             try:
-                colour = _upright(file)
+                color = _upright(file)
             except _Unreadable:  # behind its header
                 broken.append(file)
                 continue
             name = f"{_spoken(file.stem)}.png"
-            _write(out / "images" / name, shrink(colour, factor))
+            _write(out / "images" / name, shrink(color, factor))
             if masks is not None:
                 used.append(sources[file])
                 mask = mask_files.read_mask(used[-1], encoding, "upright")
                 white.append(mask.mean())
-                _write_mask(out, name, mask, colour.shape, factor, used[-1])
+                _write_mask(out, name, mask, color.shape, factor, used[-1])
     notes += _left_out([file.name for file in broken], _BROKEN)
     taken = [file for file in taken if file not in broken]
     _check_enough(folder, len(taken), notes)

@@ -173,18 +173,18 @@ def read_frames(
             f"{len(paths) * width * height * 3 / 2**30:.0f} GiB, more than "
             f"{MAX_BYTES / 2**30:.0f}; read them smaller with factor= or max_side="
         )
-    colours = np.empty((len(paths), height, width, 3), np.uint8)
+    colors = np.empty((len(paths), height, width, 3), np.uint8)
     alphas = np.full((len(paths), height, width), 255, np.uint8)
 
     def decode(row):
         alpha = known = None
         if paths[row].suffix.lower() == pictures.EXR:
-            colour, known = pictures.read_light(paths[row])
+            color, known = pictures.read_light(paths[row])
         else:
-            colour, alpha = pictures.read_image(paths[row], orientation)
+            color, alpha = pictures.read_image(paths[row], orientation)
         if alpha is not None and background is not None:
-            colour = pictures.over(colour, alpha, background)
-        colours[row] = shrink(colour, shrink_by)
+            color = pictures.over(color, alpha, background)
+        colors[row] = shrink(color, shrink_by)
         if alpha is not None:
             alphas[row] = shrink(alpha[..., None], shrink_by)[..., 0]
         if known is not None:
@@ -203,7 +203,7 @@ def read_frames(
             reading.advance()
     alpha = alphas if any_alpha else None
     if not unknown:
-        return Frames(colours, alpha, None, ())
+        return Frames(colors, alpha, None, ())
     observed = np.ones(alphas.shape, bool)
     for row, known in unknown.items():
         observed[row] = known
@@ -211,7 +211,7 @@ def read_frames(
         f"{len(unknown)} EXR images have pixels outside their data window or not "
         f"finite, {1 - observed.mean():.1%} of all: taken as not observed"
     )
-    return Frames(colours, alpha, observed, (note,))
+    return Frames(colors, alpha, observed, (note,))
 
 
 def read_masks(
@@ -339,14 +339,14 @@ def pixels_of(
     return pixel, depth, inside & seen & (depth > 0)
 
 
-def coloured_points(
+def colored_points(
     position: np.ndarray,
     images: np.ndarray,
     cameras: Camera,
     rows: np.ndarray,
     skip: np.ndarray | None,
 ) -> PointCloud:
-    """Static points with the median colour of up to 16 of the frames `rows`.
+    """Static points with the median color of up to 16 of the frames `rows`.
 
     Occlusion is not tested; the median forgives it in a minority of the frames. Pixels
     marked in `skip` [frames, height, width] do not count; unseen points are grey.
@@ -361,10 +361,10 @@ def coloured_points(
             inside &= ~skip[row, line, column]
         sample[inside] = images[row, line, column][inside]
     seen = ~np.isnan(samples[..., 0]).all(0)
-    colour = np.full((len(position), 3), UNSEEN, np.uint8)
+    color = np.full((len(position), 3), UNSEEN, np.uint8)
     if seen.any():
-        colour[seen] = np.round(np.nanmedian(samples[:, seen], axis=0))
-    return PointCloud(position, colour)
+        color[seen] = np.round(np.nanmedian(samples[:, seen], axis=0))
+    return PointCloud(position, color)
 
 
 def load_array(path: pathlib.Path, most: int) -> np.ndarray:

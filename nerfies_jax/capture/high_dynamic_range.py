@@ -1,6 +1,6 @@
 """Film of high dynamic range (HLG, PQ) as 8-bit sRGB, the same curve for every frame.
 
-Nothing adapts to a frame: what has one brightness in two frames keeps one colour. White
+Nothing adapts to a frame: what has one brightness in two frames keeps one color. White
 paper is at 203 nits (ITU-R BT.2408), which is where sRGB ends here; what is darker than
 half of that keeps its brightness, and what is brighter is rolled off, up to 1000 nits.
 The packages of ffmpeg that do this (zscale) are not in PyAV's.

@@ -1,6 +1,6 @@
 """Pictures in and out: PNG and JPEG by scikit-image and imageio, EXR by OpenEXR.
 
-Sizes are bounded from the header, before anything is decoded. Colours are sRGB in 8
+Sizes are bounded from the header, before anything is decoded. Colors are sRGB in 8
 bits on disk and in memory; EXR holds linear light, which is turned into them.
 """
 
@@ -81,7 +81,7 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
 
     A picture that a viewer would turn (EXIF) is refused, unless `orientation` is
     "stored": then its pixels come as they lie in the file, which is what COLMAP's
-    cameras refer to. 16-bit grey is rounded to 8 bits; 16-bit colour is cut to them.
+    cameras refer to. 16-bit grey is rounded to 8 bits; 16-bit color is cut to them.
     The linear light of an EXR becomes sRGB, brighter than 1 as 1.
     """
     path = pathlib.Path(path)
@@ -111,7 +111,7 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
                 pixels = np.asarray(image.convert("RGB" if opaque else "RGBA"))
         else:
             raise CaptureError(
-                f"{path}: colour mode {header.mode}; expected grey, RGB or RGBA, so "
+                f"{path}: color mode {header.mode}; expected grey, RGB or RGBA, so "
                 "save it as an RGB PNG"
             )
     except CaptureError:
@@ -164,16 +164,16 @@ def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
         where all pixels are known. Their color is black.
     """
     stored = exr.read_exr(path)
-    if stored.colour is None:
-        raise CaptureError(f"{path}: no colour channels; save it with R, G and B")
+    if stored.color is None:
+        raise CaptureError(f"{path}: no color channels; save it with R, G and B")
     transparent = stored.alpha is not None and stored.color_finite & (stored.alpha < 1)
     if np.any(transparent):
         raise CaptureError(
-            f"{path}: it is transparent in places, and its colours may be multiplied "
+            f"{path}: it is transparent in places, and its colors may be multiplied "
             "by alpha or not; lay it over its background first, or save it as a PNG"
         )
     stored = exr.in_display_window(path, stored)
-    color = np.round(srgb_from_linear(stored.colour) * 255).astype(np.uint8)
+    color = np.round(srgb_from_linear(stored.color) * 255).astype(np.uint8)
     known = stored.color_finite
     if known.all():
         return color, None
@@ -184,19 +184,19 @@ def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
 def read_image(
     path: AnyPath, orientation: str = "refuse"
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colour [height, width, 3] uint8 and alpha [height, width] uint8 where stored."""
+    """Color [height, width, 3] uint8 and alpha [height, width] uint8 where stored."""
     pixels = read_pixels(path, orientation)
     channels = pixels.shape[2]
     alpha = pixels[..., -1] if channels in (2, 4) else None
-    colour = pixels[..., :3] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
-    return np.ascontiguousarray(colour), alpha
+    color = pixels[..., :3] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+    return np.ascontiguousarray(color), alpha
 
 
-def over(colour: np.ndarray, alpha: np.ndarray, background: tuple) -> np.ndarray:
-    """uint8 colour with straight alpha laid over one colour, all as stored (sRGB)."""
+def over(color: np.ndarray, alpha: np.ndarray, background: tuple) -> np.ndarray:
+    """uint8 color with straight alpha laid over one color, all as stored (sRGB)."""
     cover = alpha[..., None].astype(np.float32) / 255
     behind = np.asarray(background, np.float32) * 255
-    return np.round(colour * cover + behind * (1 - cover)).astype(np.uint8)
+    return np.round(color * cover + behind * (1 - cover)).astype(np.uint8)
 
 
 def write_png(path: AnyPath, pixels: np.ndarray):

@@ -49,4 +49,4 @@ def points_beside(
         return None, (note,)
     position = (model.points - np.array(scene.center)) * scene.scale
     note = f"{len(position)} points taken from {folders[0]}"
-    return PointCloud(position.astype(np.float32), model.colours), (note,)
+    return PointCloud(position.astype(np.float32), model.colors), (note,)

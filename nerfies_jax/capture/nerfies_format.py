@@ -122,7 +122,7 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
     Pictures go to `rgb/<factor>x`, averaged for factors above 1. Beside what Nerfies
     knows it keeps, in files and keys that other readers pass over: exact times, depth
     (DyCheck's place), moving masks (NeRF-DS's), masks of filmed pixels, optical flow,
-    and the colours of the points. What other tools found (`given`) stays out; of what
+    and the colors of the points. What other tools found (`given`) stays out; of what
     is read again, frames in neither split are missing, and where none was held out
     every eighth is.
     """
@@ -142,7 +142,7 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
             world = capture.points.position.astype(np.float64) / capture.scale
             np.save(folder / "points.npy", world + capture.centre, allow_pickle=False)
             np.save(
-                folder / "points_colour.npy", capture.points.colour, allow_pickle=False
+                folder / "points_color.npy", capture.points.color, allow_pickle=False
             )
 
 
@@ -189,7 +189,7 @@ def _write_tables(capture, folder):
 
 
 def _write_pictures(capture, folder, factor):
-    """Colours, masks and depth at one reduction."""
+    """Colors, masks and depth at one reduction."""
     depths, moving, valid = capture.depths, capture.moving, capture.valid
 
     def place(kind):
@@ -304,14 +304,14 @@ def _points(path, images, cameras, views, moving):
     position = ((world - np.array(scene.center)) * scene.scale).astype(np.float32)[
         finite
     ]
-    colours = path / "points_colour.npy"  # ours
-    if colours.exists():
-        colour = frames.load_array(colours, 3 * MAX_POINTS)
-        if colour.shape != world.shape or colour.dtype != np.uint8:
+    colors = path / "points_color.npy"  # ours
+    if colors.exists():
+        color = frames.load_array(colors, 3 * MAX_POINTS)
+        if color.shape != world.shape or color.dtype != np.uint8:
             raise CaptureError(
-                f"{colours}: {colour.dtype} of shape {colour.shape}; expected uint8 of "
+                f"{colors}: {color.dtype} of shape {color.shape}; expected uint8 of "
                 f"{world.shape}, as points.npy"
             )
-        return PointCloud(position, colour[finite]), notes
-    cloud = frames.coloured_points(position, images, cameras, views.train, moving)
-    return cloud, (*notes, "points.npy has no colours: sampled from the pictures")
+        return PointCloud(position, color[finite]), notes
+    cloud = frames.colored_points(position, images, cameras, views.train, moving)
+    return cloud, (*notes, "points.npy has no colors: sampled from the pictures")

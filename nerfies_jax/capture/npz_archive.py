@@ -156,7 +156,7 @@ def _range(text, count, name):
 
 
 def background_of(images):
-    """The colour [0, 1] of the corners, if nearly all corners have the same."""
+    """The color [0, 1] of the corners, if nearly all corners have the same."""
     corners = images[:, [0, 0, -1, -1], [0, -1, 0, -1]].reshape(-1, 3)
     usual = np.median(corners, axis=0)
     if (corners == usual).all(1).mean() < 0.95:

@@ -18,7 +18,7 @@ def as_pinholes(capture: Capture) -> Capture:
     """The same capture as pinholes would have filmed it; itself where they did.
 
     Focal length, principal point and size stay, so that nothing else changes; pixels
-    that the lens did not film are marked in `valid`. Colour is sampled bilinearly,
+    that the lens did not film are marked in `valid`. Color is sampled bilinearly,
     masks and depth from the nearest pixel. Z-depth needs no change: a ray keeps its
     points. Flow is left out: both its ends would move.
     """

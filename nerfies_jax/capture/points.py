@@ -1,4 +1,4 @@
-"""Scene points: where they put the scene, and the colours they have."""
+"""Scene points: where they put the scene, and the colors they have."""
 
 import pathlib
 from typing import NamedTuple
@@ -76,10 +76,10 @@ def place_by_cameras(cameras: Camera) -> Placement:
 
 
 def read_ply(path: pathlib.Path) -> PointCloud:
-    """Positions (as stored) and colours of a .ply point cloud; grey without colours.
+    """Positions (as stored) and colors of a .ply point cloud; grey without colors.
 
     Raises CaptureError for what is no such file, has more than `MAX_POINTS`, or has
-    colours that are neither uchar nor floats between 0 and 1.
+    colors that are neither uchar nor floats between 0 and 1.
     """
     try:
         with path.open("rb") as file:
@@ -96,10 +96,10 @@ def read_ply(path: pathlib.Path) -> PointCloud:
         position = np.stack([vertex[axis] for axis in "xyz"], axis=1)
         names = {each.name for each in vertex.properties}
         if {"red", "green", "blue"} <= names:
-            colour = np.stack([vertex[k] for k in ("red", "green", "blue")], axis=1)
-            colour = _bytes(colour, path)
+            color = np.stack([vertex[k] for k in ("red", "green", "blue")], axis=1)
+            color = _bytes(color, path)
         else:
-            colour = np.full(position.shape, UNSEEN, np.uint8)
+            color = np.full(position.shape, UNSEEN, np.uint8)
     except CaptureError:
         raise
     except (OSError, ValueError, KeyError, plyfile.PlyParseError) as error:
@@ -108,16 +108,16 @@ def read_ply(path: pathlib.Path) -> PointCloud:
             f"{path}: not a readable point cloud ({reason}); export it again"
         ) from None
     finite = np.isfinite(position).all(1)
-    return PointCloud(position[finite].astype(np.float32), colour[finite])
+    return PointCloud(position[finite].astype(np.float32), color[finite])
 
 
-def _bytes(colour, path):
-    """Colours as uint8; those of floats are between 0 and 1."""
-    if colour.dtype == np.uint8:
-        return colour
-    if colour.dtype.kind == "f" and ((colour >= 0) & (colour <= 1)).all():
-        return np.round(colour * 255).astype(np.uint8)
+def _bytes(color, path):
+    """Colors as uint8; those of floats are between 0 and 1."""
+    if color.dtype == np.uint8:
+        return color
+    if color.dtype.kind == "f" and ((color >= 0) & (color <= 1)).all():
+        return np.round(color * 255).astype(np.uint8)
     raise CaptureError(
-        f"{path}: colours are {colour.dtype} from {colour.min():g} to "
-        f"{colour.max():g}; write them as uchar, or as floats between 0 and 1"
+        f"{path}: colors are {color.dtype} from {color.min():g} to "
+        f"{color.max():g}; write them as uchar, or as floats between 0 and 1"
     )

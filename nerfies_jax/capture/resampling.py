@@ -22,7 +22,7 @@ def array_places(
 
 
 def bilinear(picture: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Colour [height, width, channels] at array coordinates; uint8 is rounded."""
+    """Color [height, width, channels] at array coordinates; uint8 is rounded."""
     channels = [
         scipy.ndimage.map_coordinates(
             picture[..., channel].astype(np.float32), place, order=1, mode="nearest"

@@ -60,7 +60,7 @@ def refuse_skew(capture: Capture, path: AnyPath, what: str) -> None:
 
 
 def write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
-    """The scene's points and their colours as .ply."""
+    """The scene's points and their colors as .ply."""
     cloud = capture.points
     # World coordinates may be large: metres of a map need more than float32 has.
     kind = "f4" if units == "scene" else "f8"
@@ -71,7 +71,7 @@ def write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
     for column, axis in enumerate("xyz"):
         table[axis] = position[:, column]
     for column, name in enumerate(("red", "green", "blue")):
-        table[name] = cloud.colour[:, column]
+        table[name] = cloud.color[:, column]
     plyfile.PlyData([plyfile.PlyElement.describe(table, "vertex")]).write(str(path))
 
 

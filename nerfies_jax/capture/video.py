@@ -21,7 +21,7 @@ from nerfies_jax.capture.images import MAX_PIXELS
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
 HD_LINES = 720  # from here on players take BT.709 where a film does not say
-_UNSAID = 2  # ffmpeg's number of a colour space that is not told
+_UNSAID = 2  # ffmpeg's number of a color space that is not told
 SLACK = 3  # frames by which the stated length of a whole film may be wrong
 LEAST_RATE = 0.001  # frames per second; rates are fractions of up to 1001 seconds
 
@@ -77,7 +77,7 @@ def _encode(av, partial, path, first, frames, frames_per_second, quality):
         stream.width, stream.height = width + width % 2, height + height % 2
         stream.pix_fmt = "yuv420p"
         # Without these tags a player guesses the matrix from the height of the picture
-        # and shifts the colours of small films; BT.709 is what sRGB displays assume.
+        # and shifts the colors of small films; BT.709 is what sRGB displays assume.
         stream.codec_context.color_primaries = 1
         stream.codec_context.color_trc = 13
         stream.codec_context.colorspace = 1
@@ -252,7 +252,7 @@ def read_video(
     tag is carried out, and high dynamic range is tone-mapped. `rows` are the numbers of
     the only frames to be shown; nothing behind the last of them is decoded. `grey` is
     for uint8 [height, width] of the light as it is coded: a frame of 3840x2160 HLG
-    costs 0.16 s of processor time, and 1.8 s in colour. `damaged` is "refuse" or "skip"
+    costs 0.16 s of processor time, and 1.8 s in color. `damaged` is "refuse" or "skip"
     what cannot be decoded, as the end of a download that broke off;
     `notes_of` says how much is missing. Pixels are made square.
     """

@@ -1,11 +1,11 @@
-"""A learnt code for each exposure, which colour reads and density does not.
+"""A learnt code for each exposure, which color reads and density does not.
 
 NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "latent appearance modeling")
 gives each photograph a code (GLO, Bojanowski et al. 2018) that says how light, exposure
 and white balance were; Nerfies (Park et al. 2021, arXiv:2011.12948, section 3.1) takes
-it over. Geometry is the same under all codes, because only the colour branch gets them.
+it over. Geometry is the same under all codes, because only the color branch gets them.
 
-In the official Nerfies code the codes are dead: its colour branch asks for another
+In the official Nerfies code the codes are dead: its color branch asks for another
 switch, and under the published presets their gradient is exactly zero.
 """
 
@@ -30,7 +30,7 @@ class AppearanceSpec:
 
 
 def effect(spec: AppearanceSpec) -> Effect:
-    """The seams of `spec`: the code joins what the colour branch reads."""
+    """The seams of `spec`: the code joins what the color branch reads."""
     return Effect(
         "appearance",
         tables=(Table(spec.table, APPEARANCE, spec.width),),

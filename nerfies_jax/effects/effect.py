@@ -30,16 +30,16 @@ class Medium(NamedTuple):
     """What else is on the ray, at one sample."""
 
     density: Scalar  # per unit of the field
-    colour: Vector  # in [0, 1]
+    color: Vector  # in [0, 1]
     # Logit of the share of this medium's opacity, the static one gets the rest (NSFF's
     # blending); None gives both all of theirs (NeRF-W).
     share: Scalar | None = None
-    beta: Scalar | None = None  # how uncertain the colour is (NeRF-W)
+    beta: Scalar | None = None  # how uncertain the color is (NeRF-W)
     extras: dict[str, Array] = {}  # noqa: RUF012  what the penalty needs again
 
 
 class Surface(NamedTuple):
-    """One sample of one ray, as colour sees it; slopes reach none of the parameters."""
+    """One sample of one ray, as color sees it; slopes reach none of the parameters."""
 
     point: Vector  # where it was observed
     features: Float[Array, " width"]  # last hidden layer of the level's trunk there
@@ -52,7 +52,7 @@ class Surface(NamedTuple):
 class Look(NamedTuple):
     """What an effect found at a surface."""
 
-    features: Float[Array, " features"]  # that colour reads
+    features: Float[Array, " features"]  # that color reads
     found: dict[str, Array] = {}  # noqa: RUF012  what the penalty needs again
 
 
@@ -65,11 +65,11 @@ class RayOutput(NamedTuple):
     static_weight: Float[Array, "*rays samples"]
     media: dict[str, Medium]  # by effect, leaves with leading axes rays and samples
     media_weight: dict[str, Float[Array, "*rays samples"]]
-    colour: Float[Array, "*rays 3"]
+    color: Float[Array, "*rays 3"]
     alpha: Float[Array, "*rays"]
     distance: Float[Array, "*rays"]  # expected, units of the field
     median_distance: Float[Array, "*rays"]
-    beta: Float[Array, "*rays"] | None  # standard deviation of the colour, or None
+    beta: Float[Array, "*rays"] | None  # standard deviation of the color, or None
     spacing: Float[Array, "*rays samples"]  # what length each sample stands for
     # Known to be behind the samples; None: the last one stands for all behind it.
     background: Float[Array, "*rays 3"] | None
@@ -90,7 +90,7 @@ class Batch(NamedTuple):
     origin: Float[Array, "rays 3"]
     direction: Float[Array, "rays 3"]
     cosine: Float[Array, " rays"]  # z-depth per distance along the ray
-    colour: Float[Array, "rays 3"]
+    color: Float[Array, "rays 3"]
     valid: Bool[Array, " rays"]
 
 

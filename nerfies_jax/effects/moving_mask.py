@@ -2,7 +2,7 @@
 
 Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, its mask that guides the deformation
 field. The text with its equations was not at hand; its code (JokerYan/NeRF-DS) is
-followed. Where colours change as a mirror moves, they cannot say what corresponds. A
+followed. Where colors change as a mirror moves, they cannot say what corresponds. A
 network says of each observed point and moment how surely it moves; the warp and the
 ambient slice read that beside their code; and masks of the pictures teach it.
 """
@@ -75,7 +75,7 @@ def network(spec: MovingMaskSpec) -> MLPSpec:
 
 
 def effect(spec: MovingMaskSpec) -> Effect:
-    """The seams of `spec`; without masks in a capture it learns from colours alone."""
+    """The seams of `spec`; without masks in a capture it learns from colors alone."""
     return Effect(
         NAME,
         tables=(Table(spec.table, MOMENT, spec.code_width),),

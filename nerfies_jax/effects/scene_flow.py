@@ -112,7 +112,7 @@ class Dynamic(NamedTuple):
     """What the medium is at one point and time."""
 
     density: Scalar  # per unit of the field
-    colour: Vector
+    color: Vector
     flow: Float[Array, "2 3"]  # to the next moment and the previous one, field units
     # Logits of how likely what is there then was hidden or not there now.
     disocclusion: Float[Array, "2"]
@@ -126,7 +126,7 @@ class Neighbour(NamedTuple):
     back: Float[Array, "rays samples 3"]  # the flow from there to here, likewise
     visible: Float[Array, "rays samples"]  # 1 - disocclusion
     disocclusion: Float[Array, "rays samples"]
-    colour: Float[Array, "rays 3"]  # of that moment along these rays
+    color: Float[Array, "rays 3"]  # of that moment along these rays
     weight: Float[Array, "rays samples"]  # that it was composited with
     present: Bool[Array, " rays"]  # whether the capture has that moment
 
@@ -199,7 +199,7 @@ def dynamic(
         hidden = mlp.hidden_features(trunk, params.flow_trunk, inputs)
     flow = spec.flow_bound * jnp.tanh(mlp.affine(params.flow, hidden))
     logits = mlp.affine(params.disocclusion, sample.features)
-    return Dynamic(sample.density, sample.colour, flow.reshape(2, 3), logits)
+    return Dynamic(sample.density, sample.color, flow.reshape(2, 3), logits)
 
 
 def medium(
@@ -219,7 +219,7 @@ def medium(
         "flow_backward": own.flow[BACKWARD],
         "disocclusion": own.disocclusion,
     }
-    return Medium(own.density, own.colour, share=share, extras=extras)
+    return Medium(own.density, own.color, share=share, extras=extras)
 
 
 def neighbour(
@@ -257,7 +257,7 @@ def neighbour(
         back=there.flow[..., 1 - side, :],
         visible=jax.nn.sigmoid(-logit),  # 1 - sigmoid(logit) would round to 0
         disocclusion=jax.nn.sigmoid(logit),
-        colour=_alone(level, weight, there.colour),
+        color=_alone(level, weight, there.color),
         weight=weight,
         present=present,
     )
@@ -277,12 +277,12 @@ def penalty(
     mask = jnp.where(batch.valid, picture_mask(spec, level, context.step), 0)
     values = {
         "dynamic": lambda: flow_losses.weighted_mean(
-            jnp.square(_alone(level, weight, own.colour) - batch.colour), mask
+            jnp.square(_alone(level, weight, own.color) - batch.color), mask
         ),
         "warped": lambda: sum(
             flow_losses.warped(
-                one.colour,
-                batch.colour,
+                one.color,
+                batch.color,
                 one.weight,
                 one.visible,
                 jnp.where(one.present, mask, 0),
@@ -321,10 +321,10 @@ def penalty(
     return terms
 
 
-def _alone(level, weight, colour):
-    """Colours of rays through the medium alone, before what is known to be behind."""
+def _alone(level, weight, color):
+    """Colors of rays through the medium alone, before what is known to be behind."""
     composite = jax.vmap(compositing.composite)
-    return composite(weight, colour, level.distances, level.background).colour
+    return composite(weight, color, level.distances, level.background).color
 
 
 def picture_mask(

@@ -56,20 +56,20 @@ def mean_where(
 
 
 def warped(
-    colour: Float[Array, "rays 3"],
+    color: Float[Array, "rays 3"],
     target: Float[Array, "rays 3"],
     weight: Float[Array, "rays samples"],
     visible: Float[Array, "rays samples"],
     mask: Float[Array, " rays"],
 ) -> Scalar:
-    """Squared error of a neighbour's colours brought here, where it shows the same.
+    """Squared error of a neighbour's colors brought here, where it shows the same.
 
     Rays count by their composited `visible`, 1 - disocclusion. The weights of
-    compositing are held fixed there: density is to explain colour, not to make rays
+    compositing are held fixed there: density is to explain color, not to make rays
     count less.
     """
     seen = jnp.sum(jax.lax.stop_gradient(weight) * visible, axis=-1)
-    return weighted_mean(jnp.square(colour - target), mask * seen)
+    return weighted_mean(jnp.square(color - target), mask * seen)
 
 
 def cycle(

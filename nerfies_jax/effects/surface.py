@@ -1,8 +1,8 @@
-"""Colour that knows where its surface is, and how it lies, at the moment.
+"""Color that knows where its surface is, and how it lies, at the moment.
 
 Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, its surface-aware NeRF. The text with
 its equations was not at hand; its code (JokerYan/NeRF-DS) is followed. A mirror that
-moves shows other things, so colour reads the observed point and the normal there,
+moves shows other things, so color reads the observed point and the normal there,
 beside the view direction. A head of the template says the normal in the template; the
 warp turns it to where it is observed. It learns from the slope of the density, and may
 not face away from the camera.
@@ -30,7 +30,7 @@ NAME = "surface"
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceSpec:
-    """What colour reads, and what a normal that is wrong counts for.
+    """What color reads, and what a normal that is wrong counts for.
 
     Bands of both encodings are shut for `closed_steps` and open one by one over the
     next `anneal_steps`, as those of the point in the paper's code; those of the normal
@@ -95,7 +95,7 @@ def look(
     surface: Surface,
     condition: FrameCondition,
 ) -> Look:
-    """What colour reads of one sample, and its normals.
+    """What color reads of one sample, and its normals.
 
     "head" is what the head says, of any length, in the template; "observed" is its
     direction turned to the observation; "slope" is where density falls fastest in the
@@ -105,7 +105,7 @@ def look(
     # slopes through the trunk emptied the scene.
     head = mlp.affine(params[level], jax.lax.stop_gradient(surface.features))
     observed = unit(surface.turned(unit(head)))
-    # Colour may not bend the normals to its liking.
+    # Color may not bend the normals to its liking.
     seen = jax.lax.stop_gradient(observed)
     read = [
         encoding.encode(one, value, window(spec, one, condition.step, value))

@@ -1,7 +1,7 @@
-"""What passes through single exposures, and how far their colours can be trusted.
+"""What passes through single exposures, and how far their colors can be trusted.
 
 NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "transient objects"): beside the
-static field each photograph has a medium of its own, with density, colour and an
+static field each photograph has a medium of its own, with density, color and an
 uncertainty `beta`. People and cars settle there. Pictures show it, held-out ones with
 codes between those of their neighbours in time, unless it is left out
 (`variants.without_effects`), as the paper does and `held_out_codes.score`.
@@ -35,7 +35,7 @@ NAME = TABLE = "transient"
 class TransientSpec:
     """The medium and its costs; defaults of the paper and of its reimplementation.
 
-    `beta_min` is the least standard deviation of a ray's colour, in units of colour. It
+    `beta_min` is the least standard deviation of a ray's color, in units of color. It
     bounds the loss from below; without it a pixel that is met exactly would be worth
     anything. `density_weight` is the paper's lambda_u: what keeps the static scene out
     of the transient medium. `beta_power` is that of `photometric`: zero is the paper's
@@ -67,14 +67,14 @@ class TransientSpec:
         if not 0 <= self.beta_power <= 2:
             raise ValueError(
                 f"beta_power={self.beta_power} must be in [0, 2]: 0 is the likelihood, "
-                "at 2 colours learn as from a squared error"
+                "at 2 colors learn as from a squared error"
             )
         network(self, 1)  # refuses wrong depths and widths
 
 
 def network(spec: TransientSpec, features: int) -> MLPSpec:
     """What reads [template features, code] and answers the medium before activation."""
-    heads = (("density", 1), ("colour", 3), ("beta", 1))
+    heads = (("density", 1), ("color", 3), ("beta", 1))
     return MLPSpec(
         inputs=features + spec.code_width,
         depth=spec.depth,
@@ -106,7 +106,7 @@ def init(
 def medium(
     spec: TransientSpec, params: MLP, sample: Sample, condition: FrameCondition
 ) -> Medium:
-    """Density, colour and uncertainty of the medium at one sample.
+    """Density, color and uncertainty of the medium at one sample.
 
     The trunk is shared and learns from both media, as in the paper: nothing is stopped.
     """
@@ -114,7 +114,7 @@ def medium(
     raw = mlp.apply(network(spec, sample.features.shape[-1]), params, inputs)
     return Medium(
         density=jax.nn.softplus(raw["density"][0]),
-        colour=jax.nn.sigmoid(raw["colour"]),
+        color=jax.nn.sigmoid(raw["color"]),
         beta=jax.nn.softplus(raw["beta"][0]),
     )
 
@@ -124,7 +124,7 @@ def uncertainty(
     weights: Float[Array, "*rays samples"],
     beta: Float[Array, "*rays samples"],
 ) -> Float[Array, "*rays"]:
-    """Standard deviation of a ray's colour: beta_min + Σ w β over its samples.
+    """Standard deviation of a ray's color: beta_min + Σ w β over its samples.
 
     `weights` are the transient medium's. The paper has β_min inside the sum, so that a
     ray which meets no transient has a β of zero and an infinite loss. Like the public
@@ -134,33 +134,33 @@ def uncertainty(
 
 
 def photometric(
-    colour: Float[Array, "*rays 3"],
+    color: Float[Array, "*rays 3"],
     truth: Float[Array, "*rays 3"],
     beta: Float[Array, "*rays"],
     valid: Bool[Array, "*rays"] | None,
     beta_power: float = 0.0,
 ) -> Float[Array, ""]:
-    """Mean over the valid rays of (|colour - truth|² / 2β² + log β) [β]^beta_power.
+    """Mean over the valid rays of (|color - truth|² / 2β² + log β) [β]^beta_power.
 
     At a power of zero the first two terms of equation 13, where the second reads
-    log β² / 2. At a given residual it is least at β = |colour - truth|, and never less
+    log β² / 2. At a given residual it is least at β = |color - truth|, and never less
     than log beta_min: it is negative for good fits. The public reimplementation adds 3
     so that curves stay above zero, which changes no gradient, and takes the mean over
     the channels, which makes the first term a third.
 
-    [β] is β that teaches nothing, its power in [0, 2]. At zero colours learn at 1/β² of
+    [β] is β that teaches nothing, its power in [0, 2]. At zero colors learn at 1/β² of
     their residuals: what a short run has not learnt yet is called uncertain, and what
     is uncertain is not learnt, so that a floor's checks stay gone. At one they learn at
-    1/β, at two alike, and β still goes to |colour - truth| (Seitzer et al. 2022,
+    1/β, at two alike, and β still goes to |color - truth| (Seitzer et al. 2022,
     arXiv:2203.09168, the β-NLL, whose β is half of this power).
     """
     if valid is not None:
         # Selected before anything is squared or divided: unfilmed pixels may hold NaN.
-        colour = jnp.where(valid[..., None], colour, 0)
+        color = jnp.where(valid[..., None], color, 0)
         truth = jnp.where(valid[..., None], truth, 0)
         beta = jnp.where(valid, beta, 1)
     # Divided first: the square of a residual far below beta must not underflow alone.
-    scaled = (colour - truth) / beta[..., None]
+    scaled = (color - truth) / beta[..., None]
     each = jnp.sum(jnp.square(scaled), axis=-1) / 2 + jnp.log(beta)
     if beta_power:
         each = each * jax.lax.stop_gradient(beta) ** beta_power

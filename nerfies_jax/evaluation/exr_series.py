@@ -38,7 +38,7 @@ def write(
 def write_frame(
     path: AnyPath, rendering: Rendering, view: View, flow: np.ndarray | None = None
 ) -> None:
-    """Linear colour (RGB), alpha (A) and z-depth (Z), and what saw it in the header.
+    """Linear color (RGB), alpha (A) and z-depth (Z), and what saw it in the header.
 
     `flow` [height, width, 2], pixels right and down, goes to `flow.x` and `flow.y`;
     where it is NaN they are 0, and so is `flow.A`.
@@ -51,7 +51,7 @@ def write_frame(
     height, width = rendering.alpha.shape
     exr.write_exr(
         path,
-        colour=images.linear_from_srgb(np.clip(rendering.colour, 0, 1)),
+        color=images.linear_from_srgb(np.clip(rendering.color, 0, 1)),
         alpha=rendering.alpha,
         depth=rendering.depth,
         extra=extra,

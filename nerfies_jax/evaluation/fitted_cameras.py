@@ -1,6 +1,6 @@
 """Cameras fitted to frames that were never learnt from, the scene as it is.
 
-A wrong camera costs a good scene several dB. By the colours alone: the squared error of
+A wrong camera costs a good scene several dB. By the colors alone: the squared error of
 the rendered frame falls along its slope with respect to the camera, a screw in the
 camera's own frame.
 """
@@ -73,8 +73,8 @@ def photometric_loss(
     draw = _drawer(model, state, view, size)
 
     def loss(screw_px):
-        colour = draw(_moved(view.camera, screw_px, depth))
-        return LEVELS**2 * losses.mse(colour, truth, valid)
+        color = draw(_moved(view.camera, screw_px, depth))
+        return LEVELS**2 * losses.mse(color, truth, valid)
 
     return loss
 
@@ -167,19 +167,19 @@ def fit_cameras(
 
 
 def _drawer(model, state, view, size):
-    """Camera -> colour; what does not depend on the camera is computed once."""
+    """Camera -> color; what does not depend on the camera is computed once."""
     if model.stages is None:
         return lambda camera: (
             model.render(
                 state.params, view._replace(camera=camera), size, state.step
-            ).colour
+            ).color
         )
     stages, params = model.stages, state.params
     deformed = stages.deform(params, stages.prepare(params), view.time)
     return lambda camera: (
         stages.draw(
             params, deformed, view._replace(camera=camera), size, state.step
-        ).colour
+        ).color
     )
 
 

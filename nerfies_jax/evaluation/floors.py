@@ -22,7 +22,7 @@ class Averages(NamedTuple):
     """Held-out frames made of other pictures; NumPy, one row for each."""
 
     places: np.ndarray  # which of the scored frames
-    colour: np.ndarray  # [places, height, width, 3] float32 in [0, 1]
+    color: np.ndarray  # [places, height, width, 3] float32 in [0, 1]
     known: np.ndarray | None  # [places, height, width] bool; None where all of it is
 
 
@@ -56,7 +56,7 @@ def neighbour_means(capture: Capture, rows: np.ndarray) -> Averages | None:
     """
     if len(capture.train) < NEIGHBOURS or not np.ptp(capture.times[capture.train]):
         return None
-    colours, known = [], []
+    colors, known = [], []
     for row in rows:
         chosen = neighbour_rows(capture, row)
         pictures = capture.images[chosen].astype(np.float32) / 255
@@ -65,11 +65,11 @@ def neighbour_means(capture: Capture, rows: np.ndarray) -> Averages | None:
             filmed = capture.valid[chosen]
         count = filmed.sum(axis=0)
         total = np.where(filmed[..., None], pictures, 0).sum(axis=0)
-        colours.append(total / np.maximum(count, 1)[..., None])
+        colors.append(total / np.maximum(count, 1)[..., None])
         known.append(count > 0)
     return Averages(
         np.arange(len(rows)),
-        np.stack(colours).astype(np.float32),
+        np.stack(colors).astype(np.float32),
         None if capture.valid is None else np.stack(known),
     )
 
@@ -86,7 +86,7 @@ def time_averages(
 
     Of at most `frames` of the rows, at most `moments` of the times that were learnt
     from, both evenly spread. All else of the view (its camera, its appearance) stays.
-    Colours are clipped, then averaged as stored (sRGB).
+    Colors are clipped, then averaged as stored (sRGB).
     """
     if frames < 1 or moments < 1:
         raise ValueError(
@@ -101,6 +101,6 @@ def time_averages(
     for time in times:  # outside: what is deformed for an instant serves all its views
         instant = in_default_precision(time)
         for place, view in enumerate(views):
-            colour = draw(state, view._replace(time=instant)).colour
-            total[place] += np.clip(colour, 0, 1)
+            color = draw(state, view._replace(time=instant)).color
+            total[place] += np.clip(color, 0, 1)
     return Averages(places, (total / len(times)).astype(np.float32), None)

@@ -136,13 +136,13 @@ def metrics(numbers: Mapping[str, float]) -> list[Metric]:
 def _pictures(scored, capture, lpips):
     """Means over the frames, each over the pixels that have what it needs."""
     parts = {}
-    for row, colour in zip(scored.rows, scored.colour, strict=True):
+    for row, color in zip(scored.rows, scored.color, strict=True):
         valid = None if capture.valid is None else capture.valid[row]
         moving = None if capture.moving is None else capture.moving[row]
-        scores = _score(colour, capture.images[row], valid, moving)
+        scores = _score(color, capture.images[row], valid, moving)
         if lpips is not None:
             scores["heldout.lpips"] = _lpips(
-                lpips.params, lpips.network, colour, capture.images[row], valid
+                lpips.params, lpips.network, color, capture.images[row], valid
             )
         for key, value in jax.device_get(scores).items():
             parts.setdefault(key, []).append(value)
@@ -158,7 +158,7 @@ def _floors(floors, scored, capture):
         numbers["floor.neighbours"] = known_mean(own[:, 0])
     if floors.still is not None:
         own = _floor_psnr(floors.still, scored, capture)
-        drawn = floors.still._replace(colour=scored.colour[floors.still.places])
+        drawn = floors.still._replace(color=scored.color[floors.still.places])
         worth = _floor_psnr(drawn, scored, capture) - own
         numbers["floor.still"] = known_mean(own[:, 0])
         numbers["motion.worth"] = known_mean(worth[:, 0])
@@ -169,11 +169,11 @@ def _floors(floors, scored, capture):
 def _floor_psnr(averages, scored, capture):
     """[places, 2] PSNR of all that was filmed and of what of it moves; NaN of none."""
     psnrs = []
-    for number, (place, colour) in enumerate(
-        zip(averages.places, averages.colour, strict=True)
+    for number, (place, color) in enumerate(
+        zip(averages.places, averages.color, strict=True)
     ):
         row = scored.rows[place]
-        mask = np.ones(colour.shape[:2], bool)
+        mask = np.ones(color.shape[:2], bool)
         for part in (
             None if capture.valid is None else capture.valid[row],
             None if averages.known is None else averages.known[number],
@@ -181,21 +181,21 @@ def _floor_psnr(averages, scored, capture):
             mask = mask if part is None else mask & part
         none = np.zeros_like(mask)
         moving = none if capture.moving is None else mask & capture.moving[row]
-        psnrs.append(_masked_psnrs(colour, capture.images[row], mask, moving))
+        psnrs.append(_masked_psnrs(color, capture.images[row], mask, moving))
     return np.asarray(jax.device_get(psnrs))
 
 
 @jax.jit
-def _masked_psnrs(colour, truth, mask, moving):
-    picture = image_quality.quantise(colour)
-    truth = truth.astype(colour.dtype) / 255
+def _masked_psnrs(color, truth, mask, moving):
+    picture = image_quality.quantise(color)
+    truth = truth.astype(color.dtype) / 255
     return [image_quality.masked_psnr(picture, truth, one) for one in (mask, moving)]
 
 
 @jax.jit
-def _score(colour, truth, valid, moving):
-    picture = image_quality.quantise(colour)
-    truth = truth.astype(colour.dtype) / 255
+def _score(color, truth, valid, moving):
+    picture = image_quality.quantise(color)
+    truth = truth.astype(color.dtype) / 255
     numbers = {}
     if moving is not None:
         still = ~moving
@@ -214,9 +214,9 @@ def _score(colour, truth, valid, moving):
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _lpips(params, network, colour, truth, valid):
-    picture = image_quality.quantise(colour)
-    truth = truth.astype(colour.dtype) / 255
+def _lpips(params, network, color, truth, valid):
+    picture = image_quality.quantise(color)
+    truth = truth.astype(color.dtype) / 255
     if valid is None:
         return perceptual.lpips(params, network, picture, truth)
     return perceptual.masked_lpips(params, network, picture, truth, valid)

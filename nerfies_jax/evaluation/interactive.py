@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerfies_jax.evaluation import pictures
-from nerfies_jax.evaluation.pictures import Coloured
+from nerfies_jax.evaluation.pictures import Colored
 from nerfies_jax.evaluation.renderer import as_picture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
@@ -126,7 +126,7 @@ def as_channel(
     rendering: Rendering,
     distance: np.ndarray | None = None,
     limits: tuple[float, float] | None = None,
-) -> Coloured:
+) -> Colored:
     """One of the `CHANNELS` of a rendering as a picture, and what its ends stand for.
 
     `distance` [height, width] is how far what each pixel shows has moved, scene units,
@@ -134,12 +134,12 @@ def as_channel(
     those of motion grow.
     """
     if channel == "color":
-        return Coloured(as_picture(rendering.colour), 0.0, 1.0)
+        return Colored(as_picture(rendering.color), 0.0, 1.0)
     if channel == "opacity":
         grey = np.repeat(as_picture(rendering.alpha)[..., None], 3, axis=-1)
-        return Coloured(grey, 0.0, 1.0)
+        return Colored(grey, 0.0, 1.0)
     if channel == "depth":
-        return pictures.colour_depth(rendering.depth, rendering.alpha > 0.5, limits)
+        return pictures.color_depth(rendering.depth, rendering.alpha > 0.5, limits)
     if channel == "motion" and distance is not None:
-        return pictures.colour_distance(distance, 0.0 if limits is None else limits[1])
+        return pictures.color_distance(distance, 0.0 if limits is None else limits[1])
     raise ValueError(f"channel {channel!r}: there are {', '.join(CHANNELS)}")

@@ -11,7 +11,7 @@ class ThroughLens:
     """What a renderer of pinholes draws, on the pixel grid of the filmed picture.
 
     The render of the camera without its lens is read where each filmed pixel looks:
-    colour and alpha bilinearly, depth, which must not be mixed over an edge, from the
+    color and alpha bilinearly, depth, which must not be mixed over an edge, from the
     nearest pixel. Everything is 0 where the pinhole does not look; those pixels are
     not `valid` in `pinholes.scorable`. A view without a lens is passed on.
     """
@@ -27,7 +27,7 @@ class ThroughLens:
         straight = view._replace(camera=pinholes.pinhole(view.camera))
         drawn = self._draw(state, straight)
         place, inside = self._maps.of(view.camera)
-        flat = np.concatenate([drawn.colour, np.asarray(drawn.alpha)[..., None]], -1)
+        flat = np.concatenate([drawn.color, np.asarray(drawn.alpha)[..., None]], -1)
         flat = np.where(inside[..., None], resampling.bilinear(flat, place), 0)
         depth = np.asarray(drawn.depth)
         return Rendering(

@@ -1,4 +1,4 @@
-"""Pictures that let a person judge a run: comparisons, colour codes, sheets, a curve.
+"""Pictures that let a person judge a run: comparisons, color codes, sheets, a curve.
 
 Everything takes NumPy arrays and gives uint8 [height, width, 3], or writes one PNG.
 """
@@ -23,16 +23,16 @@ PANEL_WIDTH = 240  # pixels at least: smaller pictures are enlarged so labels fi
 GAP = 6  # pixels between panels
 TEXT_HEIGHT = 20
 INK, PAPER, FADED = (32, 33, 36), (255, 255, 255), (110, 113, 120)
-UNKNOWN = (128, 128, 128)  # grey is in none of the colour maps
-# Rows of colour_maps.png, 256 colours each, which are matplotlib's inferno and viridis
+UNKNOWN = (128, 128, 128)  # grey is in none of the color maps
+# Rows of color_maps.png, 256 colors each, which are matplotlib's inferno and viridis
 # (CC0): a run is looked at without matplotlib.
 ERROR_MAP, DEPTH_MAP = 0, 1
 # The share of depths beyond each end of the shown range; one stray splat in front of
-# the camera would otherwise turn the whole picture into one colour.
+# the camera would otherwise turn the whole picture into one color.
 STRAY_SHARE = 0.01
 
 
-class Coloured(NamedTuple):
+class Colored(NamedTuple):
     """A quantity as a picture, and the values its two ends stand for."""
 
     picture: np.ndarray  # [..., height, width, 3] uint8
@@ -47,12 +47,12 @@ class History(NamedTuple):
     psnr: Sequence[float]  # dB, held-out frames
 
 
-def colour_depth(
+def color_depth(
     depth: np.ndarray,
     known: np.ndarray | None = None,
     limits: tuple[float, float] | None = None,
-) -> Coloured:
-    """Depth in the colours of viridis, near bright and far dark; unknown grey.
+) -> Colored:
+    """Depth in the colors of viridis, near bright and far dark; unknown grey.
 
     One range for all pictures given, `limits` or the 1st to 99th percentile of what is
     known (finite, positive and `known`), so that frames can be compared.
@@ -64,12 +64,10 @@ def colour_depth(
         limits = _limits(depth[shown])
     low, high = limits
     nearness = 1 - np.where(shown, depth - low, 0) / _span(low, high)
-    return Coloured(_mapped(nearness, shown, DEPTH_MAP), low, high)
+    return Colored(_mapped(nearness, shown, DEPTH_MAP), low, high)
 
 
-def colour_error(
-    image: np.ndarray, truth: np.ndarray, largest: float | int
-) -> Coloured:
+def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> Colored:
     """Mean absolute difference over the channels of pictures in [0, 1].
 
     Black is 0, light yellow `largest` and more; grey where either is not finite.
@@ -80,12 +78,12 @@ def colour_error(
         )
     error = np.mean(np.abs(as_unit(image) - as_unit(truth)), axis=-1)
     shown = np.isfinite(error)
-    return Coloured(
+    return Colored(
         _mapped(np.where(shown, error, 0) / largest, shown, ERROR_MAP), 0, largest
     )
 
 
-def colour_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Coloured:
+def color_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Colored:
     """How far things moved, scene units: black is not at all, grey is unknown.
 
     Light yellow is the 99th percentile, or `at_least` where that is farther.
@@ -93,14 +91,14 @@ def colour_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Colour
     shown = np.isfinite(distance)
     largest = max(float(at_least), _limits(distance[shown])[1] if shown.any() else 0.0)
     unit = np.where(shown, distance, 0) / _span(0.0, largest)
-    return Coloured(_mapped(unit, shown, ERROR_MAP), 0.0, largest)
+    return Colored(_mapped(unit, shown, ERROR_MAP), 0.0, largest)
 
 
-def colour_flow(flow: np.ndarray, largest: float | int | None = None) -> Coloured:
+def color_flow(flow: np.ndarray, largest: float | int | None = None) -> Colored:
     """Image motion [..., height, width, 2]: direction as hue, length as saturation.
 
     Still is white, right is red, down yellow-green, left cyan and up violet; full
-    colour from `largest` pixels on (the 99th percentile of the lengths by default).
+    color from `largest` pixels on (the 99th percentile of the lengths by default).
     Unknown is grey.
     """
     flow = np.asarray(flow, np.float32)
@@ -113,11 +111,11 @@ def colour_flow(flow: np.ndarray, largest: float | int | None = None) -> Coloure
         )
     hue = np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi) % 1
     saturation = np.clip(length / (largest or 1), 0, 1)
-    colour = skimage.color.hsv2rgb(
+    color = skimage.color.hsv2rgb(
         np.stack([hue, saturation, np.ones_like(hue)], axis=-1)
     )
-    picture = np.where(shown[..., None], as_bytes(colour), np.uint8(UNKNOWN))
-    return Coloured(picture, 0.0, float(largest))
+    picture = np.where(shown[..., None], as_bytes(color), np.uint8(UNKNOWN))
+    return Colored(picture, 0.0, float(largest))
 
 
 def comparison(
@@ -131,8 +129,8 @@ def comparison(
     """Truth, render, error and depth side by side, one row for each frame.
 
     Pictures [frames, height, width, 3] (uint8, or floats in [0, 1]), depth [frames,
-    height, width] in scene units with one colour range over all rows. `captions` stand
-    above the rows; the bars below say what the colours mean.
+    height, width] in scene units with one color range over all rows. `captions` stand
+    above the rows; the bars below say what the colors mean.
     """
     frames = len(truth)
     if not (len(render) == len(depth) == len(captions) == frames > 0):
@@ -141,18 +139,18 @@ def comparison(
             f"{frames} true, {len(render)} rendered, {len(depth)} depths and "
             f"{len(captions)} captions; pass one of each for every row"
         )
-    error = colour_error(render, truth, largest_error)
-    coloured_depth = colour_depth(depth, known_depth)
-    columns = [as_bytes(truth), as_bytes(render), error.picture, coloured_depth.picture]
+    error = color_error(render, truth, largest_error)
+    colored_depth = color_depth(depth, known_depth)
+    columns = [as_bytes(truth), as_bytes(render), error.picture, colored_depth.picture]
     columns = [_enlarged(column) for column in columns]
     width = columns[0].shape[2]
     titles = ("truth", "render", "error", "depth")
     rows = [_beside([_text(title, width) for title in titles])]
     for frame, caption in enumerate(captions):
-        rows.append(_text(caption, 4 * width + 3 * GAP, colour=FADED))
+        rows.append(_text(caption, 4 * width + 3 * GAP, color=FADED))
         rows.append(_beside([column[frame] for column in columns]))
     blank = _paper(2 * TEXT_HEIGHT + GAP, width)
-    far, near = coloured_depth.high, coloured_depth.low
+    far, near = colored_depth.high, colored_depth.low
     rows.append(
         _beside(
             [
@@ -177,7 +175,7 @@ def contact_sheet(
         )
     cells = _enlarged(np.stack([as_bytes(picture) for picture in pictures]))
     cells = [
-        _stacked([cell, _text(caption, cell.shape[1], colour=FADED)])
+        _stacked([cell, _text(caption, cell.shape[1], color=FADED)])
         for cell, caption in zip(cells, captions, strict=True)
     ]
     columns = min(columns, len(cells))
@@ -290,7 +288,7 @@ def _limits(values):
 
 
 def _span(low, high):
-    return high - low if high > low else 1.0  # a flat depth has one colour
+    return high - low if high > low else 1.0  # a flat depth has one color
 
 
 def _mapped(unit, shown, row):
@@ -301,7 +299,7 @@ def _mapped(unit, shown, row):
 
 @functools.cache
 def _tables():
-    file = pathlib.Path(__file__).with_name("colour_maps.png")
+    file = pathlib.Path(__file__).with_name("color_maps.png")
     with PIL.Image.open(file) as picture:
         return np.asarray(picture)
 
@@ -311,16 +309,16 @@ def _font():
     return PIL.ImageFont.load_default(15)  # the one that Pillow brings along
 
 
-def _text(words, width, colour=INK, align="left"):
+def _text(words, width, color=INK, align="left"):
     strip = PIL.Image.new("RGB", (width, TEXT_HEIGHT), PAPER)
     draw = PIL.ImageDraw.Draw(strip)
     at = 0 if align == "left" else width - draw.textlength(words, font=_font())
-    draw.text((at, 0), words, fill=colour, font=_font())
+    draw.text((at, 0), words, fill=color, font=_font())
     return np.asarray(strip)
 
 
 def _bar(row, left, right, width):
-    """The colour map from its low to its high end, with the two values below it."""
+    """The color map from its low to its high end, with the two values below it."""
     ramp = _tables()[row][np.linspace(0, 255, width).astype(int)]
     ends = np.minimum(_text(left, width), _text(right, width, align="right"))
     return _stacked([np.repeat(ramp[None], TEXT_HEIGHT, 0), ends])

@@ -172,6 +172,6 @@ def _all_compiled(model, *lowered):
     return [program.compile(model.compiler_options) for program in lowered]
 
 
-def as_picture(colour: np.ndarray) -> np.ndarray:
-    """A rendered colour as 8 bits."""
-    return np.round(np.clip(colour, 0, 1) * 255).astype(np.uint8)
+def as_picture(color: np.ndarray) -> np.ndarray:
+    """A rendered color as 8 bits."""
+    return np.round(np.clip(color, 0, 1) * 255).astype(np.uint8)

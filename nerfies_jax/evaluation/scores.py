@@ -19,7 +19,7 @@ class Scored(NamedTuple):
     """Frames as rendered, and their scores; NumPy, one row per frame."""
 
     rows: np.ndarray  # of the capture
-    colour: np.ndarray  # [frames, height, width, 3] float32, clipped to [0, 1]
+    color: np.ndarray  # [frames, height, width, 3] float32, clipped to [0, 1]
     alpha: np.ndarray  # [frames, height, width]
     depth: np.ndarray  # [frames, height, width] z-depth, scene units
     psnr: np.ndarray  # dB, of the 8-bit picture
@@ -49,13 +49,13 @@ def score(
             rendering = renderer(state, view_of(capture, row))
             truth = capture.images[row].astype(np.float32) / 255
             valid = None if capture.valid is None else capture.valid[row]
-            scores.append(jax.device_get(_score(rendering.colour, truth, valid)))
+            scores.append(jax.device_get(_score(rendering.color, truth, valid)))
             renderings.append(rendering)
             stage.advance()
     psnr, ssim = np.asarray(scores).T
     return Scored(
         rows=np.asarray(rows),
-        colour=np.clip(np.stack([r.colour for r in renderings]), 0, 1),
+        color=np.clip(np.stack([r.color for r in renderings]), 0, 1),
         alpha=np.stack([r.alpha for r in renderings]),
         depth=np.stack([r.depth for r in renderings]),
         psnr=psnr,
@@ -76,18 +76,18 @@ def score_halves(
     frozen; `render(view, codes)` draws the whole frame with them, and its right half
     is scored (Martin-Brualla et al. 2021).
     """
-    colours = []
+    colors = []
     for row in rows:
         view, picture = view_of(capture, row), capture.images[row]
         half = picture.shape[1] // 2
         left = None if capture.valid is None else capture.valid[row, :, :half]
         codes = fit_code(view, picture[:, :half], left)
-        colours.append(np.asarray(render(view, codes).colour))
-    return score_right_halves(capture, rows, colours)
+        colors.append(np.asarray(render(view, codes).color))
+    return score_right_halves(capture, rows, colors)
 
 
 def score_right_halves(
-    capture: Capture, rows: np.ndarray, colours: np.ndarray | Sequence[np.ndarray]
+    capture: Capture, rows: np.ndarray, colors: np.ndarray | Sequence[np.ndarray]
 ) -> Halves:
     """Scores of the right halves of rendered frames [height, width, 3].
 
@@ -95,11 +95,11 @@ def score_right_halves(
     """
     _check_some(rows, capture)
     scores = []
-    for row, colour in zip(rows, colours, strict=True):
-        half = colour.shape[1] // 2
+    for row, color in zip(rows, colors, strict=True):
+        half = color.shape[1] // 2
         truth = capture.images[row, :, half:].astype(np.float32) / 255
         valid = None if capture.valid is None else capture.valid[row, :, half:]
-        scores.append(jax.device_get(_score(colour[:, half:], truth, valid)))
+        scores.append(jax.device_get(_score(color[:, half:], truth, valid)))
     psnr, ssim = np.asarray(scores).T
     return Halves(np.asarray(rows), psnr, ssim)
 
@@ -124,8 +124,8 @@ def known_mean(
 
 
 @jax.jit
-def _score(colour, truth, valid):
-    picture = image_quality.quantise(colour)
+def _score(color, truth, valid):
+    picture = image_quality.quantise(color)
     if valid is None:
         return image_quality.psnr(picture, truth), image_quality.ssim(picture, truth)
     return (

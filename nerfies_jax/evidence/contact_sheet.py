@@ -43,19 +43,19 @@ def _draw_tracks(picture, evidence, frame, times):
     here = np.flatnonzero(tracks.seen[:, frame])
     chosen = [_spread(here[moves[here] == kind], TRACKS // 2) for kind in (False, True)]
     for row in np.concatenate(chosen):
-        colour = BY_ITSELF if moves[row] else AT_REST
+        color = BY_ITSELF if moves[row] else AT_REST
         tail = np.arange(max(0, frame - TAIL), frame + 1)
         # From the last frame in which it was not seen.
         gap = np.flatnonzero(~tracks.seen[row, tail])
         tail = tail[gap[-1] + 1 :] if len(gap) else tail
         line = np.round(tracks.pixel[row, tail] * times * 16).astype(np.int32)
-        cv2.polylines(picture, [line], False, colour, 1, cv2.LINE_AA, shift=4)
-        cv2.circle(picture, tuple(line[-1].tolist()), 24, colour, -1, cv2.LINE_AA, 4)
+        cv2.polylines(picture, [line], False, color, 1, cv2.LINE_AA, shift=4)
+        cv2.circle(picture, tuple(line[-1].tolist()), 24, color, -1, cv2.LINE_AA, 4)
 
 
 def _spread(rows, most):
     return rows[:: max(1, -(-len(rows) // most))]
 
 
-def _tinted(picture, where, colour, share):
-    return np.where(where[..., None], (1 - share) * picture + share * colour, picture)
+def _tinted(picture, where, color, share):
+    return np.where(where[..., None], (1 - share) * picture + share * color, picture)

@@ -1,4 +1,4 @@
-"""Exposure and colour: whether points at rest look alike in all frames."""
+"""Exposure and color: whether points at rest look alike in all frames."""
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ POLISHES = 12  # rounds of medians; the gains move by less than 1e-3 afterwards
 
 
 def exposure(views: Views, points: np.ndarray) -> Finding:
-    """Whether whole frames differ in brightness or colour, by points [points, 3]."""
+    """Whether whole frames differ in brightness or color, by points [points, 3]."""
     threshold = f"{DRIFT_STOPS:g} stops, root mean square over frames and channels"
     if len(points) < GROUPS * MIN_POINTS:
         return cannot_tell(
@@ -52,12 +52,12 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
     wanted, confidence = judge(drift, DRIFT_STOPS, error / 2)
     evidence = (
         f"frames differ by {drift:.3f} stops on points at rest (brightness "
-        f"{brightness:.3f}, colour {tint:.3f}), known to {error:.3f}"
+        f"{brightness:.3f}, color {tint:.3f}), known to {error:.3f}"
     )
     numbers = {
         "drift_stops": drift,
         "brightness_stops": brightness,
-        "colour_stops": tint,
+        "color_stops": tint,
         "noise_stops": error,
         "points": float(len(points)),
     }
@@ -85,7 +85,7 @@ def sightings(views: Views, points: np.ndarray) -> np.ndarray:
 def gains(light: np.ndarray) -> np.ndarray:
     """Gain of each frame [frames, 3] in stops, by median polish (Tukey 1977).
 
-    `light` [frames, points, 3] is a frame's gain plus a point's colour, but where the
+    `light` [frames, points, 3] is a frame's gain plus a point's color, but where the
     point is hidden. NaN for frames that see too few.
     """
     gain = np.zeros((len(light), 3))
@@ -97,8 +97,8 @@ def gains(light: np.ndarray) -> np.ndarray:
         return np.full_like(gain, np.nan)
     rows = light[enough]
     for _ in range(POLISHES):
-        colour = np.nanmedian(rows - gain[enough][:, None], axis=0)
-        gain[enough] = np.nanmedian(rows - colour, axis=1)
+        color = np.nanmedian(rows - gain[enough][:, None], axis=0)
+        gain[enough] = np.nanmedian(rows - color, axis=1)
         gain[enough] -= gain[enough].mean(0)
     gain[~enough] = np.nan
     return gain

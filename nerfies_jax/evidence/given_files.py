@@ -203,8 +203,8 @@ def _depth_picture(path):
     elif path.suffix.lower() == ".exr":
         stored = exr.in_display_window(path, exr.read_exr(path))
         picture = stored.depth
-        if picture is None and stored.colour is not None:
-            picture = stored.colour[..., 0]
+        if picture is None and stored.color is not None:
+            picture = stored.color[..., 0]
     else:
         picture = images.read_numbers(path)
     if picture is None or picture.ndim != 2:

@@ -25,21 +25,21 @@ RIDGE_PX = 4.0
 
 
 def behind(views: Views, still: PointCloud, moving: np.ndarray) -> PointCloud:
-    """Places and colours on moving pixels [frames, height, width] far from any point.
+    """Places and colors on moving pixels [frames, height, width] far from any point.
 
     Each frame takes the points of those before for known; one in which the points fill
     fewer than `AROUND` cells of `KNOWN_PX` tells nothing. Host side.
     """
-    places, colours = np.asarray(still.position, np.float64), still.colour
+    places, colors = np.asarray(still.position, np.float64), still.color
     first = len(places)
     frames = np.linspace(0, len(views.row) - 1, min(FRAMES, len(views.row)))
     for frame in np.unique(frames.round().astype(int)).tolist():
-        more, colour = _seen_from(views, frame, places, colours, moving[frame])
-        places, colours = np.concatenate([places, more]), np.append(colours, colour, 0)
-    return PointCloud(places[first:].astype(np.float32), colours[first:])
+        more, color = _seen_from(views, frame, places, colors, moving[frame])
+        places, colors = np.concatenate([places, more]), np.append(colors, color, 0)
+    return PointCloud(places[first:].astype(np.float32), colors[first:])
 
 
-def _seen_from(views, frame, places, colours, moving):
+def _seen_from(views, frame, places, colors, moving):
     larger = view_set.times_smaller(views)
     cell_px, every = KNOWN_PX * larger, EVERY_PX * larger
     row, column = np.nonzero((moving & views.valid[frame])[::every, ::every])
@@ -47,16 +47,16 @@ def _seen_from(views, frame, places, colours, moving):
     at = np.stack([column, row], -1) + 0.5
     pixel, depth = view_set.project(views, frame, places)
     inside = view_set.in_picture(views, pixel, depth, 0)
-    none = np.zeros((0, 3)), colours[:0]
+    none = np.zeros((0, 3)), colors[:0]
     if not inside.any() or not len(at):
         return none
-    pixel, inverse, colour = pixel[inside], 1 / depth[inside], colours[inside]
+    pixel, inverse, color = pixel[inside], 1 / depth[inside], colors[inside]
     hidden = cKDTree(pixel).query(at)[0] > cell_px
     at, row, column = at[hidden], row[hidden], column[hidden]
     thin = _farthest_in_cells(pixel / cell_px, inverse)
     if len(thin) < AROUND or not len(at):
         return none
-    pixel, inverse, colour = pixel[thin], inverse[thin], colour[thin]
+    pixel, inverse, color = pixel[thin], inverse[thin], color[thin]
     distance, near = cKDTree(pixel).query(at, AROUND)
     known, offset = inverse[near], pixel[near] - at[:, None]
     least, most = known.min(1), known.max(1)
@@ -68,7 +68,7 @@ def _seen_from(views, frame, places, colours, moving):
         weight = near_by / (1 + (before / BEFORE) ** 2) ** 2
     ray = view_set.rays(views, frame)[row, column]
     place = views.position[frame] + ray / np.clip(guess, least, most)[:, None]
-    shade = colour[near].astype(float)
+    shade = color[near].astype(float)
     shade = [_plane(offset, shade[..., channel], weight)[0] for channel in range(3)]
     return place, np.clip(np.stack(shade, -1).round(), 0, 255).astype(np.uint8)
 

@@ -18,15 +18,15 @@ HALF_CERTAIN_PX, STEEPNESS = 0.5, 3.0
 STILLEST, OVER_NOISE = 0.25, 3.0
 # Tracks near each other in shared frames move alike.
 NEIGHBOURS, EVERY_FRAMES, NEAR_PX, NEIGHBOUR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10
-# A pixel takes after the tracks around it, by place and colour. What none is near to
-# may have come too quickly to be followed: a still scene's colours have the last word.
-VOTES, VOTE_PX, VOTE_COLOUR, REACH_PX = 8, 4.0, 20.0, 8.0
+# A pixel takes after the tracks around it, by place and color. What none is near to
+# may have come too quickly to be followed: a still scene's colors have the last word.
+VOTES, VOTE_PX, VOTE_COLOR, REACH_PX = 8, 4.0, 20.0, 8.0
 VOTE_STEP = 2  # pixels of a side that vote as one does; the sum is smoothed anyway
 FAR_FROM_TRACKS = 0.3
 # What may move is left out of the still scene that pictures are held against.
 OPEN, RIM_PX = 0.3, 8
 SUREST = 0.02  # votes are no surer than that
-SMOOTH_REACH, SMOOTH_PX, SMOOTH_COLOUR = 4, 3.0, 15.0
+SMOOTH_REACH, SMOOTH_PX, SMOOTH_COLOR = 4, 3.0, 15.0
 
 
 def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
@@ -71,7 +71,7 @@ def _neighbourhood(tracks):
 def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
     """[frames, height, width] in 0..1 that a pixel moves, by the tracks near it.
 
-    Tracks that lie near and on a pixel of like colour count most; a pixel far from all
+    Tracks that lie near and on a pixel of like color count most; a pixel far from all
     of them is as likely as `FAR_FROM_TRACKS`.
     """
     frames = len(views.row)
@@ -83,13 +83,13 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
         here = np.flatnonzero(tracks.seen[:, frame])
         if len(here) < VOTES:
             continue
-        colour = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
+        color = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
         place = tracks.pixel[here, frame]
-        theirs = colour[pixel_of(place, (height, width))]
+        theirs = color[pixel_of(place, (height, width))]
         distance, near = cKDTree(place).query(at + 0.5 * VOTE_STEP, VOTES)
         distance = (distance / picture_scale(width)).astype(np.float32)
-        unlike = colour[at[:, 1], at[:, 0], None] - theirs[near]
-        unlike = np.einsum("pvc,pvc->pv", unlike, unlike) / VOTE_COLOUR**2
+        unlike = color[at[:, 1], at[:, 0], None] - theirs[near]
+        unlike = np.einsum("pvc,pvc->pv", unlike, unlike) / VOTE_COLOR**2
         weight = np.exp(-0.5 * ((distance / VOTE_PX) ** 2 + unlike))
         weight += 1e-9 * np.exp(-distance / VOTE_PX)
         share = (weight * score[here][near]).sum(1) / weight.sum(1)
@@ -108,7 +108,7 @@ def may_move(share: np.ndarray) -> np.ndarray:
 
 
 def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
-    """[frames, height, width] bool: votes and what colours say, alike where these are.
+    """[frames, height, width] bool: votes and what colors say, alike where these are.
 
     `odds` are those of `still_pictures.log_odds`.
     """
@@ -116,8 +116,8 @@ def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
     total = np.log(share / (1 - share)) + odds
     moving = np.zeros(total.shape, bool)
     for frame, one in enumerate(total):
-        colour = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
-        moving[frame] = _smooth(one.astype(np.float32), colour) > 0
+        color = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
+        moving[frame] = _smooth(one.astype(np.float32), color) > 0
     return moving
 
 
@@ -137,14 +137,14 @@ def share_on(tracks: Tracks, moving: np.ndarray) -> np.ndarray:
     return on.sum(1) / np.maximum(tracks.seen.sum(1), 1)
 
 
-def _smooth(values, colour):
-    """[height, width] mean over pixels near and of like colour (a bilateral filter)."""
+def _smooth(values, color):
+    """[height, width] mean over pixels near and of like color (a bilateral filter)."""
     height, width = values.shape
-    values, colour = (
+    values, color = (
         cv2.copyMakeBorder(one, *(SMOOTH_REACH,) * 4, cv2.BORDER_REFLECT)
-        for one in (values, colour)
+        for one in (values, color)
     )
-    own = colour[SMOOTH_REACH:-SMOOTH_REACH, SMOOTH_REACH:-SMOOTH_REACH]
+    own = color[SMOOTH_REACH:-SMOOTH_REACH, SMOOTH_REACH:-SMOOTH_REACH]
     total, weights = np.zeros((2, height, width), np.float32)
     reach = range(-SMOOTH_REACH, SMOOTH_REACH + 1)
     for down, right in ((i, j) for i in reach for j in reach if (i + j) % 2 == 0):
@@ -152,8 +152,8 @@ def _smooth(values, colour):
             SMOOTH_REACH + down : SMOOTH_REACH + down + height,
             SMOOTH_REACH + right : SMOOTH_REACH + right + width,
         ]
-        unlike = colour[there] - own
-        unlike = np.einsum("hwc,hwc->hw", unlike, unlike) / SMOOTH_COLOUR**2
+        unlike = color[there] - own
+        unlike = np.einsum("hwc,hwc->hw", unlike, unlike) / SMOOTH_COLOR**2
         near = (down**2 + right**2) / SMOOTH_PX**2
         weight = np.exp(-0.5 * (unlike + np.float32(near)))
         total += weight * values[there]

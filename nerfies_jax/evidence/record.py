@@ -57,7 +57,7 @@ MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between th
 # camera that jumps.
 LEAST_CARRIED = 0.4
 # Shares of the budget after which there is none left for a part.
-FOR_WIDE_STEPS, FOR_TRACKS, FOR_COLOURS = 0.4, 0.5, 0.6
+FOR_WIDE_STEPS, FOR_TRACKS, FOR_COLORS = 0.4, 0.5, 0.6
 FOR_BODIES, FOR_POINTS = 0.7, 0.8
 # Of the near plane, which is that of what stands still: a hand may be far before it.
 AT_CAMERA = 0.1
@@ -200,7 +200,7 @@ def _mask(views, flow, tracks, score, watch):
     odds = np.zeros(share.shape, np.float32)
     work = 1e-6 * A_POINT_FRAME * still_points.work(views)
     work += 1e-6 * A_COMPARED_PIXEL * views.valid.size
-    if watch.has_room(FOR_COLOURS, "what colours say of what moves", work):
+    if watch.has_room(FOR_COLORS, "what colors say of what moves", work):
         still = still_points.dense(views, flow, open_to_doubt)
         odds = still_pictures.log_odds(small, still)
     masks = moving.mask(small, share, odds)

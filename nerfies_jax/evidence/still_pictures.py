@@ -1,7 +1,7 @@
 """How badly each pixel looks like the still scene that other frames show in its place.
 
 The depth of what stands still is known from its points, and behind what moves from the
-points around. A pixel at rest finds its own colour there in most other frames, however
+points around. A pixel at rest finds its own color there in most other frames, however
 its neighbours move; what moves does not.
 """
 
@@ -20,7 +20,7 @@ BLUR_PX = 0.7
 CELL = 2  # pixels of a side that share a depth
 NEARER = 0.9  # of the depth of a cell: a neighbour so near hides what shows through
 HIDDEN = 0.93  # of the depth: in the other frame something nearer stands there
-# Difference that speaks neither way, as a share of the film's spread of colours, and of
+# Difference that speaks neither way, as a share of the film's spread of colors, and of
 # its slope: places are not exact.
 EVEN, EVEN_SLOPE = 0.5, 0.25
 STEEPNESS, MOST = 2.0, 3.0  # of the logarithm of odds
@@ -28,21 +28,21 @@ OUTSIDE = (np.nan,) * 3
 
 
 def log_odds(views: Views, still: PointCloud) -> np.ndarray:
-    """[frames, height, width] that a pixel moves, by colour; 0 where nothing is known.
+    """[frames, height, width] that a pixel moves, by color; 0 where nothing is known.
 
     `still` are points at rest, none of them near what may move.
     """
     frames = len(views.row)
     if not len(still.position):
         return np.zeros(views.grey.shape, np.float32)
-    colour, spread = _levelled(views)
+    color, spread = _levelled(views)
     depth = [
         _depth(views, frame, still.position.astype(float)) for frame in range(frames)
     ]
     clipped = np.zeros(views.grey.shape, np.float32)
     for frame in range(frames):
-        unlike = _unlike(views, colour, depth, frame)
-        slope = _slope(colour[frame])
+        unlike = _unlike(views, color, depth, frame)
+        slope = _slope(color[frame])
         even = EVEN * spread + EVEN_SLOPE * slope
         with np.errstate(invalid="ignore"):
             odds = STEEPNESS * np.log((unlike + 1) / (even + 1))
@@ -61,9 +61,9 @@ def _levelled(views):
     return np.stack(blurred), float(typical.mean())
 
 
-def _slope(colour):
+def _slope(color):
     """[height, width] grey levels a pixel, the steepest around."""
-    grey = colour.mean(-1)
+    grey = color.mean(-1)
     across, down = (
         cv2.Sobel(grey, cv2.CV_32F, *by, scale=1 / 8) for by in ((1, 0), (0, 1))
     )
@@ -95,7 +95,7 @@ def _depth(views, frame, position):
     return np.ascontiguousarray(nearest[:height, :width])
 
 
-def _unlike(views, colour, depth, frame):
+def _unlike(views, color, depth, frame):
     """[height, width] grey levels; NaN where too few frames show the place."""
     width, height = views.size
     blank = np.full((height, width), np.nan, np.float32)
@@ -109,9 +109,9 @@ def _unlike(views, colour, depth, frame):
         if not 0 <= other < len(depth) or depth[other] is None:
             continue
         x, y, z = _places(views, frame, other, pixel, far).reshape(3, height, width)
-        there = cv2.remap(colour[other], x, y, cv2.INTER_LINEAR, borderValue=OUTSIDE)
+        there = cv2.remap(color[other], x, y, cv2.INTER_LINEAR, borderValue=OUTSIDE)
         before = cv2.remap(depth[other], x, y, cv2.INTER_NEAREST, borderValue=0)
-        red, green, blue = np.moveaxis(np.abs(there - colour[frame]), -1, 0)
+        red, green, blue = np.moveaxis(np.abs(there - color[frame]), -1, 0)
         unlike = np.maximum(np.maximum(red, green), blue)
         unlike[(z <= 0) | (before < HIDDEN * z)] = np.nan
         differences.append(unlike)

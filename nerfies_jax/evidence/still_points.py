@@ -27,14 +27,14 @@ def work(views: Views) -> int:
 
 
 def dense(views: Views, flow: NeighbourFlow, moving: np.ndarray) -> PointCloud:
-    """Places and colours of pixels at rest in some frames, where flow tells depth.
+    """Places and colors of pixels at rest in some frames, where flow tells depth.
 
     `moving` [frames, height, width] are the pixels to leave out, in every frame.
     """
     frames = len(views.row)
     reach = min(REACH, frames - 1)
     centres = np.linspace(0, frames - 1, min(CENTRES, frames)).round().astype(int)
-    places, colours = [], []
+    places, colors = [], []
     for centre in np.unique(centres):
         span = slice(max(0, centre - reach), min(frames, centre + reach + 1))
         near = view_slice(views, span)
@@ -49,12 +49,10 @@ def dense(views: Views, flow: NeighbourFlow, moving: np.ndarray) -> PointCloud:
         kept = placed(near, tracks, rest)
         places.append(rest.position[kept])
         pixel = starts[enough][kept, 1:].astype(int)
-        colours.append(views.image[centre][pixel[:, 1], pixel[:, 0]])
+        colors.append(views.image[centre][pixel[:, 1], pixel[:, 0]])
     if not places:
         return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-    return PointCloud(
-        np.concatenate(places).astype(np.float32), np.concatenate(colours)
-    )
+    return PointCloud(np.concatenate(places).astype(np.float32), np.concatenate(colors))
 
 
 def view_slice(views: Views, span: slice) -> Views:

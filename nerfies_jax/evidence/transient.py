@@ -20,7 +20,7 @@ from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.evidence.view_set import Views
 
 LOST_PX, LOST_SHARE = 1.0, 0.1  # forward and back must meet, of the way
-LOST_COLOUR = 0.1  # half the contrast of a picture whose deviation is a fifth
+LOST_COLOR = 0.1  # half the contrast of a picture whose deviation is a fifth
 OPENED_SHARE = 3 / 176  # of the picture's width: no strips
 PATCH = 5  # pixels to each side
 REACH_SHARES = (0.05, 0.15)  # of the width: how far what was lost is looked for
@@ -174,13 +174,13 @@ def _lost(views, index, picture, target, there, back):
     width, height = views.size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
     end = np.moveaxis(grid + there.flow, -1, 0).astype(np.float32)
-    led_back, colour = (
+    led_back, color = (
         cv2.remap(one, *end, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         for one in (back, target)
     )
     gap = np.linalg.norm(there.flow + led_back, axis=-1)
     open_end = gap > LOST_PX + LOST_SHARE * np.linalg.norm(there.flow, axis=-1)
-    changed = cv2.GaussianBlur(np.abs(picture - colour), (0, 0), 1.5) > LOST_COLOUR
+    changed = cv2.GaussianBlur(np.abs(picture - color), (0, 0), 1.5) > LOST_COLOR
     # Beyond the edge of the other picture under the common shift, and the patch's own.
     # What is near moves more than the rest, and leaves where the rest stays.
     rim = PATCH + there.reach

@@ -10,7 +10,7 @@ import scipy.ndimage as nd
 from nerfies_jax.capture.capture import Capture
 
 LONGEST_SIDE_PX = 256  # of pictures in which what need not be sharp is looked for
-PLAIN_SHARE = 0.9  # of the border's pixels: then what lies behind has one colour
+PLAIN_SHARE = 0.9  # of the border's pixels: then what lies behind has one color
 PLAIN_LEVELS = 3  # grey levels of 255: JPEG and rounding, not a picture
 MIN_POINTS = 300  # that say where the scene is
 MOST_POINTS = 4000  # that are looked at
@@ -131,7 +131,7 @@ def times_smaller(views: Views) -> int:
 
 
 def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
-    """[rows, height, width]: where a picture shows one colour behind everything.
+    """[rows, height, width]: where a picture shows one color behind everything.
 
     The median of the border where nearly all of the border has it; a plain wall that
     only fills part of the border counts as scene.
@@ -140,10 +140,10 @@ def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
     border = np.concatenate(
         [images[:, 0], images[:, -1], images[:, :, 0], images[:, :, -1]], axis=1
     )
-    colour = np.median(border.reshape(-1, 3), axis=0)
+    color = np.median(border.reshape(-1, 3), axis=0)
 
     def near(pixels):
-        return (np.abs(pixels - colour) <= PLAIN_LEVELS).all(-1)
+        return (np.abs(pixels - color) <= PLAIN_LEVELS).all(-1)
 
     if near(border).mean() < PLAIN_SHARE:
         return np.zeros(images.shape[:3], bool)

@@ -20,7 +20,7 @@ ENOUGH_WORK = 600.0
 A_SEARCHED_PIXEL = 1.1  # of flow at its finest level: 1.1 and 1.4
 A_TRACK_FRAME = 1.9  # of a start in a frame, chained and realigned: 1.9 and 1.9
 A_POINT_FRAME = 0.95  # of a pixel at rest in a frame: 1.0 and 0.9
-A_COMPARED_PIXEL = 1.0  # of colours over time: 1.5 and 0.8
+A_COMPARED_PIXEL = 1.0  # of colors over time: 1.5 and 0.8
 A_PATH_FRAME = 15.0  # of a path of least acceleration: 18 and 9
 A_BODY_TERM = 5.0  # of a track of a rigid thing times its frames squared: 4.8
 

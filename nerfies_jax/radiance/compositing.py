@@ -30,7 +30,7 @@ THIN_BELOW = 0.25
 class Composite(NamedTuple):
     """What one ray sees."""
 
-    colour: Float[Array, "3"]
+    color: Float[Array, "3"]
     alpha: Float[Array, ""]  # share of the light that stops; may round to 1 + 1e-6
     distance: Float[Array, ""]  # expected, of what stops it
     median_distance: Float[Array, ""]  # by which half the light has stopped
@@ -63,7 +63,7 @@ def weights(optical_depth: Float[Array, " samples"]) -> Float[Array, " samples"]
 def media_weights(
     optical_depth: Float[Array, "media samples"],
 ) -> Float[Array, "media samples"]:
-    """How much each of several media on one ray adds to its colour.
+    """How much each of several media on one ray adds to its color.
 
     Light reaches a sample through all the media before it, and at the sample each
     medium counts as if it were alone: the transient objects of NeRF-W (Martin-Brualla
@@ -101,34 +101,34 @@ def thinned(
 
 def composite(
     weights: Float[Array, " samples"],
-    colours: Float[Array, "samples 3"],
+    colors: Float[Array, "samples 3"],
     distances: Float[Array, " samples"],
     background: Float[Array, "3"] | None,
 ) -> Composite:
-    """Colour, opacity and distances of a ray.
+    """Color, opacity and distances of a ray.
 
     A `background` shines through what the samples let pass. `None` says that the last
-    sample is the background, its interval being `AT_INFINITY`: its colour counts but
+    sample is the background, its interval being `AT_INFINITY`: its color counts but
     `alpha`, `distance` and `median_distance` leave it out, as `alpha` does in the
     Nerfies code. (That code also adds white behind such a sample, where none can be
     seen.)
     """
     # Sums of products: a matrix product may be rounded to ten bits on a GPU.
-    colour = jnp.sum(weights[:, None] * colours, axis=0)
-    return _composite(colour, weights, distances, background)
+    color = jnp.sum(weights[:, None] * colors, axis=0)
+    return _composite(color, weights, distances, background)
 
 
 def composite_media(
     optical_depth: Float[Array, "media samples"],
-    colours: Float[Array, "media samples 3"],
+    colors: Float[Array, "media samples 3"],
     distances: Float[Array, " samples"],
     background: Float[Array, "3"] | None,
 ) -> Composite:
     """`composite` of several media by `media_weights`; `alpha` is of all together."""
     each = media_weights(optical_depth)
-    colour = jnp.sum(each[..., None] * colours, axis=(0, 1))
+    color = jnp.sum(each[..., None] * colors, axis=(0, 1))
     joint = weights(jnp.sum(optical_depth, axis=0))
-    return _composite(colour, joint, distances, background)
+    return _composite(color, joint, distances, background)
 
 
 def expected_distance(
@@ -152,18 +152,18 @@ def median_index(weights: Float[Array, " samples"]) -> Int[Array, ""]:
     return jnp.where(jnp.any(passed), jnp.argmax(passed), weights.shape[0] - 1)
 
 
-def _composite(colour, weights, distances, background):
+def _composite(color, weights, distances, background):
     if background is None:
         finite = weights[:-1]
         alpha = jnp.sum(finite)
     else:
         finite = weights
         alpha = jnp.sum(finite)
-        colour = colour + (1 - alpha) * background
+        color = color + (1 - alpha) * background
     distance = expected_distance(finite, distances[: finite.shape[0]], distances[-1])
     # The median may read the sample at infinity: it falls back to it anyway.
     median = distances[median_index(weights)]
-    return Composite(colour, alpha, distance, median)
+    return Composite(color, alpha, distance, median)
 
 
 _running_sum = at_least_float32(jnp.cumsum)

@@ -1,4 +1,4 @@
-"""The template: a network from an encoded point to density and colour."""
+"""The template: a network from an encoded point to density and color."""
 
 import dataclasses
 import math
@@ -41,7 +41,7 @@ DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu, "exp": exponentia
 class TemplateSpec:
     """Size and activations of the network; the defaults are Mildenhall et al. 2020.
 
-    `direction` is None where colour does not depend on the view. "relu" densities are
+    `direction` is None where color does not depend on the view. "relu" densities are
     the first paper's; a ray that starts with none of them positive never learns, and
     under an interval at infinity the slope is 1e10 (softplus: at most 6e-3). "exp"
     becomes a wall in the fewest steps, which is what a grid of features wants.
@@ -61,7 +61,7 @@ class TemplateSpec:
     depth: int = 8
     width: int = 256
     skips: tuple[int, ...] = (5,)  # layers that read the input again; counted from 0
-    colour_width: int = 128
+    color_width: int = 128
     density: str = "softplus"
     density_bias: float = 0.0  # added before the activation; negative starts emptier
     anneal_steps: int | None = steps(None)
@@ -82,7 +82,7 @@ class TemplateSpec:
                 f"depth={self.depth} must be at least 1: media and surfaces read the "
                 "last layer"
             )
-        for name in ("width", "colour_width"):
+        for name in ("width", "color_width"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
         if self.anneal_steps is not None and self.anneal_steps < 1:
@@ -106,7 +106,7 @@ class Template(NamedTuple):
     """Parameters."""
 
     trunk: mlp.MLP  # heads "density" and "bottleneck"
-    colour: mlp.MLP  # reads [bottleneck, condition]; head "colour"
+    color: mlp.MLP  # reads [bottleneck, condition]; head "color"
     # Of a grid or of planes, where there are any.
     tables: grids.Tables | tuple[planes.Level, ...] | None = None
 
@@ -115,7 +115,7 @@ class Radiance(NamedTuple):
     """What the field is at one point."""
 
     density: Float[Array, ""]  # per unit of the field, not negative
-    colour: Float[Array, "3"]  # sRGB in (0, 1)
+    color: Float[Array, "3"]  # sRGB in (0, 1)
     features: Float[Array, " width"]  # the trunk's last layer, for other media
 
 
@@ -125,10 +125,10 @@ def trunk_spec(spec: TemplateSpec, inputs: int) -> MLPSpec:
     return MLPSpec(inputs, spec.depth, spec.width, heads, spec.skips)
 
 
-def colour_spec(spec: TemplateSpec, condition: int) -> MLPSpec:
+def color_spec(spec: TemplateSpec, condition: int) -> MLPSpec:
     """The branch that reads the bottleneck and `condition` features of the ray."""
     inputs = spec.width + condition
-    return MLPSpec(inputs, 1, spec.colour_width, (("colour", HeadSpec(3)),))
+    return MLPSpec(inputs, 1, spec.color_width, (("color", HeadSpec(3)),))
 
 
 def init(
@@ -139,14 +139,14 @@ def init(
     dtype=jnp.float32,
 ) -> Template:
     """Glorot weights; `inputs` and `condition` are the widths that `apply` will get."""
-    trunk_key, colour_key = jax.random.split(key)
+    trunk_key, color_key = jax.random.split(key)
     tables, grid = None, GRIDS.get(type(spec.position))
     if grid is not None:
         tables_key = jax.random.fold_in(key, 2)  # the others are as without
         tables = grid.init(spec.position, tables_key, dtype)
     return Template(
         mlp.init(trunk_spec(spec, inputs), trunk_key, dtype),
-        mlp.init(colour_spec(spec, condition), colour_key, dtype),
+        mlp.init(color_spec(spec, condition), color_key, dtype),
         tables,
     )
 
@@ -198,56 +198,56 @@ def apply(
     condition: Float[Array, " condition"],
     density_noise: Float[Array, ""] | None = None,
 ) -> Radiance:
-    """Density and colour at one point (Mildenhall et al. 2020, figure 7).
+    """Density and color at one point (Mildenhall et al. 2020, figure 7).
 
     `features` are the point's encoding and what effects add to it; `condition` is the
     encoded view direction and codes, the same along a ray. `density_noise` is added
     before the activation. The density never depends on `condition`. ValueError where
-    the colour branch reads another number of them.
+    the color branch reads another number of them.
     """
-    read = len(params.colour.hidden[0].weight) - spec.width
+    read = len(params.color.hidden[0].weight) - spec.width
     if len(condition) != read:
         raise ValueError(
-            f"the colour branch reads {read} features of the ray, and condition has "
+            f"the color branch reads {read} features of the ray, and condition has "
             f"{len(condition)}; give `init` that many"
         )
     raw, hidden = raw_density(spec, params, features)
     if density_noise is not None:
         raw = raw + density_noise
-    return coloured(spec, params, raw, hidden, colour_offset(spec, params, condition))
+    return colored(spec, params, raw, hidden, color_offset(spec, params, condition))
 
 
-def colour_offset(
+def color_offset(
     spec: TemplateSpec, params: Template, condition: Float[Array, " condition"]
-) -> Float[Array, " colour_width"]:
-    """What the first layer of colour makes of `condition`, its bias included.
+) -> Float[Array, " color_width"]:
+    """What the first layer of color makes of `condition`, its bias included.
 
     The same for all samples of a ray.
     """
-    bottleneck, first = params.trunk.heads["bottleneck"], params.colour.hidden[0]
+    bottleneck, first = params.trunk.heads["bottleneck"], params.color.hidden[0]
     ours, rest = jnp.split(first.weight, [spec.width])
     return condition @ rest[: len(condition)] + (bottleneck.bias @ ours + first.bias)
 
 
-def coloured(
+def colored(
     spec: TemplateSpec,
     params: Template,
     raw: Float[Array, ""],
     hidden: Float[Array, " width"],
-    offset: Float[Array, " colour_width"],
+    offset: Float[Array, " color_width"],
     more: Float[Array, " more"] | None = None,
 ) -> Radiance:
-    """What `raw_density` found, with its colour.
+    """What `raw_density` found, with its color.
 
-    `offset` is the `colour_offset` of the ray; `more` is read behind its condition.
+    `offset` is the `color_offset` of the ray; `more` is read behind its condition.
     """
-    bottleneck, first = params.trunk.heads["bottleneck"], params.colour.hidden[0]
+    bottleneck, first = params.trunk.heads["bottleneck"], params.color.hidden[0]
     # Nothing bends between the bottleneck and this layer: all samples meet the product
     # of both, and never the bottleneck itself.
     branch = dense.product(hidden, bottleneck.weight @ first.weight[: spec.width])
     if more is not None:
         branch = branch + dense.product(more, first.weight[-len(more) :])
     branch = branch + offset
-    colour = mlp.affine(params.colour.heads["colour"], jax.nn.relu(branch))
+    color = mlp.affine(params.color.heads["color"], jax.nn.relu(branch))
     activation = DENSITIES[spec.density]
-    return Radiance(activation(raw), jax.nn.sigmoid(colour), hidden)
+    return Radiance(activation(raw), jax.nn.sigmoid(color), hidden)

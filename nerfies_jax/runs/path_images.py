@@ -37,7 +37,7 @@ def render(
     with replaced_folder(out) as folder:
         places = [folder / f"{number:04d}.png" for number in range(len(views))]
         for number, (place, view) in enumerate(zip(places, views, strict=True), 1):
-            images.write_png(place, as_picture(renderer(state, view).colour))
+            images.write_png(place, as_picture(renderer(state, view).color))
             yield number
         try:
             video.library()

@@ -69,7 +69,7 @@ def make(
     run = with_found_cameras(run, state)
     rows, left_out = frames_to_score(run, trained)
     scored = evaluation.score(trained.draw, state, run.filmed, rows)
-    if not np.isfinite(scored.colour).all():
+    if not np.isfinite(scored.color).all():
         raise FloatingPointError(
             f"no report: what the state of step {trained.result.steps:,} draws is not "
             "finite"
@@ -246,7 +246,7 @@ def score_halves(
     if halves is None:
         return [], ()
     before = evaluation.score_right_halves(
-        run.capture, scored.rows[few], scored.colour[few]
+        run.capture, scored.rows[few], scored.color[few]
     )
     psnr, ssim = (evaluation.known_mean(each) for each in (halves.psnr, halves.ssim))
     unfitted = evaluation.known_mean(before.psnr)
@@ -271,13 +271,13 @@ def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
         f"SSIM {scored.ssim[i]:.3f}"
         for i in shown
     ]
-    truth, colour = capture.images[scored.rows[shown]], scored.colour[shown]
+    truth, color = capture.images[scored.rows[shown]], scored.color[shown]
     if capture.valid is not None:  # what was not filmed is black in both: no error
         filmed = capture.valid[scored.rows[shown]][..., None]
-        truth, colour = np.where(filmed, truth, 0), np.where(filmed, colour, 0)
+        truth, color = np.where(filmed, truth, 0), np.where(filmed, color, 0)
     picture = pictures.comparison(
         truth,
-        colour,
+        color,
         scored.depth[shown],
         captions,
         known_depth=scored.alpha[shown] > 0.5,
@@ -307,7 +307,7 @@ def save_film(
     def frames(stage):
         for view in views:
             rendering = renderer(state, evaluation.resized(view, size, film.size))
-            yield evaluation.as_picture(rendering.colour)
+            yield evaluation.as_picture(rendering.color)
             stage.advance()
 
     with events.stage("rendering the video", film.frames) as stage:
@@ -331,7 +331,7 @@ def save_player(
     first = evaluation.view_of(run.capture, int(run.capture.train[0]))
     try:
         state = trained.result.state
-        poster = evaluation.as_picture(trained.renderer(state, first).colour)
+        poster = evaluation.as_picture(trained.renderer(state, first).color)
         player = write(
             folder / "player.html",
             f"{run.capture.name}: {run.config.preset}",

@@ -11,7 +11,7 @@ from nerfies_jax.capture import camera_paths
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import Renderer, interactive, model_flow
 from nerfies_jax.evaluation.interactive import Eye, Look
-from nerfies_jax.evaluation.pictures import Coloured
+from nerfies_jax.evaluation.pictures import Colored
 from nerfies_jax.evaluation.representation import SplatCloud, Splatting
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.runs.run import Run
@@ -136,7 +136,7 @@ class Screen:
             return f"since time 0: black none, light yellow {high:.3g} scene units"
         return ""
 
-    def _keep_limits(self, channel: str, image: Coloured) -> None:
+    def _keep_limits(self, channel: str, image: Colored) -> None:
         # Motion since time 0 grows with the time, depth is much the same everywhere.
         if channel == "motion":
             self._limits[channel] = image.low, image.high

@@ -151,7 +151,7 @@ class Effect(NamedTuple):
     required_data: frozenset[str] = frozenset()
     # Of radiance fields, all in units of the field, for one point of one ray.
     tables: tuple[Table, ...] = ()
-    # (params, condition) -> what the colour branch reads beside the view direction
+    # (params, condition) -> what the color branch reads beside the view direction
     condition: Callable[[PyTree, FrameCondition], Features] | None = None
     condition_width: int = 0
     # (params, point, condition) -> displacement: template point minus observed point
@@ -165,13 +165,13 @@ class Effect(NamedTuple):
     # (params, observed point, condition) -> codes of the point by name, which join
     # those of the frame for every `displace` and `lift`
     mark: Callable[[PyTree, Vector, FrameCondition], dict[str, Features]] | None = None
-    # (params, level, `effect.Surface`, condition) -> `effect.Look`: what colour reads
+    # (params, level, `effect.Surface`, condition) -> `effect.Look`: what color reads
     # of each sample, so many features
     surface: Callable[[PyTree, str, Any, FrameCondition], Any] | None = None
     surface_width: int = 0
     # (params, `effect.Sample`, condition) -> `effect.Medium`; on the last level only
     medium: Callable[[PyTree, Any, FrameCondition], Any] | None = None
-    # Least standard deviation of a ray's colour, where the medium has a `beta`.
+    # Least standard deviation of a ray's color, where the medium has a `beta`.
     beta_min: float | None = None
     beta_power: float = 0.0  # `transient.photometric`; zero is the likelihood
     # Of Gaussians.

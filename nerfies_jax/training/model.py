@@ -41,7 +41,7 @@ class View(NamedTuple):
 class Rendering(NamedTuple):
     """One whole frame."""
 
-    colour: Float[Array, "height width 3"]  # sRGB; not clipped
+    color: Float[Array, "height width 3"]  # sRGB; not clipped
     alpha: Float[Array, "height width"]
     # Expected z-depth, scene units; None in a training step that nobody asks for it.
     depth: Float[Array, "height width"] | None

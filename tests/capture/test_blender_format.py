@@ -245,7 +245,7 @@ def test_nerfstudio_points_masks_and_lists(tmp_path):
     assert [again.ids[row][-1] for row in again.heldout] == ["1", "4", "7"]
     assert (~capture.valid).sum() == 1
     assert not capture.valid[0, 1, 2]
-    assert capture.points.colour[7].tolist() == [0, 200, 0]
+    assert capture.points.color[7].tolist() == [0, 200, 0]
     world = capture.points.position / capture.scale + capture.centre
     np.testing.assert_allclose(world[:, 0], rows["x"], atol=1e-5)
     # Depths seen lie within 4 +- 0.9 of the world; near and far lie around them.
@@ -255,17 +255,17 @@ def test_nerfstudio_points_masks_and_lists(tmp_path):
     assert np.linalg.norm(np.ptp(corners, axis=0)) < 1.2  # unit diagonal but outliers
 
 
-def points_file(path, colour, kind):
-    rows = np.zeros(len(colour), f"f4, f4, f4, {kind}, {kind}, {kind}")
+def points_file(path, color, kind):
+    rows = np.zeros(len(color), f"f4, f4, f4, {kind}, {kind}, {kind}")
     rows.dtype.names = ("x", "y", "z", "red", "green", "blue")
-    rows["red"] = colour
+    rows["red"] = color
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(path)
     return path
 
 
-def test_colours_of_points_are_bytes_or_shares(tmp_path):
+def test_colors_of_points_are_bytes_or_shares(tmp_path):
     shares = points_file(tmp_path / "a.ply", [0, 0.5, 1], "f4")
-    assert points.read_ply(shares).colour[:, 0].tolist() == [0, 128, 255]
+    assert points.read_ply(shares).color[:, 0].tolist() == [0, 128, 255]
     other = points_file(tmp_path / "b.ply", [0, 128, 255], "f4")
     with pytest.raises(CaptureError, match=r"b\.ply: .*float32 from 0 to 255; .*uchar"):
         points.read_ply(other)

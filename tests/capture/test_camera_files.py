@@ -125,7 +125,7 @@ def test_a_colmap_model_comes_back_through_colmap(bent, tmp_path):
     model = colmap.read_model(tmp_path / "out" / "sparse" / "0")
     shown = np.abs(model.points[:, None] - points).max(axis=2).argmin(axis=1)
     np.testing.assert_allclose(model.points, points[shown], atol=1e-9)
-    np.testing.assert_array_equal(model.colours, capture.points.colour[shown])
+    np.testing.assert_array_equal(model.colors, capture.points.color[shown])
     assert len(shown) > 20
     # Depths are in the same units, of the frames that show each point.
     assert len(model.depths) <= colmap_writer.MOST_SEEN * len(points)

@@ -80,10 +80,10 @@ def test_everything_in_the_files_arrives(tmp_path):
     np.testing.assert_allclose(capture.cameras.focal_px, 30)
     np.testing.assert_allclose(capture.cameras.pixel_aspect, 1.1, rtol=1e-6)
     np.testing.assert_allclose(capture.cameras.principal_point_px[0], [12.5, 7.75])
-    order = np.argsort(capture.points.colour[:, 0])
+    order = np.argsort(capture.points.color[:, 0])
     world = capture.points.position[order] / capture.scale + capture.centre
     np.testing.assert_allclose(world, WORLD, atol=1e-5)
-    assert capture.points.colour[order][7].tolist() == [7, 20, 30]
+    assert capture.points.color[order][7].tolist() == [7, 20, 30]
 
 
 def test_the_scene_has_unit_size_and_its_depths_lie_between_near_and_far(tmp_path):
@@ -143,11 +143,11 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
     y, x = np.mgrid[:64, :96] + 0.5
     rays = theirs.cam_from_img(np.stack([x.ravel(), y.ravel()], 1)).reshape(64, 96, 2)
 
-    def colour(grad):  # a slow function of the viewing direction
+    def color(grad):  # a slow function of the viewing direction
         return 128 + 90 * np.sin(np.stack([3 * grad[..., 0], 4 * grad[..., 1]], -1))
 
     pixels = np.zeros((64, 96, 3))
-    pixels[..., :2], pixels[..., 2] = colour(rays), 128
+    pixels[..., :2], pixels[..., 2] = color(rays), 128
     for row in range(3):
         PIL.Image.fromarray(np.round(pixels).astype(np.uint8)).save(
             tmp_path / f"images/f_{row:03d}.png"
@@ -171,7 +171,7 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
         np.ones((height, width), bool) if capture.valid is None else capture.valid[1]
     )
     assert valid.mean() > 0.7
-    error = capture.images[1][..., :2].astype(float) - colour(grad)
+    error = capture.images[1][..., :2].astype(float) - color(grad)
     # Rounding twice gives 1; the rest is bilinear interpolation of a slow function.
     assert np.abs(error[valid]).max() < 1.6
 

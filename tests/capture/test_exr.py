@@ -11,20 +11,20 @@ from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.geometry import camera
 
 RNG = np.random.default_rng(0)
-COLOUR = RNG.uniform(0, 50, (5, 7, 3)).astype(np.float32)
+COLOR = RNG.uniform(0, 50, (5, 7, 3)).astype(np.float32)
 DEPTH = RNG.uniform(1, 1000, (5, 7)).astype(np.float32)
 
 
 def test_float_channels_come_back_bit_for_bit(tmp_path):
     flow = RNG.normal(size=(5, 7)).astype(np.float32)
     counts = RNG.integers(0, 2**32, (5, 7), np.uint32)
-    colour = COLOUR.copy()
+    color = COLOR.copy()
     exr.write_exr(
-        tmp_path / "a.exr", colour, DEPTH / 1000, DEPTH, {"flow.x": flow, "id": counts}
+        tmp_path / "a.exr", color, DEPTH / 1000, DEPTH, {"flow.x": flow, "id": counts}
     )
-    np.testing.assert_array_equal(colour, COLOUR)  # OpenEXR keeps hands off our arrays
+    np.testing.assert_array_equal(color, COLOR)  # OpenEXR keeps hands off our arrays
     picture = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(picture.colour, COLOUR)
+    np.testing.assert_array_equal(picture.color, COLOR)
     np.testing.assert_array_equal(picture.alpha, DEPTH / 1000)
     np.testing.assert_array_equal(picture.depth, DEPTH)
     np.testing.assert_array_equal(picture.extra["flow.x"], flow)
@@ -42,7 +42,7 @@ def test_a_header_takes_points_of_the_world_to_the_picture(tmp_path):
         skew_px=np.float32(0.5),
     )
     header = exr_camera.attributes(one, size, 0.25)
-    exr.write_exr(tmp_path / "a.exr", COLOUR, header=header)
+    exr.write_exr(tmp_path / "a.exr", COLOR, header=header)
     with OpenEXR.File(str(tmp_path / "a.exr"), header_only=True) as file:
         read = dict(file.header())
     points = RNG.uniform(-0.5, 0.5, (20, 3))
@@ -62,10 +62,10 @@ def test_a_header_takes_points_of_the_world_to_the_picture(tmp_path):
 
 
 @pytest.mark.hard_cases
-def test_half_rounds_colour_but_not_depth(tmp_path):
-    exr.write_exr(tmp_path / "a.exr", COLOUR, depth=DEPTH, half=True)
+def test_half_rounds_color_but_not_depth(tmp_path):
+    exr.write_exr(tmp_path / "a.exr", COLOR, depth=DEPTH, half=True)
     picture = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(picture.colour, COLOUR.astype(np.float16))
+    np.testing.assert_array_equal(picture.color, COLOR.astype(np.float16))
     np.testing.assert_array_equal(picture.depth, DEPTH)
 
 
@@ -73,7 +73,7 @@ def test_half_rounds_colour_but_not_depth(tmp_path):
 def test_nan_and_infinity_are_zeroed_and_marked(tmp_path):
     depth = DEPTH.copy()
     depth[1, 2], depth[3, 4] = np.nan, np.inf
-    exr.write_exr(tmp_path / "a.exr", COLOUR, depth=depth)
+    exr.write_exr(tmp_path / "a.exr", COLOR, depth=depth)
     picture = exr.read_exr(tmp_path / "a.exr")
     bad = ~np.isfinite(depth)
     np.testing.assert_array_equal(picture.finite, ~bad)
@@ -81,16 +81,16 @@ def test_nan_and_infinity_are_zeroed_and_marked(tmp_path):
 
 
 def test_a_strided_view_is_written_as_it_looks(tmp_path):
-    exr.write_exr(tmp_path / "a.exr", COLOUR[::2, ::-1])
+    exr.write_exr(tmp_path / "a.exr", COLOR[::2, ::-1])
     picture = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(picture.colour, COLOUR[::2, ::-1])
+    np.testing.assert_array_equal(picture.color, COLOR[::2, ::-1])
 
 
 def test_a_file_without_our_channels(tmp_path):
     with OpenEXR.File({}, {"Y": DEPTH.copy(), "mask": DEPTH.copy()}) as file:
         file.write(str(tmp_path / "a.exr"))
     picture = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(picture.colour[..., 2], DEPTH)
+    np.testing.assert_array_equal(picture.color[..., 2], DEPTH)
     assert (picture.alpha, picture.depth) == (None, None)
     assert list(picture.extra) == ["mask"]
 
@@ -109,7 +109,7 @@ def test_a_file_cut_short_is_refused(tmp_path, kept):
 def test_a_bomb_is_refused_before_it_is_decoded(tmp_path):
     with pytest.raises(CaptureError, match="no such picture"):
         exr.read_exr(tmp_path / "a.exr")
-    exr.write_exr(tmp_path / "a.exr", COLOUR)
+    exr.write_exr(tmp_path / "a.exr", COLOR)
     data = (tmp_path / "a.exr").read_bytes()
     window = np.array([0, 0, 6, 4], "<i4").tobytes()
     wide = np.array([0, 0, 49_999, 49_999], "<i4").tobytes()
@@ -136,32 +136,32 @@ def write_window(path, color, left, top, width, height, **more):
 
 
 def test_a_crop_is_placed_in_its_display_window(tmp_path):
-    path = write_window(tmp_path / "a.exr", COLOUR / 50, 3, 2, 12, 10)
+    path = write_window(tmp_path / "a.exr", COLOR / 50, 3, 2, 12, 10)
     assert images.read_header(path).size == (12, 10)
     color, known = images.read_light(path)
     inside = np.zeros((10, 12), bool)
     inside[2:7, 3:10] = True
     np.testing.assert_array_equal(known, inside)
-    whole = images.srgb_from_linear(COLOUR / 50) * 255
+    whole = images.srgb_from_linear(COLOR / 50) * 255
     np.testing.assert_allclose(color[2:7, 3:10], whole, atol=0.51)
     assert not color[~inside].any()
-    alone = write_window(tmp_path / "b.exr", COLOUR, 0, 0, 7, 5)
+    alone = write_window(tmp_path / "b.exr", COLOR, 0, 0, 7, 5)
     assert images.read_light(alone)[1] is None
 
 
 def test_overscan_is_dropped_and_a_window_elsewhere_refused(tmp_path):
-    path = write_window(tmp_path / "a.exr", COLOUR / 50, -2, -1, 4, 4)
+    path = write_window(tmp_path / "a.exr", COLOR / 50, -2, -1, 4, 4)
     color, known = images.read_light(path)
-    whole = images.srgb_from_linear(COLOUR / 50) * 255
+    whole = images.srgb_from_linear(COLOR / 50) * 255
     np.testing.assert_allclose(color, whole[1:5, 2:6], atol=0.51)
     assert known is None
-    path = write_window(tmp_path / "a.exr", COLOUR, 9, 0, 8, 8)
+    path = write_window(tmp_path / "a.exr", COLOR, 9, 0, 8, 8)
     with pytest.raises(CaptureError, match=r"at \(9, 0\) lies outside its display"):
         images.read_light(path)
 
 
 def test_pixels_without_color_are_not_observed(tmp_path):
-    color = COLOUR[:4, :6] / 50
+    color = COLOR[:4, :6] / 50
     color[1, 2, 0], color[2, 4, 1] = np.nan, np.inf
     depth = np.full((4, 6), np.inf, np.float32)  # of a sky, which has a color
     for name in "ab":
@@ -182,7 +182,7 @@ def test_transforms_of_a_crop_keep_their_principal_point(tmp_path):
     pose = np.eye(4)
     for row in range(3):
         pose[0, 3] = row
-        write_window(tmp_path / f"{row}.exr", COLOUR / 50, 3, 2, 14, 10)
+        write_window(tmp_path / f"{row}.exr", COLOR / 50, 3, 2, 14, 10)
     lens = {"fl_x": 9.0, "cx": 6.5, "cy": 5.0, "w": 14, "h": 10}
     entries = [
         {"file_path": f"{row}.exr", "transform_matrix": pose.tolist()}
@@ -204,11 +204,11 @@ def test_other_peoples_files(data_dir):
     assert len(files) >= 16
     for file in files:
         picture = exr.read_exr(file)
-        assert picture.colour is not None or picture.extra, file
+        assert picture.color is not None or picture.extra, file
         assert picture.finite.any()
     ball = exr.read_exr(folder / "Beachball/singlepart.0001.exr")
     assert ball.origin == (654, 245)
-    assert ball.colour.shape == (876, 911, 3)
+    assert ball.color.shape == (876, 911, 3)
     assert ball.depth is not None
     assert "left.R" in ball.extra
     rings = exr.read_exr(folder / "TestImages/BrightRingsNanInf.exr")

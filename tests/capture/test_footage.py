@@ -93,7 +93,7 @@ def test_a_film_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
         footage.from_film(tmp_path / "a.mp4", tmp_path / "d", 1)
 
 
-def test_colours_are_made_of_the_frames_that_are_kept_alone(tmp_path, monkeypatch):
+def test_colors_are_made_of_the_frames_that_are_kept_alone(tmp_path, monkeypatch):
     film(tmp_path / "a.mp4", range(0, 1000, 40))
     made, pixels = [], video._pixels
     monkeypatch.setattr(video, "_pixels", lambda one: made.append(one) or pixels(one))
@@ -151,7 +151,7 @@ def test_masks_of_zero_and_one_are_written_as_meant(tmp_path):
 
 
 def test_what_is_cut_out_of_a_picture_is_black(tmp_path):
-    """The colour that an editor leaves behind transparency is not to be matched."""
+    """The color that an editor leaves behind transparency is not to be matched."""
     pixels = np.full((32, 32, 4), 200, np.uint8)
     pixels[:, :, 3] = np.repeat([0, 255], 16)[:, None]
     for name in ("0.png", "1.png", "2.png"):

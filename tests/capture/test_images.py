@@ -11,7 +11,7 @@ from nerfies_jax.capture import exr, images, masks
 from nerfies_jax.capture.capture import CaptureError
 
 RNG = np.random.default_rng(0)
-COLOUR = RNG.integers(0, 256, (6, 9, 3), np.uint8)
+COLOR = RNG.integers(0, 256, (6, 9, 3), np.uint8)
 ALPHA = RNG.integers(0, 256, (6, 9), np.uint8)
 
 
@@ -20,27 +20,27 @@ def save(path, pixels):
     return path
 
 
-def test_colour_and_grey(tmp_path):
-    colour, alpha = images.read_image(save(tmp_path / "a.png", COLOUR))
-    np.testing.assert_array_equal(colour, COLOUR)
+def test_color_and_grey(tmp_path):
+    color, alpha = images.read_image(save(tmp_path / "a.png", COLOR))
+    np.testing.assert_array_equal(color, COLOR)
     assert alpha is None
-    colour, alpha = images.read_image(save(tmp_path / "b.png", ALPHA))
-    np.testing.assert_array_equal(colour, np.repeat(ALPHA[..., None], 3, 2))
+    color, alpha = images.read_image(save(tmp_path / "b.png", ALPHA))
+    np.testing.assert_array_equal(color, np.repeat(ALPHA[..., None], 3, 2))
     assert alpha is None
 
 
 def test_alpha_is_kept_apart(tmp_path):
-    both = np.concatenate([COLOUR, ALPHA[..., None]], -1)
-    colour, alpha = images.read_image(save(tmp_path / "a.png", both))
-    np.testing.assert_array_equal(colour, COLOUR)
+    both = np.concatenate([COLOR, ALPHA[..., None]], -1)
+    color, alpha = images.read_image(save(tmp_path / "a.png", both))
+    np.testing.assert_array_equal(color, COLOR)
     np.testing.assert_array_equal(alpha, ALPHA)
 
 
 def test_grey_with_alpha_is_not_transposed(tmp_path):
     # skimage.io.imread returns [width, 2, ...] for these.
-    both = np.stack([COLOUR[..., 0], ALPHA], -1)
-    colour, alpha = images.read_image(save(tmp_path / "a.png", both))
-    np.testing.assert_array_equal(colour[..., 1], COLOUR[..., 0])
+    both = np.stack([COLOR[..., 0], ALPHA], -1)
+    color, alpha = images.read_image(save(tmp_path / "a.png", both))
+    np.testing.assert_array_equal(color[..., 1], COLOR[..., 0])
     np.testing.assert_array_equal(alpha, ALPHA)
 
 
@@ -51,12 +51,12 @@ def test_a_palette_is_looked_up(tmp_path):
     image.putdata(indices.ravel().tolist())
     image.putpalette(palette.ravel().tolist())
     image.save(tmp_path / "a.png")
-    colour, alpha = images.read_image(tmp_path / "a.png")
-    np.testing.assert_array_equal(colour, palette[indices])
+    color, alpha = images.read_image(tmp_path / "a.png")
+    np.testing.assert_array_equal(color, palette[indices])
     assert alpha is None
     image.save(tmp_path / "b.png", transparency=2)
-    colour, alpha = images.read_image(tmp_path / "b.png")
-    np.testing.assert_array_equal(colour, palette[indices])
+    color, alpha = images.read_image(tmp_path / "b.png")
+    np.testing.assert_array_equal(color, palette[indices])
     np.testing.assert_array_equal(alpha == 0, indices == 2)
 
 
@@ -66,15 +66,15 @@ def test_one_bit_and_sixteen_bits(tmp_path):
     np.testing.assert_array_equal(masks.read_mask(tmp_path / "a.png"), bits)
     deep = RNG.integers(0, 65536, (6, 9)).astype(np.uint16)
     images.write_png(tmp_path / "b.png", deep)
-    colour, _ = images.read_image(tmp_path / "b.png")
-    np.testing.assert_array_equal(colour[..., 0], np.round(deep / 257).astype(int))
+    color, _ = images.read_image(tmp_path / "b.png")
+    np.testing.assert_array_equal(color[..., 0], np.round(deep / 257).astype(int))
 
 
 @pytest.mark.parametrize("packing", [None, "tiff_lzw", "tiff_deflate"])
 @pytest.mark.parametrize(
     ("stored", "read"),
     [
-        (COLOUR, COLOUR),
+        (COLOR, COLOR),
         (ALPHA, ALPHA),
         (ALPHA > 128, np.where(ALPHA > 128, 255, 0)),
         (ALPHA * np.uint16(257), ALPHA),
@@ -86,12 +86,12 @@ def test_a_tiff_is_read_however_it_is_packed(tmp_path, stored, read, packing):
     np.testing.assert_array_equal(pixels, read)
 
 
-def test_sixteen_bit_colour_loses_at_most_its_low_byte(tmp_path):
+def test_sixteen_bit_color_loses_at_most_its_low_byte(tmp_path):
     deep = RNG.integers(0, 65536, (6, 9, 3)).astype(">u2")
     rows = b"".join(b"\0" + row.tobytes() for row in deep)
     write_png_by_hand(tmp_path / "a.png", (9, 6), 16, 2, rows)
-    colour, _ = images.read_image(tmp_path / "a.png")
-    np.testing.assert_array_equal(colour, deep >> 8)
+    color, _ = images.read_image(tmp_path / "a.png")
+    np.testing.assert_array_equal(color, deep >> 8)
 
 
 def write_png_by_hand(path, size, depth, kind, rows):
@@ -111,7 +111,7 @@ def write_png_by_hand(path, size, depth, kind, rows):
 @pytest.mark.parametrize("ending", ["png", "jpg"])
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_a_turned_picture_is_refused_or_read_as_stored(tmp_path, ending, orientation):
-    image = PIL.Image.fromarray(COLOUR)
+    image = PIL.Image.fromarray(COLOR)
     tags = image.getexif()
     tags[0x0112] = orientation
     image.save(
@@ -124,8 +124,8 @@ def test_a_turned_picture_is_refused_or_read_as_stored(tmp_path, ending, orienta
         return
     with pytest.raises(CaptureError, match="orientation is 6"):
         images.read_image(tmp_path / f"a.{ending}")
-    colour, _ = images.read_image(tmp_path / f"a.{ending}", orientation="stored")
-    assert colour.shape == (6, 9, 3)
+    color, _ = images.read_image(tmp_path / f"a.{ending}", orientation="stored")
+    assert color.shape == (6, 9, 3)
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])
@@ -148,7 +148,7 @@ def test_what_is_no_picture_is_refused(tmp_path):
     (tmp_path / "b.png").write_text("hello")
     with pytest.raises(CaptureError, match="not a readable picture"):
         images.read_image(tmp_path / "b.png")
-    PIL.Image.fromarray(COLOUR).convert("CMYK").save(tmp_path / "c.jpg")
+    PIL.Image.fromarray(COLOR).convert("CMYK").save(tmp_path / "c.jpg")
     with pytest.raises(CaptureError, match="CMYK"):
         images.read_image(tmp_path / "c.jpg")
 
@@ -163,15 +163,15 @@ def test_a_bomb_is_refused_before_it_is_decoded(tmp_path, side):
 
 
 def test_laying_over_a_background(tmp_path):
-    pixels = images.over(COLOUR, ALPHA, (1.0, 0.5, 0.0))
+    pixels = images.over(COLOR, ALPHA, (1.0, 0.5, 0.0))
     cover = ALPHA[..., None] / 255
-    exact = COLOUR * cover + np.array([255, 127.5, 0]) * (1 - cover)
+    exact = COLOR * cover + np.array([255, 127.5, 0]) * (1 - cover)
     assert np.abs(pixels - exact).max() <= 0.5 + 1e-4
 
 
 def test_a_picture_comes_back_as_it_was_written(tmp_path):
-    images.write_png(tmp_path / "a.png", COLOUR)
-    np.testing.assert_array_equal(images.read_image(tmp_path / "a.png")[0], COLOUR)
+    images.write_png(tmp_path / "a.png", COLOR)
+    np.testing.assert_array_equal(images.read_image(tmp_path / "a.png")[0], COLOR)
     images.write_png(tmp_path / "m.png", ALPHA > 100)
     np.testing.assert_array_equal(masks.read_mask(tmp_path / "m.png"), ALPHA > 100)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "m.png"]
@@ -192,21 +192,21 @@ def test_srgb_curves_are_the_standard_and_each_others_inverse():
     )
 
 
-def test_linear_light_is_read_as_the_colours_it_is_seen_as(tmp_path):
-    light = images.linear_from_srgb(COLOUR / 255)
+def test_linear_light_is_read_as_the_colors_it_is_seen_as(tmp_path):
+    light = images.linear_from_srgb(COLOR / 255)
     light[0, 0] = 3.0  # brighter than a screen
     exr.write_exr(tmp_path / "a.exr", light, alpha=np.ones(light.shape[:2]))
     assert images.read_header(tmp_path / "a.exr").size == (9, 6)
-    colour, alpha = images.read_image(tmp_path / "a.exr")
-    expected = COLOUR.copy()
+    color, alpha = images.read_image(tmp_path / "a.exr")
+    expected = COLOR.copy()
     expected[0, 0] = 255
-    np.testing.assert_array_equal(colour, expected)
+    np.testing.assert_array_equal(color, expected)
     assert alpha is None
     exr.write_exr(tmp_path / "b.exr", light, alpha=ALPHA / 255)
     with pytest.raises(CaptureError, match="transparent in places"):
         images.read_image(tmp_path / "b.exr")
     exr.write_exr(tmp_path / "c.exr", depth=light[..., 0])
-    with pytest.raises(CaptureError, match="no colour"):
+    with pytest.raises(CaptureError, match="no color"):
         images.read_image(tmp_path / "c.exr")
     with pytest.raises(CaptureError, match="no such picture"):
         images.read_header(tmp_path / "d.exr")

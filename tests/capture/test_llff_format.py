@@ -103,7 +103,7 @@ def test_a_nerfies_directory_takes_the_points_of_the_model_beside_it(tmp_path):
     np.testing.assert_allclose(
         capture.points.position, known.points.position, atol=1e-6
     )
-    np.testing.assert_array_equal(capture.points.colour, known.points.colour)
+    np.testing.assert_array_equal(capture.points.color, known.points.color)
     file = tmp_path / "out/camera/f_000.json"
     one = json.loads(file.read_text())
     one["position"][0] += 0.1

@@ -265,7 +265,7 @@ def test_dycheck_depth_is_scaled_and_may_be_absent(tmp_path):
     assert half[0, 0] == pytest.approx(corner[corner > 0].mean())
 
 
-def test_points_are_scaled_and_coloured_from_the_pictures(tmp_path):
+def test_points_are_scaled_and_colored_from_the_pictures(tmp_path):
     make(tmp_path)
     for row in range(6):
         save_picture(
@@ -278,9 +278,9 @@ def test_points_are_scaled_and_coloured_from_the_pictures(tmp_path):
     np.testing.assert_allclose(
         capture.points.position, [[0, 0, 1], [0, 0, -6]], atol=1e-7
     )
-    assert capture.points.colour[0, 0] in range(40, 46)
+    assert capture.points.color[0, 0] in range(40, 46)
     assert (
-        capture.points.colour[1].tolist() == [frames.UNSEEN] * 3
+        capture.points.color[1].tolist() == [frames.UNSEEN] * 3
     )  # behind every camera
     assert any("1 points are not finite" in note for note in capture.notes)
 
@@ -459,7 +459,7 @@ def test_what_is_written_is_read_back(tmp_path):
         np.testing.assert_allclose(one, other, atol=2e-7)
     np.testing.assert_allclose(second.depths, first.depths, rtol=3e-7)
     np.testing.assert_allclose(second.points.position, first.points.position, atol=3e-7)
-    np.testing.assert_array_equal(second.points.colour, first.points.colour)
+    np.testing.assert_array_equal(second.points.color, first.points.color)
     for name in ("near", "far", "scale", "centre", "background", "frames_per_second"):
         assert getattr(second, name) == getattr(first, name)
     np.testing.assert_allclose(second.up, first.up, atol=1e-7)

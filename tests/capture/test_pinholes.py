@@ -30,7 +30,7 @@ def look(camera, pixels):
 
 
 def pattern(camera, capture):
-    """A smooth colour of the viewing direction alone, as this camera sees it."""
+    """A smooth color of the viewing direction alone, as this camera sees it."""
     width, height = capture.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)

@@ -36,9 +36,9 @@ def one_camera(field, value):
     return {"cameras": cameras._replace(**{field: leaf})}
 
 
-def cloud(*positions, colours=None):
+def cloud(*positions, colors=None):
     places = np.array(positions, np.float64)
-    count = len(places) if colours is None else colours
+    count = len(places) if colors is None else colors
     return {"points": PointCloud(places, np.zeros((count, 3), np.uint8))}
 
 
@@ -77,7 +77,7 @@ CAPTURES = [
     ({"train": np.array([], int)}, "no frame to learn from"),
     ({"heldout": np.array([2])}, "'f2' is both"),
     (cloud([np.inf] * 3, [np.inf] * 3), "2 scene points"),
-    (cloud([0.0] * 3, [0.0] * 3, colours=1), "(1, 3)"),
+    (cloud([0.0] * 3, [0.0] * 3, colors=1), "(1, 3)"),
     ({"depths": spoilt(make().depths, (1, 0, 0), np.nan)}, "'f1' has 1"),
     (one_camera("position", np.nan), "camera 'f2': position"),
     (one_camera("radial", np.inf), "camera 'f2': radial"),

@@ -164,7 +164,7 @@ def test_tracks_follow_numpy_s_map_and_meet_their_own_material(scene):
     assert np.mean(truth.things[row, y, x] == truth.track_thing[seen]) > 0.9
 
 
-def test_static_points_have_the_same_colour_for_both_cameras(scene, rng):
+def test_static_points_have_the_same_color_for_both_cameras(scene, rng):
     capture, truth = scene
     differences, shuffled = [], []
     for row in (7, 8, 9):
@@ -181,9 +181,9 @@ def test_static_points_have_the_same_colour_for_both_cameras(scene, rng):
         there = capture.depths[twin, line[inside], column[inside]]
         seen[inside] &= np.abs(there - depth[inside]) < 0.02
         here = capture.images[row, y, x][seen].astype(float)
-        twin_colour = capture.images[twin, line[seen], column[seen]].astype(float)
-        differences.append(np.abs(here - twin_colour))
-        shuffled.append(np.abs(here - rng.permutation(twin_colour)))
+        twin_color = capture.images[twin, line[seen], column[seen]].astype(float)
+        differences.append(np.abs(here - twin_color))
+        shuffled.append(np.abs(here - rng.permutation(twin_color)))
     # Half a pixel of misplacement remains, on a texture finer than these small pixels.
     same, other = np.concatenate(differences), np.concatenate(shuffled)
     assert len(same) > 300
@@ -195,7 +195,7 @@ def test_points_lie_on_static_surfaces_with_little_noise(scene):
     assert len(capture.points.position) == SPEC.points
     static = [thing for thing in SPEC.things if not thing.moves()]
     eye = np.array([0.0, 0.1, 0.6])
-    for point, colour in zip(*capture.points, strict=True):
+    for point, color in zip(*capture.points, strict=True):
         # Signed distance to a box or ball: outside plus inside parts.
         gaps = []
         for thing in static:
@@ -208,7 +208,7 @@ def test_points_lie_on_static_surfaces_with_little_noise(scene):
             gaps.append(abs(gap))
         assert min(gaps) < 5 * SPEC.point_noise
         assert np.linalg.norm(point - eye) < 2
-        assert colour.dtype == np.uint8
+        assert color.dtype == np.uint8
 
 
 @pytest.mark.full

@@ -240,9 +240,9 @@ def test_albedo_is_smooth_and_lies_between_black_and_white(float64, rng):
     points = rng.uniform(-0.2, 0.2, (500, 3))
     ids = rng.integers(0, len(textures), 500)
     albedo = jax.vmap(lambda i, p: texture.albedo(textures, i, p))
-    colour = np.asarray(jax.jit(albedo)(ids, points))
-    assert 0 < colour.min() < colour.max() < 1
-    assert np.std(colour, axis=0).min() > 0.05
+    color = np.asarray(jax.jit(albedo)(ids, points))
+    assert 0 < color.min() < color.max() < 1
+    assert np.std(color, axis=0).min() > 0.05
     weight = np.array([0.2, 0.5, -0.4])
     error = gradients.directional_error(
         lambda p: jnp.sum(weight * albedo(ids[:9], p)), points[:9], step=1e-7

@@ -19,7 +19,7 @@ def film(count=8, size=(31, 45)):
     return [np.clip(frame, 0, 255).astype(np.uint8) for frame in frames]
 
 
-def test_colours_and_times_survive_odd_sizes(tmp_path):
+def test_colors_and_times_survive_odd_sizes(tmp_path):
     frames = film()
     video.write_video(tmp_path / "a.mp4", iter(frames), 12.5, quality=2)
     decoded = list(video.read_video(tmp_path / "a.mp4"))
@@ -58,7 +58,7 @@ def test_equal_frames_make_equal_films_whatever_was_in_memory(tmp_path):
     assert films[0] == films[1]
 
 
-def test_the_file_says_which_colours_it_holds(tmp_path):
+def test_the_file_says_which_colors_it_holds(tmp_path):
     video.write_video(tmp_path / "a.mp4", film())
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0].codec_context
@@ -105,8 +105,8 @@ def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected, mark):
 )
 def test_a_mirror_is_no_turn(tmp_path, across, down, expected):
     """Quadrants R G over B W; the matrix of the track (ISO 14496-12) mirrors them."""
-    colours = {"R": (255, 0, 0), "G": (0, 255, 0), "B": (0, 0, 255), "W": (255,) * 3}
-    picture = np.reshape([*colours.values()], (2, 2, 3)).astype(np.uint8)
+    colors = {"R": (255, 0, 0), "G": (0, 255, 0), "B": (0, 0, 255), "W": (255,) * 3}
+    picture = np.reshape([*colors.values()], (2, 2, 3)).astype(np.uint8)
     picture = picture.repeat(16, 0).repeat(24, 1)
     video.write_video(tmp_path / "a.mp4", [picture] * 2, quality=2)
     data = bytearray((tmp_path / "a.mp4").read_bytes())
@@ -130,16 +130,16 @@ def test_a_mirror_is_no_turn(tmp_path, across, down, expected):
     _, grey = next(iter(video.read_video(tmp_path / "a.mp4", grey=True)))
     for mark, (y, x) in zip(expected, np.ndindex(2, 2), strict=True):
         at = (8 + 16 * y, 12 + 24 * x)
-        assert np.abs(decoded[at] - np.array(colours[mark])).max() < 12
+        assert np.abs(decoded[at] - np.array(colors[mark])).max() < 12
         assert (grey[at] > 240) == (mark == "W")
 
 
 @pytest.mark.parametrize(
     ("height", "space"), [(718, "ITU601"), (720, "ITU709")], ids=["small", "hd"]
 )
-def test_a_film_without_colour_tags_has_those_of_its_size(tmp_path, height, space):
-    colour = np.array([200, 30, 40])
-    picture = np.zeros((height, 64, 3), np.uint8) + colour.astype(np.uint8)
+def test_a_film_without_color_tags_has_those_of_its_size(tmp_path, height, space):
+    color = np.array([200, 30, 40])
+    picture = np.zeros((height, 64, 3), np.uint8) + color.astype(np.uint8)
     with av.open(str(tmp_path / "a.mp4"), "w") as container:
         stream = container.add_stream("h264", rate=10)
         stream.width, stream.height, stream.pix_fmt = 64, height, "yuv420p"
@@ -152,7 +152,7 @@ def test_a_film_without_colour_tags_has_those_of_its_size(tmp_path, height, spac
         container.mux(stream.encode())
     _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
     # The other matrix is off by up to 30.
-    assert np.abs(decoded[100, 30] - colour).max() <= 4
+    assert np.abs(decoded[100, 30] - color).max() <= 4
 
 
 def test_of_rows_alone_nothing_behind_the_last_is_decoded(tmp_path):
@@ -189,8 +189,8 @@ def srgb(linear):
 
 
 def test_high_dynamic_range_keeps_what_is_no_brighter_than_half_of_white():
-    """Colours of sRGB at 95 nits and less, coded as PQ in the primaries of BT.2020."""
-    colours = np.array([[1, 1, 1], [0.9, 0.1, 0.05], [0.1, 0.5, 1], [0, 0, 0]])
+    """Colors of sRGB at 95 nits and less, coded as PQ in the primaries of BT.2020."""
+    colors = np.array([[1, 1, 1], [0.9, 0.1, 0.05], [0.1, 0.5, 1], [0, 0, 0]])
     # ITU-R BT.2087-0, equation for linear BT.709 to linear BT.2020
     to_wide = [
         [0.6274, 0.3293, 0.0433],
@@ -198,10 +198,10 @@ def test_high_dynamic_range_keeps_what_is_no_brighter_than_half_of_white():
         [0.0164, 0.0880, 0.8956],
     ]
     for nits in (95, 30, 2):
-        code = np.round(65535 * pq_code(nits * colours @ np.transpose(to_wide)))
+        code = np.round(65535 * pq_code(nits * colors @ np.transpose(to_wide)))
         shown = high_dynamic_range.tone_mapped(code.astype(np.uint16), "PQ")
-        expected = 255 * srgb(nits / 203 * colours)
-        # A level of rounding, and one of matrices of four digits at dark colours
+        expected = 255 * srgb(nits / 203 * colors)
+        # A level of rounding, and one of matrices of four digits at dark colors
         assert np.abs(shown - expected).max() < 2
     grey = np.repeat(np.linspace(0, 1, 4001)[:, None], 3, axis=1)
     for transfer in ("PQ", "HLG"):

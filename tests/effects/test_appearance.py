@@ -1,4 +1,4 @@
-"""Appearance codes: colour reads them, density does not, and they learn."""
+"""Appearance codes: color reads them, density does not, and they learn."""
 
 import dataclasses
 import functools
@@ -24,7 +24,7 @@ TINY = RadianceScene(
     steps=10,
     rays=8,
     template=TemplateSpec(
-        EncodingSpec(2), EncodingSpec(1), depth=1, width=8, skips=(), colour_width=4
+        EncodingSpec(2), EncodingSpec(1), depth=1, width=8, skips=(), color_width=4
     ),
     sampling=SamplingSpec(5, 3, jitter=False),
     appearance=AppearanceSpec(width=3),
@@ -82,7 +82,7 @@ def test_the_condition_is_the_code_itself(table, rng):
     assert read is code
 
 
-def test_codes_change_the_colour_and_never_the_geometry(dtype):
+def test_codes_change_the_color_and_never_the_geometry(dtype):
     params = params_of(dtype)
     first, second = (
         tracer()(params, ray(dtype), condition(jnp.asarray([value] * 3, dtype)))
@@ -93,10 +93,10 @@ def test_codes_change_the_colour_and_never_the_geometry(dtype):
         np.testing.assert_array_equal(one.distances, other.distances)
         assert one.distance == other.distance
         # both levels read it; a reimplementation of NeRF-W leaves the coarse one out
-        assert np.abs(one.colour - other.colour).max() > 1e-2
+        assert np.abs(one.color - other.color).max() > 1e-2
 
 
-def test_colour_has_the_code_s_slope(float64, rng):
+def test_color_has_the_code_s_slope(float64, rng):
     params = params_of("float64")
     pull = rng.normal(size=3)
     plain = dataclasses.replace(TINY, sampling=SamplingSpec(4, 0, jitter=False))
@@ -104,7 +104,7 @@ def test_colour_has_the_code_s_slope(float64, rng):
 
     def shade(code):
         levels = render(params, ray("float64"), condition(code))
-        return sum(jnp.sum(pull * level.colour) for level in levels)
+        return sum(jnp.sum(pull * level.color) for level in levels)
 
     assert gradients.directional_error(shade, rng.normal(size=3)) < 1e-8
 

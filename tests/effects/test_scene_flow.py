@@ -106,7 +106,7 @@ def test_a_flow_with_a_trunk_of_its_own_reads_nothing_of_the_medium_s(dtype):
         return scene_flow.dynamic(spec, params, at, at, jnp.asarray(0.4, dtype))
 
     both = said(TINY, shared), said(own, apart)
-    for name in ("density", "colour", "disocclusion"):
+    for name in ("density", "color", "disocclusion"):
         np.testing.assert_array_equal(*(getattr(one, name) for one in both))
     assert not np.array_equal(both[0].flow, both[1].flow)
     grad = jax.grad(lambda params: said(own, params).flow.sum())(apart)

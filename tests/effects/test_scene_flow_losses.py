@@ -116,15 +116,15 @@ def test_slopes_are_those_of_differences(float64, rng):
     flow, back = (rng.normal(size=(rays, samples, 3)) for _ in "ab")
     seen = rng.uniform(0.1, 1, (rays, samples))
     weight = jnp.asarray(rng.uniform(0, 0.2, (rays, samples)))
-    colour, target = (rng.uniform(size=(rays, 3)) for _ in "ab")
+    color, target = (rng.uniform(size=(rays, 3)) for _ in "ab")
     depth, other = rng.uniform(1, 5, rays), jnp.asarray(rng.uniform(1, 25, rays))
     present = np.array([True, True, False, True, True])
     mask = jnp.asarray(np.where(present, rng.uniform(size=rays), 0))
     target, present = jnp.asarray(target), jnp.asarray(present)
 
-    def total(flow, back, seen, colour, depth, through):
+    def total(flow, back, seen, color, depth, through):
         return (
-            10 * flow_losses.warped(colour, target, weight, seen, mask)
+            10 * flow_losses.warped(color, target, weight, seen, mask)
             + flow_losses.cycle(flow, back, seen, present)
             + 10 * flow_losses.magnitude(flow, weight, present)
             + flow_losses.smoothness(flow, present)
@@ -134,5 +134,5 @@ def test_slopes_are_those_of_differences(float64, rng):
             + flow_losses.normalised_depth(depth, other, present)
         )
 
-    given = flow, back, seen, colour, depth, rng.uniform(0, 0.2, (rays, samples))
+    given = flow, back, seen, color, depth, rng.uniform(0, 0.2, (rays, samples))
     assert gradients.directional_error(total, *given, step=1e-6) < 1e-7

@@ -21,7 +21,7 @@ TINY = RadianceScene(
     steps=10,
     rays=16,
     template=TemplateSpec(
-        EncodingSpec(2), EncodingSpec(1), depth=2, width=8, skips=(), colour_width=4
+        EncodingSpec(2), EncodingSpec(1), depth=2, width=8, skips=(), color_width=4
     ),
     sampling=SamplingSpec(6, 4, jitter=False),
     appearance=AppearanceSpec(width=2),
@@ -84,5 +84,5 @@ def test_with_it_the_ray_sees_both_through_one_transmittance(dtype):
     np.testing.assert_allclose(joint.static_weight, weights, atol=tolerance)
     np.testing.assert_allclose(joint.media_weight["transient"], others, atol=tolerance)
     np.testing.assert_allclose(joint.beta, beta, rtol=tolerance)
-    assert np.abs(joint.colour - alone.colour).max() > 1e-2
+    assert np.abs(joint.color - alone.color).max() > 1e-2
     assert float(joint.distance) < float(alone.distance)  # it stands in front

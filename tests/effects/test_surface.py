@@ -1,4 +1,4 @@
-"""NeRF-DS: masks that guide, and normals that colour reads, written out in NumPy."""
+"""NeRF-DS: masks that guide, and normals that color reads, written out in NumPy."""
 
 import dataclasses
 import functools
@@ -113,7 +113,7 @@ class ByHand:
             -slope / np.linalg.norm(slope),
         )
 
-    def colour(self, level, x, direction):
+    def color(self, level, x, direction):
         spec = SPEC.template if level == "fine" else SPEC.coarse
         _, hidden = self.trunk(level, self.warped(x), self.lifted(x))
         net = self.params["template"][level]
@@ -124,7 +124,7 @@ class ByHand:
         normal = self.normals(level, x)[1]
         read.append(networks.waves(FEW, x, networks.window(2, 2 * share)))
         read.append(networks.waves(EncodingSpec(1), normal, networks.window(1, share)))
-        logits = networks.heads(net.colour, np.concatenate(read))["colour"]
+        logits = networks.heads(net.color, np.concatenate(read))["color"]
         return 1 / (1 + np.exp(-logits))
 
 
@@ -138,7 +138,7 @@ def central(function, x, step=1e-6):
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_normals_and_colours_of_a_ray_are_those_written_out(number, float64):
+def test_normals_and_colors_of_a_ray_are_those_written_out(number, float64):
     params = params_of("float64")
     levels, direction, code = seen(params, "float64")
     level, name = levels[number], ("coarse", "fine")[number]
@@ -151,10 +151,10 @@ def test_normals_and_colours_of_a_ray_are_those_written_out(number, float64):
             # central differences in float64
             np.testing.assert_allclose(found[key][row], value, atol=1e-7, err_msg=key)
     weight = np.asarray(level.static_weight)
-    colours = [by_hand.colour(name, x, direction) for x in np.asarray(level.point)]
+    colors = [by_hand.color(name, x, direction) for x in np.asarray(level.point)]
     behind = np.asarray(field_of(SPEC).metadata.background or (0, 0, 0))
-    whole = weight @ np.asarray(colours) + (1 - weight.sum()) * behind
-    np.testing.assert_allclose(level.colour, whole, atol=1e-7)
+    whole = weight @ np.asarray(colors) + (1 - weight.sum()) * behind
+    np.testing.assert_allclose(level.color, whole, atol=1e-7)
 
 
 def test_float32_normals_are_those_of_float64():
@@ -304,7 +304,7 @@ def test_costs_are_finite_where_density_is_level_and_where_it_is_a_wall(size, dt
         level = field_of(SPEC).render_ray(params, ray, when)[-1]
         rays = jax.tree.map(lambda leaf: leaf[None], level)
         costs = surface.costs_of(rays, direction[None], jnp.ones(1, bool))
-        return sum(costs) + jnp.sum(level.colour)
+        return sum(costs) + jnp.sum(level.color)
 
     value, slopes = jax.jit(jax.value_and_grad(cost))(params)
     assert np.isfinite(value)

@@ -49,15 +49,15 @@ def medium_by_hand(params, met, when):
     )
     return (
         math.log1p(math.exp(raw["density"][0])),
-        1 / (1 + np.exp(-raw["colour"])),
+        1 / (1 + np.exp(-raw["color"])),
         math.log1p(math.exp(raw["beta"][0])),
     )
 
 
-def loss_by_hand(colour, truth, beta, valid, power=0.0):
+def loss_by_hand(color, truth, beta, valid, power=0.0):
     """In float64, of the valid rays."""
-    colour, truth, beta = (networks.exact(x)[valid] for x in (colour, truth, beta))
-    squared = np.sum((colour - truth) ** 2, axis=1)
+    color, truth, beta = (networks.exact(x)[valid] for x in (color, truth, beta))
+    squared = np.sum((color - truth) ** 2, axis=1)
     return np.mean((squared / (2 * beta**2) + np.log(beta)) * beta**power)
 
 
@@ -65,12 +65,12 @@ def test_the_medium_is_the_loop_over_its_layers(dtype):
     params, met, when = params_of(dtype), sample(dtype), condition(dtype)
     medium = medium_of(SPEC, params, met, when)
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
-    density, colour, beta = medium_by_hand(params, met, when)
+    density, color, beta = medium_by_hand(params, met, when)
     np.testing.assert_allclose(medium.density, density, rtol=tolerance)
-    np.testing.assert_allclose(medium.colour, colour, rtol=tolerance)
+    np.testing.assert_allclose(medium.color, color, rtol=tolerance)
     np.testing.assert_allclose(medium.beta, beta, rtol=tolerance)
     assert medium.share is None  # both media have all of their opacity
-    for leaf in (medium.density, medium.colour, medium.beta):
+    for leaf in (medium.density, medium.color, medium.beta):
         assert leaf.dtype == dtype
 
 
@@ -86,7 +86,7 @@ def test_the_trunk_learns_from_the_transient(float64, rng):
             met._replace(features=features),
             when._replace(codes={"transient": code}),
         )
-        values = [medium.density[None], medium.colour, medium.beta[None]]
+        values = [medium.density[None], medium.color, medium.beta[None]]
         return pull @ jnp.concatenate(values)
 
     args = (params, met.features, when.codes["transient"])
@@ -102,10 +102,10 @@ def test_wild_features_leave_the_medium_finite_and_not_negative(size, dtype):
     for sign in (-1, 1):
         met = sample(dtype)._replace(features=np.full(FEATURES, sign * size, dtype))
         medium = jax.tree.map(np.asarray, medium_of(SPEC, params, met, when))
-        for leaf in (medium.density, medium.colour, medium.beta):
+        for leaf in (medium.density, medium.color, medium.beta):
             assert np.all(np.isfinite(leaf))
             assert np.all(leaf >= 0)
-        assert np.all(medium.colour <= 1)
+        assert np.all(medium.color <= 1)
 
 
 def test_uncertainty_is_the_least_plus_what_is_met(dtype, rng):
@@ -140,20 +140,20 @@ def test_a_ray_that_meets_no_transient_has_the_least_uncertainty(dtype):
 
 
 def rays_of(dtype, rng, count=9):
-    colour, truth = rng.uniform(size=(2, count, 3)).astype(dtype)
+    color, truth = rng.uniform(size=(2, count, 3)).astype(dtype)
     beta = rng.uniform(0.03, 1, count).astype(dtype)
-    return colour, truth, beta, rng.uniform(size=count) < 0.7
+    return color, truth, beta, rng.uniform(size=count) < 0.7
 
 
 @pytest.mark.parametrize("power", [0.0, 1.0])
 def test_photometric_is_the_mean_of_the_valid_rays_alone(power, dtype, rng):
-    colour, truth, beta, valid = rays_of(dtype, rng)
+    color, truth, beta, valid = rays_of(dtype, rng)
     assert 0 < np.sum(valid) < len(valid)
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     for mask, counted in ((valid, valid), (None, valid | True)):
-        loss, _ = photometric(colour, truth, beta, mask, power)
+        loss, _ = photometric(color, truth, beta, mask, power)
         assert loss.dtype == dtype
-        exact = loss_by_hand(colour, truth, beta, counted, power)
+        exact = loss_by_hand(color, truth, beta, counted, power)
         np.testing.assert_allclose(loss, exact, rtol=tolerance)
 
 
@@ -162,11 +162,11 @@ def test_photometric_is_the_mean_of_the_valid_rays_alone(power, dtype, rng):
 @pytest.mark.parametrize("offset", [0.0, 1e-30, 1e-7, 1e-3, 1.0, 1e4, 1e15])
 def test_photometric_holds_from_no_residual_to_a_huge_one(offset, power, dtype):
     """The slopes of a power are those of zero times that power of beta, held still."""
-    colour = np.full((1, 3), offset, dtype)
+    color = np.full((1, 3), offset, dtype)
     truth = np.zeros((1, 3), dtype)
     beta = np.asarray([0.03], dtype)
-    value, grads = photometric(colour, truth, beta, np.array([True]), power)
-    residual, b = float(colour[0, 0]), float(beta[0])
+    value, grads = photometric(color, truth, beta, np.array([True]), power)
+    residual, b = float(color[0, 0]), float(beta[0])
     exact = b**power * (3 * residual**2 / (2 * b**2) + math.log(b))
     tolerance = {"float32": 2e-6, "float64": 1e-14}[dtype]
     np.testing.assert_allclose(value, exact, rtol=tolerance)
@@ -180,13 +180,13 @@ def test_photometric_holds_from_no_residual_to_a_huge_one(offset, power, dtype):
 @pytest.mark.parametrize("hole", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("power", [0.0, 1.0])
 def test_unfilmed_pixels_teach_nothing_whatever_they_hold(power, hole, dtype, rng):
-    colour, truth, beta = whole = rays_of(dtype, rng, 3)[:3]
+    color, truth, beta = whole = rays_of(dtype, rng, 3)[:3]
     valid = np.array([True, False, True])
     broken = [leaf.copy() for leaf in whole]
     for leaf in broken:
         leaf[1] = hole
     value, grads = jax.tree.map(np.asarray, photometric(*broken, valid, power))
-    exact = loss_by_hand(colour, truth, beta, valid, power)
+    exact = loss_by_hand(color, truth, beta, valid, power)
     np.testing.assert_allclose(value, exact, rtol=2e-6)
     for grad in grads:
         assert np.all(np.isfinite(grad))
@@ -196,14 +196,14 @@ def test_unfilmed_pixels_teach_nothing_whatever_they_hold(power, hole, dtype, rn
 
 
 def test_photometric_has_its_slopes(float64, rng):
-    colour, truth, _, valid = map(jnp.asarray, rays_of("float64", rng))
+    color, truth, _, valid = map(jnp.asarray, rays_of("float64", rng))
 
-    def of_samples(colour, truth, weights, beta):
+    def of_samples(color, truth, weights, beta):
         rays = transient.uncertainty(0.03, weights, beta)
-        return transient.photometric(colour, truth, rays, valid)
+        return transient.photometric(color, truth, rays, valid)
 
     samples = rng.uniform(size=(2, 9, 4))
-    assert gradients.directional_error(of_samples, colour, truth, *samples) < 1e-7
+    assert gradients.directional_error(of_samples, color, truth, *samples) < 1e-7
 
 
 def context(dtype, density, valid):

@@ -25,23 +25,23 @@ from tests import gradients, scenes
 from tests.evaluation.test_heldout import FIELD
 
 CLOUD = np.random.default_rng(4).uniform((-0.3, -0.2, -0.1), (0.3, 0.2, 0.1), (24, 3))
-COLOURS = np.random.default_rng(5).uniform(0, 1, (24, 3))
+COLORS = np.random.default_rng(5).uniform(0, 1, (24, 3))
 WIDTH_PX = 2.5
 
 
 def blobs(params, view, size, step):
-    """A scene in closed form: a blot of colour where each point is projected to."""
+    """A scene in closed form: a blot of color where each point is projected to."""
     del step
-    points, colours = params
+    points, colors = params
     place, depth = jax.vmap(lambda point: cameras.project(view.camera, point))(points)
     away = rays.pixel_centres(size, place.dtype)[:, :, None] - place
     # As wide as its distance makes it, on the picture of whatever size.
     width = WIDTH_PX * view.camera.focal_px / 40 / depth
     near = jnp.exp(-jnp.sum(away**2, axis=-1) / (2 * width**2))
-    # A mean of colours: none is clipped by eight bits, which the fit would feel.
+    # A mean of colors: none is clipped by eight bits, which the fit would feel.
     total = 0.5 + jnp.sum(near, axis=-1, keepdims=True)
-    colour = 0.1 + 0.8 * jnp.einsum("hwp,pc->hwc", near, colours) / total
-    return Rendering(colour, near[..., 0], near[..., 0])
+    color = 0.1 + 0.8 * jnp.einsum("hwp,pc->hwc", near, colors) / total
+    return Rendering(color, near[..., 0], near[..., 0])
 
 
 MODEL = Model("blobs", None, None, blobs, (), lambda state: {})
@@ -51,8 +51,8 @@ MODEL = Model("blobs", None, None, blobs, (), lambda state: {})
 def capture():
     """Six frames of blobs as their cameras see them, all held out but one."""
     film = scenes.tiny_capture()
-    params = in_default_precision((CLOUD + film_centre(film), COLOURS))
-    draw = jax.jit(lambda view: blobs(params, view, film.size, None).colour)
+    params = in_default_precision((CLOUD + film_centre(film), COLORS))
+    draw = jax.jit(lambda view: blobs(params, view, film.size, None).color)
     pictures = [draw(evaluation.view_of(film, row)) for row in range(len(film.ids))]
     return dataclasses.replace(
         film,
@@ -73,7 +73,7 @@ def film_centre(film):
 
 
 def state_of(film):
-    params = in_default_precision((CLOUD + film_centre(film), COLOURS))
+    params = in_default_precision((CLOUD + film_centre(film), COLORS))
     return TrainState(params, (), (), jnp.zeros((), jnp.int32), jax.random.key(0))
 
 
@@ -215,7 +215,7 @@ def test_the_slope_of_the_error_is_that_of_both_representations(kind, float64):
     depth = jnp.asarray(0.6, float64)
     loss = fitted_cameras.photometric_loss(model, state, view, picture, valid, depth)
     screw = jnp.asarray([0.3, -0.2, 0.5, 0.1, 0.4, -0.3])  # pixels
-    # A Gaussian enters or leaves a pixel by less than 1/255 of its colour.
+    # A Gaussian enters or leaves a pixel by less than 1/255 of its color.
     bound = {"gaussians": 1e-4, "radiance": 1e-6}[kind]
     assert gradients.directional_error(loss, screw, step=1e-6) < bound
 

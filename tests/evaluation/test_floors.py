@@ -66,8 +66,8 @@ def test_a_mean_of_neighbours_is_of_those_that_filmed_a_pixel():
     expected = np.full((*SIZE[::-1], 3), 40 / 255)
     expected[:, :5] = 50 / 255
     expected[0] = 0
-    np.testing.assert_allclose(means.colour[0], expected, atol=1e-6)
-    np.testing.assert_allclose(means.colour[1], 70 / 255, atol=1e-6)
+    np.testing.assert_allclose(means.color[0], expected, atol=1e-6)
+    np.testing.assert_allclose(means.color[1], 70 / 255, atol=1e-6)
     np.testing.assert_array_equal(means.known[0], expected[..., 0] > 0)
     assert means.known[1].all()
     at_once = dataclasses.replace(capture, times=np.zeros(12, np.float32))
@@ -83,8 +83,8 @@ def test_an_average_over_time_leaves_the_rest_of_a_view():
         level = float(view.time) + float(view.camera.position[0])
         order.append(float(view.time))
         shape = SIZE[::-1]
-        colour = np.full((*shape, 3), 2 * level, np.float32)
-        return Rendering(colour, np.ones(shape), np.ones(shape))
+        color = np.full((*shape, 3), 2 * level, np.float32)
+        return Rendering(color, np.ones(shape), np.ones(shape))
 
     rows = capture.heldout
     averages = floors.time_averages(draw, NOBODY, capture, rows, frames=2, moments=3)
@@ -92,10 +92,10 @@ def test_an_average_over_time_leaves_the_rest_of_a_view():
     times = capture.times[capture.train]
     times = times[[0, round((len(times) - 1) / 2), -1]]
     assert order == [t for t in times for _ in range(2)]  # an instant serves all views
-    for place, colour in zip(averages.places, averages.colour, strict=True):
+    for place, color in zip(averages.places, averages.color, strict=True):
         position = capture.cameras.position[rows[place], 0]
         exact = np.mean(np.clip(2 * (times.astype(float) + position), 0, 1))
-        np.testing.assert_allclose(colour, exact, atol=1e-6)
+        np.testing.assert_allclose(color, exact, atol=1e-6)
     with pytest.raises(ValueError, match="frames=0 and moments=3"):
         floors.time_averages(draw, NOBODY, capture, rows, frames=0, moments=3)
 
@@ -131,10 +131,10 @@ def test_a_pinhole_s_render_is_bent_as_the_lens_films(bulge):
 
     def draw(state, view):
         assert not pinholes.has_lens(view.camera)
-        colour = (
+        color = (
             pattern(cameras.take(capture.cameras, 0), capture).astype(np.float32) / 255
         )
-        return Rendering(colour, np.ones((height, width)), x)
+        return Rendering(color, np.ones((height, width)), x)
 
     judged = pinholes.scorable(bent, traced=False)
     render = ThroughLens(draw, capture.size)(NOBODY, evaluation.view_of(bent, 0))
@@ -142,15 +142,15 @@ def test_a_pinhole_s_render_is_bent_as_the_lens_films(bulge):
     assert seen[5:-5, 5:-5].mean() > 0.8
     assert (seen.mean() < 0.99) == (bulge < 0)
     # Rounding to levels, and bilinear sampling of a smooth pattern.
-    away = np.abs(255 * render.colour - bent.images[0])[seen]
+    away = np.abs(255 * render.color - bent.images[0])[seen]
     assert away.max() <= 1.01
     assert (
         np.abs(
-            255 * draw(NOBODY, evaluation.view_of(capture, 0)).colour - bent.images[0]
+            255 * draw(NOBODY, evaluation.view_of(capture, 0)).color - bent.images[0]
         ).max()
         > 5
     )
-    assert not render.colour[~seen].any()
+    assert not render.color[~seen].any()
     assert not judged.depths[0][~seen].any()
     np.testing.assert_array_equal(render.alpha, seen)
     assert set(np.unique(render.depth)) <= set(x[0])  # never between two surfaces

@@ -50,13 +50,13 @@ def drawn(capture, rng):
     """Held-out frames as a poor scene might draw them."""
     rows = capture.heldout
     truth = capture.images[rows] / 255
-    colour = np.clip(truth + 0.1 * rng.normal(size=truth.shape), 0, 1)
+    color = np.clip(truth + 0.1 * rng.normal(size=truth.shape), 0, 1)
     near = np.ones(truth.shape[:3]) if capture.depths is None else capture.depths[rows]
     depth = near * rng.uniform(0.7, 1.4, near.shape)
     psnr = np.arange(len(rows)) + 20.0
     return Scored(
         rows,
-        np.float32(colour),
+        np.float32(color),
         np.ones(near.shape, np.float32),
         np.float32(depth),
         psnr,
@@ -91,7 +91,7 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
         capture = dataclasses.replace(capture, valid=valid)
     scored = drawn(capture, rng)
     places = np.array([len(scored.rows) - 1])
-    grey = Averages(places, np.full_like(scored.colour[places], 0.4), None)
+    grey = Averages(places, np.full_like(scored.color[places], 0.4), None)
     floors = Floors(grey._replace(known=~valid[scored.rows[places]]), grey)
     numbers = heldout_metrics(scored, capture, floors=floors)
     unscored = {"heldout.unscored"} if filmed else set()
@@ -99,7 +99,7 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     assert set(numbers) == (ALWAYS | MASKED | DEPTHS | FLOORS | unscored) - lost
     assert numbers["heldout.psnr"] == pytest.approx(scored.psnr.mean())
     rows = capture.heldout
-    picture = np.round(scored.colour.astype(float) * 255) / 255
+    picture = np.round(scored.color.astype(float) * 255) / 255
     truth = capture.images[rows] / 255
     known = valid[rows] if filmed else np.ones_like(valid[rows])
     moving = capture.moving[rows]
@@ -165,7 +165,7 @@ def test_large_pictures_get_ms_ssim_and_weights_lpips(rng, tmp_path):
     scored = drawn(capture, rng)
     numbers = heldout_metrics(scored, capture, lpips=lpips)
     assert set(numbers) == ALWAYS | {"heldout.ms_ssim", "heldout.lpips"}
-    picture = np.round(scored.colour[0] * 255) / np.float32(255)
+    picture = np.round(scored.color[0] * 255) / np.float32(255)
     truth = np.float32(capture.images[rows[0]] / 255)
     exact = jax.jit(image_quality.ms_ssim)(picture, truth)
     assert numbers["heldout.ms_ssim"] == pytest.approx(float(exact), abs=1e-5)

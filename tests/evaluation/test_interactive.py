@@ -78,8 +78,8 @@ def test_images_are_coarse_while_the_view_moves_and_reach_full_size_at_rest():
 
 def test_channels_show_what_they_are_called():
     alpha = np.float32([[0.0, 1.0]])
-    colour, depth = np.float32([[[0, 0, 0], [1, 0.5, 2]]]), np.float32([[0.0, 3.0]])
-    rendering = Rendering(colour, alpha, depth)
+    color, depth = np.float32([[[0, 0, 0], [1, 0.5, 2]]]), np.float32([[0.0, 3.0]])
+    rendering = Rendering(color, alpha, depth)
 
     def picture(channel, **rest):
         return interactive.as_channel(channel, rendering, **rest)

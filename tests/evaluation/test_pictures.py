@@ -1,4 +1,4 @@
-"""Pictures that mean what they show: colours decoded by hand, sizes, hard inputs."""
+"""Pictures that mean what they show: colors decoded by hand, sizes, hard inputs."""
 
 import sys
 
@@ -19,59 +19,59 @@ def mapped(name, value):
 
 def test_depth_is_bright_near_and_dark_far_over_one_range():
     depth = np.array([[[1.0, 2.0]], [[3.0, 5.0]]])
-    coloured = pictures.colour_depth(depth, limits=(1.0, 5.0))
-    assert (coloured.low, coloured.high) == (1.0, 5.0)
+    colored = pictures.color_depth(depth, limits=(1.0, 5.0))
+    assert (colored.low, colored.high) == (1.0, 5.0)
     for at, index in (
         ((0, 0, 0), 255),
         ((0, 0, 1), 191),
         ((1, 0, 0), 128),
         ((1, 0, 1), 0),
     ):
-        np.testing.assert_array_equal(coloured.picture[at], mapped("viridis", index))
+        np.testing.assert_array_equal(colored.picture[at], mapped("viridis", index))
 
 
 @pytest.mark.hard_cases
 def test_one_stray_depth_does_not_flatten_the_picture(rng):
     depth = rng.uniform(2, 4, (3, 40, 40))
     depth[0, 0, 0] = 1e6
-    coloured = pictures.colour_depth(depth)
-    assert 2 <= coloured.low < coloured.high <= 4
-    np.testing.assert_array_equal(coloured.picture[0, 0, 0], mapped("viridis", 0))
+    colored = pictures.color_depth(depth)
+    assert 2 <= colored.low < colored.high <= 4
+    np.testing.assert_array_equal(colored.picture[0, 0, 0], mapped("viridis", 0))
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf, 0.0, -1.0])
-def test_unknown_depth_is_grey_and_a_flat_one_has_one_colour(unknown):
+def test_unknown_depth_is_grey_and_a_flat_one_has_one_color(unknown):
     depth = np.full((4, 5), 3.0)
     depth[1, 2] = unknown
     known = np.ones((4, 5), bool)
     known[3, 3] = False
-    picture = pictures.colour_depth(depth, known).picture
+    picture = pictures.color_depth(depth, known).picture
     assert tuple(picture[1, 2]) == tuple(picture[3, 3]) == GREY
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 2
-    nothing = pictures.colour_depth(np.full((4, 5), unknown)).picture
+    nothing = pictures.color_depth(np.full((4, 5), unknown)).picture
     assert np.all(nothing == 128)
 
 
 def test_error_is_linear_up_to_its_largest():
     truth = np.zeros((1, 4, 3), np.uint8)
     render = np.array([[[0, 0, 0], [0.3, 0, 0], [0.2, 0.2, 0.2], [1, np.nan, 0]]])
-    picture = pictures.colour_error(render, truth, largest=0.2).picture[0]
+    picture = pictures.color_error(render, truth, largest=0.2).picture[0]
     for column, index in ((0, 0), (1, 128), (2, 255)):
         np.testing.assert_array_equal(picture[column], mapped("inferno", index))
     assert tuple(picture[3]) == GREY
     with pytest.raises(ValueError, match="positive, got 0"):
-        pictures.colour_error(render, truth, 0)
+        pictures.color_error(render, truth, 0)
 
 
 def test_flow_is_white_at_rest_and_hue_tells_the_direction():
     flow = np.array([[[0, 0], [4, 0], [-9, 0], [2, 0], [np.nan, 0]]], float)
-    picture = pictures.colour_flow(flow, largest=4.0).picture[0]
+    picture = pictures.color_flow(flow, largest=4.0).picture[0]
     expected = [(255, 255, 255), (255, 0, 0), (0, 255, 255), (255, 128, 128), GREY]
     np.testing.assert_array_equal(picture, expected)
-    still = pictures.colour_flow(np.zeros((2, 3, 2)))
+    still = pictures.color_flow(np.zeros((2, 3, 2)))
     assert np.all(still.picture == 255)
-    assert pictures.colour_flow(np.full((2, 3, 2), np.nan)).high == 1
+    assert pictures.color_flow(np.full((2, 3, 2), np.nan)).high == 1
 
 
 def test_a_comparison_holds_every_panel_unchanged(rng):
@@ -146,12 +146,12 @@ def test_drawing_leaves_no_figure_behind(tmp_path):
     assert matplotlib.pyplot.get_fignums() == []
 
 
-def test_colours_are_matplotlibs_and_only_the_curve_needs_it(tmp_path, monkeypatch):
+def test_colors_are_matplotlibs_and_only_the_curve_needs_it(tmp_path, monkeypatch):
     ramp = np.linspace(0, 1, 256)[None]
     truth = np.zeros((1, 256, 3))
-    error = pictures.colour_error(truth + ramp[..., None], truth, 1.0).picture
+    error = pictures.color_error(truth + ramp[..., None], truth, 1.0).picture
     np.testing.assert_array_equal(error[0], [mapped("inferno", i) for i in range(256)])
-    depth = pictures.colour_depth(2 - ramp, limits=(1.0, 2.0)).picture
+    depth = pictures.color_depth(2 - ramp, limits=(1.0, 2.0)).picture
     np.testing.assert_array_equal(depth[0], [mapped("viridis", i) for i in range(256)])
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(extras.MissingExtra, match=r"matplotlib.*nerfies-jax\[report\]"):

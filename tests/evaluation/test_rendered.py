@@ -63,7 +63,7 @@ def test_a_renderer_sees_parameters_time_and_step_and_compiles_once_a_shape():
     renderer = evaluation.Renderer(MODEL._replace(render=render), SIZE)
     view = evaluation.view_of(capture, 3)
     for step, level in ((0, 0.1), (7, 0.4), (20, 0.2)):
-        picture = renderer(state_at(step, level), view).colour
+        picture = renderer(state_at(step, level), view).color
         expected = level + float(capture.times[3]) / 10 + step / 100
         np.testing.assert_allclose(picture, expected, atol=1e-6)
     renderer(state_at(0, [0.1, 0.2]), view)
@@ -116,7 +116,7 @@ class Counted:
         picture = act()
         jax.effects_barrier()
         ran = tuple(self.calls[name] - before[name] for name in before)
-        return ran, float(picture.colour[0, 0, 0])
+        return ran, float(picture.color[0, 0, 0])
 
 
 def test_a_renderer_keeps_what_stays_and_drops_what_changes():
@@ -169,7 +169,7 @@ def test_a_survey_is_made_once_for_trained_parameters_and_their_step():
         [(first, 0), (first, 0), (first, 7), (other, 7), (other, 7)]
     ):
         state = TrainState(params, (), (), jnp.int32(step), None)
-        picture = renderer(state, view).colour
+        picture = renderer(state, view).color
         expected = 0.1 + float(view.time) / 10 + step / 100
         np.testing.assert_allclose(picture, expected, atol=1e-6)
         jax.effects_barrier()
@@ -220,12 +220,12 @@ def test_a_scene_in_stages_is_drawn_as_in_one(moving):
     staged = evaluation.Renderer(model, capture.size)
     whole = evaluation.Renderer(model._replace(stages=None), capture.size)
     views = [evaluation.view_of(capture, row) for row in (0, 3, 5)]
-    first, last = (whole(state, view).colour for view in (views[0], views[-1]))
+    first, last = (whole(state, view).color for view in (views[0], views[-1]))
     assert np.abs(first - last).max() > 0.05
     for view in views:
         picture, expected = staged(state, view), whole(state, view)
         # Depth is a quotient by an opacity, and processors differ in how sums are cut.
-        for name, rtol in (("colour", 1e-7), ("alpha", 1e-7), ("depth", 3e-5)):
+        for name, rtol in (("color", 1e-7), ("alpha", 1e-7), ("depth", 3e-5)):
             np.testing.assert_allclose(
                 getattr(picture, name),
                 getattr(expected, name),

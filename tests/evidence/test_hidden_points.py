@@ -28,7 +28,7 @@ def film_before(hole=HOLE, front=False):
         edge = edge[(edge[:, 0] > -0.22) & (edge[:, 0] < -0.14)]
         position = np.concatenate([position, edge])
         red = np.append(red, np.zeros(len(edge)))
-    colour = np.repeat(red[:, None], 3, 1).astype(np.uint8)
+    color = np.repeat(red[:, None], 3, 1).astype(np.uint8)
     inside = np.stack(np.meshgrid(*2 * [np.linspace(-HOLE, HOLE, 120)]), -1)
     inside = wall(*inside.reshape(-1, 2).T)
     moving = np.zeros(views.grey.shape, bool)
@@ -36,19 +36,19 @@ def film_before(hole=HOLE, front=False):
         pixel, _ = view_set.project(views, frame, inside)
         row, column = np.clip(pixel[:, ::-1].astype(int).T, 0, [[71], [95]])
         mask[row, column] = True
-    return views, PointCloud(position.astype(np.float32), colour), moving
+    return views, PointCloud(position.astype(np.float32), color), moving
 
 
 @pytest.mark.parametrize("front", [False, True])
 def test_a_wall_goes_on_behind_what_moves(front):
-    """Its plane and colours; an edge before it takes no part."""
+    """Its plane and colors; an edge before it takes no part."""
     views, still, moving = film_before(front=front)
     found = hidden_points.behind(views, still, moving)
     x, y, z = found.position.astype(float).T
     assert np.abs(z - wall(x, y)[:, 2]).max() < 0.03
     assert np.maximum(np.abs(x), np.abs(y)).max() < HOLE + 0.05
     true = np.round(128 + 70 * x)
-    assert np.abs(found.colour[:, 0] - true).mean() < 3
+    assert np.abs(found.color[:, 0] - true).mean() < 3
     # Wherever the hole is looked at there is a point near; pixels by the edge show it.
     for frame in () if front else (0, 6, 11):
         pixel, _ = view_set.project(views, frame, found.position)
@@ -66,5 +66,5 @@ def test_nothing_is_guessed_where_points_are():
 @pytest.mark.parametrize("points", [0, 5])
 def test_few_points_tell_of_nothing(points):
     views, still, moving = film_before()
-    few = PointCloud(still.position[:points], still.colour[:points])
+    few = PointCloud(still.position[:points], still.color[:points])
     assert len(hidden_points.behind(views, few, moving).position) == 0

@@ -218,11 +218,11 @@ def test_what_moves_looks_unlike_the_wall_behind_it_and_the_wall_like_itself(lig
         nd.binary_erosion(part, np.ones((1, 3, 3))) & inner
         for part in (capture.moving, ~capture.moving)
     )
-    assert (odds[card] > 0).mean() > 0.75  # the rest has the wall's colour by chance
+    assert (odds[card] > 0).mean() > 0.75  # the rest has the wall's color by chance
     assert (odds[wall] < 0).mean() > 0.98
     beside = wall & nd.binary_dilation(capture.moving, np.ones((1, 9, 9)))
-    assert (odds[beside] < 0).mean() > 0.9  # next to the edge colours mix
-    none = PointCloud(capture.points.position[:0], capture.points.colour[:0])
+    assert (odds[beside] < 0).mean() > 0.9  # next to the edge colors mix
+    none = PointCloud(capture.points.position[:0], capture.points.color[:0])
     assert not still_pictures.log_odds(views, none).any()
 
 
@@ -269,7 +269,7 @@ def test_moving_neighbours_convince_and_a_lonely_track_is_overruled():
     assert score[inside] > 0.5 > score[outside]
 
 
-def test_still_points_lie_on_the_wall_and_have_its_colours():
+def test_still_points_lie_on_the_wall_and_have_its_colors():
     capture, evidence = gathered()
     cloud = evidence.still
     assert len(cloud.position) > 2000
@@ -282,8 +282,8 @@ def test_still_points_lie_on_the_wall_and_have_its_colours():
     x, y = pixel[inside].astype(int).T
     still = ~capture.moving[evidence.row[12]][y, x]
     seen, other = (views.image[12][y, x + off].astype(float) for off in (0, 6))
-    colour = cloud.colour[inside]
-    off, by_chance = (abs(one - colour)[still].mean() for one in (seen, other))
+    color = cloud.color[inside]
+    off, by_chance = (abs(one - color)[still].mean() for one in (seen, other))
     assert off < 0.3 * by_chance
 
 

@@ -14,13 +14,13 @@ def test_the_picture_shows_how_far_points_are_from_where_they_should_be():
     capture, _, known = scenes.tiny_tracks()
     shown = ablate_picture.shown_row(known, capture)
     row = known.rows[shown]
-    colour = {"a": capture.images[row]}
+    color = {"a": capture.images[row]}
 
     def apart(path):
         picture = ablate_picture.draw(
             capture,
             known,
-            colour,
+            color,
             {"a": capture.depths[row]},
             {"a": path},
             {"a": ""},

@@ -36,13 +36,13 @@ def test_scored_exposures_are_never_learnt_from():
 
 def test_psnr_is_of_the_chosen_pixels_of_all_frames():
     truth = np.zeros((2, 4, 5, 3), np.uint8)
-    colour = np.zeros((2, 4, 5, 3), np.float32)
+    color = np.zeros((2, 4, 5, 3), np.float32)
     where = np.zeros((2, 4, 5), bool)
     where[0, :2, 0] = True
-    colour[0, 0, 0] = 0.2  # one of two chosen pixels
-    colour[1] = 1.0  # not chosen
+    color[0, 0, 0] = 0.2  # one of two chosen pixels
+    color[1] = 1.0  # not chosen
     expected = -10 * np.log10(0.2**2 / 2)
-    assert abs(appearance_codes._psnr(colour, truth, where) - expected) < 1e-5
+    assert abs(appearance_codes._psnr(color, truth, where) - expected) < 1e-5
 
 
 @pytest.mark.slow

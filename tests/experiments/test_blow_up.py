@@ -20,7 +20,7 @@ FIELD = (
     "sampling.fine=4",
     "template.depth=1",
     "template.width=8",
-    "template.colour_width=8",
+    "template.color_width=8",
     "template.skips=",
     "coarse=none",
 )

@@ -58,7 +58,7 @@ def cell(folder):
     found = results.read(path, SPEC)
     if found is None:
         numbers = {name: 0.25 for name in MEASURES}
-        arrays = {"colour": np.arange(999.0), "depth": np.ones((3, 4), np.float32)}
+        arrays = {"color": np.arange(999.0), "depth": np.ones((3, 4), np.float32)}
         results.write(path, SPEC, ArmResult(numbers, arrays, {"steps": 3}))
         found = results.read(path, SPEC)
     return found

@@ -28,11 +28,11 @@ def test_the_products_of_a_static_field_are_those_of_its_networks(name):
     ray = Ray(*jax.device_put((0 * forward, forward, near, far)))
     condition = FrameCondition(near, {}, jax.device_put(np.int32(0)))
 
-    def colours(params):
-        return [level.colour for level in field.render_ray(params, ray, condition)]
+    def colors(params):
+        return [level.color for level in field.render_ray(params, ray, condition)]
 
     params = jax.eval_shape(lambda: field.init(jax.random.key(0)))
-    counted = matrix_flops.count(colours, params)
+    counted = matrix_flops.count(colors, params)
     plan = spec.sampling
     expected = network_flops(spec.template, plan.coarse + plan.fine)
     if plan.fine:
@@ -49,9 +49,9 @@ def network_flops(one, samples):
     each, width = point * one.width, one.width
     for layer in range(1, one.depth):
         each += (width + point * (layer in one.skips)) * width
-    each += width + (width + 3) * one.colour_width  # density, colour
+    each += width + (width + 3) * one.color_width  # density, color
     bottleneck = (width + 1) * width  # once, joined to the layer that reads it
-    return 2 * (samples * each + (view + bottleneck) * one.colour_width)
+    return 2 * (samples * each + (view + bottleneck) * one.color_width)
 
 
 def test_every_default_preset_has_effects_and_every_paper_is_there():

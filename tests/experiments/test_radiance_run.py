@@ -19,7 +19,7 @@ TINY = (
     "template.skips=",
     "template.depth=1",
     "template.width=8",
-    "template.colour_width=8",
+    "template.color_width=8",
     "warp.skips=",
     "warp.depth=1",
     "warp.width=8",
@@ -103,7 +103,7 @@ def test_the_appearance_goes_from_one_frame_to_another(run, tmp_path):
         more = ("--appearance", *ends, "--out", tmp_path / folder)
         assert main(render, run, *path, *still, *more) == 0
     there, back, at = (
-        [exr.read_exr(tmp_path / folder / f"{n:04d}.exr").colour for n in range(3)]
+        [exr.read_exr(tmp_path / folder / f"{n:04d}.exr").color for n in range(3)]
         for folder in ("there", "back", "at")
     )
     np.testing.assert_array_equal(there[0], at[0])

@@ -100,7 +100,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
         metrics["floor.still"], metrics["heldout.psnr"], atol=1e-4
     )
     capture = scenes.tiny_capture()
-    means = floors.neighbour_means(capture, capture.heldout).colour
+    means = floors.neighbour_means(capture, capture.heldout).color
     error = np.square(
         np.round(255 * means) / 255 - capture.images[capture.heldout] / 255
     )

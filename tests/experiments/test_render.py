@@ -118,7 +118,7 @@ def test_a_render_that_fails_leaves_the_earlier_one_as_it_was(run, monkeypatch, 
     with monkeypatch.context() as patch:
         as_picture = evaluation.as_picture
         sizes = iter((24, 24, 8))
-        cut = lambda colour: as_picture(colour)[:, : next(sizes)]  # noqa: E731
+        cut = lambda color: as_picture(color)[:, : next(sizes)]  # noqa: E731
         patch.setattr(evaluation, "as_picture", cut)
         with pytest.raises(ValueError, match="frame 2 is"):
             main(run, *SWAY)

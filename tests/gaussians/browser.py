@@ -127,7 +127,7 @@ def packed_blobs():
         quaternion=np.tile(np.float32([1, 0, 0, 0]), (len(steps), count, 1)),
         log_scale=np.full((len(steps), count, 3), np.log(0.04), np.float32),
         opacity=np.full((len(steps), count), 0.95, np.float32),
-        colour=np.float32(list(COLORS.values())),
+        color=np.float32(list(COLORS.values())),
         left_out=0,
     )
     return packing.pack(instants, np.full(count, 1e-4))

@@ -122,7 +122,7 @@ def scene_of(name, spec=None, dtype="float64", count=9):
 def moving_scene(noise=0.1):
     """Parameters of `scenes.TINY_DEFORMABLE`: its capture's points, which all move."""
     cloud, rng = scenes.tiny_capture().points, np.random.default_rng(0)
-    rows = splats.from_points(cloud.position, cloud.colour / 255, degree=1)
+    rows = splats.from_points(cloud.position, cloud.color / 255, degree=1)
     init = jitted(mlp_motion.init, static_argnums=1)
     nets = init(jax.random.key(0), scenes.TINY_MOTION)
     nets = jax.tree.map(lambda leaf: leaf + noise * rng.normal(size=leaf.shape), nets)

@@ -100,7 +100,7 @@ def turn_of(wxyz):
 
 
 def drawn_by_hand(params, time):
-    """Mean, rotation, scale, opacity and colour of each, in float64."""
+    """Mean, rotation, scale, opacity and color of each, in float64."""
     rows, net = params.rows["splats"], params.nets[NAME]
     reference, residual, _ = kept_by_hand(params.rows[NAME], net.law)
     code, drawn = code_at(net.times, time), []
@@ -140,11 +140,11 @@ def test_all_is_made_of_features_as_they_are_kept(time, dtype):
         rows = effect().deform(params, still, condition, None)
         return derived[0].sh_dc[:, 0], effect().derive(params, derived, rows, condition)
 
-    colour, found = jitted(run)(params, put(time, dtype))
-    *expected, colours = drawn_by_hand(host(params), time)
+    color, found = jitted(run)(params, put(time, dtype))
+    *expected, colors = drawn_by_hand(host(params), time)
     for leaf, by_hand in zip(
-        (found.mean, found.scale, found.opacity, colour),
-        (expected[0], *expected[2:], colours),
+        (found.mean, found.scale, found.opacity, color),
+        (expected[0], *expected[2:], colors),
         strict=True,
     ):
         np.testing.assert_allclose(leaf, by_hand, rtol=EXACT[dtype], atol=EXACT[dtype])

@@ -62,7 +62,7 @@ def composited(cloud, camera, spec):
     drawn = dense_splats.render(
         gaussians, jnp.asarray(cloud.rgb), camera, CAPTURE.size, spec
     )
-    return drawn.colour + (1 - drawn.alpha[..., None]) * cloud.background
+    return drawn.color + (1 - drawn.alpha[..., None]) * cloud.background
 
 
 @pytest.mark.parametrize("without", [(), ("motion",)])
@@ -70,7 +70,7 @@ def test_a_cloud_composites_to_the_rendered_image(built, without):
     metadata, state = built
     view = evaluation.view_of(CAPTURE, int(CAPTURE.train[2]))
     model = variants.without_effects(SPEC, metadata, without, False)
-    expected = evaluation.Renderer(model, CAPTURE.size)(state, view).colour
+    expected = evaluation.Renderer(model, CAPTURE.size)(state, view).color
     splatting = browser_splats.splatting(SPEC, metadata, without)
     cloud = splatting(
         state, float(view.time), int(view.appearance), view.camera.position

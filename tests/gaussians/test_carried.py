@@ -333,7 +333,7 @@ def test_rows_that_stand_still_carry_what_stands_still():
     size = scenes.tiny_capture().size
     whole = model.render(state.params, view, size, state.step)
     quick = faster.model.render(faster.state.params, view, size, state.step)
-    np.testing.assert_allclose(quick.colour, whole.colour, atol=1e-5)
+    np.testing.assert_allclose(quick.color, whole.color, atol=1e-5)
     hidden, _ = variants.without_moving(model, state, 1e-3)
     left = splats.active_mask(model.stages.rows(hidden.params)).reshape(-1, EACH)
     np.testing.assert_array_equal(left.all(axis=1), left.any(axis=1))

@@ -162,9 +162,9 @@ def test_the_nth_smallest_is_that_of_a_sort(count, dtype):
 def some_shot(dtype="float32", size=(5, 6)):
     rng = np.random.default_rng(0)
     drawn, truth = rng.uniform(1, 4, (2, *size)).astype(dtype)
-    colour = np.zeros((*size, 3), dtype)
+    color = np.zeros((*size, 3), dtype)
     return Observation(
-        Rendering(colour, np.ones(size, dtype), drawn), colour, None, truth
+        Rendering(color, np.ones(size, dtype), drawn), color, None, truth
     )
 
 

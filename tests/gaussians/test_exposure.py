@@ -27,7 +27,7 @@ CHANGE = np.array([[0.3, 0.05, 0, 0.02], [0, 0.1, 0, 0], [0, 0.05, -0.2, 0.01]])
 
 @pytest.fixture(scope="module")
 def built():
-    """A model, and a state whose exposures change the colours of some frames."""
+    """A model, and a state whose exposures change the colors of some frames."""
     metadata = scene.metadata_of(CAPTURE)
     model = scene.build(SPEC, metadata)
     state = model.init(CAPTURE, jax.random.key(0))
@@ -40,7 +40,7 @@ def built():
 def pictures(model, state, rows):
     renderer = evaluation.Renderer(model, CAPTURE.size)
     views = [evaluation.view_of(CAPTURE, row) for row in rows]
-    return np.stack([renderer(state, view).colour for view in views])
+    return np.stack([renderer(state, view).color for view in views])
 
 
 def test_a_frame_is_drawn_in_its_light_and_one_never_seen_between_its_neighbours(built):

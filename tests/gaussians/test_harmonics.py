@@ -50,10 +50,10 @@ def test_no_direction_looks_along_z_and_has_no_gradient(part, dtype):
     np.testing.assert_array_equal(jacobian, np.zeros((3, 3)))
 
 
-def test_colour_is_clamped_at_zero_from_below(dtype, rng):
+def test_color_is_clamped_at_zero_from_below(dtype, rng):
     coefficients = rng.normal(size=(50, 16, 3)).astype(dtype)
     mean, position = rng.normal(size=(50, 3)), np.array([0.5, -2.0, 1.0])
-    colour = jitted(harmonics.colour_towards)(
+    color = jitted(harmonics.color_towards)(
         coefficients, mean.astype(dtype), position.astype(dtype)
     )
     direction = mean - position
@@ -63,15 +63,15 @@ def test_colour_is_clamped_at_zero_from_below(dtype, rng):
     )
     assert (expected < -0.5).any()
     tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
-    np.testing.assert_allclose(colour, np.maximum(expected + 0.5, 0), atol=tolerance)
+    np.testing.assert_allclose(color, np.maximum(expected + 0.5, 0), atol=tolerance)
 
 
-def test_colour_gradient_equals_central_differences(float64, rng):
+def test_color_gradient_equals_central_differences(float64, rng):
     coefficients = put(0.1 * rng.normal(size=(5, 16, 3)))
     mean, position = put(rng.normal(size=(5, 3))), put([3.0, 1.0, 2.0])
     weights = rng.normal(size=(5, 3))
 
     def loss(*args):
-        return jnp.sum(harmonics.colour_towards(*args) * weights)
+        return jnp.sum(harmonics.color_towards(*args) * weights)
 
     assert gradients.directional_error(loss, coefficients, mean, position) < 1e-8

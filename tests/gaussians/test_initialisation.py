@@ -14,13 +14,13 @@ SPEC = InitSpec(points=10**4, random=70, extra_random=30)
 
 def own_points(spec, capture):
     """How many of the capture's own points the start has; checks the count foretold."""
-    position, colour = initialisation.initial_points(spec, capture, 0)
+    position, color = initialisation.initial_points(spec, capture, 0)
     assert (
         position.shape
-        == colour.shape
+        == color.shape
         == (initialisation.initial_count(spec, capture), 3)
     )
-    assert ((colour >= 0) & (colour <= 1)).all()
+    assert ((color >= 0) & (color <= 1)).all()
     if capture.points is None:
         return 0
     known = {tuple(point) for point in capture.points.position}

@@ -62,7 +62,7 @@ def test_a_frame_is_drawn_from_the_file_alone(trained, saved):
     for params, about in (trained, model_file.load(saved)):
         model = scene.build(about["spec"], about["metadata"])
         draw = jitted(model.render, static_argnums=2)
-        pictures.append(draw(params, view, SIZE, np.int32(about["step"])).colour)
+        pictures.append(draw(params, view, SIZE, np.int32(about["step"])).color)
     assert np.ptp(pictures[0]) > 0.1
     np.testing.assert_allclose(pictures[1], pictures[0], atol=1e-6)
 

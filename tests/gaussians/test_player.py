@@ -42,7 +42,7 @@ def swing(params, gaussians, condition, ready):
 
 @functools.cache
 def moving_scene():
-    """A scene whose Gaussians are long, coloured, moving, or behind everyone."""
+    """A scene whose Gaussians are long, colored, moving, or behind everyone."""
     capture = scenes.tiny_capture()
     model = scene.build(
         SPEC, scene.metadata_of(capture), (Effect("swing", deform=swing),)
@@ -71,7 +71,7 @@ def drawn(row, time):
     """The model's picture from a camera of the capture."""
     _, state, capture = moving_scene()
     view = evaluation.view_of(capture, row)._replace(time=jnp.asarray(time, "float32"))
-    return renderer()(state, view).colour
+    return renderer()(state, view).color
 
 
 @functools.cache
@@ -96,7 +96,7 @@ def inside(page, name):
 
 
 def unpacked(page, time):
-    """Gaussians and colours at a time, by the header alone."""
+    """Gaussians and colors at a time, by the header alone."""
     header = json.loads(inside(page, "header"))
     data = base64.b64decode(inside(page, "data"))
     arrays = {}
@@ -116,7 +116,7 @@ def unpacked(page, time):
         now[name][rows] += arrays[f"{name}.step"][:, None] * between
     leaves = now["mean"], now["quaternion"], np.exp(now["log_scale"]), now["opacity"]
     leaves = (*leaves[:3], leaves[3][:, 0])
-    return put(Gaussians(*leaves), "float32"), put(arrays["colour"], "float32")
+    return put(Gaussians(*leaves), "float32"), put(arrays["color"], "float32")
 
 
 def psnr(one, other):
@@ -128,10 +128,10 @@ def compiled_render():
     capture = moving_scene()[2]
     background = jnp.asarray(capture.background or (0, 0, 0), jnp.float32)
     return jitted(
-        lambda gaussians, colours, camera: (
+        lambda gaussians, colors, camera: (
             rendering.render(
-                gaussians, colours, camera, capture.size, SPEC.raster, background
-            ).rendering.colour
+                gaussians, colors, camera, capture.size, SPEC.raster, background
+            ).rendering.color
         )
     )
 
@@ -139,14 +139,14 @@ def compiled_render():
 @pytest.mark.parametrize("time", [0.0, 0.5, 1.0])
 def test_what_is_in_the_page_draws_as_the_model_does(page, time):
     _, state, capture = moving_scene()
-    gaussians, colours = unpacked(page, time)
+    gaussians, colors = unpacked(page, time)
     for row in capture.heldout:
         view = evaluation.view_of(capture, row)
-        picture = compiled_render()(gaussians, colours, view.camera)
+        picture = compiled_render()(gaussians, colors, view.camera)
         # 73 dB at an instant; halfway between two, 64: a straight line for an arc.
         assert psnr(picture, drawn(int(row), time)) > 60
     active = int(splats.active_mask(state.params.rows["splats"]).sum())
-    assert len(colours) <= active - BEHIND
+    assert len(colors) <= active - BEHIND
 
 
 def test_a_scene_too_large_for_a_page_gets_fewer_instants(tmp_path, monkeypatch):
@@ -240,7 +240,7 @@ FOOTPRINTS = """([camera, time, antialiased]) => {
       }
     }`, `#version 300 es
     void main() {}`, names);
-  const count = HEADER.arrays.colour.shape[0], bytes = 4 * 10 * count;
+  const count = HEADER.arrays.color.shape[0], bytes = 4 * 10 * count;
   gl.bindVertexArray(gl.createVertexArray());
   gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, gl.createBuffer());
   gl.bufferData(gl.TRANSFORM_FEEDBACK_BUFFER, bytes, gl.STATIC_READ);
@@ -260,7 +260,7 @@ FOOTPRINTS = """([camera, time, antialiased]) => {
 def test_the_page_projects_as_the_library(opened, page, antialiased):
     one = odd_camera()
     size = moving_scene()[2].size
-    gaussians, colours = unpacked(page, 0.3)
+    gaussians, colors = unpacked(page, 0.3)
     # Some Gaussians are nearer than this.
     raster = dataclasses.replace(SPEC.raster, antialiased=antialiased, near=0.55)
     expected = jitted(projection.project, static_argnums=(2, 3))(
@@ -280,7 +280,7 @@ def test_the_page_projects_as_the_library(opened, page, antialiased):
     shown = np.asarray(expected.extent_px[:, 0] > 0)
     np.testing.assert_array_equal(table[:, 9] == 1, shown)
     assert 100 < shown.sum() < len(shown)
-    parts = (expected.mean_px, expected.whitening, expected.opacity[:, None], colours)
+    parts = (expected.mean_px, expected.whitening, expected.opacity[:, None], colors)
     exact = np.concatenate([np.asarray(part)[shown] for part in parts], axis=1)
     # Both are float32. Gaussians near the camera plane are thousands of px away.
     np.testing.assert_allclose(table[shown, :9], exact, rtol=2e-3, atol=2e-3)
@@ -314,7 +314,7 @@ def test_a_browser_draws_what_the_model_does(opened, time):
 
 
 def test_what_moves_does_not_hide_what_stands_behind_it():
-    """The thing behind keeps a colour of its own, though no view shows it."""
+    """The thing behind keeps a color of its own, though no view shows it."""
     capture = scenes.tiny_capture()
     camera = jax.tree.map(lambda leaf: leaf[capture.train[0]], capture.cameras)
     ahead = camera.position + np.outer([0.4, 0.8], camera.camera_from_world[2])
@@ -331,4 +331,4 @@ def test_what_moves_does_not_hide_what_stands_behind_it():
 
     seen = sampled.seen_in_training(at, rows, SPEC.raster, jnp.asarray(0), capture)
     assert seen.most[9] > sampled.LEAST_SEEN_PX
-    np.testing.assert_allclose(seen.colour[9], 0.25, atol=1e-5)
+    np.testing.assert_allclose(seen.color[9], 0.25, atol=1e-5)

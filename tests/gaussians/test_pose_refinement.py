@@ -96,7 +96,7 @@ def test_slopes_of_the_loss_are_those_of_differences():
             moved = refined(own, frames.cameras, metadata.depth)
             seen = view._replace(camera=cameras.take(moved, 0))
             drawn = model.render(state.params, seen, EVEN.size, state.step)
-            return jnp.mean((drawn.colour - truth) ** 2)
+            return jnp.mean((drawn.color - truth) ** 2)
 
         screws = 1e-3 * np.random.default_rng(1).normal(size=(6, 6))
         assert gradients.directional_error(loss, screws, directions=2) < 1e-4
@@ -156,8 +156,8 @@ def misplaced_px(given, true):
 def drawn_from(model, state, capture):
     renderer = evaluation.Renderer(model, capture.size)
     views = [evaluation.view_of(capture, int(row)) for row in capture.train]
-    colours = [renderer(state, view).colour for view in views]
-    return jnp.asarray(np.round(255 * np.clip(colours, 0, 1)), jnp.uint8)
+    colors = [renderer(state, view).color for view in views]
+    return jnp.asarray(np.round(255 * np.clip(colors, 0, 1)), jnp.uint8)
 
 
 def test_frames_between_lie_between_and_other_cameras_stay():

@@ -97,7 +97,7 @@ def dense(mode, means, quats, scales, opacities, colors, *views):
             gaussians, colors, camera_of(view, K), SIZE, spec, offset
         )
         alpha = image.alpha[..., None]
-        color = image.colour + background * (1 - alpha)
+        color = image.color + background * (1 - alpha)
         depth = image.depth[..., None] / jnp.maximum(alpha, 1e-10)
         return jnp.concatenate([color, depth, alpha], axis=-1)
 

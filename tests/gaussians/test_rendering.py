@@ -71,8 +71,8 @@ def test_render_equals_the_dense_renderer(float64, rng):
     behind = np.asarray(background) * (1 - exact.alpha)[..., None]
     depth = exact.depth / np.maximum(exact.alpha, 1e-10)
     pairs = [
-        (frame.rendering.colour, exact.colour[..., :3] + behind),
-        (frame.features, exact.colour[..., 3:]),
+        (frame.rendering.color, exact.color[..., :3] + behind),
+        (frame.features, exact.color[..., 3:]),
         (frame.rendering.alpha, exact.alpha),
         (frame.rendering.depth, depth),
     ]
@@ -82,9 +82,9 @@ def test_render_equals_the_dense_renderer(float64, rng):
 
 # RGBA or gray colors would put a color where depth is read.
 WRONG = [
-    ("colours", (24, 4), r"`colours` has shape \[24, 4\], expected \[gaussians, 3\]"),
-    ("colours", (24, 1), r"`colours` has shape \[24, 1\]"),
-    ("colours", (24,), r"`colours` has shape \[24\]"),
+    ("colors", (24, 4), r"`colors` has shape \[24, 4\], expected \[gaussians, 3\]"),
+    ("colors", (24, 1), r"`colors` has shape \[24, 1\]"),
+    ("colors", (24,), r"`colors` has shape \[24\]"),
     ("background", (13, 21, 4), "`background` has shape"),
     ("features", (24,), "`features` has shape"),
     ("mean2d_offset", (2,), "`mean2d_offset` has shape"),
@@ -93,9 +93,9 @@ WRONG = [
 
 @pytest.mark.parametrize(("name", "shape", "words"), WRONG)
 def test_arrays_of_the_wrong_shape_are_refused(name, shape, words, rng):
-    arrays = dict(colours=np.ones((24, 3))) | {name: np.ones(shape)}
+    arrays = dict(colors=np.ones((24, 3))) | {name: np.ones(shape)}
     scene = make_gaussians(rng, 24, "float32"), make_camera("float32", (21, 13))
-    colors, *_ = put((arrays.pop("colours"),), "float32")
+    colors, *_ = put((arrays.pop("colors"),), "float32")
     others = {key: put(value, "float32") for key, value in arrays.items()}
     with pytest.raises(ValueError, match=words):
         rendering.render(scene[0], colors, scene[1], (21, 13), **others)
@@ -132,7 +132,7 @@ def test_render_and_all_gradients_equal_the_dense_renderer(spec, float64, rng):
         depth = picture.depth * jnp.maximum(picture.alpha, 1e-10)
         return jnp.concatenate(
             [
-                picture.colour,
+                picture.color,
                 frame.features,
                 picture.alpha[..., None],
                 depth[..., None],
@@ -142,11 +142,11 @@ def test_render_and_all_gradients_equal_the_dense_renderer(spec, float64, rng):
 
     def dense(gaussians, values, background, offset, pose):
         picture = dense_splats.render(gaussians, values, pose, size, spec, offset)
-        colour = picture.colour.at[..., :3].add(
+        color = picture.color.at[..., :3].add(
             background * (1 - picture.alpha)[..., None]
         )
         return jnp.concatenate(
-            [colour, picture.alpha[..., None], picture.depth[..., None]], -1
+            [color, picture.alpha[..., None], picture.depth[..., None]], -1
         )
 
     args = (gaussians, values, background, put(np.zeros((60, 2))), camera)
@@ -176,12 +176,12 @@ def test_render_gradient_equals_central_differences(float64, rng):
         mean=put(np.asarray(gaussians.mean) * 0.2),
     )
     camera = make_camera(float64, size)
-    colours = put(rng.uniform(size=(6, 3)))
+    colors = put(rng.uniform(size=(6, 3)))
     toward = weights_for(rng, size, 3)
 
-    def loss(gaussians, colours):
-        frame = rendering.render(gaussians, colours, camera, size)
+    def loss(gaussians, colors):
+        frame = rendering.render(gaussians, colors, camera, size)
         picture = frame.rendering
-        return jnp.sum(picture.colour * toward) + jnp.sum(picture.depth)
+        return jnp.sum(picture.color * toward) + jnp.sum(picture.depth)
 
-    assert gradients.directional_error(loss, gaussians, colours) < 1e-6
+    assert gradients.directional_error(loss, gaussians, colors) < 1e-6

@@ -126,22 +126,22 @@ def test_a_frame_has_the_harmonics_of_its_step():
     shaded = with_rows(plain, sh_rest=rest)
     render = jitted(model.render, static_argnums=2)
 
-    def colour(params, step):
+    def color(params, step):
         drawn = render(params, view, (20, 15), np.int32(step))
         assert drawn.depth.shape == drawn.alpha.shape == (15, 20)
         assert finite(drawn)
-        return drawn.colour
+        return drawn.color
 
     every = scenes.TINY_SPLATS.sh_every  # below it no band but the first has trained
-    np.testing.assert_array_equal(colour(shaded, every - 1), colour(plain, every))
-    assert np.abs(colour(shaded, every) - colour(plain, every)).max() > 0.05
+    np.testing.assert_array_equal(color(shaded, every - 1), color(plain, every))
+    assert np.abs(color(shaded, every) - color(plain, every)).max() > 0.05
 
 
 def test_few_points_start_from_random_ones_in_the_views():
     capture = scenes.tiny_capture()
     spec = InitSpec(random=50, min_points=10**6)
-    position, colour = initialisation.initial_points(spec, capture, 0)
-    assert position.shape == colour.shape == (50, 3)
+    position, color = initialisation.initial_points(spec, capture, 0)
+    assert position.shape == color.shape == (50, 3)
     turn = capture.cameras.camera_from_world[capture.train]
     offset = position[None] - capture.cameras.position[capture.train][:, None]
     depth = np.einsum("fk,fnk->fn", turn[:, 2], offset)

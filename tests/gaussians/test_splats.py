@@ -117,8 +117,8 @@ def test_the_degree_grows_on_schedule():
 
 def test_first_scales_are_the_root_mean_square_of_three_distances(rng):
     points = rng.normal(size=(40, 3)).astype(np.float32)
-    colours = rng.uniform(size=(40, 3))
-    splats = rows.from_points(points, colours, degree=2)
+    colors = rng.uniform(size=(40, 3))
+    splats = rows.from_points(points, colors, degree=2)
     gap = np.linalg.norm(points[:, None].astype(float) - points[None], axis=-1)
     nearest = np.sort(gap, axis=1)[:, 1:4]
     expected = np.log(np.sqrt(np.mean(nearest**2, axis=1)))
@@ -126,7 +126,7 @@ def test_first_scales_are_the_root_mean_square_of_three_distances(rng):
     np.testing.assert_allclose(scale[:, 0], expected, atol=1e-6)
     assert splats.sh_rest.shape == (40, 8, 3)
     np.testing.assert_allclose(splats.opacity_logit, np.log(0.1 / 0.9), rtol=1e-6)
-    np.testing.assert_allclose(0.5 + 0.28209479177387814 * dc[:, 0], colours, atol=1e-6)
+    np.testing.assert_allclose(0.5 + 0.28209479177387814 * dc[:, 0], colors, atol=1e-6)
 
 
 @pytest.mark.hard_cases
@@ -198,10 +198,10 @@ def test_inactive_rows_change_neither_the_picture_nor_learn_anything(rng):
     camera = put(camera, "float32")
 
     def loss(splats):
-        colour = rendering.render_harmonics(
+        color = rendering.render_harmonics(
             rows.activate(splats), rows.active_harmonics(splats, 0), camera, (16, 12)
-        ).rendering.colour
-        return jnp.sum(colour**2), colour
+        ).rendering.color
+        return jnp.sum(color**2), color
 
     # Five rows beyond the active hold numbers of their own, inactive in one of the two.
     pad = jitted(rows.pad_rows, static_argnums=1)
@@ -210,8 +210,8 @@ def test_inactive_rows_change_neither_the_picture_nor_learn_anything(rng):
         lambda leaf: np.concatenate([leaf[:7], leaf[6:1:-1]]), padded
     )._replace(opacity_logit=padded.opacity_logit)
     run = jitted(jax.grad(loss, has_aux=True))
-    grads, colour = run(padded)
-    assert colour.max() > 0.1
-    np.testing.assert_array_equal(colour, run(other)[1])
+    grads, color = run(padded)
+    assert color.max() > 0.1
+    np.testing.assert_array_equal(color, run(other)[1])
     assert any(leaf[:7].any() for leaf in grads)
     assert not any(leaf[7:].any() for leaf in grads)

@@ -31,7 +31,7 @@ def learned():
         quaternion=turn.astype(np.float32),
         log_scale=np.full((25, 3, 3), math.log(0.05), np.float32),
         opacity=opacity.astype(np.float32),
-        colour=np.float32([[1.2, 0.5, 0], [0, 0, 1], [0.2, 0.2, 0.2]]),
+        color=np.float32([[1.2, 0.5, 0], [0, 0, 1], [0.2, 0.2, 0.2]]),
         left_out=0,
     )
 
@@ -51,7 +51,7 @@ def test_what_moves_on_cubics_and_fades_by_bells_comes_back():
         # 9 degrees to either side: the unit quaternion is off a line by 1e-3 at most
         np.testing.assert_allclose(turn, instants.quaternion[row], atol=2e-3)
     np.testing.assert_allclose(curves.scale, 0.05, rtol=1e-3)
-    np.testing.assert_allclose(curves.colour[0], [1, 128 / 255, 0], atol=1e-7)
+    np.testing.assert_allclose(curves.color[0], [1, 128 / 255, 0], atol=1e-7)
 
 
 def test_a_row_of_the_file_is_what_its_shader_unpacks():

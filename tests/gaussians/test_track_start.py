@@ -193,7 +193,7 @@ def test_gaussians_start_on_the_card_and_move_with_it():
     effect = effect_of(MOTIONS["bases"])
     start = StartSpec(motion="tracks", moving_points=200, fit_steps=300)
     started = track_start.start(start, effect, evidence, capture, jax.random.key(0))
-    assert len(started.position) == len(started.colour) == len(started.rows) == 200
+    assert len(started.position) == len(started.color) == len(started.rows) == 200
     points = Points(
         jnp.asarray(started.position), jnp.asarray(started.rows), started.nets
     )
@@ -215,7 +215,7 @@ def test_where_no_moving_pixel_has_a_depth_the_motion_starts_alone(monkeypatch):
     effects = (effect_of(MOTIONS["bases"]),)
     start = StartSpec(motion="tracks", fit_steps=2)
     started = track_start.start(start, *effects, evidence, capture, jax.random.key(0))
-    assert len(started.position) == len(started.colour) == len(started.rows) == 0
+    assert len(started.position) == len(started.color) == len(started.rows) == 0
     rows = splats.from_points(np.eye(3), np.eye(3))
     params = Params({"splats": rows, "se3_bases": jnp.ones((3, 13))}, {"se3_bases": 0})
     begun = track_start.put_in(params, effects, started)
@@ -253,7 +253,7 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     assert (still[active] > 0.99).sum() == active.sum() - 150
     wall = np.asarray(rows["splats"].mean)[active & (still > 0.99)]
     assert abs(np.median(wall[:, 2]) - films.FAR) < 0.05
-    # What stands hidden begins opaque, in the colour that was guessed.
+    # What stands hidden begins opaque, in the color that was guessed.
     opaque = np.asarray(jax.nn.sigmoid(rows["splats"].opacity_logit)) > 0.8
     np.testing.assert_array_equal(rows["splats"].mean[opaque], places[::2])
     shade = 0.5 + splats.SH_DC * rows["splats"].sh_dc[opaque]

@@ -29,8 +29,8 @@ def test_splats_without_motion_are_the_canonical_ones(swaying):
         jitted(each.render, static_argnums=2)(state.params, view, SIZE, state.step)
         for each in (without, static)  # with its motion it is another picture
     )
-    assert np.ptp(picture.colour) > 0.1
-    np.testing.assert_array_equal(picture.colour, expected.colour)
+    assert np.ptp(picture.color) > 0.1
+    np.testing.assert_array_equal(picture.color, expected.color)
 
 
 @pytest.mark.parametrize("name", [n for n, s in PRESETS.items() if s.motion])
@@ -171,9 +171,9 @@ def test_what_moves_may_be_left_out(swaying):
     alone = jax.jit(splats.take_rows)(state.params, np.flatnonzero(shown))
     view = evaluation.view_of(scenes.tiny_capture(), 0)
     picture, expected = (
-        evaluation.Renderer(model, SIZE)(one, view).colour
+        evaluation.Renderer(model, SIZE)(one, view).color
         for one in (left, state._replace(params=alone))
     )
     np.testing.assert_allclose(picture, expected, atol=1e-6)
-    everything = evaluation.Renderer(model, SIZE)(state, view).colour
+    everything = evaluation.Renderer(model, SIZE)(state, view).color
     assert np.abs(picture - everything).max() > 0.02

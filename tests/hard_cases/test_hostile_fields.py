@@ -70,7 +70,7 @@ def test_a_field_stays_finite_from(name, start, tmp_path):
     # The loop may stop with a word; none of these starts gives it a reason.
     assert ended.result.stopped_by == "steps", ended.result.message
     assert not hostile.not_finite(picture)
-    assert np.all((picture.colour > -1e-5) & (picture.colour < 2 + 1e-5))
+    assert np.all((picture.color > -1e-5) & (picture.color < 2 + 1e-5))
     assert np.all((picture.alpha > -1e-5) & (picture.alpha < 1 + 1e-5))
     assert np.all(picture.depth >= 0)
 

@@ -116,7 +116,7 @@ def one_point(rows):
     return rows._replace(mean=np.zeros_like(rows.mean) + rows.mean[:1])
 
 
-def one_colour(rows):
+def one_color(rows):
     return rows._replace(sh_dc=np.zeros_like(rows.sh_dc))
 
 
@@ -157,7 +157,7 @@ ROWS = {
     ),
     "opaque": lambda rows: with_logit(rows, 100.0),
     "transparent": lambda rows: with_logit(rows, -100.0),
-    "of one colour": one_colour,
+    "of one color": one_color,
     "about the cameras": about_the_cameras,
     "alone": alone,
     "far away": lambda rows: rows._replace(mean=rows.mean * np.float32(1e6)),
@@ -201,7 +201,7 @@ def falls(prepared, frames, trained):
     """The last frame's mean squared error after training, over that before it."""
     truth = np.float32(frames.images[-1]) / 255
     before, after = (
-        np.mean((np.asarray(drawn(prepared, state, frames, -1).colour) - truth) ** 2)
+        np.mean((np.asarray(drawn(prepared, state, frames, -1).color) - truth) ** 2)
         for state in (prepared.start, trained.result.state)
     )
     return after / before
@@ -268,9 +268,9 @@ def test_every_system_trains_from_hostile_starts(name, case):
 def points_at(position):
     """The capture with other points, all of them grey."""
     position = np.asarray(position, np.float32)
-    colour = np.full(position.shape, 128, np.uint8)
+    color = np.full(position.shape, 128, np.uint8)
     return dataclasses.replace(
-        scenes.tiny_capture(), points=PointCloud(position, colour)
+        scenes.tiny_capture(), points=PointCloud(position, color)
     )
 
 

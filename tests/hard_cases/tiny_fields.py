@@ -94,7 +94,7 @@ def small_template(spec: TemplateSpec) -> TemplateSpec:
         depth=2,
         width=8,
         skips=(1,),
-        colour_width=8,
+        color_width=8,
     )
 
 
@@ -122,7 +122,7 @@ def frames_of(capture: Capture, required_data: frozenset[str]) -> Frames:
 def started(name: str) -> Run:
     """The field of one paper on the tiny capture.
 
-    Behind the samples of a paper with rendered scenes is the known colour, behind those
+    Behind the samples of a paper with rendered scenes is the known color, behind those
     of the others an interval of 1e10.
     """
     capture = scenes.tiny_capture()

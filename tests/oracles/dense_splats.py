@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 
 class Picture(NamedTuple):
-    colour: jax.Array  # [height, width, channels]
+    color: jax.Array  # [height, width, channels]
     alpha: jax.Array  # [height, width]
     depth: jax.Array  # sum of w z, not divided
 

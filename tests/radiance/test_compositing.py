@@ -117,15 +117,15 @@ def test_media_share_their_transmittance(level, dtype, rng):
 
 def test_media_composite_term_by_term(float64, rng):
     depth = rng.uniform(0, 0.3, (2, 9))
-    colours, background = rng.uniform(size=(2, 9, 3)), rng.uniform(size=3)
+    colors, background = rng.uniform(size=(2, 9, 3)), rng.uniform(size=3)
     distances = np.sort(rng.uniform(1, 2, 9))
-    seen = composite_media(depth, colours, distances, background)
+    seen = composite_media(depth, colors, distances, background)
     passed = np.exp(-depth.sum())
-    colour = passed * background
+    color = passed * background
     for medium, weights in enumerate(exact_weights(depth)):
         for sample, weight in enumerate(weights):
-            colour = colour + weight * colours[medium, sample]
-    np.testing.assert_allclose(seen.colour, colour, rtol=1e-13)
+            color = color + weight * colors[medium, sample]
+    np.testing.assert_allclose(seen.color, color, rtol=1e-13)
     assert abs(float(seen.alpha) - (1 - passed)) < 1e-14
     joint = exact_weights(depth.sum(0)[None])[0]
     assert abs(float(seen.distance) - joint @ distances / joint.sum()) < 1e-13
@@ -151,16 +151,16 @@ def test_intervals_end_as_told(dtype):
 
 
 def scene(dtype, samples=6):
-    colours = np.linspace(0.1, 0.9, 3 * samples).reshape(-1, 3).astype(dtype)
-    return colours, np.linspace(2.0, 4.5, samples).astype(dtype)
+    colors = np.linspace(0.1, 0.9, 3 * samples).reshape(-1, 3).astype(dtype)
+    return colors, np.linspace(2.0, 4.5, samples).astype(dtype)
 
 
 @jax.jit
-def seen_and_slope(weights, colours, distances, background):
+def seen_and_slope(weights, colors, distances, background):
     """The composite, and the slope of its depth in the weights."""
 
     def depth(weights):
-        seen = compositing.composite(weights, colours, distances, background)
+        seen = compositing.composite(weights, colors, distances, background)
         return seen.distance, seen
 
     grad, seen = jax.grad(depth, has_aux=True)(weights)
@@ -169,12 +169,12 @@ def seen_and_slope(weights, colours, distances, background):
 
 @pytest.mark.hard_cases
 def test_an_empty_ray_is_background_at_its_far_end(dtype):
-    colours, distances = scene(dtype)
+    colors, distances = scene(dtype)
     background = np.asarray([1.0, 0.5, 0.25], dtype)
     for scale in (0.0, 1e-38, 1e-20, 1e-8):
         weights = (scale * np.array([0.0, 1, 0, 2, 0, 0])).astype(dtype)
-        seen, grads = seen_and_slope(weights, colours, distances, background)
-        np.testing.assert_allclose(seen.colour, background, atol=1e-7)
+        seen, grads = seen_and_slope(weights, colors, distances, background)
+        np.testing.assert_allclose(seen.color, background, atol=1e-7)
         assert abs(float(seen.distance) - 4.5) < 1e-4
         assert float(seen.median_distance) == 4.5
         assert np.all(np.abs(grads) <= 4.5 / EMPTY_BELOW)
@@ -186,7 +186,7 @@ def test_an_empty_ray_is_background_at_its_far_end(dtype):
         (EMPTY_BELOW / 2, 3.5, 1e-5),
     ):
         weights = (alpha * np.eye(6)[1]).astype(dtype)
-        seen, _ = seen_and_slope(weights, colours, distances, background)
+        seen, _ = seen_and_slope(weights, colors, distances, background)
         assert abs(float(seen.distance) - wanted) < close
 
 
@@ -204,11 +204,11 @@ def test_composites_have_the_slopes_of_central_differences(float64, rng):
     white, nowhere = jnp.asarray([1.0, 0.9, 0.8]), None
     faint = jnp.asarray(rng.uniform(0, 1e-4, 8))
 
-    def loss(depth, colours, distances, scale):
+    def loss(depth, colors, distances, scale):
         weights, total = compositing.weights(depth), 0.0
         for behind in (white, nowhere):
-            seen = compositing.composite(weights, colours, distances, behind)
-            total += jnp.sum(jnp.sin(3 * seen.colour))
+            seen = compositing.composite(weights, colors, distances, behind)
+            total += jnp.sum(jnp.sin(3 * seen.color))
             total += seen.alpha**2 + seen.distance**2
         far = distances[-1]
         return total + compositing.expected_distance(scale * faint, distances, far)

@@ -26,8 +26,8 @@ def repainted(rows):
         view = evaluation.view_of(capture, int(row))
         codes = field.codes_at(params, view)
         codes["appearance"] = jnp.asarray([3.0, -4.0, 2.0])
-        colour = draw(params, view.camera, view.time, codes, capture.size, step).colour
-        pictures[row] = evaluation.as_picture(np.asarray(colour))
+        color = draw(params, view.camera, view.time, codes, capture.size, step).color
+        pictures[row] = evaluation.as_picture(np.asarray(color))
     return dataclasses.replace(capture, images=pictures)
 
 
@@ -40,9 +40,9 @@ def test_a_code_is_found_again_from_half_a_picture_if_that_was_filmed():
     renderer = evaluation.Renderer(nerf_scene.build(TINY_FIELD, metadata), filmed.size)
 
     def before_and_after(capture):
-        colour = evaluation.score(renderer, state, capture, rows).colour
+        color = evaluation.score(renderer, state, capture, rows).color
         return (
-            evaluation.score_right_halves(capture, rows, colour),
+            evaluation.score_right_halves(capture, rows, color),
             held_out_codes.score(TINY_FIELD, metadata, state, capture, rows),
         )
 
@@ -66,8 +66,8 @@ def test_codes_are_fitted_to_the_samples_that_a_picture_is_made_of():
     codes = field.codes_at(params, view)
     codes["appearance"] = jnp.asarray([3.0, -4.0])
     draw = jax.jit(field.render, static_argnums=4)
-    colour = draw(params, view.camera, view.time, codes, capture.size, step).colour
-    capture.images[rows[0]] = evaluation.as_picture(np.asarray(colour))
+    color = draw(params, view.camera, view.time, codes, capture.size, step).color
+    capture.images[rows[0]] = evaluation.as_picture(np.asarray(color))
     state = TrainState(params, (), (), step, jax.random.key(0))
     scored = held_out_codes.score(spec, metadata, state, capture, rows)
     assert scored.psnr[0] > 48  # of evenly spread samples: 33

@@ -55,10 +55,10 @@ def template_params(flat, level):
         "density": layer(flat, f"{path}/MLP_2/logit"),
         "bottleneck": layer(flat, f"{path}/bottleneck"),
     }
-    colour = {"colour": layer(flat, f"{path}/MLP_1/logit")}
+    color = {"color": layer(flat, f"{path}/MLP_1/logit")}
     return Template(
         MLP(trunk(flat, f"{path}/MLP_0", 8), heads),
-        MLP(trunk(flat, f"{path}/MLP_1", 1), colour),
+        MLP(trunk(flat, f"{path}/MLP_1", 1), color),
     )
 
 
@@ -107,12 +107,12 @@ def level(flat, name, distance, ray):
     length = jnp.sqrt(jnp.sum(jnp.square(ray["directions"])))
     spacing = length * compositing.intervals(distance, compositing.AT_INFINITY)
     weight = official_weights(radiance.density * spacing)
-    seen = compositing.composite(weight, radiance.colour, distance, None)
+    seen = compositing.composite(weight, radiance.color, distance, None)
     return {
         "points": point,
         "warped_points": warped,
         "weights": weight,
-        "rgb": seen.colour,
+        "rgb": seen.color,
         "acc": seen.alpha,
         # upstream does not divide by the opacity, nor leave out the last sample
         "depth": jnp.sum(weight * distance),
@@ -149,14 +149,14 @@ def penalty_context(flat, when, coarse):
     )
 
 
-def total(flat, rays, colour, static, static_ids, places):
+def total(flat, rays, color, static, static_ids, places):
     """The loss; and its parts, what rays see, and Jacobians at the given places."""
     seen = jax.vmap(both_levels, (None, 0))(flat, rays)
     when = jax.vmap(lambda id_: frame_condition(flat, id_))(rays["id_warp"])
     context = penalty_context(flat, when, seen["coarse"])
     strained, _ = elastic.energy(ELASTIC, context)
     drift = background.mean_drift(BackgroundSpec(), context, static, static_ids)
-    error = sum(losses.mse(level["rgb"], colour) for level in seen.values())
+    error = sum(losses.mse(level["rgb"], color) for level in seen.values())
     loss = error + 1e-3 * strained + drift
     along = jax.vmap(jax.jacfwd(displacement(flat)), (0, None))
     bent = {name: jax.vmap(along)(at, when) for name, at in places.items()}

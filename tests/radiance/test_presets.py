@@ -95,7 +95,7 @@ def test_the_networks_read_their_input_again_where_the_papers_do(name, inputs, l
 
 @pytest.mark.slow  # but "nerf": tests/radiance/test_scene.py trains one
 @pytest.mark.parametrize("name", [f"{name}-small" for name in PAPERS[1:]])
-def test_a_small_preset_learns_more_than_one_colour(name):
+def test_a_small_preset_learns_more_than_one_color(name):
     capture = scenes.tiny_capture()
     spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=32)
     if name == "tineuvox-small":  # 27 times as many numbers to step
@@ -108,7 +108,7 @@ def test_a_small_preset_learns_more_than_one_colour(name):
         state, metrics = step(state, frames)
         errors.append(float(metrics["mse"]))
     assert np.isfinite(errors).all()
-    # Papers' on waves reach 0.85 to 0.88 of it; a picture of one colour has all of it.
+    # Papers' on waves reach 0.85 to 0.88 of it; a picture of one color has all of it.
     pictures = capture.images[capture.train] / 255
     variance = np.mean((pictures - pictures.mean((0, 1, 2))) ** 2)
     assert np.mean(errors[-40:]) < 0.9 * variance

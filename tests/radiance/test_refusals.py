@@ -60,7 +60,7 @@ def sample_pdf(edges, weights, count):
     ("call", "words"),
     [
         (lambda: TemplateSpec(density="sine"), "'sine'.*softplus"),
-        (lambda: TemplateSpec(colour_width=0), "colour_width=0"),
+        (lambda: TemplateSpec(color_width=0), "color_width=0"),
         (lambda: TemplateSpec(width=0), "width=0"),
         (lambda: TemplateSpec(depth=0, skips=()), "depth=0"),
         (lambda: TemplateSpec(density_bias=np.nan), "density_bias=nan must be finite"),

@@ -35,7 +35,7 @@ TINY_TEMPLATE = TemplateSpec(
     depth=2,
     width=16,
     skips=(),
-    colour_width=8,
+    color_width=8,
 )
 STATIC = RadianceScene(
     steps=40,
@@ -117,13 +117,13 @@ def test_a_static_level_is_the_plain_nerf(union, behind, asked, dtype):
     params = drawn.params(field.init, dtype)
     levels = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
     coarse, fine = jax.tree.map(np.asarray, levels)
-    assert fine.colour.dtype == dtype
+    assert fine.color.dtype == dtype
     even = np.linspace(0.5, 1.5, 8)
     expected = plain_nerf(params["template"]["coarse"], ray, even, behind)
     tolerance = {"float32": 3e-6, "float64": 1e-12}[dtype]
-    np.testing.assert_allclose(coarse.colour, expected, atol=tolerance)
+    np.testing.assert_allclose(coarse.color, expected, atol=tolerance)
     expected = plain_nerf(params["template"]["fine"], ray, fine.distances, behind)
-    np.testing.assert_allclose(fine.colour, expected, atol=tolerance)
+    np.testing.assert_allclose(fine.color, expected, atol=tolerance)
     assert len(fine.distances) == asked
     if behind is None:
         assert fine.distances[-1] == ray.far
@@ -137,20 +137,20 @@ def test_a_static_level_is_the_plain_nerf(union, behind, asked, dtype):
 
 
 def plain_nerf(net, ray, distances, behind):
-    """One ray of the two-layer field in NumPy, in float64; `behind` it a colour."""
+    """One ray of the two-layer field in NumPy, in float64; `behind` it a color."""
     origin, direction, _, far = networks.exact(tuple(ray))
-    colour, passing = np.zeros(3), 1.0
+    color, passing = np.zeros(3), 1.0
     view = networks.waves(TINY_TEMPLATE.direction, direction)
     ends = np.append(distances[1:], 1e10 if behind is None else far)
     for distance, end in zip(distances, ends, strict=True):
         point = origin + distance * direction
         heads = networks.heads(net.trunk, networks.waves(TINY_TEMPLATE.position, point))
         beside = np.concatenate([heads["bottleneck"], view])
-        shade = 1 / (1 + np.exp(-networks.heads(net.colour, beside)["colour"]))
+        shade = 1 / (1 + np.exp(-networks.heads(net.color, beside)["color"]))
         alpha = 1 - np.exp(-np.logaddexp(0, heads["density"][0]) * (end - distance))
-        colour = colour + passing * alpha * shade
+        color = color + passing * alpha * shade
         passing = passing * (1 - alpha)
-    return colour if behind is None else colour + passing * np.asarray(behind)
+    return color if behind is None else color + passing * np.asarray(behind)
 
 
 @pytest.mark.full
@@ -162,7 +162,7 @@ def test_blocks_of_rays_do_not_show_in_a_picture():
         rendered(dataclasses.replace(STATIC, sampling=plan)),
     )
     # Another tiling of the matrix products moves last bits
-    np.testing.assert_allclose(whole.colour, other.colour, atol=1e-6)
+    np.testing.assert_allclose(whole.color, other.color, atol=1e-6)
     np.testing.assert_allclose(whole.depth, other.depth, rtol=1e-5)
 
 
@@ -219,7 +219,7 @@ def test_memory_of_a_render_does_not_grow_with_the_picture():
 
     small, large = temporaries((40, 40)), temporaries((160, 160))
     pixels = 160 * 160 - 40 * 40
-    # Positions in and colour, alpha and depth out, each at most copied once
+    # Positions in and color, alpha and depth out, each at most copied once
     assert large - small <= pixels * 4 * (2 + 5) * 3, (small, large)
 
 
@@ -363,8 +363,8 @@ def test_a_medium_has_the_share_that_it_is_given(logit, without):
         moved = jax.tree.map(lambda leaf: leaf + 1, params["template"])
         changed = params if without else params | {"template": moved}
         return (
-            field.render_ray(params, ray, condition)[-1].colour,
-            other.render_ray(changed, ray, condition)[-1].colour,
+            field.render_ray(params, ray, condition)[-1].color,
+            other.render_ray(changed, ray, condition)[-1].color,
         )
 
     # Samples go where the changed coarse level sends them.

@@ -34,7 +34,7 @@ GRID = TemplateSpec(
     depth=1,
     width=8,
     skips=(),
-    colour_width=8,
+    color_width=8,
     density="exp",
     density_bias=-12.0,
 )
@@ -122,7 +122,7 @@ def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     whole = jax.jit(model.render, static_argnums=2)(params, view, SIZE, STEP)
     assert 0.1 < whole.alpha.mean() < 0.98
     most = skipping.SKIPPED_DEPTH + np.exp(-skipping.OPAQUE_DEPTH)
-    for name in ("colour", "alpha"):
+    for name in ("color", "alpha"):
         error = np.abs(getattr(skipped, name) - getattr(whole, name))
         assert np.sqrt(np.mean(error**2)) < most, name  # 39 dB
         if not spec.sampling.fine:  # else samples move where coarse weights change
@@ -135,10 +135,10 @@ def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     # Were nothing occupied, samples would be skipped that the picture is made of.
     nothing = jax.tree.map(jnp.zeros_like, occupied)
     bare = draw(params, nothing, view, SIZE, STEP)
-    assert np.abs(bare.colour - whole.colour).max() > 10 * most
+    assert np.abs(bare.color - whole.color).max() > 10 * most
 
 
-def test_space_is_surveyed_of_a_warp_that_colours_what_it_moves():
+def test_space_is_surveyed_of_a_warp_that_colors_what_it_moves():
     """The survey asks the template where the warp leads, and still gives it all."""
 
     def displace(_, point, condition):
@@ -166,7 +166,7 @@ def test_where_nothing_is_skipped_a_frame_is_the_full_quadrature(monkeypatch):
     drawn = jax.jit(model.surveyed.draw, static_argnums=3)(params, {}, view, SIZE, STEP)
     whole = jax.jit(model.render, static_argnums=2)(params, view, SIZE, STEP)
     assert 0.1 < whole.alpha.mean() < 0.98
-    np.testing.assert_allclose(drawn.colour, whole.colour, atol=1e-5)
+    np.testing.assert_allclose(drawn.color, whole.color, atol=1e-5)
     np.testing.assert_allclose(drawn.depth, whole.depth, atol=1e-4)
 
 
@@ -185,7 +185,7 @@ def test_a_frame_does_not_depend_on_how_it_is_cut(pixels, monkeypatch):
         draw = jax.jit(functools.partial(model.surveyed.draw), static_argnums=3)
         pictures.append(draw(params, occupied, view, pixels, STEP))
     limit = np.exp(-skipping.OPAQUE_DEPTH)
-    np.testing.assert_allclose(pictures[0].colour, pictures[1].colour, atol=limit)
+    np.testing.assert_allclose(pictures[0].color, pictures[1].color, atol=limit)
 
 
 def test_a_survey_finds_a_small_thing_whichever_cell_it_is_in():

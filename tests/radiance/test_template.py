@@ -17,7 +17,7 @@ from tests import drawn as values
 from tests import gradients
 from tests.oracles import networks
 
-SMALL = TemplateSpec(depth=4, width=16, skips=(2,), colour_width=8)
+SMALL = TemplateSpec(depth=4, width=16, skips=(2,), color_width=8)
 INPUTS, CONDITION = 7, 5
 
 
@@ -37,8 +37,8 @@ def by_hand(spec, params, features, condition, noise=0.0):
     raw = heads["density"][0] + spec.density_bias + noise
     density = np.logaddexp(raw, 0) if spec.density == "softplus" else max(raw, 0)
     beside = np.concatenate([heads["bottleneck"], condition])
-    colour = 1 / (1 + np.exp(-networks.heads(params.colour, beside)["colour"]))
-    return density, colour, hidden
+    color = 1 / (1 + np.exp(-networks.heads(params.color, beside)["color"]))
+    return density, color, hidden
 
 
 apply = jax.jit(template.apply, static_argnums=0)
@@ -52,7 +52,7 @@ apply = jax.jit(template.apply, static_argnums=0)
         pytest.param("softplus", 0, None, marks=pytest.mark.full),
     ],
 )
-def test_density_colour_and_features_layer_by_layer(density, condition, noise, dtype):
+def test_density_color_and_features_layer_by_layer(density, condition, noise, dtype):
     spec = dataclasses.replace(SMALL, density=density, density_bias=2.0)
     params, *inputs = drawn(dtype, condition=condition)
     added = None if noise is None else np.asarray(noise, dtype)
@@ -73,7 +73,7 @@ def test_gradients(float64):
 
     def total(params, features, condition):
         answer = template.apply(SMALL, params, features, condition)
-        return answer.density**2 + jnp.sum(answer.colour) + jnp.sum(answer.features**2)
+        return answer.density**2 + jnp.sum(answer.color) + jnp.sum(answer.features**2)
 
     error = gradients.directional_error(total, params, features, condition, step=1e-6)
     assert error < 1e-6
@@ -87,7 +87,7 @@ def test_density_does_not_depend_on_where_it_is_seen_from(dtype):
     answer = jax.tree.map(np.asarray, seen(params, features, views))
     assert np.all(answer.density == answer.density[0])
     assert np.all(answer.features == answer.features[0])
-    assert np.all(np.ptp(answer.colour, axis=0) > 1e-3)
+    assert np.all(np.ptp(answer.color, axis=0) > 1e-3)
 
 
 PLANES = dataclasses.replace(
@@ -205,7 +205,7 @@ def test_bfloat16_is_finite_and_near():
 
     def seen(params, *inputs):
         answer = template.apply(spec, params, *inputs)
-        return answer.density + jnp.sum(answer.colour), answer
+        return answer.density + jnp.sum(answer.color), answer
 
     slope = jax.jit(jax.value_and_grad(seen, has_aux=True))
     (_, answer), grads = slope(params, features, condition)
@@ -215,4 +215,4 @@ def test_bfloat16_is_finite_and_near():
     wide = jax.tree.map(lambda x: np.asarray(x, np.float64), (params, features))
     exact = by_hand(spec, *wide, np.asarray(condition, np.float64))
     np.testing.assert_allclose(np.asarray(answer.density, float), exact[0], rtol=0.05)
-    np.testing.assert_allclose(np.asarray(answer.colour, float), exact[1], atol=0.02)
+    np.testing.assert_allclose(np.asarray(answer.color, float), exact[1], atol=0.02)

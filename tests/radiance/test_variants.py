@@ -31,7 +31,7 @@ def drawn(seen, without=(), blended=False):
     draw = variants.without_effects(TINY_FIELD, metadata, without, blended)
     step = jnp.asarray(10, jnp.int32)
     picture = jax.jit(draw.render, static_argnums=2)(params, seen, SIZE, step)
-    return np.asarray(picture.colour)
+    return np.asarray(picture.color)
 
 
 @pytest.mark.full
@@ -43,7 +43,7 @@ def test_a_field_without_its_warp_is_the_template():
     model = nerf_scene.build(still, metadata)
     expected = jax.jit(model.render, static_argnums=2)(
         {"template": params["template"], "codes": codes}, view, SIZE, jnp.int32(10)
-    ).colour
+    ).color
     np.testing.assert_allclose(picture, expected, atol=1e-6)
     assert np.abs(picture - drawn(view)).max() > 1e-3
 

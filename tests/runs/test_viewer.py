@@ -91,7 +91,7 @@ def test_a_screen_draws_what_the_renderer_draws_and_without_effects(kind, monkey
     eye = eye_of(row)
     picture = whole(shown, state, eye, first, 1)
     renderer = evaluation.Renderer(run.model, CAPTURE.size)
-    expected = renderer(state, evaluation.view_of(CAPTURE, row)).colour
+    expected = renderer(state, evaluation.view_of(CAPTURE, row)).color
     difference = picture - 255.0 * expected.clip(0, 1)
     # 8 bits round by half; the pose went through a quaternion
     assert np.abs(difference).mean() < 0.6
@@ -307,7 +307,7 @@ def test_images_of_a_field_reach_full_size_however_slow_they_are(tmp_path, monke
         view = evaluation.resized(
             evaluation.view_of(CAPTURE, row), CAPTURE.size, (160, 120)
         )
-        expected = evaluation.Renderer(run.model, (160, 120))(state, view).colour
+        expected = evaluation.Renderer(run.model, (160, 120))(state, view).color
         # JPEG of quality 90
         assert np.abs(browser.picture - 255.0 * expected.clip(0, 1)).mean() < 4
 

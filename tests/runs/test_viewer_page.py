@@ -135,7 +135,7 @@ def rendered(each, moment, without=()):
     camera = interactive.camera_of(each.still_eye(), size)
     view = View(camera, np.float32(moment), np.int32(0))
     renderer = evaluation.Renderer(model, size)
-    return renderer(each.state, in_default_precision(view)).colour.clip(0, 1)
+    return renderer(each.state, in_default_precision(view)).color.clip(0, 1)
 
 
 def test_the_browser_renders_the_gaussians_at_every_time_and_without_effects(

@@ -123,17 +123,17 @@ def photograph(camera):
         np.stack([across.ravel(), down.ravel()], -1), camera.position.dtype
     )
 
-    def colour(pixel):
+    def color(pixel):
         grads = (pixel - camera.principal_point_px) / camera.focal_px
         direction = jnp.append(grads, 1) @ camera.camera_from_world
         distance = -camera.position[2] / direction[2]
         return texture(camera.position + distance * direction)
 
-    return jax.vmap(colour)(centres)
+    return jax.vmap(color)(centres)
 
 
 @pytest.mark.full
-def test_a_camera_is_found_from_colours_alone_and_wrong_minima_are_flagged(dtype):
+def test_a_camera_is_found_from_colors_alone_and_wrong_minima_are_flagged(dtype):
     """Eight starts as one batch: near ones come back, far ones are flagged."""
     truth = scene_camera(dtype, distorted=False)
     seen = jax.jit(photograph)(truth)

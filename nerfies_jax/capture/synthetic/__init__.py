@@ -1,4 +1,4 @@
-"""Analytic moving scenes with exact colour, depth, flow, masks and point tracks.
+"""Analytic moving scenes with exact color, depth, flow, masks and point tracks.
 
     capture, truth = synthetic.make(synthetic.PRESETS["default"])
 

@@ -31,7 +31,7 @@ class Schedule(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One frame as filmed; what is not colour belongs to the pixel's centre."""
+    """One frame as filmed; what is not color belongs to the pixel's centre."""
 
     image: Float[Array, "height width 3"]  # sRGB-coded in [0, 1], not rounded
     depth: Float[Array, "height width"]  # z-depth, scene units; 0 for nothing
@@ -78,7 +78,7 @@ def picture(
     def hit(direction):
         return trace.cast(spec, camera.position, direction, time, transient_shown)
 
-    def colour(hit, direction):
+    def color(hit, direction):
         # The sensor clips each sample: a highlight must not spill beyond its rim.
         return jnp.clip(trace.shade(spec, hit, direction, light_gain), 0, 1)
 
@@ -90,7 +90,7 @@ def picture(
         directions = jax.vmap(jax.vmap(lambda p: view_direction(camera, p)))(samples)
         hits = jax.vmap(jax.vmap(hit))(directions)
         lit = jax.tree.map(lambda leaf: leaf[:, :-1], hits)
-        light = jax.vmap(jax.vmap(colour))(lit, directions[:, :-1])
+        light = jax.vmap(jax.vmap(color))(lit, directions[:, :-1])
         centre = jax.tree.map(lambda leaf: leaf[:, -1], hits)
         return texture.srgb(jnp.mean(light, axis=1)), centre
 

@@ -133,7 +133,7 @@ def _film(spec, plan):
 def _points(spec, plan, images, hits, moving, seed):
     """Static points that the first camera sees, as structure from motion finds them.
 
-    A little off, with the colour of a pixel, evenly over its pictures.
+    A little off, with the color of a pixel, evenly over its pictures.
     """
     rng = np.random.default_rng([seed, 4])
     still = (hits.thing != trace.NOTHING) & ~moving

@@ -122,7 +122,7 @@ class SceneSpec:
     frames: int = 60  # instants over the capture, all seen by the first camera
     heldout_every: int = 4  # the second camera looks at every so-manieth instant
     skip_every: int | None = None  # the first camera's frames kept from training, too
-    supersampling: int = 2  # n x n rays for each pixel's colour
+    supersampling: int = 2  # n x n rays for each pixel's color
     points: int = 2500  # static surface points, as from structure from motion
     point_noise: float = 0.0005  # root mean square of each coordinate, scene units
     tracks: int = 384  # true tracks of moving surface points

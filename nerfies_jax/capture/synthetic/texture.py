@@ -23,9 +23,9 @@ EDGE = 6.0  # steepness of a checker edge: it takes about a tenth of a square
 
 @dataclasses.dataclass(frozen=True)
 class Texture:
-    """Two colours mixed by checker, stripes and noise, with blots of a third.
+    """Two colors mixed by checker, stripes and noise, with blots of a third.
 
-    Colours are sRGB-coded in [0, 1]. The shares say how strongly each pattern mixes.
+    Colors are sRGB-coded in [0, 1]. The shares say how strongly each pattern mixes.
     """
 
     dark: Vector = (0.2, 0.2, 0.25)

@@ -112,22 +112,22 @@ def shade(
     """Linear light of one ray, not clipped: Lambert, ambient, and any highlight."""
     dtype = direction.dtype
     towards_light = jnp.asarray(motion.unit_axis(spec.light), dtype)
-    base = surface_colour(spec, jnp.maximum(hit.thing, 0), hit.material)
+    base = surface_color(spec, jnp.maximum(hit.thing, 0), hit.material)
     lambert = jnp.maximum(jnp.sum(hit.normal * towards_light), 0)
     # More of the ambient light comes from above: it models the shaded side.
     sky = 0.75 + 0.25 * hit.normal[1]
-    colour = base * (spec.ambient * sky + (1 - spec.ambient) * lambert)
+    color = base * (spec.ambient * sky + (1 - spec.ambient) * lambert)
     if spec.specular is not None:
         shines = hit.thing == spec.id_of(spec.specular.thing)
         half = towards_light - direction / jnp.sqrt(jnp.sum(direction**2))
         cosine = jnp.sum(hit.normal * half) / jnp.sqrt(jnp.sum(half**2))
         lobe = jnp.maximum(cosine, 0) ** spec.specular.sharpness
-        colour = colour + jnp.where(shines, spec.specular.strength * lobe, 0)
+        color = color + jnp.where(shines, spec.specular.strength * lobe, 0)
     behind = jnp.asarray(linear_from_srgb(np.asarray(spec.background)), dtype)
-    return light_gain * jnp.where(hit.thing == NOTHING, behind, colour)
+    return light_gain * jnp.where(hit.thing == NOTHING, behind, color)
 
 
-def surface_colour(
+def surface_color(
     spec: SceneSpec, thing: Int[Array, ""], material: Float[Array, "3"]
 ) -> Float[Array, "3"]:
     """Linear albedo of one material point: the texture without any light."""

@@ -118,7 +118,7 @@ def pixel(alphas, values, spec):
 
 
 def pixel_and_slopes(alphas, values, spec):
-    """Colour and what is left, and slopes in `alphas` and `values`; one or two rows."""
+    """Color and what is left, and slopes in `alphas` and `values`; one or two rows."""
     hidden = (0, max(0, 2 - len(alphas)))  # what is not drawn behind a single one
     drawn, slopes = _pixel_and_slopes(
         np.pad(alphas, hidden), np.pad(values, hidden), spec
@@ -129,8 +129,8 @@ def pixel_and_slopes(alphas, values, spec):
 @functools.partial(jax.jit, static_argnums=2)
 def _pixel_and_slopes(alphas, values, spec):
     def loss(alphas, values):
-        colour, left = pixel(alphas, values, spec)
-        return colour + left / 2, (colour, left)
+        color, left = pixel(alphas, values, spec)
+        return color + left / 2, (color, left)
 
     slopes, drawn = jax.grad(loss, (0, 1), has_aux=True)(alphas, values)
     return drawn, slopes
@@ -142,9 +142,9 @@ def test_an_alpha_jumps_at_the_cut_and_nowhere_else(dtype):
     values = np.asarray([1.0], dtype)
     for share, drawn in ((1 - ulps, False), (1 + ulps, True)):
         alpha = np.asarray([share / 255], dtype)
-        (colour, left), (slope, _) = pixel_and_slopes(alpha, values, ONE_PIXEL)
+        (color, left), (slope, _) = pixel_and_slopes(alpha, values, ONE_PIXEL)
         expected = float(alpha[0]) if drawn else 0
-        assert abs(colour - expected) <= ulps / 255
+        assert abs(color - expected) <= ulps / 255
         assert abs(left - (1 - expected)) <= ulps
         assert abs(slope[0] - (0.5 if drawn else 0)) < 4 * ulps
 
@@ -162,9 +162,9 @@ def test_an_alpha_stays_at_its_clamp_and_one_is_finite(spec, dtype):
     through = spec.clamp_gradient == "through"
     for alpha in (0.99 * (1 - ulps), 0.99 * (1 + ulps), 1 - ulps, 1.0):
         alphas = np.asarray([alpha, 0.5], dtype)
-        (colour, left), slopes = pixel_and_slopes(alphas, values, spec)
+        (color, left), slopes = pixel_and_slopes(alphas, values, spec)
         drawn = min(alpha, 0.99)
-        assert abs(colour - (drawn + (1 - drawn) / 8)) < 4 * ulps
+        assert abs(color - (drawn + (1 - drawn) / 8)) < 4 * ulps
         assert abs(left - (1 - drawn) / 2) < 4 * ulps
         # 1 - 0.25/2 - 1/4 of what lies behind
         expected = 0.625 if through or alpha < 0.99 else 0
@@ -181,8 +181,8 @@ def test_a_pixel_is_done_on_the_side_of_the_stop_its_transmittance_is_on(dtype):
         # 0.98 * 0.98 stay clear of the clamp: (1 - 0.98) (1 - a) = stop * share.
         alpha = 1 - ONE_PIXEL.transmittance_threshold * share / 0.02
         alphas = np.asarray([0.98, alpha], dtype)
-        (colour, left), slopes = pixel_and_slopes(alphas, values, ONE_PIXEL)
-        assert abs(colour - (0.02 * alpha if drawn else 0)) < ulps
+        (color, left), slopes = pixel_and_slopes(alphas, values, ONE_PIXEL)
+        assert abs(color - (0.02 * alpha if drawn else 0)) < ulps
         assert abs(left - (1e-3 if drawn else 0.02)) < ulps
         assert bool(slopes[0][1] != 0) is drawn
 
