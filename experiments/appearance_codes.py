@@ -96,7 +96,7 @@ def compare_exposure(film, steps, seed):
         renderer = evaluation.Renderer(model, capture.size)
         drawn[name] = evaluation.score(renderer, state, capture, rows).color
         figures[f"{name}: seconds"] = seconds
-        key = "without codes" if name == "without codes" else "codes of neighbours"
+        key = "without codes" if name == "without codes" else "codes of neighbors"
         figures[f"{key}: PSNR (dB)"] = _right_psnr(drawn[name], capture.images[rows])
     halves = held_out_codes.score(*model.spec, state, capture, rows)
     figures["codes fitted to the left half: PSNR (dB)"] = float(np.mean(halves.psnr))

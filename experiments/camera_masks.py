@@ -7,7 +7,7 @@ The built-in scene is filmed with a cube so large that it fills much of the pict
 its pictures go to `experiments.prepare` without their cameras: in one pass, in two
 (what moves is found with the first cameras and left out for the second), and with the
 true masks. Positions are compared with the truth after the best similarity, as shares
-of the path's extent; turns are those between neighbouring frames. The hand that holds
+of the path's extent; turns are those between neighboring frames. The hand that holds
 the camera is drawn by the seed.
 """
 

@@ -33,7 +33,7 @@ class InitSpec:
     min_points: int = 100
     extra_random: int | None = 0
     opacity: float = 0.1
-    scale: float = 1.0  # over the distance to the nearest neighbours
+    scale: float = 1.0  # over the distance to the nearest neighbors
     max_scale: float = 0.03  # first scale, over the distance to the nearest camera
     source: str = "auto"
 
@@ -155,7 +155,7 @@ def _random_points(rng, capture, count, span):
 def clamp_scales(rows: Splats, capture: Capture, max_scale: float) -> Splats:
     """The rows, none wider than a share of its distance to the nearest camera.
 
-    A lone point gets the distance to its neighbours for a scale, and close to a camera
+    A lone point gets the distance to its neighbors for a scale, and close to a camera
     it covers the picture: the first steps on a capture with such points took 2 s each.
     """
     cameras = scipy.spatial.cKDTree(capture.cameras.position[capture.train])

@@ -11,7 +11,7 @@ from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTra
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import in_default_precision
 
-NEIGHBOURS = 8  # Gaussians that carry a point
+NEIGHBORS = 8  # Gaussians that carry a point
 LEAST_OPACITY = 0.05  # of a Gaussian that can carry one; fainter ones are not seen
 
 
@@ -25,12 +25,12 @@ def follow(
 ) -> PointTracks | None:
     """Points of the start at all other moments, carried by the Gaussians around them.
 
-    A point moves as the `NEIGHBOURS` nearest Gaussians that can be seen do on average,
-    where they are at the start; `neighbour_weights` says how much each counts. This
+    A point moves as the `NEIGHBORS` nearest Gaussians that can be seen do on average,
+    where they are at the start; `neighbor_weights` says how much each counts. This
     tells where what is drawn at a point goes. It cannot tell whether these Gaussians
     stand for the point: beside a silhouette some belong to what is behind it, and where
     Gaussians fade in and out instead of moving, a point stays. The average of a turn is
-    exact at the mean of the neighbours, and off by the turn of the way from there.
+    exact at the mean of the neighbors, and off by the turn of the way from there.
     Every point is carried by something, so none is lost; between Gaussians there is no
     Jacobian, so no strain. `known.start_points` [tracks, 3] and the result are in scene
     units, `state` is that of `scene.build`. None without motion or without points.
@@ -100,21 +100,21 @@ def carried(
     if not len(rows):
         return path
     tree = scipy.spatial.cKDTree(means[start, rows])
-    count = min(NEIGHBOURS, len(rows))
+    count = min(NEIGHBORS, len(rows))
     distance, nearest = tree.query(points, np.arange(1, count + 1))
     nearest = rows[nearest]
-    weight = neighbour_weights(distance, opacity[nearest])
+    weight = neighbor_weights(distance, opacity[nearest])
     for moment, mean in enumerate(means):
         moved = mean[nearest].astype(float) - means[start][nearest]
         path[:, moment] += np.einsum("pk,pkd->pd", weight, moved)
     return path
 
 
-def neighbour_weights(distance: np.ndarray, opacity: np.ndarray) -> np.ndarray:
-    """Weights [points, neighbours] that sum to one, nearest neighbour first.
+def neighbor_weights(distance: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """Weights [points, neighbors] that sum to one, nearest neighbor first.
 
     Opacity times a Gaussian of the distance, as wide as half the way to the farthest
-    of the neighbours: not their own extents, which are thin across a surface and would
+    of the neighbors: not their own extents, which are thin across a surface and would
     leave a point beside it to a single one.
     """
     # Where all lie at the point itself, no distance differs, whatever the width.

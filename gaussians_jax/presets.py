@@ -17,7 +17,7 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
-from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.neighbors import NeighborSpec
 from gaussians_jax.effects.node_motion import MaskSpec, NodeMotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
@@ -118,14 +118,14 @@ SONATA = SplatScene(
         opacity=1e-4,
         warm_up=3000,
     ),
-    neighbours=NeighbourSpec(start=3000),
+    neighbors=NeighborSpec(start=3000),
     spectral=SpectralSpec(),
     depth=DepthSpec(),
 )
 
 # E-D3DGS (Bae et al. 2024, arXiv:2404.03613), its code's numbers for HyperNeRF's
 # chicken: two views a step, no D-SSIM, growth to the end, no opacity reset but a price
-# on opacity. The two views are any two, where its are neighbours, and the rates of its
+# on opacity. The two views are any two, where its are neighbors, and the rates of its
 # networks do not grow with the scene, but all do with the root of the views, which
 # there they do not. Codes and heads start otherwise (`EmbeddingMotionSpec`).
 E_D3DGS = SplatScene(
@@ -134,7 +134,7 @@ E_D3DGS = SplatScene(
     dssim_weight=0.0,
     densification=DefaultStrategySpec(refine_stop_iter=60_000, reset_every=6_000_000),
     motion=EmbeddingMotionSpec(),
-    neighbours=NeighbourSpec(),
+    neighbors=NeighborSpec(),
 )
 
 # MoBa-GS: growth up to half of the run, then alternating updates, and from three
@@ -153,10 +153,10 @@ MOBA = SplatScene(
     acceleration=AccelerationSpec(start=3000),
 )
 
-# DynMF: ten trajectories, sparse coefficients that are alike among neighbours. What the
+# DynMF: ten trajectories, sparse coefficients that are alike among neighbors. What the
 # paper leaves open is as in 3D-GS and Deformable 3DGS.
 DYNMF = SplatScene(
-    steps=30_000, motion=TimeBasisSpec(), neighbours=NeighbourSpec(start=3000)
+    steps=30_000, motion=TimeBasisSpec(), neighbors=NeighborSpec(start=3000)
 )
 
 # Spacetime Gaussians: cubic motion, opacity over time. Not here: features and a small
@@ -232,7 +232,7 @@ D_MISO = SplatScene(
 # 0.005 on): ten Gaussians of an anchor, two views a step, a fifth of the loss half of
 # 1 - SSIM, one color from everywhere, growth from step 9000 to 50,000, no resets. It
 # rounds from step 10,000 on, where bits cost from 15,000; here both begin together. Its
-# price on features that differ between neighbours (0.01), a codec for the places of
+# price on features that differ between neighbors (0.01), a codec for the places of
 # anchors and a rate for each part of what an anchor makes are not here. All rates are
 # times the root of the views, which there they are not.
 ADC_GS = SplatScene(

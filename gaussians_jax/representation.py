@@ -65,7 +65,7 @@ ADVISED = ("splats-static", "splats-tracked", "splats-deformable")
 # 25.1, 24.6 and 25.9.
 UNTRACKED = "spacetime"
 # Of a scene's spec: the motion, and what is nothing without one.
-MOTION_PARTS = ("motion", "neighbours", *OF_MOTION)
+MOTION_PARTS = ("motion", "neighbors", *OF_MOTION)
 
 
 def growth(spec: Any, state: TrainState) -> float:

@@ -13,7 +13,7 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import SMALL_BASIS_MOTION
 from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
-from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.neighbors import NeighborSpec
 from gaussians_jax.effects.node_motion import SMALL_NODE_MOTION, MaskSpec
 from gaussians_jax.effects.plane_motion import SMALL_PLANE_MOTION
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
@@ -106,7 +106,7 @@ SMALL_TRACKED = dataclasses.replace(
 SMALL_DYNMF = dataclasses.replace(
     SMALL_FROM_TRACKS,
     motion=dataclasses.replace(SMALL_TIME_BASIS, warm_up=600),
-    neighbours=NeighbourSpec(start=600),
+    neighbors=NeighborSpec(start=600),
 )
 SMALL_SPACETIME = dataclasses.replace(SMALL_FROM_TRACKS, motion=PolynomialMotionSpec())
 SMALL_SPLINE = dataclasses.replace(SMALL_FROM_TRACKS, motion=SplineMotionSpec())
@@ -124,7 +124,7 @@ SMALL_E_D3DGS = dataclasses.replace(
         learning_rate_end=1e-5,
         embedding_rate=1e-3,
     ),
-    neighbours=NeighbourSpec(start=600),
+    neighbors=NeighborSpec(start=600),
 )
 # Built-in scene, 600 steps of one view each, one seed (held-out PSNR, and where it
 # moves): 28.69 / 24.54, without the rigid term 28.59 / 24.49, with a weight of 1 28.28
@@ -216,7 +216,7 @@ SMALL_SONATA = dataclasses.replace(
         warm_up=600,
         embedding_rate=1e-3,
     ),
-    neighbours=NeighbourSpec(start=600),
+    neighbors=NeighborSpec(start=600),
     spectral=SpectralSpec(),
     depth=DepthSpec(),
 )

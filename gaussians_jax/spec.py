@@ -17,7 +17,7 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_flow,
     motion_growth,
-    neighbours,
+    neighbors,
     node_motion,
     plane_motion,
     polynomial_motion,
@@ -39,7 +39,7 @@ from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
-from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.neighbors import NeighborSpec
 from gaussians_jax.effects.node_motion import NodeMotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
@@ -72,7 +72,7 @@ AnyMotion = (
     | NodeMotionSpec
     | AnchorMotionSpec
 )
-# Motions with a vector for each Gaussian that neighbours may be kept alike in.
+# Motions with a vector for each Gaussian that neighbors may be kept alike in.
 EMBEDDED = {
     KanMotionSpec: kan_motion.NAME,
     TimeBasisSpec: time_basis.NAME,
@@ -117,7 +117,7 @@ class SplatScene:
     carried: CarriedSpec | None = None  # what is drawn of each row; None: the row
     start: StartSpec = StartSpec()
     acceleration: AccelerationSpec | None = None
-    neighbours: NeighbourSpec | None = None
+    neighbors: NeighborSpec | None = None
     motion_growth: MotionGrowthSpec | None = None
     spectral: SpectralSpec | None = None
     depth: DepthSpec | None = None
@@ -204,7 +204,7 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "none: their turns would train nothing; leave it out as well "
             "(alternation=none)"
         )
-    if spec.neighbours is not None:
+    if spec.neighbors is not None:
         _embedded(motion)
     resting = isinstance(motion, AnchorMotionSpec) and not motion.moves
     if resting and spec.start.motion == "tracks":
@@ -276,7 +276,7 @@ def _refuse_late(spec, still):
     starts = {"motion.warm_up": still}
     parts = {
         "motion.rate": getattr(spec.motion, "rate", None),
-        "neighbours": spec.neighbours,
+        "neighbors": spec.neighbors,
         "acceleration": spec.acceleration,
         "flow": None if spec.start.motion == "tracks" else spec.flow,
     }
@@ -291,11 +291,11 @@ def _refuse_late(spec, still):
 
 
 def _embedded(motion):
-    """What of a motion its neighbours keep alike; ValueError where it has no such."""
+    """What of a motion its neighbors keep alike; ValueError where it has no such."""
     if type(motion) not in EMBEDDED:
         raise ValueError(
-            "neighbours keep embeddings or coefficients alike, and this motion has "
-            "none; leave them out (neighbours=none), or choose a preset with a KAN "
+            "neighbors keep embeddings or coefficients alike, and this motion has "
+            "none; leave them out (neighbors=none), or choose a preset with a KAN "
             "motion or a time basis"
         )
     return EMBEDDED[type(motion)]
@@ -360,9 +360,9 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
             acceleration.effect(spec.acceleration, metadata.extent, metadata.moments)
         )
     # A trained scene is drawn without its motion as well.
-    if spec.neighbours is not None and motion is not None:
+    if spec.neighbors is not None and motion is not None:
         of = _embedded(spec.motion)
-        effects.append(neighbours.effect(spec.neighbours, metadata.extent, of))
+        effects.append(neighbors.effect(spec.neighbors, metadata.extent, of))
     if spec.motion_growth is not None:
         effects.append(motion_growth.effect(spec.motion_growth, metadata.extent))
     if spec.spectral is not None:

@@ -209,7 +209,7 @@ def from_points(
     `points` [n, 3] in scene units and `colors` [n, 3] in [0, 1]. The standard
     deviation is `scale` times the root mean square distance to the three nearest points
     that lie elsewhere (Kerbl et al. 2023, section 5.1, says the mean distance; their
-    code counts a duplicate as a neighbour at distance zero and floors the result at
+    code counts a duplicate as a neighbor at distance zero and floors the result at
     3e-4 whatever the unit). With two or three distinct points it uses those there are;
     where there is one, `lone_scale` is that distance.
     """
@@ -233,7 +233,7 @@ def from_points(
             )
     if not 0 < scale < math.inf:
         raise ValueError(f"the first scale must be positive and finite, got {scale}")
-    distance = neighbour_distance(points, lone_scale)
+    distance = neighbor_distance(points, lone_scale)
     log_scale = np.clip(np.log(scale * distance), *LOG_SCALE_RANGE)
     count, rest = len(points), (degree + 1) ** 2 - 1
     return Splats(
@@ -246,7 +246,7 @@ def from_points(
     )
 
 
-def neighbour_distance(
+def neighbor_distance(
     points: Float[np.ndarray, "points 3"], lone_scale: float
 ) -> Float[np.ndarray, " points"]:
     """Root mean square distance to the three nearest points that lie elsewhere.
@@ -255,11 +255,11 @@ def neighbour_distance(
     """
     # Distinct in float32, the precision they are trained in.
     distinct, place = np.unique(points.astype(np.float32), axis=0, return_inverse=True)
-    neighbours = min(3, len(distinct) - 1)
-    if neighbours == 0:
+    neighbors = min(3, len(distinct) - 1)
+    if neighbors == 0:
         return np.full(len(points), float(lone_scale))
     tree = scipy.spatial.cKDTree(distinct.astype(np.float64))
-    distance, _ = tree.query(tree.data, k=neighbours + 1)
+    distance, _ = tree.query(tree.data, k=neighbors + 1)
     return np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1))[place.reshape(-1)]
 
 

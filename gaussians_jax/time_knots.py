@@ -93,7 +93,7 @@ def at(
     "cubic" (Catmull-Rom) has a continuous velocity as well, and its error falls as the
     third power. Both are exact at the knots, to rounding. Scales are interpolated in
     the logarithm and stay positive. Quaternions are interpolated as vectors of one
-    sign and normalised: neighbours are at most 90 degrees apart as vectors, so what
+    sign and normalised: neighbors are at most 90 degrees apart as vectors, so what
     lies between them is never short.
     """
     if not knots.track.mean.shape[1]:
@@ -145,7 +145,7 @@ def _window(
     if interpolation == "linear":
         return left, [1 - u, u]
     before, here, there, after = catmull_rom(u)
-    # In the first and the last interval the missing neighbour is the continuation of
+    # In the first and the last interval the missing neighbor is the continuation of
     # the parabola through three knots, 3a - 3b + c: its weight goes to those three.
     first, last = left == 0, left == count - 2
     start = jnp.clip(left - 1, 0, count - 4)

@@ -51,7 +51,7 @@ LEANS_ON = {
     "temporal_opacity": ("motion",),
     "alternation": ("motion",),
     "acceleration": ("motion",),
-    "neighbours": ("motion",),
+    "neighbors": ("motion",),
     "motion_growth": ("motion", "densification"),
     "flow": ("motion",),
 }
@@ -181,7 +181,7 @@ def tiny_splats(name):
         densification=shrunk(spec.densification, cap_max=256),
         motion=motion,
         acceleration=shrunk(spec.acceleration, samples=16),
-        neighbours=shrunk(spec.neighbours, count=3),
+        neighbors=shrunk(spec.neighbors, count=3),
     )
 
 

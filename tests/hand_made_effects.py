@@ -18,7 +18,7 @@ from gaussians_jax.effects import (
     motion_basis,
     motion_flow,
     motion_growth,
-    neighbours,
+    neighbors,
     node_motion,
     plane_motion,
     polynomial_motion,
@@ -63,7 +63,7 @@ SPLAT_MODULES = {
     "temporal_opacity": temporal_opacity,
     "carried": carried,
     "acceleration": acceleration,
-    "neighbours": neighbours,
+    "neighbors": neighbors,
     "motion_growth": motion_growth,
     "spectral": spectral,
     "depth": depth,
@@ -144,8 +144,8 @@ def of_splats(spec, metadata):
         effects.append(carried.effect(spec.carried, spec.steps, still))
     if spec.acceleration is not None:
         effects.append(acceleration.effect(spec.acceleration, extent, frames))
-    if spec.neighbours is not None:
-        effects.append(neighbours.effect(spec.neighbours, extent, effects[0].name))
+    if spec.neighbors is not None:
+        effects.append(neighbors.effect(spec.neighbors, extent, effects[0].name))
     if spec.motion_growth is not None:
         effects.append(motion_growth.effect(spec.motion_growth, extent))
     if spec.spectral is not None:

@@ -12,7 +12,7 @@ from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
-from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.neighbors import NeighborSpec
 from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.spec import SplatScene
@@ -57,7 +57,7 @@ TINY_SONATA = dataclasses.replace(
     motion=KanMotionSpec(
         embedding=4, time_code=3, hidden=(6,), kernels=3, warm_up=3, learning_rate=1e-2
     ),
-    neighbours=NeighbourSpec(count=4, start=3),
+    neighbors=NeighborSpec(count=4, start=3),
     spectral=SpectralSpec(),
     depth=DepthSpec(),
 )

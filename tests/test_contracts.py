@@ -52,7 +52,7 @@ EXCUSED = {
         ["rays.across_ray", "codes.check_ids", "splats.rows_to_write"], "host"
     ),
     "losses.check_geman_mcclure": "settings",
-    **dict.fromkeys(["splats.from_points", "splats.neighbour_distance"], "host"),
+    **dict.fromkeys(["splats.from_points", "splats.neighbor_distance"], "host"),
     **dict.fromkeys(["splats.random_in_views", "splats.scene_extent"], "host"),
     **dict.fromkeys(["splats.capacity_for", "harmonics.degree_of"], "sizes"),
     **dict.fromkeys(["kan.spacing", "kan.width", "kan.centres"], "settings"),

@@ -209,8 +209,8 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
             nets["carried"] = mlp.init(turns, key)
         if spec.spectral is not None:
             nets["spectral"] = spectral.init(spec.spectral)
-        if spec.neighbours is not None:
-            states.add("neighbours")
+        if spec.neighbors is not None:
+            states.add("neighbors")
         if spec.motion_growth is not None:
             states.add("motion_growth")
         assert set(state.params.rows) == rows

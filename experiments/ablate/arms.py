@@ -152,7 +152,7 @@ SONATA = Suite(
             "bspline": Arm("sonata-small", ("motion.network=bspline",)),
             "no-frequency": Arm("sonata-small", ("spectral=none",)),
             "no-depth": Arm("sonata-small", ("depth=none",), needs="depths"),
-            "no-neighbours": Arm("sonata-small", ("neighbours=none",)),
+            "no-neighbors": Arm("sonata-small", ("neighbors=none",)),
             "deformable": Arm("splats-deformable-small"),
             "static": Arm("splats-static-small"),
         }
@@ -216,10 +216,10 @@ SONATA = Suite(
             ("psnr", "depth_median", "moving_depth_median"),
         ),
         Claim(
-            "Alike embeddings of neighbours make motion coherent (not ablated in the "
+            "Alike embeddings of neighbors make motion coherent (not ablated in the "
             "paper)",
             "full",
-            "no-neighbours",
+            "no-neighbors",
             TRACKED,
         ),
     ),

@@ -12,7 +12,7 @@ COLUMNS = (
     ("SSIM", "heldout.ssim", 3),
     ("moving", "heldout.moving_psnr", 2),
     ("still", "heldout.still_psnr", 2),
-    ("neighbours", "floor.neighbours", 2),
+    ("neighbors", "floor.neighbors", 2),
     ("time average", "floor.still", 2),
     ("EPE", "tracks.epe", 4),
     ("EPE at rest", "tracks.still_epe", 4),
@@ -23,7 +23,7 @@ COLUMNS = (
 )
 READING = """\
 PSNR (dB) and SSIM of held-out pictures as they were filmed; *moving* and *still* are
-the PSNR of pixels that move by themselves and of the others. *neighbours* is the PSNR
+the PSNR of pixels that move by themselves and of the others. *neighbors* is the PSNR
 of the mean of the two training pictures before and after, *time average* that of the
 run's own renders averaged over time: a run that does not stand above both did nothing.
 *EPE* is how far points that are followed are from where they truly are, in scene units,

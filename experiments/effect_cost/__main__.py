@@ -70,7 +70,7 @@ NEEDS = {
     "mask": ("warp",),
     "alternation": ("motion",),
     "acceleration": ("motion",),
-    "neighbours": ("motion",),
+    "neighbors": ("motion",),
     "motion_growth": ("motion",),
     "flow": ("motion",),
 }

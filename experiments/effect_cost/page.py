@@ -63,7 +63,7 @@ depth loss ({depth:.2f}). A warp makes a step of a field {warp:.2f} times as lon
 with an elastic penalty on 4 samples of a ray, asked at one step of five, it is
 {elastic:.2f}. Motion takes a step of splats to {mlp:.2f} (MLP), {kan:.2f} (KAN) or
 {basis:.2f} (basis) of a still one, the acceleration penalty to {acceleration:.2f}. NSFF
-is the dearest of fields ({flow:.2f}): it traces each ray at its neighbours' times, too.
+is the dearest of fields ({flow:.2f}): it traces each ray at its neighbors' times, too.
 Annealing, alternation and motion-guided growth cost a step nothing that can be
 measured: they change what is learnt and when."""
 QUOTED = {

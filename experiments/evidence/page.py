@@ -17,7 +17,7 @@ them to one part in a hundred."""
 FLOWS = """\
 ## Ways to find flow
 
-The same pairs of neighbouring frames of the built-in scenes, pictures brought to one
+The same pairs of neighboring frames of the built-in scenes, pictures brought to one
 mean and spread, as they are and enlarged first; medians where both frames show the
 point, and the share of these pixels that are more than a pixel off. Seconds of the
 processor are for one pair, one way."""

@@ -22,7 +22,7 @@ from nerfies_jax.runs import run_folder
 from nerfies_jax.runs.platform import CACHE
 
 FLOW_SCENES = ("default", "fast", "articulated", "exposure")
-PAIRS = 5  # of neighbours in each of these, evenly over the film
+PAIRS = 5  # of neighbors in each of these, evenly over the film
 TIMES = (1, 2)  # how many times larger the pictures are made first
 
 
@@ -80,7 +80,7 @@ def _pairs(name, seed):
         row = views.row[frame]
         flow = capture.flow
         if flow.next_row[row] != views.row[frame + 1]:
-            raise RuntimeError(f"{name}: frames {frame} and after are no neighbours")
+            raise RuntimeError(f"{name}: frames {frame} and after are no neighbors")
         known = flow.forward[row], flow.forward_seen[row], capture.moving[row]
         yield pictures[frame : frame + 2], known
 

@@ -15,7 +15,7 @@ TOP = 2.0 ** (BANDS - 1)  # of the last band, whose slopes and bends are the lar
 
 
 def _sides(edge):
-    """The neighbours of an edge in both precisions, and itself."""
+    """The neighbors of an edge in both precisions, and itself."""
     places = [edge]
     for kind in (np.float32, np.float64):
         places += [float(np.nextafter(kind(edge), kind(to))) for to in (-9, 9)]

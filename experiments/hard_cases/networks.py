@@ -49,7 +49,7 @@ def _exact_edge(x, first=0):
 
 
 def _sides(edge):
-    """The neighbours of an edge in both precisions, and itself."""
+    """The neighbors of an edge in both precisions, and itself."""
     places = [edge]
     for kind in (np.float32, np.float64):
         places += [float(np.nextafter(kind(edge), kind(to))) for to in (-9e9, 9e9)]

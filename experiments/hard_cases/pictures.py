@@ -146,7 +146,7 @@ def _bands_textbook(pixels):
 HAAR = Case(
     name="wavelet bands of low contrast",
     breaks="sums of pixels round before they are subtracted",
-    formula="differences of neighbours first",
+    formula="differences of neighbors first",
     axis="contrast at level 1000.3",
     at=_SOFT,
     inputs=1000.3 + _SOFT[:, None] * _QUAD,

@@ -180,7 +180,7 @@ def _exact_thinned(x):
 
 
 def _sides(edge):
-    """Below and above an edge, by its neighbours in both precisions and by 1e-6."""
+    """Below and above an edge, by its neighbors in both precisions and by 1e-6."""
     places = [edge * (1 - 1e-6), edge, edge * (1 + 1e-6)]
     for kind in (np.float32, np.float64):
         places += [float(np.nextafter(kind(edge), kind(to))) for to in (-9, 9)]

@@ -62,7 +62,7 @@ def cloth(rng, points, times, waves=8):
 
 
 def wiggles(rng, points, times):
-    """Every point on an ellipse of its own, unlike its neighbours'."""
+    """Every point on an ellipse of its own, unlike its neighbors'."""
     rest = rng.uniform(-1, 1, (points, 3))
     pace = 2 * np.pi * rng.uniform(0.5, 2.5, (points, 1))
     phase = pace * times + rng.uniform(0, 2 * np.pi, (points, 1))

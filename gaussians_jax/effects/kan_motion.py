@@ -3,7 +3,7 @@
 "Sonata", equation 11: a learnt embedding of each Gaussian and a learnt code of the time
 go through an RBF-KAN to residuals of position, scale and rotation. Where the paper is
 silent this follows Bae et al. 2024, "Per-Gaussian embedding-based deformation",
-arXiv:2404.03613 (E-D3DGS), whose inputs, neighbours and constants it shares, and where
+arXiv:2404.03613 (E-D3DGS), whose inputs, neighbors and constants it shares, and where
 `coarser` is set its two networks, a coarse and a fine one (`motion_codes`).
 
 The first layer of the network is a sum over its inputs. What the embeddings add to it
@@ -50,7 +50,7 @@ class KanMotionSpec:
     time_code: int = 256
     frames_per_code: int = 2  # a table of ceil(frames / 2) codes
     # Standard deviation of the first embeddings and time codes. E-D3DGS starts from
-    # zero embeddings, which a penalty on differing neighbours never tells apart.
+    # zero embeddings, which a penalty on differing neighbors never tells apart.
     spread: float = 0.1
     # First embeddings as random waves over space, so many radians from the middle of
     # the Gaussians to their root mean square distance; None draws each by itself.

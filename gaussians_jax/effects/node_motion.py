@@ -20,7 +20,7 @@ What is not as in SC-GS: turns are rotation vectors, where it has quaternions; w
 nodes are near is found when rows change and not in every step; the rigid term is a mean
 and not a sum, over a fixed number of links and not those within a radius, and compares
 any two moments, in the code two within a twentieth of the film; a node's kernel has no
-weight of its own, as it has in the code, and starts as wide as neighbours are far, not
+weight of its own, as it has in the code, and starts as wide as neighbors are far, not
 as a tenth of the scene; one turn of a node moves and turns what it carries, where the
 code has two; and nodes start among the first Gaussians, or from tracks half on what
 moves and half on what is at rest, where the paper first trains them as Gaussians of
@@ -194,13 +194,13 @@ def openness(mask: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
 
 
 def placed(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes:
-    """The nodes at these places, each as wide as its neighbours are far; host side.
+    """The nodes at these places, each as wide as its neighbors are far; host side.
 
     Fewer places than nodes are taken in turn: nodes that coincide share the influence.
     """
     count, kind = len(nodes.position), nodes.position.dtype
     everywhere = position[np.arange(count) % len(position)]
-    radius = splats.neighbour_distance(everywhere, 1.0)
+    radius = splats.neighbor_distance(everywhere, 1.0)
     return nodes._replace(
         position=jnp.asarray(everywhere, kind),
         log_radius=jnp.asarray(np.log(radius), kind),

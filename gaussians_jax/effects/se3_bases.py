@@ -44,7 +44,7 @@ class SE3BasesSpec:
     """How many bases over how many knots, and how they learn.
 
     `still_logit` is the first logit of staying; from 4 on points at rest keep 13 % of
-    their neighbours' motion, from 9 on 0.1 %. At 100 they could never move: 35.5 for
+    their neighbors' motion, from 9 on 0.1 %. At 100 they could never move: 35.5 for
     36.7 dB on a film of a hand before books, whose cameras are off by half a pixel. The
     rate of shifts is in scene extents.
     """

@@ -2,8 +2,8 @@
 
 SplineGS (Park et al. 2025, CVPR, arXiv:2412.09982), section 4.2, its motion-adaptive
 spline (equations 3 and 4): control points at even times, and between them a cubic
-Hermite polynomial whose slopes are those of the chord between the neighbours, which is
-Catmull-Rom. Left open are the slopes at the ends, where a neighbour is missing (here
+Hermite polynomial whose slopes are those of the chord between the neighbors, which is
+Catmull-Rom. Left open are the slopes at the ends, where a neighbor is missing (here
 the end stands for it), and how many control points there are at first. All Gaussians
 have as many here; the paper takes away those that hardly matter (equations 7 and 8). It
 moves means; here turns have control points, too: rotation vectors, interpolated alike.

@@ -5,7 +5,7 @@ K trajectories b_k(t), a Gaussian keeps K coefficients c_k, and is at p + sum_k 
 b_k(t). The factorisation of all paths into K is that of a singular value decomposition,
 so a scene of few bodies needs few. Like the paper, one coefficient stands for all parts
 of a trajectory, here a shift and a turn; coefficients are sparse (`sparsity`) and alike
-among neighbours (`effects.neighbours`). A Gaussian whose coefficients are zero does not
+among neighbors (`effects.neighbors`). A Gaussian whose coefficients are zero does not
 move, exactly, and so all start.
 
 The paper's equations were not at hand, only its abstract and accounts of its method,

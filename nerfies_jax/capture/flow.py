@@ -13,7 +13,7 @@ class FrameFlow(NamedTuple):
     """Flow from each frame to the next and the previous one of the same camera.
 
     From the centre of a pixel to where what it shows lies in the other frame, in pixels
-    right and down; `seen` where both frames show it. A frame without a neighbour names
+    right and down; `seen` where both frames show it. A frame without a neighbor names
     its own row, and nothing is seen. NumPy leaves in a capture, JAX in training.
     """
 
@@ -26,7 +26,7 @@ class FrameFlow(NamedTuple):
 
 
 def sides(flow: FrameFlow):
-    """("forward", shift, seen, row of the neighbour), and the same backward."""
+    """("forward", shift, seen, row of the neighbor), and the same backward."""
     return ((SIDES[0], *flow[:3]), (SIDES[1], *flow[3:]))
 
 
@@ -46,7 +46,7 @@ def validate(
                 )
         if rows.shape != (count,) or not np.issubdtype(rows.dtype, np.integer):
             raise ValueError(
-                f"neighbours of {name} flow are {rows.dtype} of shape {rows.shape}; "
+                f"neighbors of {name} flow are {rows.dtype} of shape {rows.shape}; "
                 f"expected one row number per frame, ({count},)"
             )
         bad = (rows < 0) | (rows >= count)
@@ -78,13 +78,13 @@ def validate(
 
 
 def take(flow: FrameFlow, rows: np.ndarray) -> FrameFlow:
-    """Some of the frames, in this order; who loses its neighbour sees none of it."""
+    """Some of the frames, in this order; who loses its neighbor sees none of it."""
     rows = np.asarray(rows, np.int64)
     place = np.full(len(flow.next_row), -1)
     place[rows] = np.arange(len(rows))
     taken = []
-    for _, shift, seen, neighbour in sides(flow):
-        moved = place[neighbour[rows]]
+    for _, shift, seen, neighbor in sides(flow):
+        moved = place[neighbor[rows]]
         lost = moved < 0
         there = np.where(lost, np.arange(len(rows)), moved).astype(np.int32)
         shift, seen = shift[rows], seen[rows]  # copies: rows are a list
@@ -99,9 +99,9 @@ def shrink(flow: FrameFlow, factor: int) -> FrameFlow:
     The mean of each block, seen where all of it is; trimmed as the pictures are.
     """
     shrunk = []
-    for _, shift, seen, neighbour in sides(flow):
+    for _, shift, seen, neighbor in sides(flow):
         both = [shrink_one(*one, factor) for one in zip(shift, seen, strict=True)]
-        shrunk += [np.stack(array) for array in zip(*both, strict=True)] + [neighbour]
+        shrunk += [np.stack(array) for array in zip(*both, strict=True)] + [neighbor]
     return FrameFlow(*shrunk)
 
 

@@ -11,26 +11,26 @@ from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.capture.json_files import read_json, write_json
 
-NEIGHBOURS = "neighbours.json"  # {"forward": {id: id of the next frame}, "backward":
+NEIGHBORS = "neighbors.json"  # {"forward": {id: id of the next frame}, "backward":
 
 
 def write(flow: FrameFlow, ids: Sequence[str], folder: pathlib.Path, factor: int):
     """Flow of the pictures at one reduction, into a capture's folder `flow`.
 
     `<factor>x/forward/ID.npy` is float32 [height, width, 3]: right and down in pixels
-    of that reduction, and 1 where seen. Frames without a neighbour have no file.
+    of that reduction, and 1 where seen. Frames without a neighbor have no file.
     """
-    neighbours = {}
+    neighbors = {}
     for name, shift, seen, rows in flows.sides(flows.shrink(flow, factor)):
         target = folder / f"{factor}x" / name
         target.mkdir(parents=True, exist_ok=True)
         paired = np.flatnonzero(rows != np.arange(len(rows)))
-        neighbours[name] = {ids[row]: ids[rows[row]] for row in paired}
+        neighbors[name] = {ids[row]: ids[rows[row]] for row in paired}
         for row in paired:
             both = np.concatenate([shift[row], seen[row, ..., None]], axis=-1)
             array = both.astype(np.float32)
             np.save(target / f"{ids[row]}.npy", array, allow_pickle=False)
-    write_json(folder / NEIGHBOURS, neighbours)
+    write_json(folder / NEIGHBORS, neighbors)
 
 
 def read(
@@ -42,12 +42,12 @@ def read(
 ) -> FrameFlow | None:
     """What `write` wrote for the frames `ids`, whose shrunk pictures have `size`.
 
-    None where the folder has no flow. Neighbours that are not among the frames are
+    None where the folder has no flow. Neighbors that are not among the frames are
     passed over.
     """
-    if not (folder / NEIGHBOURS).is_file():
+    if not (folder / NEIGHBORS).is_file():
         return None
-    neighbours = read_json(folder / NEIGHBOURS, dict[str, dict[str, str]])
+    neighbors = read_json(folder / NEIGHBORS, dict[str, dict[str, str]])
     row_of = {name: row for row, name in enumerate(ids)}
     width, height = size
     leaves = []
@@ -56,7 +56,7 @@ def read(
         seen = np.zeros((len(ids), height, width), bool)
         rows = np.arange(len(ids), dtype=np.int32)
         for row, name in enumerate(ids):
-            other = row_of.get(neighbours.get(side, {}).get(name))
+            other = row_of.get(neighbors.get(side, {}).get(name))
             file = folder / f"{source}x" / side / f"{name}.npy"
             if other is None or not file.is_file():
                 continue

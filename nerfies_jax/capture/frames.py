@@ -276,7 +276,7 @@ def hold_out_in_time(
 def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Rows to learn from and to score on: the middle one of every `every` frames.
 
-    The middle, not the first: a held-out frame then has neighbours on both sides. Of
+    The middle, not the first: a held-out frame then has neighbors on both sides. Of
     fewer frames than `every` one is held out, of fewer than three none.
     """
     if every < 2:

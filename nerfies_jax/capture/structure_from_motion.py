@@ -48,9 +48,9 @@ class MappingSpec:
     # points for 456; of films of 86 and 87 pictures 2.0 and 2.9 times the points, 0.42
     # and 0.31 px off for 0.73 and 0.60, in 8 and 10 s for 4 and 6.
     first_octave: int = -1
-    # "auto" matches neighbours where names follow a film of more than 40 pictures.
+    # "auto" matches neighbors where names follow a film of more than 40 pictures.
     matcher: Literal["auto", "sequential", "exhaustive"] = "auto"
-    overlap: int = 10  # neighbours to match in a film
+    overlap: int = 10  # neighbors to match in a film
     in_order: bool = True  # names follow the film
     threads: int | None = None  # as many as there are cores
     at_least: float = 0.5  # share of the pictures that must find their place

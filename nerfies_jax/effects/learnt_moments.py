@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 
 def interval(moments: int) -> float:
-    """Time from one of so many moments to the next; a single one has no neighbours."""
+    """Time from one of so many moments to the next; a single one has no neighbors."""
     if moments < 1:
         raise ValueError(f"a capture has at least one moment, got moments={moments}")
     return 1 / (moments - 1) if moments > 1 else 2.0

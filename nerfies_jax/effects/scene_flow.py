@@ -41,7 +41,7 @@ class FlowWeights:
     """
 
     dynamic: float = 1.0  # squared error of the medium alone
-    warped: float = 1.0  # of the neighbouring moments, brought here along the flow
+    warped: float = 1.0  # of the neighboring moments, brought here along the flow
     disocclusion: float = 0.1
     cycle: float = 1.0  # 0.1 in the code, 1 in its configurations
     magnitude: float = 0.1
@@ -118,7 +118,7 @@ class Dynamic(NamedTuple):
     disocclusion: Float[Array, "2"]
 
 
-class Neighbour(NamedTuple):
+class Neighbor(NamedTuple):
     """Samples of the rays, followed to the next or the previous moment."""
 
     point: Float[Array, "rays samples 3"]  # where the flow leads
@@ -222,13 +222,13 @@ def medium(
     return Medium(own.density, own.color, share=share, extras=extras)
 
 
-def neighbour(
+def neighbor(
     spec: SceneFlowSpec,
     times: tuple[float, ...],
     params: SceneFlow,
     context: PenaltyContext,
     side: int,
-) -> Neighbour:
+) -> Neighbor:
     """The samples of the last level at the moment after (FORWARD) or before them.
 
     Where it is more or less than an interval away, beside frames that are held out,
@@ -251,7 +251,7 @@ def neighbour(
     )
     weight = flow_losses.dynamic_weights(level.spacing, there.density)
     logit = extras["disocclusion"][..., side]
-    return Neighbour(
+    return Neighbor(
         point=point,
         flow=flow,
         back=there.flow[..., 1 - side, :],
@@ -273,7 +273,7 @@ def penalty(
     batch, level = context.batch, context.levels[-1]
     own = level.media[NAME]
     weight = flow_losses.dynamic_weights(level.spacing, own.density)
-    sides = [neighbour(spec, times, params, context, side) for side in (0, 1)]
+    sides = [neighbor(spec, times, params, context, side) for side in (0, 1)]
     mask = jnp.where(batch.valid, picture_mask(spec, level, context.step), 0)
     values = {
         "dynamic": lambda: flow_losses.weighted_mean(
@@ -354,11 +354,11 @@ def flow_term(
     context: PenaltyContext,
     gap: float,
     weight: Float[Array, "rays samples"],
-    sides: list[Neighbour],
+    sides: list[Neighbor],
 ) -> Scalar:
-    """Pixels between where the flow leads, as the neighbour sees it, and the capture's.
+    """Pixels between where the flow leads, as the neighbor sees it, and the capture's.
 
-    The neighbouring frame may be more or less than a `gap` away, where frames are held
+    The neighboring frame may be more or less than a `gap` away, where frames are held
     out; the flow is then stretched as if points moved evenly.
     """
     batch, frames, level = context.batch, context.frames, context.levels[-1]

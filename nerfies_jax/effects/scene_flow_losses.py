@@ -1,7 +1,7 @@
 """The terms of neural scene flow fields, each a function of arrays alone.
 
 Li et al. 2021, arXiv:2011.13084, as settled by the public code. Rays without a
-neighbouring moment are counted out by `present`; a mean over nothing is zero.
+neighboring moment are counted out by `present`; a mean over nothing is zero.
 """
 
 import math
@@ -62,7 +62,7 @@ def warped(
     visible: Float[Array, "rays samples"],
     mask: Float[Array, " rays"],
 ) -> Scalar:
-    """Squared error of a neighbour's colors brought here, where it shows the same.
+    """Squared error of a neighbor's colors brought here, where it shows the same.
 
     Rays count by their composited `visible`, 1 - disocclusion. The weights of
     compositing are held fixed there: density is to explain color, not to make rays
@@ -114,7 +114,7 @@ def kinetic(
 ) -> Scalar:
     """Half the mean squared acceleration, forward + backward flow, per axis.
 
-    Of rays with both neighbours.
+    Of rays with both neighbors.
     """
     return 0.5 * mean_where(jnp.mean(jnp.square(forward + backward), axis=-1), present)
 

@@ -1,4 +1,4 @@
-"""Smooth grids and planes: features of neighbours may not differ for nothing.
+"""Smooth grids and planes: features of neighbors may not differ for nothing.
 
 The total variation that Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, put on their
 voxel grid for real captures. Their text was not at hand. Their code (hustvl/TiNeuVox)
@@ -73,7 +73,7 @@ def has_tables(spec: TemplateSpec) -> bool:
 
 
 def variation(spec: TemplateSpec, params: Template, key: Key[Array, ""]) -> Scalar:
-    """Mean squared difference of neighbours in the tables, features squared.
+    """Mean squared difference of neighbors in the tables, features squared.
 
     The mean over the levels of a hashed grid, at `VARIED` vertices of each, and over
     all planes.

@@ -3,7 +3,7 @@
 NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "transient objects"): beside the
 static field each photograph has a medium of its own, with density, color and an
 uncertainty `beta`. People and cars settle there. Pictures show it, held-out ones with
-codes between those of their neighbours in time, unless it is left out
+codes between those of their neighbors in time, unless it is left out
 (`variants.without_effects`), as the paper does and `held_out_codes.score`.
 """
 

@@ -1,6 +1,6 @@
 """What held-out frames are worth without a scene, and without its motion.
 
-Two pictures that cost nothing to make: the mean of the neighbouring frames, and the
+Two pictures that cost nothing to make: the mean of the neighboring frames, and the
 mean of a scene's own renders over time. A scene below the first shows less than two
 frames laid over each other do, and one below the second is better with its motion
 left out.
@@ -15,7 +15,7 @@ from nerfies_jax.evaluation.frames import spread, view_of
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.training.model import TrainState, in_default_precision
 
-NEIGHBOURS = 2
+NEIGHBORS = 2
 
 
 class Averages(NamedTuple):
@@ -29,11 +29,11 @@ class Averages(NamedTuple):
 class Floors(NamedTuple):
     """Both floors of one run; None where there is nothing to take the mean of."""
 
-    neighbours: Averages | None
+    neighbors: Averages | None
     still: Averages | None
 
 
-def neighbour_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
+def neighbor_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
     """The two frames learnt from that are nearest to a frame in time, nearest first.
 
     Of its own camera where that has two to learn from, else of all cameras; of frames
@@ -41,24 +41,24 @@ def neighbour_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
     """
     rows = capture.train
     same = rows[capture.camera_ids[rows] == capture.camera_ids[row]]
-    rows = np.sort(same if len(same) >= NEIGHBOURS else rows)
+    rows = np.sort(same if len(same) >= NEIGHBORS else rows)
     apart = np.abs(capture.times[rows].astype(np.float64) - float(capture.times[row]))
     # Times are float32: a tie is within 1e-6.
-    return rows[np.argsort(np.round(apart, 6), kind="stable")[:NEIGHBOURS]]
+    return rows[np.argsort(np.round(apart, 6), kind="stable")[:NEIGHBORS]]
 
 
-def neighbour_means(capture: Capture, rows: np.ndarray) -> Averages | None:
-    """The mean of the neighbours (`neighbour_rows`) of each row, as filmed.
+def neighbor_means(capture: Capture, rows: np.ndarray) -> Averages | None:
+    """The mean of the neighbors (`neighbor_rows`) of each row, as filmed.
 
-    Each pixel is the mean of those neighbours that filmed it, and unknown where none
+    Each pixel is the mean of those neighbors that filmed it, and unknown where none
     did. None where there are not two frames to learn from at different times: nothing
     is nearest then.
     """
-    if len(capture.train) < NEIGHBOURS or not np.ptp(capture.times[capture.train]):
+    if len(capture.train) < NEIGHBORS or not np.ptp(capture.times[capture.train]):
         return None
     colors, known = [], []
     for row in rows:
-        chosen = neighbour_rows(capture, row)
+        chosen = neighbor_rows(capture, row)
         pictures = capture.images[chosen].astype(np.float32) / 255
         filmed = np.ones(pictures.shape[:3], bool)
         if capture.valid is not None:

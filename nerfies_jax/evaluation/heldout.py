@@ -36,7 +36,7 @@ TOLERANCES = {
     "heldout.moving_ssim": 0.02,
     "heldout.still_psnr": 0.2,
     "heldout.unscored": 0.01,
-    "floor.neighbours": 0.05,
+    "floor.neighbors": 0.05,
     "floor.still": 0.3,
     "motion.worth": 0.2,
     "motion.moving_worth": 0.3,
@@ -153,9 +153,9 @@ def _pictures(scored, capture, lpips):
 def _floors(floors, scored, capture):
     """PSNR of pictures that cost nothing, and how far motion is above the second."""
     numbers = {}
-    if floors.neighbours is not None:
-        own = _floor_psnr(floors.neighbours, scored, capture)
-        numbers["floor.neighbours"] = known_mean(own[:, 0])
+    if floors.neighbors is not None:
+        own = _floor_psnr(floors.neighbors, scored, capture)
+        numbers["floor.neighbors"] = known_mean(own[:, 0])
     if floors.still is not None:
         own = _floor_psnr(floors.still, scored, capture)
         drawn = floors.still._replace(color=scored.color[floors.still.places])

@@ -1,7 +1,7 @@
 """Dense flow between neighboring frames that follow each other in time, both ways.
 
 OpenCV's DIS (Kroeger et al. 2016, arXiv:1603.03590) on pictures brought to one mean and
-contrast. Only neighbours are compared: over longer gaps patterns that repeat are taken
+contrast. Only neighbors are compared: over longer gaps patterns that repeat are taken
 for each other. Where an area is lost even so, or jumps, it is looked for where its last
 motion would take it.
 """
@@ -35,7 +35,7 @@ LOST_SHARE = 0.06
 JUMP_SHARE, AS_ALIKE = 0.03, 1.1
 
 
-class NeighbourFlow(NamedTuple):
+class NeighborFlow(NamedTuple):
     """Flow of each frame to the next and to the previous one in time.
 
     From pixel centres, in pixels right and down; `seen` where going there and back ends
@@ -121,12 +121,12 @@ def dis(times: int) -> Callable[..., np.ndarray]:
     return flow
 
 
-def between_neighbours(
+def between_neighbors(
     views: Views,
     pictures: np.ndarray,
     span: tuple[float, float] | None = None,
     room_for: Callable[[int], int] = lambda count: count,
-) -> NeighbourFlow:
+) -> NeighborFlow:
     """Flow between all frames that follow each other, both ways, and checked.
 
     `pictures` are the views' as `levelled` makes them. With `span`, the nearest and
@@ -190,7 +190,7 @@ def between_neighbours(
     return checked_flow
 
 
-def checked(forward: np.ndarray, backward: np.ndarray) -> NeighbourFlow:
+def checked(forward: np.ndarray, backward: np.ndarray) -> NeighborFlow:
     """Flow [frames, height, width, 2] to the next and the previous frame, as `closed`.
 
     The last frame's forward flow and the first one's backward flow are not seen.
@@ -200,7 +200,7 @@ def checked(forward: np.ndarray, backward: np.ndarray) -> NeighbourFlow:
         there, back = forward[frame], backward[frame + 1]
         forward_seen[frame] = closed(there, back)
         backward_seen[frame + 1] = closed(back, there)
-    return NeighbourFlow(forward, forward_seen, backward, backward_seen)
+    return NeighborFlow(forward, forward_seen, backward, backward_seen)
 
 
 def _lost(flow, frame):

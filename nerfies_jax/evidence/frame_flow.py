@@ -33,17 +33,17 @@ def with_flow(capture: Capture) -> Capture:
         film = np.ptp(views.time) > 0
         span = view_set.depth_span(capture, views) if film else None
         pictures = dense_flow.levelled(views)
-        neighbours = dense_flow.between_neighbours(views, pictures, span)
-        flow.forward[views.row] = neighbours.forward
-        flow.forward_seen[views.row] = neighbours.forward_seen & views.valid
+        neighbors = dense_flow.between_neighbors(views, pictures, span)
+        flow.forward[views.row] = neighbors.forward
+        flow.forward_seen[views.row] = neighbors.forward_seen & views.valid
         flow.next_row[views.row[:-1]] = views.row[1:]
-        flow.backward[views.row] = neighbours.backward
-        flow.backward_seen[views.row] = neighbours.backward_seen & views.valid
+        flow.backward[views.row] = neighbors.backward
+        flow.backward_seen[views.row] = neighbors.backward_seen & views.valid
         flow.previous_row[views.row[1:]] = views.row[:-1]
-    note = "optical flow between neighbouring frames found in the pictures"
+    note = "optical flow between neighboring frames found in the pictures"
     if (flow.next_row == own).all():
         note = (
             "no optical flow: no camera has two frames to learn from, so no two frames "
-            "are neighbours"
+            "are neighbors"
         )
     return dataclasses.replace(capture, flow=flow, notes=(*capture.notes, note))

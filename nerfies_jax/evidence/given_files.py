@@ -248,7 +248,7 @@ def _flow(path, capture):
         if array.shape != expected or not np.isfinite(array).all():
             raise CaptureError(
                 f"{path}: {side} flow of shape {array.shape}; expected {expected}, "
-                "finite: between neighbours of the frames to learn from, in order of "
+                "finite: between neighbors of the frames to learn from, in order of "
                 "time, in pixels of the pictures as they are read"
             )
     forward, backward = np.zeros((2, len(capture.ids), height, width, 2), np.float32)

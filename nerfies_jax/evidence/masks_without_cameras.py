@@ -37,7 +37,7 @@ def moving_masks(images: np.ndarray) -> np.ndarray:
     whole = view_set.without_cameras(images)
     views = view_set.smaller(whole, view_set.times_smaller(whole))
     pictures = dense_flow.levelled(views)
-    flow = dense_flow.between_neighbours(views, pictures)
+    flow = dense_flow.between_neighbors(views, pictures)
     tracks = tracking.from_flow(views, flow, pictures)
     off = _off_the_camera_motion(tracks, WITHIN_SHARE * views.size[0])
     known = np.isfinite(off).any(1)

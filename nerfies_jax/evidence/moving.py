@@ -17,7 +17,7 @@ HALF_CERTAIN_PX, STEEPNESS = 0.5, 3.0
 # books counts as moving, with it 7 %: the hand.
 STILLEST, OVER_NOISE = 0.25, 3.0
 # Tracks near each other in shared frames move alike.
-NEIGHBOURS, EVERY_FRAMES, NEAR_PX, NEIGHBOUR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10
+NEIGHBORS, EVERY_FRAMES, NEAR_PX, NEIGHBOR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10
 # A pixel takes after the tracks around it, by place and color. What none is near to
 # may have come too quickly to be followed: a still scene's colors have the last word.
 VOTES, VOTE_PX, VOTE_COLOR, REACH_PX = 8, 4.0, 20.0, 8.0
@@ -39,25 +39,25 @@ def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
     with np.errstate(divide="ignore"):
         odds = STEEPNESS * np.log(np.maximum(far, 1e-3) / half)
     own = 1 / (1 + np.exp(-np.minimum(odds, 50)))
-    alike = _neighbourhood(tracks)
+    alike = _neighborhood(tracks)
     total = np.asarray(alike.sum(1)).ravel() + 1e-9
     score = own
     for _ in range(ROUNDS):
         around = alike @ score / total
-        score = (own + NEIGHBOUR_WEIGHT * around) / (1 + NEIGHBOUR_WEIGHT)
+        score = (own + NEIGHBOR_WEIGHT * around) / (1 + NEIGHBOR_WEIGHT)
     return score
 
 
-def _neighbourhood(tracks):
+def _neighborhood(tracks):
     """[tracks, tracks] sparse: how near tracks are in frames that see both."""
     rows, columns, weights = [], [], []
     for frame in range(0, tracks.seen.shape[1], EVERY_FRAMES):
         here = np.flatnonzero(tracks.seen[:, frame])
-        if len(here) <= NEIGHBOURS:
+        if len(here) <= NEIGHBORS:
             continue
         place = tracks.pixel[here, frame]
-        distance, near = cKDTree(place).query(place, NEIGHBOURS + 1)
-        rows.append(np.repeat(here, NEIGHBOURS))
+        distance, near = cKDTree(place).query(place, NEIGHBORS + 1)
+        rows.append(np.repeat(here, NEIGHBORS))
         columns.append(here[near[:, 1:]].ravel())
         weights.append(np.exp(-0.5 * (distance[:, 1:] / NEAR_PX) ** 2).ravel())
     shape = (len(tracks.seen),) * 2

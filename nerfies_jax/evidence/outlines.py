@@ -1,6 +1,6 @@
 """Outlines before a plain background: do all views agree on one solid thing?
 
-Where neighbouring times are far apart there is no flow, but a thing at rest has one
+Where neighboring times are far apart there is no flow, but a thing at rest has one
 visual hull (Laurentini 1994): what lies in all its outlines at once fills each of them.
 What moves is cut away by the outlines of other times.
 """
@@ -83,7 +83,7 @@ def uncovered(
         place, inside = _pixels(views, index, cells)
         filled = np.zeros_like(shape)
         filled[tuple(place[inside, ::-1].T)] = True
-        # A cell covers its neighbours: it is as wide as that in the nearest view.
+        # A cell covers its neighbors: it is as wide as that in the nearest view.
         depth = np.linalg.norm(views.position[index] - (low + high) / 2)
         width = side * views.intrinsics[index][0, 0] / depth
         filled = nd.binary_dilation(

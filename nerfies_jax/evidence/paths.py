@@ -146,7 +146,7 @@ def _deviation(stencils, path, offset, miss):
     """Of a common factor of the depths, by what the film alone says.
 
     A factor bends the path as the offsets from the camera bend. What the path bends
-    itself, and a track's error `miss` in scene units, hide it. Neighbouring frames are
+    itself, and a track's error `miss` in scene units, hide it. Neighboring frames are
     no independent witnesses: the mean over the path counts, not the sum. In the
     built-in scenes that is 2 to 4 %, where the true errors are 0.6 to 1.1 %.
     """

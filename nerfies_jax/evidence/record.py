@@ -2,7 +2,7 @@
 
     evidence = record.gather(capture)
 
-Flow between neighbours in time, tracks, which of them and which pixels move, their
+Flow between neighbors in time, tracks, which of them and which pixels move, their
 paths in space, and points that stand still: host side, one core, no gradients.
 """
 
@@ -33,7 +33,7 @@ from nerfies_jax.evidence import (
     view_set,
 )
 from nerfies_jax.evidence import tracks as tracking
-from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.dense_flow import NeighborFlow
 from nerfies_jax.evidence.record_file import Evidence, digest, load, save
 from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
@@ -162,7 +162,7 @@ def _flow(views, pictures, span, watch):
         what, each = "a second look at wide steps", dense_flow.SECOND_LOOK * a_search
         return watch.room_for(count, FOR_WIDE_STEPS, what, each)
 
-    return dense_flow.between_neighbours(views, pictures, span, room_for)
+    return dense_flow.between_neighbors(views, pictures, span, room_for)
 
 
 def _rounded(flow):
@@ -284,7 +284,7 @@ def _unusable(views, flow):
     return ""
 
 
-def carried(views: Views, flow: NeighbourFlow) -> float:
+def carried(views: Views, flow: NeighborFlow) -> float:
     """Share of the textured pixels whose flow leads to the next frame and back."""
     shown = views.textured[:-1]
     return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
@@ -314,7 +314,7 @@ def _measured(depths, tracks):
 
 
 def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
-    """z-depth where it is known and does not jump to a neighbour's; NaN elsewhere."""
+    """z-depth where it is known and does not jump to a neighbor's; NaN elsewhere."""
     least, most = nd.minimum_filter(depth, 3), nd.maximum_filter(depth, 3)
     return np.where((least > 0) & (most - least < jump * depth), depth, np.nan)
 

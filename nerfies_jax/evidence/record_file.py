@@ -9,7 +9,7 @@ import numpy as np
 from nerfies_jax.capture import cache_files
 from nerfies_jax.capture.capture import Capture, PointCloud
 from nerfies_jax.capture.given import Given
-from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.dense_flow import NeighborFlow
 from nerfies_jax.evidence.paths import Paths
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
@@ -22,7 +22,7 @@ class Evidence(NamedTuple):
     """Of the frames to learn from, in order of time."""
 
     row: np.ndarray  # [frames] row of the capture
-    flow: NeighbourFlow
+    flow: NeighborFlow
     moving: np.ndarray  # [frames, height, width] bool
     tracks: Tracks
     score: np.ndarray  # [tracks] in 0..1: how certainly it moves
@@ -79,7 +79,7 @@ def _identity(path):
 def load(path: pathlib.Path) -> Evidence:
     """What `save` wrote under the same name; ValueError and OSError for all else."""
     kinds = {
-        "flow": NeighbourFlow,
+        "flow": NeighborFlow,
         "tracks": Tracks,
         "rest": RestPoints,
         "paths": Paths,

@@ -17,8 +17,8 @@ from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-# Pairs are neighbours in space in some frame, and seen together in some.
-NEIGHBOURS, EVERY_FRAMES, SHARED_FRAMES = 12, 3, 5
+# Pairs are neighbors in space in some frame, and seen together in some.
+NEIGHBORS, EVERY_FRAMES, SHARED_FRAMES = 12, 3, 5
 HOPS = (8, 4)  # frames at once where enough points are shared, against drift
 SHARED_POINTS, SHARED_SHARE = 10, 0.6
 FEWEST = 6  # points that tell a turn; fewer tell a shift
@@ -81,7 +81,7 @@ def _pairs(position, known):
         here = np.flatnonzero(known[:, frame])
         if len(here) < 3:
             continue
-        wanted = min(NEIGHBOURS, len(here) - 1)
+        wanted = min(NEIGHBORS, len(here) - 1)
         _, near = cKDTree(position[here, frame]).query(
             position[here, frame], wanted + 1
         )

@@ -5,7 +5,7 @@ import numpy as np
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import rest_points, still_points, view_set
 from nerfies_jax.evidence import tracks as tracking
-from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.dense_flow import NeighborFlow
 from nerfies_jax.evidence.findings import (
     BACKGROUND,
     CERTAIN,
@@ -153,7 +153,7 @@ def _stays(views, evidence, frame, points):
     span = slice(max(0, frame - REACH), frame + REACH + 1)
     near, at = still_points.view_slice(views, span), frame - span.start
     starts = np.concatenate([np.full((len(which), 1), at), pixel[which]], axis=-1)
-    flow = NeighbourFlow(*(part[span] for part in evidence.flow))
+    flow = NeighborFlow(*(part[span] for part in evidence.flow))
     tracks = tracking.chain(flow, starts)
     enough = tracks.seen.sum(1) > min(LEAST_FOLLOWED, len(near.row) - 1)
     which, tracks = which[enough], tracks.take(enough)

@@ -2,7 +2,7 @@
 
 The depth of what stands still is known from its points, and behind what moves from the
 points around. A pixel at rest finds its own color there in most other frames, however
-its neighbours move; what moves does not.
+its neighbors move; what moves does not.
 """
 
 import cv2
@@ -18,7 +18,7 @@ OTHERS = (3, 6, 10, 15, 22, 30)  # frames before and after
 QUANTILE, LEAST_FRAMES = 0.3, 3
 BLUR_PX = 0.7
 CELL = 2  # pixels of a side that share a depth
-NEARER = 0.9  # of the depth of a cell: a neighbour so near hides what shows through
+NEARER = 0.9  # of the depth of a cell: a neighbor so near hides what shows through
 HIDDEN = 0.93  # of the depth: in the other frame something nearer stands there
 # Difference that speaks neither way, as a share of the film's spread of colors, and of
 # its slope: places are not exact.

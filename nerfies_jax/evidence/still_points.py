@@ -5,7 +5,7 @@ import numpy as np
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.evidence import rest_points
 from nerfies_jax.evidence import tracks as tracking
-from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.dense_flow import NeighborFlow
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import TRACK_PX, Tracks
 from nerfies_jax.evidence.view_set import Views
@@ -26,7 +26,7 @@ def work(views: Views) -> int:
     return min(CENTRES, frames) * each
 
 
-def dense(views: Views, flow: NeighbourFlow, moving: np.ndarray) -> PointCloud:
+def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
     """Places and colors of pixels at rest in some frames, where flow tells depth.
 
     `moving` [frames, height, width] are the pixels to leave out, in every frame.
@@ -39,7 +39,7 @@ def dense(views: Views, flow: NeighbourFlow, moving: np.ndarray) -> PointCloud:
         span = slice(max(0, centre - reach), min(frames, centre + reach + 1))
         near = view_slice(views, span)
         starts = _starts(near, moving[centre], centre - span.start)
-        still = NeighbourFlow(*(part[span] for part in flow))
+        still = NeighborFlow(*(part[span] for part in flow))
         tracks = without(tracking.chain(still, starts), moving[span])
         enough = tracks.seen.sum(1) >= min(LEAST_FRAMES, reach + 1)
         tracks = tracks.take(enough)

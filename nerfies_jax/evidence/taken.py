@@ -6,12 +6,12 @@ import numpy as np
 from nerfies_jax.capture.given import Given
 from nerfies_jax.evidence import dense_flow
 from nerfies_jax.evidence import tracks as tracking
-from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.dense_flow import NeighborFlow
 from nerfies_jax.evidence.tracks import Tracks
 from nerfies_jax.evidence.view_set import Views
 
 
-def flow(given: Given, views: Views) -> NeighbourFlow | None:
+def flow(given: Given, views: Views) -> NeighborFlow | None:
     """Checked both ways, as our own is."""
     if given.forward is None:
         return None

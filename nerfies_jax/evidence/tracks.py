@@ -6,7 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.dense_flow import NeighborFlow
 from nerfies_jax.evidence.view_set import Views
 
 # Starts: every so many pixels in every third frame, about 10,000 tracks of 60 frames of
@@ -73,7 +73,7 @@ def work(views: Views, sparser: int = 1) -> int:
     return len(grid(views, sparser)) * len(views.row)
 
 
-def chain(flow: NeighbourFlow, starts: np.ndarray) -> Tracks:
+def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
     """Points carried from frame to frame until flow cannot be trusted, both ways.
 
     `starts` [tracks, 3]: frame, column and row in px, as of `grid`.
@@ -170,7 +170,7 @@ def _enlarged(pixel, times):
 
 
 def from_flow(
-    views: Views, flow: NeighbourFlow, pictures: np.ndarray, sparser: int = 1
+    views: Views, flow: NeighborFlow, pictures: np.ndarray, sparser: int = 1
 ) -> Tracks:
     """All tracks of a film, from an even grid; nothing is known of what moves yet."""
     tracks = long_enough(chain(flow, grid(views, sparser)))

@@ -13,7 +13,7 @@ import scipy.ndimage as nd
 import skimage.feature
 
 from nerfies_jax.evidence import dense_flow, motion, view_set
-from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.dense_flow import NeighborFlow
 from nerfies_jax.evidence.findings import TRANSIENT as EFFECT
 from nerfies_jax.evidence.findings import Finding, cannot_tell, judge
 from nerfies_jax.evidence.record import Evidence
@@ -51,7 +51,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
     if apart > MOST_APART:
         return cannot_tell(
             EFFECT,
-            f"{apart:.0%} of the neighbouring frames are too far apart to tell what "
+            f"{apart:.0%} of the neighboring frames are too far apart to tell what "
             "goes from what is passed by",
             threshold,
         )
@@ -60,7 +60,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
         return cannot_tell(EFFECT, f"only {len(gone)} pairs of frames", threshold)
     # What the other pairs lose is the noise of those that jump.
     usual = float(np.sort(gone)[: -2 * MIN_TIMES].mean())
-    worst = np.sort(_above_neighbours(gone))[::-1]
+    worst = np.sort(_above_neighbors(gone))[::-1]
     wanted, confidence = judge(float(worst[MIN_TIMES - 1]), GONE_SHARE, usual)
     times = int((worst > GONE_SHARE).sum())
     if wanted is False and not _always_there(evidence):
@@ -82,8 +82,8 @@ def transient(views: Views, evidence: Evidence) -> Finding:
     return Finding(EFFECT, measurement, threshold, wanted, confidence, numbers)
 
 
-def _above_neighbours(gone):
-    """What a pair loses beyond the median of its neighbours: a fast pan loses often."""
+def _above_neighbors(gone):
+    """What a pair loses beyond the median of its neighbors: a fast pan loses often."""
     above = []
     for at, one in enumerate(gone):
         beside = np.r_[gone[max(0, at - AROUND) : at], gone[at + 1 : at + 1 + AROUND]]
@@ -97,7 +97,7 @@ def _always_there(evidence):
     return there.mean() > 0.5 or not there.any()
 
 
-def jumps(views: Views, flow: NeighbourFlow) -> tuple[np.ndarray, np.ndarray]:
+def jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
     """[pairs]: shares of pixels that one frame shows and the next does not, or reverse.
 
     The lesser of both directions: what comes hides what was there. And the shares of

@@ -36,7 +36,7 @@ class Seconds(NamedTuple):
 
 
 PARTS = Seconds(
-    "flow between neighbours",
+    "flow between neighbors",
     "tracks and the points at rest that explain them best",
     "what moves",
     "paths in space",

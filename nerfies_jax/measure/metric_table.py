@@ -107,7 +107,7 @@ METRICS: dict[str, Entry] = {
         *("Camera rotation error", "Geometry", "deg", "lower"),
         "Mean error of the fitted rotation from each camera to the next.",
     ),
-    "floor.neighbours": Entry(
+    "floor.neighbors": Entry(
         *("Baseline: mean of two neighbors", "Motion", "dB", "equal"),
         "The PSNR of the mean of the two training frames nearest in time; a model that "
         "scores less has learned little.",

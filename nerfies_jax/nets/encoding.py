@@ -27,7 +27,7 @@ class EncodingSpec:
     times_pi: bool = False
 
     def __post_init__(self):
-        # 2^24 and above would turn neighbouring float32 coordinates into noise
+        # 2^24 and above would turn neighboring float32 coordinates into noise
         if not 0 <= self.bands <= 24:
             raise ValueError(
                 f"an encoding has 0 to 24 bands, got bands={self.bands}; ten resolve a "

@@ -232,7 +232,7 @@ def variation_at_random(
 ) -> Float[Array, ""]:
     """`total_variation` guessed from `count` vertices a level; the mean over levels.
 
-    Without bias. A hashed level counts as well: rows of neighbours, whoever else shares
+    Without bias. A hashed level counts as well: rows of neighbors, whoever else shares
     them. Squares, not lengths, so what is even has a slope of zero and not a NaN.
     """
 
@@ -254,16 +254,16 @@ def variation_at_random(
 def total_variation(
     table: Float[Array, "rows features"], cells: int
 ) -> Float[Array, ""]:
-    """Mean squared difference of neighbouring vertices of a level that is not hashed.
+    """Mean squared difference of neighboring vertices of a level that is not hashed.
 
-    Features squared for each pair of neighbours along an axis. ValueError where
+    Features squared for each pair of neighbors along an axis. ValueError where
     vertices share rows.
     """
     vertices = cells + 1
     if len(table) != vertices**3:
         raise ValueError(
             f"{len(table)} rows are not the {vertices}^3 vertices of {cells} cells: "
-            "a hashed level has no neighbours"
+            "a hashed level has no neighbors"
         )
     grid = table.reshape(vertices, vertices, vertices, -1)
     # XLA:CPU adds floats to one sum one after the other, and squares them at that pace:

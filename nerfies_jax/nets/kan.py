@@ -176,7 +176,7 @@ class KAN(NamedTuple):
 
 
 def spacing(spec: KANSpec, layer: int) -> float:
-    """h, the distance between neighbouring centres of one layer."""
+    """h, the distance between neighboring centres of one layer."""
     low, high = spec.grid_of(layer)
     gaps = spec.kernels - (DEGREE if spec.basis == "bspline" else 1)
     return (high - low) / gaps

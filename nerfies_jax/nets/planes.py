@@ -208,7 +208,7 @@ def linear(
 
 
 def total_variation(plane: Float[Array, "first second features"]) -> Float[Array, ""]:
-    """Squared differences of neighbouring vertices, the mean along each axis added.
+    """Squared differences of neighboring vertices, the mean along each axis added.
 
     K-Planes, equation 3. 4DGS has `time_smoothness` along one axis under this name.
     """

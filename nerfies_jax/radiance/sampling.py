@@ -178,7 +178,7 @@ def refine(
 def _last_not_above(edges, values):
     """Which of sorted edges is the last up to each value; the first if none is."""
     if len(edges) > COUNTED:
-        # XLA sums in a tree: from 300 bins on neighbouring float32 sums step back by an
+        # XLA sums in a tree: from 300 bins on neighboring float32 sums step back by an
         # ulp, and a search needs them sorted.
         edges = jax.lax.cummax(edges)
         return jnp.maximum(jnp.searchsorted(edges, values, side="right") - 1, 0)

@@ -96,7 +96,7 @@ class Preparation:
     ] = "OPENCV"
     """COLMAP's name for the lens, the same for all pictures."""
     matcher: Literal["auto", "sequential", "exhaustive"] = "auto"
-    """Which pictures to compare: neighbours, or all with all (auto: neighbours of more
+    """Which pictures to compare: neighbors, or all with all (auto: neighbors of more
     than 40 pictures)."""
     threads: int | None = None
     """How many cores to use (default: all)."""

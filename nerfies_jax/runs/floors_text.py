@@ -11,8 +11,8 @@ _WORSE_DB = -0.05
 def lines(numbers: Mapping[str, float]) -> list[str]:
     """Both floors and what motion is worth, for the end of a run."""
     parts = []
-    if "floor.neighbours" in numbers:
-        parts.append(f"{numbers['floor.neighbours']:.2f} dB the mean of two neighbours")
+    if "floor.neighbors" in numbers:
+        parts.append(f"{numbers['floor.neighbors']:.2f} dB the mean of two neighbors")
     if "floor.still" in numbers:
         parts.append(
             f"{numbers['floor.still']:.2f} dB its own renders averaged in time"
@@ -29,10 +29,10 @@ def lines(numbers: Mapping[str, float]) -> list[str]:
 def warnings(numbers: Mapping[str, float]) -> list[str]:
     """One line for each floor that the run is below."""
     psnr, sentences = numbers["heldout.psnr"], []
-    if psnr < numbers.get("floor.neighbours", psnr):
+    if psnr < numbers.get("floor.neighbors", psnr):
         sentences.append(
-            f"warning: {psnr:.2f} dB is below the {numbers['floor.neighbours']:.2f} dB "
-            f"of two neighbouring frames laid over each other: {LONGER} "
+            f"warning: {psnr:.2f} dB is below the {numbers['floor.neighbors']:.2f} dB "
+            f"of two neighboring frames laid over each other: {LONGER} "
             "(python -m experiments.inspect_scene says which)"
         )
     if numbers.get("motion.worth", 0.0) < _WORSE_DB:

@@ -122,7 +122,7 @@ def measure(
 def _floors(run, state, draw, rows, frame_seconds):
     frames, moments = budget.still(frame_seconds, len(rows), run.filmed.size)
     return Floors(
-        floors.neighbour_means(run.filmed, rows),
+        floors.neighbor_means(run.filmed, rows),
         floors.time_averages(draw, state, run.filmed, rows, frames, moments),
     )
 

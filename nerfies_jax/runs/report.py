@@ -32,7 +32,7 @@ HEADLINES = (
     "heldout.ssim",
     "heldout.moving_psnr",
     "heldout.still_psnr",
-    "floor.neighbours",
+    "floor.neighbors",
     "motion.worth",
     "train.seconds",
     "render.ms_per_frame",

@@ -28,7 +28,7 @@ def some_flow(frames=4, size=(6, 4)):
     return FrameFlow(*leaves)
 
 
-def test_selected_frames_keep_their_neighbours_and_lose_those_that_went():
+def test_selected_frames_keep_their_neighbors_and_lose_those_that_went():
     whole = make(flow=some_flow())
     part = capturing.select(whole, np.array([3, 0, 1])).flow
     assert part.next_row.tolist() == [0, 2, 2]  # f3 none, f0 to f1, f1 lost f2
@@ -97,6 +97,6 @@ def test_stored_flow_that_does_not_fit_is_refused_with_its_file(tmp_path):
         nerfies_format.read(tmp_path / "copy")
     file.unlink()  # a frame may lack its flow
     assert not nerfies_format.read(tmp_path / "copy").flow.forward_seen[0].any()
-    (folder / "neighbours.json").write_text(json.dumps({"forward": [1, 2]}))
-    with pytest.raises(CaptureError, match=r"neighbours\.json"):
+    (folder / "neighbors.json").write_text(json.dumps({"forward": [1, 2]}))
+    with pytest.raises(CaptureError, match=r"neighbors\.json"):
         nerfies_format.read(tmp_path / "copy")

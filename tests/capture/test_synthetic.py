@@ -295,8 +295,8 @@ def test_a_specular_surface_adds_light_to_its_own_thing_alone(small):
     difference = shiny.images.astype(int) - capture.images
     assert difference.min() >= 0
     assert difference[truth.things == 1].max() > 20
-    # A corner of the cube may reach into a pixel whose centre, and four neighbours,
-    # show the wall; then a diagonal neighbour shows the cube.
+    # A corner of the cube may reach into a pixel whose centre, and four neighbors,
+    # show the wall; then a diagonal neighbor shows the cube.
     inner = scipy.ndimage.binary_erosion(truth.things == 0, np.ones((1, 3, 3)))
     assert inner.any()
     assert difference[inner].max() == 0

@@ -119,7 +119,7 @@ def test_a_flow_with_a_trunk_of_its_own_reads_nothing_of_the_medium_s(dtype):
 
 @pytest.mark.hard_cases
 def test_a_medium_on_planes_is_finite_where_there_is_no_moment(dtype):
-    """As neighbours of the first and the last are, at any distance."""
+    """As neighbors of the first and the last are, at any distance."""
     network = dataclasses.replace(
         TINY.network, position=PlanesSpec(3, (1, 2), moments=4, features=2)
     )
@@ -162,7 +162,7 @@ def slopes_of(params, frames, batch, arrays, times):
 
 
 @pytest.mark.hard_cases
-def test_the_first_and_the_last_moment_have_one_neighbour(float64):
+def test_the_first_and_the_last_moment_have_one_neighbor(float64):
     (_, grad), _ = slopes_of(*scenario("float64"), TIMES)
     strength = {name: np.abs(np.asarray(x)).sum((1, -1)) for name, x in grad.items()}
     rows = np.array(ROWS)
@@ -176,7 +176,7 @@ def test_the_first_and_the_last_moment_have_one_neighbour(float64):
 
 @pytest.mark.full
 @pytest.mark.hard_cases
-def test_a_single_moment_has_no_neighbours_and_no_flow_to_learn(dtype):
+def test_a_single_moment_has_no_neighbors_and_no_flow_to_learn(dtype):
     params, frames, batch, arrays = scenario(dtype)
     still = frames._replace(times=np.zeros(MOMENTS, dtype))
     slopes_and_terms = slopes_of(params, still, batch, arrays, (0.0,))
@@ -190,7 +190,7 @@ def test_a_single_moment_has_no_neighbours_and_no_flow_to_learn(dtype):
 
 
 @pytest.mark.parametrize("held_out", [2, 3, 8])
-def test_neighbours_are_moments_that_were_filmed(held_out, dtype):
+def test_neighbors_are_moments_that_were_filmed(held_out, dtype):
     """And not those that lie an interval away, where no picture says what is seen."""
     filmed = np.arange(40) / 39
     learnt = np.delete(filmed, np.arange(0, 40, held_out)).astype(np.float32)
@@ -242,7 +242,7 @@ def test_what_is_surely_hidden_keeps_a_slope(dtype):
     @jax.value_and_grad
     def visible(params):
         context = context_of(TINY, params, frames, batch, *arrays, 0)
-        there = scene_flow.neighbour(TINY, TIMES, params, context, scene_flow.FORWARD)
+        there = scene_flow.neighbor(TINY, TIMES, params, context, scene_flow.FORWARD)
         return jnp.mean(there.visible)
 
     value, grad = visible(sure)

@@ -41,7 +41,7 @@ def of(grid, axes):
     return np.mean([np.mean(np.diff(grid, axis=axis) ** 2) for axis in range(axes)])
 
 
-def test_smoothness_is_the_mean_square_between_neighbours(dtype, rng):
+def test_smoothness_is_the_mean_square_between_neighbors(dtype, rng):
     effect = smoothness.effect(SmoothnessSpec(2.0, until=5), TEMPLATES)
     found = tables(dtype, rng)
     term = roughness(effect, found, 4)

@@ -39,30 +39,30 @@ def film(frames=12, **changes):
     )
 
 
-def test_neighbours_are_the_nearest_in_time_of_the_same_camera():
+def test_neighbors_are_the_nearest_in_time_of_the_same_camera():
     capture = film()
-    assert sorted(floors.neighbour_rows(capture, 4)) == [3, 5]
-    assert list(floors.neighbour_rows(capture, 10)) == [9, 11]
+    assert sorted(floors.neighbor_rows(capture, 4)) == [3, 5]
+    assert list(floors.neighbor_rows(capture, 10)) == [9, 11]
     # Of the camera's own frames, however far, if it has two; else of all.
     ids = np.zeros(12, np.int32)
     ids[[0, 4, 11]] = 1
     rig = dataclasses.replace(capture, camera_ids=ids)
-    assert list(floors.neighbour_rows(rig, 4)) == [0, 11]
+    assert list(floors.neighbor_rows(rig, 4)) == [0, 11]
     ids[11] = 0
-    assert sorted(floors.neighbour_rows(rig, 4)) == [3, 5]
+    assert sorted(floors.neighbor_rows(rig, 4)) == [3, 5]
     # By their times, not by their rows; of equally near ones the first.
     turned = dataclasses.replace(capture, times=capture.times[::-1].copy())
-    assert sorted(floors.neighbour_rows(turned, 1)) == [0, 2]
+    assert sorted(floors.neighbor_rows(turned, 1)) == [0, 2]
     still = dataclasses.replace(capture, times=np.zeros(12, np.float32))
-    assert list(floors.neighbour_rows(still, 4)) == [0, 2]
+    assert list(floors.neighbor_rows(still, 4)) == [0, 2]
 
 
-def test_a_mean_of_neighbours_is_of_those_that_filmed_a_pixel():
+def test_a_mean_of_neighbors_is_of_those_that_filmed_a_pixel():
     valid = np.ones((12, *SIZE[::-1]), bool)
     valid[3, :, :5] = False
     valid[[3, 5], 0] = False
     capture = film(valid=valid)
-    means = floors.neighbour_means(capture, np.array([4, 7]))
+    means = floors.neighbor_means(capture, np.array([4, 7]))
     expected = np.full((*SIZE[::-1], 3), 40 / 255)
     expected[:, :5] = 50 / 255
     expected[0] = 0
@@ -71,9 +71,9 @@ def test_a_mean_of_neighbours_is_of_those_that_filmed_a_pixel():
     np.testing.assert_array_equal(means.known[0], expected[..., 0] > 0)
     assert means.known[1].all()
     at_once = dataclasses.replace(capture, times=np.zeros(12, np.float32))
-    assert floors.neighbour_means(at_once, capture.heldout) is None
+    assert floors.neighbor_means(at_once, capture.heldout) is None
     single = dataclasses.replace(capture, train=capture.train[:1])
-    assert floors.neighbour_means(single, capture.heldout) is None
+    assert floors.neighbor_means(single, capture.heldout) is None
 
 
 def test_an_average_over_time_leaves_the_rest_of_a_view():
@@ -101,7 +101,7 @@ def test_an_average_over_time_leaves_the_rest_of_a_view():
 
 
 def test_a_run_below_a_floor_is_told_what_to_do():
-    numbers = {"heldout.psnr": 20.0, "floor.neighbours": 19.0, "floor.still": 19.5}
+    numbers = {"heldout.psnr": 20.0, "floor.neighbors": 19.0, "floor.still": 19.5}
     numbers |= {"motion.worth": 0.5}
     assert floors_text.warnings(numbers) == []
     assert "19.00 dB the mean of two" in floors_text.lines(numbers)[0]
@@ -110,7 +110,7 @@ def test_a_run_below_a_floor_is_told_what_to_do():
     (worse,) = floors_text.warnings(numbers | {"motion.worth": -0.06})
     assert "0.06 dB worse" in worse
     below, worse = floors_text.warnings(
-        numbers | {"floor.neighbours": 22.7, "motion.worth": -0.25}
+        numbers | {"floor.neighbors": 22.7, "motion.worth": -0.25}
     )
     assert "20.00 dB is below the 22.70 dB" in below
     assert "0.25 dB worse" in worse

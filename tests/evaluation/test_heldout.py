@@ -33,7 +33,7 @@ NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), jax.random.key(0))
 ALWAYS = {"heldout.psnr", "heldout.ssim"}
 MASKED = {f"heldout.{name}" for name in ("moving_psnr", "moving_ssim", "still_psnr")}
 FLOORS = {
-    *(f"floor.{name}" for name in ("neighbours", "still")),
+    *(f"floor.{name}" for name in ("neighbors", "still")),
     *(f"motion.{name}" for name in ("worth", "moving_worth")),
 }
 DEPTHS = {
@@ -95,7 +95,7 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     floors = Floors(grey._replace(known=~valid[scored.rows[places]]), grey)
     numbers = heldout_metrics(scored, capture, floors=floors)
     unscored = {"heldout.unscored"} if filmed else set()
-    lost = {"floor.neighbours"} if filmed else set()  # what is known was not filmed
+    lost = {"floor.neighbors"} if filmed else set()  # what is known was not filmed
     assert set(numbers) == (ALWAYS | MASKED | DEPTHS | FLOORS | unscored) - lost
     assert numbers["heldout.psnr"] == pytest.approx(scored.psnr.mean())
     rows = capture.heldout

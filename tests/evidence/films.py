@@ -119,7 +119,7 @@ def rod(turn: float, frames: int = 12, side: int = 56) -> Capture:
     ball = rng.normal(size=(4000, 3))
     ball *= 0.4 / np.linalg.norm(ball, axis=1, keepdims=True)
     times = np.linspace(0, 1, frames)
-    # Neighbouring moments lie far apart: no flow between them.
+    # Neighboring moments lie far apart: no flow between them.
     angles = 2.4 * np.arange(frames)
     images = np.full((frames, side, side, 3), 255, np.uint8)
     turns, places = [], []

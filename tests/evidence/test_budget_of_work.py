@@ -127,7 +127,7 @@ def test_as_many_wide_steps_as_there_is_room_for_are_searched_again(monkeypatch)
         asked.append(count)
         return 3
 
-    dense_flow.between_neighbours(views, pictures, (1.0, 3.0), room_for)
+    dense_flow.between_neighbors(views, pictures, (1.0, 3.0), room_for)
     assert asked == [10]
     assert sorted(looked) == [(0, 1), (1, 2), (2, 3)]
 

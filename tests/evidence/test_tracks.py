@@ -20,7 +20,7 @@ from nerfies_jax.evidence import (
     tracks,
     view_set,
 )
-from nerfies_jax.evidence.dense_flow import NeighbourFlow
+from nerfies_jax.evidence.dense_flow import NeighborFlow
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks
 from tests.evidence import films
@@ -68,7 +68,7 @@ def tracks_of(views, position):
 def test_flow_of_a_wall_is_that_of_its_homography_in_any_light(light):
     capture = films.film(shown=lambda time: False, gain=light, frames=4)
     views = view_set.in_time_order(capture)
-    flow = dense_flow.between_neighbours(views, dense_flow.levelled(views))
+    flow = dense_flow.between_neighbors(views, dense_flow.levelled(views))
     ray = view_set.rays(views, 1)
     point = views.position[1] + films.FAR * ray
     there, _ = view_set.project(views, 2, point.reshape(-1, 3))
@@ -95,8 +95,8 @@ def test_flow_that_a_thing_lost_is_found_from_how_it_came():
     capture = films.film(shown=lambda time: False, frames=6)
     views = view_set.in_time_order(capture)
     pictures = dense_flow.levelled(views)
-    true = dense_flow.between_neighbours(views, pictures)
-    flow = NeighbourFlow(*(part.copy() for part in true))
+    true = dense_flow.between_neighbors(views, pictures)
+    flow = NeighborFlow(*(part.copy() for part in true))
     area = np.s_[20:50, 30:70]
     for frame, shift, seen in ((2, *flow[:2]), (3, *flow[2:])):
         shift[frame][area], seen[frame][area] = 9.0, False
@@ -125,7 +125,7 @@ def test_chains_follow_flow_both_ways_until_it_ends():
     shift = np.tile(np.float32([1.25, -0.5]), (*shape, 1))
     seen = np.ones(shape, bool)
     seen[3] = False  # nothing leads from the fourth frame to the fifth
-    flow = NeighbourFlow(shift, seen, -shift, np.ones(shape, bool))
+    flow = NeighborFlow(shift, seen, -shift, np.ones(shape, bool))
     chained = tracks.chain(flow, np.array([[2.0, 10.0, 12.0], [2.0, 29.0, 12.0]]))
     assert chained.seen[0].tolist() == [True] * 4 + [False]
     steps = np.arange(-2, 2)[:, None]
@@ -144,7 +144,7 @@ def test_wide_steps_are_found_from_where_a_still_scene_would_be():
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     shares = []
     for span in (None, view_set.depth_span(capture, views)):
-        flow = dense_flow.between_neighbours(views, pictures, span)
+        flow = dense_flow.between_neighbors(views, pictures, span)
         far_off = []
         for frame, depth in enumerate(capture.depths[:-1]):
             step = (views.position[frame] - views.position[frame + 1])[:2]
@@ -254,7 +254,7 @@ def test_cameras_that_are_off_by_a_pixel_set_no_wall_in_motion():
     assert evidence.moving[capture.moving].mean() > 0.5
 
 
-def test_moving_neighbours_convince_and_a_lonely_track_is_overruled():
+def test_moving_neighbors_convince_and_a_lonely_track_is_overruled():
     rng = np.random.default_rng(0)
     pixel = rng.uniform(0, 60, (300, 1, 2)).astype(np.float32)
     seen = np.ones((300, 6), bool)

@@ -53,7 +53,7 @@ def test_psnr_is_of_the_chosen_pixels_of_all_frames():
             "exposure",
             {
                 "without codes: PSNR (dB)",
-                "codes of neighbours: PSNR (dB)",
+                "codes of neighbors: PSNR (dB)",
                 "codes fitted to the left half: PSNR (dB)",
             },
         ),

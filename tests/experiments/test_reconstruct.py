@@ -100,12 +100,12 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
         metrics["floor.still"], metrics["heldout.psnr"], atol=1e-4
     )
     capture = scenes.tiny_capture()
-    means = floors.neighbour_means(capture, capture.heldout).color
+    means = floors.neighbor_means(capture, capture.heldout).color
     error = np.square(
         np.round(255 * means) / 255 - capture.images[capture.heldout] / 255
     )
     exact = np.mean(-10 * np.log10(error.mean(axis=(1, 2, 3))))
-    np.testing.assert_allclose(metrics["floor.neighbours"], exact, atol=1e-3)
+    np.testing.assert_allclose(metrics["floor.neighbors"], exact, atol=1e-3)
     assert metrics["heldout.psnr"] < exact  # two steps
     document, printed = capsys.readouterr()
     assert json.loads(document)["metrics"] == metrics

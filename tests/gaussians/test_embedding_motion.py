@@ -15,7 +15,7 @@ from gaussians_jax.effects.embedding_motion import (
     EmbeddingMotionSpec,
 )
 from gaussians_jax.effects.kan_motion import Offsets
-from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.neighbors import NeighborSpec
 from gaussians_jax.spec import effects_of
 from gaussians_jax.splats import Params
 from nerfies_jax.nets import codes
@@ -32,7 +32,7 @@ SCENE = dataclasses.replace(
     scenes.TINY_SPLATS,
     batch_size=2,
     motion=dataclasses.replace(SPEC, frames_per_code=1, grow_until=20),
-    neighbours=NeighbourSpec(count=4),
+    neighbors=NeighborSpec(count=4),
 )
 
 

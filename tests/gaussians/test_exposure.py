@@ -43,7 +43,7 @@ def pictures(model, state, rows):
     return np.stack([renderer(state, view).color for view in views])
 
 
-def test_a_frame_is_drawn_in_its_light_and_one_never_seen_between_its_neighbours(built):
+def test_a_frame_is_drawn_in_its_light_and_one_never_seen_between_its_neighbors(built):
     model, metadata, state = built
     rows = [int(row) for row in CAPTURE.train]
     between = int(CAPTURE.heldout[0])

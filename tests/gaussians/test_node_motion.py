@@ -312,7 +312,7 @@ def test_training_searches_only_when_rows_change():
     assert np.abs(run({NAME: other}).mean - fresh).max() > 1e-2
 
 
-def test_nodes_are_spread_out_and_as_wide_as_their_neighbours_are_far():
+def test_nodes_are_spread_out_and_as_wide_as_their_neighbors_are_far():
     points = np.concatenate([np.zeros((50, 3)), np.eye(3) * [1.0, 2.0, 5.0]])
     chosen = points[skinning.farthest_points(points, 9)]
     assert len(chosen) == 4  # that differ
@@ -343,7 +343,7 @@ def test_nodes_at_rest_stay_at_rest_when_others_are_fitted_to_paths():
     assert (np.asarray(nodes.position)[:8, 2] < 0.5).all()  # half of them move
     shift = node_motion.moves(nodes, small, EXTENT, jnp.float32(1)).shift
     assert np.linalg.norm(shift[8:], axis=1).max() < 0.05
-    assert splats.neighbour_distance(still, 1.0).min() > 0
+    assert splats.neighbor_distance(still, 1.0).min() > 0
 
 
 def test_nothing_is_computed_for_what_only_resting_nodes_carry():

@@ -80,7 +80,7 @@ def test_points_are_carried_by_gaussians_that_all_move_alike(
     assert followed.drift == pytest.approx(drift, rel=1e-4)
 
 
-def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbours_mean(
+def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbors_mean(
     filmed, monkeypatch, cloud
 ):
     """x(t) = R(t) x with a turn of t radians about an axis through the origin."""
@@ -103,7 +103,7 @@ def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbours_mea
     right = np.stack([turned(body, time) for time in times], axis=1)
     error = np.linalg.norm(followed.path - right, axis=-1)
     assert error[:, known.start].max() == pytest.approx(0, abs=1e-6)
-    # The mean of eight of twenty neighbours 0.01 away lies some 0.003 beside the point.
+    # The mean of eight of twenty neighbors 0.01 away lies some 0.003 beside the point.
     turn = 2 * np.abs(np.sin((times - times[known.start]) / 2))
     assert np.all(error <= 0.01 * turn + 1e-6)
     still = np.linalg.norm(right - known.start_points[:, None], axis=-1)
@@ -130,10 +130,10 @@ def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
     np.testing.assert_allclose(followed.path, still, atol=1e-6)
 
 
-def test_the_weights_of_neighbours_are_a_slow_sum(rng):
+def test_the_weights_of_neighbors_are_a_slow_sum(rng):
     distance = np.sort(rng.uniform(size=(4, 8)), axis=1)
     opacity = rng.uniform(0.1, 1, size=(4, 8))
-    weights = point_tracks.neighbour_weights(distance, opacity)
+    weights = point_tracks.neighbor_weights(distance, opacity)
     for row in range(4):
         expected = [
             opacity[row, k] / np.exp(2 * (distance[row, k] / distance[row, 7]) ** 2)
@@ -143,7 +143,7 @@ def test_the_weights_of_neighbours_are_a_slow_sum(rng):
             weights[row], expected / np.sum(expected), rtol=1e-12
         )
     # All at the point itself: by opacity alone.
-    weights = point_tracks.neighbour_weights(np.zeros((1, 2)), np.array([[0.3, 0.1]]))
+    weights = point_tracks.neighbor_weights(np.zeros((1, 2)), np.array([[0.3, 0.1]]))
     np.testing.assert_allclose(weights, [[0.75, 0.25]], rtol=1e-12)
 
 

@@ -31,7 +31,7 @@ from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_flow import FlowSpec
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec
-from gaussians_jax.effects.neighbours import NeighbourSpec
+from gaussians_jax.effects.neighbors import NeighborSpec
 from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
 from gaussians_jax.effects.spline_motion import SplineMotionSpec
@@ -123,11 +123,11 @@ SETTINGS = [
     (MotionSpec, dict(scale_rule="cubic"), "unknown scale_rule 'cubic'"),
     (MotionSpec, dict(block=0), "block >= 1"),
     (MotionSpec, dict(learning_rate_end=0.0), "both are positive"),
-    (NeighbourSpec, dict(count=0), "count >= 1"),
-    (NeighbourSpec, dict(start=-1), "start >= 0"),
-    (NeighbourSpec, dict(gamma=-1.0), "not negative"),
-    (NeighbourSpec, dict(weight=math.nan), "not negative"),
-    (NeighbourSpec, dict(scale="metres"), "unknown scale 'metres'"),
+    (NeighborSpec, dict(count=0), "count >= 1"),
+    (NeighborSpec, dict(start=-1), "start >= 0"),
+    (NeighborSpec, dict(gamma=-1.0), "not negative"),
+    (NeighborSpec, dict(weight=math.nan), "not negative"),
+    (NeighborSpec, dict(scale="metres"), "unknown scale 'metres'"),
     (RasterSpec, dict(alpha_max=1.0), "alpha_threshold < alpha_max < 1"),
     (RasterSpec, dict(near=0.0), "0 < near < far"),
     (RasterSpec, dict(tile=12), "tile must be one of"),
@@ -232,12 +232,12 @@ CALLS = [
     (lambda: kan_motion.init(jax.random.key(0), KanMotionSpec(), 0), "frames=0"),
     (lambda: motion_growth.effect(MotionGrowthSpec(), 0.0), "extent=0.0"),
     (lambda: moba(motion=None), "without a motion"),
-    (lambda: moba(motion=scenes.TINY_MOTION, neighbours=NeighbourSpec()),
-     "neighbours=none"),
+    (lambda: moba(motion=scenes.TINY_MOTION, neighbors=NeighborSpec()),
+     "neighbors=none"),
     (lambda: spec.effects_of(
-        dataclasses.replace(scenes.TINY_DEFORMABLE, neighbours=NeighbourSpec()),
+        dataclasses.replace(scenes.TINY_DEFORMABLE, neighbors=NeighborSpec()),
         spec.SceneMetadata(1.0, (0.0, 0.0, 0.0), 3)),
-     "neighbours=none"),
+     "neighbors=none"),
     (lambda: moba(motion=PolynomialMotionSpec(), alternation=None,
                   carried=CarriedSpec()),
      "motion.fading=none"),

@@ -197,7 +197,7 @@ COUNTED = {
     "alternation": ("start", "stop"),
     "annealing": ("after",),
     "acceleration": ("start",),
-    "neighbours": ("start",),
+    "neighbors": ("start",),
     "motion_growth": ("start",),
     "spectral": ("after",),
 }

@@ -41,7 +41,7 @@ def draw(dtype, turn=1.5, seed=0):
 
 
 def splined(table, time):
-    """Catmull-Rom as a Hermite spline with half the way between the neighbours."""
+    """Catmull-Rom as a Hermite spline with half the way between the neighbors."""
     knots = np.arange(len(table))
     around = np.concatenate([table[:1], table, table[-1:]])
     slope = (around[2:] - around[:-2]) / 2

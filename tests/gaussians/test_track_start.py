@@ -88,7 +88,7 @@ def test_every_motion_can_be_fitted_to_paths(name):
     assert fitted.last < 0.02
     middle = places_of(effect, fitted.points, time[FRAMES // 2])
     off = np.linalg.norm(middle - position[:, FRAMES // 2], axis=-1)
-    # Also where a path was not known: it moves as its neighbours do.
+    # Also where a path was not known: it moves as its neighbors do.
     assert np.median(off) < 0.03
 
 

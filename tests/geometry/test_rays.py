@@ -43,7 +43,7 @@ def test_rays_go_through_pixel_centres(dtype):
 
 @pytest.mark.hard_cases
 def test_pixels_without_a_ray_are_marked(dtype):
-    """The corners of a strong barrel lens; no NaN and no made-up neighbour there."""
+    """The corners of a strong barrel lens; no NaN and no made-up neighbor there."""
     camera = make_camera(dtype, radial=np.asarray([-0.8, 0, 0], dtype))
     grid = pixel_rays(camera)
     valid = np.asarray(grid.valid)

@@ -150,7 +150,7 @@ def test_scene_flow_of_a_single_bare_frame_stays_finite():
     assert ended.result.stopped_by == "steps", ended.result.message
     assert ended.last["mse"] < ended.first["mse"]
     for name in ("warped", "disocclusion", "cycle", "magnitude", "kinetic"):
-        assert ended.last[f"scene_flow/{name}"] == 0  # there is no neighbour
+        assert ended.last[f"scene_flow/{name}"] == 0  # there is no neighbor
 
 
 # --- what the field knows of a hostile capture ---------------------------------------

@@ -121,7 +121,7 @@ def test_slopes_have_slopes_and_values_beside_them_are_the_same(float64):
     np.testing.assert_allclose(value, total(tables, point), rtol=1e-14)
 
 
-def test_total_variation_is_the_mean_over_neighbours(float64, rng):
+def test_total_variation_is_the_mean_over_neighbors(float64, rng):
     table = rng.normal(size=(27, 2))
     grid = table.reshape(3, 3, 3, 2)
     pairs = [
@@ -130,12 +130,12 @@ def test_total_variation_is_the_mean_over_neighbours(float64, rng):
     ]
     found = jax.jit(grids.total_variation, static_argnums=1)(table, 2)
     np.testing.assert_allclose(found, np.mean(pairs), rtol=1e-14)
-    with pytest.raises(ValueError, match="a hashed level has no neighbours"):
+    with pytest.raises(ValueError, match="a hashed level has no neighbors"):
         grids.total_variation(jnp.asarray(table[:20]), 2)
 
 
 def test_variation_at_random_is_that_of_every_level_hashed_or_not(float64):
-    """Every pair of neighbours of each level in a loop; the last one is hashed."""
+    """Every pair of neighbors of each level in a loop; the last one is hashed."""
     tables, key = filled(SPEC, np.float64), jax.random.key(0)
     pairs = []
     for table, cells in zip(tables, SPEC.cells(), strict=True):

@@ -260,7 +260,7 @@ def test_a_code_is_its_row_at_its_own_time_and_between_rows_elsewhere(dtype):
     np.testing.assert_allclose(codes[5], between, rtol=1e-6)
 
 
-def test_an_exposure_that_was_not_learnt_lies_between_its_neighbours(float64):
+def test_an_exposure_that_was_not_learnt_lies_between_its_neighbors(float64):
     spec = dataclasses.replace(STATIC, appearance=AppearanceSpec(width=2))
     tables, at = codes_by(scene.field(spec, METADATA), "float64")
     table = tables["appearance"]

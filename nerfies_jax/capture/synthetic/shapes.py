@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from nerfies_jax.capture.synthetic.motion import Vector
 from nerfies_jax.geometry import rays
 
-# A pair of crossings between two neighbouring probes is missed, a fold seen edge-on: of
+# A pair of crossings between two neighboring probes is missed, a fold seen edge-on: of
 # 350 rays at 14 to 34 degrees to the cloth's plane one was, above that none.
 PROBES = 16
 REFINEMENTS = 5  # Newton inside the bracket

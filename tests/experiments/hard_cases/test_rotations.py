@@ -39,7 +39,7 @@ def _every_degree(x):
 
 
 def test_stumpff_functions_are_continuous_across_their_switch(dtype):
-    """Neighbouring numbers, one by the series and one by the closed form."""
+    """Neighboring numbers, one by the series and one by the closed form."""
     above = np.asarray(SERIES_BELOW, dtype)
     below = np.nextafter(above, np.asarray(0, dtype))
     ends = np.array([[below], [above]])
@@ -94,7 +94,7 @@ def test_any_length_has_finite_value_slope_and_curvature(dtype):
 
 
 def test_lengths_at_the_edge_of_the_range_are_told_apart(dtype):
-    """The least normal number is normalised, its neighbour below is the identity."""
+    """The least normal number is normalised, its neighbor below is the identity."""
     edge = np.finfo(dtype).tiny
     below = np.nextafter(edge, np.asarray(0, dtype))
     given = np.array([[0, edge, 0, 0], [0, below, 0, 0]], dtype)

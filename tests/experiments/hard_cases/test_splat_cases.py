@@ -40,7 +40,7 @@ def one(dtype, mean=(0, 0, 2), opacity=0.5):
     return Gaussians(*(np.asarray(x, jnp.dtype(dtype)) for x in fields))
 
 
-def neighbours(value, dtype):
+def neighbors(value, dtype):
     """That number in that precision, and the next ones below and above."""
     exact = np.dtype(dtype).type(value)
     return [np.nextafter(exact, -np.inf), exact, np.nextafter(exact, np.inf)]
@@ -66,7 +66,7 @@ def seen_and_slopes(gaussians, view):
     ],
 )
 def test_what_is_drawn_ends_within_one_step_of_its_edge(what, edge, drawn, dtype):
-    for value, expected in zip(neighbours(edge, dtype), drawn, strict=True):
+    for value, expected in zip(neighbors(edge, dtype), drawn, strict=True):
         place = {"opacity": value} if what == "opacity" else {"mean": (0, 0, value)}
         footprint, slopes = seen_and_slopes(one(dtype, **place), camera(dtype))
         assert bool(footprint.visible[0]) is expected

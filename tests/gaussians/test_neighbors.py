@@ -1,4 +1,4 @@
-"""Neighbour graph and the consistency of embeddings over it."""
+"""Neighbor graph and the consistency of embeddings over it."""
 
 import jax
 import jax.numpy as jnp
@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from gaussians_jax import splats as rows
-from gaussians_jax.effects import neighbours
-from gaussians_jax.effects.neighbours import Neighbours, NeighbourSpec
+from gaussians_jax.effects import neighbors
+from gaussians_jax.effects.neighbors import Neighbors, NeighborSpec
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.training.effects import PenaltyContext, weighted_sum
 from tests import gradients
 from tests.gaussians.shared import finite, full, jitted, put
 
-FEW = NeighbourSpec(count=4)
-value_and_slope = jitted(jax.value_and_grad(neighbours.inconsistency))
+FEW = NeighborSpec(count=4)
+value_and_slope = jitted(jax.value_and_grad(neighbors.inconsistency))
 
 
 def scene(mean, active=None, width=3, dtype="float32"):
@@ -34,7 +34,7 @@ def scene(mean, active=None, width=3, dtype="float32"):
 def graph_of(spec, *args, extent=1.0, **options):
     """A scene's codes, and its graph as NumPy arrays."""
     params = scene(*args, **options)
-    graph = neighbours.find(spec, params, extent=extent)
+    graph = neighbors.find(spec, params, extent=extent)
     return params.rows["code"], jax.tree.map(np.asarray, graph)
 
 
@@ -43,7 +43,7 @@ def some_places(count=40, seed=1):
 
 
 def listed(graph, row):
-    """The neighbours of a row that have a weight."""
+    """The neighbors of a row that have a weight."""
     return set(graph.index[row][graph.weight[row] > 0].tolist())
 
 
@@ -51,7 +51,7 @@ def listed(graph, row):
 def test_the_graph_is_that_of_all_distances(scale, dtype):
     places = some_places()
     active = np.arange(40) % 5 != 2
-    spec = NeighbourSpec(count=6, gamma=3.0, scale=scale)
+    spec = NeighborSpec(count=6, gamma=3.0, scale=scale)
     _, graph = graph_of(spec, places, active, dtype=dtype, extent=0.7)
 
     places = places.astype(dtype).astype(float)
@@ -77,13 +77,13 @@ def test_the_graph_is_that_of_all_distances(scale, dtype):
 @pytest.mark.hard_cases
 def test_the_weight_is_that_of_the_published_code():
     """0.82 at a hundredth of a unit; the printed form has 2e-9 there, 0 from 0.044."""
-    _, graph = graph_of(NeighbourSpec(scale="units"), [[0, 0, 0], [0.01, 0, 0]])
+    _, graph = graph_of(NeighborSpec(scale="units"), [[0, 0, 0], [0.01, 0, 0]])
     np.testing.assert_allclose(graph.weight[:, 0], 0.8187308, rtol=1e-6)
 
 
 @pytest.mark.hard_cases
 def test_weights_by_spacing_do_not_depend_on_the_unit():
-    places, spec = some_places(), NeighbourSpec(count=5)
+    places, spec = some_places(), NeighborSpec(count=5)
     (_, graph), (_, large) = (graph_of(spec, size * places) for size in (1, 1e3))
     np.testing.assert_array_equal(graph.index, large.index)
     np.testing.assert_allclose(graph.weight, large.weight, rtol=1e-5)
@@ -108,7 +108,7 @@ def test_with_few_active_rows_the_rest_names_itself(active_count, dtype):
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("copies", [2, *full(5, 12)])
-def test_clones_at_one_place_are_neighbours_but_never_oneself(copies, dtype):
+def test_clones_at_one_place_are_neighbors_but_never_oneself(copies, dtype):
     """Densification puts a clone onto its parent; the nearest distance is then zero."""
     places = np.repeat(some_places(6), copies, axis=0)
     _, graph = graph_of(FEW, places, dtype=dtype)
@@ -132,7 +132,7 @@ def slow_inconsistency(code, graph, active, count):
 
 def test_the_penalty_is_the_sum_over_all_pairs(dtype):
     active = np.arange(40) % 7 != 3
-    spec = NeighbourSpec(count=6)
+    spec = NeighborSpec(count=6)
     code, graph = graph_of(spec, some_places(), active, width=5, dtype=dtype)
     value, _ = value_and_slope(code, graph, active)
     exact = graph._replace(weight=graph.weight.astype(float))
@@ -143,9 +143,9 @@ def test_the_penalty_is_the_sum_over_all_pairs(dtype):
     )
 
 
-def test_few_neighbours_are_averaged_over_those_there_are(float64):
+def test_few_neighbors_are_averaged_over_those_there_are(float64):
     active = np.arange(8) < 3
-    spec = NeighbourSpec(count=6, gamma=0.0)
+    spec = NeighborSpec(count=6, gamma=0.0)
     code, graph = graph_of(spec, some_places(8), active, dtype="float64")
     value, _ = value_and_slope(code, graph, active)
     code = np.asarray(code)[:3]
@@ -155,12 +155,12 @@ def test_few_neighbours_are_averaged_over_those_there_are(float64):
 
 
 def test_gradients_of_the_penalty(float64):
-    active, spec = np.arange(40) % 7 != 3, NeighbourSpec(count=6)
+    active, spec = np.arange(40) % 7 != 3, NeighborSpec(count=6)
     code, graph = graph_of(spec, some_places(), active, width=5, dtype="float64")
     graph, active = put(graph), put(active)
 
     def total(code):
-        return neighbours.inconsistency(code, graph, active)
+        return neighbors.inconsistency(code, graph, active)
 
     assert gradients.directional_error(total, code) < 1e-7
 
@@ -171,7 +171,7 @@ def test_gradients_of_the_penalty(float64):
 def test_slopes_are_finite_and_bounded_where_embeddings_meet(kind, apart):
     """1e-20 is 0 in float16, and the square root's slope at 0 is infinite."""
     kind = jnp.dtype(kind)
-    graph = Neighbours(np.int32([[1], [0]]), np.full((2, 1), 0.25, kind))
+    graph = Neighbors(np.int32([[1], [0]]), np.full((2, 1), 0.25, kind))
     code = np.asarray([[0.0, 0.0], [apart, 0.0]], kind)
     value, grad = value_and_slope(code, graph, np.ones(2, bool))
     assert np.isfinite(np.asarray(value, np.float64))
@@ -184,18 +184,16 @@ def test_slopes_are_finite_and_bounded_where_embeddings_meet(kind, apart):
 @pytest.mark.hard_cases
 def test_weights_that_vanish_bring_neither_loss_nor_slope(dtype):
     places = [[0, 0, 0], [1, 0, 0], [0, 3, 0]]
-    code, graph = graph_of(NeighbourSpec(scale="units"), places, dtype=dtype)
+    code, graph = graph_of(NeighborSpec(scale="units"), places, dtype=dtype)
     assert not graph.weight.any()
     value, grad = value_and_slope(code, graph, np.ones(3, bool))
-    np.testing.assert_allclose(value, 1e-9, rtol=1e-6)  # 20 floors of 2 neighbours
+    np.testing.assert_allclose(value, 1e-9, rtol=1e-6)  # 20 floors of 2 neighbors
     assert not grad.any()
 
 
 def test_the_effect_weighs_and_waits_for_its_start():
     params = scene(some_places())
-    effect = neighbours.effect(
-        NeighbourSpec(weight=0.5, start=10), extent=1.0, of="code"
-    )
+    effect = neighbors.effect(NeighborSpec(weight=0.5, start=10), extent=1.0, of="code")
     graph = effect.state(params)
 
     def penalty(params, graph, step):
@@ -212,6 +210,6 @@ def test_the_effect_weighs_and_waits_for_its_start():
     linked = np.mean(np.asarray(graph.weight) > 1e-3)
     np.testing.assert_allclose(linked_term, linked, rtol=1e-6)
     assert linked > 0.5
-    absent = neighbours.effect(NeighbourSpec(), extent=1.0, of="kan_motion")
+    absent = neighbors.effect(NeighborSpec(), extent=1.0, of="kan_motion")
     with pytest.raises(ValueError, match=r"no rows .kan_motion.*code"):
         absent.state(params)

@@ -1,7 +1,7 @@
-"""Neighbouring Gaussians keep similar embeddings, and so move alike.
+"""Neighboring Gaussians keep similar embeddings, and so move alike.
 
 "Sonata", equation 18, after Luiten et al. 2024, "Dynamic 3D Gaussians",
-arXiv:2308.09713: the neighbours are found on the host whenever the rows have changed
+arXiv:2308.09713: the neighbors are found on the host whenever the rows have changed
 and stay as they are in between.
 """
 
@@ -21,10 +21,10 @@ from gaussians_jax.splats import Params
 from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
-NAME = "neighbours"
+NAME = "neighbors"
 SCALES = ("spacing", "extent", "units")
 # The unit of length of `scale="spacing"`, as a multiple of the median distance to the
-# farthest of the 20 neighbours: that distance is 0.020, 0.030 and 0.034 scene units in
+# farthest of the 20 neighbors: that distance is 0.020, 0.030 and 0.034 scene units in
 # three reconstructions of real rooms and gardens (4k, 139k and 3k points).
 SPACING = 0.03
 # The equation's, of an embedding squared: its square root has a slope at zero, and
@@ -34,15 +34,15 @@ LINKED = 1e-3  # pairs of a larger weight are logged as linked
 
 
 @dataclasses.dataclass(frozen=True)
-class NeighbourSpec:
-    """How many neighbours count, and how fast their weight falls with the distance.
+class NeighborSpec:
+    """How many neighbors count, and how fast their weight falls with the distance.
 
     The weight is exp(-gamma d^2): the equation prints the distance unsquared, but the
     code it goes back to squares it, and unsquared it is 0 in float32 beyond d = 0.044.
     `scale` is the unit of d. "units" are scene units, as in that code. "extent" is the
     spread of the cameras, which says little about the spacing of the Gaussians: where
     the cameras hardly move, as in a small preset of a real capture, 43 % of the rows
-    have no neighbour left with a weight above 1e-3. With "spacing" those are 3 % or
+    have no neighbor left with a weight above 1e-3. With "spacing" those are 3 % or
     less in every capture measured, whatever its unit and however dense it has grown.
     """
 
@@ -66,19 +66,19 @@ class NeighbourSpec:
             raise ValueError(f"unknown scale {self.scale!r}; choose from {SCALES}")
 
 
-class Neighbours(NamedTuple):
-    """The graph between two changes of the rows, nearest neighbours first.
+class Neighbors(NamedTuple):
+    """The graph between two changes of the rows, nearest neighbors first.
 
-    Inactive rows, and active ones that have fewer neighbours, name themselves with
+    Inactive rows, and active ones that have fewer neighbors, name themselves with
     weight zero.
     """
 
-    index: Int[Array, "gaussians neighbours"]
-    weight: Float[Array, "gaussians neighbours"]  # in [0, 1]
+    index: Int[Array, "gaussians neighbors"]
+    weight: Float[Array, "gaussians neighbors"]  # in [0, 1]
 
 
-def find(spec: NeighbourSpec, params: Params, extent: float) -> Neighbours:
-    """The neighbours of every active Gaussian among the active; host side.
+def find(spec: NeighborSpec, params: Params, extent: float) -> Neighbors:
+    """The neighbors of every active Gaussian among the active; host side.
 
     By the canonical means; `extent` is in scene units. Measured on one core: 31 ms for
     10k rows, 450 ms for 100k.
@@ -94,7 +94,7 @@ def find(spec: NeighbourSpec, params: Params, extent: float) -> Neighbours:
         unit = _unit(spec, distance, extent)
         index[active, :count] = active[near]
         weight[active, :count] = np.exp(-spec.gamma * (distance / unit) ** 2)
-    return Neighbours(
+    return Neighbors(
         jnp.asarray(index, jnp.int32), jnp.asarray(weight, means.dtype.name)
     )
 
@@ -124,10 +124,10 @@ def _unit(spec, distance, extent):
 
 def inconsistency(
     embedding: Float[Array, "gaussians width"],
-    neighbours: Neighbours,
+    neighbors: Neighbors,
     active: Bool[Array, " gaussians"],
 ) -> Float[Array, ""]:
-    """1 / (N K) sum sqrt(w |x_i - x_k|^2 + 1e-20) over active i, their neighbours k.
+    """1 / (N K) sum sqrt(w |x_i - x_k|^2 + 1e-20) over active i, their neighbors k.
 
     Equation 18 of "Sonata". Its slope in an embedding is at most a few sqrt(w) / (N K)
     long and zero where the two are equal. K is the number there are, if fewer.
@@ -135,31 +135,31 @@ def inconsistency(
     # float16 rounds 1e-20 to zero and the slope at equality to NaN.
     floor = max(FLOOR, float(jnp.finfo(embedding.dtype).tiny))
 
-    # One neighbour of all rows after the other. Width 32, 20 neighbours, 10k rows, one
+    # One neighbor of all rows after the other. Width 32, 20 neighbors, 10k rows, one
     # core, forward and backward: 11.6 ms and 2.6 MB, against 61 ms and 77 MB for one
     # gather of all pairs, whose slopes no longer fit the cache when they are summed.
     @functools.partial(jax.remat, prevent_cse=False)
-    def one_neighbour(total, pair):
+    def one_neighbor(total, pair):
         index, weight = pair
         distance_sq = jnp.sum(jnp.square(embedding - embedding[index]), axis=-1)
         length = jnp.sqrt(weight * distance_sq + floor)
         return total + jnp.sum(jnp.where(active, length, 0)), None
 
-    pairs = neighbours.index.T, neighbours.weight.T.astype(embedding.dtype)
-    total, _ = jax.lax.scan(one_neighbour, jnp.zeros((), embedding.dtype), pairs)
+    pairs = neighbors.index.T, neighbors.weight.T.astype(embedding.dtype)
+    total, _ = jax.lax.scan(one_neighbor, jnp.zeros((), embedding.dtype), pairs)
     active_count = jnp.sum(active)
-    each = jnp.minimum(neighbours.index.shape[1], active_count - 1)
+    each = jnp.minimum(neighbors.index.shape[1], active_count - 1)
     return total / jnp.maximum(active_count * each, 1).astype(embedding.dtype)
 
 
-def effect(spec: NeighbourSpec, extent: float, of: str) -> Effect:
+def effect(spec: NeighborSpec, extent: float, of: str) -> Effect:
     """The seams of the penalty on `params.rows[of]`, [gaussians, width]."""
 
-    def state(params: Params) -> Neighbours:
+    def state(params: Params) -> Neighbors:
         if of not in params.rows:
             raise ValueError(
-                f"there are no rows {of!r} whose neighbours could be alike, only "
-                f"{sorted(params.rows)}; leave the neighbours out of this scene"
+                f"there are no rows {of!r} whose neighbors could be alike, only "
+                f"{sorted(params.rows)}; leave the neighbors out of this scene"
             )
         return find(spec, params, extent)
 
