@@ -38,7 +38,7 @@ def save(path: pathlib.Path, rows: list[dict], curve: Curve) -> None:
         xlabel="knots", ylabel="position error / size of the motion", title=curve.name
     )
     quality.axvline(
-        curve.exact_cpu_ms, color="grey", linestyle=":", label="the network"
+        curve.exact_cpu_ms, color="gray", linestyle=":", label="the network"
     )
     quality.set(
         xlabel="ms of one core for an instant (labels: knots)",
@@ -61,7 +61,7 @@ def _bars(axes, rows):
     names = [row["name"] for row in rows]
     for kind, shift, color in (
         ("forward", -0.2, "tab:green"),
-        ("both", 0.2, "tab:grey"),
+        ("both", 0.2, "tab:gray"),
     ):
         there = [k for k, row in enumerate(rows) if row[f"{kind}_cpu_ms"] is not None]
         values = [rows[k][f"{kind}_cpu_ms"] for k in there]

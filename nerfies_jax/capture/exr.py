@@ -30,7 +30,7 @@ class ExrPicture(NamedTuple):
 
 
 def read_exr(path: AnyPath) -> ExrPicture:
-    """The first part's data window. A luminance channel Y alone becomes grey color."""
+    """The first part's data window. A luminance channel Y alone becomes gray color."""
     path = _existing(path)
     try:
         origin, (width, height), display_size = _windows(path)

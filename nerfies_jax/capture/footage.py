@@ -88,9 +88,9 @@ def from_film(
     """
     moments, scores = [], []
     with events.stage("decoding the video to find sharp frames") as stage:
-        for seconds, grey in read_video(film, grey=True, damaged="skip"):
+        for seconds, gray in read_video(film, gray=True, damaged="skip"):
             moments.append(seconds)
-            scores.append(sharpness(grey))
+            scores.append(sharpness(gray))
             stage.advance(text=f"{len(scores):,} frames")
     # Frames come in the order in which they are shown, but .avi has only the times at
     # which they are decoded, and B-frames are not decoded in that order.
@@ -302,11 +302,11 @@ def _upright(file):
                 f"{file}: a picture of 32-bit floats, whose white is not known; save "
                 "it with 8 or 16 bits"
             )
-        if picture.mode.startswith("I"):  # 16 bits of grey
+        if picture.mode.startswith("I"):  # 16 bits of gray
             values = np.asarray(picture)
             if not 0 <= values.min() <= values.max() <= 65535:
                 raise CaptureError(
-                    f"{file}: grey of 32 bits, up to {values.max()}, whose white is "
+                    f"{file}: gray of 32 bits, up to {values.max()}, whose white is "
                     "not known; save it with 8 or 16 bits"
                 )
             values = values.astype(np.uint32) // 257
@@ -359,10 +359,10 @@ def _write_mask(out, name, mask, shape, factor, source):
     _write(out / "masks" / f"{name}.png", blocks(mask, factor).all((-3, -1)))
 
 
-def sharpness(grey: np.ndarray) -> float:
+def sharpness(gray: np.ndarray) -> float:
     """Variance of the Laplacian of a picture [height, width]: high with sharp edges."""
-    step = max(1, max(grey.shape) // 480)
-    thinned = grey[::step, ::step].astype(np.float32)
+    step = max(1, max(gray.shape) // 480)
+    thinned = gray[::step, ::step].astype(np.float32)
     return float(scipy.ndimage.laplace(thinned).var())
 
 

@@ -22,7 +22,7 @@ from nerfies_jax.geometry.camera import Camera
 MAX_FRAMES = 100_000
 MAX_BYTES = 16 * 2**30  # of decoded pictures
 HELD_OUT = 8  # every 8th frame where the files say nothing, as LLFF and Mip-NeRF 360
-UNSEEN = 128  # grey of a point that no frame shows
+UNSEEN = 128  # gray of a point that no frame shows
 SUFFIXES = (".png", ".jpg", ".jpeg")  # in small letters; files may have others
 
 
@@ -349,7 +349,7 @@ def colored_points(
     """Static points with the median color of up to 16 of the frames `rows`.
 
     Occlusion is not tested; the median forgives it in a minority of the frames. Pixels
-    marked in `skip` [frames, height, width] do not count; unseen points are grey.
+    marked in `skip` [frames, height, width] do not count; unseen points are gray.
     """
     size = (images.shape[2], images.shape[1])
     rows = rows[np.linspace(0, len(rows) - 1, min(16, len(rows))).astype(int)]

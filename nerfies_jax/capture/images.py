@@ -77,11 +77,11 @@ def _orientation(image):
 
 
 def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
-    """One picture as uint8 [height, width, 1 to 4]: grey, grey+alpha, RGB or RGBA.
+    """One picture as uint8 [height, width, 1 to 4]: gray, gray+alpha, RGB or RGBA.
 
     A picture that a viewer would turn (EXIF) is refused, unless `orientation` is
     "stored": then its pixels come as they lie in the file, which is what COLMAP's
-    cameras refer to. 16-bit grey is rounded to 8 bits; 16-bit color is cut to them.
+    cameras refer to. 16-bit gray is rounded to 8 bits; 16-bit color is cut to them.
     The linear light of an EXR becomes sRGB, brighter than 1 as 1.
     """
     path = pathlib.Path(path)
@@ -111,7 +111,7 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
                 pixels = np.asarray(image.convert("RGB" if opaque else "RGBA"))
         else:
             raise CaptureError(
-                f"{path}: color mode {header.mode}; expected grey, RGB or RGBA, so "
+                f"{path}: color mode {header.mode}; expected gray, RGB or RGBA, so "
                 "save it as an RGB PNG"
             )
     except CaptureError:
@@ -146,7 +146,7 @@ def opened(path: AnyPath) -> Iterator[PIL.Image.Image]:
 def read_numbers(path: AnyPath) -> np.ndarray:
     """The first channel of a picture as it is stored, [height, width]: no light.
 
-    Grey of 16 bits and more keeps all of them; otherwise as `read_pixels`.
+    Gray of 16 bits and more keeps all of them; otherwise as `read_pixels`.
     """
     path = pathlib.Path(path)
     if not read_header(path).mode.startswith("I"):

@@ -76,7 +76,7 @@ def place_by_cameras(cameras: Camera) -> Placement:
 
 
 def read_ply(path: pathlib.Path) -> PointCloud:
-    """Positions (as stored) and colors of a .ply point cloud; grey without colors.
+    """Positions (as stored) and colors of a .ply point cloud; gray without colors.
 
     Raises CaptureError for what is no such file, has more than `MAX_POINTS`, or has
     colors that are neither uchar nor floats between 0 and 1.

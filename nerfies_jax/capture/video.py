@@ -243,14 +243,14 @@ def read_video(
     stride: int = 1,
     most: int = 2**31,
     rows: Collection[int] | None = None,
-    grey: bool = False,
+    gray: bool = False,
     damaged: str = "refuse",
 ) -> Iterator[tuple[float, np.ndarray]]:
     """Seconds and uint8 sRGB [height, width, 3] of every `stride`-th frame, upright.
 
     Times are the film's own, so a variable frame rate stays true. A phone's rotation
     tag is carried out, and high dynamic range is tone-mapped. `rows` are the numbers of
-    the only frames to be shown; nothing behind the last of them is decoded. `grey` is
+    the only frames to be shown; nothing behind the last of them is decoded. `gray` is
     for uint8 [height, width] of the light as it is coded: a frame of 3840x2160 HLG
     costs 0.16 s of processor time, and 1.8 s in color. `damaged` is "refuse" or "skip"
     what cannot be decoded, as the end of a download that broke off;
@@ -288,7 +288,7 @@ def read_video(
                     return
                 shown += 1
                 shown_as = _square(frame, aspect)
-                if grey:
+                if gray:
                     pixels = shown_as.to_ndarray(format="gray")
                 else:
                     pixels = _pixels(shown_as)

@@ -31,12 +31,12 @@ class CameraFitSpec:
 
     The unknowns are a turn and a shift that move a picture at `depth` by so many
     pixels, so that one step length suits all. Found means that the mean squared error,
-    in grey levels of 255, changes by at most `tolerance` a pixel: where pictures have
+    in gray levels of 255, changes by at most `tolerance` a pixel: where pictures have
     slopes of two levels a pixel, that is 0.001 pixel from the least.
     """
 
     max_steps: int = 100  # of L-BFGS
-    tolerance: float = 0.01  # squared grey levels per pixel
+    tolerance: float = 0.01  # squared gray levels per pixel
     # Larger pictures are halved, thirded, ...: a field would take minutes for each.
     most_pixels: int = 5000
 
@@ -64,7 +64,7 @@ def photometric_loss(
     valid: Bool[Array, "height width"] | None,
     depth: Float[Array, ""],
 ) -> Callable[[Float[Array, "6"]], Float[Array, ""]]:
-    """Mean squared error in grey levels of a frame whose camera is moved by a screw.
+    """Mean squared error in gray levels of a frame whose camera is moved by a screw.
 
     The screw is (turn, shift) in pixels, for what lies at z-depth `depth`.
     """
@@ -90,7 +90,7 @@ def fit_camera(
 ) -> Fit:
     """The camera near `view`'s whose rendering is closest to `picture`.
 
-    Under `jit`. `residual` is the length of the slope, squared grey levels per pixel. A
+    Under `jit`. `residual` is the length of the slope, squared gray levels per pixel. A
     picture that does not depend on the camera is never converged.
     """
     loss = photometric_loss(model, state, view, picture, valid, depth)

@@ -136,8 +136,8 @@ def as_channel(
     if channel == "color":
         return Colored(as_picture(rendering.color), 0.0, 1.0)
     if channel == "opacity":
-        grey = np.repeat(as_picture(rendering.alpha)[..., None], 3, axis=-1)
-        return Colored(grey, 0.0, 1.0)
+        gray = np.repeat(as_picture(rendering.alpha)[..., None], 3, axis=-1)
+        return Colored(gray, 0.0, 1.0)
     if channel == "depth":
         return pictures.color_depth(rendering.depth, rendering.alpha > 0.5, limits)
     if channel == "motion" and distance is not None:

@@ -23,7 +23,7 @@ PANEL_WIDTH = 240  # pixels at least: smaller pictures are enlarged so labels fi
 GAP = 6  # pixels between panels
 TEXT_HEIGHT = 20
 INK, PAPER, FADED = (32, 33, 36), (255, 255, 255), (110, 113, 120)
-UNKNOWN = (128, 128, 128)  # grey is in none of the color maps
+UNKNOWN = (128, 128, 128)  # gray is in none of the color maps
 # Rows of color_maps.png, 256 colors each, which are matplotlib's inferno and viridis
 # (CC0): a run is looked at without matplotlib.
 ERROR_MAP, DEPTH_MAP = 0, 1
@@ -52,7 +52,7 @@ def color_depth(
     known: np.ndarray | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Colored:
-    """Depth in the colors of viridis, near bright and far dark; unknown grey.
+    """Depth in the colors of viridis, near bright and far dark; unknown gray.
 
     One range for all pictures given, `limits` or the 1st to 99th percentile of what is
     known (finite, positive and `known`), so that frames can be compared.
@@ -70,7 +70,7 @@ def color_depth(
 def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> Colored:
     """Mean absolute difference over the channels of pictures in [0, 1].
 
-    Black is 0, light yellow `largest` and more; grey where either is not finite.
+    Black is 0, light yellow `largest` and more; gray where either is not finite.
     """
     if not largest > 0:
         raise ValueError(
@@ -84,7 +84,7 @@ def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> C
 
 
 def color_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Colored:
-    """How far things moved, scene units: black is not at all, grey is unknown.
+    """How far things moved, scene units: black is not at all, gray is unknown.
 
     Light yellow is the 99th percentile, or `at_least` where that is farther.
     """
@@ -99,7 +99,7 @@ def color_flow(flow: np.ndarray, largest: float | int | None = None) -> Colored:
 
     Still is white, right is red, down yellow-green, left cyan and up violet; full
     color from `largest` pixels on (the 99th percentile of the lengths by default).
-    Unknown is grey.
+    Unknown is gray.
     """
     flow = np.asarray(flow, np.float32)
     shown = np.all(np.isfinite(flow), axis=-1)

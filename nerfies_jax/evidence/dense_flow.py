@@ -54,13 +54,13 @@ def enlarged(views: Views) -> int:
 
 
 def levelled(views: Views, times: int | None = None) -> np.ndarray:
-    """[frames, height, width] uint8: grey pictures of one mean and spread, enlarged.
+    """[frames, height, width] uint8: gray pictures of one mean and spread, enlarged.
 
     Without it a film of varying exposure has 79 % of its pixels marked as moving.
     """
-    grey = 255 * views.grey
-    mean, spread = grey.mean((1, 2)), np.maximum(grey.std((1, 2)), 1e-3)
-    scaled = (grey - mean[:, None, None]) / spread[:, None, None]
+    gray = 255 * views.gray
+    mean, spread = gray.mean((1, 2)), np.maximum(gray.std((1, 2)), 1e-3)
+    scaled = (gray - mean[:, None, None]) / spread[:, None, None]
     alike = np.clip(scaled * np.median(spread) + np.median(mean), 0, 255)
     pictures = [np.rint(one).astype(np.uint8) for one in alike]
     times = enlarged(views) if times is None else times

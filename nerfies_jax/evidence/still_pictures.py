@@ -34,12 +34,12 @@ def log_odds(views: Views, still: PointCloud) -> np.ndarray:
     """
     frames = len(views.row)
     if not len(still.position):
-        return np.zeros(views.grey.shape, np.float32)
+        return np.zeros(views.gray.shape, np.float32)
     color, spread = _levelled(views)
     depth = [
         _depth(views, frame, still.position.astype(float)) for frame in range(frames)
     ]
-    clipped = np.zeros(views.grey.shape, np.float32)
+    clipped = np.zeros(views.gray.shape, np.float32)
     for frame in range(frames):
         unlike = _unlike(views, color, depth, frame)
         slope = _slope(color[frame])
@@ -62,10 +62,10 @@ def _levelled(views):
 
 
 def _slope(color):
-    """[height, width] grey levels a pixel, the steepest around."""
-    grey = color.mean(-1)
+    """[height, width] gray levels a pixel, the steepest around."""
+    gray = color.mean(-1)
     across, down = (
-        cv2.Sobel(grey, cv2.CV_32F, *by, scale=1 / 8) for by in ((1, 0), (0, 1))
+        cv2.Sobel(gray, cv2.CV_32F, *by, scale=1 / 8) for by in ((1, 0), (0, 1))
     )
     return cv2.dilate(np.hypot(across, down), np.ones((3, 3)))
 
@@ -96,7 +96,7 @@ def _depth(views, frame, position):
 
 
 def _unlike(views, color, depth, frame):
-    """[height, width] grey levels; NaN where too few frames show the place."""
+    """[height, width] gray levels; NaN where too few frames show the place."""
     width, height = views.size
     blank = np.full((height, width), np.nan, np.float32)
     if depth[frame] is None:

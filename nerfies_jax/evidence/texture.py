@@ -33,7 +33,7 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
         return cannot_tell(
             EFFECT, "plain background fills most of the views", threshold
         )
-    cycles = float(np.median([_finest(views.grey[one]) for one in seen]))
+    cycles = float(np.median([_finest(views.gray[one]) for one in seen]))
     near, far = view_set.depth_span(capture, views)
     depth = math.sqrt(near * far)
     scale = scene_metadata.metadata_of(capture, 1.0).scale
@@ -52,14 +52,14 @@ def _shown(views):
     return np.unique(np.linspace(0, len(views.row) - 1, SHOWN).round().astype(int))
 
 
-def _finest(grey):
+def _finest(gray):
     """Cycles a pixel below which `ENERGY` of the slopes' energy lies, less the noise.
 
     Noise is white, and what there is at the highest frequencies is taken for it.
     """
-    height, width = grey.shape
+    height, width = gray.shape
     window = np.hanning(height)[:, None] * np.hanning(width)
-    power = np.abs(np.fft.fft2((grey - grey.mean()) * window)) ** 2
+    power = np.abs(np.fft.fft2((gray - gray.mean()) * window)) ** 2
     across, down = np.fft.fftfreq(width), np.fft.fftfreq(height)
     frequency = np.hypot(*np.meshgrid(across, down))
     noise = np.median(power[frequency > 0.45])

@@ -11,14 +11,14 @@ from nerfies_jax.capture.capture import Capture
 
 LONGEST_SIDE_PX = 256  # of pictures in which what need not be sharp is looked for
 PLAIN_SHARE = 0.9  # of the border's pixels: then what lies behind has one color
-PLAIN_LEVELS = 3  # grey levels of 255: JPEG and rounding, not a picture
+PLAIN_LEVELS = 3  # gray levels of 255: JPEG and rounding, not a picture
 MIN_POINTS = 300  # that say where the scene is
 MOST_POINTS = 4000  # that are looked at
 OUTSIDE = 0.02  # share of points on either side taken for outliers
-# Slope in grey levels a pixel, and over what noise alone gives (a Gaussian derivative
+# Slope in gray levels a pixel, and over what noise alone gives (a Gaussian derivative
 # of 1 px passes a fifth of it); flow over less is a guess of its regulariser.
 LEAST_GRADIENT, LEAST_OVER_NOISE, NOISE_PASSED = 0.4, 3.0, 0.2
-# Grey levels. A lawn has detail in every corner, and all of it would pass for noise:
+# Gray levels. A lawn has detail in every corner, and all of it would pass for noise:
 # 12 to 15 levels in scikit-image's grass and gravel, made four times smaller.
 MOST_NOISE = 6.0
 
@@ -34,7 +34,7 @@ class Views(NamedTuple):
     camera: np.ndarray  # [frames] which physical camera
     time: np.ndarray  # [frames] in [0, 1]
     image: np.ndarray  # [frames, height, width, 3] uint8 sRGB
-    grey: np.ndarray  # [frames, height, width] float32 in [0, 1]
+    gray: np.ndarray  # [frames, height, width] float32 in [0, 1]
     valid: np.ndarray  # [frames, height, width] bool: neither black border nor plain
     textured: np.ndarray  # [frames, height, width] bool: flow can be seen there
     intrinsics: np.ndarray  # [frames, 3, 3]: pixel ~ K @ point in camera
@@ -44,7 +44,7 @@ class Views(NamedTuple):
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
-        return self.grey.shape[2], self.grey.shape[1]
+        return self.gray.shape[2], self.gray.shape[1]
 
     def depth_of(self, position: np.ndarray) -> np.ndarray:
         """Z-depth [points, frames] of places [points, frames, 3], scene units."""
@@ -61,16 +61,16 @@ def in_time_order(capture: Capture, rows: np.ndarray | None = None) -> Views:
 def without_cameras(images: np.ndarray) -> Views:
     """Pictures [frames, height, width, 3] uint8 in order of time; cameras are NaN."""
     frames, height, width = images.shape[:3]
-    grey = np.ascontiguousarray(images.mean(-1) / 255, np.float32)
+    gray = np.ascontiguousarray(images.mean(-1) / 255, np.float32)
     unknown = np.full((frames, 3, 3), np.nan)
     return Views(
         row=np.arange(frames),
         camera=np.zeros(frames, int),
         time=np.linspace(0, 1, frames),
         image=images,
-        grey=grey,
+        gray=gray,
         valid=np.ones((frames, height, width), bool),
-        textured=np.stack([_textured(one) for one in grey]),
+        textured=np.stack([_textured(one) for one in gray]),
         intrinsics=unknown,
         rotation=unknown,
         position=unknown[:, 0],
@@ -79,7 +79,7 @@ def without_cameras(images: np.ndarray) -> Views:
 
 def _views(capture, rows):
     image = capture.images[rows]
-    grey = np.ascontiguousarray(image.mean(-1) / 255, np.float32)
+    gray = np.ascontiguousarray(image.mean(-1) / 255, np.float32)
     valid = ~plain(capture, rows)
     if capture.valid is not None:
         # What is sampled at the rim of a black corner is half black.
@@ -92,9 +92,9 @@ def _views(capture, rows):
         camera=capture.camera_ids[rows],
         time=capture.times[rows].astype(np.float64),
         image=image,
-        grey=grey,
+        gray=gray,
         valid=valid,
-        textured=valid & np.stack([_textured(one) for one in grey]),
+        textured=valid & np.stack([_textured(one) for one in gray]),
         intrinsics=np.stack([_matrix(cameras, row) for row in rows]),
         rotation=cameras.camera_from_world[rows].astype(np.float64),
         position=cameras.position[rows].astype(np.float64),
@@ -118,7 +118,7 @@ def smaller(views: Views, factor: int) -> Views:
     scale = np.diag([1 / factor, 1 / factor, 1.0])
     return views._replace(
         image=shrunk(views.image),
-        grey=shrunk(views.grey),
+        gray=shrunk(views.gray),
         valid=shrunk(np.uint8(views.valid)) > 0,
         textured=shrunk(np.uint8(views.textured)) > 0,
         intrinsics=scale @ views.intrinsics,
@@ -233,12 +233,12 @@ def _matrix(cameras, row):
     )
 
 
-def _textured(grey):
+def _textured(gray):
     """Where the picture varies in every direction: no aperture problem.
 
-    The lesser eigenvalue of the structure tensor over 2 px, as a slope in grey levels.
+    The lesser eigenvalue of the structure tensor over 2 px, as a slope in gray levels.
     """
-    down, across = (nd.gaussian_filter(grey, 1, order) for order in ((1, 0), (0, 1)))
+    down, across = (nd.gaussian_filter(gray, 1, order) for order in ((1, 0), (0, 1)))
     xx, yy, xy = (
         nd.gaussian_filter(product, 2)
         for product in (across * across, down * down, across * down)
@@ -248,7 +248,7 @@ def _textured(grey):
     # Immerkaer 1996: the Laplacian of a picture that has no curvature is noise alone.
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
     # Its lower quarter (0.3186 deviations): where there is least detail.
-    noise = np.quantile(np.abs(nd.convolve(grey, mask)), 0.25) / (6 * 0.3186)
+    noise = np.quantile(np.abs(nd.convolve(gray, mask)), 0.25) / (6 * 0.3186)
     noise = min(noise, MOST_NOISE / 255)
     bound = max(LEAST_GRADIENT / 255, LEAST_OVER_NOISE * NOISE_PASSED * noise)
     return least > bound**2

@@ -82,7 +82,7 @@ def plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray:
 
 
 def unlike(pictures, flow):
-    """[height, width] grey levels by which surroundings differ along the flow."""
+    """[height, width] gray levels by which surroundings differ along the flow."""
     one, other = pictures
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))

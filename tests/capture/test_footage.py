@@ -47,14 +47,14 @@ def test_sharpness_falls_with_blur():
 
 
 def film(path, milliseconds, shape=(32, 48)):
-    """A film whose frame k, shown at its own time, is grey 10 k."""
+    """A film whose frame k, shown at its own time, is gray 10 k."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("h264", rate=30, options={"crf": "0"})
         stream.height, stream.width = shape
         stream.pix_fmt, stream.codec_context.time_base = "yuv444p", Fraction(1, 1000)
         for number, moment in enumerate(milliseconds):
-            grey = np.full((*shape, 3), 10 * number, np.uint8)
-            frame = av.VideoFrame.from_ndarray(grey, format="rgb24")
+            gray = np.full((*shape, 3), 10 * number, np.uint8)
+            frame = av.VideoFrame.from_ndarray(gray, format="rgb24")
             frame.pts, frame.time_base = moment, Fraction(1, 1000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
@@ -132,7 +132,7 @@ def test_a_picture_of_floats_is_refused_by_name(tmp_path):
     deep = np.full((32, 32), 70_000, np.int32)
     for name in ("0.tif", "1.tif", "2.tif"):
         PIL.Image.fromarray(deep).save(tmp_path / name)
-    with pytest.raises(CaptureError, match=r"0\.tif: grey of 32 bits, up to 70000"):
+    with pytest.raises(CaptureError, match=r"0\.tif: gray of 32 bits, up to 70000"):
         footage.from_pictures(tmp_path, tmp_path / "out")
 
 
@@ -255,11 +255,11 @@ def test_what_files_say_of_a_lens_may_be_anything(tmp_path):
 
 
 def test_two_frames_of_one_time_cost_one_of_them(tmp_path, monkeypatch):
-    def read(path, grey=False, rows=None, damaged="refuse"):
+    def read(path, gray=False, rows=None, damaged="refuse"):
         for row in range(30) if rows is None else sorted(rows):
             # The fifth frame comes a tenth of a millisecond after the fourth.
             seconds = row / 30 if row != 4 else 0.1001
-            yield seconds, np.full((32, 48) if grey else (32, 48, 3), row, np.uint8)
+            yield seconds, np.full((32, 48) if gray else (32, 48, 3), row, np.uint8)
 
     monkeypatch.setattr(footage, "read_video", read)
     monkeypatch.setattr(footage, "transfer_of", lambda film: None)

@@ -20,7 +20,7 @@ def save(path, pixels):
     return path
 
 
-def test_color_and_grey(tmp_path):
+def test_color_and_gray(tmp_path):
     color, alpha = images.read_image(save(tmp_path / "a.png", COLOR))
     np.testing.assert_array_equal(color, COLOR)
     assert alpha is None
@@ -36,7 +36,7 @@ def test_alpha_is_kept_apart(tmp_path):
     np.testing.assert_array_equal(alpha, ALPHA)
 
 
-def test_grey_with_alpha_is_not_transposed(tmp_path):
+def test_gray_with_alpha_is_not_transposed(tmp_path):
     # skimage.io.imread returns [width, 2, ...] for these.
     both = np.stack([COLOR[..., 0], ALPHA], -1)
     color, alpha = images.read_image(save(tmp_path / "a.png", both))

@@ -127,11 +127,11 @@ def test_a_mirror_is_no_turn(tmp_path, across, down, expected):
     struct.pack_into(">9i", data, start, *matrix)
     (tmp_path / "a.mp4").write_bytes(data)
     _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
-    _, grey = next(iter(video.read_video(tmp_path / "a.mp4", grey=True)))
+    _, gray = next(iter(video.read_video(tmp_path / "a.mp4", gray=True)))
     for mark, (y, x) in zip(expected, np.ndindex(2, 2), strict=True):
         at = (8 + 16 * y, 12 + 24 * x)
         assert np.abs(decoded[at] - np.array(colors[mark])).max() < 12
-        assert (grey[at] > 240) == (mark == "W")
+        assert (gray[at] > 240) == (mark == "W")
 
 
 @pytest.mark.parametrize(
@@ -203,10 +203,10 @@ def test_high_dynamic_range_keeps_what_is_no_brighter_than_half_of_white():
         expected = 255 * srgb(nits / 203 * colors)
         # A level of rounding, and one of matrices of four digits at dark colors
         assert np.abs(shown - expected).max() < 2
-    grey = np.repeat(np.linspace(0, 1, 4001)[:, None], 3, axis=1)
+    gray = np.repeat(np.linspace(0, 1, 4001)[:, None], 3, axis=1)
     for transfer in ("PQ", "HLG"):
         ramp = high_dynamic_range.tone_mapped(
-            np.round(65535 * grey).astype(np.uint16), transfer
+            np.round(65535 * gray).astype(np.uint16), transfer
         )
         assert (np.diff(ramp[:, 1].astype(int)) >= 0).all()
         assert (ramp[0].max(), ramp[-1].min()) == (0, 255)
@@ -357,5 +357,5 @@ def test_pixels_are_made_square(tmp_path):
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     assert next(video.read_video(path))[1].shape == (48, 64, 3)
-    assert next(video.read_video(path, grey=True))[1].shape == (48, 64)
+    assert next(video.read_video(path, gray=True))[1].shape == (48, 64)
     assert "pixels of shape 2, made square" in video.notes_of(path, 3, 0.2)

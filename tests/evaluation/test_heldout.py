@@ -91,8 +91,8 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
         capture = dataclasses.replace(capture, valid=valid)
     scored = drawn(capture, rng)
     places = np.array([len(scored.rows) - 1])
-    grey = Averages(places, np.full_like(scored.color[places], 0.4), None)
-    floors = Floors(grey._replace(known=~valid[scored.rows[places]]), grey)
+    gray = Averages(places, np.full_like(scored.color[places], 0.4), None)
+    floors = Floors(gray._replace(known=~valid[scored.rows[places]]), gray)
     numbers = heldout_metrics(scored, capture, floors=floors)
     unscored = {"heldout.unscored"} if filmed else set()
     lost = {"floor.neighbors"} if filmed else set()  # what is known was not filmed

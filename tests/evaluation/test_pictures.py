@@ -10,7 +10,7 @@ import skimage.io
 from nerfies_jax.capture import extras
 from nerfies_jax.evaluation import pictures
 
-GREY = (128, 128, 128)
+GRAY = (128, 128, 128)
 
 
 def mapped(name, value):
@@ -41,13 +41,13 @@ def test_one_stray_depth_does_not_flatten_the_picture(rng):
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf, 0.0, -1.0])
-def test_unknown_depth_is_grey_and_a_flat_one_has_one_color(unknown):
+def test_unknown_depth_is_gray_and_a_flat_one_has_one_color(unknown):
     depth = np.full((4, 5), 3.0)
     depth[1, 2] = unknown
     known = np.ones((4, 5), bool)
     known[3, 3] = False
     picture = pictures.color_depth(depth, known).picture
-    assert tuple(picture[1, 2]) == tuple(picture[3, 3]) == GREY
+    assert tuple(picture[1, 2]) == tuple(picture[3, 3]) == GRAY
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 2
     nothing = pictures.color_depth(np.full((4, 5), unknown)).picture
     assert np.all(nothing == 128)
@@ -59,7 +59,7 @@ def test_error_is_linear_up_to_its_largest():
     picture = pictures.color_error(render, truth, largest=0.2).picture[0]
     for column, index in ((0, 0), (1, 128), (2, 255)):
         np.testing.assert_array_equal(picture[column], mapped("inferno", index))
-    assert tuple(picture[3]) == GREY
+    assert tuple(picture[3]) == GRAY
     with pytest.raises(ValueError, match="positive, got 0"):
         pictures.color_error(render, truth, 0)
 
@@ -67,7 +67,7 @@ def test_error_is_linear_up_to_its_largest():
 def test_flow_is_white_at_rest_and_hue_tells_the_direction():
     flow = np.array([[[0, 0], [4, 0], [-9, 0], [2, 0], [np.nan, 0]]], float)
     picture = pictures.color_flow(flow, largest=4.0).picture[0]
-    expected = [(255, 255, 255), (255, 0, 0), (0, 255, 255), (255, 128, 128), GREY]
+    expected = [(255, 255, 255), (255, 0, 0), (0, 255, 255), (255, 128, 128), GRAY]
     np.testing.assert_array_equal(picture, expected)
     still = pictures.color_flow(np.zeros((2, 3, 2)))
     assert np.all(still.picture == 255)

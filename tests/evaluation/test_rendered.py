@@ -23,7 +23,7 @@ def state_at(step, level):
 
 
 def flat(params, view, size, step):
-    """A grey picture: parameters, time and step show in it."""
+    """A gray picture: parameters, time and step show in it."""
     shape = size[::-1]
     level = params + view.time / 10 + step.astype(jnp.float32) / 100
     return Rendering(
@@ -129,10 +129,10 @@ def test_a_renderer_keeps_what_stays_and_drops_what_changes():
 
     def drawn(params, view):
         state = TrainState(params, (), (), jnp.zeros((), jnp.int32), None)
-        ran, grey = counted.since(lambda: renderer(state, view))
+        ran, gray = counted.since(lambda: renderer(state, view))
         time = float(view.time)
         exact = float(params["mean"]) + time * 2 * float(params["weight"]) + time / 10
-        np.testing.assert_allclose(grey, exact, atol=1e-6)
+        np.testing.assert_allclose(gray, exact, atol=1e-6)
         return ran
 
     assert drawn(params, here) == (1, 1, 1)

@@ -47,7 +47,7 @@ def film(
     """Cameras look along +z at a wall with a card before it.
 
     `card` says where the card is at a time, `gain` the factor on linear light, `camera`
-    the position, `shown` whether the card is there. `blank` paints everything grey;
+    the position, `shown` whether the card is there. `blank` paints everything gray;
     `half` is half the card's side.
     """
     width, height = SIZE

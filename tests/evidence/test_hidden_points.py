@@ -31,7 +31,7 @@ def film_before(hole=HOLE, front=False):
     color = np.repeat(red[:, None], 3, 1).astype(np.uint8)
     inside = np.stack(np.meshgrid(*2 * [np.linspace(-HOLE, HOLE, 120)]), -1)
     inside = wall(*inside.reshape(-1, 2).T)
-    moving = np.zeros(views.grey.shape, bool)
+    moving = np.zeros(views.gray.shape, bool)
     for frame, mask in enumerate(moving):
         pixel, _ = view_set.project(views, frame, inside)
         row, column = np.clip(pixel[:, ::-1].astype(int).T, 0, [[71], [95]])

@@ -201,12 +201,12 @@ def test_the_finest_detail_is_that_of_the_picture(period_px):
     film = films.film()
     width, height = films.SIZE
     wave = 0.5 + 0.3 * np.sin(2 * np.pi * np.arange(width) / period_px)
-    grey = np.tile(wave, (films.FRAMES, height, 1)).astype(np.float32)
-    finding = texture.texture(film, still().views._replace(grey=grey), 1)
+    gray = np.tile(wave, (films.FRAMES, height, 1)).astype(np.float32)
+    finding = texture.texture(film, still().views._replace(gray=gray), 1)
     # A Hann window of 96 pixels smears a frequency by two lines of its spectrum.
     slack = 2 * period_px / width
     assert finding.numbers["finest_px"] == pytest.approx(period_px, rel=slack)
-    halved = texture.texture(film, still().views._replace(grey=grey), 2)
+    halved = texture.texture(film, still().views._replace(gray=gray), 2)
     assert halved.numbers["finest_px"] == 2 * finding.numbers["finest_px"]
 
 

@@ -26,7 +26,7 @@ def views(sway=0.25) -> Views:
         camera=np.zeros(FRAMES, int),
         time=time,
         image=np.zeros((*blank.shape, 3), np.uint8),
-        grey=blank,
+        gray=blank,
         valid=blank == 0,
         textured=blank == 0,
         intrinsics=np.tile(matrix, (FRAMES, 1, 1)),

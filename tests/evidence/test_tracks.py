@@ -140,7 +140,7 @@ def test_wide_steps_are_found_from_where_a_still_scene_would_be():
     capture = films.film(camera=lambda t: (1.2 * t - 0.6, 0.0, 0.0), frames=4)
     views = view_set.in_time_order(capture)
     pictures = dense_flow.levelled(views)
-    height, width = views.grey.shape[1:]
+    height, width = views.gray.shape[1:]
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     shares = []
     for span in (None, view_set.depth_span(capture, views)):
@@ -401,9 +401,9 @@ def test_what_moves_before_the_near_plane_of_the_wall_is_known():
 @pytest.mark.parametrize("coarse", [1.0, 1.5])
 def test_detail_everywhere_is_texture_and_no_noise(coarse, rng):
     """As a lawn's; noise of as many levels is of single pixels and has no slopes."""
-    grey = nd.gaussian_filter(rng.normal(size=(90, 120)), coarse)
-    grey = np.float32(0.5 + 0.15 * grey / grey.std())
-    assert view_set._textured(grey).mean() > 0.5
+    gray = nd.gaussian_filter(rng.normal(size=(90, 120)), coarse)
+    gray = np.float32(0.5 + 0.15 * gray / gray.std())
+    assert view_set._textured(gray).mean() > 0.5
     plain = np.float32(0.5 + 4 / 255 * rng.normal(size=(90, 120)))
     assert view_set._textured(plain).mean() < 0.05
 

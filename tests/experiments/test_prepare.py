@@ -61,7 +61,7 @@ BAD = {
     "no focal": (dict(focal=None), [], "'focal'"),
     "focal zero": (dict(focal=np.array(0.0)), [], "focal = 0"),
     "poses short": (dict(poses=np.zeros((19, 4, 4))), [], "20 images"),
-    "grey": (dict(images=np.zeros((20, 8, 10), np.float32)), [], "(20, 8, 10)"),
+    "gray": (dict(images=np.zeros((20, 8, 10), np.float32)), [], "(20, 8, 10)"),
     "too bright": (dict(images=np.full((20, 8, 10, 3), 7.0)), [], "to 7"),
     "NaN": (dict(poses=np.full((20, 4, 4), np.nan)), [], "NaN"),
     "objects": (dict(times=np.array([{}] * 20)), [], "not a readable .npz"),

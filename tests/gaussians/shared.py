@@ -42,7 +42,7 @@ def some_gaussians(count, dtype="float64", seed=0):
 
 
 def rows_of(gaussians, opacity_logit=0.0, rest=0):
-    """Grey rows of these Gaussians, all of one opacity."""
+    """Gray rows of these Gaussians, all of one opacity."""
     mean, quaternion, scale = (np.asarray(x) for x in gaussians[:3])
     count = len(mean)
     leaves = (

@@ -266,7 +266,7 @@ def test_every_system_trains_from_hostile_starts(name, case):
 
 
 def points_at(position):
-    """The capture with other points, all of them grey."""
+    """The capture with other points, all of them gray."""
     position = np.asarray(position, np.float32)
     color = np.full(position.shape, 128, np.uint8)
     return dataclasses.replace(
