@@ -3,7 +3,7 @@
     python -m experiments.compare RUN RUN ...
     python -m experiments.compare RUN RUN --psnr 22 24 --frames 4 --out compared
 
-The runs must have learnt from the same frames of the same capture. Prints a table of
+The runs must have learned from the same frames of the same capture. Prints a table of
 scores, times and sizes and after how many seconds of training each run reached a PSNR;
 saves compare.json, curves.png, and pictures.png with held-out frames side by side.
 Seconds are those of the machine of each run: the table says where machines differ.

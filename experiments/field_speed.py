@@ -136,9 +136,9 @@ def measured(capture, preset: str, seconds, size: tuple[int, int], seed: int) ->
         ssim.append(found["heldout.ssim"])
         moving.append(found.get("heldout.moving_psnr"))  # none where nothing moves
         spent.append(took)
-    learnt = {"psnr": scores, "ssim": ssim, "moving_psnr": moving}
-    learnt |= {"steps": steps, "spent": spent}
-    return learnt | drawn(model, state, capture, size)
+    learned = {"psnr": scores, "ssim": ssim, "moving_psnr": moving}
+    learned |= {"steps": steps, "spent": spent}
+    return learned | drawn(model, state, capture, size)
 
 
 def _named(preset):

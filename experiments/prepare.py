@@ -24,7 +24,7 @@ class Npz:
     """Arrays `images`, `poses` (OpenGL camera to world), `focal` and `times`.
 
     Where rows in a row share one pose, those are a validation sweep: they are held out,
-    the rows before them are learnt from and the rows after them are left out.
+    the rows before them are learned from and the rows after them are left out.
     """
 
     file: cli.Positional[pathlib.Path]

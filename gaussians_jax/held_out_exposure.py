@@ -1,4 +1,4 @@
-"""Exposures of frames that were never learnt from, fitted to half of each.
+"""Exposures of frames that were never learned from, fitted to half of each.
 
 The protocol of NeRF-W (Martin-Brualla et al. 2021), as for the codes of fields: the
 scene stays as it is, and the other half is scored.

@@ -105,7 +105,7 @@ def save(
         coded = features + others
         notes.append(
             f"The features of its anchors are {features / 1e6:.2f} MB by their bits "
-            f"under the learnt law, all else {others / 1e6:.2f} MB at 32 bits a number "
+            f"under the learned law, the rest {others / 1e6:.2f} MB at 32 bits each "
             f"({MODEL} holds all at 32 bits)."
         )
     if isinstance(spec.motion, BasisMotionSpec):

@@ -208,7 +208,7 @@ def _exposed(effects, params, drawn, view):
 
 
 def _posed(effects, params, frames):
-    """What is learnt from, its cameras as training has them."""
+    """What is learned from, its cameras as training has them."""
     for effect in effects:
         if effect.pose is not None:
             own = params.nets.get(effect.name)

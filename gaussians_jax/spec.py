@@ -163,7 +163,7 @@ class SceneMetadata:
 
     @property
     def moments(self) -> int:
-        """How many times are learnt from: fewer than frames of several cameras."""
+        """How many times are learned from: fewer than frames of several cameras."""
         return self.frames if self.times is None else self.times
 
 

@@ -191,10 +191,10 @@ def _init(spec, metadata, effects, key):
             condition + extras,
         )
     rows = {MOMENT: len(metadata.times)}
-    learnt = 1 + max((max(left, right) for left, right, _ in metadata.exposures))
+    learned = 1 + max((max(left, right) for left, right, _ in metadata.exposures))
     params = {"template": nets, "codes": {}}
     for table in specs.tables_of(effects):
-        count = rows.get(table.by, learnt)
+        count = rows.get(table.by, learned)
         params["codes"][table.name] = codes.init(
             jax.random.fold_in(keys[1], stream(table.name)), count, table.width
         )
@@ -212,7 +212,7 @@ def look_up(
     time: Scalar,
     appearance: Int[Array, ""],
 ) -> Codes:
-    """The codes of one frame: between rows where its time was not learnt from."""
+    """The codes of one frame: between rows where its time was not learned from."""
     frame_codes = {}
     for table in tables:
         rows = params["codes"][table.name]

@@ -1,4 +1,4 @@
-"""Appearance codes of frames that were never learnt from, fitted to half of each.
+"""Appearance codes of frames that were never learned from, fitted to half of each.
 
 The protocol of NeRF-W (Martin-Brualla et al. 2021): the network stays as it is, the
 code is fitted to the left half of a frame, and the right half is scored.
@@ -39,7 +39,7 @@ def score(
 ) -> evaluation.Halves | None:
     """Scores of the right halves of frames, their codes fitted to the left ones.
 
-    None where the field has no codes that only frames learnt from own. A transient
+    None where the field has no codes that only frames learned from own. A transient
     medium is left out: what passed by in one frame is in no other.
     """
     whole = scene.field(spec, metadata, effects=effects)

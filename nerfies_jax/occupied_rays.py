@@ -1,6 +1,6 @@
 """The rays of a step where something was found: empty ones have little left to teach.
 
-Of more rays than a step has, those are learnt from that meet an occupied cell, and a
+Of more rays than a step has, those are learned from that meet an occupied cell, and a
 share of any (`OccupancySpec`). Space is surveyed anew as training goes on, and what was
 found empty once stays so. Müller et al. 2022, arXiv:2201.05989, appendix E.2, skip the
 samples in empty cells instead: a step then has as many rays as its samples pay for,
@@ -82,7 +82,7 @@ def chosen(
     return jnp.concatenate([jnp.arange(anywhere), anywhere + order])
 
 
-def learnt_from(field: Field, occupied: Cells, candidates: Batch) -> Batch:
+def learned_from(field: Field, occupied: Cells, candidates: Batch) -> Batch:
     """The rays of a step, of `OccupancySpec.candidates` times as many."""
     spec = field.spec.sampling.occupancy
     lines = jax.vmap(functools.partial(field_ray, field.metadata))(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from nerfies_jax.effects import learnt_moments, scene_flow
+from nerfies_jax.effects import learned_moments, scene_flow
 from nerfies_jax.evidence import usable_paths
 from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.field import Field
@@ -143,7 +143,7 @@ def fit_flow(
             "scene flow to"
         )
     moments = np.where(apart > 0, apart, 1)
-    moments = moments / learnt_moments.interval(len(field.metadata.times))
+    moments = moments / learned_moments.interval(len(field.metadata.times))
     shift = np.diff(paths.position, axis=1) / moments[:, None]
     unit = max(float(np.linalg.norm(shift, axis=-1)[both].mean()), 1e-12)
     away = _flow_distances(field, paths, shift, both)

@@ -6,7 +6,7 @@ import numpy as np
 
 from nerfies_jax import evaluation, scene
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.effects import learnt_moments, scene_flow
+from nerfies_jax.effects import learned_moments, scene_flow
 from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTracks
 from nerfies_jax.render_ray import Bound, mean_flow
@@ -133,7 +133,7 @@ def _flow_mover(field) -> Move | None:
         return None
     metadata = field.metadata
     centre = np.asarray(metadata.centre, np.float32)
-    gap = learnt_moments.interval(len(metadata.times))
+    gap = learned_moments.interval(len(metadata.times))
 
     @jax.jit
     def hop(params, step, points, view, side, length):

@@ -199,7 +199,7 @@ def micro_batch(
         return draw_batch(frames, count, key), None
     batch = draw_batch(frames, plan.candidates * count, key)
     cells = state.aux_state
-    return occupied_rays.learnt_from(radiance, cells, batch), cells
+    return occupied_rays.learned_from(radiance, cells, batch), cells
 
 
 def descend(

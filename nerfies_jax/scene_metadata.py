@@ -21,9 +21,9 @@ class SceneMetadata:
     centre: tuple[float, float, float]  # of the filmed volume, scene units
     scale: float  # field = (scene - centre) * scale
     background: tuple[float, float, float] | None  # color behind everything, if known
-    times: tuple[float, ...]  # distinct times that are learnt from, rising
+    times: tuple[float, ...]  # distinct times that are learned from, rising
     # For each appearance id the rows of the table of codes it lies between, and where:
-    # (left, right, progress). An exposure that is not learnt from lies between those
+    # (left, right, progress). An exposure that is not learned from lies between those
     # before and after it in time.
     exposures: tuple[tuple[int, int, float], ...]
     available_data: frozenset[str] = frozenset()  # of "depths", "points", "flow"
@@ -122,10 +122,10 @@ def _frustum_points(capture, near, far, depths=8):
 
 
 def exposures(capture: Capture) -> tuple[tuple[int, int, float], ...]:
-    """`SceneMetadata.exposures`; one row for each id that is learnt from."""
+    """`SceneMetadata.exposures`; one row for each id that is learned from."""
     ids = np.asarray(capture.appearance_ids)
-    learnt = np.unique(ids[capture.train])
-    row_of = {int(learnt_id): row for row, learnt_id in enumerate(learnt)}
+    learned = np.unique(ids[capture.train])
+    row_of = {int(learned_id): row for row, learned_id in enumerate(learned)}
     when = {
         int(one): float(np.mean(capture.times[ids == one])) for one in np.unique(ids)
     }

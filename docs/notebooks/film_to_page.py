@@ -109,7 +109,7 @@ if filmed is not None:
 # ## Train
 #
 # A run folder, as the command makes it: settings, checkpoints, scores, pictures, a film
-# from a moving camera, the page. Every eighth frame is held out and never learnt from.
+# from a moving camera, the page. Every eighth frame is held out and never learned from.
 
 # %%
 source = CaptureSource(OUT / "capture", max_side=MAX_SIDE)

@@ -173,7 +173,7 @@ fitted, values = train(start)
 #
 # The truth, what was begun with, what was fitted and where it is still wrong (five
 # times brighter). A flat picture of the mean color is the least one can do; what was
-# learnt has to beat it by far.
+# learned has to beat it by far.
 
 # %%
 panels = {

@@ -16,7 +16,7 @@
 # Everything beyond a static scene is an *effect*: a name and some pure functions, each
 # in a seam of its own ([own_effect.md](../own_effect.md) lists the seams). Here is one
 # that the library does not have: every Gaussian swings to and fro along a line of its
-# own, all of them with one period that is learnt as well. It is written, its gradients
+# own, all of them with one period that is learned as well. It is written, its gradients
 # are checked, it is trained on a scene that does move, and it is held against the same
 # scene without it.
 
@@ -42,7 +42,7 @@ FRAMES = 24
 # `init_rows` are parameters with a row for each Gaussian (they are cloned, split and
 # removed with it), `init` those without. `deform` says where Gaussians are at a time
 # from 0 to 1, and `penalty` what swinging costs. The swing starts at exactly zero: an
-# effect that is added to a scene must not change it before it has learnt something.
+# effect that is added to a scene must not change it before it has learned something.
 
 
 # %%
@@ -170,7 +170,7 @@ for axis, (title, panel) in zip(axes, panels.items(), strict=True):
 plt.show()
 
 # %% [markdown]
-# ## What it has learnt
+# ## What it has learned
 #
 # The reach of most Gaussians stays near zero, for most of the scene stands still; a few
 # swing. Was that worth it? The two numbers above the pictures say.

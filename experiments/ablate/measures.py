@@ -103,7 +103,7 @@ LEGENDS = {
     "model_mb": "model MB: the one file of a trained scene; of a field its "
     "parameters, without\nthe optimiser.",
     "coded_mb": "coded MB: the same scene, features by their bits where there is a "
-    "learnt law and all\nother numbers at 32 bits.",
+    "learned law and all\nother numbers at 32 bits.",
 }
 
 

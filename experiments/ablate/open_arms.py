@@ -65,7 +65,7 @@ RATE = Suite(
     },
     claims=(
         Claim(
-            "Features coded under a learnt law take less and cost no quality",
+            "Features coded under a learned law take less and cost no quality",
             "bits-at-1e-3",
             "no-law",
             CODED,

@@ -1,4 +1,4 @@
-"""A motion that a network has learnt, to try things on: in closed form, or of a run."""
+"""A learned motion to try things on: in closed form, or of a run."""
 
 import dataclasses
 from collections.abc import Callable
@@ -76,7 +76,7 @@ def of_model(
 
 
 def fitted(count: int, spec: MotionSpec, steps: int) -> Moving:
-    """`analytic` as a network has learnt it: half a ball that moves, half a wall.
+    """`analytic` as a network has learned it: half a ball that moves, half a wall.
 
     A network, because its motion has the small fast parts that a smooth formula lacks;
     fitted, because one that was never trained does not move.

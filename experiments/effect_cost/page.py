@@ -65,7 +65,7 @@ with an elastic penalty on 4 samples of a ray, asked at one step of five, it is
 {basis:.2f} (basis) of a still one, the acceleration penalty to {acceleration:.2f}. NSFF
 is the dearest of fields ({flow:.2f}): it traces each ray at its neighbors' times, too.
 Annealing, alternation and motion-guided growth cost a step nothing that can be
-measured: they change what is learnt and when."""
+measured: they change what is learned and when."""
 QUOTED = {
     "appearance": "nerf-w-small.only_appearance",
     "background": "nerfies-small.warp_and_background",

@@ -87,7 +87,7 @@ another method in the same table, and what the small presets of both make of it 
 the gain over the same seeds, ± its 95 % interval. *start* is what both motions start
 from; *no depth* is Sonata without its depth term, which none of its rivals has and
 which learns the exact depth of built-in films. LPIPS stands there as it was published
-alone: it takes learnt weights, which are downloads of their own (`--lpips-weights` of
+alone: it takes learned weights, which are downloads of their own (`--lpips-weights` of
 `reconstruct` and `benchmark`), and the papers use two of them (VGG, and AlexNet in
 Sonata's table of HyperNeRF). The papers' films, sizes and lengths are others, so this
 says whether the order holds here, not whether they measured rightly. The two papers'

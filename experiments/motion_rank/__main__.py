@@ -3,7 +3,7 @@
     python -m experiments.motion_rank
     python -m experiments.motion_rank --kinds scene wiggles --seeds 3 --out rank
 
-Known trajectories of points are learnt directly, without pictures, from some of the
+Known trajectories of points are learned directly, without pictures, from some of the
 times; the others are held out. Displacements are modelled as
 
 - time basis:   sum_k c_ik b_k(t), K trajectories shared by all points (DynMF);
@@ -99,9 +99,9 @@ class RankResult(NamedTuple):
     kind: str
     model: str
     count: int | None  # None: has no basis
-    learnt: list[float]
+    learned: list[float]
     held_out: list[float]
-    floor: list[float] | None  # what `learnt` cannot go below
+    floor: list[float] | None  # what `learned` cannot go below
     seconds: float  # of processor time for one fit, without compiling
 
 
@@ -140,7 +140,7 @@ def table(args: MotionRank) -> list[RankResult]:
 
 def one_row(args, fits, kind, model, count, drawn) -> RankResult:
     """Fit one model to every draw; `fits` keeps what is compiled."""
-    learnt, held_out, floor, seconds = [], [], [], []
+    learned, held_out, floor, seconds = [], [], [], []
     for seed, tracks in enumerate(drawn):
         keep = np.arange(len(tracks.times)) % 4 != 2
         known = tracks._replace(times=tracks.times[keep], moved=tracks.moved[:, keep])
@@ -153,12 +153,12 @@ def one_row(args, fits, kind, model, count, drawn) -> RankResult:
         seconds.append(time.process_time() - began)
         size = np.sqrt(np.mean(np.sum(tracks.moved**2, axis=-1)))
         off = np.sum((predicted - tracks.moved) ** 2, axis=-1)
-        learnt.append(float(np.sqrt(np.mean(off[:, keep])) / size))
+        learned.append(float(np.sqrt(np.mean(off[:, keep])) / size))
         held_out.append(float(np.sqrt(np.mean(off[:, ~keep])) / size))
         if model in FLOORS:
             floor.append(float(FLOORS[model](known.moved, count) / size))
     return RankResult(
-        kind, model, count, learnt, held_out, floor or None, float(np.median(seconds))
+        kind, model, count, learned, held_out, floor or None, float(np.median(seconds))
     )
 
 

@@ -25,7 +25,7 @@ def progress(row) -> str:
     """One line for a model that is done."""
     count = "" if row.count is None else f" K={row.count}"
     return (
-        f"{row.kind} {row.model}{count}: {np.mean(row.learnt):.4f}, held out "
+        f"{row.kind} {row.model}{count}: {np.mean(row.learned):.4f}, held out "
         f"{np.mean(row.held_out):.4f}, {row.seconds:.1f} s"
     )
 
@@ -33,14 +33,14 @@ def progress(row) -> str:
 def text(rows) -> str:
     """One line for each model and K."""
     lines = [
-        f"\n{'tracks':8s} {'model':13s} {'K':>3s} {'learnt':>16s} "
+        f"\n{'tracks':8s} {'model':13s} {'K':>3s} {'learned':>16s} "
         f"{'held out':>16s} {'floor':>8s} {'CPU s':>6s}"
     ]
     for row in rows:
         floor = f"{np.mean(row.floor):8.4f}" if row.floor else f"{'-':>8s}"
         lines.append(
             f"{row.kind:8s} {row.model:13s} {row.count or '-':>3} "
-            f"{markdown.over_seeds(row.learnt, 4):>16s} "
+            f"{markdown.over_seeds(row.learned, 4):>16s} "
             f"{markdown.over_seeds(row.held_out, 4):>16s} {floor} {row.seconds:6.2f}"
         )
     return "\n".join(lines)
@@ -62,7 +62,7 @@ def format_conclusions(rows) -> str:
 
 
 def _mean(row, held_out=False):
-    return float(np.mean(row.held_out if held_out else row.learnt))
+    return float(np.mean(row.held_out if held_out else row.learned))
 
 
 def _against_time(own):
@@ -70,10 +70,10 @@ def _against_time(own):
         pair = own.get(("moving basis", count)), own.get(("time basis", count))
         if None in pair:
             continue
-        learnt, held = (_mean(pair[0], h) / _mean(pair[1], h) for h in (False, True))
-        verdict = "shows" if learnt <= TIME_GATE else "DOES NOT SHOW"
+        learned, held = (_mean(pair[0], h) / _mean(pair[1], h) for h in (False, True))
+        verdict = "shows" if learned <= TIME_GATE else "DOES NOT SHOW"
         yield (
-            f"  K={count}: the moving basis has {learnt:.2f} of the time basis' error "
+            f"  K={count}: the moving basis has {learned:.2f} of the time basis' error "
             f"({held:.2f} held out). Its claim to at most {TIME_GATE:g} {verdict}."
         )
 
@@ -99,14 +99,16 @@ def _against_residual(own):
     if residual is None or not moving:
         return
     count = 8 if 8 in moving else max(moving)
-    learnt, held = (_mean(residual, h) / _mean(moving[count], h) for h in (False, True))
+    learned, held = (
+        _mean(residual, h) / _mean(moving[count], h) for h in (False, True)
+    )
     what = (
         "the basis is not what helps"
-        if learnt <= RESIDUAL_GATE and held <= RESIDUAL_GATE
+        if learned <= RESIDUAL_GATE and held <= RESIDUAL_GATE
         else "the basis helps"
     )
     yield (
-        f"  Without a basis (residual): {learnt:.2f} of the moving basis' error at "
+        f"  Without a basis (residual): {learned:.2f} of the moving basis' error at "
         f"K={count} ({held:.2f} held out): {what}."
     )
 
@@ -141,7 +143,7 @@ def _across_counts(own):
 def _floors(own):
     for name in ("time basis", "separable"):
         above = [
-            np.mean(row.learnt) / np.mean(row.floor)
+            np.mean(row.learned) / np.mean(row.floor)
             for (model, _), row in own.items()
             # below a thousandth the fit, not the rank, is what limits
             if model == name and row.floor and np.mean(row.floor) > 1e-3
@@ -172,13 +174,13 @@ def write(out, record, rows) -> None:
 
 def page(stored) -> str:
     """The page in docs/results below the docstring, from a motion_rank.json."""
-    heads = ("tracks", "model", "K", "learnt", "held out", "floor", "CPU s")
+    heads = ("tracks", "model", "K", "learned", "held out", "floor", "CPU s")
     rows = [
         [
             row["kind"],
             row["model"],
             "" if row["count"] is None else str(row["count"]),
-            *(markdown.over_seeds(row[name], 4) for name in ("learnt", "held_out")),
+            *(markdown.over_seeds(row[name], 4) for name in ("learned", "held_out")),
             markdown.number(np.mean(row["floor"]), 4) if row["floor"] else "",
             markdown.number(row["seconds"], 2),
         ]
@@ -189,13 +191,13 @@ def page(stored) -> str:
 
 
 def draw_figure(rows, path) -> None:
-    """Error against K for each kind of tracks, learnt above and held out below."""
+    """Error against K for each kind of tracks, learned above and held out below."""
     kinds = list(dict.fromkeys(row.kind for row in rows))
     size = (3.6 * len(kinds) + 2, 6.4)
     figure = figures.new_figure(figsize=size, dpi=120, layout="constrained")
     axes = figure.subplots(2, len(kinds), squeeze=False, sharey=True)
     counts = sorted({row.count for row in rows if row.count is not None})
-    for line, part in zip(axes, ("learnt", "held_out"), strict=True):
+    for line, part in zip(axes, ("learned", "held_out"), strict=True):
         for panel, kind in zip(line, kinds, strict=True):
             _draw_panel(panel, [row for row in rows if row.kind == kind], part)
             panel.set_title(f"{kind}, {part.replace('_', ' ')} times", fontsize=10)
@@ -203,7 +205,7 @@ def draw_figure(rows, path) -> None:
             panel.set_xlabel("basis vectors K")
         line[0].set_ylabel("RMS error / RMS displacement")
     # A floor may be rounding alone, which would flatten everything above it.
-    errors = [e for row in rows for e in (*row.learnt, *row.held_out)]
+    errors = [e for row in rows for e in (*row.learned, *row.held_out)]
     axes[0, 0].set_ylim(min(errors) / 2, 1.5 * max(errors))
     axes[0, -1].legend(
         frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5)
@@ -229,7 +231,7 @@ def _draw_panel(panel, rows, part):
         panel.fill_between(
             counts, error.min(axis=1), error.max(axis=1), color=color, alpha=0.15
         )
-        if part == "learnt" and own and own[0].floor:
+        if part == "learned" and own and own[0].floor:
             floor = [np.mean(row.floor) for row in own]
             panel.plot(counts, floor, ":", color=color, label=f"{model}: floor")
     panel.grid(alpha=0.3)

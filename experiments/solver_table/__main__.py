@@ -40,7 +40,7 @@ class Settings:
     solvers: tuple[str, ...] | None = None  # all that can
     steps: tuple[int, ...] = (5, 10, 20, 50, 100, 200)  # at most so many
     frames: int = 4  # held out
-    pictures: int = 16  # learnt from
+    pictures: int = 16  # learned from
     training_steps: int = 2000
     pixels: int = 32  # of a side
     width: int = 64

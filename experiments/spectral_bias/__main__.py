@@ -60,7 +60,7 @@ class SpectralBias:
     batch: int = 256
     """Random points of a step."""
     points: int | None = None
-    """Points that are learnt from, the same for all; new ones in every step if None."""
+    """Fixed training points; None draws new ones in every step."""
     kinds: tuple[str, ...] = KINDS
     """Networks; the first one's time is what the others get."""
     out: pathlib.Path | None = None

@@ -6,7 +6,7 @@ reference feature, and a residual feature for each of the ten Gaussians it carri
 network makes these of the features, against the anchor; a coarse network of reference
 feature and time moves the anchor, a fine one of residual feature and time each of what
 it carries. Features are kept rounded: they are trained with noise as wide as a step,
-and their bits under a learnt law are part of the loss.
+and their bits under a learned law are part of the loss.
 
 Read were the paper's abstract, a summary of its method and the settings of its code
 (H-Huang774/ADC-GS); its equations were not at hand. What they leave open is settled so.

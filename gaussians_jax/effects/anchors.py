@@ -32,7 +32,7 @@ class RateSpec:
 
     weight: float = 1e-3  # of the mean bits of a number of the features
     start: int = steps(20_000)  # of noise and cost
-    step: float = 0.1  # first, in units of the features; it is learnt
+    step: float = 0.1  # first, in units of the features; it is learned
     width: int = 32  # of the network that tells residual from reference features
     learning_rate: float = 2e-4
     learning_rate_end: float = 1e-5

@@ -27,7 +27,7 @@ HELD = 1e-6  # squared error a pixel that a change of one in one number counts f
 
 @dataclasses.dataclass(frozen=True)
 class ExposureSpec:
-    """How fast exposures are learnt.
+    """How fast exposures are learned.
 
     Each row of the table learns from its own frames alone, once in so many steps as
     there are frames; Adam's step then counts some eight times.
@@ -49,7 +49,7 @@ def init(key: Key[Array, ""], exposures: int) -> Float[Array, "exposures 3 4"]:
 def of_id(
     table: Float[Array, "exposures 3 4"], places: Places, appearance: Int[Array, ""]
 ) -> Float[Array, "3 4"]:
-    """The change of one appearance id; of one never learnt from, between two in time.
+    """The change of one appearance id; of one never learned from, between two in time.
 
     The mean of all is no change, and counts as constant: a slope through it would
     reach the rows of all other frames, and Adam makes whole steps of the smallest. An

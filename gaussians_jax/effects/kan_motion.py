@@ -1,8 +1,8 @@
 """Motion as a network of Gaussian kernels, of a code for each Gaussian and the time.
 
-"Sonata", equation 11: a learnt embedding of each Gaussian and a learnt code of the time
-go through an RBF-KAN to residuals of position, scale and rotation. Where the paper is
-silent this follows Bae et al. 2024, "Per-Gaussian embedding-based deformation",
+"Sonata", equation 11: a learned embedding of each Gaussian and a learned code of the
+time go through an RBF-KAN to residuals of position, scale and rotation. Where the paper
+is silent this follows Bae et al. 2024, "Per-Gaussian embedding-based deformation",
 arXiv:2404.03613 (E-D3DGS), whose inputs, neighbors and constants it shares, and where
 `coarser` is set its two networks, a coarse and a fine one (`motion_codes`).
 

@@ -108,7 +108,9 @@ def init_times(
 ) -> Float[Array, "moments code"]:
     """The table of codes over time, started as the embeddings are."""
     if frames < 1:
-        raise ValueError(f"frames={frames}: a motion is learnt from at least one frame")
+        raise ValueError(
+            f"frames={frames}: a motion is learned from at least one frame"
+        )
     count = moments(spec, frames)
     if spec.waves is None:
         scale = math.sqrt(3) * spec.spread  # of a uniform draw

@@ -9,7 +9,7 @@ Gaussians there are.
 
 With a mask (`MaskSpec`) it is the motion of EDGS (Kong et al. 2025, AAAI,
 arXiv:2502.20378): sparse anchors carry Gaussians by a radial kernel, and a mask that is
-learnt along says which of them move. The network is asked for those alone, and
+learned along says which of them move. The network is asked for those alone, and
 Gaussians that only resting anchors carry are passed over. Its anchors also make the
 looks of their Gaussians, which here keep their own.
 
@@ -68,7 +68,7 @@ ROWS_AT_ONCE, NODES_AT_ONCE = 512, 32  # blocks that are passed over where nothi
 
 @dataclasses.dataclass(frozen=True)
 class MaskSpec:
-    """A learnt mask of nodes: which of them move at all (EDGS).
+    """A learned mask of nodes: which of them move at all (EDGS).
 
     Each node keeps a number of its own, where EDGS has a small network of an anchor's
     feature; its kernel and loss were not at hand. Sizes and weights are our choice.

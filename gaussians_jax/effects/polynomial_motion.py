@@ -4,7 +4,7 @@ Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812): a Gaussian has a time of
 m, at which it is where its row says; s = t - m later its mean is off by a cubic in s
 (equation 8, degree 3), its rotation by a turn that grows with s (equation 9, degree 1),
 and its opacity is exp(-(s / w)^2) of its own (equation 7, `temporal_opacity`), with a
-width w that is learnt. No network, and nothing shared. The text was not at hand: the
+width w that is learned. No network, and nothing shared. The text was not at hand: the
 numbers are those of readers who quote it, the rest is as in its code
 (oppo-us-research/SpacetimeGaussians).
 

@@ -1,4 +1,4 @@
-"""Cameras of the frames that are learnt from, refined while the scene is.
+"""Cameras of the frames that are learned from, refined while the scene is.
 
 A screw for each frame, in the camera's own frame, descends with the Gaussians: the pose
 refinement of BARF (Lin et al. 2021, arXiv:2104.06405) for splats, as MotionGS has it
@@ -67,7 +67,7 @@ def _moved(screws, cameras, depth):
 def found(screws: Screws, capture: Capture, depth: float) -> Capture:
     """A capture with its cameras as training found them; host side.
 
-    A frame that was not learnt from lies between the corrections of those before and
+    A frame that was not learned from lies between the corrections of those before and
     after it of the same physical camera; what no such camera filmed stays as it is.
     """
     own = np.asarray(screws)
@@ -75,12 +75,12 @@ def found(screws: Screws, capture: Capture, depth: float) -> Capture:
     moves = np.zeros((len(capture.times), 6), own.dtype)
     cameras_of, times = capture.camera_ids[capture.train], capture.times[capture.train]
     for one in np.unique(cameras_of):
-        learnt = np.flatnonzero(cameras_of == one)
-        learnt = learnt[np.argsort(times[learnt], kind="stable")]
+        learned = np.flatnonzero(cameras_of == one)
+        learned = learned[np.argsort(times[learned], kind="stable")]
         rows = np.flatnonzero(capture.camera_ids == one)
         for axis in range(6):
             moves[rows, axis] = np.interp(
-                capture.times[rows], times[learnt], own[learnt, axis]
+                capture.times[rows], times[learned], own[learned, axis]
             )
     moves[capture.train] = own
     given = in_default_precision((moves, capture.cameras))

@@ -68,7 +68,7 @@ def weights(
 ) -> Float[Array, "*points near"]:
     """exp(-d² / 2r²) of each near node, over their sum.
 
-    In SC-GS's code a learnt share of each node multiplies it, and 1e-7 is added. The
+    In SC-GS's code a learned share of each node multiplies it, and 1e-7 is added. The
     plain quotient is 0/0 in float32 from 13 radii on. This one depends on differences
     alone and goes over to the node that is nearest in its own radii; some 1e6 times as
     far away as nodes are apart, float32 takes them for equally far. A radius outside

@@ -29,7 +29,7 @@ ALWAYS = LOG_WIDTH_RANGE[1] / 2  # 90 films: the least share of one film is 0.99
 
 @dataclasses.dataclass(frozen=True)
 class TemporalOpacitySpec:
-    """How long a Gaussian is first seen, and how that is learnt.
+    """How long a Gaussian is first seen, and how that is learned.
 
     `width` is over the time for which tracks near it were followed: 1/e of the opacity
     is left so far from its own time.

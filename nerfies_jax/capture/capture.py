@@ -44,7 +44,7 @@ class Capture:
     cameras: Camera  # NumPy leaves, float32, leading axis frames
     times: np.ndarray  # [frames] float32 in [0, 1] over the whole capture
     train: np.ndarray  # rows to learn from
-    heldout: np.ndarray  # rows to score on; never learnt from
+    heldout: np.ndarray  # rows to score on; never learned from
     near: float  # scene units along the viewing axis
     far: float
     warp_ids: np.ndarray  # [frames] int32, 0..n-1: which moment
@@ -77,7 +77,7 @@ class Capture:
 
 
 def point_depths(capture: Capture) -> np.ndarray:
-    """The z-depths of all points in all frames learnt from, beyond the near plane.
+    """The z-depths of all points in all frames learned from, beyond the near plane.
 
     In scene units, in no order; empty where there are no points.
     """
@@ -247,7 +247,7 @@ def _check_rows(capture, where, frames):
     shared = np.intersect1d(capture.train, capture.heldout)
     if shared.size:
         raise CaptureError(
-            f"{where}: frame {capture.ids[shared[0]]!r} is both learnt from and held "
+            f"{where}: frame {capture.ids[shared[0]]!r} is both learned from and held "
             f"out ({shared.size} such); a score on it would mean nothing"
         )
 

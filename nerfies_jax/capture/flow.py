@@ -118,5 +118,5 @@ def shrink_one(
 
 
 def training_flow(capture) -> FrameFlow | None:
-    """The flow of the rows of a `Capture` that are learnt from; None if it has none."""
+    """Select the flow of the training frames; None if the capture has none."""
     return None if capture.flow is None else take(capture.flow, capture.train)

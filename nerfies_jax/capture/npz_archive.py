@@ -24,7 +24,7 @@ def convert(
     The archive holds `images`, `poses` (OpenGL camera to world), `focal` and `times`.
     Rows to score on and to learn from are named as "first:last+1". Where none are, and
     rows in a row share one pose, those are a validation sweep: they are held out, the
-    rows before them are learnt from and the rows after them are left out. Returns what
+    rows before them are learned from and the rows after them are left out. Returns what
     to say of it.
     """
     images, poses, times, focal = read_npz(pathlib.Path(file))
@@ -116,14 +116,14 @@ def rows_of(poses, heldout, train, where):
     if heldout is not None:
         scored = _range(heldout, count, "--heldout")
         others = np.setdiff1d(np.arange(count), scored)
-        learnt = others if train is None else _range(train, count, "--train")
-        both = np.intersect1d(learnt, scored)
+        learned = others if train is None else _range(train, count, "--train")
+        both = np.intersect1d(learned, scored)
         if both.size:
             raise ValueError(
                 f"--train {train} and --heldout {heldout} share row {both[0]}; what is "
-                "scored must not be learnt from"
+                "scored must not be learned from"
             )
-        return learnt, scored, "rows as asked for"
+        return learned, scored, "rows as asked for"
     if train is not None:
         raise ValueError("--train needs --heldout too, so that both are known")
     same = np.abs(np.diff(poses, axis=0)).max((1, 2)) < SAME_POSE
@@ -141,8 +141,8 @@ def rows_of(poses, heldout, train, where):
             f"rows {start} to {start + length - 1} share one pose: held out; "
             f"{rest} rows after them left out",
         )
-    learnt, scored = hold_out_every(count, HELD_OUT, where)
-    return learnt, scored, f"every {HELD_OUT}th row is held out"
+    learned, scored = hold_out_every(count, HELD_OUT, where)
+    return learned, scored, f"every {HELD_OUT}th row is held out"
 
 
 def _range(text, count, name):

@@ -21,7 +21,7 @@ def write(
 ) -> None:
     """The folder of transforms.json, `images`, `masks` and points, or nothing of it.
 
-    All frames are in it, with their times; `train_filenames` names those learnt from,
+    All frames are in it, with their times; `train_filenames` names those learned from,
     `val_filenames` and `test_filenames` those held out. Masks are black where nothing
     was filmed. Axes are the capture's, whichever of them is up.
     """

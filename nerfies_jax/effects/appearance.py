@@ -1,4 +1,4 @@
-"""A learnt code for each exposure, which color reads and density does not.
+"""A learned code for each exposure, which color reads and density does not.
 
 NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "latent appearance modeling")
 gives each photograph a code (GLO, Bojanowski et al. 2018) that says how light, exposure

@@ -85,7 +85,7 @@ class RayOutput(NamedTuple):
 class Batch(NamedTuple):
     """The rays of one step and what was filmed there; leading axis rays."""
 
-    row: Int[Array, " rays"]  # of the frames learnt from
+    row: Int[Array, " rays"]  # of the frames learned from
     pixel: Float[Array, "rays 2"]
     origin: Float[Array, "rays 3"]
     direction: Float[Array, "rays 3"]

@@ -1,4 +1,4 @@
-"""A mask of what moves, learnt for every point, which guides warp and slice.
+"""A mask of what moves, learned for every point, which guides warp and slice.
 
 Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, its mask that guides the deformation
 field. The text with its equations was not at hand; its code (JokerYan/NeRF-DS) is

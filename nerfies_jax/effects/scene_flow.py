@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from nerfies_jax.effects import learnt_moments
+from nerfies_jax.effects import learned_moments
 from nerfies_jax.effects import scene_flow_losses as flow_losses
 from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Scalar, Vector
 from nerfies_jax.geometry import camera as cameras
@@ -132,12 +132,12 @@ class Neighbor(NamedTuple):
 
 
 def effect(spec: SceneFlowSpec, times: tuple[float, ...], features: int) -> Effect:
-    """The seams of `spec` for a capture that is learnt from at these rising times.
+    """The seams of `spec` for a capture that is learned from at these rising times.
 
     They need not be even: frames are held out. `features` is the width of the static
     template's trunk.
     """
-    learnt_moments.interval(len(times))  # refuses none
+    learned_moments.interval(len(times))  # refuses none
     required_data = {"depths": spec.weights.depth, "flow": spec.weights.flow}
     return Effect(
         NAME,
@@ -238,8 +238,8 @@ def neighbor(
     extras = level.media[NAME].extras
     flow = extras[("flow_forward", "flow_backward")[side]]
     now = context.condition.time
-    time, present = learnt_moments.beside(times, now, SIGNS[side])
-    intervals = jnp.abs(time - now) / learnt_moments.interval(len(times))
+    time, present = learned_moments.beside(times, now, SIGNS[side])
+    intervals = jnp.abs(time - now) / learned_moments.interval(len(times))
     point = level.point + intervals[:, None, None] * flow
 
     def ask(point, direction, time):
@@ -316,7 +316,7 @@ def penalty(
         value = depth_term(context, weight)
         terms["depth"] = Term(value, spec.weights.depth * fade)
     if spec.weights.flow > 0 and context.frames.flow is not None:
-        value = flow_term(context, learnt_moments.interval(len(times)), weight, sides)
+        value = flow_term(context, learned_moments.interval(len(times)), weight, sides)
         terms["flow"] = Term(value, spec.weights.flow * fade)
     return terms
 

@@ -149,9 +149,9 @@ def photometric(
     the channels, which makes the first term a third.
 
     [β] is β that teaches nothing, its power in [0, 2]. At zero colors learn at 1/β² of
-    their residuals: what a short run has not learnt yet is called uncertain, and what
-    is uncertain is not learnt, so that a floor's checks stay gone. At one they learn at
-    1/β, at two alike, and β still goes to |color - truth| (Seitzer et al. 2022,
+    their residuals: what a short run has not learned yet is called uncertain, and what
+    is uncertain is not learned, so that a floor's checks stay gone. At one they learn
+    at 1/β, at two alike, and β still goes to |color - truth| (Seitzer et al. 2022,
     arXiv:2203.09168, the β-NLL, whose β is half of this power).
     """
     if valid is not None:

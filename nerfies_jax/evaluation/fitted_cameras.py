@@ -1,4 +1,4 @@
-"""Cameras fitted to frames that were never learnt from, the scene as it is.
+"""Cameras fitted to frames that were never learned from, the scene as it is.
 
 A wrong camera costs a good scene several dB. By the colors alone: the squared error of
 the rendered frame falls along its slope with respect to the camera, a screw in the

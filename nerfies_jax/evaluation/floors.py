@@ -34,7 +34,7 @@ class Floors(NamedTuple):
 
 
 def neighbor_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
-    """The two frames learnt from that are nearest to a frame in time, nearest first.
+    """The two frames learned from that are nearest to a frame in time, nearest first.
 
     Of its own camera where that has two to learn from, else of all cameras; of frames
     equally near, the first in the capture.
@@ -84,7 +84,7 @@ def time_averages(
 ) -> Averages:
     """The mean over time of what a scene draws from the cameras of some rows.
 
-    Of at most `frames` of the rows, at most `moments` of the times that were learnt
+    Of at most `frames` of the rows, at most `moments` of the times that were learned
     from, both evenly spread. All else of the view (its camera, its appearance) stays.
     Colors are clipped, then averaged as stored (sRGB).
     """

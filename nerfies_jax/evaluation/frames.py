@@ -44,7 +44,7 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
 def as_found(model: Model, state: TrainState, capture: Capture) -> Capture:
     """A capture with the cameras that training found; as it is where it looks for none.
 
-    It need not be the one that was learnt from: with a lens, or without, of the same
+    It need not be the one that was learned from: with a lens, or without, of the same
     frames.
     """
     if model.found is None:

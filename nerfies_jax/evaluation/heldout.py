@@ -1,4 +1,4 @@
-"""All that is measured of frames that were never learnt from; a table of the keys."""
+"""All that is measured of frames that were never learned from; a table of the keys."""
 
 import functools
 from collections.abc import Mapping

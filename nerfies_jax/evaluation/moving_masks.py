@@ -19,7 +19,7 @@ def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
     """A capture with masks of what moves, and a note where they are not its own.
 
     They are those of `evidence.record` of the frames that scores are of and of those
-    learnt from together, kept in `folder`. Held-out pictures enter it, so it is for
+    learned from together, kept in `folder`. Held-out pictures enter it, so it is for
     scores alone, never for training. Only the masks of held-out rows are to be read.
     Without masks where the capture has none and flow cannot follow it.
     """
@@ -54,8 +54,8 @@ def _films(capture):
     """Rows to follow points through: all, then those of the cameras that are scored.
 
     The second where pictures jump between the cameras of a rig. Held-out frames of the
-    built-in scene, filmed by a camera beside that learnt from: the masks overlap the
-    true ones to 0.72 in the first way (0.79 where frames are learnt from), and to 0.40
+    built-in scene, filmed by a camera beside that learned from: the masks overlap the
+    true ones to 0.72 in the first way (0.79 where frames are learned from), and to 0.40
     in the second, whose frames are four times as far apart.
     """
     used = np.sort(np.concatenate([capture.train, capture.heldout]))

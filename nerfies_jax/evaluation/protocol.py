@@ -25,9 +25,11 @@ class GroundTruth(NamedTuple):
     """What all arms are held against; NumPy. Without a truth there are no tracks."""
 
     rows: np.ndarray  # held-out frames of the capture that are rendered
-    moments: np.ndarray  # frames learnt from, in time: when points are looked for
+    moments: np.ndarray  # frames learned from, in time: when points are looked for
     path: np.ndarray  # [tracks, moments, 3] where they are, scene units
-    seen: np.ndarray  # [tracks, moments] whether the camera that is learnt from sees it
+    seen: (
+        np.ndarray
+    )  # [tracks, moments] whether the camera that is learned from sees it
     # The moment from which points are followed: the middle one. D-NeRF's template is
     # what it sees at time 0, and its warp jumps there.
     start: int

@@ -26,7 +26,9 @@ class Saved(NamedTuple):
 
     model_bytes: int | None = None  # of the one file that holds all of it
     notes: tuple[str, ...] = ()  # what the reader should know of them
-    coded_bytes: float | None = None  # of the same scene, by bits where a law is learnt
+    coded_bytes: float | None = (
+        None  # of the same scene, by bits where a law is learned
+    )
 
 
 class Player(NamedTuple):

@@ -1,4 +1,4 @@
-"""Scores of frames that were never learnt from."""
+"""Scores of frames that were never learned from."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -69,7 +69,7 @@ def score_halves(
     capture: Capture,
     rows: np.ndarray,
 ) -> Halves:
-    """Score frames whose appearance was never learnt, by NeRF-W's protocol.
+    """Score frames whose appearance was never learned, by NeRF-W's protocol.
 
     `fit_code(view, left, valid)` finds the codes of a frame from its left half alone,
     uint8 [height, width // 2, 3] and which of it was filmed (or None), with the network

@@ -44,7 +44,7 @@ def follow(
 ) -> SurfaceTracks:
     """At most `count` points, evenly spread over the picture nearest to `time`.
 
-    Followed over all frames learnt from, or `frames` of them, evenly spread.
+    Followed over all frames learned from, or `frames` of them, evenly spread.
     """
     rows = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     rows = spread(rows, frames or len(rows))

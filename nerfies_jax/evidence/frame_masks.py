@@ -1,4 +1,4 @@
-"""Masks of what moves for a capture that came without, on the frames learnt from."""
+"""Masks of what moves for a capture that came without, on the frames learned from."""
 
 import dataclasses
 import pathlib
@@ -11,7 +11,7 @@ from nerfies_jax.evidence import record
 
 
 def with_masks(capture: Capture, folder: pathlib.Path = CACHE / "evidence") -> Capture:
-    """The capture with the evidence's masks of its frames learnt from; held-out ones,
+    """The capture with the evidence's masks of its frames learned from; held-out ones,
     which are not looked at, have none.
 
     As it was, with a note, where the film cannot be followed.

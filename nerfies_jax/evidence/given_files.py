@@ -54,14 +54,14 @@ def attached(capture: Capture, files: GivenFiles) -> Capture:
 
 def _rows(count, capture, path, what):
     """The capture's rows that so many frames are."""
-    learnt = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    learned = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     every = np.argsort(capture.times, kind="stable")
-    for rows in (learnt, every):
+    for rows in (learned, every):
         if count == len(rows):
             return rows
     raise CaptureError(
         f"{path}: {what} of {count} frames; the capture has {len(every)}, "
-        f"{len(learnt)} of them to learn from: give one for each, in order of time"
+        f"{len(learned)} of them to learn from: give one for each, in order of time"
     )
 
 
@@ -242,8 +242,8 @@ def _flow(path, capture):
             )
         sides = {side: arrays[side] for side in ("forward", "backward")}
     width, height = capture.size
-    learnt = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-    expected = (len(learnt) - 1, height, width, 2)
+    learned = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    expected = (len(learned) - 1, height, width, 2)
     for side, array in sides.items():
         if array.shape != expected or not np.isfinite(array).all():
             raise CaptureError(
@@ -252,7 +252,7 @@ def _flow(path, capture):
                 "time, in pixels of the pictures as they are read"
             )
     forward, backward = np.zeros((2, len(capture.ids), height, width, 2), np.float32)
-    forward[learnt[:-1]], backward[learnt[1:]] = sides["forward"], sides["backward"]
+    forward[learned[:-1]], backward[learned[1:]] = sides["forward"], sides["backward"]
     return {"forward": forward, "backward": backward}
 
 

@@ -1,4 +1,4 @@
-"""Latent tables (GLO, Bojanowski et al. 2018): one learnt code for each id."""
+"""Latent tables (GLO, Bojanowski et al. 2018): one learned code for each id."""
 
 from typing import Any
 

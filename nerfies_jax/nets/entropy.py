@@ -1,4 +1,4 @@
-"""What learnt numbers cost to keep: bits under a normal law, noise for rounding.
+"""What learned numbers cost to keep: bits under a normal law, noise for rounding.
 
 Balle et al. 2017, "End-to-end optimized image compression", arXiv:1611.01704, section
 3: what is kept is rounded to a step, and while it is trained noise as wide as the step

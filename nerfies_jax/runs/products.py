@@ -170,7 +170,7 @@ def save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
 
 
 def _capture_notes(run, folder):
-    """Of what was learnt from, how it was preprocessed, and of what scores are of."""
+    """Of what was learned from, how it was preprocessed, and of what scores are of."""
     unpreprocessed = json.loads((folder / CONFIG).read_text()).get(LEFT_OUT, [])
     return dict.fromkeys([*run.capture.notes, *unpreprocessed, *run.filmed.notes])
 

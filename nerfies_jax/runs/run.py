@@ -44,7 +44,7 @@ class Run(NamedTuple):
     """Everything that a run is made of before its first step."""
 
     config: RunConfig
-    capture: Capture  # what is learnt from: with pinholes where only they are drawn
+    capture: Capture  # what is learned from: with pinholes where only they are drawn
     filmed: Capture  # what held-out frames are scored against (`pinholes.scorable`)
     representation: Representation
     spec: Any  # of the representation's `spec_type`

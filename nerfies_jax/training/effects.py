@@ -26,7 +26,7 @@ Scalar = Float[Array, ""]
 Vector = Float[Array, "3"]
 Features = Float[Array, " features"]
 
-# What a table of codes has a row for: the distinct times that were learnt from, or the
+# What a table of codes has a row for: the distinct times that were learned from, or the
 # exposures ("appearance ids") of the capture.
 MOMENT, APPEARANCE = "moment", "appearance"
 
@@ -96,7 +96,7 @@ class Observation(NamedTuple):
     truth: Float[Array, "height width 3"]  # sRGB in [0, 1]
     valid: Bool[Array, "height width"] | None  # None: everywhere
     depth: Float[Array, "height width"] | None  # z-depth, scene units; 0 unknown
-    frames: Frames | None = None  # all that is learnt from
+    frames: Frames | None = None  # all that is learned from
     row: Int[Array, ""] | int | None = None  # of this frame among them
 
 
@@ -110,11 +110,11 @@ class PenaltyContext(NamedTuple):
     # On a radiance field: the rays of the step as rendered, and the field itself.
     # Of all warps together, in units of the field:
     displace: Callable[[Vector, FrameCondition], Vector] | None = None
-    # Of one frame learnt from, by its row:
+    # Of one frame learned from, by its row:
     condition_of: Callable[[Int[Array, ""]], FrameCondition] | None = None
     batch: Any = None  # `effect.Batch`, leading axis rays
     levels: Any = None  # `effect.RayOutput`s, coarse to fine, leading axis rays
-    frames: Frames | None = None  # all that is learnt from, in scene units
+    frames: Frames | None = None  # all that is learned from, in scene units
     box: Any = None  # `effect.Box`, from scene units to those of the field
     # On Gaussians: the frame of the step, and the scene at other times.
     observation: Observation | None = None
@@ -205,8 +205,8 @@ class Effect(NamedTuple):
     # (params, picture [height, width, 3] sRGB, appearance id) -> the picture as it was
     # filmed; of all that is drawn, in training and afterwards
     expose: Callable[[PyTree, Any, Int[Array, ""]], Any] | None = None
-    # (params, cameras of the frames that are learnt from) -> the same, refined; whoever
-    # reads the frames of a step has these
+    # (params, cameras of the frames that are learned from) -> the same, refined;
+    # whoever reads the frames of a step has these
     pose: Callable[[PyTree, Camera], Camera] | None = None
     # (params, capture) -> the capture with all cameras as `pose` has them; host side
     found: Callable[[PyTree, Any], Any] | None = None

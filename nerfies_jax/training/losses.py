@@ -253,7 +253,7 @@ def photometric(
     """(1 - w) L1 + w (1 - SSIM), Kerbl et al. 2023, arXiv:2308.04079, equation 7.
 
     SSIM is zero-padded as in their code, and 1 - SSIM is not halved. Where `valid` is
-    false both images read zero, so nothing there is learnt; windows that overlap the
+    false both images read zero, so nothing there is learned; windows that overlap the
     edge of the mask see that zero in both. `dssim_weight=0` builds no windows.
     """
     if not 0 <= dssim_weight <= 1:

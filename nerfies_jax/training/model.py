@@ -26,7 +26,7 @@ class Frames(NamedTuple):
         None  # [frames, height, width] float32 z-depth, scene units; 0 unknown
     )
     points: Any = None  # [points, 3] float32 static scene points, scene units
-    flow: FrameFlow | None = None  # rows count the frames that are learnt from
+    flow: FrameFlow | None = None  # rows count the frames that are learned from
     moving: Any = None  # [frames, height, width] bool: moves by itself
 
 

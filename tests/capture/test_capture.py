@@ -50,9 +50,9 @@ def make(frames=4, size=(6, 4), **changes):
     [(2, 8, []), (3, 8, [1]), (5, 8, [2]), (60, 1000, [30]), (16, 8, [4, 12])],
 )
 def test_few_frames_hold_one_out_and_two_none(count, every, expected):
-    learnt, scored = frames_of_files.hold_out_every(count, every, "here")
+    learned, scored = frames_of_files.hold_out_every(count, every, "here")
     assert scored.tolist() == expected
-    assert sorted([*learnt, *scored]) == list(range(count))
+    assert sorted([*learned, *scored]) == list(range(count))
 
 
 def test_names_without_a_common_count_have_an_order_and_a_note():

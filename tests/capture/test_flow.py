@@ -41,7 +41,7 @@ def test_selected_frames_keep_their_neighbors_and_lose_those_that_went():
     assert whole.flow.forward[1].any()  # the whole capture is as it was
 
 
-def test_training_flow_counts_the_frames_that_are_learnt_from():
+def test_training_flow_counts_the_frames_that_are_learned_from():
     whole = make(flow=some_flow(), train=np.array([1, 2]), heldout=np.array([0, 3]))
     flow = flows.training_flow(whole)
     assert flow.next_row.tolist() == [1, 1]

@@ -177,7 +177,7 @@ def test_splits(tmp_path, dataset, heldout, train, scored):
     assert capture.train.size == train
     if scored is not None:
         assert capture.heldout.tolist() == scored
-    else:  # HyperNeRF: every fourth is learnt from, those half-way are scored
+    else:  # HyperNeRF: every fourth is learned from, those half-way are scored
         assert [capture.ids[row] for row in capture.train] == [
             "000",
             "004",

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from nerfies_jax.effects import learnt_moments
+from nerfies_jax.effects import learned_moments
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
@@ -56,7 +56,7 @@ REFUSED = [
     (SceneFlowSpec, {"network": STRICT}, "moments before the first.*clamp"),
     (FlowWeights, {"cycle": -1.0}, "cycle=-1"),
     (FlowWeights, {"depth": math.inf}, "depth=inf"),
-    (learnt_moments.interval, {"moments": 0}, "moments=0"),
+    (learned_moments.interval, {"moments": 0}, "moments=0"),
     (SmoothnessSpec, {"weight": -1.0}, "weight=-1.0"),
     (SmoothnessSpec, {"until": 0}, "until=0.*none"),
     (TimeWarpSpec, {"embedding": 0}, "embedding=0"),

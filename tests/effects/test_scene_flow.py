@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.effects import learnt_moments, scene_flow
+from nerfies_jax.effects import learned_moments, scene_flow
 from nerfies_jax.effects.effect import Sample
 from nerfies_jax.effects.scene_flow import FlowWeights
 from nerfies_jax.nets.planes import PlanesSpec
@@ -193,17 +193,17 @@ def test_a_single_moment_has_no_neighbors_and_no_flow_to_learn(dtype):
 def test_neighbors_are_moments_that_were_filmed(held_out, dtype):
     """And not those that lie an interval away, where no picture says what is seen."""
     filmed = np.arange(40) / 39
-    learnt = np.delete(filmed, np.arange(0, 40, held_out)).astype(np.float32)
-    times = tuple(float(time) for time in learnt)
-    beside = jax.jit(learnt_moments.beside, static_argnums=(0, 2))
-    now = jnp.asarray(learnt, dtype)
+    learned = np.delete(filmed, np.arange(0, 40, held_out)).astype(np.float32)
+    times = tuple(float(time) for time in learned)
+    beside = jax.jit(learned_moments.beside, static_argnums=(0, 2))
+    now = jnp.asarray(learned, dtype)
     for sign in scene_flow.SIGNS:
         found, present = beside(times, now, sign)
-        places = np.arange(len(learnt)) + sign
-        inside = (places >= 0) & (places < len(learnt))
+        places = np.arange(len(learned)) + sign
+        inside = (places >= 0) & (places < len(learned))
         np.testing.assert_array_equal(present, inside)
         np.testing.assert_array_equal(
-            np.asarray(found)[inside], learnt[places[inside]].astype(dtype)
+            np.asarray(found)[inside], learned[places[inside]].astype(dtype)
         )
 
 

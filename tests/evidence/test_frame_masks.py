@@ -1,4 +1,4 @@
-"""Masks for a capture without: the evidence's, on the frames learnt from alone."""
+"""Masks for a capture without: the evidence's, on the frames learned from alone."""
 
 import dataclasses
 import types

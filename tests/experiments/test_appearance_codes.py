@@ -24,14 +24,14 @@ def test_each_scene_varies_in_one_thing_only():
     assert passed.exposure is None
 
 
-def test_scored_exposures_are_never_learnt_from():
+def test_scored_exposures_are_never_learned_from():
     film = appearance_codes.filmed("exposure", (16, 12))
     small = dataclasses.replace(film, frames=9, supersampling=1)
     capture, _ = synthetic.make(small, 0)
     rows = capture.heldout[capture.camera_ids[capture.heldout] == 1]
-    learnt = set(capture.appearance_ids[capture.train])
+    learned = set(capture.appearance_ids[capture.train])
     assert len(rows) == 2
-    assert not learnt & set(capture.appearance_ids[rows])
+    assert not learned & set(capture.appearance_ids[rows])
 
 
 def test_psnr_is_of_the_chosen_pixels_of_all_frames():

@@ -44,9 +44,9 @@ def test_no_factorisation_passes_below_its_floor_and_a_fit_comes_close(model):
     for count in args.counts:
         tracks = motion_tracks.make("cloth", 8, 12, seed=3)
         row = motion_rank.one_row(args, {}, "cloth", model, count, [tracks])
-        assert row.learnt[0] > row.floor[0] * (1 - 1e-5)
+        assert row.learned[0] > row.floor[0] * (1 - 1e-5)
         if model == "time basis":  # its factors are free numbers, and a network of t
-            assert row.learnt[0] < 1.2 * row.floor[0] + 0.02
+            assert row.learned[0] < 1.2 * row.floor[0] + 0.02
         rng = np.random.default_rng(0)
         anywhere = jnp.asarray(rng.normal(size=(8, 3)), jnp.float32)
         chosen = motion_rank.model_of(model, count)
@@ -94,8 +94,8 @@ def test_a_tiny_run_prints_and_keeps_everything(tmp_path, capsys):
         *(("moving basis", 4), ("residual", None)),
     ]
     for row in rows:
-        assert len(row.learnt) == len(row.held_out) == 2
-        assert np.isfinite(row.learnt + row.held_out).all()
+        assert len(row.learned) == len(row.held_out) == 2
+        assert np.isfinite(row.learned + row.held_out).all()
         assert (row.floor is not None) == (row.model in motion_rank.FLOORS)
     printed = capsys.readouterr().out
     assert "without a basis" in printed.lower()

@@ -195,12 +195,12 @@ def test_codes_at_their_edges_have_the_values_and_slopes_of_the_network(
 def test_all_but_the_number_of_rows_has_its_slope(float64, rng):
     params, embedding = filled("float64"), rng.normal(size=(3, 3))
 
-    def total(learnt, embedding, time):
-        whole = learnt._replace(rows=jnp.asarray(params.rows))
+    def total(learned, embedding, time):
+        whole = learned._replace(rows=jnp.asarray(params.rows))
         return sum(jnp.sum(jnp.sin(leaf)) for leaf in moved(whole, embedding, time))
 
-    learnt, time = params._replace(rows=np.zeros(0)), np.asarray(0.37)
-    assert gradients.directional_error(total, learnt, embedding, time) < 1e-6
+    learned, time = params._replace(rows=np.zeros(0)), np.asarray(0.37)
+    assert gradients.directional_error(total, learned, embedding, time) < 1e-6
     slope = jax.jit(jax.grad(lambda *given: jnp.sum(moved(*given).position)))
     slopes = slope(params, embedding, time)
     assert not slopes.rows.any()

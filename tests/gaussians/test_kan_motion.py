@@ -187,26 +187,26 @@ def test_codes_as_waves_are_finite_where_all_gaussians_are_in_one_place(dtype):
 )
 def test_the_mlp_has_as_many_parameters(changes):
     spec = KanMotionSpec(**changes)
-    learnt = kan_motion.field_spec(spec)
+    learned = kan_motion.field_spec(spec)
     other = kan_motion.field_spec(dataclasses.replace(spec, network="mlp"))
     inits = (
-        (learnt, functools.partial(kan.init, spec=learnt)),
+        (learned, functools.partial(kan.init, spec=learned)),
         (other, functools.partial(mlp.init, other)),
     )
     for network, run in inits:
         shapes = jax.eval_shape(run, jax.random.key(0))
         counted = sum(leaf.size for leaf in jax.tree.leaves(shapes))
         assert kan_motion.parameter_count(network) == counted
-    goal, width = kan_motion.parameter_count(learnt), other.width
+    goal, width = kan_motion.parameter_count(learned), other.width
     chosen, wider, narrower = (
         abs(kan_motion.parameter_count(dataclasses.replace(other, width=w)) - goal)
         for w in (width, width + 1, width - 1)
     )
     assert chosen <= min(wider, narrower)
-    assert (other.depth, other.heads) == (len(spec.hidden), learnt.heads)
+    assert (other.depth, other.heads) == (len(spec.hidden), learned.heads)
     if not spec.trainable_kernels:
         splines = kan_motion.field_spec(dataclasses.replace(spec, network="bspline"))
-        assert splines == dataclasses.replace(learnt, basis="bspline")
+        assert splines == dataclasses.replace(learned, basis="bspline")
 
 
 @pytest.mark.hard_cases

@@ -67,16 +67,16 @@ def test_a_run_with_every_part_learns_and_stays_finite(paper):
     carried = jax.tree.leaves(result.state.aux_state)
     assert {len(leaf) for leaf in carried} == {capacity}
     # The opacities are reset at step 20: the picture needs some hundred to come back.
-    learnt = train(paper, result.state, 421).state
-    assert finite(learnt.params)
-    first, last = psnr(paper, start(paper)), psnr(paper, learnt)
+    learned = train(paper, result.state, 421).state
+    assert finite(learned.params)
+    first, last = psnr(paper, start(paper)), psnr(paper, learned)
     assert last > first + 3, (first, last)
     # Prepared once and drawn from that, as drawn whole.
     capture = scenes.tiny_capture()
     view = evaluation.view_of(capture, int(capture.heldout[0]))
     whole = jax.jit(model.render, static_argnums=2)
-    expected = whole(learnt.params, view, capture.size, learnt.step)
-    drawn = evaluation.Renderer(model, capture.size)(learnt, view)
+    expected = whole(learned.params, view, capture.size, learned.step)
+    drawn = evaluation.Renderer(model, capture.size)(learned, view)
     close(drawn, expected, 2e-5)
 
 

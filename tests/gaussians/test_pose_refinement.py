@@ -167,13 +167,13 @@ def test_frames_between_lie_between_and_other_cameras_stay():
     screws = (1e-2 * rng.normal(size=(5, 6))).astype(np.float32)
     screws = screws - screws.mean(axis=0)
     found = pose_refinement.found(jnp.asarray(screws), one, DEPTH).cameras
-    learnt = refined(screws, cameras.take(EVEN.cameras, rows), DEPTH)
-    np.testing.assert_allclose(found.position[rows], learnt.position, atol=1e-6)
+    learned = refined(screws, cameras.take(EVEN.cameras, rows), DEPTH)
+    np.testing.assert_allclose(found.position[rows], learned.position, atol=1e-6)
     between = (screws[2] + screws[3]) / 2  # times are even
     turn, place = by_scipy(between, cameras.take(EVEN.cameras, held))
     np.testing.assert_allclose(found.position[held], place, atol=1e-6)
     np.testing.assert_allclose(found.camera_from_world[held], turn, atol=1e-6)
-    # The second camera, of which nothing was learnt.
+    # The second camera, of which nothing was learned.
     np.testing.assert_array_equal(found.position[6], EVEN.cameras.position[6])
 
 

@@ -33,7 +33,7 @@ PICTURE = (8, 6)
 
 
 class Place(NamedTuple):
-    """What is otherwise static: where the scene is, and how fast it is learnt."""
+    """What is otherwise static: where the scene is, and how fast it is learned."""
 
     near: Any
     far: Any

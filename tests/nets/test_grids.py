@@ -103,7 +103,7 @@ def test_gradients_match_central_differences(place, float64):
 
 
 def test_slopes_have_slopes_and_values_beside_them_are_the_same(float64):
-    """Normals of a density are learnt from: slopes by the place have slopes by rows."""
+    """Losses read normals: the gradient by position has gradients by table entries."""
     tables = filled(SPEC, np.float64)
     weight = np.random.default_rng(1).normal(size=6)
     point = jnp.array([0.3, -0.21, 0.71])

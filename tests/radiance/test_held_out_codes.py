@@ -1,4 +1,4 @@
-"""Codes fitted to halves of frames that were never learnt from."""
+"""Codes fitted to halves of frames that were never learned from."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from tests.scenes import TINY_FIELD
 
 
 def repainted(rows):
-    """The capture as the field itself would film it, in appearances it never learnt."""
+    """The capture as the field would film it, in appearances it never learned."""
     capture, (metadata, params, _) = scenes.tiny_capture(), scenes.tiny_field()
     field = nerf_scene.field(TINY_FIELD, metadata)
     draw = jax.jit(field.render, static_argnums=4)

@@ -95,7 +95,7 @@ def test_a_run_surveys_and_learns_from_what_is_left():
     assert (seen & ~left).any()  # by itself it would
 
 
-def test_valid_rays_that_meet_something_are_learnt_from():
+def test_valid_rays_that_meet_something_are_learned_from():
     capture = scenes.tiny_capture()
     metadata = scene.metadata_of(capture, SPEC)
     field = scene.field(SPEC, metadata)
@@ -103,7 +103,7 @@ def test_valid_rays_that_meet_something_are_learnt_from():
     every = scene.draw_batch(frames, 160, jax.random.key(1))
     every = every._replace(valid=every.valid.at[::3].set(False))
     cells = jnp.zeros((CELLS,) * 3, bool).at[:, : CELLS // 2].set(True)
-    batch = occupied_rays.learnt_from(field, cells, every)
+    batch = occupied_rays.learned_from(field, cells, every)
     assert len(batch.row) == SPEC.rays
     by_itself = [
         bool(every.valid[n])

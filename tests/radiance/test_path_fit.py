@@ -48,7 +48,7 @@ def film(known=None, still=200):
 
 
 def narrow(network):
-    """A third as wide as a small preset's: one body is soon learnt."""
+    """A third as wide as a small preset's: one body is soon learned."""
     return dataclasses.replace(network, depth=3, width=32)
 
 

@@ -260,11 +260,11 @@ def test_a_code_is_its_row_at_its_own_time_and_between_rows_elsewhere(dtype):
     np.testing.assert_allclose(codes[5], between, rtol=1e-6)
 
 
-def test_an_exposure_that_was_not_learnt_lies_between_its_neighbors(float64):
+def test_an_exposure_that_was_not_learned_lies_between_its_neighbors(float64):
     spec = dataclasses.replace(STATIC, appearance=AppearanceSpec(width=2))
     tables, at = codes_by(scene.field(spec, METADATA), "float64")
     table = tables["appearance"]
-    assert table.shape == (2, 2)  # only what is learnt from has a row
+    assert table.shape == (2, 2)  # only what is learned from has a row
     (code,) = at([0.0], [2])["appearance"]
     np.testing.assert_allclose(code, 0.75 * table[0] + 0.25 * table[1], atol=1e-7)
 
@@ -272,11 +272,11 @@ def test_an_exposure_that_was_not_learnt_lies_between_its_neighbors(float64):
 def test_facts_place_held_out_exposures_by_time():
     capture = scenes.tiny_capture()
     metadata = scene.metadata_of(capture, STATIC)
-    learnt = set(capture.appearance_ids[capture.train].tolist())
-    rows = [metadata.exposures[one] for one in sorted(learnt)]
-    assert sorted(left for left, right, _ in rows) == list(range(len(learnt)))
+    learned = set(capture.appearance_ids[capture.train].tolist())
+    rows = [metadata.exposures[one] for one in sorted(learned)]
+    assert sorted(left for left, right, _ in rows) == list(range(len(learned)))
     assert all(left == right for left, right, _ in rows)
-    assert max(max(left, right) for left, right, _ in metadata.exposures) < len(learnt)
+    assert max(max(left, right) for left, right, _ in metadata.exposures) < len(learned)
     assert metadata.times == tuple(sorted(set(capture.times[capture.train].tolist())))
 
 

@@ -412,7 +412,7 @@ def test_training_waits_while_it_is_paused_and_never_for_nobody(tmp_path, monkey
 
 
 @pytest.mark.slow
-def test_who_looks_on_changes_nothing_of_what_is_learnt(tmp_path, capsys):
+def test_who_looks_on_changes_nothing_of_what_is_learned(tmp_path, capsys):
     run, state = a_run("gaussians")
     frames = evaluation.frames_of(CAPTURE, run.model.required_data)
     alone = loop.fit(run.model, state, frames, steps=3)

@@ -87,14 +87,14 @@ def test_steps_are_compiled_as_their_model_asks(frames):
         fit(frames, model=model, steps=7)
 
 
-def test_what_steps_have_learnt_can_be_differentiated(float64):
+def test_what_steps_have_learned_can_be_differentiated(float64):
     """By the rate of a gradient descent whose fourth step is known in closed form."""
 
     class Point(NamedTuple):
         x: jax.Array
         step: jax.Array
 
-    def learnt(rate):
+    def learned(rate):
         def step(state, frames):
             x = state.x - rate * 2 * frames * state.x
             return Point(x, state.step + 1), {"loss": jnp.sum(x**2)}
@@ -103,7 +103,7 @@ def test_what_steps_have_learnt_can_be_differentiated(float64):
         state, metrics = chunk.scan_steps(step, start, jnp.array([0.5, 3.0]), 4)
         return jnp.sum(state.x), metrics["loss"]
 
-    (total, losses), slope = jax.value_and_grad(learnt, has_aux=True)(0.1)
+    (total, losses), slope = jax.value_and_grad(learned, has_aux=True)(0.1)
     shrink = 1 - 0.1 * np.array([1.0, 6.0])
     np.testing.assert_allclose(total, shrink**4 @ [1, -2], rtol=1e-12)
     expected = [((shrink**n * [1, -2]) ** 2).sum() for n in range(1, 5)]

@@ -24,7 +24,7 @@ class Schedule(NamedTuple):
     instant: np.ndarray  # int32
     camera_id: np.ndarray  # int32: 0 in the hand, 1 beside it
     time: np.ndarray  # float32 in [0, 1]
-    learn: np.ndarray  # bool: may be learnt from
+    learn: np.ndarray  # bool: may be learned from
     cameras: Camera
     light_gain: np.ndarray  # [frames, 3] float32, of linear light
     transient_shown: np.ndarray  # bool

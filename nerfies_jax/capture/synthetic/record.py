@@ -25,7 +25,7 @@ TRUTH_FILE = "truth.npz"  # beside the Nerfies files, which other readers pass o
 def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
     """Film a scene: what a camera would give, and what only the scene knows.
 
-    The first camera's frames are learnt from, the second's scored. The seed moves the
+    The first camera's frames are learned from, the second's scored. The seed moves the
     hand, the exposure, and which points are drawn; never the things. The same spec and
     seed give the same bits on the same machine and number of cores.
     """

@@ -29,7 +29,7 @@ class Cameras:
     The hand sweeps to and fro about the target and leans forward, with smooth shake. It
     does so at another pace than the things move: a thing that swings in step with the
     camera has no depth that one camera could tell.
-    The second camera looks at the same target; what it sees is never learnt from.
+    The second camera looks at the same target; what it sees is never learned from.
     """
 
     distance: float = 0.66  # from the target at rest, scene units

@@ -1,4 +1,4 @@
-"""The moments that a capture is learnt from: how far apart, which lies beside one."""
+"""The moments that a capture is learned from: how far apart, which lies beside one."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ def interval(moments: int) -> float:
 def beside(
     times: tuple[float, ...], time: Float[Array, " rays"], sign: int
 ) -> tuple[Float[Array, " rays"], Bool[Array, " rays"]]:
-    """The learnt moment after (1) or before (-1) the one nearest to a time.
+    """The learned moment after (1) or before (-1) the one nearest to a time.
 
     The second is whether there is one; where there is none, the first is an interval
     away.
