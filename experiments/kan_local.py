@@ -141,8 +141,8 @@ def local(spec, layer, inputs, nearest: int):
     # Kernel by kernel, as the dense sum goes: [points, in, out] gathered at a time.
     def add(total, k):
         which = first + k
-        centre = low + step * which.astype(inputs.dtype)
-        gaussian = jnp.exp(-(((inputs - centre) / kan.width(spec, 0)) ** 2))
+        center = low + step * which.astype(inputs.dtype)
+        gaussian = jnp.exp(-(((inputs - center) / kan.width(spec, 0)) ** 2))
         weight = layer.kernel[which, every]
         return total + jnp.einsum("ni,nio->no", gaussian, weight), None
 

@@ -70,12 +70,12 @@ def tile_rects(
     extent_px: Float[Array, "gaussians 2"],
     grid: Grid,
 ) -> TileRects:
-    """Tiles with a pixel centre inside mean +- extent; extent 0 means not drawn."""
+    """Tiles with a pixel center inside mean +- extent; extent 0 means not drawn."""
     eps = jnp.finfo(mean_px.dtype).eps
     # Rounding of mean +- extent, so that a pixel on the edge is never lost.
     reach = extent_px + 8 * eps * (jnp.abs(mean_px) + extent_px)
     limit = jnp.asarray([grid.columns, grid.rows], mean_px.dtype)
-    # Tile t covers pixel centres t * tile + 0.5 ... (t + 1) * tile - 0.5.
+    # Tile t covers pixel centers t * tile + 0.5 ... (t + 1) * tile - 0.5.
     low = jnp.ceil((mean_px - reach + 0.5) / grid.tile) - 1
     high = jnp.floor((mean_px + reach - 0.5) / grid.tile) + 1
     low = jnp.clip(low, 0, limit).astype(jnp.int32)
@@ -219,10 +219,10 @@ def _running_max(marks):
 
 
 def _ellipse_meets_tile(shape, row, column, log_cut, grid):
-    """Whether the smallest exponent over the tile's pixel centres reaches the cut.
+    """Whether the smallest exponent over the tile's pixel centers reaches the cut.
 
     The minimum of a convex form over a rectangle lies on an edge that faces the
-    centre, or is zero inside: the two lines x = clip(mean x) and y = clip(mean y) hold
+    center, or is zero inside: the two lines x = clip(mean x) and y = clip(mean y) hold
     it in every case.
     """
     mean_x, mean_y, p, k, r, log_opacity = shape

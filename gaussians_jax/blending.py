@@ -187,7 +187,7 @@ def _by_length(isects, batch):
 
 
 def _tile_rows(tiles, isects, grid, dtype):
-    """First pair, end, and centre (px) of each tile of a batch; padding is empty."""
+    """First pair, end, and center (px) of each tile of a batch; padding is empty."""
     start = isects.starts.at[tiles].get(mode="fill", fill_value=0)
     end = isects.ends.at[tiles].get(mode="fill", fill_value=0)
     corner = jnp.stack([tiles % grid.columns, tiles // grid.columns]) * grid.tile
@@ -205,14 +205,14 @@ def _chunk(table, ranks, start, end, position, chunk):
 
 
 def _pixels(grid, dtype):
-    """Pixel centres relative to the tile's, x then y, flattened row by row."""
+    """Pixel centers relative to the tile's, x then y, flattened row by row."""
     line = np.arange(grid.tile) - (grid.tile - 1) / 2
     y, x = np.meshgrid(line, line, indexing="ij")
     return jnp.asarray(x.ravel(), dtype), jnp.asarray(y.ravel(), dtype)
 
 
 def _whitened(rows, middle):
-    """u and v at the tile centres, and their slopes p (u in x), r, -r k (v in y, x)."""
+    """u and v at the tile centers, and their slopes p (u in x), r, -r k (v in y, x)."""
     mean_x, mean_y, p, k, r = rows[:5]
     dx, dy = middle[0] - mean_x, middle[1] - mean_y
     return p * dx, r * (dy - k * dx), p, r, -(r * k)
@@ -290,7 +290,7 @@ def _trace_back(transmittance, behind, raw, alpha, rows, toward, spec):
 def _pair_gradients(rows, middle, weight, grad, toward, grid):
     """Gradient of the table's columns, one row per pair: [chunk, batch, columns].
 
-    Moments are taken about the tile centre, where u and v of a Gaussian that is seen
+    Moments are taken about the tile center, where u and v of a Gaussian that is seen
     are of order one; about a mean 1e4 px away they would cancel in float32.
     """
     moments = _moments(grad, grid)

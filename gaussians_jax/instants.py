@@ -89,7 +89,7 @@ def in_world(rows: Splats, capture: Capture) -> Splats:
 
     A uniform scale changes no direction, so rotations and harmonics stay.
     """
-    mean = np.asarray(rows.mean, np.float64) / capture.scale + capture.centre
+    mean = np.asarray(rows.mean, np.float64) / capture.scale + capture.center
     log_scale = np.asarray(rows.log_scale, np.float64) - math.log(capture.scale)
     return rows._replace(
         mean=jnp.asarray(mean, rows.mean.dtype),

@@ -113,7 +113,7 @@ def places_at_one_moment(paths: Paths) -> Float[np.ndarray, "points 3"]:
     label = rigid_groups.labels(paths.position, paths.known, BODIES)
     middle = len(paths.times) // 2
     bodies = rigid_groups.motion(paths.position, paths.known, label, middle)
-    return rigid_groups.centres(paths.position, paths.known, bodies)[0]
+    return rigid_groups.centers(paths.position, paths.known, bodies)[0]
 
 
 def along(deviation: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points"]:

@@ -40,7 +40,7 @@ class Footprints(NamedTuple):
     the other fields and passes no gradient back.
     """
 
-    mean_px: Float[Array, "gaussians 2"]  # x right, y down; pixel centres at +0.5
+    mean_px: Float[Array, "gaussians 2"]  # x right, y down; pixel centers at +0.5
     whitening: Float[Array, "gaussians 3"]  # p 1/px, k px/px, r 1/px
     opacity: Float[Array, " gaussians"]  # compensated where antialiased
     depth: Float[Array, " gaussians"]  # z, scene units
@@ -134,16 +134,16 @@ def _project_frame(offset, camera, size, spec):
     x, y, z = dot(world[0], offset), dot(world[1], offset), dot(world[2], offset)
     focal_x = camera.focal_px
     focal_y = camera.focal_px * camera.pixel_aspect
-    centre_x, centre_y = camera.principal_point_px
+    center_x, center_y = camera.principal_point_px
     tan_x, tan_y = x / z, y / z
     mean_px = jnp.stack(
         [
-            focal_x * tan_x + camera.skew_px * tan_y + centre_x,
-            focal_y * tan_y + centre_y,
+            focal_x * tan_x + camera.skew_px * tan_y + center_x,
+            focal_y * tan_y + center_y,
         ]
     )
-    tan_x = _clamp_tangent(tan_x, focal_x, centre_x, width, spec)
-    tan_y = _clamp_tangent(tan_y, focal_y, centre_y, height, spec)
+    tan_x = _clamp_tangent(tan_x, focal_x, center_x, width, spec)
+    tan_y = _clamp_tangent(tan_y, focal_y, center_y, height, spec)
     across = -(focal_x * tan_x + camera.skew_px * tan_y)
     down = -focal_y * tan_y
     first = [
@@ -155,10 +155,10 @@ def _project_frame(offset, camera, size, spec):
     return mean_px, z, (first, second)
 
 
-def _clamp_tangent(tangent, focal, centre, pixels, spec):
+def _clamp_tangent(tangent, focal, center, pixels, spec):
     margin = spec.tangent_margin * 0.5 * pixels
     return jnp.clip(
-        tangent, -(centre + margin) / focal, (pixels - centre + margin) / focal
+        tangent, -(center + margin) / focal, (pixels - center + margin) / focal
     )
 
 

@@ -29,7 +29,7 @@ from nerfies_jax.training.model import TrainState
 MAGIC = 0x674B
 TEXELS_ACROSS = 4096  # of the viewer's texture; a Gaussian is four of them in a row
 ALWAYS = 1e4  # width of the bell of what does not fade, in films: 1 - 3e-9 at its ends
-FARTHEST_CENTRE = 10.0  # of a bell, in films; farther off it is no bell any more
+FARTHEST_CENTER = 10.0  # of a bell, in films; farther off it is no bell any more
 FAINTEST = 1e-3  # weight in the fit of motion of what cannot be seen at all
 FAINTEST_SEEN = 0.05  # opacity; what is fainter is not measured
 MEASURED = 12  # views
@@ -53,7 +53,7 @@ _ROW = np.dtype(
 class Curves(NamedTuple):
     """Gaussians over time, as such a file holds them; float64, scene units.
 
-    With u the time since `centre`, in films: a mean is `position + motion[0] u +
+    With u the time since `center`, in films: a mean is `position + motion[0] u +
     motion[1] u² + motion[2] u³`, a rotation `quaternion + turning u` at unit length, an
     opacity `opacity exp(-(u / width)²)`.
     """
@@ -65,7 +65,7 @@ class Curves(NamedTuple):
     scale: np.ndarray  # [gaussians, 3]
     color: np.ndarray  # [gaussians, 3] in [0, 1]
     opacity: np.ndarray  # [gaussians]
-    centre: np.ndarray  # [gaussians]
+    center: np.ndarray  # [gaussians]
     width: np.ndarray  # [gaussians]
 
 
@@ -84,14 +84,14 @@ def fit(instants: Instants) -> Curves:
     Where a Gaussian is faint its place counts for less.
     """
     times = np.linspace(0, 1, len(instants.mean))
-    opacity, centre, width = _bells(times, instants.opacity.astype(np.float64))
+    opacity, center, width = _bells(times, instants.opacity.astype(np.float64))
     since = times - 0.5
     weight = instants.opacity.astype(np.float64) + FAINTEST
     means = instants.mean.astype(np.float64)
     place = _polynomials(since, weight, means, 4)
     turn = _polynomials(since, weight, instants.quaternion.astype(np.float64), 2)
-    # From powers of the time since the middle to those of the time since the centre.
-    shift = (centre - 0.5)[:, None]
+    # From powers of the time since the middle to those of the time since the center.
+    shift = (center - 0.5)[:, None]
     a, b, c, d = np.moveaxis(place, 1, 0)
     motion = np.stack([b + shift * (2 * c + 3 * d * shift), c + 3 * d * shift, d], 1)
     return Curves(
@@ -102,7 +102,7 @@ def fit(instants: Instants) -> Curves:
         scale=np.exp(instants.log_scale.astype(np.float64).mean(axis=0)),
         color=np.clip(instants.color, 0, 1).astype(np.float64),
         opacity=opacity,
-        centre=centre,
+        center=center,
         width=width,
     )
 
@@ -116,7 +116,7 @@ def _polynomials(since, weight, values, terms):
 
 
 def _bells(times, opacity):
-    """Height, centre and width of the bells nearest to opacities [instants, gaussians].
+    """Height, center and width of the bells nearest to opacities [instants, gaussians].
 
     A parabola fitted to the logarithm, where it opens downwards and comes nearer than
     one opacity for all times.
@@ -130,7 +130,7 @@ def _bells(times, opacity):
     opens_down = fitted[:, 2] < -((1 / ALWAYS) ** 2)
     curvature = np.where(opens_down, -fitted[:, 2], 1.0)
     offset = fitted[:, 1] / (2 * curvature)
-    opens_down &= np.abs(offset) < FARTHEST_CENTRE
+    opens_down &= np.abs(offset) < FARTHEST_CENTER
     offset = np.where(opens_down, offset, 0.0)
     height = np.exp(np.minimum(fitted[:, 0] + curvature * offset**2, 0))
     bell = height * np.exp(-curvature * (since[:, None] - offset) ** 2)
@@ -145,7 +145,7 @@ def _bells(times, opacity):
 
 def at(curves: Curves, time: float) -> Gaussians:
     """The Gaussians at a time in [0, 1], as the viewer draws them."""
-    since = (time - curves.centre)[:, None]
+    since = (time - curves.center)[:, None]
     first, second, third = np.moveaxis(curves.motion, 1, 0)
     mean = curves.position + since * (first + since * (second + since * third))
     turn = curves.quaternion + curves.turning * since
@@ -168,7 +168,7 @@ def encode(curves: Curves, capture: Capture) -> bytes:
         rows[name][:count] = getattr(curves, name)
     rgba = np.concatenate([curves.color, curves.opacity[:, None]], axis=1)
     rows["rgba"][:count] = np.round(255 * rgba)
-    rows["bell"][:count] = np.stack([curves.centre, curves.width], axis=1)
+    rows["bell"][:count] = np.stack([curves.center, curves.width], axis=1)
     about = {
         "type": "splat",
         "size": rows.nbytes,

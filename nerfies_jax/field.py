@@ -144,12 +144,12 @@ def draw(
         return Rendering(level.color, level.alpha, depth)
 
     width, height = size
-    centres = rays.pixel_centres(size, camera.position.dtype).reshape(-1, 2)
+    centers = rays.pixel_centers(size, camera.position.dtype).reshape(-1, 2)
     # A slope, as of the camera, is found block by block: all samples of a frame at once
     # would need as much memory as a training step over all its pixels.
     flat = jax.lax.map(
         jax.checkpoint(pixel),
-        centres,
+        centers,
         batch_size=min(bound.spec.sampling.block, width * height),
     )
     return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)

@@ -33,10 +33,10 @@ def field_ray(
 
     The planes are z-depths, so a slanted ray is sampled further out.
     """
-    centre = jnp.asarray(metadata.centre, origin.dtype)
+    center = jnp.asarray(metadata.center, origin.dtype)
     span = metadata.scale / cosine
     return Ray(
-        (origin - centre) * metadata.scale,
+        (origin - center) * metadata.scale,
         direction,
         metadata.near * span,
         metadata.far * span,

@@ -68,7 +68,7 @@ def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
     metadata = field.metadata
 
     def inside(place):
-        return ((place - np.asarray(metadata.centre)) * metadata.scale).astype(
+        return ((place - np.asarray(metadata.center)) * metadata.scale).astype(
             np.float32
         )
 

@@ -40,10 +40,10 @@ def follow(
         return _follow_flow(field, state, capture, known)
     views = [evaluation.view_of(capture, int(row)) for row in known.moments]
     views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
-    centre = np.asarray(metadata.centre, np.float32)
+    center = np.asarray(metadata.center, np.float32)
 
     def to_field(points):
-        return in_default_precision((points - centre) * np.float32(metadata.scale))
+        return in_default_precision((points - center) * np.float32(metadata.scale))
 
     static = _static_points(capture)
 
@@ -72,7 +72,7 @@ def follow(
             to_field(static),
         )
     )
-    path = followed.points / np.float32(metadata.scale) + centre
+    path = followed.points / np.float32(metadata.scale) + center
     still_path = known.start_points[:, None]
     path = np.where(followed.converged[..., None], path, still_path)
     stretch = np.linalg.svd(np.eye(3) + grads.astype(float), compute_uv=False)
@@ -132,7 +132,7 @@ def _flow_mover(field) -> Move | None:
     if all(effect.name != scene_flow.NAME for effect in field.effects):
         return None
     metadata = field.metadata
-    centre = np.asarray(metadata.centre, np.float32)
+    center = np.asarray(metadata.center, np.float32)
     gap = learned_moments.interval(len(metadata.times))
 
     @jax.jit
@@ -147,11 +147,11 @@ def _flow_mover(field) -> Move | None:
         hops = max(round(abs(end - begin) / gap), 1)
         length = in_default_precision(np.float32(abs(end - begin) / (hops * gap)))
         side = scene_flow.FORWARD if end >= begin else scene_flow.BACKWARD
-        place = in_default_precision((points - centre) * np.float32(metadata.scale))
+        place = in_default_precision((points - center) * np.float32(metadata.scale))
         for time in np.linspace(begin, end, hops, endpoint=False):
             view = here._replace(time=jnp.asarray(time, here.time.dtype))
             place = hop(state.params, state.step, place, view, side, length)
-        reached = np.asarray(place) / np.float32(metadata.scale) + centre
+        reached = np.asarray(place) / np.float32(metadata.scale) + center
         known = np.isfinite(reached).all(axis=1)
         return Moved(np.where(known[:, None], reached, points), known)
 
@@ -163,7 +163,7 @@ def mover(spec, metadata, effects=()) -> Move | None:
     field = scene.field(spec, metadata, effects=effects)
     if all(effect.displace is None for effect in field.effects):
         return _flow_mover(field)
-    centre = np.asarray(metadata.centre, np.float32)
+    center = np.asarray(metadata.center, np.float32)
 
     @jax.jit
     def solve(params, step, points, here, there):
@@ -176,11 +176,11 @@ def mover(spec, metadata, effects=()) -> Move | None:
         return tracked.points[:, 1], tracked.converged[:, 1]
 
     def move(state, points, here, there):
-        inside = in_default_precision((points - centre) * np.float32(metadata.scale))
+        inside = in_default_precision((points - center) * np.float32(metadata.scale))
         reached, known = jax.device_get(
             solve(state.params, state.step, inside, here, there)
         )
-        moved = reached / np.float32(metadata.scale) + centre
+        moved = reached / np.float32(metadata.scale) + center
         return Moved(np.where(known[:, None], moved, points), known)
 
     return move

@@ -61,7 +61,7 @@ NERF_W = dataclasses.replace(
 # Pumarola et al. 2020, arXiv:2011.13961, and its code: one network for both levels,
 # 500 rays, 800k steps at a rate that falls tenfold every 500k. Its curriculum, which
 # shows the frames one by one over the first 10k steps, is not there, nor are its crop
-# of the centre and its total variation over time; rays come from all frames in every
+# of the center and its total variation over time; rays come from all frames in every
 # step, where its step has one time.
 D_NERF = dataclasses.replace(
     NERF,

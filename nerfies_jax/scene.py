@@ -314,7 +314,7 @@ def loss_terms(
     levels = jax.vmap(lambda *ray: radiance.render_ray(params, *ray, guide))(
         lines, conditions, keys
     )
-    centre = jnp.asarray(metadata.centre, batch.origin.dtype)
+    center = jnp.asarray(metadata.center, batch.origin.dtype)
     context = PenaltyContext(
         condition=conditions,
         step=step,
@@ -325,7 +325,7 @@ def loss_terms(
         batch=batch,
         levels=levels,
         frames=frames,
-        box=Box(centre, jnp.asarray(metadata.scale, batch.origin.dtype)),
+        box=Box(center, jnp.asarray(metadata.scale, batch.origin.dtype)),
     )
     terms = _color_terms(radiance.effects, levels, batch)
     return terms | penalty_terms(radiance.effects, params, context, {})

@@ -18,8 +18,8 @@ class SceneMetadata:
 
     near: float  # z-depth, scene units
     far: float
-    centre: tuple[float, float, float]  # of the filmed volume, scene units
-    scale: float  # field = (scene - centre) * scale
+    center: tuple[float, float, float]  # of the filmed volume, scene units
+    scale: float  # field = (scene - center) * scale
     background: tuple[float, float, float] | None  # color behind everything, if known
     times: tuple[float, ...]  # distinct times that are learned from, rising
     # For each appearance id the rows of the table of codes it lies between, and where:
@@ -36,9 +36,9 @@ def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
     field; None keeps the capture's own coordinates.
     """
     near, far = _span(capture)
-    centre, half_side = _box(capture, near, far)
+    center, half_side = _box(capture, near, far)
     if extent is None:
-        centre, scale = (0.0, 0.0, 0.0), 1.0
+        center, scale = (0.0, 0.0, 0.0), 1.0
     else:
         scale = extent / half_side
     times = np.unique(capture.times[capture.train])
@@ -52,7 +52,7 @@ def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
     return SceneMetadata(
         near=near,
         far=far,
-        centre=tuple(float(x) for x in centre),
+        center=tuple(float(x) for x in center),
         scale=float(scale),
         background=capture.background,
         times=tuple(float(time) for time in times),
@@ -78,7 +78,7 @@ def _span(capture):
 
 
 def _box(capture, near, far):
-    """Centre and longest half-side of what is filmed."""
+    """Center and longest half-side of what is filmed."""
     if capture.points is not None and len(capture.points.position) >= MIN_POINTS:
         positions = capture.points.position
         low, high = np.quantile(positions, (OUTLIERS, 1 - OUTLIERS), axis=0)
@@ -100,7 +100,7 @@ def _box(capture, near, far):
 
 
 def _frustum_points(capture, near, far, depths=8):
-    """Corners and centres of the pictures at some depths, in scene units.
+    """Corners and centers of the pictures at some depths, in scene units.
 
     Without skew and distortion: they say roughly where the scene is.
     """

@@ -142,12 +142,12 @@ def shown_cells(bound: Bound, camera: Camera, size: tuple[int, int]) -> occupanc
     def seen(direction):
         return exact_einsum("ij,...j->...i", camera.camera_from_world, direction)
 
-    centres = rays.pixel_centres(size, dtype)
-    border = jnp.concatenate([centres[0], centres[-1], centres[:, 0], centres[:, -1]])
+    centers = rays.pixel_centers(size, dtype)
+    border = jnp.concatenate([centers[0], centers[-1], centers[:, 0], centers[:, -1]])
     ray = seen(jax.vmap(lambda at: rays.pixel_ray(camera, at).direction)(border))
     slope = ray[:, :2] / ray[:, 2:]
     corner = occupancy.corners(cells_across(bound), bound.spec.extent, dtype)
-    world = corner / metadata.scale + jnp.asarray(metadata.centre, dtype)
+    world = corner / metadata.scale + jnp.asarray(metadata.center, dtype)
     place = seen(world - camera.position)
     lateral, depth = place[..., :2], place[..., 2:]
     beyond = jnp.concatenate(
@@ -178,8 +178,8 @@ def draw(
     pixels = width * height
     blocks = -(-pixels // BLOCK)
     block = -(-pixels // blocks)
-    centres = rays.pixel_centres(size, camera.position.dtype).reshape(-1, 2)
-    centres = jnp.pad(centres, ((0, blocks * block - pixels), (0, 0)), mode="edge")
+    centers = rays.pixel_centers(size, camera.position.dtype).reshape(-1, 2)
+    centers = jnp.pad(centers, ((0, blocks * block - pixels), (0, 0)), mode="edge")
     grid = None
     if frustum_grid.resolves(bound):
         grid = frustum_grid.displacements(bound, camera, condition, size)
@@ -190,7 +190,7 @@ def draw(
             columns = jax.vmap(lambda at: frustum_grid.column(grid, at, size))(position)
         return _block(bound, occupied, camera, condition, position, columns)
 
-    drawn = jax.lax.map(part, centres.reshape(blocks, block, 2))
+    drawn = jax.lax.map(part, centers.reshape(blocks, block, 2))
     return jax.tree.map(
         lambda x: x.reshape(-1, *x.shape[2:])[:pixels].reshape(
             height, width, *x.shape[2:]

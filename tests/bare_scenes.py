@@ -211,7 +211,7 @@ def field_loss(spec, metadata, params, batch, key):
 
     def ray(origin, direction, cosine, key):
         plan = spec.sampling
-        origin = (origin - jnp.asarray(metadata.centre, origin.dtype)) * metadata.scale
+        origin = (origin - jnp.asarray(metadata.center, origin.dtype)) * metadata.scale
         span = metadata.scale / cosine
         near, far = metadata.near * span, metadata.far * span
         first, second, _ = jax.random.split(key, 3)

@@ -33,7 +33,7 @@ SIZE = (8, 6)
 ROWS = [0, 3, 1, 2, 2, 1]  # of the rays; rows are moments here
 TIMES = (0.0, 1 / 3, 0.7, 1.0)
 FAR = 3.2  # behind all samples, where a background is known
-BOX_SCALE, BOX_CENTRE = 0.5, (0.2, -0.1, 2.0)
+BOX_SCALE, BOX_CENTER = 0.5, (0.2, -0.1, 2.0)
 
 
 def frames_and_batch(rng, dtype):
@@ -95,8 +95,8 @@ def context_of(
     if behind is not None:
         end = FAR - distance[:, -1:]
         behind = jnp.broadcast_to(jnp.asarray(behind, distance.dtype), (RAYS, 3))
-    centre = jnp.asarray(BOX_CENTRE, distance.dtype)
-    origin = (batch.origin - centre) * BOX_SCALE
+    center = jnp.asarray(BOX_CENTER, distance.dtype)
+    origin = (batch.origin - center) * BOX_SCALE
     point = origin[:, None] + distance[..., None] * batch.direction[:, None]
     conditions = FrameCondition(frames.times[batch.row], {}, jnp.full(RAYS, step))
 
@@ -130,7 +130,7 @@ def context_of(
         batch=batch,
         levels=(level,),
         frames=frames,
-        box=Box(centre, jnp.asarray(BOX_SCALE, distance.dtype)),
+        box=Box(center, jnp.asarray(BOX_SCALE, distance.dtype)),
         step=jnp.asarray(step),
         key=jax.random.key(0),
     )
@@ -207,7 +207,7 @@ def oracle(params, frames, batch, arrays, step, behind=None):
     for r in range(RAYS):
         row, distance = batch.row[r], distances[r]
         time, direction = frames.times[row], batch.direction[r]
-        origin = (batch.origin[r] - BOX_CENTRE) * BOX_SCALE
+        origin = (batch.origin[r] - BOX_CENTER) * BOX_SCALE
         points = [origin + d * direction for d in distance]
         here = [dynamic(params, x, direction, time) for x in points]
         weight = composite([h[0] for h in here], distance, behind)
@@ -295,7 +295,7 @@ def _flow_pixel(lists, frames, batch, r, side, points, flows, weight):
     )
     last = points[-1] + stretch * flows[-1, side]
     place = place + (1 - weight.sum()) * last
-    place = place / BOX_SCALE + np.array(BOX_CENTRE)
+    place = place / BOX_SCALE + np.array(BOX_CENTER)
     turn, position = (
         frames.cameras.camera_from_world[other],
         frames.cameras.position[other],

@@ -220,7 +220,7 @@ OTHERS = {
     "gj.Params gj.Splats "
     "nj.kan.KANSpec nj.kan.KAN nj.kan.KANLayer nj.kan.Kernels",
     "settings": "nj.PRESETS nj.with_steps gj.PRESETS gj.with_steps nj.checked "
-    "nj.losses.check_geman_mcclure nj.kan.spacing nj.kan.centres nj.kan.width "
+    "nj.losses.check_geman_mcclure nj.kan.spacing nj.kan.centers nj.kan.width "
     "nj.kan.init nj.so3.identity nj.se3.identity nj.quaternion.identity",
     "models and captures": "nj.build nj.metadata_of gj.build gj.metadata_of nj.fit "
     "nj.built_in_scene nj.load_capture nj.saved_run nj.frames_of nj.view_of nj.score",

@@ -98,12 +98,12 @@ def truth(case: Case, inputs: np.ndarray, order: int, digits: int = 120) -> np.n
 
 def _differences(function, row, order):
     step = mpmath.mpf(10) ** -32
-    centre = [mpmath.mpf(float(x)) for x in row]
-    axes = range(len(centre))
+    center = [mpmath.mpf(float(x)) for x in row]
+    axes = range(len(center))
 
     @functools.cache
     def after(moves):
-        moved = [x + count * step for x, count in zip(centre, moves, strict=True)]
+        moved = [x + count * step for x, count in zip(center, moves, strict=True)]
         return mpmath.matrix(function(moved))
 
     def at(*moves):

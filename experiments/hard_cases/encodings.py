@@ -186,7 +186,7 @@ def _contracted(contract):
 
 
 def _contracted_as_printed(point):
-    """Both branches of the paper's equation are differentiated, also at the centre."""
+    """Both branches of the paper's equation are differentiated, also at the center."""
     size = jnp.max(jnp.abs(point))
     return jnp.where(size > 1, (2 - 1 / size) * (point / size), point)
 
@@ -200,7 +200,7 @@ def _exact_contraction(x):
 _DISTANCES = _with_negatives([0, 1e-30, 1e-8, 0.5, *_sides(1.0), 2, 100, 1e8, 1e30])
 CONTRACTION = Case(
     name="contraction of space",
-    breaks="(2 - 1/|x|) x/|x| in the branch not taken: NaN slope at the centre",
+    breaks="(2 - 1/|x|) x/|x| in the branch not taken: NaN slope at the center",
     formula="the norm held at one there, x / |x| before the factor",
     switch="the box, |x| = 1",
     axis="|x|",

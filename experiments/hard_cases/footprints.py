@@ -195,7 +195,7 @@ FAR_MEAN = Case(
     exact=_exact_mean_px,
     bounds={"float32": (1e-6, 1e-6, 6e-7), "float64": (1e-15, 1e-15, 1e-15)},
     caught=(("float32", "value"),),
-    alike=False,  # a whole footprint against its centre
+    alike=False,  # a whole footprint against its center
 )
 
 

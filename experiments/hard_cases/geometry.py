@@ -9,7 +9,7 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import distortion, rays
 
 FOCAL_PX = 512.0
-CENTRE_PX = (320.0, 240.0)
+CENTER_PX = (320.0, 240.0)
 TURN = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]]) / 3
 
 
@@ -19,7 +19,7 @@ def _pinhole(rotation, position):
         camera_from_world=constant(rotation, kind),
         position=position,
         focal_px=constant(FOCAL_PX, kind),
-        principal_point_px=constant(CENTRE_PX, kind),
+        principal_point_px=constant(CENTER_PX, kind),
         skew_px=constant(np.zeros(()), kind),
         pixel_aspect=constant(np.ones(()), kind),
         radial=constant(np.zeros(3), kind),
@@ -40,13 +40,13 @@ def _textbook_far_pixel(both):
 
 
 def _on_plane(lateral, depth):
-    return FOCAL_PX * lateral / depth + constant(CENTRE_PX, lateral.dtype)
+    return FOCAL_PX * lateral / depth + constant(CENTER_PX, lateral.dtype)
 
 
 def _exact_pixel(x, y, divisor):
     return [
-        FOCAL_PX * x / divisor + CENTRE_PX[0],
-        FOCAL_PX * y / divisor + CENTRE_PX[1],
+        FOCAL_PX * x / divisor + CENTER_PX[0],
+        FOCAL_PX * y / divisor + CENTER_PX[1],
     ]
 
 

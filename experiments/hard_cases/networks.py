@@ -14,7 +14,7 @@ from nerfies_jax.nets.kan import KAN, KANLayer, KANSpec, Kernels
 from nerfies_jax.nets.mlp import HeadSpec
 
 KERNELS = 8
-# Centres at whole numbers, which every precision holds, and w = h = 1.
+# Centers at whole numbers, which every precision holds, and w = h = 1.
 HEADS = (("y", HeadSpec(1)),)
 EDGE = KANSpec(1, heads=HEADS, kernels=KERNELS, grid=(0.0, 7.0), base=False)
 FAR_EDGE = dataclasses.replace(EDGE, grid=(1024.0, 1031.0))
@@ -31,8 +31,8 @@ def _edge(spec, x, weights=WEIGHTS, kernels=None):
 
 def _gaussians(x):
     """FastKAN's layer: nothing holds its inputs."""
-    centre = jnp.arange(KERNELS, dtype=x.dtype)
-    return jnp.exp(-((x - centre) ** 2)) @ constant(WEIGHTS, x.dtype)[:, None]
+    center = jnp.arange(KERNELS, dtype=x.dtype)
+    return jnp.exp(-((x - center) ** 2)) @ constant(WEIGHTS, x.dtype)[:, None]
 
 
 def _exact_edge(x, first=0):
@@ -88,8 +88,8 @@ OUTSIDE = Case(
 
 def _expanded(x):
     """As a matrix product would have it, |x|² - 2xμ + μ²."""
-    centre = 1024 + jnp.arange(KERNELS, dtype=x.dtype)
-    squares = x**2 - 2 * x * centre + centre**2
+    center = 1024 + jnp.arange(KERNELS, dtype=x.dtype)
+    squares = x**2 - 2 * x * center + center**2
     return jnp.exp(-squares) @ constant(WEIGHTS, x.dtype)[:, None]
 
 
@@ -117,15 +117,15 @@ CHOSEN = 3  # the one kernel of the next case, at x = 3
 def _trained(x):
     """One kernel of a trained width e^s; x and s."""
     shape = KERNELS, 1
-    centre = jnp.arange(KERNELS, dtype=x.dtype)[:, None]
-    kernels = (Kernels(centre, jnp.broadcast_to(x[1], shape)),)
+    center = jnp.arange(KERNELS, dtype=x.dtype)[:, None]
+    kernels = (Kernels(center, jnp.broadcast_to(x[1], shape)),)
     return _edge(TRAINED_EDGE, x[:1], np.eye(KERNELS)[CHOSEN], kernels)
 
 
 def _by_variance(x):
     sigma = jnp.exp(x[1]) / math.sqrt(2)
-    centre = jnp.arange(KERNELS, dtype=x.dtype)
-    kernels = jnp.exp(-((x[0] - centre) ** 2) / (2 * sigma**2))
+    center = jnp.arange(KERNELS, dtype=x.dtype)
+    kernels = jnp.exp(-((x[0] - center) ** 2) / (2 * sigma**2))
     return kernels @ jnp.eye(KERNELS, dtype=x.dtype)[:, CHOSEN, None]
 
 
@@ -134,7 +134,7 @@ def _exact_trained(x):
     return [mpmath.exp(-(((x[0] - CHOSEN) * mpmath.exp(-log_width)) ** 2))]
 
 
-# One step of bfloat16 beside the kernel's centre, 2^-6, is many narrow widths.
+# One step of bfloat16 beside the kernel's center, 2^-6, is many narrow widths.
 _WIDTHS = np.array(
     [
         [CHOSEN + beside, s]
@@ -187,9 +187,9 @@ def _by_moments(x):
 def _exact_standardised(x):
     features = [64 + x[0] * mpmath.mpf(p) for p in _PATTERN]
     mean = mpmath.fsum(features) / len(features)
-    centred = [f - mean for f in features]
-    variance = mpmath.fsum(c**2 for c in centred) / len(features)
-    return [c / mpmath.sqrt(variance + mpmath.mpf(kan.NORM_VARIANCE)) for c in centred]
+    centered = [f - mean for f in features]
+    variance = mpmath.fsum(c**2 for c in centered) / len(features)
+    return [c / mpmath.sqrt(variance + mpmath.mpf(kan.NORM_VARIANCE)) for c in centered]
 
 
 # Powers of two, so that what is standardised is exact in float32.
@@ -197,7 +197,7 @@ _SPREADS = np.array([0, 2.0**-13, 2.0**-12, 2.0**-10, 2.0**-7, 0.125, 1, 16])
 NORM = Case(
     name="KAN features of little spread",
     breaks="mean square less squared mean: no digit left, or a negative variance",
-    formula="mean square of what is centred, + 1e-6",
+    formula="mean square of what is centered, + 1e-6",
     axis="spread about 64",
     at=_SPREADS,
     inputs=_SPREADS[:, None],

@@ -30,7 +30,7 @@ def rigid(rng, points, times):
     """Blobs that swing about axes of their own and drift, each at its own pace."""
     rest, path = [], []
     for share in np.array_split(np.arange(points), BLOBS):
-        centre = rng.uniform(-0.7, 0.7, 3)
+        center = rng.uniform(-0.7, 0.7, 3)
         local = rng.uniform(-0.3, 0.3, (len(share), 3))
         axis = rng.normal(size=3)
         axis /= np.linalg.norm(axis)
@@ -41,8 +41,8 @@ def rigid(rng, points, times):
             + ((local @ axis)[:, None, None] * axis) * (1 - np.cos(angle))[:, None]
         )
         drift = rng.normal(0, 0.3, 3) * np.sin(_phase(rng, times, 0.5, 1.5))[:, None]
-        rest.append(centre + local)
-        path.append(centre + turned + drift)
+        rest.append(center + local)
+        path.append(center + turned + drift)
     return np.concatenate(rest), np.concatenate(path)
 
 

@@ -117,8 +117,8 @@ def make_scene(count: int, width: int, height: int) -> dict:
     """Half uniform, half in four clusters; three sigma about 6.5 px."""
     rng = np.random.default_rng(0)
     size = np.array([width, height])
-    centre = rng.random((4, 2))[rng.integers(0, 4, count)] * size
-    clustered = centre + rng.normal(size=(count, 2)) * size * 0.06
+    center = rng.random((4, 2))[rng.integers(0, 4, count)] * size
+    clustered = center + rng.normal(size=(count, 2)) * size * 0.06
     spread = rng.random((count, 2)) * size
     one, two = np.exp(rng.normal(0.3, 0.5, (2, count))) ** 2
     angle = rng.random(count) * np.pi

@@ -178,7 +178,7 @@ def terms(spec: DepthSpec, observation: Observation) -> dict[str, Term]:
     truth, rendering = observation.depth, observation.rendering
     if truth is None:
         return {}
-    # Depths are often kept in half precision, which neither counts nor centres them.
+    # Depths are often kept in half precision, which neither counts nor centers them.
     truth, drawn = widened(truth), widened(rendering.depth)
     known = (truth > 0) & jnp.isfinite(truth) & (drawn > 0) & jnp.isfinite(drawn)
     known = known & (rendering.alpha >= spec.opaque)

@@ -85,10 +85,10 @@ def init_embedding(
     if spec.waves is None:
         drawn = jax.random.normal(key, (mean.shape[0], spec.embedding), jnp.float32)
         return spec.spread * drawn.astype(mean.dtype)
-    centred = mean - jnp.mean(mean, axis=0)
-    radius_sq = jnp.mean(jnp.sum(centred**2, axis=1))
+    centered = mean - jnp.mean(mean, axis=0)
+    radius_sq = jnp.mean(jnp.sum(centered**2, axis=1))
     # One Gaussian, or all in one place: every code is that of the middle.
-    unit = centred / jnp.sqrt(jnp.where(radius_sq > 0, radius_sq, 1))
+    unit = centered / jnp.sqrt(jnp.where(radius_sq > 0, radius_sq, 1))
     return _random_waves(key, spec, unit, spec.embedding)
 
 

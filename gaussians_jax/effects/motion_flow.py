@@ -164,8 +164,8 @@ def drawn_flow(
         first, jnp.concatenate([values, *more], axis=1), size, picture
     )
     matrix, offset = image[..., :4].reshape(*image.shape[:2], 2, 2), image[..., 4:6]
-    centre = rays.pixel_centres(size, image.dtype)
-    flow = exact_einsum("hwij,hwj->hwi", matrix, centre) + offset
+    center = rays.pixel_centers(size, image.dtype)
+    flow = exact_einsum("hwij,hwj->hwi", matrix, center) + offset
     depth, share = lax.stop_gradient(image[..., 6]), lax.stop_gradient(image[..., 7])
     alpha = lax.stop_gradient(1 - left)
     return Drawn(
@@ -208,8 +208,8 @@ def camera_flow(
     """
     first, second = pair
     height, width = depth.shape
-    centre = rays.pixel_centres((width, height), depth.dtype)
-    offset = centre - first.principal_point_px
+    center = rays.pixel_centers((width, height), depth.dtype)
+    offset = center - first.principal_point_px
     y = offset[..., 1] / (first.focal_px * first.pixel_aspect)
     x = (offset[..., 0] - first.skew_px * y) / first.focal_px
     slopes = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
@@ -217,7 +217,7 @@ def camera_flow(
         slopes, first.camera_from_world
     )
     pixel, _ = jax.vmap(jax.vmap(cameras.project, (None, 0)), (None, 0))(second, place)
-    return pixel - centre
+    return pixel - center
 
 
 def error(

@@ -1,6 +1,6 @@
 """Motion as few rigid motions over time, and weights that say who takes part in which.
 
-Each basis is a turn and a shift about a centre of its own at knots in time, with a
+Each basis is a turn and a shift about a center of its own at knots in time, with a
 Catmull-Rom spline between them. A Gaussian moves by the mean of the bases under softmax
 weights of its own, one of which stands for staying where it is. The form of Shape of
 Motion (Wang et al. 2024, arXiv:2407.13764), which has a basis for each frame and no
@@ -91,14 +91,14 @@ class Poses(NamedTuple):
 
 
 class Bases(NamedTuple):
-    """The rigid motions: x goes to centre + R(turn) (x - centre) + shift.
+    """The rigid motions: x goes to center + R(turn) (x - center) + shift.
 
     Turn and shift are the sums of the two splines.
     """
 
     fine: Poses
     coarse: Poses
-    centre: Float[Array, "bases 3"]  # scene units
+    center: Float[Array, "bases 3"]  # scene units
 
 
 class Motion(NamedTuple):
@@ -138,7 +138,7 @@ def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
     turned = jax.vmap(lie.displacement, (None, None, 0))
     linear = jnp.swapaxes(jax.vmap(turned, (0, None, None))(turn, none, axes), 1, 2)
     return Motion(
-        turn, linear, shift - exact_einsum("bij,bj->bi", linear, bases.centre)
+        turn, linear, shift - exact_einsum("bij,bj->bi", linear, bases.center)
     )
 
 
@@ -171,7 +171,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     canonical_frame = len(times) // 2
     label = rigid_groups.labels(position, known, spec.bases)
     bodies = rigid_groups.motion(position, known, label, canonical_frame)
-    canonical, middle = rigid_groups.centres(position, known, bodies)
+    canonical, middle = rigid_groups.centers(position, known, bodies)
     turn = rigid_groups.rotation_vectors(bodies.rotation, canonical_frame)
     moved = np.einsum("gtij,gj->gti", bodies.rotation, middle) + bodies.shift
     turn = _at_knots(rigid_groups.smoothed(turn), times, spec)
@@ -224,7 +224,7 @@ def effect(spec: SE3BasesSpec, steps: int, extent: float) -> Effect:
         return jnp.full((), spec.logit_rate)
 
     def rates(step):
-        # A centre and a shift say the same twice over; centres stay.
+        # A center and a shift say the same twice over; centers stay.
         now = rate(step)
         coarse = Poses(now, extent * now)
         fine = jax.tree.map(lambda own: spec.fine_rate * own, coarse)

@@ -70,7 +70,7 @@ function cameraOf(view, lens, width, height) {
     focal: lens.focal * enlarged,
     aspect: lens.aspect,
     skew: lens.skew * enlarged,
-    centre: lens.centre.map(
+    center: lens.center.map(
       (place, k) => [width, height][k] / 2 + enlarged * (place - lens.size[k] / 2)),
     size: [width, height],
     enlarged,

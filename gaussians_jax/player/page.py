@@ -136,7 +136,7 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
         "focal": first.focal_px,
         "aspect": first.pixel_aspect,
         "skew": first.skew_px,
-        "centre": first.principal_point_px,
+        "center": first.principal_point_px,
         "size": capture.size,
         # On the viewing axis, so that turning about it begins with the first picture.
         "target": target,

@@ -14,7 +14,7 @@ uniform int movers, before;
 uniform float share;
 uniform mat3 rotation; // from world to camera
 uniform vec3 position;
-uniform vec2 focal, centre, size, margin;
+uniform vec2 focal, center, size, margin;
 uniform float skew, near, far, eps2d, least;
 uniform bool antialiased;
 
@@ -55,10 +55,10 @@ Footprint footprintOf(int index) {
   float z = view.z;
   if (!(z >= near && z <= far && shown.opacity >= least)) return shown;
   vec2 tangent = view.xy / z;
-  shown.mean = focal * tangent + vec2(skew * tangent.y, 0.0) + centre;
+  shown.mean = focal * tangent + vec2(skew * tangent.y, 0.0) + center;
 
   // Rows of T = J W R diag(scale), with the tangents clamped in J alone.
-  tangent = clamp(tangent, -(centre + margin) / focal, (size - centre + margin) / focal);
+  tangent = clamp(tangent, -(center + margin) / focal, (size - center + margin) / focal);
   float twice = 2.0 / dot(q, q);
   float w = q.x, x = q.y, y = q.z, s = q.w;
   mat3 axes = rotation * mat3(
@@ -244,7 +244,7 @@ function setCamera(set, scene, camera, raster, time) {
   set("rotation", "Matrix3fv", true, camera.rotation);
   set("position", "3fv", camera.position);
   set("focal", "2f", camera.focal, camera.focal * camera.aspect);
-  set("centre", "2fv", camera.centre);
+  set("center", "2fv", camera.center);
   set("size", "2fv", camera.size);
   set("margin", "2fv", camera.size.map((pixels) => raster.tangent_margin * 0.5 * pixels));
   set("skew", "1f", camera.skew);

@@ -78,7 +78,7 @@ def read(
     if points is not None and len(points.position) >= 3:
         notes += pose_conventions.check(cameras, points.position, size, where)
     placement, more = _place(cameras, points, split.transforms, size)
-    offset = cameras.position.astype(np.float64) - placement.centre
+    offset = cameras.position.astype(np.float64) - placement.center
     times, camera_ids, when = _times(entries, split)
     if camera_ids is None:
         camera_ids = _camera_ids(entries, times, split, is_train)
@@ -104,7 +104,7 @@ def read(
         points=_placed(points, placement),
         background=background if alpha is not None else split.transforms.background,
         scale=placement.scale,
-        centre=placement.centre,
+        center=placement.center,
         # Blender's and nerfstudio's world, where the file has not ours.
         up=frames.unit(split.transforms.up) or (0.0, 0.0, 1.0),
         frames_per_second=split.transforms.fps,
@@ -126,7 +126,7 @@ def _placed(points, placement):
     """Points of the file in scene units; None where there are none."""
     if points is None:
         return None
-    position = (points.position - np.array(placement.centre)) * placement.scale
+    position = (points.position - np.array(placement.center)) * placement.scale
     return points._replace(position=position.astype(np.float32))
 
 

@@ -165,20 +165,20 @@ def focus_point(train_cameras: Camera, near: float, far: float) -> np.ndarray:
     the point lies halfway (in inverse depth) along the mean axis instead.
     """
     axes = train_cameras.camera_from_world[:, 2, :].astype(np.float64)
-    centres = train_cameras.position.astype(np.float64)
+    centers = train_cameras.position.astype(np.float64)
     across = across_ray(axes)
     system = across.sum(axis=0)
     mean_axis = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
-    mean_centre = centres.mean(axis=0)
+    mean_center = centers.mean(axis=0)
     halfway = 2 / (1 / near + 1 / far)
     # Smallest eigenvalue per camera = mean squared sine to the common direction.
     if np.linalg.eigvalsh(system)[0] < 1e-3 * len(axes):
-        return mean_centre + halfway * mean_axis
-    point = np.linalg.solve(system, np.einsum("nij,nj->i", across, centres))
-    depth = float((point - mean_centre) @ mean_axis)
+        return mean_center + halfway * mean_axis
+    point = np.linalg.solve(system, np.einsum("nij,nj->i", across, centers))
+    depth = float((point - mean_center) @ mean_axis)
     if near < depth < far:
         return point
-    return mean_centre + halfway * mean_axis
+    return mean_center + halfway * mean_axis
 
 
 class _Window(NamedTuple):
@@ -190,14 +190,14 @@ class _Window(NamedTuple):
 
 
 def _window(train_cameras, target, up):
-    centres = train_cameras.position.astype(np.float64)
-    middle = np.median(centres, axis=0)
+    centers = train_cameras.position.astype(np.float64)
+    middle = np.median(centers, axis=0)
     forward = target - middle
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     upward = np.cross(right, forward)
-    offset = centres - middle
+    offset = centers - middle
     wide = np.quantile(np.abs(offset @ right), 0.7)
     high = np.quantile(np.abs(offset @ upward), 0.7)
     # A camera that hardly moved still sways a little, to show depth.

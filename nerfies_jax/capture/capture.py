@@ -32,7 +32,7 @@ class PointCloud(NamedTuple):
 class Capture:
     """A filmed scene on the host: NumPy only, one row per frame.
 
-    Everything geometric is in scene units: `scene_units = (world - centre) * scale`.
+    Everything geometric is in scene units: `scene_units = (world - center) * scale`.
     Building one checks it: shapes agree, every number is finite, the rows to learn
     from and to score on are disjoint.
     """
@@ -60,7 +60,7 @@ class Capture:
     points: PointCloud | None = None
     background: tuple[float, float, float] | None = None  # what lies behind, if known
     scale: float = 1.0
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     up: tuple[float, float, float] | None = None  # unit, scene axes, if known
     frames_per_second: float | None = None  # of the footage, if known
     path: pathlib.Path | None = None
@@ -193,10 +193,10 @@ def _check_numbers(capture, where):
             f"{where}: near = {capture.near:g} and far = {capture.far:g}; "
             "expected 0 < near < far"
         )
-    if not (0 < capture.scale < np.inf and np.isfinite(capture.centre).all()):
+    if not (0 < capture.scale < np.inf and np.isfinite(capture.center).all()):
         raise CaptureError(
-            f"{where}: scale = {capture.scale:g} and centre = {capture.centre}; "
-            "expected a positive scale and a finite centre"
+            f"{where}: scale = {capture.scale:g} and center = {capture.center}; "
+            "expected a positive scale and a finite center"
         )
     rate = capture.frames_per_second
     if rate is not None and not 0 < rate < np.inf:

@@ -69,8 +69,8 @@ def read(
     )
     notes += (*stored.notes, *more)
     placement = place_by_points(model.points, model.positions, model.depths)
-    centre, scale = np.array(placement.centre), placement.scale
-    cameras = _cameras(lenses, model.rotations, (model.positions - centre) * scale)
+    center, scale = np.array(placement.center), placement.scale
+    cameras = _cameras(lenses, model.rotations, (model.positions - center) * scale)
     ids = tuple(map(name_of, model.names))
     clock = name_times.clock(
         [pathlib.PurePosixPath(name).with_suffix("").as_posix() for name in model.names]
@@ -100,10 +100,10 @@ def read(
         valid=valid,
         moving=moving,
         points=PointCloud(
-            ((model.points - centre) * scale).astype(np.float32), model.colors
+            ((model.points - center) * scale).astype(np.float32), model.colors
         ),
         scale=scale,
-        centre=placement.centre,
+        center=placement.center,
         up=frames.up_direction(cameras),
         path=path,
         notes=(*notes, *lost),
@@ -340,12 +340,12 @@ def _cameras(lenses, rotations, positions):
         if len(bent) >= 5:
             radial[row, 2] = bent[4]
     focal = np.array([[lens.focal_length_x, lens.focal_length_y] for lens in lenses])
-    centre = [[lens.principal_point_x, lens.principal_point_y] for lens in lenses]
+    center = [[lens.principal_point_x, lens.principal_point_y] for lens in lenses]
     return Camera(
         camera_from_world=rotations.astype(np.float32),
         position=positions.astype(np.float32),
         focal_px=focal[:, 0].astype(np.float32),
-        principal_point_px=np.array(centre, np.float32),
+        principal_point_px=np.array(center, np.float32),
         skew_px=np.zeros(len(lenses), np.float32),
         pixel_aspect=(focal[:, 1] / focal[:, 0]).astype(np.float32),
         radial=radial,

@@ -19,8 +19,8 @@ def undistort(
     """Pictures, where they exist, masks, and the pinhole (pycolmap.Camera) of them all.
 
     The pinhole is the one that COLMAP's own undistorter chooses for the first lens.
-    Bilinear between pixel centres; a pixel that looks past the source's outermost
-    centres does not exist and is black. Masks are sampled at the nearest pixel.
+    Bilinear between pixel centers; a pixel that looks past the source's outermost
+    centers does not exist and is black. Masks are sampled at the nearest pixel.
     """
     pycolmap = library()
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lenses[0])

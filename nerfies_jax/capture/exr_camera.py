@@ -18,14 +18,14 @@ def attributes(camera: Camera, size: tuple[int, int], time: float) -> dict[str, 
     """
     turn = np.asarray(camera.camera_from_world, np.float64)
     focal, aspect = float(camera.focal_px), float(camera.pixel_aspect)
-    centre = np.asarray(camera.principal_point_px, np.float64)
+    center = np.asarray(camera.principal_point_px, np.float64)
     from_world = np.eye(4)
     from_world[:3, :3] = turn
     from_world[:3, 3] = -turn @ np.asarray(camera.position, np.float64)
     # Rows: pixels over the size, z, and z again to divide by.
     ndc = np.zeros((4, 4))
-    ndc[0, :3] = np.array([focal, float(camera.skew_px), centre[0]]) / size[0]
-    ndc[1, 1:3] = np.array([focal * aspect, centre[1]]) / size[1]
+    ndc[0, :3] = np.array([focal, float(camera.skew_px), center[0]]) / size[0]
+    ndc[1, 1:3] = np.array([focal * aspect, center[1]]) / size[1]
     ndc[2:, 2] = 1
 
     def on_rows(matrix):
@@ -38,7 +38,7 @@ def attributes(camera: Camera, size: tuple[int, int], time: float) -> dict[str, 
         "cameraAxes": AXES,
         "sceneTime": float(time),
         "focalLengthPx": np.float32([focal, focal * aspect]),
-        "principalPointPx": centre.astype(np.float32),
+        "principalPointPx": center.astype(np.float32),
         "skewPx": float(camera.skew_px),
         "radialDistortion": np.asarray(camera.radial, np.float32),
         "tangentialDistortion": np.asarray(camera.tangential, np.float32),

@@ -12,7 +12,7 @@ SIDES = ("forward", "backward")
 class FrameFlow(NamedTuple):
     """Flow from each frame to the next and the previous one of the same camera.
 
-    From the centre of a pixel to where what it shows lies in the other frame, in pixels
+    From the center of a pixel to where what it shows lies in the other frame, in pixels
     right and down; `seen` where both frames show it. A frame without a neighbor names
     its own row, and nothing is seen. NumPy leaves in a capture, JAX in training.
     """

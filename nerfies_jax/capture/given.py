@@ -33,7 +33,7 @@ class Given(NamedTuple):
     """
 
     size: tuple[int, int]  # width and height
-    track_pixel: np.ndarray | None = None  # [frames, tracks, 2]; centres at +0.5
+    track_pixel: np.ndarray | None = None  # [frames, tracks, 2]; centers at +0.5
     track_seen: np.ndarray | None = None  # [frames, tracks] bool
     track_place: np.ndarray | None = None  # [frames, tracks, 3] scene units
     moving: np.ndarray | None = None  # [frames, height, width] bool

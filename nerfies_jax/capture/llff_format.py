@@ -39,7 +39,7 @@ def read(
     Poses belong to the pictures in the order of their names, so none may be missing,
     whatever `missing` says. `factor` is relative to the full-size pictures, of which
     the file has the size. The pose's columns are the camera's down, right and backward
-    axes; the principal point is the picture's centre. Times as for COLMAP's pictures;
+    axes; the principal point is the picture's center. Times as for COLMAP's pictures;
     `heldout` is a number n for every n-th frame, 8 if not given.
     """
     path = pathlib.Path(path)
@@ -87,7 +87,7 @@ def read(
         camera_ids=camera_ids,
         valid=valid,
         scale=placed.scale,
-        centre=placed.centre,
+        center=placed.center,
         up=frames.up_direction(cameras),
         path=path,
         notes=(*notes, f"every {every}th frame is held out"),
@@ -102,7 +102,7 @@ def _placed(poses):
 
 
 def _cameras(poses, placed, size):
-    positions = (poses.positions - np.array(placed.centre)) * placed.scale
+    positions = (poses.positions - np.array(placed.center)) * placed.scale
     full = [
         camera.pinhole(rotation, position, focal, poses.size)
         for rotation, position, focal in zip(

@@ -10,7 +10,7 @@ from nerfies_jax.capture.nerfies_views import NerfiesViews
 
 PLACES = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
 # A model of another world, or of cameras that were refined since, would put its points
-# elsewhere: centres may differ by this share of their spread.
+# elsewhere: centers may differ by this share of their spread.
 SAME_PLACE = 1e-3
 
 
@@ -42,8 +42,8 @@ def points_beside(
     ]
     scene, rows = views.scene, np.array(pairs, int).reshape(-1, 2)
     place = views.cameras.position[rows[:, 1]].astype(np.float64)
-    centres = (model.positions[rows[:, 0]] - np.array(scene.center)) * scene.scale
-    off = np.linalg.norm(centres - place, axis=1)
+    centers = (model.positions[rows[:, 0]] - np.array(scene.center)) * scene.scale
+    off = np.linalg.norm(centers - place, axis=1)
     if not len(rows) or off.max() > SAME_PLACE * np.linalg.norm(np.ptp(place, axis=0)):
         note = f"{folders[0]} has other cameras: its points are left out"
         return None, (note,)

@@ -86,7 +86,7 @@ def read(
         points=points,
         background=views.scene.background,
         scale=views.scene.scale,
-        centre=views.scene.center,
+        center=views.scene.center,
         up=frames.unit(views.extra.up) or frames.up_direction(cameras),
         frames_per_second=views.extra.fps,
         path=path,
@@ -140,7 +140,7 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
                 flow_files.write(capture.flow, capture.ids, folder / "flow", factor)
         if capture.points is not None:
             world = capture.points.position.astype(np.float64) / capture.scale
-            np.save(folder / "points.npy", world + capture.centre, allow_pickle=False)
+            np.save(folder / "points.npy", world + capture.center, allow_pickle=False)
             np.save(
                 folder / "points_color.npy", capture.points.color, allow_pickle=False
             )
@@ -149,7 +149,7 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
 def _write_tables(capture, folder):
     scene = {
         "scale": float(capture.scale),
-        "center": [float(x) for x in capture.centre],
+        "center": [float(x) for x in capture.center],
         "near": float(capture.near),
         "far": float(capture.far),
     }

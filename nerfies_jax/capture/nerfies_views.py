@@ -40,7 +40,7 @@ class CameraFile(msgspec.Struct):
 
 
 class SceneFile(msgspec.Struct):
-    """`scene.json`: near and far in scene units already, scale and centre not."""
+    """`scene.json`: near and far in scene units already, scale and center not."""
 
     scale: float
     center: Triple
@@ -231,7 +231,7 @@ def _common_size(path, ids, files):
 
 
 def cameras_of(
-    files: Sequence[CameraFile], scale: float, centre: Sequence[float]
+    files: Sequence[CameraFile], scale: float, center: Sequence[float]
 ) -> Camera:
     """Cameras in scene units from those of the files, which are in world units."""
 
@@ -244,7 +244,7 @@ def cameras_of(
     ]
     return Camera(
         camera_from_world=column([file.orientation for file in files]),
-        position=((world - np.asarray(centre)) * scale).astype(np.float32),
+        position=((world - np.asarray(center)) * scale).astype(np.float32),
         focal_px=column([file.focal_length for file in files]),
         principal_point_px=column([file.principal_point for file in files]),
         skew_px=column([file.skew for file in files]),
@@ -256,7 +256,7 @@ def cameras_of(
 
 def camera_entry(one: Camera, capture: Capture, size: tuple[int, int]) -> dict:
     """What `camera/<id>.json` says of one camera of pictures of `size`."""
-    position = one.position.astype(np.float64) / capture.scale + capture.centre
+    position = one.position.astype(np.float64) / capture.scale + capture.center
     return {
         "orientation": one.camera_from_world.tolist(),
         "position": position.tolist(),

@@ -1,6 +1,6 @@
 """Camera paths in files: nerfstudio's camera_path.json and Nerfies' folder of cameras.
 
-nerfstudio's is in scene units, with a vertical field of view and centred pinholes of
+nerfstudio's is in scene units, with a vertical field of view and centered pinholes of
 square pixels alone. Nerfies' is in world units and has whole cameras.
 """
 
@@ -151,7 +151,7 @@ def _nerfies(path, capture):
                 f"{first}; a film has one size"
             )
     size = round(first[0]), round(first[1])
-    cameras = cameras_of(files, capture.scale, capture.centre)
+    cameras = cameras_of(files, capture.scale, capture.center)
     return cameras, size, [file.time for file in files]
 
 

@@ -167,9 +167,9 @@ def _source_pixels(camera, size):
 
 
 def _slopes(camera, size):
-    """Image-plane slopes [pixels, 2] of the pixel centres, the lens left aside."""
+    """Image-plane slopes [pixels, 2] of the pixel centers, the lens left aside."""
     focal, skew = float(camera.focal_px), float(camera.skew_px)
-    offset = np.asarray(rays.pixel_centres(size)) - np.asarray(
+    offset = np.asarray(rays.pixel_centers(size)) - np.asarray(
         camera.principal_point_px
     )
     y = offset[..., 1] / (focal * float(camera.pixel_aspect))

@@ -22,7 +22,7 @@ NEAR_MARGIN = 0.5  # what moves stands before what structure from motion finds
 class Placement(NamedTuple):
     """How the world becomes the scene, and the depths it needs, in scene units."""
 
-    centre: tuple[float, float, float]
+    center: tuple[float, float, float]
     scale: float
     near: float
     far: float
@@ -54,7 +54,7 @@ def place_by_points(
 def place_by_cameras(cameras: Camera) -> Placement:
     """A guess where no points are known: the cameras look at the scene.
 
-    The scene is centred on the point nearest to all viewing axes and as large as the
+    The scene is centered on the point nearest to all viewing axes and as large as the
     cameras' mean distance from it; near is a twentieth of that, far four times.
     """
     axes = cameras.camera_from_world[:, 2].astype(np.float64)
@@ -65,14 +65,14 @@ def place_by_cameras(cameras: Camera) -> Placement:
     meets = np.linalg.svd(matrix, compute_uv=False)[-1] > 1e-3 * len(axes)
     spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
     if meets:
-        centre = np.linalg.solve(matrix, right)
-        distance = np.linalg.norm(positions - centre, axis=1).mean()
+        center = np.linalg.solve(matrix, right)
+        distance = np.linalg.norm(positions - center, axis=1).mean()
     else:
         distance = 10 * spread
-        centre = positions.mean(0) + axes.mean(0) * distance
+        center = positions.mean(0) + axes.mean(0) * distance
     if not distance > 0:  # every camera at one place: any size is as good
-        distance, centre = 1.0, positions.mean(0) + axes.mean(0)
-    return Placement(tuple(centre.tolist()), float(1 / distance), 0.05, 4.0)
+        distance, center = 1.0, positions.mean(0) + axes.mean(0)
+    return Placement(tuple(center.tolist()), float(1 / distance), 0.05, 4.0)
 
 
 def read_ply(path: pathlib.Path) -> PointCloud:

@@ -1,4 +1,4 @@
-"""A picture read at other places than its pixel centres. Host side."""
+"""A picture read at other places than its pixel centers. Host side."""
 
 import numpy as np
 import scipy.ndimage
@@ -11,9 +11,9 @@ def array_places(
 
     `pixels` [height, width, 2] are positions in px, NaN where there is none; the source
     is `source_size` (width, height). Returns row and column [2, height, width], zero
-    where the position is not between the outermost pixel centres, and that mask.
+    where the position is not between the outermost pixel centers, and that mask.
     """
-    place = np.moveaxis(pixels[..., ::-1], -1, 0) - 0.5  # centres lie at +0.5
+    place = np.moveaxis(pixels[..., ::-1], -1, 0) - 0.5  # centers lie at +0.5
     last = np.array(source_size[::-1])[:, None, None] - 1
     inside = np.isfinite(place).all(0)
     place = np.where(inside, place, 0)

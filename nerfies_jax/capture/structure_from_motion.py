@@ -304,7 +304,7 @@ def _judged(model) -> dict:
     points = [p for p in model.points3D.values() if p.track.length() >= MIN_TRACK]
     if not points:
         return {"points": 0, "error_px": 0.0, "angle_deg": 0.0}
-    centre = {
+    center = {
         number: image.projection_center()
         for number, image in model.images.items()
         if image.has_pose
@@ -312,7 +312,7 @@ def _judged(model) -> dict:
     few = points[:: -(-len(points) // MOST_JUDGED)]
     angles = []
     for point in few:
-        sights = np.array([centre[each.image_id] for each in point.track.elements])
+        sights = np.array([center[each.image_id] for each in point.track.elements])
         sights = point.xyz - sights
         sights /= np.linalg.norm(sights, axis=1, keepdims=True)
         angles.append(np.degrees(np.arccos(np.clip(sights @ sights.T, -1, 1).min())))

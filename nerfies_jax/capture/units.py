@@ -14,4 +14,4 @@ def places_in(units: Units, capture: Capture, points: np.ndarray) -> np.ndarray:
     points = np.asarray(points, np.float64)
     if units == "scene":
         return points
-    return points / capture.scale + np.asarray(capture.centre)
+    return points / capture.scale + np.asarray(capture.center)

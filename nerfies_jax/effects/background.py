@@ -66,7 +66,7 @@ def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:
     if point.shape[0] > spec.points:
         rows = jax.random.randint(choice_key, (spec.points,), 0, point.shape[0])
         point = point[rows]
-    point = (point - context.box.centre) * context.box.scale
+    point = (point - context.box.center) * context.box.scale
     noise = jax.random.normal(noise_key, point.shape, point.dtype)
     frames = context.frames.times.shape[0]
     rows = jax.random.randint(frame_key, point.shape[:1], 0, frames)

@@ -95,9 +95,9 @@ class Batch(NamedTuple):
 
 
 class Box(NamedTuple):
-    """`field = (scene - centre) * scale`."""
+    """`field = (scene - center) * scale`."""
 
-    centre: Vector  # scene units
+    center: Vector  # scene units
     scale: Scalar
 
 

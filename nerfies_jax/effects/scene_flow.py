@@ -374,7 +374,7 @@ def flow_term(
         point = level.point + elapsed[:, None, None] * one.flow
         place = flow_losses.settle(weight, point) / context.box.scale
         camera = cameras.take(frames.cameras, other)
-        pixel, depth = jax.vmap(cameras.project)(camera, place + context.box.centre)
+        pixel, depth = jax.vmap(cameras.project)(camera, place + context.box.center)
         target = batch.pixel + _pixels(shift, batch.row, batch.pixel).astype(
             pixel.dtype
         )

@@ -98,7 +98,7 @@ def picture_distance(
 
 
 def _pixels(rendering):
-    """The centres [height * width, 2] of its pixels, row after row."""
+    """The centers [height * width, 2] of its pixels, row after row."""
     height, width = rendering.alpha.shape
     column, line = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([column.ravel(), line.ravel()], axis=1)

@@ -50,10 +50,10 @@ class Sight(NamedTuple):
 def sight(views: Views, tracks: Tracks, known: np.ndarray) -> Sight:
     """Of the tracks where they are `known` [tracks, frames]."""
     track, frame = np.nonzero(known)
-    centre = views.intrinsics[frame, :2, 2]
+    center = views.intrinsics[frame, :2, 2]
     to_px = views.intrinsics[frame, :2].copy()
     to_px[:, :, 2] = 0
-    return Sight(track, frame, tracks.pixel[track, frame] - centre, to_px)
+    return Sight(track, frame, tracks.pixel[track, frame] - center, to_px)
 
 
 def misses(views: Views, seen: Sight, body: Body) -> np.ndarray:

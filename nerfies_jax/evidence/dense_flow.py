@@ -38,7 +38,7 @@ JUMP_SHARE, AS_ALIKE = 0.03, 1.1
 class NeighborFlow(NamedTuple):
     """Flow of each frame to the next and to the previous one in time.
 
-    From pixel centres, in pixels right and down; `seen` where going there and back ends
+    From pixel centers, in pixels right and down; `seen` where going there and back ends
     at the start. The last frame has no next one, the first none before: zero, unseen.
     """
 

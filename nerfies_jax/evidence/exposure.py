@@ -106,6 +106,6 @@ def gains(light: np.ndarray) -> np.ndarray:
 
 def _along_widest(points):
     """Where points lie along the direction in which they spread most."""
-    centred = points - np.median(points, axis=0)
-    _, _, axes = np.linalg.svd(centred, full_matrices=False)
-    return centred @ axes[0]
+    centered = points - np.median(points, axis=0)
+    _, _, axes = np.linalg.svd(centered, full_matrices=False)
+    return centered @ axes[0]

@@ -17,7 +17,7 @@ from nerfies_jax.capture.given import Given, GivenFiles
 
 MOST_NUMBERS = 2_000_000_000  # of one file
 # Names of tracks and of where they are seen, which axis counts the frames where the
-# shape leaves it open, and where the first pixel has its centre: TAPIR, whose pictures
+# shape leaves it open, and where the first pixel has its center: TAPIR, whose pictures
 # begin at 0, and CoTracker, which samples with corners aligned.
 TRACK_NAMES = (
     ("tracks", "visibles", 1, 0.5),

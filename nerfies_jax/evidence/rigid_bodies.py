@@ -163,7 +163,7 @@ def _first(paths, own):
     position, known = paths.position[own], paths.known[own]
     canonical = position.shape[1] // 2
     motion = rigid_groups.motion(position, known, np.zeros(len(own), int), canonical)
-    point, (middle,) = rigid_groups.centres(position, known, motion)
+    point, (middle,) = rigid_groups.centers(position, known, motion)
     shift = motion.shift[0] + motion.rotation[0] @ middle
     return Body(point - middle, motion.rotation[0], shift)
 

@@ -165,7 +165,7 @@ def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.n
     return rotation, shift
 
 
-def centres(
+def centers(
     position: np.ndarray, known: np.ndarray, bodies: RigidMotion
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where each path is in the canonical frame, and each group's middle there.
@@ -192,7 +192,7 @@ def miss(position: np.ndarray, known: np.ndarray, count: int) -> float:
     """
     label = labels(position, known, count)
     bodies = motion(position, known, label, position.shape[1] // 2)
-    canonical, _ = centres(position, known, bodies)
+    canonical, _ = centers(position, known, bodies)
     moved = np.einsum("ptij,pj->pti", bodies.rotation[label], canonical)
     away = np.linalg.norm(moved + bodies.shift[label] - position, axis=-1)
     return float(np.median(away[known]))

@@ -16,7 +16,7 @@ from nerfies_jax.evidence.findings import (
 )
 from nerfies_jax.evidence.motion import rest_noise
 from nerfies_jax.evidence.record import Evidence
-from nerfies_jax.evidence.still_points import CENTRES, REACH
+from nerfies_jax.evidence.still_points import CENTERS, REACH
 from nerfies_jax.evidence.view_set import MIN_POINTS, Views
 
 CELLS = (8, 6)  # across and down: a picture is covered where a cell holds a point
@@ -79,7 +79,7 @@ def moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> flo
 
 def _looked_from(views):
     last = len(views.row) - 1
-    frames = np.linspace(0, last, min(CENTRES, last + 1)).round().astype(int)
+    frames = np.linspace(0, last, min(CENTERS, last + 1)).round().astype(int)
     return np.unique(frames).tolist()
 
 

@@ -12,7 +12,7 @@ from nerfies_jax.evidence.view_set import Views
 from nerfies_jax.geometry.rays import across_ray
 
 REACH = 8  # frames before and after
-CENTRES = 12  # frames whose pixels are placed
+CENTERS = 12  # frames whose pixels are placed
 EVERY_PX = 2
 LEAST_FRAMES = 4
 MISS_PX = 0.5  # at most, in seven frames of ten
@@ -23,7 +23,7 @@ def work(views: Views) -> int:
     """Pixels times frames that `dense` looks at, at most."""
     frames, (width, height) = len(views.row), views.size
     each = width * height // EVERY_PX**2 * min(2 * REACH + 1, frames)
-    return min(CENTRES, frames) * each
+    return min(CENTERS, frames) * each
 
 
 def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
@@ -33,12 +33,12 @@ def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
     """
     frames = len(views.row)
     reach = min(REACH, frames - 1)
-    centres = np.linspace(0, frames - 1, min(CENTRES, frames)).round().astype(int)
+    centers = np.linspace(0, frames - 1, min(CENTERS, frames)).round().astype(int)
     places, colors = [], []
-    for centre in np.unique(centres):
-        span = slice(max(0, centre - reach), min(frames, centre + reach + 1))
+    for center in np.unique(centers):
+        span = slice(max(0, center - reach), min(frames, center + reach + 1))
         near = view_slice(views, span)
-        starts = _starts(near, moving[centre], centre - span.start)
+        starts = _starts(near, moving[center], center - span.start)
         still = NeighborFlow(*(part[span] for part in flow))
         tracks = without(tracking.chain(still, starts), moving[span])
         enough = tracks.seen.sum(1) >= min(LEAST_FRAMES, reach + 1)
@@ -49,7 +49,7 @@ def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
         kept = placed(near, tracks, rest)
         places.append(rest.position[kept])
         pixel = starts[enough][kept, 1:].astype(int)
-        colors.append(views.image[centre][pixel[:, 1], pixel[:, 0]])
+        colors.append(views.image[center][pixel[:, 1], pixel[:, 0]])
     if not places:
         return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     return PointCloud(np.concatenate(places).astype(np.float32), np.concatenate(colors))

@@ -165,7 +165,7 @@ def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tr
 
 
 def _enlarged(pixel, times):
-    # OpenCV counts from the centre of the first pixel, here centres lie at +0.5.
+    # OpenCV counts from the center of the first pixel, here centers lie at +0.5.
     return np.ascontiguousarray(pixel * times - 0.5, np.float32)
 
 

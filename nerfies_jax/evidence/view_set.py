@@ -26,7 +26,7 @@ MOST_NOISE = 6.0
 class Views(NamedTuple):
     """Frames to learn from.
 
-    Pinholes in float64. Pixels are those of the small pictures, whose centres lie
+    Pinholes in float64. Pixels are those of the small pictures, whose centers lie
     at +0.5.
     """
 
@@ -158,7 +158,7 @@ def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
 
 
 def rays(views: Views, index: int) -> np.ndarray:
-    """[height, width, 3]: world directions of z-depth one through the pixel centres."""
+    """[height, width, 3]: world directions of z-depth one through the pixel centers."""
     width, height = views.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixel = np.stack([x, y, np.ones_like(x)], axis=-1)

@@ -1,7 +1,7 @@
 """A pinhole camera with Brown-Conrady distortion: project and unproject.
 
 Frames and axes (docs/conventions.md): camera x points right, y down, z forward; pixel
-centres lie at +0.5, so the centre of the top-left pixel is (0.5, 0.5).
+centers lie at +0.5, so the center of the top-left pixel is (0.5, 0.5).
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class Camera(NamedTuple):
     """
 
     camera_from_world: Float[Array, "*batch 3 3"]  # rotation; rows right, down, forward
-    position: Float[Array, "*batch 3"]  # of the centre, in world scene units
+    position: Float[Array, "*batch 3"]  # of the center, in world scene units
     focal_px: Float[Array, "*batch"]  # horizontal focal length
     principal_point_px: Float[Array, "*batch 2"]
     skew_px: Float[Array, "*batch"]
@@ -147,10 +147,10 @@ def forward_axis(camera: Camera) -> Float[Array, "*batch 3"]:
 def camera_matrix(camera: Camera) -> Float[Array, "*batch 3 3"]:
     """K of `pixel ~ K @ point_in_camera`; it does not contain the distortion."""
     zero, one = jnp.zeros_like(camera.focal_px), jnp.ones_like(camera.focal_px)
-    centre = camera.principal_point_px
+    center = camera.principal_point_px
     rows = [
-        [camera.focal_px, camera.skew_px, centre[..., 0]],
-        [zero, camera.focal_px * camera.pixel_aspect, centre[..., 1]],
+        [camera.focal_px, camera.skew_px, center[..., 0]],
+        [zero, camera.focal_px * camera.pixel_aspect, center[..., 1]],
         [zero, zero, one],
     ]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
@@ -173,7 +173,7 @@ def move(
     """
     rotation, shift = lie.exp_se3(angular, linear)
     turned = exact_product(rotation, camera.camera_from_world)
-    # t' = R t + V v with t = -R c; the centre moves by -R'ᵀ V v, and nothing cancels.
+    # t' = R t + V v with t = -R c; the center moves by -R'ᵀ V v, and nothing cancels.
     moved = camera.position - exact_product(shift, turned)
     return camera._replace(camera_from_world=turned, position=moved)
 
@@ -210,7 +210,7 @@ def pinhole(
     size: tuple[int, int],
     dtype: Any = np.float32,
 ) -> Camera:
-    """A camera without skew or distortion, centred on its picture. NumPy leaves."""
+    """A camera without skew or distortion, centered on its picture. NumPy leaves."""
     return Camera(
         camera_from_world=np.asarray(camera_from_world, dtype),
         position=np.asarray(position, dtype),
@@ -303,11 +303,11 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
     if min(size) < 1:
         raise ValueError(f"{name}: picture size {size} must be at least 1x1 pixels")
     # A wrong unit or a camera of another resolution; a crop may lie a picture aside.
-    centre = np.asarray(camera.principal_point_px, np.float64)
-    aside = (np.abs(centre / size - 0.5) > 1.5).any(axis=-1)
+    center = np.asarray(camera.principal_point_px, np.float64)
+    aside = (np.abs(center / size - 0.5) > 1.5).any(axis=-1)
     if aside.any():
         raise ValueError(
-            f"{name}: the principal point {centre.reshape(-1, 2)[aside.ravel()][0]} is "
+            f"{name}: the principal point {center.reshape(-1, 2)[aside.ravel()][0]} is "
             f"more than a picture outside {size[0]}x{size[1]}{_row(aside, 0)}; resize "
             "the camera with its picture"
         )

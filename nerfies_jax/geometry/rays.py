@@ -31,20 +31,20 @@ class Rays(NamedTuple):
 
 @checked(broadcast=True)
 def pixel_ray(camera: Camera, pixel: Float[Array, "2"]) -> Rays:
-    """The ray of one pixel position; column i, row j is centred on (i + ½, j + ½)."""
+    """The ray of one pixel position; column i, row j is centered on (i + ½, j + ½)."""
     direction, converged = cameras.unproject(camera, pixel)
     return Rays(jnp.asarray(camera.position), direction, converged)
 
 
 @checked(broadcast=True)
 def pixel_rays(camera: Camera, size: tuple[int, int]) -> Rays:
-    """Rays [height, width] through the pixel centres of a (width, height) picture."""
+    """Rays [height, width] through the pixel centers of a (width, height) picture."""
     return jax.vmap(jax.vmap(lambda pixel: pixel_ray(camera, pixel)))(
-        pixel_centres(size, camera.position.dtype)
+        pixel_centers(size, camera.position.dtype)
     )
 
 
-def pixel_centres(size: tuple[int, int], dtype=jnp.float32) -> Float[Array, "h w 2"]:
+def pixel_centers(size: tuple[int, int], dtype=jnp.float32) -> Float[Array, "h w 2"]:
     """Positions (column + ½, row + ½) of all pixels of a (width, height) picture."""
     width, height = size
     columns, rows = jnp.meshgrid(

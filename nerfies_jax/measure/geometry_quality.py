@@ -221,9 +221,9 @@ def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similar
         raise ValueError(
             f"an alignment pairs points, got {len(points)} and {len(truth)} of them"
         )
-    # In float64 about the centres: 1e6 away, float32 gets the scale 1e-3 wrong.
-    centre, true_centre = points.mean(0), truth.mean(0)
-    offsets, true_offsets = points - centre, truth - true_centre
+    # In float64 about the centers: 1e6 away, float32 gets the scale 1e-3 wrong.
+    center, true_center = points.mean(0), truth.mean(0)
+    offsets, true_offsets = points - center, truth - true_center
     left, spread, right = np.linalg.svd(true_offsets.T @ offsets / len(points))
     mirrored = np.linalg.det(left) * np.linalg.det(right) < 0
     signs = np.array([1.0, 1.0, -1.0 if mirrored else 1.0])
@@ -238,7 +238,7 @@ def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similar
     return Similarity(
         scale=scale,
         rotation=rotation,
-        translation=true_centre - scale * rotation @ centre,
+        translation=true_center - scale * rotation @ center,
         rank=rank,
         determined=rank >= 2 and not ambiguous,
     )

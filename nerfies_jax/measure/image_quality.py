@@ -166,10 +166,10 @@ def masked_ssim(
     truth: Float[Array, "height width channels"],
     mask: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
-    """SSIM of the masked pixels; NaN where no window meets the mask's centre.
+    """SSIM of the masked pixels; NaN where no window meets the mask's center.
 
     Every window's moments are means over its pixels inside the mask (Gaussian weights
-    divided by their sum), and windows centred on the mask are averaged. With a full
+    divided by their sum), and windows centered on the mask are averaged. With a full
     mask this is `ssim`; what lies outside the mask never matters. `partial_ssim` is the
     published protocol.
     """
@@ -190,9 +190,9 @@ def masked_ssim(
 
     luminance, contrast = _terms(image, truth, mean)
     radius = losses.RADIUS
-    centred = mask[radius:-radius, radius:-radius, None]
-    total = jnp.sum(jnp.where(centred, luminance * contrast, 0.0))
-    return total / (jnp.sum(centred).astype(image.dtype) * image.shape[-1])
+    centered = mask[radius:-radius, radius:-radius, None]
+    total = jnp.sum(jnp.where(centered, luminance * contrast, 0.0))
+    return total / (jnp.sum(centered).astype(image.dtype) * image.shape[-1])
 
 
 @checked(broadcast=True, images=("image", "truth"))
@@ -246,14 +246,14 @@ def _terms(image, truth, mean):
     The identity of `losses.dssim_map`, the terms apart and with any windowed `mean`:
     2 cov(x, y) = var(x) + var(y) - var(x - y), variances about the truth's mean.
     """
-    centre = losses.middle_level(truth)
+    center = losses.middle_level(truth)
     difference = image - truth
-    mean_image, mean_truth = mean(image - centre), mean(truth - centre)
+    mean_image, mean_truth = mean(image - center), mean(truth - center)
     mean_difference = mean_image - mean_truth
     variance_difference = mean(difference**2) - mean_difference**2
-    squares = mean((image - centre) ** 2 + (truth - centre) ** 2)
+    squares = mean((image - center) ** 2 + (truth - center) ** 2)
     variances = squares - mean_image**2 - mean_truth**2
-    brightness = (mean_image + centre) ** 2 + (mean_truth + centre) ** 2
+    brightness = (mean_image + center) ** 2 + (mean_truth + center) ** 2
     luminance = 1.0 - mean_difference**2 / (brightness + C1)
     contrast = 1.0 - variance_difference / (variances + C2)
     return luminance, contrast

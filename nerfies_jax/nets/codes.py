@@ -15,7 +15,7 @@ def init(
 ) -> Table:
     """Codes drawn uniformly from [-scale, scale].
 
-    Nerfies draws from [0, 0.05); centred, the mean code is what an unseen moment gets.
+    Nerfies draws from [0, 0.05); centered, the mean code is what an unseen moment gets.
     """
     if ids < 1 or width < 1:
         raise ValueError(

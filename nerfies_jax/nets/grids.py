@@ -120,7 +120,7 @@ def contract(point: Float[Array, "3"]) -> Float[Array, "3"]:
 
     Barron et al. 2022, arXiv:2111.12077, equation 10: (2 - 1/|x|) x/|x| beyond a norm
     of one, with the largest coordinate for a norm, so that cubes stay cubes. Its slope
-    is continuous along a ray from the centre; a point at infinity has none.
+    is continuous along a ray from the center; a point at infinity has none.
     """
     # The norm is held out of the branch that is not taken, where it may be zero.
     size = jnp.max(jnp.abs(point))

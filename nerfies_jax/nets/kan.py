@@ -32,7 +32,7 @@ BASES = ("rbf", "bspline")
 OUTPUT = "output"  # name of the only head where a spec has `out_features`
 DEGREE = 3  # of the B-splines, of which there are so many more than intervals
 HEAD_INITIALISERS = ("glorot", "small", "zero")
-# Narrower kernels leave gaps between the centres, wider ones are so alike that their
+# Narrower kernels leave gaps between the centers, wider ones are so alike that their
 # weights cannot be told apart: the Gram matrix of 16 kernels has condition 5.7 at
 # sigma / h = 0.5, 58 at 0.707, 4.5e3 at 1 and 2e7 at 1.5.
 WIDTH_RATIOS = (0.25, 1.5)
@@ -51,15 +51,15 @@ class KANSpec:
     Layers lead from `in_features` through the `hidden` widths to `out_features`, or
     to several named `heads` in their place, which all read the last hidden layer.
 
-    The first layer's `kernels` centres lie on `grid`, where raw inputs are expected;
+    The first layer's `kernels` centers lie on `grid`, where raw inputs are expected;
     those of the others on `hidden_grid`, in front of which `norm` standardises the
     features of each point. The norm has no trained scale, which would be a trained
     width under another name, and the first layer has none: it would turn one or two
     coordinates into signs. `width_ratio` is sigma / h, the kernels' standard deviation
-    over the distance of their centres; the grid resolves half a period per h whatever
+    over the distance of their centers; the grid resolves half a period per h whatever
     it is.
 
-    `trainable_kernels` makes every input's centres and log-widths parameters (Sonata,
+    `trainable_kernels` makes every input's centers and log-widths parameters (Sonata,
     equations 9 and 10). The paper argues against it (appendix A.3): with one width and
     even spacing all Gaussians have one spectrum, exp(-sigma^2 w^2 / 2), and the weights
     alone shape the sum's by their interference, sum_g C_g exp(-i w mu_g); unequal
@@ -95,7 +95,7 @@ class KANSpec:
             raise ValueError(f"out_features={self.out_features} must be at least 1")
         if self.kernels < 2:
             raise ValueError(
-                f"kernels={self.kernels}: a grid has at least two centres, one at each "
+                f"kernels={self.kernels}: a grid has at least two centers, one at each "
                 "end"
             )
         for name in ("grid", "hidden_grid"):
@@ -161,9 +161,9 @@ class KANLayer(NamedTuple):
 
 
 class Kernels(NamedTuple):
-    """Centres and log(sqrt(2) sigma) of one layer's Gaussians, if they are trained."""
+    """Centers and log(sqrt(2) sigma) of one layer's Gaussians, if they are trained."""
 
-    centre: Float[Array, "kernels inputs"]
+    center: Float[Array, "kernels inputs"]
     log_width: Float[Array, "kernels inputs"]
 
 
@@ -176,14 +176,14 @@ class KAN(NamedTuple):
 
 
 def spacing(spec: KANSpec, layer: int) -> float:
-    """h, the distance between neighboring centres of one layer."""
+    """h, the distance between neighboring centers of one layer."""
     low, high = spec.grid_of(layer)
     gaps = spec.kernels - (DEGREE if spec.basis == "bspline" else 1)
     return (high - low) / gaps
 
 
-def centres(spec: KANSpec, layer: int, dtype=jnp.float32) -> Float[Array, " kernels"]:
-    """The fixed centres of one layer, or where the trained ones start.
+def centers(spec: KANSpec, layer: int, dtype=jnp.float32) -> Float[Array, " kernels"]:
+    """The fixed centers of one layer, or where the trained ones start.
 
     Those of B-splines begin and end one interval outside the grid, on which they then
     sum to one.
@@ -237,7 +237,7 @@ def init(key: Key[Array, ""], spec: KANSpec, dtype=jnp.float32) -> KAN:
     if spec.trainable_kernels:
         kernels = tuple(
             Kernels(
-                jnp.tile(centres(spec, layer, dtype)[:, None], (1, inputs)),
+                jnp.tile(centers(spec, layer, dtype)[:, None], (1, inputs)),
                 jnp.full((spec.kernels, inputs), math.log(width(spec, layer)), dtype),
             )
             for layer, inputs in enumerate(widths)
@@ -374,9 +374,9 @@ def standardise(
     largest = jnp.max(jnp.abs(features), axis=-1, keepdims=True)
     scale = jnp.maximum(power_of_two(jax.lax.stop_gradient(largest)), 1)
     scaled = features / scale
-    centred = scaled - jnp.mean(scaled, axis=-1, keepdims=True)
-    variance = jnp.mean(centred**2, axis=-1, keepdims=True)
-    return centred * jax.lax.rsqrt(variance + NORM_VARIANCE / scale**2)
+    centered = scaled - jnp.mean(scaled, axis=-1, keepdims=True)
+    variance = jnp.mean(centered**2, axis=-1, keepdims=True)
+    return centered * jax.lax.rsqrt(variance + NORM_VARIANCE / scale**2)
 
 
 @checked
@@ -427,16 +427,16 @@ def _sum_over_inputs(spec, index, layer, kernels, inputs):
     """A layer without its bias."""
     dtype = inputs.dtype
     # One standard deviation beyond the end the outermost Gaussian is steepest. The
-    # last B-spline has its centre one interval beyond: all slopes are there still.
+    # last B-spline has its center one interval beyond: all slopes are there still.
     margin = width(spec, index)
     if spec.basis == "rbf":
         margin /= math.sqrt(2)
     held = hold(inputs, spec.grid_of(index), margin)
     if kernels is None:
-        centre = centres(spec, index, dtype)
-        per_width = jnp.full_like(centre, 1 / width(spec, index))
+        center = centers(spec, index, dtype)
+        per_width = jnp.full_like(center, 1 / width(spec, index))
     else:
-        centre = kernels.centre
+        center = kernels.center
         start = math.log(width(spec, index))
         bounds = start - LOG_WIDTH_RANGE, start + LOG_WIDTH_RANGE
         per_width = jnp.exp(-jnp.clip(kernels.log_width, *bounds))
@@ -456,14 +456,14 @@ def _sum_over_inputs(spec, index, layer, kernels, inputs):
     # The scan already keeps XLA from merging the two passes.
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def add_kernel(total, kernel):
-        centre, per_width, weight = kernel
-        distance = (held - centre) * per_width
+        center, per_width, weight = kernel
+        distance = (held - center) * per_width
         value = jnp.exp(-(distance**2)) if gaussian else bsplines.cubic(distance)
         return total + value @ weight, None
 
     nothing = jnp.zeros((*inputs.shape[:-1], layer.bias.shape[0]), dtype)
     total, _ = jax.lax.scan(
-        add_kernel, nothing, (centre, per_width, layer.kernel), unroll=4
+        add_kernel, nothing, (center, per_width, layer.kernel), unroll=4
     )
     if layer.base is not None:
         total = total + jax.nn.silu(inputs) @ layer.base

@@ -52,13 +52,13 @@ def _told(capture):
     """All by name, a row for each frame where it is of frames."""
     ids = np.array(capture.ids)
     cameras = {f"camera {k}": v for k, v in capture.cameras._asdict().items()}
-    bounds = np.array([capture.near, capture.far, capture.scale, *capture.centre])
+    bounds = np.array([capture.near, capture.far, capture.scale, *capture.center])
     return {
         "frames": ids,
         "size": np.array(capture.size),
         "frames to learn from": np.sort(ids[capture.train]),
         "held-out frames": np.sort(ids[capture.heldout]),
-        "bounds, scale or centre": bounds,
+        "bounds, scale or center": bounds,
         "times": capture.times,
         **cameras,
         "pictures": np.stack([_means(image) for image in capture.images]),
@@ -89,7 +89,7 @@ def _unlike(before, now):
         bound = LEVELS if name == "pictures" else TOLERANCE * (1 + np.abs(old))
         far = ~(np.abs(new.astype(np.float64) - old) <= bound)
         if far.any():
-            if name in ("size", "bounds, scale or centre"):
+            if name in ("size", "bounds, scale or center"):
                 return f"other {name}"
             row = int(np.argmax(far.reshape(len(far), -1).any(axis=1)))
             return f"other {name} ({now['frames'][row]} first)"

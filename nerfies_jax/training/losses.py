@@ -190,8 +190,8 @@ def dssim_map(
     With d = image - target and local means m and variances v,
     1 - SSIM = a + b - ab, a = m_d^2 / (m_i^2 + m_t^2 + C1), b = v_d / (v_i + v_t + C2):
     no difference of nearly equal numbers, and four windows instead of five. Variances
-    are taken about the target's mean, which they do not depend on; uncentred, a pair of
-    constant images at 0.9 reads 4e-5 too low in float32, and 1000 +- 1 is 2e-3 off.
+    are taken about the target's mean, which they do not depend on; uncentered, a pair
+    of constant images at 0.9 reads 4e-5 too low in float32, and 1000 +- 1 is 2e-3 off.
 
     The window is eleven shifted sums along each axis with one of the four maps in
     flight. CPU ms of forward and backward at 160x120x3 and 480x270x3, one core:
@@ -208,18 +208,18 @@ def dssim_map(
     """
     image, target = _comparable(image, target, padding)
     constant = value_range**2
-    centre = middle_level(target)
+    center = middle_level(target)
     shape, channels = image.shape, image.shape[-1]
     image, target = (materialised(x.reshape(shape[0], -1)) for x in (image, target))
     difference = image - target
-    x, y = image - centre, target - centre
+    x, y = image - center, target - center
     maps = jnp.stack([x, y, x * x + y * y, difference * difference])
-    outside = jnp.stack([-centre, -centre, 2 * centre**2, jnp.zeros_like(centre)])
+    outside = jnp.stack([-center, -center, 2 * center**2, jnp.zeros_like(center)])
     mean_x, mean_y, power, power_d = _blur(maps, outside, channels)
     mean_d = mean_x - mean_y
     variance_d = power_d - mean_d**2
     variances = power - mean_x**2 - mean_y**2
-    means_sq = (mean_x + centre) ** 2 + (mean_y + centre) ** 2
+    means_sq = (mean_x + center) ** 2 + (mean_y + center) ** 2
     luminance = mean_d**2 / (means_sq + LUMINANCE * constant)
     structure = variance_d / (variances + CONTRAST * constant)
     dissimilarity = luminance + structure - luminance * structure
@@ -273,7 +273,7 @@ def middle_level(target: Float[Array, "*shape"]) -> Float[Array, ""]:
     """The mean to 12 bits, without a slope; variances may be taken about it.
 
     The compiler may contract x - sum * (1 / count) into one operation, in one place and
-    not in another, and so take E[x] and E[x^2] about two centres that are half an ulp
+    not in another, and so take E[x] and E[x^2] about two centers that are half an ulp
     of the level apart: 4e-5 of SSIM at level 1000 in float32. Rounded, it is one.
     """
     mean = lax.stop_gradient(jnp.mean(target))

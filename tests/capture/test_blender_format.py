@@ -72,7 +72,7 @@ def test_everything_in_the_files_arrives(tmp_path):
     assert (np.abs(capture.images[2] - white) <= 0.501).all()
     assert capture.background == (1.0, 1.0, 1.0)
     assert (capture.near, capture.far) == (2.0, 6.0)
-    assert (capture.scale, capture.centre) == (1.0, (0.0, 0.0, 0.0))
+    assert (capture.scale, capture.center) == (1.0, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(
         capture.cameras.focal_px, 0.5 * 10 / math.tan(0.5 * ANGLE), rtol=1e-6
     )
@@ -246,7 +246,7 @@ def test_nerfstudio_points_masks_and_lists(tmp_path):
     assert (~capture.valid).sum() == 1
     assert not capture.valid[0, 1, 2]
     assert capture.points.color[7].tolist() == [0, 200, 0]
-    world = capture.points.position / capture.scale + capture.centre
+    world = capture.points.position / capture.scale + capture.center
     np.testing.assert_allclose(world[:, 0], rows["x"], atol=1e-5)
     # Depths seen lie within 4 +- 0.9 of the world; near and far lie around them.
     assert 1.2 < capture.near / capture.scale < 2.4
@@ -396,5 +396,5 @@ def test_a_real_scene_has_the_cameras_its_card_lists(data_dir):
     np.testing.assert_allclose(
         capture.cameras.focal_px[rows], known["K"][:, 0, 0], rtol=1e-6
     )
-    centre = capture.cameras.principal_point_px[rows]
-    np.testing.assert_allclose(centre, known["K"][:, :2, 2], rtol=1e-6)
+    center = capture.cameras.principal_point_px[rows]
+    np.testing.assert_allclose(center, known["K"][:, :2, 2], rtol=1e-6)

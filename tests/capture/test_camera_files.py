@@ -17,7 +17,7 @@ from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
 SIZE = (24, 16)
-CENTRE, SCALE = (100.0, -20.0, 3.0), 0.25
+CENTER, SCALE = (100.0, -20.0, 3.0), 0.25
 
 
 def filmed(bent=True, frames=9):
@@ -58,7 +58,7 @@ def filmed(bent=True, frames=9):
             rng.integers(0, 256, (60, 3), np.uint8),
         ),
         scale=SCALE,
-        centre=CENTRE,
+        center=CENTER,
         up=(0.0, -1.0, 0.0),
         frames_per_second=12.0,
     )
@@ -68,7 +68,7 @@ def in_world(capture):
     """Cameras and points of a capture as its own files would have them."""
     cameras = capture.cameras
     places = (cameras.position, capture.points.position)
-    return [np.float64(p) / capture.scale + np.array(capture.centre) for p in places]
+    return [np.float64(p) / capture.scale + np.array(capture.center) for p in places]
 
 
 def same_cameras(read, written, rows):

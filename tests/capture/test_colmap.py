@@ -75,13 +75,13 @@ def test_everything_in_the_files_arrives(tmp_path):
         np.testing.assert_allclose(
             capture.cameras.camera_from_world[row], rotation(row).as_matrix(), atol=1e-6
         )
-        world = capture.cameras.position[row] / capture.scale + capture.centre
+        world = capture.cameras.position[row] / capture.scale + capture.center
         np.testing.assert_allclose(world, position(row), atol=3e-6)
     np.testing.assert_allclose(capture.cameras.focal_px, 30)
     np.testing.assert_allclose(capture.cameras.pixel_aspect, 1.1, rtol=1e-6)
     np.testing.assert_allclose(capture.cameras.principal_point_px[0], [12.5, 7.75])
     order = np.argsort(capture.points.color[:, 0])
-    world = capture.points.position[order] / capture.scale + capture.centre
+    world = capture.points.position[order] / capture.scale + capture.center
     np.testing.assert_allclose(world, WORLD, atol=1e-5)
     assert capture.points.color[order][7].tolist() == [7, 20, 30]
 
@@ -122,7 +122,7 @@ def test_our_cameras_project_as_colmap_does(tmp_path, lens):
         pixel, *_ = frames.pixels_of(
             capture.cameras, row, capture.points.position, SIZE
         )
-        world = capture.points.position.astype(float) / capture.scale + capture.centre
+        world = capture.points.position.astype(float) / capture.scale + capture.center
         inner = rotation(row).apply(world - position(row))
         np.testing.assert_allclose(pixel, theirs.img_from_cam(inner), atol=2e-4)
 
@@ -217,8 +217,8 @@ def test_pictures_may_be_fractions_of_the_model(
     np.testing.assert_allclose(
         capture.cameras.focal_px, 30 * expected[0] / 24, rtol=1e-6
     )
-    centre = np.array([12.5, 7.75]) * expected[0] / 24
-    np.testing.assert_allclose(capture.cameras.principal_point_px[0], centre, rtol=1e-6)
+    center = np.array([12.5, 7.75]) * expected[0] / 24
+    np.testing.assert_allclose(capture.cameras.principal_point_px[0], center, rtol=1e-6)
 
 
 def test_the_largest_of_several_models_is_read(tmp_path):

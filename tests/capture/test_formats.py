@@ -130,7 +130,7 @@ def test_a_real_capture_projects_its_points_where_they_were_seen(
     assert splits in (None, (capture.train.size, capture.heldout.size))
     assert splits or any("black borders" in note for note in capture.notes)
     seen = np.load(data_dir / name / "points_tri.npz")
-    position = np.float32((seen["xyz"] - np.array(capture.centre)) * capture.scale)
+    position = np.float32((seen["xyz"] - np.array(capture.center)) * capture.scale)
     errors = []
     for row in range(len(capture.ids)):
         pixel, *_ = frames.pixels_of(capture.cameras, row, position, size)

@@ -41,7 +41,7 @@ def make(folder, poses=None, folders=("images",), count=COUNT):
 
 
 def world(capture):
-    return capture.cameras.position / capture.scale + capture.centre
+    return capture.cameras.position / capture.scale + capture.center
 
 
 def test_the_cameras_are_those_of_the_colmap_model(tmp_path):

@@ -94,7 +94,7 @@ def test_everything_in_the_files_arrives(tmp_path):
     assert capture.camera_ids.tolist() == [0, 1, 0, 1, 0, 1]
     np.testing.assert_allclose(capture.times, [0, 0.2, 0.4, 0.6, 0.8, 1], atol=1e-7)
     cameras = capture.cameras
-    # (position - centre) * scale, by hand
+    # (position - center) * scale, by hand
     np.testing.assert_allclose(
         cameras.position, [[row * 0.5, 0, 0.25] for row in range(6)], atol=1e-7
     )
@@ -455,12 +455,12 @@ def test_what_is_written_is_read_back(tmp_path):
     for name in ("images", "times", "valid", "moving", *splits):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name))
     for one, other in zip(first.cameras, second.cameras, strict=True):
-        # Positions pass through float64 world units: half an ulp of the centre, 3.
+        # Positions pass through float64 world units: half an ulp of the center, 3.
         np.testing.assert_allclose(one, other, atol=2e-7)
     np.testing.assert_allclose(second.depths, first.depths, rtol=3e-7)
     np.testing.assert_allclose(second.points.position, first.points.position, atol=3e-7)
     np.testing.assert_array_equal(second.points.color, first.points.color)
-    for name in ("near", "far", "scale", "centre", "background", "frames_per_second"):
+    for name in ("near", "far", "scale", "center", "background", "frames_per_second"):
         assert getattr(second, name) == getattr(first, name)
     np.testing.assert_allclose(second.up, first.up, atol=1e-7)
 
@@ -511,7 +511,7 @@ def test_a_real_dycheck_capture_has_its_cameras_without_pictures(data_dir):
     assert views.size == (720, 960)
     lens = np.unique(views.cameras.focal_px)
     assert lens.size == 3
-    # The card: scaled camera centres lie within [-0.06, 0.34].
+    # The card: scaled camera centers lie within [-0.06, 0.34].
     assert -0.07 < views.cameras.position.min() < views.cameras.position.max() < 0.35
     for fixed in (1, 2):
         rows = views.camera_ids == fixed

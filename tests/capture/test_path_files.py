@@ -67,7 +67,7 @@ def test_a_nerfies_path_keeps_the_whole_camera_and_the_world(tmp_path):
     np.testing.assert_array_equal(read.times, TIMES)
     assert read.size == SIZE
     entry = json.loads((tmp_path / "path" / "000001.json").read_text())
-    place = planned.cameras.position[1] / capture.scale + capture.centre
+    place = planned.cameras.position[1] / capture.scale + capture.center
     np.testing.assert_allclose(entry["position"], place, rtol=1e-6)
 
 

@@ -67,7 +67,7 @@ CAPTURES = [
     ({"near": 0.0}, "near = 0"),
     ({"far": np.inf}, "far = inf"),
     ({"scale": 0.0}, "scale = 0"),
-    ({"centre": (0.0, np.nan, 0.0)}, "nan"),
+    ({"center": (0.0, np.nan, 0.0)}, "nan"),
     ({"warp_ids": I32([0, 1, 2, -1])}, "'f3' has warp_id -1"),
     ({"camera_ids": I32([0, 2**30, 0, 0])}, "camera_id 1073741824"),
     ({"train": np.array([1, 4])}, "row 4"),

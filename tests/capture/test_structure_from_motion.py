@@ -52,7 +52,7 @@ def film(folder, count, plain=False):
 
 
 def aligned(guess, true):
-    """Error of camera centres after the best similarity, relative to their spread."""
+    """Error of camera centers after the best similarity, relative to their spread."""
     guess, true = guess - guess.mean(0), true - true.mean(0)
     u, values, v = np.linalg.svd(true.T @ guess)
     scale = values.sum() / (guess**2).sum()

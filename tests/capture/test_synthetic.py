@@ -39,17 +39,17 @@ def small():
 
 
 def pixels_of(capture, truth, rng, count, among=None):
-    """Random (row, y, x), the world points seen there and the pixel centres."""
+    """Random (row, y, x), the world points seen there and the pixel centers."""
     shown = truth.things >= 0 if among is None else among
     places = rng.choice(np.flatnonzero(shown), count, replace=False)
     row, y, x = np.unravel_index(places, shown.shape)
-    centres = np.stack([x, y], -1) + 0.5
+    centers = np.stack([x, y], -1) + 0.5
     points = np.empty((count, 3))
     for i in range(count):
         camera = cameras.take(capture.cameras, row[i])
-        along = scene_oracle.directions(camera, centres[i : i + 1])[0]
+        along = scene_oracle.directions(camera, centers[i : i + 1])[0]
         points[i] = camera.position + capture.depths[row[i], y[i], x[i]] * along
-    return (row, y, x), points, centres
+    return (row, y, x), points, centers
 
 
 def linear(images):
@@ -75,11 +75,11 @@ def test_the_capture_has_the_frames_and_rows_that_were_asked_for(scene):
 
 def test_depth_and_ids_are_numpy_s(scene, rng):
     capture, truth = scene
-    (row, y, x), _, centres = pixels_of(capture, truth, rng, 200)
+    (row, y, x), _, centers = pixels_of(capture, truth, rng, 200)
     wrong = 0
     for i in range(len(row)):
         camera = cameras.take(capture.cameras, row[i])
-        along = scene_oracle.directions(camera, centres[i : i + 1])[0]
+        along = scene_oracle.directions(camera, centers[i : i + 1])[0]
         depth, thing = scene_oracle.first(
             SPEC.things,
             camera.position.astype(float),
@@ -88,7 +88,7 @@ def test_depth_and_ids_are_numpy_s(scene, rng):
         )
         same = thing == truth.things[row[i], y[i], x[i]]
         wrong += not (same and abs(depth - capture.depths[row[i], y[i], x[i]]) < 2e-5)
-    assert wrong <= 2  # pixel centres within rounding of a silhouette
+    assert wrong <= 2  # pixel centers within rounding of a silhouette
 
 
 def test_moving_pixels_are_those_whose_points_move(scene, rng):
@@ -121,7 +121,7 @@ def test_flow_leads_to_where_numpy_sees_the_moved_point(scene, rng, step):
     wrong_sight = 0
     # Half of them where the point is lost, or the test would hardly look at occlusion.
     for among in (has_next & seen, has_next & ~seen):
-        (row, y, x), points, centres = pixels_of(capture, truth, rng, 80, among)
+        (row, y, x), points, centers = pixels_of(capture, truth, rng, 80, among)
         for i in range(len(row)):
             index = truth.things[row[i], y[i], x[i]]
             other = row[i] + step
@@ -135,7 +135,7 @@ def test_flow_leads_to_where_numpy_sees_the_moved_point(scene, rng, step):
             moved = scene_oracle.observe(SPEC.things[index], canonical, time)
             pixel = scene_oracle.project(camera, moved)[0]
             # float32 depth of a grazing ray is the largest part: 3e-4 px measured.
-            assert np.abs(flow[row[i], y[i], x[i]] - (pixel - centres[i])).max() < 3e-3
+            assert np.abs(flow[row[i], y[i], x[i]] - (pixel - centers[i])).max() < 3e-3
             eye = camera.position.astype(float)
             distance, thing = scene_oracle.first(SPEC.things, eye, moved[0] - eye, time)
             inside = np.all((pixel >= 0) & (pixel <= SPEC.size))
@@ -295,7 +295,7 @@ def test_a_specular_surface_adds_light_to_its_own_thing_alone(small):
     difference = shiny.images.astype(int) - capture.images
     assert difference.min() >= 0
     assert difference[truth.things == 1].max() > 20
-    # A corner of the cube may reach into a pixel whose centre, and four neighbors,
+    # A corner of the cube may reach into a pixel whose center, and four neighbors,
     # show the wall; then a diagonal neighbor shows the cube.
     inner = scipy.ndimage.binary_erosion(truth.things == 0, np.ones((1, 3, 3)))
     assert inner.any()
@@ -324,11 +324,11 @@ def test_lumps_merge_and_part_and_a_shutter_opens_and_shuts():
     time = capture.times[film]
     vanished = 0
     for lump, other, reach in zip(lumps, lumps[::-1], radius[::-1], strict=True):
-        centre = np.stack(
+        center = np.stack(
             [scene_oracle.pose(spec.things[other], t)[:3, 3] for t in time]
         )
         mine = truth.track_thing == lump
-        apart = np.linalg.norm(truth.track_world[mine] - centre, axis=-1) - reach
+        apart = np.linalg.norm(truth.track_world[mine] - center, axis=-1) - reach
         seen = truth.track_seen[mine][:, film]
         assert not seen[apart < -1e-3].any()
         vanished += ((apart < -1e-3).any(1) & seen[:, [0, 4, 8]].any(1)).sum()

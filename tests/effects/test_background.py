@@ -12,7 +12,7 @@ from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from nerfies_jax.training.model import Frames
 from tests import gradients
 
-CENTRE, SCALE = np.array([1.0, -2.0, 3.0]), 0.25
+CENTER, SCALE = np.array([1.0, -2.0, 3.0]), 0.25
 
 
 def context(displace, points, frames, dtype, key=None):
@@ -26,7 +26,7 @@ def context(displace, points, frames, dtype, key=None):
             "displace": displace,
             "condition_of": lambda row: FrameCondition(times[row], {}, jnp.int32(0)),
             "frames": seen._replace(points=jnp.asarray(points, dtype), times=times),
-            "box": Box(jnp.asarray(CENTRE, dtype), jnp.asarray(SCALE, dtype)),
+            "box": Box(jnp.asarray(CENTER, dtype), jnp.asarray(SCALE, dtype)),
             "key": jax.random.key(0) if key is None else key,
         }
     )
@@ -55,7 +55,7 @@ def geman_mcclure(squared, width, scaling):
 )
 def test_points_are_seen_in_the_field_in_all_frames(scaling, rng):
     """Each point once where there are few; frames alike often; noise of its size."""
-    points = rng.normal(size=(6000, 3)) + CENTRE
+    points = rng.normal(size=(6000, 3)) + CENTER
     spec = BackgroundSpec(points=6000, noise=0.5, width=0.2, scaling=scaling)
     heard = []
 
@@ -80,7 +80,7 @@ def test_points_are_seen_in_the_field_in_all_frames(scaling, rng):
     frames, counts = np.unique(np.round(times * 10), return_counts=True)
     np.testing.assert_array_equal(frames, np.arange(7))
     assert np.all(np.abs(counts - 6000 / 7) < 5 * np.sqrt(6000 / 7))
-    noise = x - (points - CENTRE) * SCALE
+    noise = x - (points - CENTER) * SCALE
     assert abs(noise.std() - 0.5) < 0.02
     assert abs(noise.mean()) < 0.02
     # frames and noise come of different keys: neither tells of the other
@@ -102,7 +102,7 @@ def test_of_many_points_as_many_as_asked_are_drawn():
 
     for key in range(2):
         assert drift(jax.random.key(key)) == 0
-        rows = heard[-1][0] / SCALE + CENTRE
+        rows = heard[-1][0] / SCALE + CENTER
         np.testing.assert_allclose(rows[:, 1] - rows[:, 0], 1, atol=2e-3)
         seen.append(np.round(rows[:, 0] / 3).astype(int))
         assert len(seen[-1]) == 400
@@ -132,7 +132,7 @@ def test_a_still_warp_costs_nothing_and_has_a_finite_slope(dtype, rng):
 
 
 def test_gradients(float64, rng):
-    points = rng.normal(size=(30, 3)) + CENTRE
+    points = rng.normal(size=(30, 3)) + CENTER
 
     def total(params):
         def displace(x, condition):

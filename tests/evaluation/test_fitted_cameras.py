@@ -34,7 +34,7 @@ def blobs(params, view, size, step):
     del step
     points, colors = params
     place, depth = jax.vmap(lambda point: cameras.project(view.camera, point))(points)
-    away = rays.pixel_centres(size, place.dtype)[:, :, None] - place
+    away = rays.pixel_centers(size, place.dtype)[:, :, None] - place
     # As wide as its distance makes it, on the picture of whatever size.
     width = WIDTH_PX * view.camera.focal_px / 40 / depth
     near = jnp.exp(-jnp.sum(away**2, axis=-1) / (2 * width**2))
@@ -51,7 +51,7 @@ MODEL = Model("blobs", None, None, blobs, (), lambda state: {})
 def capture():
     """Six frames of blobs as their cameras see them, all held out but one."""
     film = scenes.tiny_capture()
-    params = in_default_precision((CLOUD + film_centre(film), COLORS))
+    params = in_default_precision((CLOUD + film_center(film), COLORS))
     draw = jax.jit(lambda view: blobs(params, view, film.size, None).color)
     pictures = [draw(evaluation.view_of(film, row)) for row in range(len(film.ids))]
     return dataclasses.replace(
@@ -65,7 +65,7 @@ def capture():
     )
 
 
-def film_centre(film):
+def film_center(film):
     """What the first camera looks at."""
     depth = 2 / (1 / film.near + 1 / film.far)
     forward = film.cameras.camera_from_world[:, 2]
@@ -73,7 +73,7 @@ def film_centre(film):
 
 
 def state_of(film):
-    params = in_default_precision((CLOUD + film_centre(film), COLORS))
+    params = in_default_precision((CLOUD + film_center(film), COLORS))
     return TrainState(params, (), (), jnp.zeros((), jnp.int32), jax.random.key(0))
 
 
@@ -137,7 +137,7 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
     angles = Rotation.from_matrix(turns).magnitude()
     # Measured: 4e-4 units and 6e-4 rad from eight bits and a valley in which turns and
     # shifts trade; 2e-3 and 4e-3 from pictures half as wide, of pixels that are
-    # means where the scene is drawn at their centres.
+    # means where the scene is drawn at their centers.
     bound = 1e-3 if most_pixels == 5000 else 6e-3
     assert apart.max() < bound
     assert angles.max() < bound

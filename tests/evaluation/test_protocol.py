@@ -28,7 +28,7 @@ def test_the_known_paths_are_those_of_points_seen_at_the_start():
 
 def test_a_scaled_capture_has_its_paths_in_scene_units():
     capture, truth, known = scenes.tiny_tracks()
-    other = dataclasses.replace(capture, scale=2.0, centre=(0.1, 0.2, -0.3))
+    other = dataclasses.replace(capture, scale=2.0, center=(0.1, 0.2, -0.3))
     scaled = protocol.ground_truth(other, truth, 2, 5)
     expected = 2 * (known.path - np.float32([0.1, 0.2, -0.3]))
     np.testing.assert_allclose(scaled.path, expected, atol=1e-6)

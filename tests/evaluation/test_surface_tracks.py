@@ -54,7 +54,7 @@ def test_points_are_followed_until_they_leave_or_are_hidden(capture):
     np.testing.assert_array_equal(tracks.times, filmed)
     start = np.argmin(np.abs(filmed - 0.3))
     pixels = tracks.pixels[:, start]
-    np.testing.assert_allclose(pixels % 1, 0.5, atol=1e-4)  # centres of pixels
+    np.testing.assert_allclose(pixels % 1, 0.5, atol=1e-4)  # centers of pixels
     assert (pixels[:, 1] > 5).all()
     one = cameras.take(capture.cameras, 0)
     depth = (tracks.positions - one.position) @ one.camera_from_world[2]

@@ -40,7 +40,7 @@ def test_tracks_are_read_in_each_layout(tmp_path, layout):
         seen = points.seen.T.astype(np.float32)
         named = {"tracks": first, "visibles": seen}
         if layout == "cotracker":
-            # Counted from the centre of the first pixel.
+            # Counted from the center of the first pixel.
             named = {"pred_tracks": first[None] - 0.5, "pred_visibility": seen[None]}
         np.savez(path, **named)
     capture = with_files(tracks=path)

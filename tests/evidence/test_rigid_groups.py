@@ -38,7 +38,7 @@ def test_two_bodies_are_told_apart_and_their_motions_found():
     assert (label == np.repeat(label[[0, 20]], 20)).all()
     assert label[0] != label[20]
     bodies = rigid_groups.motion(position, known, label, 10)
-    canonical, _ = rigid_groups.centres(position, known, bodies)
+    canonical, _ = rigid_groups.centers(position, known, bodies)
     np.testing.assert_allclose(canonical, position[:, 10], atol=1e-6)
     turn = rigid_groups.rotation_vectors(bodies.rotation, 10)[label[0]]
     np.testing.assert_allclose(turn[:, 2], angle - angle[10], atol=1e-6)

@@ -42,9 +42,9 @@ def small(monkeypatch):
 def swinging(count=30):
     """A motion in closed form: a third of the rows swing, one of them is inactive."""
     rng = np.random.default_rng(0)
-    centre = jnp.asarray(rng.normal(size=(count, 3)), jnp.float32)
+    center = jnp.asarray(rng.normal(size=(count, 3)), jnp.float32)
     still = Gaussians(
-        centre,
+        center,
         jnp.tile(jnp.asarray([[1.0, 0, 0, 0]]), (count, 1)),
         jnp.full((count, 3), 0.1),
         jnp.ones(count).at[3].set(0),

@@ -19,7 +19,7 @@ from nerfies_jax.runs import train
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
 
-CENTRE = (1.0, -2.0, 3.0)  # of the world, which is twice as large as the scene
+CENTER = (1.0, -2.0, 3.0)  # of the world, which is twice as large as the scene
 SPLATS = ("sh_degree=1", "densification=none", "init.extra_random=0")
 SPLATS += ("motion.width=8", "motion.depth=2", "motion.skips=")
 FIELD = ("elastic=none", "background=none", "rays=32", "template.skips=")
@@ -33,7 +33,7 @@ def saved(folder, preset, overrides, shaken):
 
     `shaken` are the networks whose numbers are drawn anew, so that something moves.
     """
-    capture = dataclasses.replace(scenes.tiny_capture(), scale=0.5, centre=CENTRE)
+    capture = dataclasses.replace(scenes.tiny_capture(), scale=0.5, center=CENTER)
     nerfies_format.write(capture, folder / "filmed")
     source = CaptureSource(capture=folder / "filmed")
     run = runs.new_run(RunConfig(preset, source, steps=12, overrides=overrides))
@@ -80,7 +80,7 @@ def test_cameras_leave_with_pictures_in_three_layouts(splats, tmp_path, capsys):
     assert main(splats, "transforms", "--units", "world", "--overwrite") == 0
     table = (splats / "exports" / "transforms" / "transforms.json").read_text()
     pose = np.array(json.loads(table)["frames"][2]["transform_matrix"])
-    place = 2 * capture.cameras.position[2] + CENTRE
+    place = 2 * capture.cameras.position[2] + CENTER
     np.testing.assert_allclose(pose[:3, 3], place, rtol=1e-6)
     assert main(splats, "colmap", "--time", 0.5) == 2
     assert "--time is not for colmap, but for ply, splat" in capsys.readouterr().err
@@ -146,7 +146,7 @@ def test_gaussians_leave_at_an_instant_and_as_a_sequence(splats, tmp_path, capsy
     assert path.read_bytes() == before
     assert main(splats, "ply", "--time", "0.4", "--overwrite", "--units", "world") == 0
     in_world = plyfile.PlyData.read(path)["vertex"]["x"]
-    np.testing.assert_allclose(in_world, 2 * x + CENTRE[0], rtol=1e-6)
+    np.testing.assert_allclose(in_world, 2 * x + CENTER[0], rtol=1e-6)
 
 
 @pytest.mark.full
@@ -211,7 +211,7 @@ def test_tracks_leave_in_the_units_that_are_wanted(splats, capsys):
     words = ("--points", 30, "--frames", 3, "--units", "world", "--overwrite")
     assert main(splats, "tracks", *words) == 0
     with np.load(splats / "exports" / "tracks.npz") as stored:
-        world = 2 * tracks["positions"] + CENTRE
+        world = 2 * tracks["positions"] + CENTER
         np.testing.assert_allclose(stored["positions"], world, atol=1e-5)
 
 

@@ -23,15 +23,15 @@ def test_the_nearest_kernels_are_the_terms_of_a_loop(float64, rng):
         static_argnums=2,
     )
     x = rng.uniform(-1, 1, (20, 3))
-    centres = np.linspace(-1, 1, 8)
+    centers = np.linspace(-1, 1, 8)
     width = np.sqrt(2) * SPEC.width_ratio * 2 / 7
     for nearest in (3, 8):
         truth = np.zeros((20, 2)) + np.asarray(layer.bias)
         for n in range(20):
             for i in range(3):
-                close = np.argsort(np.abs(x[n, i] - centres), kind="stable")[:nearest]
+                close = np.argsort(np.abs(x[n, i] - centers), kind="stable")[:nearest]
                 for g in close:
-                    height = np.exp(-(((x[n, i] - centres[g]) / width) ** 2))
+                    height = np.exp(-(((x[n, i] - centers[g]) / width) ** 2))
                     truth[n] += height * np.asarray(layer.kernel)[g, i]
         nearby = local(layer, x, nearest)
         np.testing.assert_allclose(nearby, truth, rtol=0, atol=1e-13)

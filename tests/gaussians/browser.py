@@ -172,7 +172,7 @@ def projected(view, point, width, height):
         point, view["position"]
     )
     offset = view["focal"] * enlarged * np.array([x, y * view["aspect"]]) / z
-    center = np.subtract(view["centre"], np.divide(view["size"], 2)) * enlarged
+    center = np.subtract(view["center"], np.divide(view["size"], 2)) * enlarged
     return offset + center + (width / 2, height / 2)
 
 

@@ -86,10 +86,10 @@ def test_world_units_place_and_size_gaussians_as_the_capture_does(swaying):
     model, state = swaying
     rows = instants.splats_at(model, state)(1.0)
     capture = dataclasses.replace(
-        scenes.tiny_capture(), scale=0.25, centre=(1.0, -2.0, 3.0)
+        scenes.tiny_capture(), scale=0.25, center=(1.0, -2.0, 3.0)
     )
     world, rows = jax.tree.map(np.asarray, (instants.in_world(rows, capture), rows))
-    np.testing.assert_allclose(world.mean, 4 * rows.mean + capture.centre, 1e-6)
+    np.testing.assert_allclose(world.mean, 4 * rows.mean + capture.center, 1e-6)
     np.testing.assert_allclose(
         np.exp(world.log_scale), 4 * np.exp(rows.log_scale), 1e-5
     )

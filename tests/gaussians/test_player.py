@@ -272,7 +272,7 @@ def test_the_page_projects_as_the_library(opened, page, antialiased):
         "focal": float(one.focal_px),
         "aspect": float(one.pixel_aspect),
         "skew": float(one.skew_px),
-        "centre": one.principal_point_px.tolist(),
+        "center": one.principal_point_px.tolist(),
         "size": size,
     }
     program = FOOTPRINTS.replace("HEADER", inside(page, "header"))

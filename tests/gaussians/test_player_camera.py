@@ -81,8 +81,8 @@ def test_views_turn_about_their_target():
     # An image of 64 x 48 in one of 256 x 96.
     assert (first["enlarged"], first["size"]) == (2, [256, 96])
     assert first["focal"] == pytest.approx(2 * view["focal"])
-    place = 2 * (np.array(view["centre"]) - (32, 24)) + (128, 48)
-    np.testing.assert_allclose(first["centre"], place)
+    place = 2 * (np.array(view["center"]) - (32, 24)) + (128, 48)
+    np.testing.assert_allclose(first["center"], place)
 
 
 def on_sphere(azimuths, elevations, distance=3.0, target=(0.5, -1.0, 2.0)):

@@ -67,7 +67,7 @@ def test_equal_screws_leave_every_camera_and_have_exact_slopes(size, dtype):
     def place(screws):
         return refined(screws, given, DEPTH).position
 
-    # By hand: a shift v moves a centre by -R' v; of the mean there is no slope.
+    # By hand: a shift v moves a center by -R' v; of the mean there is no slope.
     slope = jax.jit(jax.jacfwd(place))(screws)[0, :, :, 3:]
     back = -DEPTH * np.asarray(given.camera_from_world[0]).T
     shares = np.arange(3) == 0

@@ -108,7 +108,7 @@ SETTINGS = [
     (KanMotionSpec, dict(spread=0.0), "equal codes stay equal"),
     (KanMotionSpec, dict(learning_rate=1e-5, learning_rate_end=1e-4), "the rate falls"),
     (KanMotionSpec, dict(embedding_rate=0.0), "embedding_rate=0.0"),
-    (KanMotionSpec, dict(kernels=1), "two centres"),
+    (KanMotionSpec, dict(kernels=1), "two centers"),
     (LearningRateSpec, dict(mean_end=0.0), "mean_end"),
     (MCMCStrategySpec, dict(growth=0.9), "growth=0.9"),
     (MCMCStrategySpec, dict(min_opacity=0.0), "min_opacity=0.0"),

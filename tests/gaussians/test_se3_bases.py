@@ -64,8 +64,8 @@ def test_gaussians_move_by_the_mean_of_rigid_motions(dtype, time):
                 splined(coarse[k], time) + splined(fine[k], time)
                 for coarse, fine in zip(bases.coarse, bases.fine, strict=True)
             )
-            centre = bases.centre[k]
-            there = Rotation.from_rotvec(turn).apply(mean - centre) + centre + shift
+            center = bases.center[k]
+            there = Rotation.from_rotvec(turn).apply(mean - center) + center + shift
             expected[row] += weights[row, 1 + k] * (there - mean)
             turns[row] += weights[row, 1 + k] * turn
     tolerance = 2e-6 if dtype == "float32" else 1e-13
@@ -124,20 +124,20 @@ def test_bases_at_rest_move_nothing_at_all_and_have_slopes(dtype):
 
 @pytest.mark.hard_cases
 def test_small_turns_keep_their_digits_far_from_the_origin(dtype):
-    """R - 1 is not formed from R: a turn of 1e-6 about a centre 1000 units away."""
+    """R - 1 is not formed from R: a turn of 1e-6 about a center 1000 units away."""
     _bases, _, _gaussians = draw(dtype)
-    centre = np.full((1, 3), 1000, dtype)
+    center = np.full((1, 3), 1000, dtype)
     turn = np.full((1, KNOTS, 3), 1e-6, dtype)
     none = np.zeros((1, KNOTS, 3), dtype)
-    one = Bases(Poses(turn, none), Poses(none, none), centre)
+    one = Bases(Poses(turn, none), Poses(none, none), center)
     motion = jax.jit(se3_bases.at_time)(one, np.asarray(0.5, dtype))
     exact = np.cross(np.full(3, 1e-6), np.eye(3)).T
     # Of first order to 1e-12.
     np.testing.assert_allclose(motion.linear[0], exact, atol=2e-12)
     still = moved(
-        one, np.array([[0, 50]], dtype), _at(centre, dtype), np.asarray(0.5, dtype)
+        one, np.array([[0, 50]], dtype), _at(center, dtype), np.asarray(0.5, dtype)
     )
-    np.testing.assert_allclose(still.mean, centre, rtol=1e-6)
+    np.testing.assert_allclose(still.mean, center, rtol=1e-6)
 
 
 def _at(mean, dtype):

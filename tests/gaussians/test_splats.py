@@ -165,8 +165,8 @@ def test_random_points_lie_where_a_camera_sees_them(rng):
     cameras = ring_of_cameras(5)
     points = rows.random_in_views(rng, cameras, (64, 48), 1.0, 4.0, 2000)
     seen = np.zeros(len(points), bool)
-    for turn, centre in zip(cameras.camera_from_world, cameras.position, strict=True):
-        x, y, z = turn @ (points - centre).T
+    for turn, center in zip(cameras.camera_from_world, cameras.position, strict=True):
+        x, y, z = turn @ (points - center).T
         u = 80 * x / z + 4 * y / z + 30
         v = 100 * y / z + 26
         inside = (u >= 0) & (u <= 64) & (v >= 0) & (v <= 48)

@@ -71,8 +71,8 @@ def test_a_row_of_the_file_is_what_its_shader_unpacks():
     words = texture[64 * index : 64 * (index + 1)]
     halves = struct.unpack("<32e", words)
     x, y, z = struct.unpack("<3f", words[:12])
-    centre, width = halves[30:]
-    since = time - centre
+    center, width = halves[30:]
+    since = time - center
     first, second, third = (np.array(halves[16 + 3 * k : 19 + 3 * k]) for k in range(3))
     mean = np.array([x, y, z]) + since * (first + since * (second + since * third))
     drawn = splatv.at(curves, time)

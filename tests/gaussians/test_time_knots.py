@@ -25,7 +25,7 @@ def moving(time, dtype="float32"):
     rng = np.random.default_rng(3)
     number = np.arange(COUNT)
     moves = jnp.asarray(number % 2, dtype)[:, None]
-    centre, swing = (jnp.asarray(rng.normal(size=(COUNT, 3)), dtype) for _ in "ab")
+    center, swing = (jnp.asarray(rng.normal(size=(COUNT, 3)), dtype) for _ in "ab")
     phase = jnp.asarray(rng.uniform(0, 6, (COUNT, 1)), dtype)
     angle = moves * jnp.sin(4 * time + phase) * 1.2
     turn = jnp.concatenate(
@@ -37,7 +37,7 @@ def moving(time, dtype="float32"):
     )
     sign = jnp.where(jnp.sin(40 * time + phase) > 0, 1, -1).astype(dtype)
     return Gaussians(
-        mean=centre + moves * swing * jnp.sin(5 * time + phase),
+        mean=center + moves * swing * jnp.sin(5 * time + phase),
         quaternion=turn * sign * 1.7,
         scale=0.2 * jnp.exp(moves * jnp.cos(3 * time) * swing),
         opacity=jnp.asarray(rng.uniform(0.1, 1, COUNT), dtype),

@@ -113,7 +113,7 @@ def test_nan_pixels_are_flagged(dtype):
     assert not undistorted(*lens, np.array([[np.nan, 0]]))[1]
 
 
-def test_no_fold_on_the_way_is_missed_where_the_lens_is_decentred(float64, rng):
+def test_no_fold_on_the_way_is_missed_where_the_lens_is_decentered(float64, rng):
     """Of 3000 lenses, against the determinant at 400 places of the way each."""
     count = 3000
     radial = rng.uniform(-1, 1, (count, 3)) * (0.4, 0.2, 0.1)

@@ -29,7 +29,7 @@ def make_camera(dtype, **changes):
     return jax.tree.map(jnp.asarray, plain._replace(**changes))
 
 
-def test_rays_go_through_pixel_centres(dtype):
+def test_rays_go_through_pixel_centers(dtype):
     camera = make_camera(dtype)
     grid = jax.tree.map(np.asarray, pixel_rays(camera))
     assert grid.direction.shape == (6, 8, 3)

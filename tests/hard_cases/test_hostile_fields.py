@@ -166,8 +166,8 @@ def test_units_of_a_capture_do_not_reach_the_field(factor):
     np.testing.assert_allclose(other.scale * factor, usual.scale, rtol=1e-6)
     np.testing.assert_allclose(other.near / factor, usual.near, rtol=1e-6)
     np.testing.assert_allclose(other.far / factor, usual.far, rtol=1e-6)
-    centre = np.asarray(other.centre) / factor
-    np.testing.assert_allclose(centre, usual.centre, atol=1e-6)
+    center = np.asarray(other.center) / factor
+    np.testing.assert_allclose(center, usual.center, atol=1e-6)
 
 
 def test_points_behind_the_far_plane_do_not_push_the_near_one_past_it():

@@ -37,7 +37,7 @@ class Place(NamedTuple):
 
     near: Any
     far: Any
-    centre: Any
+    center: Any
     scale: Any
     speed: Any  # times what the optimiser would have moved
 
@@ -101,14 +101,14 @@ def small_template(spec: TemplateSpec) -> TemplateSpec:
 def moved(metadata: SceneMetadata, place: Place) -> SceneMetadata:
     """The metadata with traced numbers, which their constructor would refuse."""
     metadata = copy.copy(metadata)
-    for name in ("near", "far", "centre", "scale"):
+    for name in ("near", "far", "center", "scale"):
         object.__setattr__(metadata, name, getattr(place, name))
     return metadata
 
 
 def place_of(metadata: SceneMetadata, speed: float = 1.0) -> Place:
     """As arrays."""
-    numbers = (metadata.near, metadata.far, metadata.centre, metadata.scale, speed)
+    numbers = (metadata.near, metadata.far, metadata.center, metadata.scale, speed)
     return Place(*(np.asarray(number, np.float32) for number in numbers))
 
 

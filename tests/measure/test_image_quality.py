@@ -286,7 +286,7 @@ def test_high_dynamic_range_loses_no_variance(dtype, rng):
     image, truth = ((1000 + x).astype(dtype) for x in pair(rng, (*SMALL, 3)))
     value, _ = ms_ssim_and_slope(image, truth)
     exact = slow_ms_ssim(*(x.astype(float) for x in (image, truth)), (0.1356, 0.8644))
-    # Without the centring of `_terms` the float32 error is of order one.
+    # Without the centering of `_terms` the float32 error is of order one.
     assert abs(value - exact) < {"float32": 2e-3, "float64": 1e-4}[dtype]
 
 

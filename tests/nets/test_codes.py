@@ -9,7 +9,7 @@ from nerfies_jax.nets import codes
 from tests import gradients
 
 
-def test_codes_are_centred_and_bounded(dtype):
+def test_codes_are_centered_and_bounded(dtype):
     init = jax.jit(lambda key: codes.init(key, 500, 8, dtype=jnp.dtype(dtype)))
     table = np.asarray(init(jax.random.key(0)))
     assert table.shape == (500, 8)

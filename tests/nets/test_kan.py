@@ -42,7 +42,7 @@ SOME = [
 apply = jax.jit(kan.apply_heads, static_argnums=0)
 
 
-def centres(spec, layer):
+def centers(spec, layer):
     return np.linspace(*spec.grid_of(layer), spec.kernels)[:, None]
 
 
@@ -59,7 +59,7 @@ def filled(spec, dtype):
         return params
     kernels = tuple(
         Kernels(
-            (0.3 * layer.centre + centres(spec, index)).astype(layer.centre.dtype),
+            (0.3 * layer.center + centers(spec, index)).astype(layer.center.dtype),
             (0.3 * layer.log_width + math.log(kan.width(spec, index))).astype(
                 layer.log_width.dtype
             ),
@@ -101,16 +101,16 @@ def by_hand(spec, params, x):
         if index and spec.norm:
             features = features - np.mean(features)
             features = features / np.sqrt(np.mean(features**2) + 1e-6)
-        centre = np.linspace(*grid, spec.kernels)[:, None]
+        center = np.linspace(*grid, spec.kernels)[:, None]
         scale = math.sqrt(2) * sigma
         if spec.trainable_kernels:
-            centre = params.kernels[index].centre
+            center = params.kernels[index].center
             scale = np.exp(params.kernels[index].log_width)
         if spec.basis == "bspline":
             psi = splines(features, grid, spec.kernels)
         else:
             kept = np.array([held(v, grid, sigma) for v in features])
-            psi = np.exp(-(((kept - centre) / scale) ** 2))
+            psi = np.exp(-(((kept - center) / scale) ** 2))
         outputs = [
             layer.bias + np.einsum("gi,gio->o", psi, layer.kernel)
             for layer in side_by_side
@@ -334,7 +334,7 @@ def test_a_b_spline_is_scipy_s_at_its_knots_between_and_beyond(dtype):
 def test_b_splines_sum_to_one_on_their_grid(float64):
     spec = dataclasses.replace(VARIANTS["B-splines"], grid=(-1.0, 2.0))
     x = np.linspace(-1, 2, 31)[:, None]
-    apart = (x - np.asarray(kan.centres(spec, 0, float))) / kan.spacing(spec, 0)
+    apart = (x - np.asarray(kan.centers(spec, 0, float))) / kan.spacing(spec, 0)
     values = jax.jit(bsplines.cubic)(apart)
     np.testing.assert_allclose(np.asarray(values).sum(1), 1, rtol=1e-14)
 
@@ -347,4 +347,4 @@ def test_what_is_off_has_no_parameters():
         for name in ("no base", "trained kernels")
     )
     assert len(jax.tree.leaves(bare)) == 2 * 4  # kernel weights and biases
-    assert [layer.centre.shape for layer in trained.kernels] == [(5, 5), (5, 7), (5, 6)]
+    assert [layer.center.shape for layer in trained.kernels] == [(5, 5), (5, 7), (5, 6)]

@@ -48,7 +48,7 @@ def splines(**changes):
         (net, {"heads": TWICE}, "different names"),
         (splines, {"in_features": 0}, "in_features >= 1"),
         (splines, {"hidden": (4, 0)}, "hidden widths"),
-        (splines, {"kernels": 1}, "two centres"),
+        (splines, {"kernels": 1}, "two centers"),
         (splines, {"grid": (1.0, 1.0)}, "grid needs low < high"),
         (splines, {"hidden_grid": (0.0, math.inf)}, "hidden_grid needs"),
         (splines, {"width_ratio": 3.0}, "cannot be told apart"),

@@ -42,10 +42,10 @@ def footprint(mean, quaternion, scale, camera, size, spec):
     )
     mean_px = (intrinsics @ (here / z))[:2]
 
-    def limit(tangent, focal, centre, pixels):
+    def limit(tangent, focal, center, pixels):
         slack = spec.tangent_margin * pixels / (2 * focal)
         return jnp.clip(
-            tangent, -centre / focal - slack, (pixels - centre) / focal + slack
+            tangent, -center / focal - slack, (pixels - center) / focal + slack
         )
 
     tx = limit(x / z, intrinsics[0, 0], intrinsics[0, 2], width)

@@ -120,7 +120,7 @@ def ray_of(metadata, batch, number):
     origin, direction = (np.asarray(x)[number] for x in (batch.origin, batch.direction))
     span = metadata.scale / np.asarray(batch.cosine)[number]
     return Ray(
-        jnp.asarray((origin - np.asarray(metadata.centre)) * metadata.scale, "float32"),
+        jnp.asarray((origin - np.asarray(metadata.center)) * metadata.scale, "float32"),
         jnp.asarray(direction),
         jnp.asarray(metadata.near * span, "float32"),
         jnp.asarray(metadata.far * span, "float32"),

@@ -30,7 +30,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
 ):
     """x + d(x) = x / s(t) - v t: a point is scaled by s and moved, in field units."""
     capture, _, known = filmed
-    metadata = types.SimpleNamespace(centre=(0.1, -0.2, 0.3), scale=4.0)
+    metadata = types.SimpleNamespace(center=(0.1, -0.2, 0.3), scale=4.0)
     times = capture.times[known.moments]
     velocity = jnp.asarray([0.3, 0.1, -0.2])
 
@@ -49,11 +49,11 @@ def test_points_are_followed_through_a_warp_in_closed_form(
     state = types.SimpleNamespace(params=velocity, step=jnp.int32(5))
     followed = point_tracks.follow(None, metadata, state, capture, known)
 
-    start = 4.0 * (known.path[:, 3] - np.float32(metadata.centre))
+    start = 4.0 * (known.path[:, 3] - np.float32(metadata.center))
     template = start / (1 + times[3]) - np.asarray(velocity) * times[3]
     for column, time in enumerate(times):
         place = (template + np.asarray(velocity) * time) * (1 + time)
-        place = place / 4.0 + np.float32(metadata.centre)
+        place = place / 4.0 + np.float32(metadata.center)
         if column == lost_at:
             place = known.path[:, 3]
         np.testing.assert_allclose(followed.path[:, column], place, atol=3e-6)
@@ -61,7 +61,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
     if lost_at is None:
         stretch = np.sqrt(np.mean(3 * np.log(1 / (1 + times)) ** 2))
         assert followed.strain == pytest.approx(stretch, rel=1e-4)
-        still = 4.0 * (capture.points.position - np.float32(metadata.centre))
+        still = 4.0 * (capture.points.position - np.float32(metadata.center))
         moved = still / (1 + times[:, None, None]) - still
         moved = moved - np.asarray(velocity) * times[:, None, None]
         drift = np.linalg.norm(moved - moved.mean(0), axis=-1).mean() / 4.0
@@ -106,12 +106,12 @@ def test_points_are_followed_along_a_flow_in_closed_form(filmed, moving, every):
     followed = point_tracks.follow(
         spec, metadata, state, capture, known, effects=(effect,)
     )
-    centre = np.asarray(metadata.centre)
+    center = np.asarray(metadata.center)
     for column, row in enumerate(chosen):
         hops = int(row) - int(chosen[known.start])
         each = np.eye(3) + moving * ((turn if hops >= 0 else turn.T) - np.eye(3))
         step = np.linalg.matrix_power(each, abs(hops))
-        expected = (known.start_points - centre) @ step.T + centre
+        expected = (known.start_points - center) @ step.T + center
         np.testing.assert_allclose(followed.path[:, column], expected, atol=2e-6)
     assert followed.found.all()
     assert followed.drift > 0.01

@@ -28,7 +28,7 @@ from tests import scenes
 METADATA = SceneMetadata(
     near=1.0,
     far=3.0,
-    centre=(0.5, 0.0, -0.5),
+    center=(0.5, 0.0, -0.5),
     scale=0.5,
     background=None,
     times=(0.0, 1.0),

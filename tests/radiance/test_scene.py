@@ -51,7 +51,7 @@ TINY_WARP = WarpSpec(
 METADATA = SceneMetadata(
     near=1.0,
     far=3.0,
-    centre=(0.5, 0.0, -0.5),
+    center=(0.5, 0.0, -0.5),
     scale=0.5,
     background=(1.0, 1.0, 1.0),
     times=(0.0, 0.25, 1.0),
@@ -283,13 +283,13 @@ def test_facts_place_held_out_exposures_by_time():
 def test_the_filmed_volume_fills_the_box():
     capture = scenes.tiny_capture()
     metadata = scene.metadata_of(capture, STATIC)
-    inside = (capture.points.position - np.asarray(metadata.centre)) * metadata.scale
+    inside = (capture.points.position - np.asarray(metadata.center)) * metadata.scale
     # Outliers of structure from motion may lie outside
     assert np.mean(np.abs(inside) <= 1) > 0.9
     assert np.abs(inside).max() > 0.5
     own = scene.metadata_of(capture, dataclasses.replace(STATIC, extent=None))
     assert own.scale == 1
-    assert own.centre == (0, 0, 0)
+    assert own.center == (0, 0, 0)
 
 
 @pytest.mark.slow

@@ -225,7 +225,7 @@ def test_a_survey_of_what_is_shown_is_that_of_everything_there(bend):
     assert 0.02 < shown.mean() < 0.4
     # Every sample of every ray is in a cell that is shown.
     ray, _ = jax.vmap(lambda pixel: field_ray_through(metadata, camera, pixel))(
-        rays.pixel_centres(capture.size).reshape(-1, 2)
+        rays.pixel_centers(capture.size).reshape(-1, 2)
     )
     share = np.linspace(0, 1, 41, dtype=np.float32)[:, None]
     distance = ray.near + share * (ray.far - ray.near)

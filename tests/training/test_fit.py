@@ -119,7 +119,7 @@ def texture(point):
 def photograph(camera):
     """The textured plane as the camera sees it, on a coarse grid of pixels."""
     across, down = np.meshgrid(np.arange(2, 64, 5) + 0.5, np.arange(2, 48, 5) + 0.5)
-    centres = jnp.asarray(
+    centers = jnp.asarray(
         np.stack([across.ravel(), down.ravel()], -1), camera.position.dtype
     )
 
@@ -129,7 +129,7 @@ def photograph(camera):
         distance = -camera.position[2] / direction[2]
         return texture(camera.position + distance * direction)
 
-    return jax.vmap(color)(centres)
+    return jax.vmap(color)(centers)
 
 
 @pytest.mark.full

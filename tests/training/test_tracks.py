@@ -232,22 +232,22 @@ def test_gradients_are_those_of_the_implicit_function(float64, rng):
 
 
 def moving(params, point, moment):
-    """Turns by `rate` rad per time about an axis through `centre`, and swells."""
+    """Turns by `rate` rad per time about an axis through `center`, and swells."""
     rate, swell = params
-    centre = moment["centre"]
-    offset = point - centre
+    center = moment["center"]
+    offset = point - center
     turned = lie.displacement(rate * moment["time"], 0 * rate, offset)
     return turned + swell * jnp.sin(3 * moment["time"]) * offset
 
 
-def moving_truth(params, canonical, times, centre):
+def moving_truth(params, canonical, times, center):
     """The observed points, by rotation matrices."""
     rate, swell = (np.asarray(p, np.float64) for p in params)
     tracks = []
     for time in times:
         turn = scipy.linalg.expm(hat(rate * time))
         matrix = turn + swell * np.sin(3 * time) * np.eye(3)
-        tracks.append((canonical - centre) @ np.linalg.inv(matrix).T + centre)
+        tracks.append((canonical - center) @ np.linalg.inv(matrix).T + center)
     return np.stack(tracks, 1)
 
 
@@ -257,13 +257,13 @@ def moving_truth(params, canonical, times, centre):
 def test_tracks_follow_points_through_a_known_motion(row, dtype, rng):
     params = (np.asarray([0.0, 2.5, 0.4], dtype), np.asarray(0.2, dtype))
     times = np.linspace(0, 1, 9)
-    centre = np.array([0.2, 0.0, -0.1])
+    center = np.array([0.2, 0.0, -0.1])
     moments = {
         "time": times.astype(dtype),
-        "centre": np.tile(centre.astype(dtype), (9, 1)),
+        "center": np.tile(center.astype(dtype), (9, 1)),
     }
     canonical = rng.uniform(-1, 1, (5, 3))
-    truth = moving_truth(params, canonical, times, centre)
+    truth = moving_truth(params, canonical, times, center)
     given = canonical if row is None else truth[:, row]
     tracks = jax.jit(lambda p, x, m: point_tracks(moving, p, x, m, row))(
         params, given.astype(dtype), moments
@@ -292,7 +292,7 @@ def test_a_track_survives_a_moment_at_which_it_is_lost(dtype):
 @pytest.mark.full
 def test_gradients_of_tracks_equal_central_differences(float64):
     params = (np.array([0.0, 2.5, 0.4]), np.array(0.2))
-    moments = {"time": np.linspace(0, 1, 5), "centre": np.full((5, 3), 0.1)}
+    moments = {"time": np.linspace(0, 1, 5), "center": np.full((5, 3), 0.1)}
 
     def total(params, points):
         tracks = point_tracks(moving, params, points, moments, 2)

@@ -31,7 +31,7 @@ class Schedule(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One frame as filmed; what is not color belongs to the pixel's centre."""
+    """One frame as filmed; what is not color belongs to the pixel's center."""
 
     image: Float[Array, "height width 3"]  # sRGB-coded in [0, 1], not rounded
     depth: Float[Array, "height width"]  # z-depth, scene units; 0 for nothing
@@ -82,7 +82,7 @@ def picture(
         # The sensor clips each sample: a highlight must not spill beyond its rim.
         return jnp.clip(trace.shade(spec, hit, direction, light_gain), 0, 1)
 
-    # The centre goes along as a last sample: one program, not two to compile.
+    # The center goes along as a last sample: one program, not two to compile.
     offsets = _sub_pixels(spec.supersampling, time.dtype)
 
     def tile(pixels):
@@ -91,14 +91,14 @@ def picture(
         hits = jax.vmap(jax.vmap(hit))(directions)
         lit = jax.tree.map(lambda leaf: leaf[:, :-1], hits)
         light = jax.vmap(jax.vmap(color))(lit, directions[:, :-1])
-        centre = jax.tree.map(lambda leaf: leaf[:, -1], hits)
-        return texture.srgb(jnp.mean(light, axis=1)), centre
+        center = jax.tree.map(lambda leaf: leaf[:, -1], hits)
+        return texture.srgb(jnp.mean(light, axis=1)), center
 
     tiles = jax.lax.map(tile, _tiles(spec.size, time.dtype))
-    image, centre = _untiled(tiles, spec.size)
+    image, center = _untiled(tiles, spec.size)
     # Directions have z-depth one, so the distance along one is the z-depth.
-    depth = jnp.where(centre.thing == trace.NOTHING, 0, centre.distance)
-    return Picture(image, depth, centre)
+    depth = jnp.where(center.thing == trace.NOTHING, 0, center.distance)
+    return Picture(image, depth, center)
 
 
 def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
@@ -134,17 +134,17 @@ def noted_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:
 
 
 def _sub_pixels(count, dtype):
-    """Offsets of count x count equal cells from the pixel's centre, and zero."""
+    """Offsets of count x count equal cells from the pixel's center, and zero."""
     offsets = (np.arange(count) + 0.5) / count - 0.5
     grid = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
     return jnp.asarray(np.concatenate([grid, np.zeros((1, 2))]), dtype)
 
 
 def _tiles(size, dtype):
-    """Pixel centres [tiles, TILE², 2] that cover a picture, and a margin beyond it."""
+    """Pixel centers [tiles, TILE², 2] that cover a picture, and a margin beyond it."""
     down, across = (-(-length // TILE) for length in size[::-1])
-    centres = rays.pixel_centres((across * TILE, down * TILE), dtype)
-    tiles = centres.reshape(down, TILE, across, TILE, 2).swapaxes(1, 2)
+    centers = rays.pixel_centers((across * TILE, down * TILE), dtype)
+    tiles = centers.reshape(down, TILE, across, TILE, 2).swapaxes(1, 2)
     return tiles.reshape(down * across, TILE**2, 2)
 
 

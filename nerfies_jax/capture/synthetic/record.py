@@ -141,7 +141,7 @@ def _points(spec, plan, images, hits, moving, seed):
     chosen = rng.choice(candidates, min(spec.points, len(candidates)), replace=False)
     row = chosen // still[0].size
     directions = jax.vmap(film.view_direction)(
-        cameras.take(plan.cameras, row), _centres_of(chosen, spec.size)
+        cameras.take(plan.cameras, row), _centers_of(chosen, spec.size)
     )
     distance = hits.distance.reshape(-1)[chosen]
     exact = plan.cameras.position[row] + distance[:, None] * np.asarray(directions)
@@ -150,8 +150,8 @@ def _points(spec, plan, images, hits, moving, seed):
     return PointCloud(position, images.reshape(-1, 3)[chosen])
 
 
-def _centres_of(flat, size):
-    """Pixel centres of flat indices into [frames, height, width]."""
+def _centers_of(flat, size):
+    """Pixel centers of flat indices into [frames, height, width]."""
     width, height = size
     return np.stack([flat % width, flat // width % height], -1).astype(np.float32) + 0.5
 

@@ -66,7 +66,7 @@ class Sphere:
         scale, _ = self._stretch(time)
         start, along = self.undeform(origin, time), direction / scale
         speed_sq = jnp.sum(along**2)
-        # From the point nearest to the centre, not from the origin: b² - ac would
+        # From the point nearest to the center, not from the origin: b² - ac would
         # cancel for a small ball far away.
         middle = -jnp.sum(start * along) / speed_sq
         nearest = start + middle * along

@@ -25,7 +25,7 @@ from nerfies_jax.geometry import rays
 class SceneTruth(NamedTuple):
     """Exact answers, row for row beside the capture. NumPy leaves.
 
-    Flow leads from the centre of a pixel to where its point lies in the next (previous)
+    Flow leads from the center of a pixel to where its point lies in the next (previous)
     frame of the same camera, in pixels. It is known, and given, where that point is
     hidden or outside, too: `seen` says where it can be compared with pictures. The last
     (first) frame of a camera has none: zero, and nowhere seen.
@@ -64,7 +64,7 @@ def track_places(capture: Capture, truth: SceneTruth, rows: np.ndarray) -> np.nd
             f"{capture.name}: its frames lie between the {last + 1} instants of the "
             "truth; make the scene again"
         )
-    world = truth.track_world[:, instants] - np.float32(capture.centre)
+    world = truth.track_world[:, instants] - np.float32(capture.center)
     return (world * capture.scale).astype(np.float32)
 
 
@@ -95,7 +95,7 @@ def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flo
     """Pixels of material points, as another frame sees them.
 
     `thing` [height, width] and `material` [height, width, 3] are what one frame's pixel
-    centres hit; camera, time and transient are those of the other.
+    centers hit; camera, time and transient are those of the other.
     """
 
     def one(thing, material):
@@ -104,8 +104,8 @@ def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flo
 
     pixel, seen = jax.lax.map(lambda row: jax.vmap(one)(*row), (thing, material))
     known = thing != trace.NOTHING
-    centres = rays.pixel_centres(spec.size, pixel.dtype)
-    shift = jnp.where(known[..., None], pixel - centres, 0)
+    centers = rays.pixel_centers(spec.size, pixel.dtype)
+    shift = jnp.where(known[..., None], pixel - centers, 0)
     return Flow(shift, seen & known)
 
 
