@@ -51,7 +51,7 @@ def splatting(
         rows = deformation.drawn_rows(every, params)
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
         coefficients = splats.active_harmonics(rows, degree)
-        color = harmonics.color_towards(coefficients, gaussians.mean, position)
+        color = harmonics.color_toward(coefficients, gaussians.mean, position)
         # The compositing weights and the transmittance sum to one, so an affine change
         # of the image is the same change of every color and of the background.
         behind = background.astype(color.dtype)

@@ -78,7 +78,7 @@ def basis(
     return tuple(terms)
 
 
-def color_towards(
+def color_toward(
     coefficients: Float[Array, "*n coefficients 3"],
     mean: Float[Array, "*n 3"],
     camera_position: Float[Array, "3"],

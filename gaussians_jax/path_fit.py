@@ -169,9 +169,9 @@ def combination(
     weight = paths.known.astype(float)
     middle = mean_places(paths)[:, None]
     # About the mean place: the ridge pulls there and not to the origin.
-    towards = np.where(paths.known[..., None], paths.position - middle, 0)
+    toward = np.where(paths.known[..., None], paths.position - middle, 0)
     normal = np.einsum("tk,nt,tl->nkl", basis, weight, basis, optimize=True) + stiff
-    right = np.einsum("tk,ntc->nkc", basis, towards)
+    right = np.einsum("tk,ntc->nkc", basis, toward)
     constant = np.linalg.lstsq(basis, np.ones(len(basis)), rcond=None)[0]
     return np.linalg.solve(normal, right) + constant[:, None] * middle
 

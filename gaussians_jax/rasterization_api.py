@@ -414,7 +414,7 @@ def _visible_colors(settings, gaussians, colors, view):
     # -R^T t, as gsplat takes it here.
     position = -exact_product(view.viewmat[:3, 3], view.viewmat[:3, :3])
     coefficients = colors[:, : (settings.sh_degree + 1) ** 2]
-    return harmonics.color_towards(coefficients, gaussians.mean, position)
+    return harmonics.color_toward(coefficients, gaussians.mean, position)
 
 
 def _radii(footprints, size):

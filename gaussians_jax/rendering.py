@@ -102,7 +102,7 @@ def render_harmonics(
     depth: bool = True,
 ) -> Frame:
     """`render` with view-dependent color from 1, 4, 9 or 16 SH coefficients."""
-    colors = harmonics.color_towards(coefficients, gaussians.mean, camera.position)
+    colors = harmonics.color_toward(coefficients, gaussians.mean, camera.position)
     extras = background, features, mean2d_offset, depth
     return render(gaussians, colors, camera, size, spec, *extras)
 

@@ -17,7 +17,7 @@ class Between(NamedTuple):
     """A view whose appearance lies between those of two frames."""
 
     view: View  # its own appearance is the one at share 0
-    towards: Int[Array, ""]  # appearance id at share 1
+    toward: Int[Array, ""]  # appearance id at share 1
     share: Float[Array, ""]  # in [0, 1]
 
 
@@ -61,7 +61,7 @@ def without_effects(
     def blend(params, between):
         view, share = between.view, between.share
         start = field.codes_at(params, view)
-        end = field.codes_at(params, view._replace(appearance=between.towards))
+        end = field.codes_at(params, view._replace(appearance=between.toward))
         # Codes of the moment are the same at both ends and stay as they are.
         codes = {name: (1 - share) * start[name] + share * end[name] for name in start}
         return view, codes

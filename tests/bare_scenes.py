@@ -269,7 +269,7 @@ def splat_step(spec, metadata, shuffled_row):
     def drawn(rows, offset, camera, size, degree):
         gaussians = splats.activate(rows)
         shown = splats.active_harmonics(rows, degree)
-        color = harmonics.color_towards(shown, gaussians.mean, camera.position)
+        color = harmonics.color_toward(shown, gaussians.mean, camera.position)
         seen = projection.project(gaussians, camera, size, spec.raster)
         placed = seen
         if offset is not None:  # whose gradient densification wants to know

@@ -132,7 +132,7 @@ def analytic(points: Float[Array, "points 3"], time: Float[Array, ""]) -> Change
 
 
 def fit(spec: MotionSpec, steps: int) -> Motion:
-    """A network after `steps` of Adam towards `analytic`, by its squared error."""
+    """A network after `steps` of Adam toward `analytic`, by its squared error."""
     rule = optax.adam(optax.cosine_decay_schedule(3e-3, steps))
     key = jax.random.key(0)
     params = mlp_motion.init(key, spec)

@@ -200,7 +200,7 @@ FAR_MEAN = Case(
 
 
 _REACHES = np.array([1e-20, 1e-18, 1e-10, 1e-3, 1, 1e3, 1e18, 1e25])
-_TOWARDS = np.array([0.36, -0.48, 0.8])
+_TOWARD = np.array([0.36, -0.48, 0.8])
 
 DIRECTION = Case(
     name="direction of a short or long offset",
@@ -208,13 +208,13 @@ DIRECTION = Case(
     formula="divided by the largest component first",
     axis="|v| / scene units",
     at=_REACHES,
-    inputs=_REACHES[:, None] * _TOWARDS,
+    inputs=_REACHES[:, None] * _TOWARD,
     stable=harmonics.unit_direction,
     textbook=lambda v: v / jnp.sqrt(jnp.sum(v**2)),
     exact=lambda v: [c / mpmath.sqrt(mpmath.fdot(v, v)) for c in v],
     bounds={"float32": (4e-7, 1e-6), "float64": (1e-15, 2e-15)},
     caught=(("float32", "value"), ("float32", "slope")),
-    timed=_TOWARDS,
+    timed=_TOWARD,
 )
 
 CASES = (NEEDLE, ANTIALIASED, FAR_MEAN, DIRECTION)

@@ -96,7 +96,7 @@ def seen_in_training(
     factor = math.ceil(max(capture.size) / MOST_SIDE_PX)
     size = (max(1, capture.size[0] // factor), max(1, capture.size[1] // factor))
     coefficients = splats.active_harmonics(rows, degree)
-    towards = jax.jit(harmonics.color_towards)
+    toward = jax.jit(harmonics.color_toward)
     moves = _moves(at, capture)
     most, total, color = 0.0, 0.0, 0.0
     for row in evaluation.spread(capture.train, MOST_VIEWS):
@@ -110,7 +110,7 @@ def seen_in_training(
         weights = list(data_parallel.rows_on_devices(_shown, (size, raster), both))
         most = np.maximum(most, np.max(weights, axis=0) * factor**2)
         weight = np.sum(weights, axis=0)
-        colors = towards(coefficients, deformed.mean, view.camera.position)
+        colors = toward(coefficients, deformed.mean, view.camera.position)
         total = total + weight
         color = color + weight[:, None] * jax.device_get(colors)
     seen = np.maximum(total, np.finfo(np.float32).tiny)

@@ -13,7 +13,7 @@ TEXTURE = "more texture bands"
 # How far from its threshold evidence must be, as a factor. What an effect is worth is
 # known to a factor of two at best: within a quarter of the threshold nobody knows.
 CERTAIN_FACTOR, LIKELY_FACTOR = 2.0, 1.25
-DEVIATIONS = 2.0  # standard errors that evidence is moved towards its threshold first
+DEVIATIONS = 2.0  # standard errors that evidence is moved toward its threshold first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ def judge(
 ) -> tuple[bool | None, str]:
     """Whether a value that is not negative passes its threshold, and how surely.
 
-    `error` is its standard error. The value is first moved two errors towards the
+    `error` is its standard error. The value is first moved two errors toward the
     threshold; if it gets there, or ends within a quarter of it, nothing is decided.
     From a factor of two on it is certain.
     """

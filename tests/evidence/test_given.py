@@ -71,7 +71,7 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     np.testing.assert_allclose(pixel[points.seen], points.pixel[points.seen], atol=1e-4)
     off = np.linalg.norm(evidence.paths.position - points.position, axis=-1)
     known = evidence.paths.known
-    assert np.median(off[known]) < 0.1 * films.NEAR  # drawn towards the wall
+    assert np.median(off[known]) < 0.1 * films.NEAR  # drawn toward the wall
     # Our own tracks still say where the wall is.
     assert len(evidence.still.position) > 2000
 

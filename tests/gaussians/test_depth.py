@@ -139,7 +139,7 @@ def test_pictures_that_say_little_stay_finite(kind, name, dtype):
 
 
 @pytest.mark.hard_cases
-def test_a_flat_drawing_is_bent_towards_the_truth(dtype):
+def test_a_flat_drawing_is_bent_toward_the_truth(dtype):
     truth = np.linspace(1, 3, COUNT, dtype=dtype)
     for kind in ("affine", "correlation"):
         grad = SLOPES[kind](np.full(COUNT, 2.0, dtype), truth, EVERYWHERE)[1]

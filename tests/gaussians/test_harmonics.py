@@ -53,7 +53,7 @@ def test_no_direction_looks_along_z_and_has_no_gradient(part, dtype):
 def test_color_is_clamped_at_zero_from_below(dtype, rng):
     coefficients = rng.normal(size=(50, 16, 3)).astype(dtype)
     mean, position = rng.normal(size=(50, 3)), np.array([0.5, -2.0, 1.0])
-    color = jitted(harmonics.color_towards)(
+    color = jitted(harmonics.color_toward)(
         coefficients, mean.astype(dtype), position.astype(dtype)
     )
     direction = mean - position
@@ -72,6 +72,6 @@ def test_color_gradient_equals_central_differences(float64, rng):
     weights = rng.normal(size=(5, 3))
 
     def loss(*args):
-        return jnp.sum(harmonics.color_towards(*args) * weights)
+        return jnp.sum(harmonics.color_toward(*args) * weights)
 
     assert gradients.directional_error(loss, coefficients, mean, position) < 1e-8

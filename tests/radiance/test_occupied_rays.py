@@ -56,8 +56,8 @@ def test_a_ray_meets_what_it_goes_through(rng, dtype):
         if np.abs(middle).max() + size > half_side:
             continue
         blocks += 1
-        origin, towards = rng.uniform(-0.4, 0.4, (2, 3))
-        direction = (towards - origin) / np.linalg.norm(towards - origin)
+        origin, toward = rng.uniform(-0.4, 0.4, (2, 3))
+        direction = (toward - origin) / np.linalg.norm(toward - origin)
         ray = Ray(*(jnp.asarray(x, dtype) for x in (origin, direction, 0.0, 0.5)))
         met = bool(occupied_rays.meets(jnp.asarray(occupied), ray, half_side))
         along = np.linspace(0, 0.5, 20_001)[:, None] * direction + origin

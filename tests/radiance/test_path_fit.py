@@ -219,8 +219,8 @@ def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
     medium = fitted.params["scene_flow"]
 
     def flow(point, time):
-        spec, towards = field.spec.scene_flow, jnp.zeros(3)
-        return scene_flow.dynamic(spec, medium, point, towards, time).flow
+        spec, toward = field.spec.scene_flow, jnp.zeros(3)
+        return scene_flow.dynamic(spec, medium, point, toward, time).flow
 
     ask = jax.jit(jax.vmap(flow, (0, None)))
     for frame in (3, 8, 12):  # the ninth was never filmed

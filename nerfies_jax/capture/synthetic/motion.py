@@ -1,6 +1,6 @@
 """How the things of a synthetic scene move rigidly: closed forms of the time.
 
-World axes: x right, y up, z towards the camera; lengths in scene units. Time runs from
+World axes: x right, y up, z toward the camera; lengths in scene units. Time runs from
 0 to 1 over the capture. A body's own origin rests at `place` in the world.
 """
 

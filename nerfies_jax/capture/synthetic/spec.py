@@ -126,7 +126,7 @@ class SceneSpec:
     points: int = 2500  # static surface points, as from structure from motion
     point_noise: float = 0.0005  # root mean square of each coordinate, scene units
     tracks: int = 384  # true tracks of moving surface points
-    light: Vector = (0.45, 0.75, 0.6)  # towards the light
+    light: Vector = (0.45, 0.75, 0.6)  # toward the light
     ambient: float = 0.45  # share of the light that comes from everywhere
     background: Vector = (0.5, 0.6, 0.7)  # sRGB, behind everything
     exposure: Exposure | None = None

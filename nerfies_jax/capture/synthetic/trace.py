@@ -111,15 +111,15 @@ def shade(
 ) -> Float[Array, "3"]:
     """Linear light of one ray, not clipped: Lambert, ambient, and any highlight."""
     dtype = direction.dtype
-    towards_light = jnp.asarray(motion.unit_axis(spec.light), dtype)
+    toward_light = jnp.asarray(motion.unit_axis(spec.light), dtype)
     base = surface_color(spec, jnp.maximum(hit.thing, 0), hit.material)
-    lambert = jnp.maximum(jnp.sum(hit.normal * towards_light), 0)
+    lambert = jnp.maximum(jnp.sum(hit.normal * toward_light), 0)
     # More of the ambient light comes from above: it models the shaded side.
     sky = 0.75 + 0.25 * hit.normal[1]
     color = base * (spec.ambient * sky + (1 - spec.ambient) * lambert)
     if spec.specular is not None:
         shines = hit.thing == spec.id_of(spec.specular.thing)
-        half = towards_light - direction / jnp.sqrt(jnp.sum(direction**2))
+        half = toward_light - direction / jnp.sqrt(jnp.sum(direction**2))
         cosine = jnp.sum(hit.normal * half) / jnp.sqrt(jnp.sum(half**2))
         lobe = jnp.maximum(cosine, 0) ** spec.specular.sharpness
         color = color + jnp.where(shines, spec.specular.strength * lobe, 0)
@@ -148,9 +148,9 @@ def visible(
     Exact: a ray is cast at the point itself; no depth picture is interpolated.
     """
     pixel, depth = cameras.project(camera, point)
-    towards = point - camera.position
-    hit = cast(spec, camera.position, towards, time, transient_shown)
-    gap = (1 - hit.distance) * jnp.sqrt(jnp.sum(towards**2))
+    toward = point - camera.position
+    hit = cast(spec, camera.position, toward, time, transient_shown)
+    gap = (1 - hit.distance) * jnp.sqrt(jnp.sum(toward**2))
     width, height = spec.size
     bounds = jnp.asarray((width, height), pixel.dtype)
     inside = jnp.all((pixel >= 0) & (pixel <= bounds)) & (depth > 0)
