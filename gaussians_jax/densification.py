@@ -17,7 +17,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from gaussians_jax import optimiser as row_optimiser
+from gaussians_jax import optimizer as row_optimizer
 from gaussians_jax import splats
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry import quaternion
@@ -152,7 +152,7 @@ def observe(
 
 
 def densify(
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     params: Params,
     moments: PyTree,
     stats: RowStats,
@@ -178,7 +178,7 @@ def densify(
         capacity = needed
     idle = capacity - count
     params, moments, fresh = _rebuild(
-        optimiser,
+        optimizer,
         params,
         moments,
         np.pad(rows, (0, idle)).astype(np.int32),
@@ -251,11 +251,11 @@ def row_summary(rows):
     return whole, drawn.opacity, jnp.max(drawn.scale, axis=1)
 
 
-@functools.partial(jax.jit, static_argnames=("optimiser", "shrink", "revised"))
-def _rebuild(optimiser, params, moments, rows, kind, inactive, key, shrink, revised):
+@functools.partial(jax.jit, static_argnames=("optimizer", "shrink", "revised"))
+def _rebuild(optimizer, params, moments, rows, kind, inactive, key, shrink, revised):
     fresh = (kind == CLONE) | (kind == CHILD)
-    params, moments = row_optimiser.gather_rows(
-        optimiser, params, moments, rows, fresh, inactive
+    params, moments = row_optimizer.gather_rows(
+        optimizer, params, moments, rows, fresh, inactive
     )
     moved = split_rows(params.rows["splats"], kind == CHILD, key, shrink)
     if revised:
@@ -299,7 +299,7 @@ def halve_opacity(logit: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def reset_opacity(
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     params: Params,
     moments: PyTree,
     spec: DefaultStrategySpec,
@@ -318,5 +318,5 @@ def reset_opacity(
     chosen = jax.tree.map(lambda _: False, params)
     only = chosen.rows["splats"]._replace(opacity_logit=True)
     chosen = chosen._replace(rows=chosen.rows | {"splats": only})
-    moments = row_optimiser.map_moments(optimiser, jnp.zeros_like, moments, chosen)
+    moments = row_optimizer.map_moments(optimizer, jnp.zeros_like, moments, chosen)
     return params, moments

@@ -44,7 +44,7 @@ def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
 def first_state(
     spec: SplatScene,
     effects: tuple[Effect, ...],
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     capture: Capture,
     key: Key[Array, ""],
 ) -> TrainState:
@@ -102,7 +102,7 @@ def first_state(
         stats = densification.empty_stats(params.rows["splats"])
     aux_state = AuxState(stats, states_of(effects, params))
     return TrainState(
-        params, optimiser.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
+        params, optimizer.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
     )
 
 

@@ -45,7 +45,7 @@ def events(
     spec: SplatScene,
     metadata: SceneMetadata,
     effects: tuple[Effect, ...],
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
 ) -> tuple[Event, ...]:
     """When rows are born, die and are reset, and effects revise what they learn."""
     revisions = tuple(_revision(effect, spec.steps) for effect in effects
@@ -54,8 +54,8 @@ def events(
     if plan is None:
         return revisions
     if isinstance(plan, MCMCStrategySpec):
-        return _mcmc_events(plan, spec.steps, effects, optimiser) + revisions
-    return _default_events(plan, spec, metadata, effects, optimiser) + revisions
+        return _mcmc_events(plan, spec.steps, effects, optimizer) + revisions
+    return _default_events(plan, spec, metadata, effects, optimizer) + revisions
 
 
 def _revision(effect, steps):
@@ -69,7 +69,7 @@ def _revision(effect, steps):
     return Event(f"revise {effect.name}", when, revise)
 
 
-def _default_events(plan, spec, metadata, effects, optimiser):
+def _default_events(plan, spec, metadata, effects, optimizer):
     last = min(plan.refine_stop_iter, spec.steps)
 
     def densify(state, frames):
@@ -81,9 +81,9 @@ def _default_events(plan, spec, metadata, effects, optimiser):
                 factor = effect.grow_score(states[effect.name], step)
                 stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
         changed = densification.densify(
-            optimiser,
+            optimizer,
             state.params,
-            state.optimiser,
+            state.optimizer,
             stats,
             stream_key(state, EVENT),
             plan,
@@ -92,15 +92,15 @@ def _default_events(plan, spec, metadata, effects, optimiser):
         )
         aux_state = AuxState(changed.stats, states_of(effects, changed.params))
         return state._replace(
-            params=changed.params, optimiser=changed.moments, aux_state=aux_state
+            params=changed.params, optimizer=changed.moments, aux_state=aux_state
         )
 
     def reset(state, frames):
         del frames
         params, moments = densification.reset_opacity(
-            optimiser, state.params, state.optimiser, plan
+            optimizer, state.params, state.optimizer, plan
         )
-        return state._replace(params=params, optimiser=moments)
+        return state._replace(params=params, optimizer=moments)
 
     grow = tuple(range(plan.refine_start_iter, last, plan.refine_every))
     return (
@@ -113,14 +113,14 @@ def _default_events(plan, spec, metadata, effects, optimiser):
     )
 
 
-def _mcmc_events(plan, steps, effects, optimiser):
+def _mcmc_events(plan, steps, effects, optimizer):
     def refine(state, frames):
         del frames
         params, moments, _ = mcmc.refine(
-            optimiser, state.params, state.optimiser, stream_key(state, EVENT), plan
+            optimizer, state.params, state.optimizer, stream_key(state, EVENT), plan
         )
         aux_state = AuxState((), states_of(effects, params))
-        return state._replace(params=params, optimiser=moments, aux_state=aux_state)
+        return state._replace(params=params, optimizer=moments, aux_state=aux_state)
 
     last = min(plan.refine_stop_iter, steps)
     when = tuple(range(plan.refine_start_iter, last, plan.refine_every))

@@ -18,7 +18,7 @@ import optax
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import densification, splats
-from gaussians_jax import optimiser as row_optimiser
+from gaussians_jax import optimizer as row_optimizer
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.geometry.precision import exact_einsum, exact_product
@@ -102,7 +102,7 @@ def compute_relocation(
 
 
 def relocate(
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     params: Params,
     moments: PyTree,
     key: Key[Array, ""],
@@ -131,12 +131,12 @@ def relocate(
         return params, moments, report._replace(refused=int(faint.sum()))
     source = np.arange(len(active))
     source[faint] = _draw(key, opacity, seen, int(faint.sum()))
-    params, moments = _spread(optimiser, params, moments, source, ~active, spec)
+    params, moments = _spread(optimizer, params, moments, source, ~active, spec)
     return params, moments, report._replace(relocated=int(faint.sum()))
 
 
 def refine(
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     params: Params,
     moments: PyTree,
     key: Key[Array, ""],
@@ -144,8 +144,8 @@ def refine(
 ) -> tuple[Params, PyTree, densification.Report]:
     """One event: the faint Gaussians move, then new ones come; host side."""
     move_key, add_key = jax.random.split(key)
-    params, moments, moved = relocate(optimiser, params, moments, move_key, spec)
-    params, moments, added = add(optimiser, params, moments, add_key, spec)
+    params, moments, moved = relocate(optimizer, params, moments, move_key, spec)
+    params, moments, added = add(optimizer, params, moments, add_key, spec)
     report = added._replace(
         relocated=moved.relocated,
         refused=moved.refused + added.refused,
@@ -155,7 +155,7 @@ def refine(
 
 
 def add(
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     params: Params,
     moments: PyTree,
     key: Key[Array, ""],
@@ -184,7 +184,7 @@ def add(
     places = np.flatnonzero(inactive)[:extra]
     source[places] = _draw(key, opacity, seen, extra)
     inactive[places] = False
-    params, moments = _spread(optimiser, params, moments, source, inactive, spec)
+    params, moments = _spread(optimizer, params, moments, source, inactive, spec)
     report = report._replace(cloned=extra, active=count + extra, capacity=capacity)
     return params, moments, report
 
@@ -203,10 +203,10 @@ def _draw(key, opacity, seen, count):
     return rng.choice(len(opacity), size=count, p=chance / chance.sum())
 
 
-def _spread(optimiser, params, moments, source, inactive, spec):
+def _spread(optimizer, params, moments, source, inactive, spec):
     copies = np.bincount(source[~inactive], minlength=len(source))[source]
     return _share(
-        optimiser,
+        optimizer,
         params,
         moments,
         source.astype(np.int32),
@@ -216,10 +216,10 @@ def _spread(optimiser, params, moments, source, inactive, spec):
     )
 
 
-@functools.partial(jax.jit, static_argnames=("optimiser", "least"))
-def _share(optimiser, params, moments, source, copies, inactive, least):
-    params, moments = row_optimiser.gather_rows(
-        optimiser, params, moments, source, copies > 1, inactive
+@functools.partial(jax.jit, static_argnames=("optimizer", "least"))
+def _share(optimizer, params, moments, source, copies, inactive, least):
+    params, moments = row_optimizer.gather_rows(
+        optimizer, params, moments, source, copies > 1, inactive
     )
     rows = params.rows["splats"]
     drawn = splats.activate(rows)

@@ -20,7 +20,7 @@ from nerfies_jax.training.schedules import Schedule
 from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
-SHARED = "shared"  # marks what mirrors no parameter in an optimiser's state
+SHARED = "shared"  # marks what mirrors no parameter in an optimizer's state
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,7 @@ class UpdateMask(NamedTuple):
 
 
 class Trained(NamedTuple):
-    """Parameters with the state of their optimiser."""
+    """Parameters with the state of their optimizer."""
 
     params: Params
     opt_state: PyTree
@@ -102,7 +102,7 @@ def update_mask(spec: AlternationSpec | None, step: Int[Array, ""] | int) -> Upd
 
 
 def freeze(
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     mask: UpdateMask,
     before: Trained,
     after: Trained,
@@ -117,9 +117,9 @@ def freeze(
     # Selected, not branched over: at 10k rows of 59 numbers, one core, a step of Adam
     # takes 2.2 ms (2.8 ms with 524k numbers of networks), 1.7 (2.9) with the selection
     # and 0.9 (1.4) in branches, which know less than `jnp.where` of what they may
-    # overwrite and need an optimiser for each group. Drawing takes 30 ms.
+    # overwrite and need an optimizer for each group. Drawing takes 30 ms.
     params = _by_group(before.params)
-    moments = _groups_of_moments(optimiser, params, before.opt_state)
+    moments = _groups_of_moments(optimizer, params, before.opt_state)
 
     def kept(group, old, new):
         return jnp.where(getattr(mask, group), new, old)
@@ -179,14 +179,14 @@ def _by_group(params):
     return Params(*(jax.tree.map(lambda _, n=name: n, part) for name, part in parts))
 
 
-def _groups_of_moments(optimiser, groups, moments):
-    """Of each leaf of the optimiser's state, the part of `Params` it belongs to."""
+def _groups_of_moments(optimizer, groups, moments):
+    """Of each leaf of the optimizer's state, the part of `Params` it belongs to."""
 
     def hidden(node):
         return isinstance(node, optax.MaskedNode)
 
     marked = optax.tree_utils.tree_map_params(
-        optimiser,
+        optimizer,
         lambda moment, group: moment if hidden(moment) else group,
         moments,
         groups,
@@ -208,7 +208,7 @@ def _owner(path, leaves):
             break
     name = jax.tree_util.keystr(path, simple=True, separator=".")
     raise ValueError(
-        f"the optimiser's {name} belongs to rows and networks alike, so it cannot stay "
+        f"the optimizer's {name} belongs to rows and networks alike, so it cannot stay "
         "as it is for one of them; give each its own by `optax.partition`, or use "
         "`scale_by_row_adam`, which counts for each leaf"
     )

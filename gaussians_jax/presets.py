@@ -108,7 +108,7 @@ SONATA = SplatScene(
     steps=60_000,
     batch_size=2,
     dssim_weight=0.0,
-    optimiser="radam",
+    optimizer="radam",
     densification=DefaultStrategySpec(refine_stop_iter=60_000, reset_every=6_000_000),
     motion=KanMotionSpec(
         waves=2.0,

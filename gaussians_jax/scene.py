@@ -22,7 +22,7 @@ from gaussians_jax.first_state import count_rows, first_state
 from gaussians_jax.initialisation import StartSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.spec import (
-    OPTIMISERS,
+    OPTIMIZERS,
     SceneMetadata,
     SplatScene,
     effects_of,
@@ -110,7 +110,7 @@ def build(
     more = tuple(effect.name for effect in effects)
     effects = all_effects(spec, metadata, effects)
     # Counts updates per row; for the networks, whose rows are never born, it is plain.
-    optimiser = OPTIMISERS[spec.optimiser]()
+    optimizer = OPTIMIZERS[spec.optimizer]()
     stages = _stages(spec, metadata, effects)
     devices = data_parallel.device_count(spec.batch_size)
 
@@ -119,7 +119,7 @@ def build(
         return stages.draw(params, deformed, view, size, step)
 
     def init(capture, key, spec=spec):
-        return first_state(spec, effects, optimiser, capture, key)
+        return first_state(spec, effects, optimizer, capture, key)
 
     def example(capture, key):
         at_rest = dataclasses.replace(spec, start=StartSpec(motion="none"))
@@ -129,9 +129,9 @@ def build(
         # By name alone: a run with other effects of one's own is another run.
         spec=(spec, metadata, *more),
         init=init,
-        step=_stepper(spec, metadata, effects, optimiser, devices),
+        step=_stepper(spec, metadata, effects, optimizer, devices),
         render=whole_frame,
-        events=growth.events(spec, metadata, effects, optimiser),
+        events=growth.events(spec, metadata, effects, optimizer),
         counts=lambda state: count_rows(effects, state),
         required_data=frozenset().union(*(effect.required_data for effect in effects)),
         stages=stages,
@@ -216,7 +216,7 @@ def _posed(effects, params, frames):
     return frames
 
 
-def _stepper(spec, metadata, effects, optimiser, devices):
+def _stepper(spec, metadata, effects, optimizer, devices):
     """One update from a batch of frames: (state, frames) -> (state, metrics), pure."""
 
     def one_view(index, state, frames):
@@ -238,7 +238,7 @@ def _stepper(spec, metadata, effects, optimiser, devices):
                 for index in range(spec.batch_size)
             ]
         metrics, grads = means
-        trained = update.descend(spec, metadata, effects, optimiser, state, grads)
+        trained = update.descend(spec, metadata, effects, optimizer, state, grads)
         aux_state = state.aux_state
         for index, (_, _, drawn) in enumerate(each):
             _, condition = _condition(spec, state, frames, index)

@@ -52,13 +52,13 @@ from gaussians_jax.effects.time_basis import TimeBasisSpec
 from gaussians_jax.initialisation import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
-from gaussians_jax.optimiser import scale_by_row_adam, scale_by_row_radam
+from gaussians_jax.optimizer import scale_by_row_adam, scale_by_row_radam
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.raster_spec import RasterSpec
 from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.step_counts import steps
 
-OPTIMISERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
+OPTIMIZERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 AnyMotion = (
     MotionSpec
     | KanMotionSpec
@@ -109,7 +109,7 @@ class SplatScene:
     learning_rates: LearningRateSpec = LearningRateSpec()
     raster: RasterSpec = RasterSpec()
     densification: DefaultStrategySpec | MCMCStrategySpec | None = DefaultStrategySpec()
-    optimiser: str = "adam"
+    optimizer: str = "adam"
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
     motion: AnyMotion | None = None
@@ -139,10 +139,10 @@ class SplatScene:
             )
         if not 0 <= self.dssim_weight <= 1:
             raise ValueError(f"dssim_weight={self.dssim_weight} must lie in [0, 1]")
-        if self.optimiser not in OPTIMISERS:
+        if self.optimizer not in OPTIMIZERS:
             raise ValueError(
-                f"unknown optimiser {self.optimiser!r}; choose from "
-                f"{sorted(OPTIMISERS)}"
+                f"unknown optimizer {self.optimizer!r}; choose from "
+                f"{sorted(OPTIMIZERS)}"
             )
 
 

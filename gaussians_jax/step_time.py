@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from gaussians_jax import projection, rendering, scene, splats, update
 from gaussians_jax.effects import deformation
-from gaussians_jax.spec import OPTIMISERS, raster_of
+from gaussians_jax.spec import OPTIMIZERS, raster_of
 from gaussians_jax.update import Drawn
 from nerfies_jax.measure.part_time import StepParts, part
 from nerfies_jax.training import losses, rate
@@ -108,16 +108,16 @@ def _own_of_effects(effects, state, frames, condition):
 
 def _update(spec, metadata, effects, state, now, frames, condition):
     """What follows the gradient, with parameters for gradients of their shape."""
-    optimiser = OPTIMISERS[spec.optimiser]()
+    optimizer = OPTIMIZERS[spec.optimizer]()
 
     def descend(state, grads):
-        return update.descend(spec, metadata, effects, optimiser, state, grads)
+        return update.descend(spec, metadata, effects, optimizer, state, grads)
 
     def gather(aux_state, *drawn):
         drawn = Drawn(*drawn)
         return update.gather(spec, effects, aux_state, drawn, condition, _size(frames))
 
-    parts = {"optimiser": part(descend, state, state.params)}
+    parts = {"optimizer": part(descend, state, state.params)}
     if update.has_statistics(spec, effects):
         footprints = jax.eval_shape(
             lambda *seen: projection.project(

@@ -35,12 +35,12 @@ def descend(
     spec: SplatScene,
     metadata: SceneMetadata,
     effects: tuple[Effect, ...],
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     state: TrainState,
     grads: Params,
 ) -> Trained:
     """Parameters and moments after one update along `grads`."""
-    updates, opt_state = optimiser.update(grads, state.optimiser, state.params)
+    updates, opt_state = optimizer.update(grads, state.optimizer, state.params)
     by_part = _learning_rates(spec, metadata, effects, state.step)
     trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
     if isinstance(spec.densification, MCMCStrategySpec):
@@ -50,8 +50,8 @@ def descend(
         trained = trained._replace(params=params)
     if spec.alternation is not None:
         mask = phases.update_mask(spec.alternation, state.step)
-        before = Trained(state.params, state.optimiser)
-        trained = phases.freeze(optimiser, mask, before, trained)
+        before = Trained(state.params, state.optimizer)
+        trained = phases.freeze(optimizer, mask, before, trained)
     return trained
 
 

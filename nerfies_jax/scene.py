@@ -54,7 +54,7 @@ __all__ = ["Field", "RadianceScene", "SceneMetadata", "build", "field", "metadat
 
 PyTree = Any
 
-OPTIMISER = optax.scale_by_adam()
+OPTIMIZER = optax.scale_by_adam()
 
 
 def metadata_of(capture: Capture, spec: RadianceScene) -> SceneMetadata:
@@ -101,7 +101,7 @@ def build(
         params = in_default_precision(params)
         cells = occupied_rays.first(radiance)
         return TrainState(
-            params, OPTIMISER.init(params), cells, jnp.zeros((), jnp.int32), key
+            params, OPTIMIZER.init(params), cells, jnp.zeros((), jnp.int32), key
         )
 
     read = frozenset().union(*(effect.required_data for effect in radiance.effects))
@@ -208,7 +208,7 @@ def descend(
     """The parameters and moments after one update along `grads`."""
     # optax counts in int32 and multiplies float32 by it.
     with jax.numpy_dtype_promotion("standard"):
-        updates, moments = OPTIMISER.update(grads, state.optimiser)
+        updates, moments = OPTIMIZER.update(grads, state.optimizer)
     rates = learning_rates(spec, effects, state.params, state.step)
     return apply_updates(state.params, updates, rates), moments
 

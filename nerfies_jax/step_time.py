@@ -44,7 +44,7 @@ def parts(
         "rays": part(draw, state, frames, batch_key),
         "forward": part(loss, state.params, frames, batch),
         "both": part(jax.value_and_grad(loss), state.params, frames, batch),
-        "optimiser": part(descend, state, state.params),
+        "optimizer": part(descend, state, state.params),
     }
 
     def with_rest(timed):

@@ -14,7 +14,7 @@ import optax
 from gaussians_jax import (
     densification,
     harmonics,
-    optimiser,
+    optimizer,
     projection,
     raster,
     splats,
@@ -251,7 +251,7 @@ def field_step(spec, metadata, draw_batch):
 
         (value, terms), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
         with jax.numpy_dtype_promotion("standard"):
-            updates, moments = adam.update(grads, state.optimiser)
+            updates, moments = adam.update(grads, state.optimizer)
         now = spec.template_rate * rate(state.step)  # all of it is of the template
         params = jax.tree.map(lambda x, d: x - now * d, state.params, updates)
         state = TrainState(params, moments, (), state.step + 1, state.key)
@@ -262,9 +262,9 @@ def field_step(spec, metadata, draw_batch):
 
 def splat_step(spec, metadata, shuffled_row):
     """One update of a static scene of Gaussians, from the frame that is its turn."""
-    update = optimiser.scale_by_row_adam().update
-    if spec.optimiser == "radam":
-        update = optimiser.scale_by_row_radam().update
+    update = optimizer.scale_by_row_adam().update
+    if spec.optimizer == "radam":
+        update = optimizer.scale_by_row_radam().update
 
     def drawn(rows, offset, camera, size, degree):
         gaussians = splats.activate(rows)
@@ -300,7 +300,7 @@ def splat_step(spec, metadata, shuffled_row):
         (value, (mse, seen)), grads = jax.value_and_grad(
             loss, argnums=wanted, has_aux=True
         )(state.params, still)
-        updates, moments = update(grads[0], state.optimiser, state.params)
+        updates, moments = update(grads[0], state.optimizer, state.params)
         rates = splat_rates.at_step(
             spec.learning_rates, metadata.extent, spec.steps, state.step
         )

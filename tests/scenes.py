@@ -53,7 +53,7 @@ TINY_SPLATS = SplatScene(
 TINY_DEFORMABLE = dataclasses.replace(TINY_SPLATS, motion=TINY_MOTION)
 TINY_SONATA = dataclasses.replace(
     TINY_SPLATS,
-    optimiser="radam",
+    optimizer="radam",
     motion=KanMotionSpec(
         embedding=4, time_code=3, hidden=(6,), kernels=3, warm_up=3, learning_rate=1e-2
     ),

@@ -218,4 +218,4 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
         assert set(state.aux_state.effects) == states
         # A count and two moments for each array that is trained, and nothing else.
         trained = len(jax.tree.leaves(state.params))
-        assert len(jax.tree.leaves(state.optimiser)) == 3 * trained
+        assert len(jax.tree.leaves(state.optimizer)) == 3 * trained

@@ -43,7 +43,7 @@ def test_what_parts_of_a_field_leave_of_a_step_is_never_negative(
         "rays": 0.5 * batches,
         "forward": 2.0 * batches,
         "backward": 3.0 * batches,
-        "optimiser": 0.25,
+        "optimizer": 0.25,
         "rest": rest,
     }
 
@@ -61,7 +61,7 @@ def test_every_part_of_a_step_of_splats_is_measured(monkeypatch):
         "project and blend": 2.0,
         "loss": 1.0,
         "mlp motion": 4.0,
-        "optimiser": 0.5,
+        "optimizer": 0.5,
         "statistics": 0.25,
         "rest": 1.25,
     }

@@ -147,7 +147,7 @@ rates = {
     "opacity_logit": 5e-2,
     "color_logit": 5e-2,
 }
-optimiser = optax.multi_transform(
+optimizer = optax.multi_transform(
     {name: optax.adam(rate) for name, rate in rates.items()},
     {name: name for name in rates},
 )
@@ -158,10 +158,10 @@ def train(params):
     def step(carry, _):
         params, state = carry
         value, slopes = jax.value_and_grad(loss)(params)
-        updates, state = optimiser.update(slopes, state)
+        updates, state = optimizer.update(slopes, state)
         return (optax.apply_updates(params, updates), state), value
 
-    carry = params, optimiser.init(params)
+    carry = params, optimizer.init(params)
     (params, _), values = jax.lax.scan(step, carry, length=STEPS)
     return params, values
 

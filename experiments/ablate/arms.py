@@ -198,7 +198,7 @@ SONATA = Suite(
         ),
         Claim(
             "An RBF-KAN on embeddings beats deformable 3DGS (the paper's own 'w/ MLP': "
-            "other inputs, losses and optimiser, too)",
+            "other inputs, losses and optimizer, too)",
             "full",
             "deformable",
             TRACKED,

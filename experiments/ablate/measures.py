@@ -101,7 +101,7 @@ LEGENDS = {
     "held-out frame (of all threads, on a CPU);\npeak MB: most memory of the process, "
     "where it made one arm alone.",
     "model_mb": "model MB: the one file of a trained scene; of a field its "
-    "parameters, without\nthe optimiser.",
+    "parameters, without\nthe optimizer.",
     "coded_mb": "coded MB: the same scene, features by their bits where there is a "
     "learned law and all\nother numbers at 32 bits.",
 }

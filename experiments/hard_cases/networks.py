@@ -1,4 +1,4 @@
-"""Hard cases of networks and optimisers: RBF-KANs, Adam and RAdam of late rows."""
+"""Hard cases of networks and optimizers: RBF-KANs, Adam and RAdam of late rows."""
 
 import dataclasses
 import math
@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from gaussians_jax import optimiser
+from gaussians_jax import optimizer
 from nerfies_jax.nets import bsplines, kan
 from nerfies_jax.nets.kan import KAN, KANLayer, KANSpec, Kernels
 from nerfies_jax.nets.mlp import HeadSpec
@@ -278,7 +278,7 @@ LENGTH = Case(
     axis="updates",
     at=_UPDATES,
     inputs=_UPDATES[:, None],
-    stable=lambda x: optimiser.moment_length(x, B2),
+    stable=lambda x: optimizer.moment_length(x, B2),
     textbook=_length_as_printed,
     exact=_exact_length,
     bounds={"float32": (4e-7,), "float64": (2e-15,)},
@@ -291,8 +291,8 @@ def _nth_update(x):
     """Adam's n-th update of a row with a steady slope; n and the slope."""
     count, slope = x[:1], x[1:]
     before = [slope**k * -jnp.expm1((count - 1) * math.log(b)) for k, b in _MOMENTS]
-    state = optimiser.RowAdamState((count - 1).astype(jnp.int32), *before)
-    return optimiser.scale_by_row_adam(B1, B2).update(slope, state)[0]
+    state = optimizer.RowAdamState((count - 1).astype(jnp.int32), *before)
+    return optimizer.scale_by_row_adam(B1, B2).update(slope, state)[0]
 
 
 _MOMENTS = ((1, B1), (2, B2))

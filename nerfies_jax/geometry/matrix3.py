@@ -27,7 +27,7 @@ Scalar = Float[Array, ""]
 # direction has finite energy and a slope that opens it again. A clamp, log max(σ, ε),
 # has slope zero there, and nothing ever un-collapses.
 COLLAPSED = 1e-2
-# The unsigned energy has a cone at σ = 0, whose curvature 1/σ no optimiser can use.
+# The unsigned energy has a cone at σ = 0, whose curvature 1/σ no optimizer can use.
 CONE = 1e-6
 # |J - 1| (Frobenius): below, strains are resolved to 1e-8 from J - 1; above, the form
 # through JᵀJ loses more by squaring than J itself does by rounding.

@@ -1,7 +1,7 @@
 """Rotations as quaternions wxyz (scalar first, Hamilton product), one at a time.
 
 q and -q are the same rotation. Functions that need unit length make it themselves,
-since what an optimiser moves is never exactly of length one.
+since what an optimizer moves is never exactly of length one.
 """
 
 import jax.numpy as jnp

@@ -55,7 +55,7 @@ class TrainState(NamedTuple):
     """
 
     params: PyTree
-    optimiser: PyTree
+    optimizer: PyTree
     aux_state: PyTree  # what the representation carries beside: row statistics, ...
     step: Int[Array, ""]
     key: Key[Array, ""]  # of the run; step i uses fold_in(key, i)

@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from gaussians_jax import densification, optimiser
+from gaussians_jax import densification, optimizer
 from gaussians_jax import splats as rows
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.splats import Params, Splats
@@ -16,7 +16,7 @@ from tests.gaussians.shared import full, put, rotations, same_bits, with_rows
 
 EXTENT = 2.0  # so that 0.02 separates small from large
 KEY = jax.random.key(0)
-TX = optax.chain(optimiser.scale_by_row_adam(), optax.scale(-1e-2))
+TX = optax.chain(optimizer.scale_by_row_adam(), optax.scale(-1e-2))
 
 
 @jax.jit

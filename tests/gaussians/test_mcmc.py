@@ -13,7 +13,7 @@ import pytest
 import rich.console
 import scipy.special
 
-from gaussians_jax import densification, mcmc, optimiser, scene
+from gaussians_jax import densification, mcmc, optimizer, scene
 from gaussians_jax import splats as rows
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec
@@ -30,7 +30,7 @@ from tests.gaussians.shared import (
     with_rows,
 )
 
-TX = optax.chain(optimiser.scale_by_row_adam(), optax.scale(-1e-2))
+TX = optax.chain(optimizer.scale_by_row_adam(), optax.scale(-1e-2))
 KEY = jax.random.key(3)
 SPEC = MCMCStrategySpec()
 QUIET = rich.console.Console(quiet=True)
@@ -310,7 +310,7 @@ def test_a_step_shakes_the_means_and_nothing_else():
     assert not shift[~active].any()
     quiet = noisy.params.rows["splats"]._replace(mean=still.params.rows["splats"].mean)
     same_bits(quiet, still.params.rows["splats"])
-    same_bits(noisy.optimiser, still.optimiser)
+    same_bits(noisy.optimizer, still.optimizer)
     assert metrics["mcmc/penalty"] == unpaid["mcmc/penalty"] > 0
     # The second step is the networks' turn: the rows stay where they are.
     same_bits(held.params.rows, noisy.params.rows)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import densification, optimiser
+from gaussians_jax import densification, optimizer
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import motion_growth
 from gaussians_jax.effects.motion_growth import MotionGrowthSpec, Travel
@@ -22,7 +22,7 @@ TAU = 2e-3  # of the default threshold in this extent, scene units
 SOFT = MotionGrowthSpec(start=100)
 HARD = dataclasses.replace(SOFT, form="hard")
 STRATEGY = DefaultStrategySpec()
-TX = optimiser.scale_by_row_adam()
+TX = optimizer.scale_by_row_adam()
 
 
 def rows_of(count, dtype="float32"):

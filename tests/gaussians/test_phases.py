@@ -11,7 +11,7 @@ import optax
 import pytest
 
 from gaussians_jax import phases, scene
-from gaussians_jax.optimiser import scale_by_row_adam
+from gaussians_jax.optimizer import scale_by_row_adam
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec, Trained, UpdateMask
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax import evaluation
@@ -39,8 +39,8 @@ def labels(params):
 def partitioned():
     """A count and a schedule's count for each of three parts, behind a clip."""
 
-    def part(optimiser):
-        return optax.chain(optimiser, optax.scale_by_schedule(lambda step: 1.0))
+    def part(optimizer):
+        return optax.chain(optimizer, optax.scale_by_schedule(lambda step: 1.0))
 
     each = {
         "mean": part(scale_by_row_adam()),
@@ -50,7 +50,7 @@ def partitioned():
     return optax.chain(optax.clip_by_global_norm(1e9), optax.partition(each, labels))
 
 
-OPTIMISERS = {
+OPTIMIZERS = {
     "row adam": scale_by_row_adam,
     "partitioned": partitioned,
 }
@@ -62,21 +62,21 @@ def slopes_at(params, step):
     return jax.tree.map(lambda leaf: leaf - aim, params)
 
 
-def descend(optimiser, trained, grads):
+def descend(optimizer, trained, grads):
     # optax mixes integers and floats in its bias corrections.
     with jax.numpy_dtype_promotion("standard"):
-        directions, moments = optimiser.update(grads, trained.opt_state, trained.params)
+        directions, moments = optimizer.update(grads, trained.opt_state, trained.params)
     moved = jax.tree.map(lambda p, d: p - RATE * d, trained.params, directions)
     return Trained(moved, moments)
 
 
-def alternate(optimiser, spec, steps, trained):
+def alternate(optimizer, spec, steps, trained):
     """All states of a run in one scan, and whose turn it was."""
 
     def body(carried, step):
         mine = phases.update_mask(spec, step)
-        after = descend(optimiser, carried, slopes_at(carried.params, step))
-        carried = phases.freeze(optimiser, mine, carried, after)
+        after = descend(optimizer, carried, slopes_at(carried.params, step))
+        carried = phases.freeze(optimizer, mine, carried, after)
         return carried, (carried, mine)
 
     return jax.lax.scan(body, trained, jnp.arange(steps))[1]
@@ -84,9 +84,9 @@ def alternate(optimiser, spec, steps, trained):
 
 @functools.cache
 def alternated(name, steps, dtype):
-    optimiser, params = OPTIMISERS[name](), rows_and_nets(COUNT, dtype)
-    start = Trained(params, jitted(optimiser.init)(params))
-    run = jitted(functools.partial(alternate, optimiser, ALTERNATION, steps))
+    optimizer, params = OPTIMIZERS[name](), rows_and_nets(COUNT, dtype)
+    start = Trained(params, jitted(optimizer.init)(params))
+    run = jitted(functools.partial(alternate, optimizer, ALTERNATION, steps))
     states, turns = run(start)
     with_start = jax.tree.map(lambda a, b: np.stack([a, *b]), start, states)
     return with_start, turns
@@ -135,7 +135,7 @@ def test_turns_follow_the_cycle_in_one_program(spec):
 
 @pytest.mark.parametrize("name", ["partitioned", *full("row adam")])
 @pytest.mark.parametrize("group", Params._fields)
-def test_a_frozen_group_and_its_optimiser_stay_bit_for_bit(name, group, dtype):
+def test_a_frozen_group_and_its_optimizer_stay_bit_for_bit(name, group, dtype):
     states, turns = alternated(name, 16, dtype)
     trains = getattr(turns, group)
     assert 0 < trains.sum() < len(trains)
@@ -164,8 +164,8 @@ def turn_at(step):
 @jitted
 def begun(params):
     """After a first step."""
-    optimiser = scale_by_row_adam()
-    return descend(optimiser, Trained(params, optimiser.init(params)), params)
+    optimizer = scale_by_row_adam()
+    return descend(optimizer, Trained(params, optimizer.init(params)), params)
 
 
 def test_zero_slopes_do_not_freeze_what_has_momentum():
@@ -191,18 +191,18 @@ def test_what_is_frozen_is_safe_from_values_that_are_not_finite(dtype):
 
 
 @pytest.mark.parametrize(
-    "optimiser",
+    "optimizer",
     [
         *full(optax.adam(1e-3)),
         optax.chain(scale_by_row_adam(), optax.scale_by_schedule(lambda step: 1.0)),
     ],
 )
-def test_a_state_that_both_groups_share_is_refused(optimiser):
+def test_a_state_that_both_groups_share_is_refused(optimizer):
     params = rows_and_nets(COUNT)
-    state = Trained(params, jax.eval_shape(optimiser.init, params))
+    state = Trained(params, jax.eval_shape(optimizer.init, params))
     turn = UpdateMask(*put((True, False)))
     with pytest.raises(ValueError, match=r"count belongs to rows and networks alike"):
-        phases.freeze(optimiser, turn, state, state)
+        phases.freeze(optimizer, turn, state, state)
 
 
 def wave(params, shift):
@@ -267,7 +267,7 @@ def test_a_scene_trains_one_group_at_a_time_in_one_program():
 
     def of(group):
         return lambda state: of_group(
-            "row adam", Trained(state.params, state.optimiser), group
+            "row adam", Trained(state.params, state.optimizer), group
         )
 
     assert steps_at_rest(states, of("rows")) == [4, 5, 7, 8]

@@ -10,7 +10,7 @@ import pytest
 from gaussians_jax import (
     harmonics,
     initialisation,
-    optimiser,
+    optimizer,
     phases,
     raster,
     rendering,
@@ -150,11 +150,11 @@ SETTINGS = [
     (WaveletSpec, dict(levels=0), "levels=0"),
     (WaveletSpec, dict(most=0.0), "most=0.0"),
     (WaveletSpec, dict(level_factor=-1.0), "level_factor=-1.0"),
-    (optimiser.scale_by_row_radam, dict(b2=0.6), "longest length that b2=0.6 allows"),
-    (optimiser.scale_by_row_radam, dict(threshold=3.0),
+    (optimizer.scale_by_row_radam, dict(b2=0.6), "longest length that b2=0.6 allows"),
+    (optimizer.scale_by_row_radam, dict(threshold=3.0),
      r"threshold=3.0 must lie in \[4, 1999\)"),
-    (optimiser.scale_by_row_radam, dict(b1=1.0), "strictly between 0 and 1"),
-    (optimiser.scale_by_row_radam, dict(b2=1.0), "strictly between 0 and 1"),
+    (optimizer.scale_by_row_radam, dict(b1=1.0), "strictly between 0 and 1"),
+    (optimizer.scale_by_row_radam, dict(b2=1.0), "strictly between 0 and 1"),
 ]  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult
 
 QUIET = rich.console.Console(quiet=True)
-BAD_STEP = re.compile(r"is not finite: (metric|params\.|optimiser\.|aux_state\.)")
+BAD_STEP = re.compile(r"is not finite: (metric|params\.|optimizer\.|aux_state\.)")
 
 
 def frames_of(capture, required_data=frozenset()):

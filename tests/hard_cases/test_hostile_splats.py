@@ -42,7 +42,7 @@ SYSTEMS += ("sc-gs", "spacetime", "spline")
 # Pruned at the first event, being too large or too faint: a scene without Gaussians.
 DIE = ("huge", "needles", "transparent")
 # |dL/dq| is 1e30 times that of a unit quaternion; its square is beyond float32.
-STOPS = {"quaternions of nearly nothing": "optimiser.second.rows.splats.quaternion"}
+STOPS = {"quaternions of nearly nothing": "optimizer.second.rows.splats.quaternion"}
 # Captures that change nothing a preset reads: they would be "as filmed" once more. Of
 # these, "unfilmed depth not a number" is half of "unfilmed frames".
 NO_DEPTHS = ("no depth known", "constant depth", "unfilmed depth not a number")

@@ -1,7 +1,7 @@
 """The papers' radiance fields shrunk to a few numbers, and whole runs of them.
 
 A field is compiled once. What a hostile start changes, down to the box of the scene and
-the rate of the optimiser, travels as arrays in `TrainState.aux_state`.
+the rate of the optimizer, travels as arrays in `TrainState.aux_state`.
 """
 
 import copy
@@ -39,7 +39,7 @@ class Place(NamedTuple):
     far: Any
     center: Any
     scale: Any
-    speed: Any  # times what the optimiser would have moved
+    speed: Any  # times what the optimizer would have moved
 
 
 class Run(NamedTuple):

@@ -380,7 +380,7 @@ def test_micro_batches_go_down_the_mean_of_all_rays():
         spec = dataclasses.replace(STATIC, micro_batches=parts)
         model = scene.build(spec, METADATA)
         after, metrics = jax.jit(model.step)(state, frames)
-        return after.optimiser.mu, metrics["loss"]
+        return after.optimizer.mu, metrics["loss"]
 
     def part(index):
         key = jax.random.fold_in(loop.step_key(state), index)

@@ -22,7 +22,7 @@ STEPS = 20  # of which the toy grows after the seventh
 NAMES = {
     "metric": "metric loss",
     "parameter": r"params\.rows\.mean \(1 of",
-    "moment": r"optimiser\.0\.nu\.rows\.mean \(1 of",
+    "moment": r"optimizer\.0\.nu\.rows\.mean \(1 of",
     "statistic": r"aux_state\.hits \(1 of",
 }
 
@@ -40,11 +40,11 @@ def spoil(state, where, value):
     if where == "parameter":
         return state._replace(params=state.params._replace(rows={"mean": rows}))
     if where == "moment":
-        adam, *rest = state.optimiser
+        adam, *rest = state.optimizer
         second = adam.nu._replace(
             rows={"mean": adam.nu.rows["mean"].at[1, 0].add(value)}
         )
-        return state._replace(optimiser=(adam._replace(nu=second), *rest))
+        return state._replace(optimizer=(adam._replace(nu=second), *rest))
     hits = state.aux_state["hits"].at[3].add(value)
     return state._replace(aux_state={**state.aux_state, "hits": hits})
 
@@ -126,9 +126,9 @@ def test_a_second_moment_that_overflows_stops_the_run(frames):
 
         grad = jax.grad(loss)(state.params)
         with jax.numpy_dtype_promotion("standard"):
-            updates, optimiser = toy.OPTIMISER.update(grad, state.optimiser)
+            updates, optimizer = toy.OPTIMIZER.update(grad, state.optimizer)
         params = optax.apply_updates(state.params, updates)
-        new = state._replace(params=params, optimiser=optimiser, step=state.step + 1)
+        new = state._replace(params=params, optimizer=optimizer, step=state.step + 1)
         return new, {"loss": loss(params) * 0}
 
     state, stepped = start(), jax.jit(steep)
@@ -142,7 +142,7 @@ def test_a_second_moment_that_overflows_stops_the_run(frames):
     result = fit(frames, model=toy.model(change=steep), steps=STEPS)
     assert result.steps == 8
     assert re.search(
-        r"step 9 is not finite: optimiser\.0\.nu\.nets\.bias \(1 of 8", result.message
+        r"step 9 is not finite: optimizer\.0\.nu\.nets\.bias \(1 of 8", result.message
     )
 
 

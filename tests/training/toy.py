@@ -14,7 +14,7 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training import loop
 from nerfies_jax.training.model import Event, Frames, Model, TrainState
 
-OPTIMISER = optax.adam(1e-2)
+OPTIMIZER = optax.adam(1e-2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,7 @@ def _init(key, spec):
     )
     extra = {"hits": jnp.zeros(spec.rows), "rest": jnp.zeros((spec.rows, 0, 3))}
     zero = jnp.zeros((), jnp.int32)
-    return TrainState(params, OPTIMISER.init(params), extra, zero, key)
+    return TrainState(params, OPTIMIZER.init(params), extra, zero, key)
 
 
 def loss(params, target, noise):
@@ -66,11 +66,11 @@ def step(state, frames):
     noise = 0.1 * jax.random.normal(noise_key, state.params.rows["mean"].shape)
     value, grad = jax.value_and_grad(loss)(state.params, target, noise)
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integers
-        updates, optimiser = OPTIMISER.update(grad, state.optimiser)
+        updates, optimizer = OPTIMIZER.update(grad, state.optimizer)
     hits = state.aux_state["hits"] + jnp.abs(grad.rows["mean"]).sum(-1)
     return TrainState(
         optax.apply_updates(state.params, updates),
-        optimiser,
+        optimizer,
         {**state.aux_state, "hits": hits},
         state.step + 1,
         state.key,

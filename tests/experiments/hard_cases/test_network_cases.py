@@ -1,4 +1,4 @@
-"""Networks and optimisers at their hard points."""
+"""Networks and optimizers at their hard points."""
 
 import pytest
 

@@ -200,12 +200,12 @@ def row_leaves(params: Params) -> Params:
 
 
 def map_moments(
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     change: Callable[[Array], Array],
     moments: PyTree,
     chosen: Params,
 ) -> PyTree:
-    """The optimiser state with `change` applied to all that mirrors a chosen leaf.
+    """The optimizer state with `change` applied to all that mirrors a chosen leaf.
 
     Which leaves those are is asked of optax, never guessed from shapes. Parts that
     `optax.partition` or `optax.masked` hides are passed over.
@@ -218,12 +218,12 @@ def map_moments(
         return change(moment) if is_chosen and not hidden(moment) else moment
 
     return optax.tree_utils.tree_map_params(
-        optimiser, visit, moments, chosen, is_leaf=hidden
+        optimizer, visit, moments, chosen, is_leaf=hidden
     )
 
 
 def gather_rows(
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     params: Params,
     moments: PyTree,
     rows: Int[Array, " capacity"],
@@ -243,4 +243,4 @@ def gather_rows(
         forget = (fresh | inactive).reshape(fresh.shape + (1,) * (moment.ndim - 1))
         return jnp.where(forget, jnp.zeros_like(moment[:1]), moment[rows])
 
-    return taken, map_moments(optimiser, gather, moments, row_leaves(params))
+    return taken, map_moments(optimizer, gather, moments, row_leaves(params))

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from gaussians_jax import optimiser
+from gaussians_jax import optimizer
 from gaussians_jax.splats import INACTIVE_LOGIT, Params, Splats
 from tests.gaussians.shared import full, jitted, put, rows_and_nets, same_bits
 
@@ -24,7 +24,7 @@ def zeros(rule, params):
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
 
 
-def partitioned(scale_by_rows=optimiser.scale_by_row_adam):
+def partitioned(scale_by_rows=optimizer.scale_by_row_adam):
     def label(params):
         del params
         kinds = Splats("mean", *["rest"] * 5)
@@ -45,12 +45,12 @@ def first_moments(tx, grads, params):
         return jitted(one_step)(grads, params)
 
 
-gather = jitted(optimiser.gather_rows, static_argnums=0)
+gather = jitted(optimizer.gather_rows, static_argnums=0)
 
 
 PAIRS = {
-    "adam": (optimiser.scale_by_row_adam, optax.scale_by_adam(eps=1e-15)),
-    "radam": (optimiser.scale_by_row_radam, optax.scale_by_radam(eps=1e-15)),
+    "adam": (optimizer.scale_by_row_adam, optax.scale_by_adam(eps=1e-15)),
+    "radam": (optimizer.scale_by_row_radam, optax.scale_by_radam(eps=1e-15)),
 }
 
 
@@ -98,8 +98,8 @@ AGES = [*range(1, 12), 100, 690, 999, 1000, 1001, 1002, 5000, 10**4, 10**5, 10**
 
 @functools.partial(jax.jit, static_argnums=1)
 def lengths_and_factors(ages, b2):
-    length = optimiser.moment_length(ages, b2)
-    return length, optimiser.rectification(length, b2)
+    length = optimizer.moment_length(ages, b2)
+    return length, optimizer.rectification(length, b2)
 
 
 @pytest.mark.hard_cases
@@ -123,7 +123,7 @@ def test_the_moments_length_is_right_from_the_first_update_on(b2, dtype):
 def test_radam_switches_exactly_where_its_length_passes_the_threshold(shift, dtype):
     """Just above the length of the seventh update, the eighth is the first adapted."""
     length = float(exact_length(7, 0.999))
-    ours = optimiser.scale_by_row_radam(threshold=length + shift)
+    ours = optimizer.scale_by_row_radam(threshold=length + shift)
     grads = np.full((1, 2), 1e-3, dtype)
     state, update, steps = zeros(ours, grads), jax.jit(ours.update), []
     for _ in range(9):
@@ -159,7 +159,7 @@ def test_rows_that_start_late_follow_radam_from_their_own_first_step(dtype):
     grads = np.random.default_rng(3).normal(size=(total, len(starts)))
     for row, start in enumerate(starts):
         grads[:start, row] = 0
-    ours = optimiser.scale_by_row_radam()
+    ours = optimizer.scale_by_row_radam()
     state = zeros(ours, grads[0].astype(dtype))
     steps, update = [], jitted(ours.update)
     for grad in grads.astype(dtype):
@@ -178,7 +178,7 @@ def test_rows_that_start_late_follow_radam_from_their_own_first_step(dtype):
 @pytest.mark.hard_cases
 def test_a_late_row_steps_as_if_it_were_alone(dtype):
     """The reference implementations start it 2.5 to 4.6 times too fast."""
-    ours = optimiser.scale_by_row_adam()
+    ours = optimizer.scale_by_row_adam()
     old = np.ones((2, 3), dtype)
     state = zeros(ours, old)
 
