@@ -266,7 +266,7 @@ def formerly(option):
 RATE = 24.0  # frames per second of films and camera paths
 VIEW_PORT = 8080
 # Those of `nerfies_jax.capture.camera_paths`, which loads JAX.
-PATHS = ("sway", "orbit", "lemniscate", "stabilised", "captured")
+PATHS = ("sway", "orbit", "lemniscate", "stabilized", "captured")
 
 
 def check_frames(frames: int | None, path: str) -> None:

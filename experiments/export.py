@@ -8,10 +8,10 @@ python -m experiments.export RUN splatv                  # all times in one file
 python -m experiments.export RUN transforms              # cameras, pictures, points
 python -m experiments.export RUN colmap --units world
 python -m experiments.export RUN nerfies
-python -m experiments.export RUN path --path stabilised  # camera_path.json, with times
+python -m experiments.export RUN path --path stabilized  # camera_path.json, with times
 python -m experiments.export RUN nerfies-path --path sway --frames 48
 python -m experiments.export RUN tracks --points 500     # what is seen, followed
-python -m experiments.export RUN exr --path stabilised   # color, alpha, depth, flow
+python -m experiments.export RUN exr --path stabilized   # color, alpha, depth, flow
 """
 
 import dataclasses

@@ -3,7 +3,7 @@
 python -m experiments.render RUN                         # the held-out frames
 python -m experiments.render RUN --path orbit            # mp4 of the moving scene
 python -m experiments.render RUN --path sway --freeze 0.5
-python -m experiments.render RUN --path stabilised       # as filmed, without the shake
+python -m experiments.render RUN --path stabilized       # as filmed, without the shake
 python -m experiments.render RUN --path camera_path.json # as nerfstudio writes it
 python -m experiments.render RUN --path sway --show depth
 python -m experiments.render RUN --path sway --show flow
@@ -43,7 +43,7 @@ class Render:
     path: str = "heldout"
     """heldout: the held-out frames. Or a camera moving within the filmed span (sway,
     lemniscate), in a circle (orbit), as it was filmed (captured), or so without its
-    shake (stabilised). Or a file: nerfstudio's camera_path.json, or a folder of
+    shake (stabilized). Or a file: nerfstudio's camera_path.json, or a folder of
     Nerfies' camera files."""
     frames: int | None = None
     """Pictures along a camera path (default: 96; a file has its own)."""

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Key
 
-from gaussians_jax import densification, initialisation, rendering, splats, track_start
+from gaussians_jax import densification, initialization, rendering, splats, track_start
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import deformation
 from gaussians_jax.growth import AuxState, states_of
@@ -28,8 +28,8 @@ HIDDEN_LOGIT = 2.0
 def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     """Roughly the memory of the first state and step; host side, nothing allocated."""
     tracked = spec.start.motion == "tracks"
-    init = initialisation.of_start(spec.init, tracked)
-    count = initialisation.initial_count(init, capture)
+    init = initialization.of_start(spec.init, tracked)
+    count = initialization.initial_count(init, capture)
     count += spec.start.moving_points if tracked else 0
     count *= 1 + (carried_count(spec) or 0)
     harmonics = 3 * (spec.sh_degree + 1) ** 2
@@ -59,8 +59,8 @@ def first_state(
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
     tracked, hidden, capture = _from_tracks(spec, effects, capture, start_key)
     most = None if spec.densification is None else spec.densification.cap_max
-    init = initialisation.of_start(spec.init, tracked is not None, most)
-    position, color = initialisation.initial_points(init, capture, seed)
+    init = initialization.of_start(spec.init, tracked is not None, most)
+    position, color = initialization.initial_points(init, capture, seed)
     if hidden is not None and most is not None:
         hidden = _thinned(hidden, most - len(position) - len(tracked.position))
     guessed = slice(len(position), len(position))
@@ -80,7 +80,7 @@ def first_state(
     )
     opaque = rows.opacity_logit.at[guessed].set(HIDDEN_LOGIT)
     rows = rows._replace(opacity_logit=opaque)
-    rows = initialisation.clamp_scales(rows, capture, spec.init.max_scale)
+    rows = initialization.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
     params = Params({"splats": rows}, {})
     for effect in effects:
@@ -115,10 +115,10 @@ def _from_tracks(spec, effects, capture, key):
     if evidence is None:
         return None, None, capture
     seeds = track_start.start(spec.start, effects[0], evidence, capture, key)
-    if len(evidence.still.position) > initialisation.point_count(capture):
+    if len(evidence.still.position) > initialization.point_count(capture):
         capture = dataclasses.replace(capture, points=evidence.still)
     hidden = None
-    if spec.start.fill_hidden and initialisation.point_count(capture):
+    if spec.start.fill_hidden and initialization.point_count(capture):
         views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
         hidden = hidden_points.behind(views, capture.points, evidence.moving)
     return seeds, hidden, capture

@@ -26,7 +26,7 @@ from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.effects.spline_motion import SplineMotionSpec
 from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
 from gaussians_jax.effects.time_basis import TimeBasisSpec
-from gaussians_jax.initialisation import InitSpec, StartSpec
+from gaussians_jax.initialization import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
@@ -55,7 +55,7 @@ from nerfies_jax.training import step_counts
 STATIC = SplatScene(steps=30_000)
 
 # Kheradmand et al. 2024, arXiv:2404.09591: its first opacity and scale, its noise and
-# its regularisers. The paper counts 1 to 6 million Gaussians, one number for each of
+# its regularizers. The paper counts 1 to 6 million Gaussians, one number for each of
 # its scenes; here it is a million. Its noise and rates are the code's; rows that moved
 # or are new start with zero moments and their own count, where the code keeps the
 # moments of those that moved and has one count for all.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import (
     growth,
-    initialisation,
+    initialization,
     mcmc,
     phases,
     rendering,
@@ -19,7 +19,7 @@ from gaussians_jax import (
 )
 from gaussians_jax.effects import deformation
 from gaussians_jax.first_state import count_rows, first_state
-from gaussians_jax.initialisation import StartSpec
+from gaussians_jax.initialization import StartSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.spec import (
     OPTIMIZERS,
@@ -67,13 +67,13 @@ def metadata_of(capture: Capture) -> SceneMetadata:
     """The metadata of a capture; host side."""
     positions = np.asarray(capture.cameras.position)[capture.train]
     halfway = 2 / (1 / capture.near + 1 / capture.far)
-    span = initialisation.filmed_depths(capture)
+    span = initialization.filmed_depths(capture)
     return SceneMetadata(
         extent=splats.scene_extent(positions, static=halfway),
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
         exposures=exposures(capture),
-        box=initialisation.filmed_box(capture, span),
+        box=initialization.filmed_box(capture, span),
         near=NEAREST * span[0],
         depth=2 / (1 / span[0] + 1 / span[1]),
         times=len(np.unique(capture.times[capture.train])),

@@ -22,7 +22,7 @@ from gaussians_jax.effects.spectral import SpectralSpec
 from gaussians_jax.effects.spline_motion import SplineMotionSpec
 from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
 from gaussians_jax.effects.time_basis import SMALL_TIME_BASIS
-from gaussians_jax.initialisation import InitSpec, StartSpec
+from gaussians_jax.initialization import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec

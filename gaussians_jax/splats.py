@@ -47,7 +47,7 @@ class Gaussians(NamedTuple):
     """What is drawn: activated, in world coordinates."""
 
     mean: Float[Array, "gaussians 3"]
-    quaternion: Float[Array, "gaussians 4"]  # wxyz; normalised where it is used
+    quaternion: Float[Array, "gaussians 4"]  # wxyz; normalized where it is used
     scale: Float[Array, "gaussians 3"]  # standard deviations, positive
     opacity: Float[Array, " gaussians"]  # in [0, 1]
 
@@ -98,7 +98,7 @@ def turned(
     """
 
     def one(turn, own):
-        return quaternions.multiply(quaternions.exp(turn), quaternions.normalise(own))
+        return quaternions.multiply(quaternions.exp(turn), quaternions.normalize(own))
 
     return jax.vmap(one)(turn, gaussians.quaternion)
 

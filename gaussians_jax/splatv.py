@@ -23,7 +23,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.measure.image_quality import psnr, quantise
+from nerfies_jax.measure.image_quality import psnr, quantize
 from nerfies_jax.training.model import TrainState
 
 MAGIC = 0x674B
@@ -257,7 +257,7 @@ def measured(
         camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), view.camera)
         picture = pictured(at(curves, float(view.time)), camera)
         own = jnp.clip(draw(state, view).color, 0, 1)
-        scores.append(float(psnr(quantise(picture), quantise(own))))
+        scores.append(float(psnr(quantize(picture), quantize(own))))
     return Fit(
         rms=float(np.sqrt(np.mean(off**2))),
         most=float(np.quantile(off.max(axis=0), 0.99)),

@@ -1,6 +1,6 @@
 """SPZ, the packed format of Niantic: versions 2 and 3 (gzip) and 4 (zstd).
 
-Layout and quantisation: github.com/nianticlabs/spz, README and headers. Fields follow
+Layout and quantization: github.com/nianticlabs/spz, README and headers. Fields follow
 one another for all Gaussians: 24-bit fixed-point means, opacities, colors, logarithms
 of scales, rotations, harmonics. Its axes are right, up, back; ours, like those of the
 PLY files of 3D Gaussian splatting, are right, down, front.
@@ -91,7 +91,7 @@ def encode(rows: Unpacked, version: int = 3) -> bytes:
             "2048; write a .ply, or scale the scene down"
         )
     mean = np.ascontiguousarray(steps.astype("<i4")[..., None]).view(np.uint8)[..., :3]
-    quaternion = _normalise(rows.quaternion) * _TURN_SIGN
+    quaternion = _normalize(rows.quaternion) * _TURN_SIGN
     pack = _pack_first_three if version == 2 else _pack_smallest_three
     # Held before they are scaled, which float32 coefficients above 2e36 would overflow;
     # their bytes end at 1 and at 10 / 3.
@@ -233,7 +233,7 @@ def _byte(values):
     )
 
 
-def _normalise(quaternion):
+def _normalize(quaternion):
     quaternion = quaternion.astype(np.float64)
     length = np.linalg.norm(quaternion, axis=1, keepdims=True)
     unit = np.divide(

@@ -50,7 +50,7 @@ def max_displacement(before: Gaussians, after: Gaussians) -> Float[Array, " gaus
     growth = jnp.max(jnp.abs(after.scale - before.scale), axis=-1)
     widest = jnp.max(jnp.abs(before.scale), axis=-1)
     first, second = (
-        jax.vmap(quaternion.normalise)(g.quaternion) for g in (before, after)
+        jax.vmap(quaternion.normalize)(g.quaternion) for g in (before, after)
     )
     # |q - q'| = 2 sin(θ/4) for the nearer sign: 1 - q·q' would lose small angles.
     apart = jnp.minimum(

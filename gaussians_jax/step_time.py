@@ -87,7 +87,7 @@ def _drawing(spec, metadata, effects, now, frames):
 
 
 def _own_of_effects(effects, state, frames, condition):
-    """Each effect that deforms or penalises."""
+    """Each effect that deforms or penalizes."""
     observation, parts = scene.observe(frames, 0, None), {}
     drawn = Rendering(
         observation.truth, *(jnp.ones(observation.truth.shape[:2]) for _ in "ad")

@@ -93,7 +93,7 @@ def at(
     "cubic" (Catmull-Rom) has a continuous velocity as well, and its error falls as the
     third power. Both are exact at the knots, to rounding. Scales are interpolated in
     the logarithm and stay positive. Quaternions are interpolated as vectors of one
-    sign and normalised: neighbors are at most 90 degrees apart as vectors, so what
+    sign and normalized: neighbors are at most 90 degrees apart as vectors, so what
     lies between them is never short.
     """
     if not knots.track.mean.shape[1]:
@@ -107,7 +107,7 @@ def at(
     mean, log_scale, turn = (between(leaf) for leaf in knots.track)
     moved = Gaussians(
         mean=mean,
-        quaternion=jax.vmap(quaternion.normalise)(turn),
+        quaternion=jax.vmap(quaternion.normalize)(turn),
         scale=jnp.exp(log_scale),
         # Not interpolated; merged from here only to be overwritten.
         opacity=jnp.zeros_like(mean[:, 0]),
@@ -199,7 +199,7 @@ def _track(gaussians):
     return Track(
         gaussians.mean,
         jnp.log(scale),
-        jax.vmap(quaternion.normalise)(gaussians.quaternion),
+        jax.vmap(quaternion.normalize)(gaussians.quaternion),
     )
 
 

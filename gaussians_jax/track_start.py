@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from gaussians_jax import path_fit
-from gaussians_jax.initialisation import StartSpec
+from gaussians_jax.initialization import StartSpec
 from gaussians_jax.path_fit import Depth, Paths, Points, PyTree, Resting
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture

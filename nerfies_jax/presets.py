@@ -8,7 +8,7 @@ preset leaves its paper, that is said beside it. All of them leave the papers in
   papers' are independent, and encodings have the identity beside the bands and no
   factor of pi.
 - `nerf` and what descends from it train without the crop of the first 500 steps, in
-  Euclidean space alone (no normalised device coordinates), without noise on densities.
+  Euclidean space alone (no normalized device coordinates), without noise on densities.
 - None of the full sizes was ever trained to its end: they want a GPU.
 """
 
@@ -137,7 +137,7 @@ NERF_DS = dataclasses.replace(
 )
 
 # Li et al. 2021, arXiv:2011.13084, and its code: one level of 128 samples, 1024 rays.
-# Not in its normalised device coordinates, which fit forward-facing captures alone, so
+# Not in its normalized device coordinates, which fit forward-facing captures alone, so
 # that the bound on the flow is one unit of the field. The kinetic term counts once; the
 # chain to frames two away and the rays drawn where the error is large are not there.
 # Flow and depth count where a capture has them; without, it trains on colors alone.

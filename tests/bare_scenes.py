@@ -29,7 +29,7 @@ from gaussians_jax.effects.node_motion import NodeMotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
 from gaussians_jax.effects.time_basis import TimeBasisSpec
-from gaussians_jax.initialisation import InitSpec, StartSpec
+from gaussians_jax.initialization import InitSpec, StartSpec
 from gaussians_jax.splats import Params
 from nerfies_jax import presets as field_presets
 from nerfies_jax.geometry import rays

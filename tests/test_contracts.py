@@ -193,7 +193,7 @@ SIZES = {
 }
 SIZES_OF = {
     "template.apply": {"inputs": 15, "condition": 3},
-    "kan.standardise": {"features": 5},
+    "kan.standardize": {"features": 5},
     "grids.level_features": {"rows": 27},
     "grids.total_variation": {"rows": 27},
     "planes.encode": {"dimensions": 4},
@@ -408,7 +408,7 @@ def _value_and_slopes(function, given, arguments):
     if function is FUNCTIONS["matrix3.svd"].call:  # refuses to be differentiated
         return *of_floats(floats), []
     values, pull, others = jax.vjp(of_floats, floats, has_aux=True)
-    # Not all ones: what is standardised has no slope along them.
+    # Not all ones: what is standardized has no slope along them.
     along = [np.cos(np.arange(x.size)).reshape(x.shape).astype(x.dtype) for x in values]
     return values, others, pull(along)[0]
 

@@ -90,7 +90,7 @@ CASES = {
     "nj.se3.inverse": broadcast(se3.inverse, (4, 4)),
     "nj.se3.left_jacobian": broadcast(se3.left_jacobian, (6,)),
     "nj.se3.from_rotation_translation": broadcast(se3.from_rotation_translation, M, V),
-    "nj.quaternion.normalise": broadcast(quaternion.normalise, Q),
+    "nj.quaternion.normalize": broadcast(quaternion.normalize, Q),
     "nj.quaternion.multiply": broadcast(quaternion.multiply, Q, Q),
     "nj.quaternion.conjugate": broadcast(quaternion.conjugate, Q),
     "nj.quaternion.rotate": broadcast(quaternion.rotate, Q, V),
@@ -125,8 +125,8 @@ CASES = {
         half="refused",
         more=True,
     ),
-    "nj.kan.standardise": exact(
-        kan.standardise, features=(5, 3), more=True, fewer=True
+    "nj.kan.standardize": exact(
+        kan.standardize, features=(5, 3), more=True, fewer=True
     ),
     "nj.kan.hold": exact(
         lambda x: kan.hold(x, (-1.0, 1.0), 0.3), x=(5, 3), more=True, fewer=True

@@ -107,13 +107,13 @@ FIELDS = Suite(
             ("track_error", "moving_psnr", "strain"),
         ),
         Claim(
-            "Elastic regularisation finds the more rigid and better solution",
+            "Elastic regularization finds the more rigid and better solution",
             "nerfies",
             "no-elastic",
             ("track_error", "moving_psnr", "strain"),
         ),
         Claim(
-            "Background regularisation keeps the background still",
+            "Background regularization keeps the background still",
             "nerfies",
             "no-background",
             ("drift", "track_error", "moving_psnr"),

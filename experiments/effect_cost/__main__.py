@@ -180,7 +180,7 @@ def _arms(name, args):
 
 
 def _spec(name, args):
-    from gaussians_jax import initialisation
+    from gaussians_jax import initialization
     from nerfies_jax.runs import representations
     from nerfies_jax.training import specs
 
@@ -191,7 +191,7 @@ def _spec(name, args):
             spec, start=dataclasses.replace(spec.start, motion="none")
         )
     if hasattr(spec, "init"):  # and of no more Gaussians than beside tracks
-        init = initialisation.of_start(spec.init, tracked=True)
+        init = initialization.of_start(spec.init, tracked=True)
         spec = dataclasses.replace(spec, init=init)
     if args.rays is not None and hasattr(spec, "rays"):
         spec = dataclasses.replace(spec, rays=args.rays)

@@ -172,8 +172,8 @@ WIDTH = Case(
 _PATTERN = np.array([1.0, -2.0, 0.5, 0.25])  # sums to -0.25, so the mean is not exact
 
 
-def _standardised(x):
-    return kan.standardise(64 + x[0] * constant(_PATTERN, x.dtype))
+def _standardized(x):
+    return kan.standardize(64 + x[0] * constant(_PATTERN, x.dtype))
 
 
 def _by_moments(x):
@@ -184,7 +184,7 @@ def _by_moments(x):
     return (features - mean) / jnp.sqrt(variance + kan.NORM_VARIANCE)
 
 
-def _exact_standardised(x):
+def _exact_standardized(x):
     features = [64 + x[0] * mpmath.mpf(p) for p in _PATTERN]
     mean = mpmath.fsum(features) / len(features)
     centered = [f - mean for f in features]
@@ -192,7 +192,7 @@ def _exact_standardised(x):
     return [c / mpmath.sqrt(variance + mpmath.mpf(kan.NORM_VARIANCE)) for c in centered]
 
 
-# Powers of two, so that what is standardised is exact in float32.
+# Powers of two, so that what is standardized is exact in float32.
 _SPREADS = np.array([0, 2.0**-13, 2.0**-12, 2.0**-10, 2.0**-7, 0.125, 1, 16])
 NORM = Case(
     name="KAN features of little spread",
@@ -201,9 +201,9 @@ NORM = Case(
     axis="spread about 64",
     at=_SPREADS,
     inputs=_SPREADS[:, None],
-    stable=_standardised,
+    stable=_standardized,
     textbook=_by_moments,
-    exact=_exact_standardised,
+    exact=_exact_standardized,
     bounds={"float32": (1e-6, 1e-5), "float64": (1e-15, 1e-14)},
     floors=(1e-30, 1),
     caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),

@@ -189,7 +189,7 @@ def _exact_pearson(x):
 CORRELATION = Case(
     name="1 - correlation of depths that agree",
     breaks="1 - r is a few ulps of 1",
-    formula="half the mean square of the difference of standardised depths",
+    formula="half the mean square of the difference of standardized depths",
     axis="departure from the truth",
     at=_OFF,
     inputs=_DEPTHS + _OFF[:, None] * _WRONG,

@@ -122,7 +122,7 @@ _LENGTHS = np.array([0, 1e-18, 1e-15, 1e-10, 1e-3, 1, 1e3, 1e10, 1e15, 1e30, 2e3
 LENGTH = Case(
     name="rotation matrix of q of any length",
     breaks="0/0 at 0; |q|³ in the curvature underflows from 1e-13 down",
-    formula="scaled by a power of two without derivative, then normalised; identity "
+    formula="scaled by a power of two without derivative, then normalized; identity "
     "at zero and infinity",
     switch="largest component 1.2e-38",
     axis="|q|",

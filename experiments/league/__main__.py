@@ -33,7 +33,7 @@ def main(args):
         from nerfies_jax.capture import formats
 
         for folder in args.captures:
-            formats.recognise(folder)
+            formats.recognize(folder)
         from experiments import results
         from experiments.league import contests
 

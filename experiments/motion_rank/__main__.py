@@ -11,7 +11,7 @@ times; the others are held out. Displacements are modelled as
 - moving basis: D(p, t) + V(p) w(p', t), `gaussians_jax.effects.motion_basis`;
 - residual:     the same with the residual straight from the network, without a basis.
 
-The first two are factorisations, and no fit of theirs can be better than a singular
+The first two are factorizations, and no fit of theirs can be better than a singular
 value decomposition cut off at K (Eckart and Young 1936): the floors. Errors are shares
 of the RMS displacement.
 """
@@ -39,7 +39,7 @@ from nerfies_jax.runs import platform
 
 TIME = EncodingSpec(5)
 FACTOR_STEPS = 4  # for each step of the networks of p and t; they still take less time
-# The factorisations reach their floors with it. For the networks of p and t 3e-3 is too
+# The factorizations reach their floors with it. For the networks of p and t 3e-3 is too
 # slow: on "mixed", at K = 8, 0.21 against 0.08, and 0.29 against 0.11 without a basis.
 RATES = dict.fromkeys(("time basis", "separable", "moving basis", "residual"), 1e-2)
 
@@ -55,13 +55,13 @@ class MotionRank:
     seeds: int = 2
     """Draws of trajectories and of networks."""
     steps: int = 1000
-    """Of Adam, four times as many for the factorisations; its rate falls to 1 %."""
+    """Of Adam, four times as many for the factorizations; its rate falls to 1 %."""
     points: int = 128
     """Followed."""
     times: int = 48
     """Of which each fourth is held out."""
     batch: int = 8
-    """Times in a step of the networks of p and t; the factorisations take all."""
+    """Times in a step of the networks of p and t; the factorizations take all."""
     basis_form: str = "bounded"
     """Of the moving basis: bounded or free directions."""
     out: pathlib.Path | None = None

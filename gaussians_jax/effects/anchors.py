@@ -1,7 +1,7 @@
 """Features of anchors: what is made of them, and what they cost to keep.
 
 The law of a reference feature is normal, with a mean and a deviation for each channel,
-that of the residual ones is normal as a network makes it of the former: a factorised
+that of the residual ones is normal as a network makes it of the former: a factorized
 model and one with a context, as Balle et al. 2018, arXiv:1802.01436, have them for
 pictures (equation 6, where the law has no fixed form, and equation 7, where it has no
 mean). Which part of ADC-GS (Huang et al. 2025, arXiv:2505.08196) this is, and that its

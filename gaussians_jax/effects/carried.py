@@ -170,12 +170,12 @@ def _standing(own, turn, rows):
     growth = jnp.exp(jnp.clip(own.log_scale, *splats.LOG_SCALE_RANGE))
 
     def turned(row, one, turn):
-        one = quaternion.normalise(one)
+        one = quaternion.normalize(one)
         if turn is not None:
             one = quaternion.multiply(quaternion.exp(turn), one)
         return quaternion.multiply(row, one)
 
-    unit = jax.vmap(quaternion.normalise)(rows.quaternion)
+    unit = jax.vmap(quaternion.normalize)(rows.quaternion)
     each = None if turn is None else 0
     over_rows = jax.vmap(jax.vmap(turned, (None, 0, each)), (0, 0, each))
     return (
@@ -191,7 +191,7 @@ def turns(
     """How what is carried turns at a time by itself, rad, in the axes of its row."""
     moment = encoding.encode(spec.time, time[None], None)
     at_time = mlp.with_known(network_spec(spec), network, moment)
-    unit = jax.vmap(jax.vmap(quaternion.normalise))(own.quaternion)
+    unit = jax.vmap(jax.vmap(quaternion.normalize))(own.quaternion)
     alone = dataclasses.replace(network_spec(spec), inputs=4)
     return mlp.apply(alone, at_time, unit)["turn"]
 

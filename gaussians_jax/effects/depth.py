@@ -89,7 +89,7 @@ def correlation(
     """1 - Pearson's r over the known pixels, in [0, 2]; zero with fewer than two."""
     depth, truth = widened(depth), widened(truth)
     known = known & (jnp.sum(known) > 1)
-    # Half the mean square of the difference of standardised depths: 1 - r itself would
+    # Half the mean square of the difference of standardized depths: 1 - r itself would
     # have no digit left where the depths agree.
     a, b = (_about_mean(x, known)[:, None] for x in (depth, truth))
     return losses.mse(a, b, known) / 2

@@ -190,10 +190,10 @@ def offsets_at_time(
 def apply(gaussians: Gaussians, offsets: Offsets, scale_rule: str) -> Gaussians:
     """Gaussians moved by their offsets.
 
-    The rotation is q / |q| + offset, which the renderer normalises; a zero quaternion
+    The rotation is q / |q| + offset, which the renderer normalizes; a zero quaternion
     counts as the identity.
     """
-    unit = jax.vmap(quaternion.normalise)(gaussians.quaternion)
+    unit = jax.vmap(quaternion.normalize)(gaussians.quaternion)
     if scale_rule == "log":
         # Bounded like the canonical logarithm, so that a wild field stays finite.
         factor = jnp.exp(jnp.clip(offsets.scale, *splats.LOG_SCALE_RANGE))

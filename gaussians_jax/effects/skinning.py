@@ -112,10 +112,10 @@ def displaced(
 
 
 def apply(gaussians: Gaussians, by: Displaced) -> Gaussians:
-    """Gaussians that were displaced and turned; rotations come out normalised."""
+    """Gaussians that were displaced and turned; rotations come out normalized."""
 
     def turned(extra, own):
-        return quaternions.normalise(own + quaternions.multiply(extra, own))
+        return quaternions.normalize(own + quaternions.multiply(extra, own))
 
     return gaussians._replace(
         mean=gaussians.mean + by.offset,

@@ -2,7 +2,7 @@
 
 DynMF (Kratimenos et al. 2024, arXiv:2312.00112): a tiny network of the time alone makes
 K trajectories b_k(t), a Gaussian keeps K coefficients c_k, and is at p + sum_k c_k
-b_k(t). The factorisation of all paths into K is that of a singular value decomposition,
+b_k(t). The factorization of all paths into K is that of a singular value decomposition,
 so a scene of few bodies needs few. Like the paper, one coefficient stands for all parts
 of a trajectory, here a shift and a turn; coefficients are sparse (`sparsity`) and alike
 among neighbors (`effects.neighbors`). A Gaussian whose coefficients are zero does not

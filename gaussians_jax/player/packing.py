@@ -39,7 +39,7 @@ def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
     near ones nothing; 16 bits for rotations, scales and colors, 8 for opacity.
     """
     low, high = splats.LOG_SCALE_RANGE
-    quantisers = {
+    quantizers = {
         "mean": (np.float32, 1.0, 0.0),
         "quaternion": (np.int16, 1 / 32767, 0.0),
         "log_scale": (np.uint16, (high - low) / 65535, low),
@@ -49,7 +49,7 @@ def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
     # A Gaussian may be brighter than white where others lie before it.
     color = np.round(np.minimum(instants.color / BRIGHTEST, 1) * 65535)
     arrays.add("color", color.astype(np.uint16), BRIGHTEST / 65535)
-    for name, (kind, scale, shift) in quantisers.items():
+    for name, (kind, scale, shift) in quantizers.items():
         values = getattr(instants, name).astype(np.float64)
         values = values.reshape(*values.shape[:2], -1)
         rest = (values.min(axis=0) + values.max(axis=0)) / 2

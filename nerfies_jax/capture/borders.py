@@ -1,4 +1,4 @@
-"""Black wedges at the rim of stabilised or undistorted film: pixels never filmed."""
+"""Black wedges at the rim of stabilized or undistorted film: pixels never filmed."""
 
 import numpy as np
 import skimage.measure

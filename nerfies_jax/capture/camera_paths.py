@@ -10,8 +10,8 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.rays import across_ray
 
-KINDS = ("sway", "orbit", "lemniscate", "stabilised", "captured")
-# Standard deviation of the smoothing of a stabilised path, as a share of the capture:
+KINDS = ("sway", "orbit", "lemniscate", "stabilized", "captured")
+# Standard deviation of the smoothing of a stabilized path, as a share of the capture:
 # half a second of ten, which takes out a hand's shake and keeps its walk.
 SMOOTHED_OVER = 0.05
 SECONDS = 4.0  # that a film plays whose rate is not known
@@ -36,7 +36,7 @@ def planned(kind: str, capture: Capture, count: int) -> CameraPath:
     times = None
     if kind == "captured":
         times = capture.times[_replayed(capture, count)]
-    elif kind == "stabilised":
+    elif kind == "stabilized":
         times = _filmed_span(capture, count)
     return CameraPath(path(kind, capture, count), capture.size, times)
 
@@ -47,7 +47,7 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     `sway` keeps to the span of the filmed positions, where a monocular reconstruction
     can be trusted, and so does `lemniscate`, a lying figure of eight; `orbit` circles
     the focus point in full; `captured` repeats the training cameras in the order of
-    their times, and `stabilised` does so without their shake. Where the capture looks
+    their times, and `stabilized` does so without their shake. Where the capture looks
     along what is up, as a camera overhead does, its middle picture says what is up.
     """
     if kind not in KINDS:
@@ -55,7 +55,7 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     if kind == "captured":
         return cameras.take(capture.cameras, _replayed(capture, count))
     train_cameras = cameras.take(capture.cameras, capture.train)
-    if kind == "stabilised":
+    if kind == "stabilized":
         when = capture.times[capture.train].astype(np.float64)
         return smoothed(train_cameras, when, _filmed_span(capture, count))
     phase = np.linspace(0, 2 * np.pi * turns, count, endpoint=False)

@@ -1,4 +1,4 @@
-"""`load`: recognise what kind of capture a folder holds, and read it."""
+"""`load`: recognize what kind of capture a folder holds, and read it."""
 
 import importlib
 import pathlib
@@ -16,7 +16,7 @@ class Format(NamedTuple):
 
     name: str
     looks_for: str
-    recognise: Callable[[pathlib.Path], bool]
+    recognize: Callable[[pathlib.Path], bool]
     module: str  # imported only when needed: decoders and pycolmap are slow to load
 
 
@@ -95,7 +95,7 @@ def _pictures_in(path):
     return len(footage.pictures_in(path)) if path.is_dir() else 0
 
 
-def recognise(path: AnyPath) -> Format:
+def recognize(path: AnyPath) -> Format:
     """The format of the capture at `path`; an error that lists what was looked for."""
     path = pathlib.Path(path)
     if not path.exists():
@@ -107,7 +107,7 @@ def recognise(path: AnyPath) -> Format:
             f"python -m experiments.prepare {verb} {shlex.quote(str(path))} OUT"
         )
     for each in FORMATS:
-        if each.recognise(path):
+        if each.recognize(path):
             return each
     pictures = _pictures_in(path)
     if pictures >= 2:
@@ -136,7 +136,7 @@ def load(
     `background` for Blender's.
     """
     path = pathlib.Path(path)
-    reader = importlib.import_module(recognise(path).module)
+    reader = importlib.import_module(recognize(path).module)
     return gate.checked(
         reader.read(
             path,

@@ -1,4 +1,4 @@
-"""Elastic regularisation: surfaces may move and turn, but stretching costs.
+"""Elastic regularization: surfaces may move and turn, but stretching costs.
 
 Park et al. 2021 (Nerfies), arXiv:2011.12948, "elastic regularization": Σ log²σ over the
 singular values of the warp's Jacobian, made robust, summed along each ray with the
@@ -37,7 +37,7 @@ class ElasticSpec:
     that of `losses.geman_mcclure`.
 
     One step of `every` asks for the penalty, which counts as many times as much in it
-    (lazy regularisation, Karras et al. 2020, arXiv:1912.04958, section 3.1); what is
+    (lazy regularization, Karras et al. 2020, arXiv:1912.04958, section 3.1); what is
     logged of it is right as a mean over so many steps.
 
     `fold_cost` is what mirroring a unit volume costs beside ρ; 0 makes mirror images

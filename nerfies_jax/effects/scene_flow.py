@@ -340,12 +340,12 @@ def picture_mask(
 
 
 def depth_term(context: PenaltyContext, weight: Float[Array, "rays samples"]) -> Scalar:
-    """How far the medium's own depth is from the capture's, both normalised."""
+    """How far the medium's own depth is from the capture's, both normalized."""
     batch, level = context.batch, context.levels[-1]
     known = _pixels(context.frames.depths, batch.row, batch.pixel)
     distance = flow_losses.settle(weight, level.distances[..., None])[..., 0]
     predicted = distance * batch.cosine / context.box.scale
-    return flow_losses.normalised_depth(
+    return flow_losses.normalized_depth(
         predicted, known.astype(predicted.dtype), batch.valid & (known > 0)
     )
 

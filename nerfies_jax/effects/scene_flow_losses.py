@@ -15,7 +15,7 @@ from nerfies_jax.radiance import compositing
 
 Scalar = Float[Array, ""]
 # Mean deviation of the depths of a batch, as a share of their median, below which they
-# count as flat: bounds the normalised depth by a thousand and its slope.
+# count as flat: bounds the normalized depth by a thousand and its slope.
 FLATTEST = 1e-3
 # Weights below count as none: the slope of a mean in a weight is up to the values over
 # the largest weight, and float32 holds 3e38.
@@ -141,7 +141,7 @@ def settle(
     return jnp.sum(weight[..., None] * values, axis=-2) + passed * values[..., -1, :]
 
 
-def normalised_depth(
+def normalized_depth(
     predicted: Float[Array, " rays"],
     target: Float[Array, " rays"],
     known: Bool[Array, " rays"],
@@ -153,11 +153,11 @@ def normalised_depth(
     """
     enough = jnp.sum(known) > 1
     known = known & enough
-    difference = _normalise(predicted, known) - _normalise(target, known)
+    difference = _normalize(predicted, known) - _normalize(target, known)
     return mean_where(jnp.square(difference)[:, None], known)
 
 
-def _normalise(depth, known):
+def _normalize(depth, known):
     """Zero where unknown. The slopes of median and deviation are kept."""
     count = jnp.sum(known)
     ordered = jnp.sort(jnp.where(known, depth, jnp.inf))

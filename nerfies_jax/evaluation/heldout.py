@@ -187,14 +187,14 @@ def _floor_psnr(averages, scored, capture):
 
 @jax.jit
 def _masked_psnrs(color, truth, mask, moving):
-    picture = image_quality.quantise(color)
+    picture = image_quality.quantize(color)
     truth = truth.astype(color.dtype) / 255
     return [image_quality.masked_psnr(picture, truth, one) for one in (mask, moving)]
 
 
 @jax.jit
 def _score(color, truth, valid, moving):
-    picture = image_quality.quantise(color)
+    picture = image_quality.quantize(color)
     truth = truth.astype(color.dtype) / 255
     numbers = {}
     if moving is not None:
@@ -215,7 +215,7 @@ def _score(color, truth, valid, moving):
 
 @functools.partial(jax.jit, static_argnums=1)
 def _lpips(params, network, color, truth, valid):
-    picture = image_quality.quantise(color)
+    picture = image_quality.quantize(color)
     truth = truth.astype(color.dtype) / 255
     if valid is None:
         return perceptual.lpips(params, network, picture, truth)

@@ -125,7 +125,7 @@ def known_mean(
 
 @jax.jit
 def _score(color, truth, valid):
-    picture = image_quality.quantise(color)
+    picture = image_quality.quantize(color)
     if valid is None:
         return image_quality.psnr(picture, truth), image_quality.ssim(picture, truth)
     return (

@@ -16,7 +16,7 @@ MIN_POINTS = 300  # that say where the scene is
 MOST_POINTS = 4000  # that are looked at
 OUTSIDE = 0.02  # share of points on either side taken for outliers
 # Slope in gray levels a pixel, and over what noise alone gives (a Gaussian derivative
-# of 1 px passes a fifth of it); flow over less is a guess of its regulariser.
+# of 1 px passes a fifth of it); flow over less is a guess of its regularizer.
 LEAST_GRADIENT, LEAST_OVER_NOISE, NOISE_PASSED = 0.4, 3.0, 0.2
 # Gray levels. A lawn has detail in every corner, and all of it would pass for noise:
 # 12 to 15 levels in scikit-image's grass and gravel, made four times smaller.

@@ -17,17 +17,17 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
-MATERIALISED, COMPONENTS = Primitive("materialised"), Primitive("components")
+MATERIALIZED, COMPONENTS = Primitive("materialized"), Primitive("components")
 COMPONENTS.multiple_results = True
 
 
-def materialised(array: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def materialized(array: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """The same, computed before what reads it; so is its cotangent.
 
     With the picture and the truth of D-SSIM so, a step of `splats-tracked-small` takes
     20.5 ms for 21.5.
     """
-    return MATERIALISED.bind(array)
+    return MATERIALIZED.bind(array)
 
 
 def components(
@@ -43,7 +43,7 @@ def components(
 
 def stacked(parts: Sequence[Float[Array, "*batch"]]) -> Float[Array, "*batch parts"]:
     """`parts`, of one shape, along a last axis; each is computed before."""
-    return jnp.stack([materialised(part) for part in parts], axis=-1)
+    return jnp.stack([materialized(part) for part in parts], axis=-1)
 
 
 def _same(array):
@@ -57,11 +57,11 @@ def _called(array):
 
 
 def _same_batched(operands, axes):
-    return MATERIALISED.bind(*operands), axes[0]
+    return MATERIALIZED.bind(*operands), axes[0]
 
 
 def _same_back(cotangent, array):
-    return [MATERIALISED.bind(cotangent)]
+    return [MATERIALIZED.bind(cotangent)]
 
 
 def _split(vectors):
@@ -85,14 +85,14 @@ def _split_back(cotangents, vectors):
     return [stacked(list(map(ad.instantiate_zeros, cotangents)))]
 
 
-MATERIALISED.def_impl(_same)
-MATERIALISED.def_abstract_eval(_same)
-mlir.register_lowering(MATERIALISED, mlir.lower_fun(_same, multiple_results=False))
+MATERIALIZED.def_impl(_same)
+MATERIALIZED.def_abstract_eval(_same)
+mlir.register_lowering(MATERIALIZED, mlir.lower_fun(_same, multiple_results=False))
 mlir.register_lowering(
-    MATERIALISED, mlir.lower_fun(_called, multiple_results=False), platform="cpu"
+    MATERIALIZED, mlir.lower_fun(_called, multiple_results=False), platform="cpu"
 )
-batching.primitive_batchers[MATERIALISED] = _same_batched
-ad.deflinear2(MATERIALISED, _same_back)
+batching.primitive_batchers[MATERIALIZED] = _same_batched
+ad.deflinear2(MATERIALIZED, _same_back)
 
 COMPONENTS.def_impl(jax.jit(_split))
 COMPONENTS.def_abstract_eval(_split_types)

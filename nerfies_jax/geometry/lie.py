@@ -3,7 +3,7 @@
 A screw is `angular` (axis × angle, rad) and `linear` (scene units): the twist (w, v) of
 Nerfies (Park et al. 2021, arXiv:2011.12948, equations 9 and 11). `linear` is not the
 translation; that is `left_jacobian(angular) @ linear`. Coefficients are Stumpff
-functions of |w|², smooth at 0, so a zero-initialised head is no special case.
+functions of |w|², smooth at 0, so a zero-initialized head is no special case.
 A turn is as exact as |w|: to 6e-8 |w| rad in float32, which is 6e-4 at 1e4 rad. Angles
 above 1e19 rad overflow float32.
 """

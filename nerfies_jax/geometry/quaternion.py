@@ -23,7 +23,7 @@ _ARCTAN = tuple((-1) ** n / (2 * n + 1) for n in range(14))
 
 @checked(broadcast=True)
 @at_least_float32
-def normalise(quaternion: Quaternion) -> Quaternion:
+def normalize(quaternion: Quaternion) -> Quaternion:
     """The same rotation at unit length.
 
     Zero (in float32 also what XLA flushes to it, below 1.2e-38) and infinity give the
@@ -67,7 +67,7 @@ def conjugate(quaternion: Quaternion) -> Quaternion:
 @at_least_float32
 def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """One vector, turned; the quaternion may have any length."""
-    unit = normalise(quaternion)
+    unit = normalize(quaternion)
     swept = jnp.cross(unit[1:], vector)
     return vector + 2 * (unit[0] * swept + jnp.cross(unit[1:], swept))
 
@@ -77,9 +77,9 @@ def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3
 def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
     """The rotation matrix; the quaternion may have any length.
 
-    The polynomial in an unnormalised q is no rotation: |q| = 1.01 bends it by 0.057.
+    The polynomial in an unnormalized q is no rotation: |q| = 1.01 bends it by 0.057.
     """
-    w, x, y, z = normalise(quaternion)
+    w, x, y, z = normalize(quaternion)
     # One stack: nested ones are slow under `vmap` (see matrix3).
     entries = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -115,7 +115,7 @@ def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
         *(w[2], xz, yz, diagonal[3]),
     ]
     rows = jnp.stack(rows).reshape(4, 4)
-    return _upper(normalise(rows[jnp.argmax(diagonal)]))
+    return _upper(normalize(rows[jnp.argmax(diagonal)]))
 
 
 @checked(broadcast=True)
@@ -133,10 +133,10 @@ def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
 def log(quaternion: Quaternion) -> Float[Array, "3"]:
     """Axis × angle, the short way round (at most π rad), of a quaternion of any length.
 
-    Zero for zero and infinity, as `normalise` takes them.
+    Zero for zero and infinity, as `normalize` takes them.
     """
     # The quotients below need no unit length, but their squares have half the range.
-    upper = _upper(normalise(quaternion))
+    upper = _upper(normalize(quaternion))
     scalar, vector = upper[0], upper[1:]
     sine_sq = jnp.sum(vector**2)
     near = sine_sq < SERIES_BELOW * scalar**2

@@ -5,7 +5,7 @@ or uint16, which are divided by 255 and 65535. Leading axes are a batch, with on
 for each image.
 Published numbers mix protocols, so each one has its name here: `padding="valid"` is
 scikit-image's Gaussian SSIM, `padding="zero"` INRIA's (0.002 to 0.011 higher on
-photographs), and `quantise` first gives the score of the 8-bit file others re-read.
+photographs), and `quantize` first gives the score of the 8-bit file others re-read.
 Images narrower than float32 are widened to it first (`widened`).
 """
 
@@ -43,7 +43,7 @@ def _refuse_stacks(image: Float[Array, "height width channels"]) -> None:
 
 
 @checked(images=("image",))
-def quantise(image: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def quantize(image: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """What is left of a picture after an 8-bit file: clipped and rounded to n/255."""
     return jnp.round(jnp.clip(image, 0.0, 1.0) * 255.0) / 255.0
 

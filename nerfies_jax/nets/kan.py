@@ -31,7 +31,7 @@ from nerfies_jax.nets.mlp import HeadSpec
 BASES = ("rbf", "bspline")
 OUTPUT = "output"  # name of the only head where a spec has `out_features`
 DEGREE = 3  # of the B-splines, of which there are so many more than intervals
-HEAD_INITIALISERS = ("glorot", "small", "zero")
+HEAD_INITIALIZERS = ("glorot", "small", "zero")
 # Narrower kernels leave gaps between the centers, wider ones are so alike that their
 # weights cannot be told apart: the Gram matrix of 16 kernels has condition 5.7 at
 # sigma / h = 0.5, 58 at 0.707, 4.5e3 at 1 and 2e7 at 1.5.
@@ -52,7 +52,7 @@ class KANSpec:
     to several named `heads` in their place, which all read the last hidden layer.
 
     The first layer's `kernels` centers lie on `grid`, where raw inputs are expected;
-    those of the others on `hidden_grid`, in front of which `norm` standardises the
+    those of the others on `hidden_grid`, in front of which `norm` standardizes the
     features of each point. The norm has no trained scale, which would be a trained
     width under another name, and the first layer has none: it would turn one or two
     coordinates into signs. `width_ratio` is sigma / h, the kernels' standard deviation
@@ -110,17 +110,17 @@ class KANSpec:
             )
         if self.norm and any(width < 3 for width in self.hidden):
             raise ValueError(
-                f"hidden={self.hidden}: standardising one feature leaves 0 and two "
+                f"hidden={self.hidden}: standardizing one feature leaves 0 and two "
                 "leaves signs; take widths of at least 3, or norm=False"
             )
         names = [name for name, _ in self.heads]
         if len(set(names)) < len(names):
             raise ValueError(f"heads must have different names, got {names}")
         for name, head in self.heads:
-            if head.init not in HEAD_INITIALISERS:
+            if head.init not in HEAD_INITIALIZERS:
                 raise ValueError(
                     f"head {name!r}: unknown init {head.init!r}; choose from "
-                    f"{HEAD_INITIALISERS}"
+                    f"{HEAD_INITIALIZERS}"
                 )
 
     def _check_basis(self):
@@ -354,7 +354,7 @@ def after_first_layer(
     for index in range(1, len(spec.hidden) + 1):
         layer, kernels = _layer(spec, params, index)
         if spec.norm:
-            features = standardise(features)
+            features = standardize(features)
         features = _sum_over_inputs(spec, index, layer, kernels, features) + layer.bias
     outputs, first_column = {}, 0
     for name, head in spec.read_outs:
@@ -365,7 +365,7 @@ def after_first_layer(
 
 @checked
 @at_least_float32
-def standardise(
+def standardize(
     features: Float[Array, "*batch features"],
 ) -> Float[Array, "*batch features"]:
     """Each point's features with mean zero and variance one, or less than one."""

@@ -18,7 +18,7 @@ ACTIVATIONS = {
     "sine": jnp.sin,
     "none": lambda x: x,
 }
-INITIALISERS = ("glorot", "he", "zero", "small")
+INITIALIZERS = ("glorot", "he", "zero", "small")
 # Half-width of "small": displacements of 1e-4 scene units per unit of feature, as
 # Nerfies' heads, but two-sided; its one-sided draw pushes every point the same way.
 SMALL = 1e-4
@@ -182,5 +182,5 @@ def _fan_in(spec, layer):
 
 
 def _check_init(name):
-    if name not in INITIALISERS:
-        raise ValueError(f"unknown initialiser {name!r}; choose from {INITIALISERS}")
+    if name not in INITIALIZERS:
+        raise ValueError(f"unknown initializer {name!r}; choose from {INITIALIZERS}")

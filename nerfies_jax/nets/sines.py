@@ -9,7 +9,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, Float
 
-from nerfies_jax.geometry.fusion import materialised
+from nerfies_jax.geometry.fusion import materialized
 from nerfies_jax.geometry.precision import at_least_float32
 
 SINCOS = Primitive("sincos")
@@ -60,7 +60,7 @@ def sincospi(
     turn = x - 2 * jnp.round(x / 2)
     quarter = jnp.round(2 * turn)
     sine, cosine = _turned(turn - quarter / 2, math.pi, quarter)
-    return materialised(sine), materialised(cosine)
+    return materialized(sine), materialized(cosine)
 
 
 @sincospi.defjvp
@@ -72,7 +72,7 @@ def _sincospi_jvp(primals, tangents):
 
 
 def _as_xla(angle):
-    return materialised(jnp.sin(angle)), materialised(jnp.cos(angle))
+    return materialized(jnp.sin(angle)), materialized(jnp.cos(angle))
 
 
 def _in_vectors(angle):

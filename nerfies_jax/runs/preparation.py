@@ -255,7 +255,7 @@ def needed(path: AnyPath) -> bool:
     path = pathlib.Path(path)
     if footage.kind_of(path) is None:
         return False
-    return path.is_file() or not any(each.recognise(path) for each in formats.FORMATS)
+    return path.is_file() or not any(each.recognize(path) for each in formats.FORMATS)
 
 
 def prepared(

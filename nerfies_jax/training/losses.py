@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from nerfies_jax.contract import checked
-from nerfies_jax.geometry.fusion import materialised
+from nerfies_jax.geometry.fusion import materialized
 from nerfies_jax.geometry.linear_call import linear_call
 from nerfies_jax.geometry.precision import at_least_float32, widened
 
@@ -210,7 +210,7 @@ def dssim_map(
     constant = value_range**2
     center = middle_level(target)
     shape, channels = image.shape, image.shape[-1]
-    image, target = (materialised(x.reshape(shape[0], -1)) for x in (image, target))
+    image, target = (materialized(x.reshape(shape[0], -1)) for x in (image, target))
     difference = image - target
     x, y = image - center, target - center
     maps = jnp.stack([x, y, x * x + y * y, difference * difference])

@@ -112,7 +112,7 @@ def test_times_play_forwards_and_back():
     assert (np.diff(quarter) > 0).all()
 
 
-def test_a_stabilised_path_keeps_a_walk_and_loses_its_shake():
+def test_a_stabilized_path_keeps_a_walk_and_loses_its_shake():
     rng, times = np.random.default_rng(0), np.linspace(0, 1, 120)
     angle = 0.8 * times - 0.4  # a steady turn about a vertical axis, and a steady walk
     walk = np.stack([2 * times, 0.1 * times, -3 + 0.5 * times], axis=1)
@@ -150,8 +150,8 @@ def test_a_path_along_the_film_is_there_when_the_film_was():
     filmed = np.sort(capture.times[capture.train])
     captured = camera_paths.planned("captured", capture, len(filmed))
     np.testing.assert_array_equal(captured.times, filmed)
-    stabilised = camera_paths.planned("stabilised", capture, 7).times
-    np.testing.assert_allclose(stabilised, np.linspace(filmed[0], filmed[-1], 7), 1e-6)
+    stabilized = camera_paths.planned("stabilized", capture, 7).times
+    np.testing.assert_allclose(stabilized, np.linspace(filmed[0], filmed[-1], 7), 1e-6)
     assert camera_paths.planned("sway", capture, 7).times is None
 
 

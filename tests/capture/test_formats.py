@@ -1,4 +1,4 @@
-"""Recognising what a folder holds, and saying what was looked for."""
+"""Recognizing what a folder holds, and saying what was looked for."""
 
 import inspect
 import subprocess
@@ -68,11 +68,11 @@ def test_what_is_no_capture_yet_is_refused_with_the_way_out(tmp_path):
         (("poses_bounds.npy", "sparse/0/cameras.bin"), "colmap"),
     ],
 )
-def test_what_is_recognised(tmp_path, files, expected):
+def test_what_is_recognized(tmp_path, files, expected):
     for name in files:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
-    assert formats.recognise(tmp_path).name == expected
+    assert formats.recognize(tmp_path).name == expected
 
 
 def test_every_reader_takes_the_common_options():

@@ -28,7 +28,7 @@ def test_colors_and_times_survive_odd_sizes(tmp_path):
     for number, (seconds, frame) in enumerate(decoded):
         assert seconds == pytest.approx(number / 12.5, abs=1e-4)
         error = np.abs(frame[:31, :45].astype(int) - frames[number])
-        # Chroma is halved and everything quantised: 2 levels on smooth pictures.
+        # Chroma is halved and everything quantized: 2 levels on smooth pictures.
         assert error.mean() < 3
         np.testing.assert_allclose(frame[31], frame[30], atol=12)
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]

@@ -9,7 +9,7 @@ from nerfies_jax.effects import scene_flow_losses as flow_losses
 from tests import gradients
 
 entropy = jax.jit(jax.value_and_grad(flow_losses.entropy))
-normalised_depth = jax.jit(jax.value_and_grad(flow_losses.normalised_depth))
+normalized_depth = jax.jit(jax.value_and_grad(flow_losses.normalized_depth))
 settle = jax.jit(flow_losses.settle)
 
 
@@ -75,8 +75,8 @@ def test_depth_is_compared_up_to_scale_and_offset(dtype):
     depth = np.random.default_rng(1).uniform(1, 4, 21).astype(dtype)
     known = np.arange(21) != 7
     odd = np.where(known, 3 * depth + 2, 1e30).astype(dtype)
-    assert normalised_depth(depth, odd, known)[0] < 1e-11
-    other, _ = normalised_depth(depth, -depth, known)
+    assert normalized_depth(depth, odd, known)[0] < 1e-11
+    other, _ = normalized_depth(depth, -depth, known)
     offset = depth[known].astype(np.float64)
     offset = offset - np.sort(offset)[9]  # the lower of the two middle ones of twenty
     # The negative has its lower middle at the upper one of these: not quite twice.
@@ -98,7 +98,7 @@ def test_depth_is_compared_up_to_scale_and_offset(dtype):
 )
 def test_depths_without_a_spread_stay_finite(dtype, depth, count):
     target = np.asarray([1.0, 3.0, 2.0, 5.0], dtype)
-    value_and_grad = normalised_depth(
+    value_and_grad = normalized_depth(
         np.asarray(depth, dtype), target, np.arange(4) < count
     )
     value, grad = map(np.asarray, value_and_grad)
@@ -131,7 +131,7 @@ def test_slopes_are_those_of_differences(float64, rng):
             + flow_losses.kinetic(flow, back, present)
             + 10 * flow_losses.entropy(4 * seen - 2)
             + jnp.sum(flow_losses.settle(through, flow) ** 2)
-            + flow_losses.normalised_depth(depth, other, present)
+            + flow_losses.normalized_depth(depth, other, present)
         )
 
     given = flow, back, seen, color, depth, rng.uniform(0, 0.2, (rays, samples))

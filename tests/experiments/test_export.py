@@ -88,8 +88,8 @@ def test_cameras_leave_with_pictures_in_three_layouts(splats, tmp_path, capsys):
 
 def test_a_path_leaves_with_its_times(splats, capsys):
     assert cli.PATHS == camera_paths.KINDS
-    assert main(splats, "path", "--path", "stabilised", "--frames", 5) == 0
-    path = splats / "exports" / "path-stabilised.json"
+    assert main(splats, "path", "--path", "stabilized", "--frames", 5) == 0
+    path = splats / "exports" / "path-stabilized.json"
     times = [
         each["render_time"] for each in json.loads(path.read_text())["camera_path"]
     ]
@@ -97,7 +97,7 @@ def test_a_path_leaves_with_its_times(splats, capsys):
     np.testing.assert_allclose(times, np.linspace(filmed.min(), filmed.max(), 5), 1e-6)
     # In the one form and out in the other; and the times of a path that has none.
     assert main(splats, "nerfies-path", "--path", path) == 0
-    (folder,) = (splats / "exports").glob("nerfies-path-path-stabilised-????????")
+    (folder,) = (splats / "exports").glob("nerfies-path-path-stabilized-????????")
     again = [json.loads(place.read_text()) for place in sorted(folder.iterdir())]
     assert [each["time"] for each in again] == times
     assert main(splats, "path", "--frames", 4) == 0

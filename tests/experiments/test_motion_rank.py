@@ -38,7 +38,7 @@ def test_the_floors_by_hand():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", list(motion_rank.FLOORS))
-def test_no_factorisation_passes_below_its_floor_and_a_fit_comes_close(model):
+def test_no_factorization_passes_below_its_floor_and_a_fit_comes_close(model):
     """The floor is of all values of the factors, the fits are of some."""
     args = MotionRank(**TINY | {"counts": (3,), "steps": 300})
     for count in args.counts:

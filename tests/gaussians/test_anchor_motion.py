@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gaussians_jax import representation, scene, splats, variants
 from gaussians_jax.effects import anchor_motion, anchors
 from gaussians_jax.effects.anchors import AnchorMotionSpec, RateSpec
-from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.initialization import InitSpec
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax import evaluation
 from nerfies_jax.nets import entropy

@@ -13,7 +13,7 @@ from gaussians_jax import densification, faces, files, instants, scene, splats, 
 from gaussians_jax.effects import carried, deformation
 from gaussians_jax.effects.carried import Carried, CarriedSpec, TurnSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.initialization import InitSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.splats import Params
 from nerfies_jax import evaluation

@@ -40,11 +40,11 @@ def expected_loss(kind, drawn, truth):
     if kind == "correlation":
         return 1 - scipy.stats.pearsonr(drawn, truth).statistic
 
-    def normalised(x):
+    def normalized(x):
         middle = np.sort(x)[(len(x) - 1) // 2]
         return (x - middle) / np.abs(x - middle).mean()
 
-    return np.abs(normalised(drawn) - normalised(truth)).mean()
+    return np.abs(normalized(drawn) - normalized(truth)).mean()
 
 
 @pytest.mark.parametrize(

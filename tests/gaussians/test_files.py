@@ -186,7 +186,7 @@ def test_damaged_files_give_one_line_with_the_path(tmp_path):
         assert len(message) < 300 + len(str(path)), case
 
 
-def test_splat_keeps_its_bytes_and_its_quantisation(tmp_path):
+def test_splat_keeps_its_bytes_and_its_quantization(tmp_path):
     rows = some_splats(degree=0)
     files.save(tmp_path / "a.splat", rows)
     assert (tmp_path / "a.splat").stat().st_size == 20 * 32

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import initialisation, spec
+from gaussians_jax import initialization, spec
 from gaussians_jax.effects import plane_motion
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
 from gaussians_jax.splats import Params
@@ -127,7 +127,7 @@ def test_what_is_kept_smooth_is_what_the_weights_say(float64):
 
 def test_the_box_holds_what_was_filmed():
     capture = scenes.tiny_capture()
-    low, high = np.array(initialisation.filmed_box(capture))
+    low, high = np.array(initialization.filmed_box(capture))
     inside = (capture.points.position > low) & (capture.points.position < high)
     assert inside.all(axis=1).mean() > 0.8
     spread = np.ptp(capture.points.position, axis=0)

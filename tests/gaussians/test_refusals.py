@@ -9,7 +9,7 @@ import pytest
 
 from gaussians_jax import (
     harmonics,
-    initialisation,
+    initialization,
     optimizer,
     phases,
     raster,
@@ -36,7 +36,7 @@ from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
 from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
 from gaussians_jax.effects.spline_motion import SplineMotionSpec
 from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
-from gaussians_jax.initialisation import InitSpec, StartSpec
+from gaussians_jax.initialization import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
@@ -225,9 +225,9 @@ FROM_POINTS = InitSpec(source="points")
 CALLS = [
     (lambda: acceleration.effect(AccelerationSpec(), 1.0, 1), "at least two frames"),
     (lambda: harmonics.degree_of(5), "1, 4, 9 or 16 coefficients, got 5"),
-    (lambda: initialisation.uses_capture_points(FROM_POINTS, capture_with(None)),
+    (lambda: initialization.uses_capture_points(FROM_POINTS, capture_with(None)),
      'it has none; choose source="random"'),
-    (lambda: initialisation.initial_count(FROM_POINTS, capture_with(0)),
+    (lambda: initialization.initial_count(FROM_POINTS, capture_with(0)),
      'it has none; choose source="random"'),
     (lambda: kan_motion.init(jax.random.key(0), KanMotionSpec(), 0), "frames=0"),
     (lambda: motion_growth.effect(MotionGrowthSpec(), 0.0), "extent=0.0"),

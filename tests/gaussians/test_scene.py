@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from gaussians_jax import first_state, initialisation, learning_rates, presets, scene
+from gaussians_jax import first_state, initialization, learning_rates, presets, scene
 from gaussians_jax.densification import DefaultStrategySpec
-from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.initialization import InitSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.spec import SceneMetadata, raster_of
 from gaussians_jax.splats import Params, Splats
@@ -140,7 +140,7 @@ def test_a_frame_has_the_harmonics_of_its_step():
 def test_few_points_start_from_random_ones_in_the_views():
     capture = scenes.tiny_capture()
     spec = InitSpec(random=50, min_points=10**6)
-    position, color = initialisation.initial_points(spec, capture, 0)
+    position, color = initialization.initial_points(spec, capture, 0)
     assert position.shape == color.shape == (50, 3)
     turn = capture.cameras.camera_from_world[capture.train]
     offset = position[None] - capture.cameras.position[capture.train][:, None]
@@ -150,7 +150,7 @@ def test_few_points_start_from_random_ones_in_the_views():
 
 
 def test_more_points_than_asked_for_are_thinned_without_repeats():
-    position, _ = initialisation.initial_points(
+    position, _ = initialization.initial_points(
         InitSpec(points=120), scenes.tiny_capture(), 0
     )
     assert len(np.unique(position, axis=0)) == len(position) == 120

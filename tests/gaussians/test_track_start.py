@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gaussians_jax import path_fit, presets, scene, spec, splats, track_start
 from gaussians_jax.effects import se3_bases, temporal_opacity
 from gaussians_jax.effects.se3_bases import SE3BasesSpec
-from gaussians_jax.initialisation import StartSpec
+from gaussians_jax.initialization import StartSpec
 from gaussians_jax.path_fit import Depth, Paths, Points
 from gaussians_jax.splats import Params
 from nerfies_jax import evaluation

@@ -62,12 +62,12 @@ def test_derivatives_of_every_kind_are_those_of_plain_indices(float64, rng):
     assert gradients.directional_error(lambda x: ours(x) @ toward, vectors[0]) < 1e-7
 
 
-def test_one_of_what_is_materialised_may_be_the_same_for_all(float64, rng):
+def test_one_of_what_is_materialized_may_be_the_same_for_all(float64, rng):
     shared, each = rng.normal(size=3), rng.normal(size=(4, 3))
 
     def value(shared, own):
         return jnp.sum(
-            fusion.materialised(jnp.sin(shared)) * fusion.materialised(own**2)
+            fusion.materialized(jnp.sin(shared)) * fusion.materialized(own**2)
         )
 
     both = jax.jit(jax.vmap(jax.grad(value, (0, 1)), (None, 0)))(shared, each)

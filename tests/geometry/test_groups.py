@@ -134,7 +134,7 @@ SHAPES = {
     so3.left_jacobian: ((3,),),
     se3.left_jacobian: ((6,),),
     se3.from_rotation_translation: ((3, 3), (3,)),
-    quaternion.normalise: ((4,),),
+    quaternion.normalize: ((4,),),
     quaternion.multiply: ((4,), (4,)),
     quaternion.conjugate: ((4,),),
     quaternion.rotate: ((4,), (3,)),

@@ -27,9 +27,9 @@ def composed(second, first, vector):
 
 
 @jax.jit
-def normalised(q):
+def normalized(q):
     """And its slope."""
-    return quaternion.normalise(q), jax.jacrev(quaternion.normalise)(q)
+    return quaternion.normalize(q), jax.jacrev(quaternion.normalize)(q)
 
 
 @jax.jit
@@ -64,9 +64,9 @@ def test_matrices_products_and_rotated_vectors_match_scipy(dtype, rng):
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("length", [0, 1e-38, 1e-30, 1e-19, 1e25, 3e38, np.inf])
-def test_normalising_never_makes_what_is_no_rotation(length, dtype):
+def test_normalizing_never_makes_what_is_no_rotation(length, dtype):
     given = np.asarray(length * np.array([0.5, -0.5, 0.1, 0.7]), dtype)
-    unit, grad = (np.asarray(leaf) for leaf in normalised(given))
+    unit, grad = (np.asarray(leaf) for leaf in normalized(given))
     assert abs(np.linalg.norm(unit) - 1) < 1e-6
     assert np.all(np.isfinite(grad))
     if length in (0, np.inf):
@@ -75,8 +75,8 @@ def test_normalising_never_makes_what_is_no_rotation(length, dtype):
 
 
 @pytest.mark.hard_cases
-def test_normalising_does_not_hide_nan():
-    assert np.isnan(normalised(np.float32([np.nan, 0, 0, 1]))[0]).any()
+def test_normalizing_does_not_hide_nan():
+    assert np.isnan(normalized(np.float32([np.nan, 0, 0, 1]))[0]).any()
 
 
 @pytest.mark.hard_cases
@@ -136,6 +136,6 @@ def test_gradients(float64, rng):
 
     # slerp holds for unit quaternions only: stay on the sphere
     def on_sphere(one, other):
-        return everything(quaternion.normalise(one), quaternion.normalise(other))
+        return everything(quaternion.normalize(one), quaternion.normalize(other))
 
     assert gradients.directional_error(on_sphere, one, other) < 1e-7

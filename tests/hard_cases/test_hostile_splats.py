@@ -11,7 +11,7 @@ import pytest
 
 from gaussians_jax import densification, growth, representation, scene, splats
 from gaussians_jax.growth import AuxState
-from gaussians_jax.initialisation import InitSpec
+from gaussians_jax.initialization import InitSpec
 from gaussians_jax.spec import effects_of
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.training.model import Frames, Model, TrainState, View

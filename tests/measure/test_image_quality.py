@@ -31,7 +31,7 @@ def blob(shape):
 
 
 psnr = jax.jit(image_quality.psnr)
-quantise = jax.jit(image_quality.quantise)
+quantize = jax.jit(image_quality.quantize)
 ssim = jax.jit(image_quality.ssim, static_argnums=2)
 ms_ssim = jax.jit(image_quality.ms_ssim, static_argnums=2)
 MASKED = ("masked_psnr", "masked_ssim", "partial_ssim")
@@ -57,16 +57,16 @@ def test_psnr_is_capped_and_exact_below_the_cap(offset, decibels, dtype):
     assert np.all(grad == 0) == (decibels == 100)
 
 
-def test_psnr_is_scikit_images_and_that_of_the_png_when_quantised(dtype, rng):
+def test_psnr_is_scikit_images_and_that_of_the_png_when_quantized(dtype, rng):
     image, truth = pair(rng)
     value = psnr(*arrays(image, truth, dtype=dtype))
     error = abs(value - peak_signal_noise_ratio(truth, image, data_range=1))
     assert error < {"float32": 1e-4, "float64": 1e-12}[dtype]
     image = image * 1.2 - 0.1  # leaves [0, 1] on both sides
     stored = [np.round(255 * np.clip(x, 0, 1)).astype(np.uint8) for x in (image, truth)]
-    quantised = [quantise(x) for x in arrays(image, truth, dtype=dtype)]
+    quantized = [quantize(x) for x in arrays(image, truth, dtype=dtype)]
     exact = peak_signal_noise_ratio(stored[1], stored[0])
-    assert psnr(*quantised) == pytest.approx(exact, abs=1e-4)
+    assert psnr(*quantized) == pytest.approx(exact, abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def structure_and_luminance(mean, image, truth):
 
 
 def slow_ssim(image, truth, mask):
-    """Of windows about masked pixels, whose weights are renormalised in the mask."""
+    """Of windows about masked pixels, whose weights are renormalized in the mask."""
     inside = mask[..., None].astype(float)
     share = np.maximum(blurred(inside), 1e-30)
     pair = structure_and_luminance(lambda x: blurred(x * inside) / share, image, truth)

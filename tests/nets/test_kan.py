@@ -202,18 +202,18 @@ def test_holding_keeps_its_slope_however_far_out(dtype):
 
 
 @jax.jit
-def standardised(features):
+def standardized(features):
     """And its slopes."""
-    return kan.standardise(features), jax.jacrev(kan.standardise)(features)
+    return kan.standardize(features), jax.jacrev(kan.standardize)(features)
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("size", [1.0, 1e20, 3e38])
-def test_features_of_any_size_are_standardised(size, dtype):
+def test_features_of_any_size_are_standardized(size, dtype):
     """In float32 the variance of 1e20 overflows, and every feature would become 0."""
     given = np.array([0.9, -0.3, 0.5, -1.0])
     exact = (given - given.mean()) / np.sqrt(given.var() + 1e-6 / size**2)
-    standard, grads = standardised((size * given).astype(dtype))
+    standard, grads = standardized((size * given).astype(dtype))
     np.testing.assert_allclose(standard, exact, rtol=1e-6)
     # d z = (1 - 1/n - z zᵀ/n) dx / deviation
     change = (np.eye(4) - 0.25 - np.outer(exact, exact) / 4) / given.std() / size
@@ -265,7 +265,7 @@ def test_bfloat16_is_finite_and_near(rng):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
     exact = np.array([by_hand(spec, params, x)["y"] for x in inputs])
     assert heads["y"].dtype == jnp.bfloat16
-    # Layers with eight bits; standardised features lose the most.
+    # Layers with eight bits; standardized features lose the most.
     error = np.abs(np.asarray(heads["y"], np.float64) - exact)
     assert np.median(error) < 0.01 * np.abs(exact).max()  # measured 2e-3
 

@@ -146,7 +146,7 @@ def test_planes_that_start_have_nothing_to_smooth_in_time_and_no_slope(dtype):
 
 
 def test_the_reference_values_of_4dgs_are_met(dtype, oracle_dir):
-    """Features, the slope of the sum of their squares, and the three regularisers."""
+    """Features, the slope of the sum of their squares, and the three regularizers."""
     stored = np.load(oracle_dir / "splatting" / "4dgs_hexplane.npz", allow_pickle=False)
     pairs = ("0", "1", "3"), ("2", "4", "5")  # theirs: xy, xz, xt, yz, yt, zt
 

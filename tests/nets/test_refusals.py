@@ -38,7 +38,7 @@ def splines(**changes):
         (EncodingSpec, {"bands": 25}, "bands=25"),
         (EncodingSpec, {"bands": 0, "identity": False}, "no features"),
         (HeadSpec, {"width": 0}, "width=0"),
-        (HeadSpec, {"width": 1, "init": "one"}, "initialiser"),
+        (HeadSpec, {"width": 1, "init": "one"}, "initializer"),
         (net, {"inputs": 0}, "inputs=0"),
         (net, {"depth": -1}, "depth=-1"),
         (net, {"skips": (0,)}, "layer 0 is not in 1 .. 3"),

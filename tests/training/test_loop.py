@@ -44,7 +44,7 @@ def test_a_run_is_the_plain_loop_over_its_steps(frames, straight):
         jax.tree.leaves(straight.state), jax.tree.leaves(state), strict=True
     ):
         if not jnp.issubdtype(plain.dtype, jax.dtypes.prng_key):
-            # Another program: a few ulps, which Adam's normalisation may enlarge.
+            # Another program: a few ulps, which Adam's normalization may enlarge.
             np.testing.assert_allclose(ours, plain, rtol=2e-4, atol=2e-6)
     assert straight.state.aux_state["hits"].shape == (9,)
     assert int(straight.state.step) == straight.steps == 20

@@ -67,7 +67,7 @@ def _of_any_length(q):
     """What follows, row by row, of one quaternion."""
     return jnp.concatenate(
         [
-            quaternion.normalise(q),
+            quaternion.normalize(q),
             quaternion.to_matrix(q).reshape(9),
             quaternion.log(q),
             quaternion.rotate(q, jnp.asarray(POINT, q.dtype)),
@@ -94,11 +94,11 @@ def test_any_length_has_finite_value_slope_and_curvature(dtype):
 
 
 def test_lengths_at_the_edge_of_the_range_are_told_apart(dtype):
-    """The least normal number is normalised, its neighbor below is the identity."""
+    """The least normal number is normalized, its neighbor below is the identity."""
     edge = np.finfo(dtype).tiny
     below = np.nextafter(edge, np.asarray(0, dtype))
     given = np.array([[0, edge, 0, 0], [0, below, 0, 0]], dtype)
-    value = jax.jit(jax.vmap(quaternion.normalise))(given)
+    value = jax.jit(jax.vmap(quaternion.normalize))(given)
     assert np.array_equal(value, [[0, 1, 0, 0], [1, 0, 0, 0]])
 
 
@@ -112,7 +112,7 @@ def test_ten_thousand_compositions_stay_a_rotation(dtype):
         step = quaternion.exp(turn)
 
         def composed(_, q):
-            return quaternion.normalise(quaternion.multiply(step, q))
+            return quaternion.normalize(quaternion.multiply(step, q))
 
         start = quaternion.identity(turn.dtype)
         return jax.lax.fori_loop(0, 10_000, composed, start)

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gaussians_jax import initialisation
-from gaussians_jax.initialisation import InitSpec
+from gaussians_jax import initialization
+from gaussians_jax.initialization import InitSpec
 from tests.gaussians.test_refusals import capture_with
 
 SPEC = InitSpec(points=10**4, random=70, extra_random=30)
@@ -14,11 +14,11 @@ SPEC = InitSpec(points=10**4, random=70, extra_random=30)
 
 def own_points(spec, capture):
     """How many of the capture's own points the start has; checks the count foretold."""
-    position, color = initialisation.initial_points(spec, capture, 0)
+    position, color = initialization.initial_points(spec, capture, 0)
     assert (
         position.shape
         == color.shape
-        == (initialisation.initial_count(spec, capture), 3)
+        == (initialization.initial_count(spec, capture), 3)
     )
     assert ((color >= 0) & (color <= 1)).all()
     if capture.points is None:
@@ -40,12 +40,12 @@ def own_points(spec, capture):
 def test_the_source_decides_whose_points_they_are(source, points, own, drawn):
     spec, capture = dataclasses.replace(SPEC, source=source), capture_with(points)
     assert own_points(spec, capture) == own
-    assert initialisation.initial_count(spec, capture) == own + drawn
+    assert initialization.initial_count(spec, capture) == own + drawn
 
 
 def test_a_start_is_never_empty():
     spec = dataclasses.replace(SPEC, min_points=0)
-    assert initialisation.initial_count(spec, capture_with(0)) == 70
+    assert initialization.initial_count(spec, capture_with(0)) == 70
     assert own_points(spec, capture_with(0)) == 0
     assert own_points(spec, capture_with(1)) == 1
 
@@ -59,18 +59,18 @@ def test_random_points_stand_in_where_no_tracks_bring_what_moves():
         (False, 120, 20),
         (False, 90, 0),
     ):
-        settled = initialisation.of_start(spec, tracked, most)
+        settled = initialization.of_start(spec, tracked, most)
         assert settled.extra_random == extra
-        assert initialisation.of_start(asked, tracked, most) == asked
+        assert initialization.of_start(asked, tracked, most) == asked
     assert own_points(spec, capture_with(150)) == 100
-    assert initialisation.initial_count(spec, capture_with(150)) == 150
+    assert initialization.initial_count(spec, capture_with(150)) == 150
 
 
 def test_random_points_do_not_depend_on_the_points_of_the_capture():
     """Or a start "without structure from motion" would have some after all."""
     spec = dataclasses.replace(SPEC, source="random")
     first, second, third = (
-        initialisation.initial_points(spec, capture_with(points), seed)
+        initialization.initial_points(spec, capture_with(points), seed)
         for points, seed in ((150, 0), (None, 0), (None, 1))
     )
     for a, b in zip(first, second, strict=True):
