@@ -240,7 +240,7 @@ def _read_splat(path):
             "not a .splat file"
         )
     table = np.frombuffer(data, _SPLAT_ROW)
-    with np.errstate(invalid="ignore"):  # a signalling NaN; caught as broken later
+    with np.errstate(invalid="ignore"):  # a signaling NaN; caught as broken later
         scale = table["scale"].astype(np.float64)
     bounds = np.exp(splats.LOG_SCALE_RANGE)
     # A flat Gaussian, of scale 0, is drawn at the smallest scale; NaN stays NaN.

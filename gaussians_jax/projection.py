@@ -67,7 +67,7 @@ def project(
     Zwicker et al. 2002 (EWA splatting), equations 29 and 31: the covariance is T T^t +
     dilation with T = J W R diag(scale); neither the 3D covariance nor its determinant
     is formed. The tangents x/z and y/z are clamped in J alone, to the image widened by
-    `spec.tangent_margin` half images. Lens distortion is not modelled: undistort first.
+    `spec.tangent_margin` half images. Lens distortion is not modeled: undistort first.
     """
     refuse_half(gaussians.mean.dtype)
 

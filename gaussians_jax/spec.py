@@ -171,7 +171,7 @@ def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
     """How to draw this capture: the raster's near plane before all that was filmed.
 
     Scenes with a far background are small in the units of a box around all points: a
-    plane at 0.01 then lies metres before the camera.
+    plane at 0.01 then lies meters before the camera.
     """
     near = min(spec.raster.near, metadata.near)
     return dataclasses.replace(spec.raster, near=near)

@@ -310,7 +310,7 @@ def scene_extent(position: np.ndarray, static: float | None = None) -> float:
     (Kerbl et al. 2023, reference implementation). Cameras that stand still have none,
     and a zero would stop the means from learning; `static`, a typical depth, stands in
     for it, and a tenth of it for that of cameras that hardly move: a hand's tremor is
-    no unit for what lies metres away, and densification would prune all of it.
+    no unit for what lies meters away, and densification would prune all of it.
     """
     position = np.asarray(position, np.float64).reshape(-1, 3)
     middle = position.mean(axis=0)

@@ -90,7 +90,7 @@ def _box(capture, near, far):
         points = _frustum_points(capture, near, far)
         low, high = np.quantile(points, (0.1, 0.9), axis=0)
     half_side = float(np.max(high - low)) / 2
-    # No least size: units are the capture's own, and in metres a cell is 1e-5 wide.
+    # No least size: units are the capture's own, and in meters a cell is 1e-5 wide.
     if not half_side > 0:
         raise ValueError(
             f"what is filmed between near = {near:g} and far = {far:g} around "

@@ -74,7 +74,7 @@ def _pairs(name, seed):
     """Frames [2, height, width], true flow, where it is seen, and what moves."""
     capture, _ = synthetic.cached(synthetic.PRESETS[name], CACHE / "scenes", seed)
     views = view_set.in_time_order(capture)
-    pictures = dense_flow.levelled(views, 1)
+    pictures = dense_flow.leveled(views, 1)
     chosen = np.linspace(0, len(views.row) - 2, PAIRS).round().astype(int)
     for frame in chosen:
         row = views.row[frame]

@@ -4,7 +4,7 @@
     python -m experiments.motion_rank --kinds scene wiggles --seeds 3 --out rank
 
 Known trajectories of points are learned directly, without pictures, from some of the
-times; the others are held out. Displacements are modelled as
+times; the others are held out. Displacements are modeled as
 
 - time basis:   sum_k c_ik b_k(t), K trajectories shared by all points (DynMF);
 - separable:    V(p) w(t), K directions of each point, weights shared by all;

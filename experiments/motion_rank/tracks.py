@@ -47,7 +47,7 @@ def rigid(rng, points, times):
 
 
 def cloth(rng, points, times, waves=8):
-    """A sheet with travelling waves of many lengths and paces, mostly across it."""
+    """A sheet with traveling waves of many lengths and paces, mostly across it."""
     rest = np.concatenate(
         [rng.uniform(-1, 1, (points, 2)), np.zeros((points, 1))], axis=1
     )

@@ -62,7 +62,7 @@ def refuse_skew(capture: Capture, path: AnyPath, what: str) -> None:
 def write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
     """The scene's points and their colors as .ply."""
     cloud = capture.points
-    # World coordinates may be large: metres of a map need more than float32 has.
+    # World coordinates may be large: meters of a map need more than float32 has.
     kind = "f4" if units == "scene" else "f8"
     fields = [(axis, kind) for axis in "xyz"]
     fields += [(name, "u1") for name in ("red", "green", "blue")]

@@ -96,7 +96,7 @@ def write(
     arrays = tracks._asdict()
     rows = arrays.pop("rows")
     arrays["frames"] = np.array([capture.ids[row] for row in rows])
-    # World coordinates may be large: float32 has metres of a map to 3 cm only.
+    # World coordinates may be large: float32 has meters of a map to 3 cm only.
     positions = places_in(units, capture, tracks.positions)
     arrays["positions"] = positions.astype(np.float32 if units == "scene" else float)
     with replaced_file(path) as partial:

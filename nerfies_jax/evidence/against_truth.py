@@ -77,7 +77,7 @@ def _followed(views, evidence, points):
     place = points.pixel[np.arange(len(start)), start]
     starts = np.concatenate([start[:, None], place], axis=1)
     chained = tracking.chain(evidence.flow, starts)
-    return tracking.realigned(chained, dense_flow.levelled(views), views.size)
+    return tracking.realigned(chained, dense_flow.leveled(views), views.size)
 
 
 def _track_error(followed: Tracks, points):

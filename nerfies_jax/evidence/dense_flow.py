@@ -53,7 +53,7 @@ def enlarged(views: Views) -> int:
     return ENLARGED if max(views.size) <= ENLARGED_BELOW_PX else 1
 
 
-def levelled(views: Views, times: int | None = None) -> np.ndarray:
+def leveled(views: Views, times: int | None = None) -> np.ndarray:
     """[frames, height, width] uint8: gray pictures of one mean and spread, enlarged.
 
     Without it a film of varying exposure has 79 % of its pixels marked as moving.
@@ -129,7 +129,7 @@ def between_neighbors(
 ) -> NeighborFlow:
     """Flow between all frames that follow each other, both ways, and checked.
 
-    `pictures` are the views' as `levelled` makes them. With `span`, the nearest and
+    `pictures` are the views' as `leveled` makes them. With `span`, the nearest and
     farthest z-depth, wide steps are looked at again from where a still scene would be,
     the first ones of them if there is no `room_for` all.
     """

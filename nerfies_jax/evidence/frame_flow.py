@@ -32,7 +32,7 @@ def with_flow(capture: Capture) -> Capture:
         # Pictures of one moment are no film: there is nothing to search twice for.
         film = np.ptp(views.time) > 0
         span = view_set.depth_span(capture, views) if film else None
-        pictures = dense_flow.levelled(views)
+        pictures = dense_flow.leveled(views)
         neighbors = dense_flow.between_neighbors(views, pictures, span)
         flow.forward[views.row] = neighbors.forward
         flow.forward_seen[views.row] = neighbors.forward_seen & views.valid

@@ -36,7 +36,7 @@ def moving_masks(images: np.ndarray) -> np.ndarray:
     """
     whole = view_set.without_cameras(images)
     views = view_set.smaller(whole, view_set.times_smaller(whole))
-    pictures = dense_flow.levelled(views)
+    pictures = dense_flow.leveled(views)
     flow = dense_flow.between_neighbors(views, pictures)
     tracks = tracking.from_flow(views, flow, pictures)
     off = _off_the_camera_motion(tracks, WITHIN_SHARE * views.size[0])

@@ -97,7 +97,7 @@ def _gathered(capture, use_depths, watch):
     factor, given = _factor(capture), capture.given or Given(capture.size)
     capture = looked_at(capture, factor)
     views = view_set.in_time_order(capture)
-    pictures = dense_flow.levelled(views)
+    pictures = dense_flow.leveled(views)
     flow = taken.flow(given, views)
     if flow is None:
         # Pictures of one moment are no film: there is nothing to search twice for.

@@ -35,7 +35,7 @@ def log_odds(views: Views, still: PointCloud) -> np.ndarray:
     frames = len(views.row)
     if not len(still.position):
         return np.zeros(views.gray.shape, np.float32)
-    color, spread = _levelled(views)
+    color, spread = _leveled(views)
     depth = [
         _depth(views, frame, still.position.astype(float)) for frame in range(frames)
     ]
@@ -50,7 +50,7 @@ def log_odds(views: Views, still: PointCloud) -> np.ndarray:
     return clipped
 
 
-def _levelled(views):
+def _leveled(views):
     """Blurred pictures of one mean and spread for each channel, and that spread."""
     image = views.image.astype(np.float32)
     mean, spread = image.mean((1, 2)), np.maximum(image.std((1, 2)), 1e-3)

@@ -133,7 +133,7 @@ def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tr
     """Each point aligned with the picture in which it began; what strays is not seen.
 
     Lucas-Kanade from the chained place, without a pyramid. `pictures` are enlarged as
-    `dense_flow.levelled` does, `size` is that of the tracks' own.
+    `dense_flow.leveled` does, `size` is that of the tracks' own.
     """
     times = pictures.shape[2] // size[0]
     pixel, seen = tracks.pixel.copy(), tracks.seen.copy()

@@ -107,7 +107,7 @@ def jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
     shown = views.textured[:-1] & flow.forward_seen[:-1]
     carried = shown.sum((1, 2)) / np.maximum(views.textured[:-1].sum((1, 2)), 1)
     views = view_set.smaller(views, part)
-    pictures = [_levelled(gray) for gray in views.gray]
+    pictures = [_leveled(gray) for gray in views.gray]
     shares = []
     for one in range(len(views.row) - 1):
         there = _way(flow.forward[one], flow.forward_seen[one], part)
@@ -144,7 +144,7 @@ def _way(flow, seen, part):
     return _Way(flow, shift, reach)
 
 
-def _levelled(gray):
+def _leveled(gray):
     """The picture less its local mean, over its contrast: exposure taken out."""
     detail = gray - cv2.GaussianBlur(gray, (0, 0), LOCAL_PX)
     spread = np.sqrt(np.mean(detail**2))

@@ -120,7 +120,7 @@ def test_as_many_wide_steps_as_there_is_room_for_are_searched_again(monkeypatch)
     monkeypatch.setattr(dense_flow.wide_steps, "improved", improved)
     monkeypatch.setattr(dense_flow.wide_steps, "is_wide", lambda *_: True)
     views = record.view_set.in_time_order(films.film(frames=6))
-    pictures = dense_flow.levelled(views)
+    pictures = dense_flow.leveled(views)
     asked = []
 
     def room_for(count):

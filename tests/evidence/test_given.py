@@ -142,7 +142,7 @@ def test_paths_lean_on_depths_given(tmp_path, kind):
         depth, path = (7 + 0.1 * row) * capture.depths[row], tmp_path / f"{name}.{kind}"
         if kind == "exr":
             OpenEXR.File({}, {"Z": depth}).write(str(path))
-        else:  # as depth cameras write it: millimetres, far below the whole of 16 bits
+        else:  # as depth cameras write it: millimeters, far below the whole of 16 bits
             PIL.Image.fromarray(np.round(100 * depth).astype(np.uint16)).save(path)
     evidence = record.gather(with_files(capture, depths=tmp_path))
     own = gathered()[1]

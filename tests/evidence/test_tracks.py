@@ -68,7 +68,7 @@ def tracks_of(views, position):
 def test_flow_of_a_wall_is_that_of_its_homography_in_any_light(light):
     capture = films.film(shown=lambda time: False, gain=light, frames=4)
     views = view_set.in_time_order(capture)
-    flow = dense_flow.between_neighbors(views, dense_flow.levelled(views))
+    flow = dense_flow.between_neighbors(views, dense_flow.leveled(views))
     ray = view_set.rays(views, 1)
     point = views.position[1] + films.FAR * ray
     there, _ = view_set.project(views, 2, point.reshape(-1, 3))
@@ -94,7 +94,7 @@ def test_flow_that_does_not_lead_back_is_not_trusted():
 def test_flow_that_a_thing_lost_is_found_from_how_it_came():
     capture = films.film(shown=lambda time: False, frames=6)
     views = view_set.in_time_order(capture)
-    pictures = dense_flow.levelled(views)
+    pictures = dense_flow.leveled(views)
     true = dense_flow.between_neighbors(views, pictures)
     flow = NeighborFlow(*(part.copy() for part in true))
     area = np.s_[20:50, 30:70]
@@ -139,7 +139,7 @@ def test_wide_steps_are_found_from_where_a_still_scene_would_be():
     # 18 px of 96 from frame to frame
     capture = films.film(camera=lambda t: (1.2 * t - 0.6, 0.0, 0.0), frames=4)
     views = view_set.in_time_order(capture)
-    pictures = dense_flow.levelled(views)
+    pictures = dense_flow.leveled(views)
     height, width = views.gray.shape[1:]
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     shares = []

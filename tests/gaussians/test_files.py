@@ -353,7 +353,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.hard_cases
-def test_a_signalling_nan_is_a_broken_row_and_no_warning(tmp_path):
+def test_a_signaling_nan_is_a_broken_row_and_no_warning(tmp_path):
     files.save(tmp_path / "a.splat", some_splats(3))
     data = bytearray((tmp_path / "a.splat").read_bytes())
     data[32 + 12 : 32 + 16] = struct.pack("<I", 0x7FA00000)

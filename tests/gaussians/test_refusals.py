@@ -127,7 +127,7 @@ SETTINGS = [
     (NeighborSpec, dict(start=-1), "start >= 0"),
     (NeighborSpec, dict(gamma=-1.0), "not negative"),
     (NeighborSpec, dict(weight=math.nan), "not negative"),
-    (NeighborSpec, dict(scale="metres"), "unknown scale 'metres'"),
+    (NeighborSpec, dict(scale="meters"), "unknown scale 'meters'"),
     (RasterSpec, dict(alpha_max=1.0), "alpha_threshold < alpha_max < 1"),
     (RasterSpec, dict(near=0.0), "0 < near < far"),
     (RasterSpec, dict(tile=12), "tile must be one of"),

@@ -185,7 +185,7 @@ def test_a_tripod_has_no_extent_of_its_own():
     with pytest.raises(ValueError, match="stand still"):
         rows.scene_extent(position)
     assert rows.scene_extent(position, static=2.5) == 2.5
-    # Nor has a hand that trembles before something metres away.
+    # Nor has a hand that trembles before something meters away.
     tremor = 1e-3 * np.eye(5, 3)
     assert rows.scene_extent(tremor, static=2.5) == pytest.approx(0.25)
 
