@@ -1,14 +1,14 @@
-"""Checks of the arguments of public functions, made while they are traced.
+"""Trace-time checks of the arguments of public functions.
 
-The jaxtyping annotations of a function are its contract. `checked` reads shapes, ranks
-and types of the arguments against them on every call, in Python: under `jax.jit` that
+The jaxtyping annotations of a function are its contract. `checked` checks shapes, ranks
+and types of the arguments against them on every call, in Python. Under `jax.jit` that
 is once, while tracing, and the compiled program is that of the undecorated function.
 With `broadcast=True` a function that is written for one item also takes any number of
 leading axes, which broadcast against each other as in NumPy.
 
 NumPy arrays become JAX arrays, and Python numbers are taken for scalars. Everything
-else is refused with a `ValueError` that names the function, the argument, what it got
-and what it takes.
+else is refused with a `ValueError` that names the function, the argument, its value and
+the expected shape and type.
 """
 
 import functools
@@ -127,7 +127,9 @@ def checked(
 
 
 def _key(plan, values):
-    """Types and shapes of arguments that are JAX arrays or None; None if others are."""
+    """Types and shapes of the arguments, or None if one is neither JAX array nor
+    None.
+    """
     key = []
     for name, _ in plan.checks:
         value = values.get(name)
@@ -154,7 +156,7 @@ def _plan(function: Callable[..., Any]) -> _Plan:
 
 @functools.cache
 def _read(name: str, annotation: Any) -> _Leaf | _Record | None:
-    """The check that an annotation asks for; None where it is not of arrays."""
+    """Return the check that an annotation asks for, or None if it is not of arrays."""
     options, optional = [annotation], False
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         options = list(typing.get_args(annotation))
@@ -202,7 +204,7 @@ def _leaf(
 
 
 def _check(title, check, value, sizes, batches):
-    """The value as the function gets it; ValueError where it does not fit."""
+    """Return the value as the function gets it, or raise ValueError."""
     if value is None and check.optional:
         return None
     if isinstance(check, _Record):

@@ -1,4 +1,4 @@
-"""The elastic energy of any warp, for programs that bring their own."""
+"""Elastic energy of an arbitrary warp, for use outside of presets."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Frames of a capture, the renderer, and scores of what it draws."""
+"""Frames of a capture, the renderer, and metrics of rendered images."""
 
 from nerfies_jax.evaluation.frames import (
     as_found,

@@ -1,4 +1,4 @@
-"""What somebody looks at in a window: cameras, sizes, pictures; no window here."""
+"""Cameras, image sizes and channels of an interactive viewer, without any GUI."""
 
 import math
 from typing import NamedTuple
@@ -20,7 +20,7 @@ SHORTEST_SIDE_PX = 12
 
 
 class Eye(NamedTuple):
-    """From where somebody looks."""
+    """Viewpoint of an interactive viewer."""
 
     quaternion: tuple[float, ...]  # w x y z, world from camera; right, down, forward
     position: tuple[float, ...]  # scene units
@@ -29,7 +29,7 @@ class Eye(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What they want to see."""
+    """Time, channel and variant that a viewer requests."""
 
     time: float  # in [0, 1]
     channel: str = "color"  # one of `CHANNELS`
@@ -38,10 +38,17 @@ class Look(NamedTuple):
 
 
 def camera_of(eye: Eye, size: tuple[int, int]) -> Camera:
-    """The camera whose picture of `size` shows what the window does, stretched to it.
+    """Return the camera of a viewpoint for an image that is stretched to the window.
 
-    Its pixels are as wide as the window's aspect makes them, so that a window of any
-    shape is filled by pictures of one size: each size is a program to compile.
+    Pixels have the aspect that the window gives them, so that a window of any shape is
+    filled by images of one size. Each size is a program to compile.
+
+    Args:
+      eye: Viewpoint, with the aspect of the window.
+      size: Width and height of the image in pixels.
+
+    Returns:
+      A camera with NumPy leaves.
     """
     width, height = size
     vertical_px = height / 2 / math.tan(eye.fov_rad / 2)
@@ -63,14 +70,27 @@ class Pyramid(NamedTuple):
     levels: int
 
     def size(self, level: int) -> tuple[int, int]:
-        """Return the width and height in pixels of the image of a level."""
+        """Return the image size of a level.
+
+        Args:
+          level: Index of the level, 0 for the coarsest.
+
+        Returns:
+          Width and height in pixels.
+        """
         width, height = self.tile
         return width << level, height << level
 
     def tiles(self, level: int) -> list[tuple[int, int]]:
-        """Return the columns and rows of the tiles of a level, the central ones first.
+        """Return the tiles of a level, the central ones first.
 
-        What somebody looks at is more often in the center than at the border.
+        Viewers look at the center more often than at the border.
+
+        Args:
+          level: Index of the level, 0 for the coarsest.
+
+        Returns:
+          Columns and rows of the tiles, `4**level` of them.
         """
         side = 1 << level
         center = (side - 1) / 2
@@ -79,9 +99,15 @@ class Pyramid(NamedTuple):
 
 
 def pyramid(full: tuple[int, int], tile_pixels: int) -> Pyramid:
-    """Divide images of size `full` into tiles of about `tile_pixels` at most.
+    """Divide images of a size into tiles of at most about `tile_pixels`.
 
-    The finest level is `full`, or a few pixels larger where it does not divide evenly.
+    Args:
+      full: Width and height of the image in pixels.
+      tile_pixels: Number of pixels of a tile.
+
+    Returns:
+      The pyramid. Its finest level has the size `full`, or a few pixels more where that
+      does not divide evenly.
     """
     levels = 1
     while True:
@@ -93,7 +119,16 @@ def pyramid(full: tuple[int, int], tile_pixels: int) -> Pyramid:
 
 
 def tile_camera(camera: Camera, pyramid: Pyramid, cell: tuple[int, int]) -> Camera:
-    """Return the camera of one tile of the image that `camera` takes."""
+    """Return the camera of one tile of an image.
+
+    Args:
+      camera: Camera of the whole image of a level.
+      pyramid: The pyramid, which has the size of a tile.
+      cell: Column and row of the tile.
+
+    Returns:
+      The camera with its principal point shifted.
+    """
     corner = np.multiply(cell, pyramid.tile)
     shifted = np.asarray(camera.principal_point_px) - corner
     return camera._replace(principal_point_px=shifted.astype(np.float32))
@@ -102,13 +137,16 @@ def tile_camera(camera: Camera, pyramid: Pyramid, cell: tuple[int, int]) -> Came
 def next_level(
     tile_seconds: float | None, levels: int, complete: int | None, moving: bool
 ) -> int | None:
-    """Return the level of a pyramid to render next, None if there is nothing to do.
+    """Return the level of a pyramid to render next.
 
     Args:
-      tile_seconds: Seconds a tile takes, None before the first one.
+      tile_seconds: Seconds that a tile takes, None before the first one.
       levels: Number of levels.
-      complete: The finest level rendered of this very view, None before the first.
-      moving: Whether the view is changing.
+      complete: The finest level rendered of this view, None before the first.
+      moving: True while the view changes.
+
+    Returns:
+      Index of the level, None if there is nothing to do.
     """
     expected = [(tile_seconds or 0.0) * 4**level for level in range(levels)]
     if complete is None:
@@ -127,11 +165,22 @@ def as_channel(
     distance: np.ndarray | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Colored:
-    """One of the `CHANNELS` of a rendering as a picture, and what its ends stand for.
+    """Convert one channel of a rendering to an image.
 
-    `distance` [height, width] is how far what each pixel shows has moved, scene units,
-    for "motion". `limits` keep depth and motion comparable from picture to picture;
-    those of motion grow.
+    Args:
+      channel: One of `CHANNELS`.
+      rendering: The rendering.
+      distance: Displacement of the surface that each pixel shows, in scene units,
+        [height, width]. Needed for "motion".
+      limits: Values of the two ends of the color map for depth and motion, which keep
+        images comparable. None takes them from this image.
+
+    Returns:
+      The image with the values that its color map spans.
+
+    Raises:
+      ValueError: If the channel is unknown, or "motion" is requested without
+        `distance`.
     """
     if channel == "color":
         return Colored(as_picture(rendering.color), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""A model's whole-frame function, compiled, keeping what stays as it was."""
+"""Compiled whole-frame renderer of a model, with its intermediate results cached."""
 
 import time
 from collections.abc import Callable
@@ -19,11 +19,11 @@ from nerfies_jax.training.model import (
 
 
 class Renderer:
-    """A model's whole-frame function; compiled once for each shape of its state.
+    """Whole-frame renderer of a model, compiled once for each shape of its state.
 
-    Where the model is drawn in stages, what stays as it was is not computed again:
-    the first stage as long as the parameters are the very same arrays, the second for
-    all views of the same instant. A survey, too, is kept with the parameters.
+    If the model renders in stages, results are reused: those of the first stage as long
+    as the parameters are the very same arrays, and those of the second for all views of
+    the same timestamp. A survey is kept with the parameters, too.
     """
 
     def __init__(self, model: Model, size: tuple[int, int]):
@@ -37,7 +37,7 @@ class Renderer:
         self.deformed_anew: list[bool] = []  # whether its instant was a new one
 
     def __call__(self, state: TrainState, view: View | tuple) -> Rendering:
-        """One picture, of a view or of the tuple that a variant draws in its place."""
+        """Render one view, or the tuple that a variant renders in place of a view."""
         programs, inputs = self.compiled(state, view), _inputs(state, view)
         start, cpu_start = time.perf_counter(), time.process_time()
         rendering, anew = self._draw(programs, *inputs)
@@ -48,7 +48,16 @@ class Renderer:
         return rendering
 
     def compiled(self, state: TrainState, view: View | tuple) -> Any:
-        """The programs for such a state and view, compiled where they were not yet."""
+        """Return the compiled programs for a state and a view, and compile them if
+        needed.
+
+        Args:
+          state: Training state, of which parameters and step are read.
+          view: The view to render, of which only the shapes matter.
+
+        Returns:
+          The compiled stages of the model.
+        """
         inputs = _inputs(state, view)
         shapes = tuple(jax.typeof(leaf) for leaf in jax.tree.leaves(inputs))
         if shapes not in self._programs:
@@ -57,7 +66,7 @@ class Renderer:
         return self._programs[shapes]
 
     def _draw(self, programs, params, view, step):
-        """The picture, and whether what is in it had to be deformed for it."""
+        """Return the image, and whether the scene had to be deformed anew for it."""
         if isinstance(programs, Surveyed):
             known, _ = self._prepared.get(
                 params,
@@ -75,11 +84,18 @@ class Renderer:
         return programs.draw(params, deformed, view, step), anew
 
     def ms_per_frame(self, frames: int, cpu: bool = False) -> float:
-        """What one of the last `frames` frames took, on the wall or of the processor.
+        """Return the median time of the last frames in milliseconds.
 
-        The median, of frames at a new instant and of further views of the same instant
-        apart, weighted by how many there were of each: the median of both together
-        would leave out deforming altogether as soon as a second view shares them.
+        Frames at a new timestamp and further views of the same timestamp have separate
+        medians, which are weighted by their counts. One median of all would leave out
+        the deformation as soon as a second view shares it.
+
+        Args:
+          frames: Number of frames, counted from the last.
+          cpu: True for processor time, False for wall time.
+
+        Returns:
+          Milliseconds per frame.
         """
         seconds = np.asarray((self.cpu_seconds if cpu else self.seconds)[-frames:])
         anew = np.asarray(self.deformed_anew[-frames:])
@@ -91,8 +107,8 @@ class Renderer:
 class _Memo:
     """The last result of a function of parameters and a key.
 
-    It is right as long as every leaf is the very same array; the leaves are held, so
-    that no new array can be taken for an old one. NumPy arrays can be written into, so
+    It is valid as long as every leaf is the very same array. The leaves are held, so
+    that no new array can be mistaken for an old one. NumPy arrays are mutable, so
     nothing is kept for parameters that contain one.
     """
 
@@ -116,7 +132,7 @@ class _Memo:
 
 
 class _Programs(NamedTuple):
-    """The stages of a model, compiled."""
+    """Compiled stages of a model."""
 
     prepare: Callable
     deform: Callable
@@ -124,7 +140,7 @@ class _Programs(NamedTuple):
 
 
 def _float32(rendering):
-    """A picture needs no more, whatever precision it was computed in."""
+    """Convert a rendering to float32, whatever precision it was computed in."""
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), rendering)
 
 
@@ -173,5 +189,12 @@ def _all_compiled(model, *lowered):
 
 
 def as_picture(color: np.ndarray) -> np.ndarray:
-    """A rendered color as 8 bits."""
+    """Convert colors to 8 bits.
+
+    Args:
+      color: Colors in [0, 1], of any shape. Values outside are clipped.
+
+    Returns:
+      uint8 values of the same shape.
+    """
     return np.round(np.clip(color, 0, 1) * 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Floor 1: where points and cameras are."""
+"""Geometry of points, rotations, cameras and rays."""
 
 import lazy_loader
 

@@ -24,9 +24,10 @@ Real = int | float | np.number
 
 
 class Camera(NamedTuple):
-    """One camera, or a batch of them along leading axes. NumPy or JAX leaves.
+    """Pinhole camera with Brown-Conrady distortion, or a batch along leading axes.
 
-    The image size is not part of it: it is the shape of the picture asked for.
+    Leaves are NumPy or JAX arrays. The image size is not part of the camera. Functions
+    that need it take it as an argument.
     """
 
     camera_from_world: Float[Array, "*batch 3 3"]  # rotation; rows right, down, forward
@@ -83,12 +84,20 @@ class Camera(NamedTuple):
 def project(
     camera: Camera, point: Float[Array, "3"]
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """The pixel of one world point, and its z-depth in scene units.
+    """Project world points to pixels.
 
-    A depth that is not positive means that the camera cannot see the point; its pixel
-    and its derivatives are then finite, and mean nothing: beside the axis it is far
-    outside the picture, on the axis in its middle. See `projectable` for points beyond
-    the lens's own range.
+    A point beside the camera gets a pixel far outside the image, one behind it on the
+    axis the principal point. Pixel and derivatives are finite there but meaningless.
+    See `projectable` for points outside the range of the lens model.
+
+    Args:
+      camera: Cameras, [...].
+      point: World points in scene units, [..., 3].
+
+    Returns:
+      Pixel positions (x, y) [..., 2] with pixel centers at +0.5, and z-depths in scene
+      units [...]. A depth that is not positive means that the camera cannot see the
+      point.
     """
     lateral, depth = _in_camera(camera, point)
     # A maximum, not a division under `where`: the quotient that is not wanted is never
@@ -107,10 +116,17 @@ def project(
 
 @checked(broadcast=True)
 def projectable(camera: Camera, point: Float[Array, "3"]) -> Bool[Array, ""]:
-    """Whether one world point is in front and where the lens model is one-to-one.
+    """Test if world points are in front of the camera and in the range of the lens.
 
-    Beyond that a polynomial distortion folds back: a point far outside the field of
-    view would land inside the picture.
+    Outside the range where it is one-to-one, a polynomial distortion folds back, and a
+    point far outside the field of view would land inside the image.
+
+    Args:
+      camera: Cameras, [...].
+      point: World points in scene units, [..., 3].
+
+    Returns:
+      Booleans [...], True where `project` can be trusted.
     """
     lateral, depth = _in_camera(camera, point)
     in_front = depth > jnp.maximum(jnp.max(jnp.abs(lateral)) / MAX_SLOPE, MIN_DEPTH)
@@ -122,10 +138,19 @@ def projectable(camera: Camera, point: Float[Array, "3"]) -> Bool[Array, ""]:
 def unproject(
     camera: Camera, pixel: Float[Array, "2"]
 ) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
-    """The unit world direction that one pixel looks along, and whether it exists.
+    """Compute the world direction in which pixels look.
 
-    Where the lens model has no one-to-one solution the flag is False, and the direction
-    is finite, has zero gradient with respect to the pixel, and means nothing.
+    Args:
+      camera: Cameras, [...], in float32 or float64.
+      pixel: Pixel positions (x, y) with centers at +0.5, [..., 2].
+
+    Returns:
+      Unit directions in the world [..., 3], and booleans [...] that are False where the
+      lens model has no one-to-one solution. The direction is then finite with zero
+      gradient with respect to the pixel, but meaningless.
+
+    Raises:
+      ValueError: If the camera or the pixel is bfloat16 or float16.
     """
     refuse_half("the camera or the pixel", camera.position, pixel)
     offset = pixel - camera.principal_point_px
@@ -140,12 +165,26 @@ def unproject(
 
 
 def forward_axis(camera: Camera) -> Float[Array, "*batch 3"]:
-    """The unit viewing axis in the world; z-depth is measured along it."""
+    """Return the viewing axis, along which z-depth is measured.
+
+    Args:
+      camera: Cameras, [...].
+
+    Returns:
+      Unit vectors in the world, [..., 3].
+    """
     return jnp.asarray(camera.camera_from_world)[..., 2, :]
 
 
 def camera_matrix(camera: Camera) -> Float[Array, "*batch 3 3"]:
-    """K of `pixel ~ K @ point_in_camera`; it does not contain the distortion."""
+    """Return the intrinsic matrix, without the distortion.
+
+    Args:
+      camera: Cameras, [...].
+
+    Returns:
+      K [..., 3, 3] in pixels, with `pixel ~ K @ point_in_camera`.
+    """
     zero, one = jnp.zeros_like(camera.focal_px), jnp.ones_like(camera.focal_px)
     center = camera.principal_point_px
     rows = [
@@ -157,7 +196,15 @@ def camera_matrix(camera: Camera) -> Float[Array, "*batch 3 3"]:
 
 
 def world_from_camera(camera: Camera) -> Float[Array, "*batch 4 4"]:
-    """The pose as a 4×4 matrix; its last column is the camera's position."""
+    """Return the camera-to-world transform.
+
+    Args:
+      camera: Cameras, [...].
+
+    Returns:
+      Homogeneous matrices [..., 4, 4]. The last column is the camera's position in
+      scene units.
+    """
     rotation = jnp.swapaxes(camera.camera_from_world, -1, -2)
     upper = jnp.concatenate([rotation, camera.position[..., None]], axis=-1)
     last = jnp.zeros_like(upper[..., :1, :]).at[..., 0, 3].set(1)
@@ -167,9 +214,16 @@ def world_from_camera(camera: Camera) -> Float[Array, "*batch 4 4"]:
 def move(
     camera: Camera, angular: Float[Array, "3"], linear: Float[Array, "3"]
 ) -> Camera:
-    """One camera with exp(angular, linear) applied on the left of camera_from_world.
+    """Apply a rigid motion on the left of `camera_from_world`.
 
-    A screw in the camera's own frame: `angular` in rad, `linear` in scene units.
+    Args:
+      camera: One camera.
+      angular: Rotation vector in radians in the camera's own frame, [3].
+      linear: Linear part of the twist in scene units in the same frame, [3]. See
+        `se3.exp`.
+
+    Returns:
+      The camera with rotation and position changed.
     """
     rotation, shift = lie.exp_se3(angular, linear)
     turned = exact_product(rotation, camera.camera_from_world)
@@ -181,7 +235,19 @@ def move(
 def resize(
     camera: Camera, old_size: tuple[int, int], new_size: tuple[int, int]
 ) -> Camera:
-    """The same camera for its picture resampled from one (width, height) to another."""
+    """Adapt cameras to an image resampled to another size.
+
+    Args:
+      camera: Cameras of the original image.
+      old_size: Width and height of the original image in pixels.
+      new_size: Width and height of the resampled image in pixels.
+
+    Returns:
+      Cameras of the resampled image.
+
+    Raises:
+      ValueError: If a size is below 1x1 pixels.
+    """
     for name, size in (("old_size", old_size), ("new_size", new_size)):
         if min(size) < 1:
             raise ValueError(
@@ -198,7 +264,16 @@ def resize(
 
 
 def crop(camera: Camera, left_px: Real, top_px: Real) -> Camera:
-    """The same camera for its picture with columns and rows cut off left and top."""
+    """Adapt cameras to an image with columns and rows removed at the left and top.
+
+    Args:
+      camera: Cameras of the original image.
+      left_px: Number of columns removed on the left.
+      top_px: Number of rows removed at the top.
+
+    Returns:
+      Cameras of the cropped image.
+    """
     corner = np.asarray([left_px, top_px], dtype=camera.principal_point_px.dtype)
     return camera._replace(principal_point_px=camera.principal_point_px - corner)
 
@@ -210,7 +285,18 @@ def pinhole(
     size: tuple[int, int],
     dtype: Any = np.float32,
 ) -> Camera:
-    """A camera without skew or distortion, centered on its picture. NumPy leaves."""
+    """Create a camera without skew or distortion, centered on its image.
+
+    Args:
+      camera_from_world: Rotation matrix [3, 3] with rows right, down, forward.
+      position: Camera center in world scene units, [3].
+      focal_px: Focal length in pixels.
+      size: Width and height of the image in pixels.
+      dtype: Floating-point type of the result.
+
+    Returns:
+      A camera with NumPy leaves.
+    """
     return Camera(
         camera_from_world=np.asarray(camera_from_world, dtype),
         position=np.asarray(position, dtype),
@@ -231,7 +317,23 @@ def look_at(
     size: tuple[int, int],
     dtype: Any = np.float32,
 ) -> Camera:
-    """A pinhole at `position` that looks at `target`; `up` points up in the picture."""
+    """Create a pinhole camera that looks at a target.
+
+    Args:
+      position: Camera center in world scene units, [3].
+      target: World point on the optical axis, [3].
+      up: World direction that points up in the image, [3]. Its length does not matter.
+      focal_px: Focal length in pixels.
+      size: Width and height of the image in pixels.
+      dtype: Floating-point type of the result.
+
+    Returns:
+      A camera with NumPy leaves.
+
+    Raises:
+      ValueError: If position and target coincide, or `up` is parallel to the viewing
+        direction.
+    """
     position, target, up = (np.asarray(x, np.float64) for x in (position, target, up))
     forward = target - position
     distance = np.linalg.norm(forward)
@@ -251,19 +353,41 @@ def look_at(
 
 
 def stack(cameras: Sequence[Camera]) -> Camera:
-    """Several cameras as one batch. NumPy leaves."""
+    """Stack cameras into one batch.
+
+    Args:
+      cameras: Cameras of equal shape and type.
+
+    Returns:
+      A camera with NumPy leaves and a new leading axis.
+    """
     return jax.tree.map(lambda *leaves: np.stack(leaves), *cameras)
 
 
 def take(cameras: Camera, rows: Any) -> Camera:
-    """Rows of a batch: one index for one camera, several for a batch of them."""
+    """Select cameras of a batch.
+
+    Args:
+      cameras: A batch of cameras.
+      rows: Index along the first axis, or several for a batch.
+
+    Returns:
+      The selected camera or batch.
+    """
     return jax.tree.map(lambda leaf: leaf[rows], cameras)
 
 
 def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> None:
-    """Raise ValueError, with `name`, value and remedy, for what cannot be used.
+    """Refuse cameras that cannot be used. Runs on the host, where cameras are read.
 
-    On the host, where cameras are read; `size` is (width, height) of the picture.
+    Args:
+      camera: A camera or a batch, with NumPy leaves.
+      size: Width and height of the image in pixels.
+      name: Name of the camera in the error message.
+
+    Raises:
+      ValueError: If a shape is wrong, a value is not finite, the orientation is not a
+        rotation, or the intrinsics cannot belong to an image of `size`.
     """
     shapes = Camera((3, 3), (3,), (), (2,), (), (), (3,), (2,))
     for field, leaf, shape in zip(Camera._fields, camera, shapes, strict=True):
@@ -321,6 +445,6 @@ def _in_camera(camera: Camera, point: Float[Array, "3"]):
 
 
 def _row(bad: np.ndarray | np.bool_, inner: int) -> str:
-    """Where in a batch the first bad entry lies; empty for a single camera."""
+    """Describe where in a batch the first bad entry lies. Empty for a single camera."""
     rows = bad.reshape(*bad.shape[: bad.ndim - inner], -1).any(axis=-1)
     return f" (row {int(np.flatnonzero(rows)[0])})" if rows.ndim else ""

@@ -47,7 +47,19 @@ _TO_BERNSTEIN = _to_bernstein()
 def distort(
     radial: Float[Array, "3"], tangential: Float[Array, "2"], slopes: Float[Array, "2"]
 ) -> Float[Array, "2"]:
-    """Where the lens moves one point of the image plane (Brown 1971)."""
+    """Apply lens distortion to one point of the image plane.
+
+    Args:
+      radial: Coefficients k1, k2, k3, [3].
+      tangential: Coefficients p1, p2, [2].
+      slopes: Undistorted image-plane position (X/Z, Y/Z), [2].
+
+    Returns:
+      The distorted position in the image plane, [2].
+
+    References:
+      Brown 1971, in the parameterization of OpenCV.
+    """
     x, y = slopes[0], slopes[1]
     radius_sq = x * x + y * y
     k1, k2, k3 = radial[0], radial[1], radial[2]
@@ -64,12 +76,24 @@ def distort(
 def undistort(
     radial: Float[Array, "3"], tangential: Float[Array, "2"], bent: Float[Array, "2"]
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
-    """The slopes that `distort` sends to `bent`, and whether there are any.
+    """Invert `distort` for one point of the image plane.
 
-    The solution is sought on the branch that contains the optical axis. Beyond the
-    branch's edge there is none, and other roots (where Newton from the distorted point
-    happily lands) belong to no ray of light. Derivatives are those of the implicit
-    function, to any order; zero where there is no solution.
+    The solution is sought on the branch that contains the optical axis. Beyond the edge
+    of that branch there is none. Other roots, where Newton's method from the distorted
+    point often lands, belong to no ray of light. Derivatives of any order are those of
+    the implicit function, and zero where there is no solution.
+
+    Args:
+      radial: Coefficients k1, k2, k3, [3].
+      tangential: Coefficients p1, p2, [2].
+      bent: Distorted position in the image plane, [2], in float32 or float64.
+
+    Returns:
+      The undistorted position (X/Z, Y/Z) [2], and a boolean that is False if no
+      solution was found.
+
+    Raises:
+      ValueError: If an argument is bfloat16 or float16.
     """
     refuse_half("the distorted point or the lens", bent, radial)
     slopes = _undistorted(radial, tangential, bent)
@@ -79,11 +103,19 @@ def undistort(
 def one_to_one(
     radial: Float[Array, "3"], tangential: Float[Array, "2"], slopes: Float[Array, "2"]
 ) -> Bool[Array, ""]:
-    """Whether the lens has not folded anywhere between the axis and `slopes`.
+    """Test if the lens has not folded anywhere between the axis and a point.
 
-    Exact for the radial terms. With tangential ones the determinant of the Jacobian
-    must be positive all the way, as far as its Bernstein coefficients on `PIECES` parts
-    of the way can tell; where they cannot, the answer is False.
+    The test is exact for the radial terms. With tangential terms the determinant of the
+    Jacobian must be positive all the way, as far as its Bernstein coefficients on
+    `PIECES` parts of the way can tell. Where they cannot, the result is False.
+
+    Args:
+      radial: Coefficients k1, k2, k3, [3].
+      tangential: Coefficients p1, p2, [2].
+      slopes: Undistorted image-plane position (X/Z, Y/Z), [2].
+
+    Returns:
+      A boolean scalar.
     """
     at_end = _determinant(_jacobian(radial, tangential, slopes)) > MIN_DETERMINANT
     on_the_way = jnp.all(tangential == 0) | (
@@ -154,7 +186,7 @@ def _undistorted_jvp(primals, tangents):
 
 
 def _solves(radial, tangential, bent, slopes):
-    """Whether `slopes` is the wanted root. False for NaN, as comparisons are."""
+    """Test if `slopes` is the wanted root. False for NaN, as comparisons are."""
     residual = jnp.max(jnp.abs(distort(radial, tangential, slopes) - bent))
     bound = RESIDUAL_ULPS * jnp.finfo(bent.dtype).eps * (1 + jnp.max(jnp.abs(bent)))
     return (residual <= bound) & one_to_one(radial, tangential, slopes)
@@ -207,7 +239,8 @@ def _radial_slope(radial, radius_sq):
 
 
 def _unfolded(radial, radius_sq):
-    """Whether the radial slope is positive from 0 to `radius_sq`, without sampling.
+    """Test if the radial derivative is positive from 0 to `radius_sq`, without
+    sampling.
 
     A cubic's least value lies at an end or where its derivative 3k1 + 10k2 s + 21k3 s²
     vanishes.
@@ -233,7 +266,7 @@ def _determinant(matrix):
 
 
 def _solve(matrix, right):
-    """matrix⁻¹ right for 2×2; zero where the plane is folded or squeezed flat."""
+    """Return matrix⁻¹ right for 2×2, or zero where the plane is folded or collapsed."""
     determinant = _determinant(matrix)
     regular = determinant > MIN_DETERMINANT
     x = matrix[1, 1] * right[0] - matrix[0, 1] * right[1]

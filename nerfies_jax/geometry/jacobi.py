@@ -1,6 +1,6 @@
-"""Jacobi's decompositions of one 3×3 matrix, in columns of scalars.
+"""Jacobi decompositions of a 3×3 matrix, in columns of scalars.
 
-A column is a tuple of three scalars, so that all of it fuses under `vmap`.
+A column is a tuple of three scalars, so that all operations fuse under `vmap`.
 """
 
 import functools
@@ -16,10 +16,21 @@ _SWEEPS = {"float32": 4, "float64": 5}  # quadratic convergence; 3 and 4 nearly 
 
 @jax.custom_jvp
 def svd(matrix):
-    """One-sided Jacobi (Hestenes 1958), in columns of scalars.
+    """Compute the singular value decomposition by one-sided Jacobi rotations.
 
-    It turns columns until they are orthogonal and never forms MᵀM, whose condition is
-    squared: σ = 1e-3 keeps 3e-5 of itself in float32 where JᵀJ leaves a fifth.
+    It rotates columns until they are orthogonal and never forms MᵀM, whose condition
+    number is squared. A singular value of 1e-3 keeps a relative error of 3e-5 in
+    float32, where the way through JᵀJ leaves a fifth.
+
+    Args:
+      matrix: A matrix M, [3, 3].
+
+    Returns:
+      Columns of U, the three singular values and columns of V, with M = U diag(σ) Vᵀ. U
+      and V are rotations, so the smallest value carries the sign of the determinant.
+
+    References:
+      Hestenes 1958.
     """
     entries, scale = near_one(matrix)  # squares of squares stay in range
     columns = [tuple(entries[row, k] for row in range(3)) for k in range(3)]
@@ -92,7 +103,14 @@ def _complete(columns):
 
 
 def eigen(matrix):
-    """Eigenvalues and columns of eigenvectors of a symmetric matrix, by Jacobi."""
+    """Compute the eigenvalue decomposition of a symmetric matrix by Jacobi rotations.
+
+    Args:
+      matrix: A symmetric matrix, [3, 3].
+
+    Returns:
+      The three eigenvalues, in no particular order, and the eigenvectors as columns.
+    """
     a = [[matrix[i, j] for j in range(3)] for i in range(3)]
     one, zero = jnp.ones_like(a[0][0]), jnp.zeros_like(a[0][0])
     basis = [tuple(one if row == k else zero for row in range(3)) for k in range(3)]
@@ -146,10 +164,28 @@ def _unit(vector, otherwise):
 
 
 def dot(a, b):
+    """Return the inner product of two vectors.
+
+    Args:
+      a: Sequence of three scalars or arrays.
+      b: Sequence of three scalars or arrays.
+
+    Returns:
+      a · b.
+    """
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a, b):
+    """Return the cross product of two vectors.
+
+    Args:
+      a: Sequence of three scalars or arrays.
+      b: Sequence of three scalars or arrays.
+
+    Returns:
+      a × b as a tuple of three.
+    """
     return (
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],

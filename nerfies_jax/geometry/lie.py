@@ -1,11 +1,12 @@
-"""Rotations and screws of one point: exponentials, logarithms, Jacobians.
+"""Exponentials, logarithms and Jacobians of rotations and twists, for one point.
 
-A screw is `angular` (axis × angle, rad) and `linear` (scene units): the twist (w, v) of
+A twist is `angular` (axis × angle, rad) and `linear` (scene units), the (w, v) of
 Nerfies (Park et al. 2021, arXiv:2011.12948, equations 9 and 11). `linear` is not the
-translation; that is `left_jacobian(angular) @ linear`. Coefficients are Stumpff
+translation, which is `left_jacobian(angular) @ linear`. Coefficients are Stumpff
 functions of |w|², smooth at 0, so a zero-initialized head is no special case.
-A turn is as exact as |w|: to 6e-8 |w| rad in float32, which is 6e-4 at 1e4 rad. Angles
-above 1e19 rad overflow float32.
+
+The error of a rotation is that of its angle: 6e-8 |w| rad in float32, which is 6e-4 at
+1e4 rad. Angles above 1e19 rad overflow float32.
 """
 
 import jax
@@ -25,9 +26,17 @@ Matrix = Float[Array, "3 3"]
 @checked(broadcast=True)
 @at_least_float32
 def transform_point(angular: Vector, linear: Vector, point: Vector) -> Vector:
-    """One point moved along a screw: R x + G v, without any matrix.
+    """Move one point by the exponential of a twist, without forming a matrix.
 
-    Written w × (...) throughout. Formed as (1 + G W) x it would lose θ ulps.
+    It is written as w × (...) throughout. Formed as (1 + G W) x it would lose θ ulps.
+
+    Args:
+      angular: Rotation vector w in radians, [3].
+      linear: Linear part v in scene units, [3].
+      point: Point x in scene units, [3].
+
+    Returns:
+      R x + G v, [3].
     """
     return point + displacement(angular, linear, point)
 
@@ -35,10 +44,18 @@ def transform_point(angular: Vector, linear: Vector, point: Vector) -> Vector:
 @checked(broadcast=True)
 @at_least_float32
 def displacement(angular: Vector, linear: Vector, point: Vector) -> Vector:
-    """How far `transform_point` moves the point: (R - 1) x + G v, uncancelled.
+    """Compute how far `transform_point` moves a point, without cancellation.
 
-    Its Jacobian keeps strains that adding the identity would round away; see
+    Its Jacobian keeps strains that adding the identity would round away. See
     `matrix3.displacement_log_energy`.
+
+    Args:
+      angular: Rotation vector w in radians, [3].
+      linear: Linear part v in scene units, [3].
+      point: Point x in scene units, [3].
+
+    Returns:
+      (R - 1) x + G v, [3].
     """
     angle_sq = jnp.sum(angular**2)
     c1, c2, c3 = (stumpff(k, angle_sq) for k in (1, 2, 3))
@@ -49,7 +66,15 @@ def displacement(angular: Vector, linear: Vector, point: Vector) -> Vector:
 @checked(broadcast=True)
 @at_least_float32
 def rotate_point(angular: Vector, point: Vector) -> Vector:
-    """One point turned about the origin."""
+    """Rotate one point about the origin.
+
+    Args:
+      angular: Rotation vector in radians, [3].
+      point: Point, [3].
+
+    Returns:
+      The rotated point, [3].
+    """
     angle_sq = jnp.sum(angular**2)
     inner = stumpff(1, angle_sq) * point
     return point + _cross(
@@ -60,7 +85,14 @@ def rotate_point(angular: Vector, point: Vector) -> Vector:
 @checked(broadcast=True)
 @at_least_float32
 def exp_so3(angular: Vector) -> Matrix:
-    """The rotation matrix of axis × angle (Rodrigues)."""
+    """Compute the rotation matrix of a rotation vector (Rodrigues' formula).
+
+    Args:
+      angular: Rotation vector in radians, [3].
+
+    Returns:
+      The rotation matrix, [3, 3].
+    """
     basis = jnp.eye(3, dtype=angular.dtype)
     return jax.vmap(rotate_point, (None, 0), out_axes=1)(angular, basis)
 
@@ -68,10 +100,16 @@ def exp_so3(angular: Vector) -> Matrix:
 @checked(broadcast=True)
 @at_least_float32
 def log_so3(rotation: Matrix) -> Vector:
-    """Axis × angle of a rotation matrix, at most π rad.
+    """Compute the rotation vector of a rotation matrix.
 
-    Through the quaternion with the largest pivot: arccos of the trace is NaN for turns
-    below 1e-4 rad in float32 and 0.1 rad off at π - 1e-3.
+    It goes through the quaternion with the largest pivot. The arccosine of the trace is
+    NaN for rotations below 1e-4 rad in float32 and 0.1 rad off at π - 1e-3.
+
+    Args:
+      rotation: Rotation matrix, [3, 3].
+
+    Returns:
+      Axis × angle [3], with an angle of at most π rad.
     """
     return quaternion.log(quaternion.from_matrix(rotation))
 
@@ -79,14 +117,30 @@ def log_so3(rotation: Matrix) -> Vector:
 @checked(broadcast=True)
 @at_least_float32
 def exp_se3(angular: Vector, linear: Vector) -> tuple[Matrix, Vector]:
-    """Rotation matrix and translation of a screw."""
+    """Compute the rigid transform of a twist.
+
+    Args:
+      angular: Rotation vector in radians, [3].
+      linear: Linear part in scene units, [3].
+
+    Returns:
+      Rotation matrix [3, 3] and translation in scene units [3].
+    """
     return exp_so3(angular), exact_product(left_jacobian(angular), linear)
 
 
 @checked(broadcast=True)
 @at_least_float32
 def log_se3(rotation: Matrix, translation: Vector) -> tuple[Vector, Vector]:
-    """The screw of a rigid motion: the inverse of `exp_se3` for turns below π."""
+    """Compute the twist of a rigid transform. Inverts `exp_se3` for angles below π.
+
+    Args:
+      rotation: Rotation matrix, [3, 3].
+      translation: Translation in scene units, [3].
+
+    Returns:
+      The angular part [3] in radians and the linear part [3] in scene units.
+    """
     angular = log_so3(rotation)
     return angular, exact_product(inverse_left_jacobian(angular), translation)
 
@@ -94,7 +148,14 @@ def log_se3(rotation: Matrix, translation: Vector) -> tuple[Vector, Vector]:
 @checked(broadcast=True)
 @at_least_float32
 def left_jacobian(angular: Vector) -> Matrix:
-    """∫₀¹ exp(τ [w]) dτ: how `exp_so3(w)` turns as w moves, in the fixed frame."""
+    """Compute the left Jacobian of `exp_so3`, ∫₀¹ exp(τ [w]) dτ.
+
+    Args:
+      angular: Rotation vector w in radians, [3].
+
+    Returns:
+      J [3, 3] with exp(w + d) = exp(J d) exp(w) to first order in d.
+    """
     angle_sq = jnp.sum(angular**2)
     return _polynomial(angular, stumpff(2, angle_sq), stumpff(3, angle_sq))
 
@@ -102,7 +163,15 @@ def left_jacobian(angular: Vector) -> Matrix:
 @checked(broadcast=True)
 @at_least_float32
 def inverse_left_jacobian(angular: Vector) -> Matrix:
-    """The inverse, for turns below 2π, where it is singular."""
+    """Compute the inverse of `left_jacobian`.
+
+    Args:
+      angular: Rotation vector in radians, [3], below 2π, where the Jacobian is
+        singular.
+
+    Returns:
+      The inverse matrix, [3, 3].
+    """
     angle_sq = jnp.sum(angular**2)
     # (1 - θ/2 cot(θ/2)) / θ², which cancels; as a quotient of sums it does not.
     c2, c3, c4 = (stumpff(k, angle_sq) for k in (2, 3, 4))
@@ -112,10 +181,20 @@ def inverse_left_jacobian(angular: Vector) -> Matrix:
 @checked(broadcast=True)
 @at_least_float32
 def left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
-    """The same for screws, ordered (angular, linear): [[J, 0], [Q, J]].
+    """Compute the left Jacobian of `exp_se3`, with components ordered (angular,
+    linear).
 
-    Barfoot and Furgale 2014, "Associating uncertainty with three-dimensional poses for
-    use in estimation problems", equation 102; their coefficients in Stumpff functions.
+    Args:
+      angular: Rotation vector in radians, [3].
+      linear: Linear part in scene units, [3].
+
+    Returns:
+      The block matrix [[J, 0], [Q, J]], [6, 6].
+
+    References:
+      Barfoot and Furgale 2014, "Associating uncertainty with three-dimensional poses
+      for use in estimation problems", equation 102, with their coefficients written as
+      Stumpff functions.
     """
     jacobian, coupling = left_jacobian(angular), _coupling(angular, linear)
     return jnp.block([[jacobian, jnp.zeros_like(jacobian)], [coupling, jacobian]])
@@ -123,7 +202,14 @@ def left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
 
 @checked(broadcast=True)
 def hat(vector: Vector) -> Matrix:
-    """[w], with [w] x = w × x."""
+    """Compute the skew-symmetric matrix of a vector.
+
+    Args:
+      vector: Vector w, [3].
+
+    Returns:
+      The matrix [w] with [w] x = w × x, [3, 3].
+    """
     x, y, z = vector
     zero = jnp.zeros_like(x)
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)

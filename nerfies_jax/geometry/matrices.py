@@ -1,4 +1,4 @@
-"""Camera parameters from intrinsic and pose matrices; on the host, in float64."""
+"""Camera parameters from intrinsic and pose matrices, on the host in float64."""
 
 from typing import Any
 

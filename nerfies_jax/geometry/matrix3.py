@@ -1,10 +1,11 @@
-"""Spectral functions of one 3×3 matrix, with derivatives that exist everywhere.
+"""Spectral functions of a 3×3 matrix, with derivatives that exist everywhere.
 
 Σ log²σ of a warp's Jacobian is the elastic energy of Nerfies (Park et al. 2021,
-arXiv:2011.12948, section 3.3). Everything is written in scalars, so that a `vmap`
-runs over long rows: on a CPU 20 times as fast as LAPACK's batched SVD, with its
-gradient 10 times. Sweeps are a loop: unrolled, energies with slopes took 1.3 times as
-long, 1.4 to compile. A value and its derivatives come from one decomposition.
+arXiv:2011.12948, section 3.3). Everything is written in scalars, so that a `vmap` runs
+over long rows. On a CPU this is 20 times as fast as LAPACK's batched SVD, and 10 times
+with its gradient. Sweeps are a loop. Unrolled, energies with gradients took 1.3 times
+as long to run and 1.4 times as long to compile. A value and its derivatives come from
+one decomposition.
 """
 
 import functools
@@ -24,8 +25,8 @@ Matrix = Float[Array, "3 3"]
 Scalar = Float[Array, ""]
 
 # Below this stretch the logarithm continues as its tangent: a collapsed or folded
-# direction has finite energy and a slope that opens it again. A clamp, log max(σ, ε),
-# has slope zero there, and nothing ever un-collapses.
+# direction has finite energy and a gradient that opens it again. A clamp,
+# log max(σ, ε), has gradient zero there, and nothing ever un-collapses.
 COLLAPSED = 1e-2
 # The unsigned energy has a cone at σ = 0, whose curvature 1/σ no optimizer can use.
 CONE = 1e-6
@@ -37,9 +38,20 @@ SMALL_DISPLACEMENT = 0.1
 @checked(broadcast=True)
 @at_least_float32
 def log_energy(matrix: Matrix) -> Scalar:
-    """Σ log²σ over the singular values: zero for rotations and for reflections.
+    """Compute Σ log²σ over the singular values of matrices.
 
-    Twice differentiable, also at equal singular values (Daleckii and Krein 1965).
+    It is zero for rotations and for reflections, and twice differentiable, also at
+    equal singular values.
+
+    Args:
+      matrix: Matrices, [..., 3, 3].
+
+    Returns:
+      Non-negative energies, [...].
+
+    References:
+      Park et al. 2021 (Nerfies), arXiv:2011.12948, section 3.3. Derivatives by Daleckii
+      and Krein 1965.
     """
     return _energy(False, matrix)
 
@@ -47,9 +59,16 @@ def log_energy(matrix: Matrix) -> Scalar:
 @checked(broadcast=True)
 @at_least_float32
 def signed_log_energy(matrix: Matrix) -> Scalar:
-    """The same, but the smallest singular value carries the sign of the determinant.
+    """Compute Σ log²σ with the determinant's sign on the smallest singular value.
 
-    A fold then costs more than a collapse and slides back through it.
+    A fold then costs more than a collapse, and gradient descent undoes it by moving
+    back through the collapse.
+
+    Args:
+      matrix: Matrices, [..., 3, 3].
+
+    Returns:
+      Non-negative energies, [...].
     """
     return _energy(True, matrix)
 
@@ -59,10 +78,18 @@ def signed_log_energy(matrix: Matrix) -> Scalar:
 def displacement_log_energy(
     displacement: Matrix, otherwise: Callable[[Matrix], Scalar] = log_energy
 ) -> Scalar:
-    """`log_energy` of 1 + `displacement`, exact for strains far below an ulp of one.
+    """Compute `log_energy` of 1 + D, exact for strains far below one ulp of one.
 
-    Take the Jacobian of the *displacement* field: of `warp(x) - x` it would have been
-    rounded already. Above `SMALL_DISPLACEMENT` the energy is `otherwise(1 + D)`.
+    Pass the Jacobian of the *displacement* field. The Jacobian of `warp(x) - x` would
+    already be rounded.
+
+    Args:
+      displacement: Jacobians D of the displacement, [..., 3, 3].
+      otherwise: Energy of 1 + D, used if |D| (Frobenius) is at least
+        `SMALL_DISPLACEMENT`.
+
+    Returns:
+      Non-negative energies, [...].
     """
     near = jnp.sum(displacement**2) < SMALL_DISPLACEMENT**2
     small = jnp.where(near, displacement, 0)
@@ -82,7 +109,16 @@ def _strain(displacement):
 @checked(broadcast=True)
 @at_least_float32
 def singular_values(matrix: Matrix) -> Float[Array, "3"]:
-    """In descending order, not negative. Once differentiable, also where equal."""
+    """Compute singular values in descending order.
+
+    They are once differentiable, also where they are equal.
+
+    Args:
+      matrix: Matrices, [..., 3, 3].
+
+    Returns:
+      Non-negative singular values, [..., 3].
+    """
     return _singular_values(matrix)
 
 
@@ -101,9 +137,14 @@ def _singular_values_jvp(primals, tangents):
 @checked(broadcast=True)
 @at_least_float32
 def svd(matrix: Matrix) -> tuple[Matrix, Float[Array, "3"], Matrix]:
-    """U, σ, V with M = U diag(σ) Vᵀ, both of them rotations; not differentiable.
+    """Compute the singular value decomposition with rotations. Not differentiable.
 
-    σ1 >= σ2 >= |σ3|, and σ3 has the sign of the determinant.
+    Args:
+      matrix: Matrices M, [..., 3, 3].
+
+    Returns:
+      U [..., 3, 3], σ [..., 3] and V [..., 3, 3] with M = U diag(σ) Vᵀ. U and V are
+      rotations, σ1 >= σ2 >= |σ3|, and σ3 has the sign of the determinant.
     """
     left, values, right = jacobi.svd(matrix)
     return _matrix(left), jnp.stack(values), _matrix(right)
@@ -202,10 +243,10 @@ def _log_sq_slope(stretch):
 
 
 def _slope_difference(one, other):
-    """Divided difference of `_log_sq_slope`; its derivative where the two are equal.
+    """Divided difference of `_log_sq_slope`, or its derivative where the two are equal.
 
-    Split at `COLLAPSED`: the shares of the way from one to the other that lie above and
-    below, on either side of which it is known without cancellation.
+    The interval is split at `COLLAPSED`. The shares of it above and below are computed
+    without cancellation, and so is the difference on either side.
     """
     high, low = jnp.maximum(one, COLLAPSED), jnp.maximum(other, COLLAPSED)
     gap = one - other
@@ -236,7 +277,7 @@ def _log_quotient_difference(excess, log_less, product):
 
 
 def _oriented(signed, matrix):
-    """U, σ, V; without sign, a negative σ3 goes into U, which then is a reflection."""
+    """U, σ, V. Unsigned, a negative σ3 goes into U, which then is a reflection."""
     left, values, right = jacobi.svd(matrix)
     if signed:
         return left, values, right

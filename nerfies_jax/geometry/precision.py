@@ -1,12 +1,13 @@
-"""Geometry of numbers with fewer than float32's 24 bits.
+"""Precision rules of geometry: half-precision inputs and matrix products.
 
-What moves a point or measures a strain is computed in float32 and rounded once at the
-end: in bfloat16 arithmetic a screw is 3e-2 off. Cameras are refused, for there the
-inputs themselves are too coarse.
+Functions that move a point or measure a strain compute in float32 and round once at the
+end. In bfloat16 arithmetic a twist is 3e-2 off. Half-precision cameras are refused,
+because the inputs themselves are too coarse.
 
-Matrix products of float32 round their factors to 8 bits by a TPU's default, to 11 by a
-GPU's, and on a CPU to what JAX's switch says where XLA takes it. Networks may; what
-places, moves, orders or measures goes through `exact_product` and `exact_einsum`.
+By default a TPU rounds the factors of float32 matrix products to 8 bits and a GPU to
+11. On a CPU, where XLA supports it, JAX's configuration decides. Networks may use the
+default. Code that places, moves, sorts or measures goes through `exact_product` and
+`exact_einsum`.
 """
 
 import functools
@@ -26,20 +27,42 @@ _HALVES = (jnp.dtype(jnp.bfloat16), jnp.dtype(jnp.float16))
 def exact_product(
     left: Num[Array, "..."], right: Num[Array, "..."]
 ) -> Num[Array, "..."]:
-    """`jnp.matmul` with all digits of its factors, whatever the default of products."""
+    """Multiply matrices at full precision, whatever JAX's default precision is.
+
+    Args:
+      left: First factor, as for `jnp.matmul`.
+      right: Second factor.
+
+    Returns:
+      `left @ right`.
+    """
     return jnp.matmul(left, right, precision=lax.Precision.HIGHEST)
 
 
 def exact_einsum(formula: str, *factors: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`jnp.einsum` with all digits of its factors, whatever the default of products."""
+    """Evaluate `jnp.einsum` at full precision, whatever JAX's default precision is.
+
+    Args:
+      formula: Subscripts, as for `jnp.einsum`.
+      *factors: Arrays.
+
+    Returns:
+      The sum of products.
+    """
     return jnp.einsum(formula, *factors, precision=lax.Precision.HIGHEST)
 
 
 def at_least_float32(function: F) -> F:
-    """`function`, computed in float32 where array arguments are bfloat16 or float16.
+    """Compute a function in float32 if any array argument is bfloat16 or float16.
 
-    Results are rounded to the arguments' type where all have the same, and are float32
-    otherwise. Derivatives follow: float32 inside, rounded once.
+    Derivatives follow: float32 inside, rounded once.
+
+    Args:
+      function: A function of arrays.
+
+    Returns:
+      The wrapped function. Its results are rounded to the type of the arguments if all
+      have the same type, and are float32 otherwise.
     """
 
     @functools.wraps(function)
@@ -58,11 +81,18 @@ def at_least_float32(function: F) -> F:
 
 
 def widened(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """At least float32: what is narrower counts pixels wrongly and loses variances.
+    """Convert half-precision values to float32.
 
-    A masked mean over 200x180 pixels in bfloat16 reads 0.064 for 0.039, because a count
-    stops at 256, SSIM of equal images -0.68; from 65504 pixels on float16 counts to
-    infinity, which a PSNR takes for no error. Slopes come back in the caller's type.
+    Narrower types miscount pixels and lose variances. A masked mean over 200x180 pixels
+    in bfloat16 gives 0.064 instead of 0.039, because a count stops at 256, and SSIM of
+    equal images gives -0.68. In float16 a count of 65504 pixels or more is infinite,
+    which makes an error zero. Gradients come back in the caller's type.
+
+    Args:
+      values: Array of any floating-point type.
+
+    Returns:
+      The values in float32, or unchanged if they are float32 or float64.
     """
     return values.astype(jnp.float32) if values.dtype in _HALVES else values
 
@@ -70,12 +100,19 @@ def widened(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def near_one(
     values: Float[Array, "*shape"], axis: int | None = None
 ) -> tuple[Float[Array, "*shape"], Float[Array, "..."]]:
-    """`values` over the power of two next to their largest size, and that power.
+    """Divide values by the power of two next to their largest magnitude.
 
-    The largest comes out between 2/3 and 4, so that sums of squares stay in range, and
-    no digit changes. Shares and directions do not depend on the scale: it carries no
-    derivative. What XLA flushes to zero (below 1.2e-38 in float32) stays zero; the axis
-    is kept, with length one.
+    The largest magnitude then lies between 2/3 and 4, so that sums of squares stay in
+    range, and no digit changes. Use it where the result does not depend on the scale,
+    such as directions and ratios, because the scale carries no derivative. Values that
+    XLA flushes to zero (below 1.2e-38 in float32) stay zero.
+
+    Args:
+      values: Array of any shape.
+      axis: Axis along which the largest is taken. None takes all of them together.
+
+    Returns:
+      The scaled values, and the scale. The axis is kept with length one.
     """
     largest = jnp.max(jnp.abs(values), axis=axis, keepdims=axis is not None)
     scale = power_of_two(lax.stop_gradient(largest))
@@ -83,10 +120,17 @@ def near_one(
 
 
 def power_of_two(size: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """The power of two next to `size`, of those whose reciprocals are normal numbers.
+    """Return the power of two next to a value, clamped so that its reciprocal is
+    normal.
 
-    XLA:CPU divides by x as it multiplies with 1 / x, and flushes that to zero from
-    8.5e37 in float32 on. NaN stays.
+    XLA:CPU divides by x by multiplying with 1 / x, which it flushes to zero from 8.5e37
+    in float32 on.
+
+    Args:
+      size: Non-negative values.
+
+    Returns:
+      Powers of two of the same shape. NaN stays NaN.
     """
     limits = jnp.finfo(size.dtype)
     power = lax.reduce_precision(size, limits.nexp, 0)
@@ -94,7 +138,15 @@ def power_of_two(size: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def refuse_half(what: str, *arrays) -> None:
-    """Raise ValueError where one of `arrays` is bfloat16 or float16."""
+    """Refuse half-precision arrays.
+
+    Args:
+      what: Name of the arrays in the error message.
+      *arrays: Arrays to check.
+
+    Raises:
+      ValueError: If one of the arrays is bfloat16 or float16.
+    """
     for array in arrays:
         if jnp.result_type(array) in _HALVES:
             raise ValueError(

@@ -1,7 +1,8 @@
-"""Rotations as quaternions wxyz (scalar first, Hamilton product), one at a time.
+"""Rotations as quaternions wxyz (scalar first, Hamilton product).
 
-q and -q are the same rotation. Functions that need unit length make it themselves,
-since what an optimizer moves is never exactly of length one.
+Leading axes of all arguments broadcast. q and -q are the same rotation. Functions that
+need unit length normalize their arguments, since an optimizer never keeps a length of
+exactly one.
 """
 
 import jax.numpy as jnp
@@ -24,12 +25,18 @@ _ARCTAN = tuple((-1) ** n / (2 * n + 1) for n in range(14))
 @checked(broadcast=True)
 @at_least_float32
 def normalize(quaternion: Quaternion) -> Quaternion:
-    """The same rotation at unit length.
+    """Scale quaternions to unit length.
 
-    Zero (in float32 also what XLA flushes to it, below 1.2e-38) and infinity give the
-    identity with zero gradient: 0/0 would poison the whole batch, and q / (|q| + small)
-    would return something that is no rotation. Slopes are as large as 1 / |q|, and a
-    curvature overflows below a length of 1e-19 in float32.
+    Zero (in float32 also values below 1.2e-38, which XLA flushes to zero) and infinity
+    give the identity with zero gradient. 0/0 would poison the whole batch, and q / (|q|
+    + small) would return something that is no rotation. Gradients are as large as 1 /
+    |q|, and second derivatives overflow below a length of 1e-19 in float32.
+
+    Args:
+      quaternion: Quaternions of any length, [..., 4].
+
+    Returns:
+      Unit quaternions of the same rotations, [..., 4].
     """
     largest = jnp.max(jnp.abs(quaternion))
     # NaN is neither small nor infinite and passes through.
@@ -43,13 +50,29 @@ def normalize(quaternion: Quaternion) -> Quaternion:
 
 
 def identity(dtype=jnp.float32) -> Quaternion:
+    """Make the identity rotation.
+
+    Args:
+      dtype: Floating-point type of the result.
+
+    Returns:
+      The quaternion (1, 0, 0, 0).
+    """
     return jnp.asarray([1, 0, 0, 0], dtype)
 
 
 @checked(broadcast=True)
 @at_least_float32
 def multiply(second: Quaternion, first: Quaternion) -> Quaternion:
-    """The rotation `first`, then `second`: the matrices' order of reading."""
+    """Compose two rotations: the result applies `first`, then `second`.
+
+    Args:
+      second: Quaternions, [..., 4].
+      first: Quaternions, [..., 4].
+
+    Returns:
+      The Hamilton products `second` `first`, [..., 4].
+    """
     w, *v = components(second)
     a, *u = components(first)
     turn = cross(v, u)
@@ -59,14 +82,29 @@ def multiply(second: Quaternion, first: Quaternion) -> Quaternion:
 
 @checked(broadcast=True)
 def conjugate(quaternion: Quaternion) -> Quaternion:
-    """The inverse rotation of a unit quaternion."""
+    """Invert the rotation of unit quaternions.
+
+    Args:
+      quaternion: Unit quaternions, [..., 4].
+
+    Returns:
+      The conjugates, [..., 4].
+    """
     return jnp.concatenate([quaternion[:1], -quaternion[1:]])
 
 
 @checked(broadcast=True)
 @at_least_float32
 def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """One vector, turned; the quaternion may have any length."""
+    """Rotate vectors.
+
+    Args:
+      quaternion: Quaternions of any length, [..., 4].
+      vector: Vectors, [..., 3].
+
+    Returns:
+      The rotated vectors, [..., 3].
+    """
     unit = normalize(quaternion)
     swept = jnp.cross(unit[1:], vector)
     return vector + 2 * (unit[0] * swept + jnp.cross(unit[1:], swept))
@@ -75,9 +113,16 @@ def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3
 @checked(broadcast=True)
 @at_least_float32
 def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
-    """The rotation matrix; the quaternion may have any length.
+    """Compute rotation matrices.
 
-    The polynomial in an unnormalized q is no rotation: |q| = 1.01 bends it by 0.057.
+    The quaternion is normalized first. The polynomial in an unnormalized q is no
+    rotation: |q| = 1.01 distorts it by 0.057.
+
+    Args:
+      quaternion: Quaternions of any length, [..., 4].
+
+    Returns:
+      Rotation matrices, [..., 3, 3].
     """
     w, x, y, z = normalize(quaternion)
     # One stack: nested ones are slow under `vmap` (see matrix3).
@@ -92,10 +137,19 @@ def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
 @checked(broadcast=True)
 @at_least_float32
 def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
-    """The unit quaternion of a rotation matrix, with w not negative.
+    """Compute the quaternions of rotation matrices.
 
-    Shepperd 1978: 4 q qᵀ is linear in the matrix, and its longest row is q up to
-    length. A formula with a fixed pivot loses all digits where that component is 0.
+    4 q qᵀ is linear in the matrix, and its longest row is q up to length. A formula
+    with a fixed pivot loses all digits where that component is 0.
+
+    Args:
+      rotation: Rotation matrices, [..., 3, 3].
+
+    Returns:
+      Unit quaternions with w not negative, [..., 4].
+
+    References:
+      Shepperd 1978.
     """
     r = rotation
     w = [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
@@ -121,7 +175,14 @@ def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
 @checked(broadcast=True)
 @at_least_float32
 def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
-    """The unit quaternion of axis × angle, in rad; below 1e19 rad in float32."""
+    """Compute the quaternions of rotation vectors.
+
+    Args:
+      rotation_vector: Axis × angle in radians, [..., 3], below 1e19 rad in float32.
+
+    Returns:
+      Unit quaternions, [..., 4].
+    """
     parts = components(rotation_vector)
     quarter_sq = dot(parts, parts) / 4
     half = stumpff(1, quarter_sq) / 2
@@ -131,9 +192,14 @@ def exp(rotation_vector: Float[Array, "3"]) -> Quaternion:
 @checked(broadcast=True)
 @at_least_float32
 def log(quaternion: Quaternion) -> Float[Array, "3"]:
-    """Axis × angle, the short way round (at most π rad), of a quaternion of any length.
+    """Compute the rotation vectors of quaternions.
 
-    Zero for zero and infinity, as `normalize` takes them.
+    Args:
+      quaternion: Quaternions of any length, [..., 4].
+
+    Returns:
+      Axis × angle [..., 3], with angles of at most π rad. Zero and infinite quaternions
+      give zero, as in `normalize`.
     """
     # The quotients below need no unit length, but their squares have half the range.
     upper = _upper(normalize(quaternion))
@@ -153,11 +219,20 @@ def log(quaternion: Quaternion) -> Float[Array, "3"]:
 @checked(broadcast=True)
 @at_least_float32
 def slerp(start: Quaternion, end: Quaternion, fraction: Float[Array, ""]) -> Quaternion:
-    """Between two unit quaternions at constant speed, the short way round."""
+    """Interpolate between unit quaternions at constant speed, along the shorter arc.
+
+    Args:
+      start: Unit quaternions at fraction 0, [..., 4].
+      end: Unit quaternions at fraction 1, [..., 4].
+      fraction: Position between the two, [...].
+
+    Returns:
+      Unit quaternions, [..., 4].
+    """
     turn = log(multiply(end, conjugate(start)))
     return multiply(exp(fraction * turn), start)
 
 
 def _upper(quaternion: Quaternion) -> Quaternion:
-    """Of q and -q the one with w not negative: the turn of at most π."""
+    """Return q or -q, the one with w not negative, whose angle is at most π."""
     return jnp.where(quaternion[0] < 0, -quaternion, quaternion)

@@ -1,8 +1,8 @@
-"""Rays: pixels to rays, distances along them, where they enter and leave.
+"""Rays of pixels, distances along them, and intersections with boxes.
 
-Samples lie at *distances* along unit directions; pictures, captures and meshes speak of
+Samples lie at *distances* along unit directions. Images, captures and meshes use
 *z-depth* along the viewing axis. The two differ by a cosine (`depth_per_distance`), up
-to 1.3 times in the corner of a phone's picture.
+to a factor of 1.3 in the corner of a phone's image.
 """
 
 from typing import NamedTuple
@@ -16,13 +16,13 @@ from nerfies_jax.contract import checked
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 
-# A component of a unit direction, below which the ray runs along the face. 1e-20 would
-# have quotients that are finite and slopes, over 1e-40, that are not in float32.
+# Component of a unit direction below which the ray runs along the face. With 1e-20
+# quotients would be finite, but gradients, over 1e-40, would not be in float32.
 PARALLEL = 1e-12
 
 
 class Rays(NamedTuple):
-    """Rays in world coordinates; one, or a batch along leading axes."""
+    """Rays in world coordinates, one or a batch along leading axes."""
 
     origin: Float[Array, "*rays 3"]  # scene units
     direction: Float[Array, "*rays 3"]  # unit length
@@ -31,21 +31,46 @@ class Rays(NamedTuple):
 
 @checked(broadcast=True)
 def pixel_ray(camera: Camera, pixel: Float[Array, "2"]) -> Rays:
-    """The ray of one pixel position; column i, row j is centered on (i + ½, j + ½)."""
+    """Compute the ray of pixel positions.
+
+    Args:
+      camera: Cameras, [...].
+      pixel: Positions (x, y), [..., 2]. The pixel in column i and row j is centered on
+        (i + 0.5, j + 0.5).
+
+    Returns:
+      Rays with leading axes [...].
+    """
     direction, converged = cameras.unproject(camera, pixel)
     return Rays(jnp.asarray(camera.position), direction, converged)
 
 
 @checked(broadcast=True)
 def pixel_rays(camera: Camera, size: tuple[int, int]) -> Rays:
-    """Rays [height, width] through the pixel centers of a (width, height) picture."""
+    """Compute the rays through all pixel centers of an image.
+
+    Args:
+      camera: Cameras, [...].
+      size: Width and height of the image in pixels.
+
+    Returns:
+      Rays with leading axes [..., height, width].
+    """
     return jax.vmap(jax.vmap(lambda pixel: pixel_ray(camera, pixel)))(
         pixel_centers(size, camera.position.dtype)
     )
 
 
 def pixel_centers(size: tuple[int, int], dtype=jnp.float32) -> Float[Array, "h w 2"]:
-    """Positions (column + ½, row + ½) of all pixels of a (width, height) picture."""
+    """Return the positions (column + 0.5, row + 0.5) of all pixels of an image.
+
+    Args:
+      size: Width and height of the image in pixels.
+      dtype: Floating-point type of the result.
+
+    Returns:
+      Positions (x, y), [height, width, 2].
+    """
     width, height = size
     columns, rows = jnp.meshgrid(
         jnp.arange(width, dtype=dtype), jnp.arange(height, dtype=dtype)
@@ -56,21 +81,43 @@ def pixel_centers(size: tuple[int, int], dtype=jnp.float32) -> Float[Array, "h w
 def point_at(
     origin: Float[Array, "3"], direction: Float[Array, "3"], distance: Float[Array, ""]
 ) -> Float[Array, "3"]:
-    """The point at one distance along one ray."""
+    """Return the point at a distance along one ray.
+
+    Args:
+      origin: Origin of the ray in scene units, [3].
+      direction: Unit direction, [3].
+      distance: Distance from the origin in scene units, a scalar.
+
+    Returns:
+      The point, [3].
+    """
     return origin + distance * direction
 
 
 def across_ray(unit: Float[np.ndarray, "*rays 3"]) -> Float[np.ndarray, "*rays 3 3"]:
-    """What a vector has across the unit direction, 1 - u uᵀ; host side, in float64."""
+    """Return projectors onto the planes across rays, 1 - u uᵀ. On the host.
+
+    Args:
+      unit: Unit directions u, [..., 3].
+
+    Returns:
+      Symmetric matrices in float64, [..., 3, 3].
+    """
     return np.eye(3) - unit[..., :, None] * unit[..., None, :]
 
 
 def depth_per_distance(
     camera: Camera, direction: Float[Array, "*rays 3"]
 ) -> Float[Array, "*rays"]:
-    """Cosine between rays and the viewing axis: z-depth = cosine × distance.
+    """Compute the cosine between rays and the viewing axis: z-depth = cosine ×
+    distance.
 
-    Positive for every ray that `pixel_rays` calls valid.
+    Args:
+      camera: One camera, or a batch that broadcasts with the rays.
+      direction: Unit directions in the world, [..., 3].
+
+    Returns:
+      Cosines [...], positive for every ray that `pixel_rays` marks valid.
     """
     return jnp.sum(direction * cameras.forward_axis(camera), axis=-1)
 
@@ -78,14 +125,32 @@ def depth_per_distance(
 def depth_of_distance(
     camera: Camera, direction: Float[Array, "*rays 3"], distance: Float[Array, "*rays"]
 ) -> Float[Array, "*rays"]:
-    """z-depth of what lies at `distance` along rays of one camera."""
+    """Convert distances along rays to z-depths.
+
+    Args:
+      camera: The camera of the rays.
+      direction: Unit directions in the world, [..., 3].
+      distance: Distances in scene units, [...].
+
+    Returns:
+      z-depths in scene units, [...].
+    """
     return distance * depth_per_distance(camera, direction)
 
 
 def distance_of_depth(
     camera: Camera, direction: Float[Array, "*rays 3"], depth: Float[Array, "*rays"]
 ) -> Float[Array, "*rays"]:
-    """Distance along rays of one camera at which they reach a z-depth."""
+    """Convert z-depths to distances along rays.
+
+    Args:
+      camera: The camera of the rays.
+      direction: Unit directions in the world, [..., 3].
+      depth: z-depths in scene units, [...].
+
+    Returns:
+      Distances in scene units, [...].
+    """
     return depth / depth_per_distance(camera, direction)
 
 
@@ -95,10 +160,20 @@ def intersect_aabb(
     low: Float[Array, "3"],
     high: Float[Array, "3"],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Distances at which one ray enters and leaves an axis-aligned box.
+    """Intersect one ray with an axis-aligned box.
 
-    The ray starts at its origin, so the entry is not negative; a ray that misses has an
-    entry that is not below its exit. The slab test of Kay and Kajiya 1986.
+    Args:
+      origin: Origin of the ray in scene units, [3].
+      direction: Unit direction, [3].
+      low: Lower corner of the box, [3].
+      high: Upper corner of the box, [3].
+
+    Returns:
+      Distances at which the ray enters and leaves. The ray starts at its origin, so the
+      entry is not negative. For a ray that misses, the entry is not below the exit.
+
+    References:
+      The slab test of Kay and Kajiya 1986.
     """
     # A component of 0 never crosses its two planes; a quotient by 0 would be 0/0 where
     # the origin lies in one of them.

@@ -1,4 +1,4 @@
-"""Stumpff functions: every coefficient of a rotation, smooth in the squared angle."""
+"""Stumpff functions, the coefficients of rotations, smooth in the squared angle."""
 
 import functools
 import math
@@ -17,11 +17,21 @@ _TERMS = {"float32": 9, "float64": 15}  # leave 3e-9 and 3e-20 of the first at 9
 
 @at_least_float32
 def stumpff(order: int, angle_sq: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """c_k(s) = Σ (-s)ⁿ / (2n + k)! of s = θ² = `angle_sq`, in rad² (Stumpff 1947).
+    """Evaluate the Stumpff function c_k(s) = Σ (-s)ⁿ / (2n + k)! of s = θ².
 
-    c0 = cos θ, c1 = sin θ / θ, c2 = (1 - cos θ) / θ², c3 = (θ - sin θ) / θ³. They take
-    θ², since θ = |w| has no derivative at w = 0, and near zero their derivatives are
-    Stumpff functions again, so no derivative of any order divides by θ there.
+    c0 = cos θ, c1 = sin θ / θ, c2 = (1 - cos θ) / θ², c3 = (θ - sin θ) / θ³. The
+    argument is θ², since θ = |w| has no derivative at w = 0. Near zero the derivatives
+    are Stumpff functions again, so no derivative of any order divides by θ there.
+
+    Args:
+      order: The order k, a non-negative integer.
+      angle_sq: Squared angles s in rad², non-negative, [...].
+
+    Returns:
+      c_k(s), [...].
+
+    References:
+      Stumpff 1947.
     """
     near = angle_sq < SERIES_BELOW
     # `where` differentiates both branches, so the one not taken must stay finite.

@@ -1,12 +1,13 @@
-"""How close a picture is to the truth: PSNR, SSIM, MS-SSIM and their masked forms.
+"""Image quality metrics: PSNR, SSIM, MS-SSIM and their masked forms.
 
 Images are `[height, width, channels]` or gray `[height, width]`, in [0, 1] or as uint8
 or uint16, which are divided by 255 and 65535. Leading axes are a batch, with one score
 for each image.
-Published numbers mix protocols, so each one has its name here: `padding="valid"` is
-scikit-image's Gaussian SSIM, `padding="zero"` INRIA's (0.002 to 0.011 higher on
-photographs), and `quantize` first gives the score of the 8-bit file others re-read.
-Images narrower than float32 are widened to it first (`widened`).
+
+Published numbers mix protocols, so each one has its name here. `padding="valid"` is
+scikit-image's Gaussian SSIM, and `padding="zero"` is INRIA's (0.002 to 0.011 higher on
+photographs). Apply `quantize` first to get the score of an image that was stored with 8
+bits. Images narrower than float32 are widened to it first.
 """
 
 from typing import Literal
@@ -26,7 +27,7 @@ C1, C2 = losses.LUMINANCE, losses.CONTRAST
 # sum to 1.0001.
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
-# Of an image; more are a batch whose axes were taken for channels.
+# More channels are a batch of gray images.
 MOST_CHANNELS = 16
 
 Padding = Literal["valid", "zero"]
@@ -44,7 +45,14 @@ def _refuse_stacks(image: Float[Array, "height width channels"]) -> None:
 
 @checked(images=("image",))
 def quantize(image: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """What is left of a picture after an 8-bit file: clipped and rounded to n/255."""
+    """Round an image as an 8-bit file does: clipped to [0, 1] and rounded to n/255.
+
+    Args:
+      image: Values of any shape.
+
+    Returns:
+      The rounded values, in [0, 1].
+    """
     return jnp.round(jnp.clip(image, 0.0, 1.0) * 255.0) / 255.0
 
 
@@ -53,10 +61,18 @@ def psnr(
     image: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],
 ) -> Float[Array, ""]:
-    """Peak signal-to-noise ratio in dB for a peak of 1; 100 dB at most.
+    """Compute the peak signal-to-noise ratio for a peak of 1.
 
-    The cap (`losses.LEAST_MSE`) is a maximum, not an offset: adding 1e-10 instead would
-    report 79.957 dB where 80 is true. Equal pictures have gradient zero.
+    It is capped at 100 dB. The cap (`losses.LEAST_MSE`) is a maximum, not an offset:
+    adding 1e-10 would report 79.957 dB where 80 is true. Equal images have gradient
+    zero.
+
+    Args:
+      image: Rendered images in [0, 1], [..., height, width, channels].
+      truth: Ground truth of the same shape.
+
+    Returns:
+      PSNR in dB, [...].
     """
     _refuse_stacks(image)
     error = widened(image) - widened(truth)
@@ -69,10 +85,20 @@ def masked_psnr(
     truth: Float[Array, "height width channels"],
     mask: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
-    """PSNR over the pixels where `mask` holds; NaN where it holds nowhere.
+    """Compute the PSNR of the masked pixels.
 
-    mPSNR of Gao et al. 2022 (DyCheck), arXiv:2210.13445. What lies outside the mask may
-    be anything, NaN included.
+    Pixels outside the mask do not matter and may be NaN.
+
+    Args:
+      image: Rendered images in [0, 1], [..., height, width, channels].
+      truth: Ground truth of the same shape.
+      mask: True for the pixels to compare, [..., height, width].
+
+    Returns:
+      PSNR in dB [...], NaN if the mask is empty.
+
+    References:
+      mPSNR of Gao et al. 2022 (DyCheck), arXiv:2210.13445.
     """
     _refuse_stacks(image)
     mask = mask[..., None]
@@ -90,12 +116,23 @@ def ssim(
     truth: Float[Array, "height width channels"],
     padding: Padding = "valid",
 ) -> Float[Array, ""]:
-    """Structural similarity, the mean over windows and channels.
+    """Compute the structural similarity, averaged over windows and channels.
 
-    Wang et al. 2004 with an 11-pixel Gaussian window of sigma 1.5. "valid" averages the
-    windows inside the picture and equals scikit-image's `structural_similarity` with
-    `gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1`;
-    "zero" puts black around both pictures and averages all pixels, as INRIA does.
+    The window is a Gaussian of 11 pixels with a sigma of 1.5. "valid" averages the
+    windows inside the image and equals scikit-image's `structural_similarity` with
+    `gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1`.
+    "zero" pads both images with black and averages all pixels, as INRIA does.
+
+    Args:
+      image: Rendered images in [0, 1], [..., height, width, channels].
+      truth: Ground truth of the same shape.
+      padding: "valid" or "zero".
+
+    Returns:
+      SSIM [...], at most 1.
+
+    References:
+      Wang et al. 2004.
     """
     _refuse_stacks(image)
     return losses.ssim(image, truth, padding=padding)
@@ -107,14 +144,30 @@ def ms_ssim(
     truth: Float[Array, "height width channels"],
     scales: int = 5,
 ) -> Float[Array, ""]:
-    """Multi-scale SSIM: Wang, Simoncelli and Bovik 2003, valid windows.
+    """Compute the multi-scale structural similarity with valid windows.
 
-    Contrast and structure at every scale, luminance at the coarsest, halved by 2x2
-    means between them (an odd last row or column is doubled). The means over pixels are
-    taken per channel and clipped at zero, the score averaged over channels, as
-    TensorFlow and pytorch-msssim do. Five scales need more than 160 pixels on the
-    shorter side; with fewer, the remaining weights are scaled to sum to one, which is
-    another metric: report the number of scales beside the score.
+    It takes contrast and structure at every scale and luminance at the coarsest. Scales
+    are halved by 2x2 means, with an odd last row or column doubled. The means over
+    pixels are taken per channel and clipped at zero, and the score is averaged over
+    channels, as in TensorFlow and pytorch-msssim.
+
+    Five scales need more than 160 pixels on the shorter side. With fewer scales the
+    remaining weights are normalized to sum to one, which is another metric, so report
+    the number of scales with the score.
+
+    Args:
+      image: Rendered images in [0, 1], [..., height, width, channels].
+      truth: Ground truth of the same shape.
+      scales: Number of scales, 1 to 5.
+
+    Returns:
+      MS-SSIM in [0, 1], [...].
+
+    Raises:
+      ValueError: If the image is too small for the number of scales.
+
+    References:
+      Wang, Simoncelli and Bovik 2003.
     """
     _refuse_stacks(image)
     _check_scales(image.shape, scales)
@@ -166,12 +219,23 @@ def masked_ssim(
     truth: Float[Array, "height width channels"],
     mask: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
-    """SSIM of the masked pixels; NaN where no window meets the mask's center.
+    """Compute the SSIM of the masked pixels.
 
-    Every window's moments are means over its pixels inside the mask (Gaussian weights
-    divided by their sum), and windows centered on the mask are averaged. With a full
-    mask this is `ssim`; what lies outside the mask never matters. `partial_ssim` is the
-    published protocol.
+    The moments of every window are means over its pixels inside the mask (Gaussian
+    weights divided by their sum), and windows centered on the mask are averaged. With a
+    full mask this is `ssim`. Pixels outside the mask never matter. `partial_ssim` is
+    the published protocol.
+
+    Args:
+      image: Rendered images in [0, 1], [..., height, width, channels].
+      truth: Ground truth of the same shape.
+      mask: True for the pixels to compare, [..., height, width].
+
+    Returns:
+      SSIM [...], NaN if no window is centered on the mask.
+
+    Raises:
+      ValueError: If the image is smaller than 11x11 pixels.
     """
     _refuse_stacks(image)
     if min(mask.shape) < TAPS:
@@ -201,12 +265,24 @@ def partial_ssim(
     truth: Float[Array, "height width channels"],
     mask: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
-    """mSSIM as DyCheck publishes it (arXiv:2210.13445), for its tables.
+    """Compute the mSSIM that DyCheck publishes, for comparison with its tables.
 
-    Each pass of the window is a partial convolution (Liu et al. 2018,
-    arXiv:1804.07723): rescaled by the share of *pixels* in the mask, not by their
-    weights, so a constant is not kept near the mask's edge; variances are clipped; and
-    windows without any pixel count as a perfect 1. `masked_ssim` does none of that.
+    Each pass of the window is a partial convolution, rescaled by the share of *pixels*
+    in the mask and not by their weights, so a constant is not kept near the edge of the
+    mask. Variances are clipped, and windows without any pixel count as a perfect 1.
+    `masked_ssim` does none of that.
+
+    Args:
+      image: Rendered images in [0, 1], [..., height, width, channels].
+      truth: Ground truth of the same shape.
+      mask: True for the pixels to compare, [..., height, width].
+
+    Returns:
+      mSSIM, [...].
+
+    References:
+      Gao et al. 2022 (DyCheck), arXiv:2210.13445. Liu et al. 2018, arXiv:1804.07723,
+      for partial convolutions.
     """
     _refuse_stacks(image)
     image, truth = widened(image), widened(truth)

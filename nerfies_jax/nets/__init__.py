@@ -1,4 +1,4 @@
-"""Floor 2: small differentiable functions with explicit parameters."""
+"""Small differentiable functions with explicit parameters."""
 
 import lazy_loader
 

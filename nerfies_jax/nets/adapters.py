@@ -47,12 +47,12 @@ def nnx(make: Callable[[Any], Any]) -> Network:
     """Adapt a `flax.nnx` module.
 
     Args:
-      make: A function from `nnx.Rngs` to the module, for example
-        `lambda rngs: nnx.Linear(3, 4, rngs=rngs)`.
+      make: A function from `nnx.Rngs` to the module, for example `lambda rngs:
+        nnx.Linear(3, 4, rngs=rngs)`.
 
     Returns:
-      The network. Its parameters are the state that `nnx.split` gives; what a call
-      changes in the module is not kept.
+      The network. Its parameters are the state that `nnx.split` gives. Changes that a
+      call makes in the module are not kept.
     """
     library = _library("flax.nnx")
 

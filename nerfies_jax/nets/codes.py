@@ -1,4 +1,4 @@
-"""Latent tables (GLO, Bojanowski et al. 2018): one learned code for each id."""
+"""Latent code tables (GLO, Bojanowski et al. 2018): one learned code for each id."""
 
 from typing import Any
 
@@ -13,9 +13,23 @@ Table = Float[Array, "ids code"]
 def init(
     key: Key[Array, ""], ids: int, width: int, scale: float = 0.05, dtype=jnp.float32
 ) -> Table:
-    """Codes drawn uniformly from [-scale, scale].
+    """Initialize codes uniformly in [-scale, scale].
 
-    Nerfies draws from [0, 0.05); centered, the mean code is what an unseen moment gets.
+    Nerfies draws from [0, 0.05). With centered codes the mean code serves an unseen
+    timestamp.
+
+    Args:
+      key: PRNG key.
+      ids: Number of codes.
+      width: Length of a code.
+      scale: Half-width of the distribution.
+      dtype: Floating-point type of the table.
+
+    Returns:
+      A table [ids, width].
+
+    Raises:
+      ValueError: If `ids` or `width` is below 1.
     """
     if ids < 1 or width < 1:
         raise ValueError(
@@ -26,9 +40,17 @@ def init(
 
 
 def check_ids(ids: Any, count: int, name: str = "ids") -> None:
-    """Raise ValueError where an id has no row in a table of `count`; on the host.
+    """Check that ids have a row in a table, on the host.
 
-    Once, where a capture meets a model: under `jit` an id outside cannot raise.
+    Call it once, where a capture meets a model. Under `jit` an invalid id cannot raise.
+
+    Args:
+      ids: Integers of any shape.
+      count: Number of rows of the table.
+      name: Name of the ids in the error message.
+
+    Raises:
+      ValueError: If ids are not integers or one is outside 0 .. count - 1.
     """
     values = np.asarray(ids)
     if not np.issubdtype(values.dtype, np.integer):
@@ -43,10 +65,17 @@ def check_ids(ids: Any, count: int, name: str = "ids") -> None:
 
 
 def look_up(table: Table, index: Int[Array, ""]) -> Float[Array, " code"]:
-    """The code of one id; `check_ids` has seen that it is in the table.
+    """Return the code of one id.
 
-    An id outside is held to the nearest row. JAX would answer NaN, and a negative id
-    would count from the end.
+    An id outside of the table is clamped to the nearest row. JAX would return NaN, and
+    a negative id would count from the end.
+
+    Args:
+      table: Codes, [ids, code].
+      index: The id, which `check_ids` has checked.
+
+    Returns:
+      The code, [code].
     """
     return table[jnp.clip(index, 0, table.shape[0] - 1)]
 
@@ -57,16 +86,31 @@ def blend(
     right: Int[Array, ""],
     progress: Float[Array, ""],
 ) -> Float[Array, " code"]:
-    """The code between two ids: the left one at progress 0, the right one at 1."""
+    """Interpolate linearly between the codes of two ids.
+
+    Args:
+      table: Codes, [ids, code].
+      left: Id at progress 0.
+      right: Id at progress 1.
+      progress: Position between the two, in [0, 1].
+
+    Returns:
+      The code, [code].
+    """
     start, end = look_up(table, left), look_up(table, right)
     # Not start + progress (end - start), which does not quite arrive at 1.
     return (1 - progress) * start + progress * end
 
 
 def at_time(table: Table, time: Float[Array, ""]) -> Float[Array, " code"]:
-    """The code at a time in [0, 1], over a table whose rows are moments in order.
+    """Interpolate a table along time, whose rows are frame times in order.
 
-    Piecewise linear between rows; times outside are held to the ends.
+    Args:
+      table: Codes at evenly spaced times from 0 to 1, [ids, code].
+      time: Time, clamped to [0, 1].
+
+    Returns:
+      The code [code], piecewise linear in time.
     """
     place = jnp.clip(time, 0, 1) * (table.shape[0] - 1)
     left = jnp.clip(jnp.floor(place), 0, max(table.shape[0] - 2, 0))
@@ -77,11 +121,21 @@ def at_time(table: Table, time: Float[Array, ""]) -> Float[Array, " code"]:
 def at_time_of(
     table: Table, rows: Float[Array, ""], time: Float[Array, ""]
 ) -> Float[Array, " code"]:
-    """As `at_time`, of the table resampled to so many rows first; `rows` at least 2.
+    """Interpolate a table along time after resampling it to fewer rows.
 
-    Ends stay ends. With as many rows as it has, or more, it is the table itself. The
-    number may be traced: nothing is made of that size. E-D3DGS, arXiv:2404.03613,
-    reads its codes so.
+    The number of rows may be traced: no array of that size is made.
+
+    Args:
+      table: Codes at evenly spaced times from 0 to 1, [ids, code].
+      rows: Number of rows to resample to, at least 2. The first and last row stay. At
+        the number of rows of the table or above, nothing is resampled.
+      time: Time, clamped to [0, 1].
+
+    Returns:
+      The code, [code].
+
+    References:
+      E-D3DGS, arXiv:2404.03613.
     """
     rows = jnp.clip(rows, min(2, table.shape[0]), table.shape[0])
     last = jnp.maximum(rows - 1, 1)

@@ -15,11 +15,12 @@ Scalar = Float[Array, ""]
 
 @dataclasses.dataclass(frozen=True)
 class EncodingSpec:
-    """Sines and cosines of 2^k x (times π where `times_pi`), k = 0 .. bands-1.
+    """Settings of a positional encoding with frequencies 2^k, k = 0 .. bands-1.
 
-    `times_pi` is Mildenhall et al. 2020, equation 4, for coordinates in [-1, 1]. The
-    published code of NeRF and Nerfies leaves π out, and its captures fill a box of
-    diagonal one. `identity` puts the coordinates themselves in front.
+    `times_pi` multiplies frequencies by π, as in Mildenhall et al. 2020, equation 4,
+    for coordinates in [-1, 1]. The published code of NeRF and Nerfies leaves π out, and
+    its captures fill a box of diagonal one. `identity` puts the coordinates themselves
+    in front.
     """
 
     bands: int
@@ -39,12 +40,21 @@ class EncodingSpec:
             )
 
     def width(self, dimensions: int) -> int:
-        """Features made of a point with so many coordinates."""
+        """Return the number of features of a point.
+
+        Args:
+          dimensions: Number of coordinates of the point.
+
+        Returns:
+          The length of `encode`'s result.
+        """
         return dimensions * (2 * self.bands + self.identity)
 
     @property
     def shortest_wave(self) -> float:
-        """Length of the last band's wave in the coordinates' units; inf without one."""
+        """Wavelength of the last band in units of the coordinates, or inf without
+        bands.
+        """
         if self.bands == 0:
             return math.inf
         return (2 if self.times_pi else 2 * math.pi) / 2 ** (self.bands - 1)
@@ -57,11 +67,22 @@ def encode(
     point: Float[Array, " dim"],
     window: Float[Array, " bands"] | None,
 ) -> Float[Array, " features"]:
-    """Features of one point: [x,] then for each band sin of all axes, cos of all axes.
+    """Encode one point: [x,] then for each band the sines and the cosines of all axes.
 
-    `window` weighs the bands (see `anneal`), never the identity; None leaves them all
-    on. The layout is that of Nerfies, whose weights can therefore be read. Narrower
-    coordinates than float32 are encoded in float32, and the features rounded.
+    The layout is that of Nerfies, whose weights can therefore be read. Coordinates
+    narrower than float32 are encoded in float32 and the features rounded.
+
+    Args:
+      spec: Settings of the encoding.
+      point: Coordinates, [dim].
+      window: Weights of the bands (see `anneal`), [bands]. The coordinates are not
+        weighted. None is a weight of one for all bands.
+
+    Returns:
+      Features, [spec.width(dim)].
+
+    Raises:
+      ValueError: If the window has another number of bands.
     """
     if spec.bands == 0:
         return point
@@ -86,12 +107,21 @@ def encode(
 @checked(broadcast=True)
 @at_least_float32
 def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
-    """Weights that open band k as `alpha` goes from k to k + 1; traced.
+    """Compute the coarse-to-fine window (1 - cos(π clip(α - k, 0, 1))) / 2.
 
-    Coarse to fine, Nerfies (Park et al. 2021): (1 - cos(π clip(α - k, 0, 1))) / 2, here
-    as sin²: the difference is 20 % off where a band begins to open, in float32. At
-    `alpha` = 0 every band is shut and only the identity passes; without identity the
-    features are then all zero.
+    It is written as sin². The difference is 20 % off in float32 where a band begins to
+    open. At `alpha` = 0 all bands are zero and only the identity passes. Without the
+    identity all features are then zero.
+
+    Args:
+      bands: Number of bands.
+      alpha: Progress α, traced. Band k opens while it goes from k to k + 1.
+
+    Returns:
+      Weights in [0, 1], [bands].
+
+    References:
+      Park et al. 2021 (Nerfies), arXiv:2011.12948, equation 8.
     """
     opened = jnp.clip(alpha - jnp.arange(bands, dtype=alpha.dtype), 0, 1)
     # The polynomial's ends are exact: a shut band is 0 and an open one is 1.

@@ -1,10 +1,11 @@
-"""What learned numbers cost to keep: bits under a normal law, noise for rounding.
+"""Entropy coding of learned numbers: rate under a normal distribution, and noise.
 
-Balle et al. 2017, "End-to-end optimized image compression", arXiv:1611.01704, section
-3: what is kept is rounded to a step, and while it is trained noise as wide as the step
-stands in for that. The bits are those of an ideal coder that knows the law, which is
-normal as in Balle et al. 2018, arXiv:1802.01436 (equations 7 and 11), but with a mean
-and a step, which are zero and one there; in 2017 it is piecewise linear.
+Parameters are stored rounded to a step. During training uniform noise as wide as the
+step stands in for rounding (Balle et al. 2017, "End-to-end optimized image
+compression", arXiv:1611.01704, section 3). Bits are those of an ideal coder that knows
+the distribution. It is normal as in Balle et al. 2018, arXiv:1802.01436 (equations 7
+and 11), but with a mean and a step, which are zero and one there. In 2017 it is
+piecewise linear.
 """
 
 import math
@@ -15,33 +16,63 @@ from jaxtyping import Array, Float, Key
 
 # Laws and steps may be those of channels, for many values each.
 Numbers = Float[Array, "*#batch"]
-# Of standard deviations and steps, as logarithms: what lies outside counts as the end.
+# Logarithms of standard deviations and steps are clamped to this range.
 LOG_RANGE = (-12.0, 8.0)
 FARTHEST = 60.0  # standard deviations (2600 bits): from there on bits are a line
 FLAT = 0.002  # standard deviations: a law is a parabola over a step below it
 
 
 def noisy(key: Key[Array, ""], values: Numbers, step: Numbers) -> Numbers:
-    """Values as far off as rounding could take them: even noise, one step wide.
+    """Add uniform noise one step wide, which stands in for rounding.
 
-    Equation 4 of Balle et al. 2018.
+    Args:
+      key: PRNG key.
+      values: Values, [...].
+      step: Quantization steps, positive, [...].
+
+    Returns:
+      Noisy values, [...].
+
+    References:
+      Balle et al. 2018, arXiv:1802.01436, equation 4.
     """
     noise = jax.random.uniform(key, values.shape, jnp.float32, -0.5, 0.5)
     return values + noise.astype(values.dtype) * step
 
 
 def rounded(values: Numbers, mean: Numbers, step: Numbers) -> Numbers:
-    """Values as they are kept: whole steps from the mean of their law."""
+    """Round values to whole steps from the mean of their distribution.
+
+    Args:
+      values: Values, [...].
+      mean: Means of their distributions, [...].
+      step: Quantization steps, positive, [...].
+
+    Returns:
+      Rounded values, [...].
+    """
     return mean + step * jnp.round((values - mean) / step)
 
 
 def bits(values: Numbers, mean: Numbers, log_scale: Numbers, step: Numbers) -> Numbers:
-    """-log2 of the share of a normal law that lies within half a step of each value.
+    """Compute -log2 of the normal probability of lying within half a step of each
+    value.
 
-    Equation 11 of Balle et al. 2018, which prints the share. Both ends are taken on the
-    side of the law where shares are small, as logarithms: as a difference of shares
-    float32 has 0, and so infinitely many bits, from 5.5 standard deviations on. `step`
-    is positive.
+    Both ends are taken on the side of the distribution where probabilities are small,
+    as logarithms. As a difference of probabilities, float32 gives 0 and so infinitely
+    many bits from 5.5 standard deviations on.
+
+    Args:
+      values: Values, [...].
+      mean: Means of their distributions, [...].
+      log_scale: Natural logarithms of their standard deviations, [...].
+      step: Quantization steps, positive, [...].
+
+    Returns:
+      Bits per value, [...].
+
+    References:
+      Balle et al. 2018, arXiv:1802.01436, equation 11, which prints the probability.
     """
     scale = jnp.exp(jnp.clip(log_scale, *LOG_RANGE))
     # By the size of the distance, whose slope at zero is zero as the answer's is.

@@ -1,9 +1,10 @@
-"""Features of a point from tables: multi-resolution grids, dense or hashed.
+"""Multi-resolution feature grids, dense or hashed.
 
-Functions of one point; callers `jax.vmap`. A network that reads features of its own
-for each place learns a scene in a tenth of the steps of one that reads waves. On a CPU
-the tables cost what XLA gathers and scatters: 2 floats a row take 3.9 and 2.4 ns a row,
-16 floats 19 and 66, so rows are narrow and levels many.
+Functions take one point, and callers `jax.vmap` them. A network that reads features of
+its own for each place learns a scene in a tenth of the steps of one that reads a
+positional encoding. On a CPU the cost is that of XLA's gather and scatter: rows of 2
+floats take 3.9 and 2.4 ns each, rows of 16 floats 19 and 66, so rows are narrow and
+levels many.
 """
 
 import dataclasses
@@ -29,14 +30,15 @@ Tables = tuple[Float[Array, "_ features"], ...]
 
 @dataclasses.dataclass(frozen=True)
 class HashGridSpec:
-    """Levels of a grid over a box, each finer than the last by the same factor.
+    """Settings of a multi-resolution hash grid over a box.
 
-    Müller et al. 2022, arXiv:2201.05989, section 3. A level whose vertices fit into
-    `rows` has a row for each; finer ones share rows by a hash of the vertex, and the
-    network sorts out who meant what. The box is [-half_side, half_side] in units of the
-    field. Beyond it space is contracted into twice the box (Barron et al. 2022,
-    arXiv:2111.12077, equation 10, in the maximum norm) or, where `contract` is false,
-    a point has the features of the nearest point in the box.
+    Müller et al. 2022, arXiv:2201.05989, section 3. Each level is finer than the last
+    by the same factor. A level whose vertices fit into `rows` has a row for each. Finer
+    ones share rows by a hash of the vertex, and the network resolves collisions. The
+    box is [-half_side, half_side] in units of the field. Space outside is contracted
+    into twice the box (Barron et al. 2022, arXiv:2111.12077, equation 10, in the
+    maximum norm). If `contract` is false, a point there has the features of the nearest
+    point in the box.
     """
 
     levels: int = 7
@@ -62,13 +64,27 @@ class HashGridSpec:
             raise ValueError(f"half_side={self.half_side} must be positive and finite")
 
     def width(self, dimensions: int) -> int:
-        """Features made of a point, which has three coordinates."""
+        """Return the number of features of a point.
+
+        Args:
+          dimensions: Number of coordinates of the point, which must be 3.
+
+        Returns:
+          The length of `encode`'s result.
+
+        Raises:
+          ValueError: If `dimensions` is not 3.
+        """
         if dimensions != 3:
             raise ValueError(f"a hash grid is of 3 dimensions, not of {dimensions}")
         return self.levels * self.features
 
     def cells(self) -> tuple[int, ...]:
-        """Along an axis of each level, from coarse to fine."""
+        """Return the number of cells along an axis of each level, from coarse to fine.
+
+        Returns:
+          One integer for each level.
+        """
         return tuple(
             round(float(cells))
             for cells in np.geomspace(self.coarsest, self.finest, self.levels)
@@ -76,7 +92,17 @@ class HashGridSpec:
 
 
 def init(spec: HashGridSpec, key: Key[Array, ""], dtype=jnp.float32) -> Tables:
-    """Nearly nothing anywhere; a level has as many rows as vertices, or `spec.rows`."""
+    """Initialize tables uniformly in [-1e-4, 1e-4].
+
+    Args:
+      spec: Settings of the grid.
+      key: PRNG key.
+      dtype: Floating-point type of the tables.
+
+    Returns:
+      One table [rows, features] for each level, with as many rows as vertices, at most
+      `spec.rows`.
+    """
     keys = jax.random.split(key, spec.levels)
     shapes = [(min((n + 1) ** 3, spec.rows), spec.features) for n in spec.cells()]
     return tuple(
@@ -91,9 +117,17 @@ def encode(
     point: Float[Array, "3"],
     window: Float[Array, " levels"] | None = None,
 ) -> Float[Array, " encoded"]:
-    """Features of one point in units of the field, the coarsest level first.
+    """Interpolate the features of one point, the coarsest level first.
 
-    `window` weighs the levels (`encoding.anneal`); None leaves them all open.
+    Args:
+      spec: Settings of the grid.
+      tables: Tables of the levels.
+      point: Point in units of the field, [3].
+      window: Weights of the levels (`encoding.anneal`), [levels]. None is a weight of
+        one for all levels.
+
+    Returns:
+      Features, [levels * features].
     """
     place = unit_place(point, spec.half_side, spec.contract)
     found = [
@@ -108,7 +142,16 @@ def encode(
 def unit_place(
     point: Float[Array, "3"], half_side: float, contracted: bool
 ) -> Float[Array, "3"]:
-    """The point in [0, 1]^3 over the box, or over its contracted surroundings."""
+    """Map a point to [0, 1]^3 over the box, or over its contracted surroundings.
+
+    Args:
+      point: Point in units of the field, [3].
+      half_side: Half side of the box in units of the field.
+      contracted: True to contract space, False to clamp to the box.
+
+    Returns:
+      The position in the unit cube, [3].
+    """
     scaled = point / half_side
     if contracted:
         return (contract(scaled) + 2) / 4
@@ -116,11 +159,20 @@ def unit_place(
 
 
 def contract(point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """All of space into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
+    """Contract all of space into the cube [-2, 2]^3. The cube [-1, 1]^3 is unchanged.
 
-    Barron et al. 2022, arXiv:2111.12077, equation 10: (2 - 1/|x|) x/|x| beyond a norm
-    of one, with the largest coordinate for a norm, so that cubes stay cubes. Its slope
-    is continuous along a ray from the center; a point at infinity has none.
+    This is (2 - 1/|x|) x/|x| beyond a norm of one, with the maximum norm, so that cubes
+    stay cubes. Its gradient is continuous along a ray from the center. A point at
+    infinity has none.
+
+    Args:
+      point: Point in units of the half side of the box, [3].
+
+    Returns:
+      The contracted point, [3].
+
+    References:
+      Barron et al. 2022 (mip-NeRF 360), arXiv:2111.12077, equation 10.
     """
     # The norm is held out of the branch that is not taken, where it may be zero.
     size = jnp.max(jnp.abs(point))
@@ -134,11 +186,19 @@ def level_features(
     cells: int,
     stride: int = 1,
 ) -> Float[Array, " features"]:
-    """Trilinear between the eight vertices around a place in [0, 1]^3.
+    """Interpolate trilinearly between the eight vertices around a position.
 
-    Exact at a vertex and continuous across the sides of a cell; the slope jumps there,
-    and at a side it is that of the cell above. With a `stride`, which divides `cells`,
-    between every so manieth vertex alone.
+    The result is exact at a vertex and continuous across the faces of a cell. The
+    gradient jumps there, and on a face it is that of the cell above.
+
+    Args:
+      table: Table of the level, [rows, features].
+      place: Position in [0, 1]^3, [3].
+      cells: Number of cells along an axis.
+      stride: Use only every `stride`-th vertex. It divides `cells`.
+
+    Returns:
+      Features, [features].
     """
     return _between_vertices(table, place, cells, stride)
 
@@ -206,16 +266,25 @@ def _vertices_around(place, cells, stride, rows):
 def vertex_row(
     vertex: Int[Array, "*batch 3"], cells: int, rows: int
 ) -> Int[Array, "*batch"]:
-    """The row of a vertex: its own where there are enough, else that of its hash.
+    """Return the table row of vertices: their own if there are enough, else by a hash.
 
-    Müller et al. 2022, equation 4; their tables have a power of two of rows, these any
-    number.
+    Args:
+      vertex: Indices of vertices, [..., 3].
+      cells: Number of cells along an axis.
+      rows: Number of rows of the table. It need not be a power of two, unlike in the
+        paper.
+
+    Returns:
+      Row indices, [...].
+
+    References:
+      Müller et al. 2022, arXiv:2201.05989, equation 4.
     """
     return _row([vertex[..., axis] for axis in range(3)], cells, rows)
 
 
 def _row(vertex, cells, rows):
-    """As `vertex_row`, of the three coordinates of a vertex."""
+    """Same as `vertex_row`, with the three coordinates of a vertex as a list."""
     vertices = cells + 1
     if rows >= vertices**3:
         x, y, z = vertex
@@ -230,10 +299,20 @@ def _row(vertex, cells, rows):
 def variation_at_random(
     spec: HashGridSpec, tables: Tables, key: Key[Array, ""], count: int
 ) -> Float[Array, ""]:
-    """`total_variation` guessed from `count` vertices a level; the mean over levels.
+    """Estimate the mean of `total_variation` over levels from random vertices.
 
-    Without bias. A hashed level counts as well: rows of neighbors, whoever else shares
-    them. Squares, not lengths, so what is even has a slope of zero and not a NaN.
+    The estimate is unbiased. A hashed level counts as well, with the rows of
+    neighboring vertices, whatever else shares them. It sums squares, not norms, so
+    constant features have gradient zero and not NaN.
+
+    Args:
+      spec: Settings of the grid.
+      tables: Tables of the levels.
+      key: PRNG key.
+      count: Number of vertices per level.
+
+    Returns:
+      A scalar.
     """
 
     def of_level(key, table, cells):
@@ -254,10 +333,17 @@ def variation_at_random(
 def total_variation(
     table: Float[Array, "rows features"], cells: int
 ) -> Float[Array, ""]:
-    """Mean squared difference of neighboring vertices of a level that is not hashed.
+    """Compute the mean squared difference of neighboring vertices of a dense level.
 
-    Features squared for each pair of neighbors along an axis. ValueError where
-    vertices share rows.
+    Args:
+      table: Table of the level, [rows, features].
+      cells: Number of cells along an axis.
+
+    Returns:
+      The mean over features and pairs of neighbors along an axis, a scalar.
+
+    Raises:
+      ValueError: If the level is hashed.
     """
     vertices = cells + 1
     if len(table) != vertices**3:
@@ -276,7 +362,7 @@ def total_variation(
 
 
 def _squared_differences(grid, axis):
-    """Of each vertex and the next, and zeros at the end."""
+    """Squared differences of each vertex and the next, with zeros at the end."""
     end = jnp.zeros_like(jax.lax.slice_in_dim(grid, 0, 1, axis=axis))
     squares = jnp.square(jnp.diff(grid, axis=axis))
     return jnp.concatenate([squares, end], axis)

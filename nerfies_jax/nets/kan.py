@@ -36,7 +36,7 @@ HEAD_INITIALIZERS = ("glorot", "small", "zero")
 # weights cannot be told apart: the Gram matrix of 16 kernels has condition 5.7 at
 # sigma / h = 0.5, 58 at 0.707, 4.5e3 at 1 and 2e7 at 1.5.
 WIDTH_RATIOS = (0.25, 1.5)
-# Of a hidden layer's features, before the kernels. Features that spread by less than
+# Added to the variance of a hidden layer's features. Features that spread by less than
 # 1e-3 are left small instead of being amplified to one.
 NORM_VARIANCE = 1e-6
 # Trained log-widths may leave their start by this much, a factor of 2e4 either way;
@@ -48,22 +48,22 @@ LOG_WIDTH_RANGE = 10.0
 class KANSpec:
     """Settings of a KAN: layer widths, kernels and their grids.
 
-    Layers lead from `in_features` through the `hidden` widths to `out_features`, or
-    to several named `heads` in their place, which all read the last hidden layer.
+    Layers lead from `in_features` through the `hidden` widths to `out_features`, or to
+    several named `heads` in their place, which all read the last hidden layer.
 
-    The first layer's `kernels` centers lie on `grid`, where raw inputs are expected;
-    those of the others on `hidden_grid`, in front of which `norm` standardizes the
-    features of each point. The norm has no trained scale, which would be a trained
-    width under another name, and the first layer has none: it would turn one or two
-    coordinates into signs. `width_ratio` is sigma / h, the kernels' standard deviation
-    over the distance of their centers; the grid resolves half a period per h whatever
-    it is.
+    The centers of the first layer's `kernels` lie on `grid`, where raw inputs are
+    expected. Those of the others lie on `hidden_grid`, in front of which `norm`
+    standardizes the features of each point. The norm has no trained scale, which would
+    be a trained width under another name, and the first layer has none: it would turn
+    one or two coordinates into signs. `width_ratio` is sigma / h, the kernels' standard
+    deviation over the distance of their centers. The grid resolves half a period per h
+    in any case.
 
     `trainable_kernels` makes every input's centers and log-widths parameters (Sonata,
-    equations 9 and 10). The paper argues against it (appendix A.3): with one width and
-    even spacing all Gaussians have one spectrum, exp(-sigma^2 w^2 / 2), and the weights
-    alone shape the sum's by their interference, sum_g C_g exp(-i w mu_g); unequal
-    widths and gaps break that up.
+    equations 9 and 10). It requires `basis="rbf"`. The paper argues against it
+    (appendix A.3): with one width and even spacing all Gaussians have one spectrum,
+    exp(-sigma^2 w^2 / 2), and the weights alone shape that of the sum by their
+    interference, sum_g C_g exp(-i w mu_g). Unequal widths and gaps break that up.
     """
 
     in_features: int
@@ -138,22 +138,33 @@ class KANSpec:
 
     @property
     def read_outs(self) -> tuple[tuple[str, HeadSpec], ...]:
-        """The heads, or the one head that `out_features` asks for."""
+        """The heads, or the one head that `out_features` stands for."""
         if self.out_features is None:
             return self.heads
         return ((OUTPUT, HeadSpec(self.out_features)),)
 
     def widths(self) -> tuple[int, ...]:
-        """Inputs of each layer; the last are those of the heads."""
+        """Return the number of inputs of each layer. The last are those of the heads.
+
+        Returns:
+          One integer for each layer.
+        """
         return (self.in_features, *self.hidden)
 
     def grid_of(self, layer: int) -> tuple[float, float]:
-        """The ends of the grid of one layer, counted from 0."""
+        """Return the ends of the grid of a layer.
+
+        Args:
+          layer: Index of the layer, counted from 0.
+
+        Returns:
+          The lower and the upper end.
+        """
         return self.hidden_grid if layer else self.grid
 
 
 class KANLayer(NamedTuple):
-    """What one layer learns."""
+    """Trained parameters of one layer."""
 
     kernel: Float[Array, "kernels inputs outputs"]  # C, a weight for each Gaussian
     base: Float[Array, "inputs outputs"] | None  # B, of the SiLU
@@ -176,17 +187,33 @@ class KAN(NamedTuple):
 
 
 def spacing(spec: KANSpec, layer: int) -> float:
-    """h, the distance between neighboring centers of one layer."""
+    """Return the distance h between neighboring centers of a layer.
+
+    Args:
+      spec: The network's settings.
+      layer: Index of the layer, counted from 0.
+
+    Returns:
+      The distance in units of the layer's inputs.
+    """
     low, high = spec.grid_of(layer)
     gaps = spec.kernels - (DEGREE if spec.basis == "bspline" else 1)
     return (high - low) / gaps
 
 
 def centers(spec: KANSpec, layer: int, dtype=jnp.float32) -> Float[Array, " kernels"]:
-    """The fixed centers of one layer, or where the trained ones start.
+    """Return the fixed centers of a layer, or the initial ones if they are trained.
 
-    Those of B-splines begin and end one interval outside the grid, on which they then
-    sum to one.
+    B-splines begin and end one interval outside the grid, on which they then sum to
+    one.
+
+    Args:
+      spec: The network's settings.
+      layer: Index of the layer, counted from 0.
+      dtype: Floating-point type of the result.
+
+    Returns:
+      Centers, [kernels].
     """
     low, high = spec.grid_of(layer)
     if spec.basis == "bspline":
@@ -195,9 +222,14 @@ def centers(spec: KANSpec, layer: int, dtype=jnp.float32) -> Float[Array, " kern
 
 
 def width(spec: KANSpec, layer: int) -> float:
-    """w = sqrt(2) sigma, the fixed width of one layer or the start of the trained.
+    """Return the fixed width of a layer's kernels, or the initial one if it is trained.
 
-    Of B-splines their spacing.
+    Args:
+      spec: The network's settings.
+      layer: Index of the layer, counted from 0.
+
+    Returns:
+      w = sqrt(2) sigma of Gaussians, the knot spacing of B-splines.
     """
     if spec.basis == "bspline":
         return spacing(spec, layer)
@@ -322,11 +354,23 @@ def apply_heads(
 def first_layer_part(
     spec: KANSpec, params: KAN, part: Float[Array, "*batch part"], start: int
 ) -> Float[Array, "*batch outputs"]:
-    """What the inputs `start`, `start + 1`, ... add to the first layer, without bias.
+    """Compute the contribution of some inputs to the first layer, without bias.
 
     A layer is a sum over its inputs, so parts that are equal for many evaluations (the
-    time for all points, a point's code for all times) are evaluated once: the sum of
-    the parts goes into `after_first_layer`.
+    time for all points, a point's code for all times) are evaluated once. Pass the sum
+    of the parts to `after_first_layer`.
+
+    Args:
+      spec: The network's settings.
+      params: Parameters from `init`.
+      part: Consecutive inputs, [..., part].
+      start: Index of the first of them among all inputs.
+
+    Returns:
+      Contributions to the first layer, [..., outputs].
+
+    Raises:
+      ValueError: If the inputs are not among those of the network.
     """
     stop = start + part.shape[-1]
     if not 0 <= start < stop <= spec.in_features:
@@ -348,7 +392,16 @@ def first_layer_part(
 def after_first_layer(
     spec: KANSpec, params: KAN, first: Float[Array, "*batch features"]
 ) -> dict[str, Float[Array, "*batch outputs"]]:
-    """Every head's output by name, from the sum of the first layer's parts."""
+    """Evaluate the heads from the sum of the first layer's parts.
+
+    Args:
+      spec: The network's settings.
+      params: Parameters from `init`.
+      first: Sum of the `first_layer_part`s of all inputs, [..., features].
+
+    Returns:
+      The output [..., width] of each head, by its name.
+    """
     layer, _ = _layer(spec, params, 0)
     features = first + layer.bias
     for index in range(1, len(spec.hidden) + 1):
@@ -368,7 +421,15 @@ def after_first_layer(
 def standardize(
     features: Float[Array, "*batch features"],
 ) -> Float[Array, "*batch features"]:
-    """Each point's features with mean zero and variance one, or less than one."""
+    """Scale each point's features to mean zero and a variance of at most one.
+
+    Args:
+      features: Features, [..., features].
+
+    Returns:
+      Features of the same shape. Their variance is one unless they spread by less than
+      1e-3.
+    """
     # Features of 1e20 have a variance that float32 cannot hold, and would all become 0.
     # A power of two changes no digit; below one, `NORM_VARIANCE` would overflow.
     largest = jnp.max(jnp.abs(features), axis=-1, keepdims=True)
@@ -384,13 +445,24 @@ def standardize(
 def hold(
     x: Float[Array, "*batch inputs"], grid: tuple[float, float], margin: float
 ) -> Float[Array, "*batch inputs"]:
-    """`x` inside the grid; outside it tends to `margin` beyond the nearer end.
+    """Pull inputs outside the grid toward it, smoothly.
 
-    Gaussians are 5e-2 of their height a quarter of a grid beyond its end and 1e-12
+    Inside the grid `x` is unchanged. Outside the result tends to `margin` beyond the
+    nearer end. The first two derivatives are continuous.
+
+    A Gaussian is 5e-2 of its height a quarter of a grid beyond the grid's end and 1e-12
     three quarters beyond, so an input that strays there stops learning, and SiLU helps
     on one side only. Codes that start 50 grids away fit a signal of 1 to 0.81 without a
-    remedy, 0.65 with tanh and 0.41 with a slope that falls as here, from 1 like
-    0.6 (margin / distance)^2. The slope and its derivative are continuous.
+    remedy, to 0.65 with tanh and to 0.41 with this function, whose gradient falls from
+    1 like 0.6 (margin / distance)^2.
+
+    Args:
+      x: Inputs, [..., inputs].
+      grid: Lower and upper end of the grid.
+      margin: Largest distance from the grid of the result, positive.
+
+    Returns:
+      Inputs of the same shape, inside `grid` or less than `margin` away.
     """
     low, high = grid
     middle, half = (low + high) / 2, (high - low) / 2
@@ -414,7 +486,7 @@ def hold(
 
 
 def _layer(spec, params, index):
-    """One layer and its kernels; the heads are the last layer, side by side."""
+    """Return one layer and its kernels. The heads, side by side, are the last layer."""
     kernels = None if params.kernels is None else params.kernels[index]
     if index < len(params.hidden):
         return params.hidden[index], kernels

@@ -25,7 +25,7 @@ SMALL = 1e-4
 
 
 class Layer(NamedTuple):
-    """An affine map; `features @ weight + bias`."""
+    """An affine map, `features @ weight + bias`."""
 
     weight: Float[Array, "inputs outputs"]
     bias: Float[Array, " outputs"]
@@ -40,7 +40,7 @@ class MLP(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class HeadSpec:
-    """One linear read-out; `init` is how its weights start, its bias is zero."""
+    """Settings of a linear output layer. `init` names its weight initializer."""
 
     width: int
     init: str = "glorot"
@@ -55,12 +55,13 @@ class HeadSpec:
 
 @dataclasses.dataclass(frozen=True)
 class MLPSpec:
-    """`depth` hidden layers of `width`; each layer in `skips` reads the input again.
+    """Settings of a multilayer perceptron with skip connections and named heads.
 
-    `heads` pairs names with read-outs; without any the network returns its last hidden
-    layer. `skips` counts from 0 and names the layer that reads the concatenation
-    [hidden, input]: the trunk of NeRF, which joins the input to what its fifth layer
-    answers, is (5,); that of Nerfies, which joins it to the fourth's, is (4,).
+    It has `depth` hidden layers of `width`. `heads` pairs names with linear output
+    layers. Without heads the network returns its last hidden layer. `skips` counts
+    layers from 0 and names those that read the concatenation [hidden, input]. The trunk
+    of NeRF, which joins the input to the output of its fifth layer, is (5,). That of
+    Nerfies, which joins it to the fourth's, is (4,).
     """
 
     inputs: int
@@ -95,12 +96,23 @@ class MLPSpec:
 
     @property
     def features(self) -> int:
-        """Width of what the heads read."""
+        """Number of features that the heads read."""
         return self.width if self.depth else self.inputs
 
 
 def init(spec: MLPSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
-    """Weights as the spec says, biases zero; drawn alike in every precision."""
+    """Initialize the parameters, with zero biases.
+
+    All precisions draw the same numbers.
+
+    Args:
+      spec: The network's settings.
+      key: PRNG key.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters, a pytree of arrays.
+    """
     keys = jax.random.split(key, spec.depth + len(spec.heads))
     hidden = tuple(
         init_layer(keys[layer], _fan_in(spec, layer), spec.width, spec.init, dtype)
@@ -116,7 +128,18 @@ def init(spec: MLPSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
 def init_layer(
     key: Key[Array, ""], inputs: int, outputs: int, init: str, dtype=jnp.float32
 ) -> Layer:
-    """One affine map. "glorot" and "he" are uniform (Glorot 2010, He 2015)."""
+    """Initialize one affine map, with zero bias.
+
+    Args:
+      key: PRNG key.
+      inputs: Number of inputs.
+      outputs: Number of outputs.
+      init: One of `INITIALIZERS`. "glorot" and "he" are uniform (Glorot 2010, He 2015).
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The layer.
+    """
     bounds = {
         "glorot": math.sqrt(6 / (inputs + outputs)),
         "he": math.sqrt(6 / inputs),
@@ -130,7 +153,16 @@ def init_layer(
 def hidden_features(
     spec: MLPSpec, params: MLP, inputs: Float[Array, "*batch inputs"]
 ) -> Float[Array, "*batch features"]:
-    """The last hidden layer, after its activation."""
+    """Evaluate the hidden layers.
+
+    Args:
+      spec: The network's settings.
+      params: Parameters from `init`.
+      inputs: Inputs, [..., inputs].
+
+    Returns:
+      The last hidden layer after its activation, [..., features].
+    """
     activation = ACTIVATIONS[spec.activation]
     hidden = inputs
     for index, layer in enumerate(params.hidden):
@@ -143,7 +175,16 @@ def hidden_features(
 def apply(
     spec: MLPSpec, params: MLP, inputs: Float[Array, "*batch inputs"]
 ) -> dict[str, Float[Array, "*batch outputs"]]:
-    """Every head's output by name, without activation. For one input or a batch."""
+    """Evaluate the heads of a network, without an activation on their outputs.
+
+    Args:
+      spec: The network's settings.
+      params: Parameters from `init`.
+      inputs: Inputs, [..., inputs].
+
+    Returns:
+      The output [..., width] of each head, by its name.
+    """
     hidden = hidden_features(spec, params, inputs)
     return {name: affine(layer, hidden) for name, layer in params.heads.items()}
 
@@ -151,15 +192,32 @@ def apply(
 def affine(
     layer: Layer, inputs: Float[Array, "*batch inputs"]
 ) -> Float[Array, "*batch outputs"]:
-    """One affine map of one input or a batch."""
+    """Evaluate one affine map.
+
+    Args:
+      layer: The layer.
+      inputs: Inputs, [..., inputs].
+
+    Returns:
+      Outputs, [..., outputs].
+    """
     return dense.product(inputs, layer.weight) + layer.bias
 
 
 def with_known(spec: MLPSpec, params: MLP, known: Float[Array, " known"]) -> MLP:
-    """The network once the last of its inputs are known: one of the others alone.
+    """Fold known inputs into the biases of a network.
 
-    What a layer makes of them is the same for a whole batch; here it is summed once,
-    into the bias of each layer that reads the input: without hidden ones, each head.
+    If the last inputs are the same for a whole batch, their contribution is computed
+    once and added to the bias of each layer that reads the input: the first and those
+    of `skips`, or each head of a network without hidden layers.
+
+    Args:
+      spec: Settings of the network with all inputs.
+      params: Parameters from `init`.
+      known: Values of the last inputs, [known].
+
+    Returns:
+      Parameters of a network of the other inputs.
     """
 
     def fold(index, layer):

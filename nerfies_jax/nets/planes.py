@@ -1,16 +1,17 @@
-"""Features of a point from planes over pairs of its coordinates, coarse and fine.
+"""Feature planes over pairs of coordinates, with multi-resolution levels.
 
-A box of space is three planes (xy, xz, yz) for a table, and with time three more (xt,
-yt, zt), so memory grows with the square of the side and not with its third or fourth
-power: tri-planes are summed (Chan et al. 2022, arXiv:2112.07945), HexPlane (Cao and
-Johnson 2023, arXiv:2301.09632) and K-Planes (Fridovich-Keil et al. 2023,
-arXiv:2301.10241, equation 2) multiply, of which the latter is followed; the equations
-of the others were not at hand. Functions of one point; callers `jax.vmap`.
+A box of space is represented by three planes (xy, xz, yz), and with time by three more
+(xt, yt, zt), so memory grows with the square of the side. Tri-planes are summed (Chan
+et al. 2022, arXiv:2112.07945). HexPlane (Cao and Johnson 2023, arXiv:2301.09632) and
+K-Planes (Fridovich-Keil et al. 2023, arXiv:2301.10241, equation 2) multiply. The
+equations here are those of K-Planes, since those of the others were not at hand.
+Functions take one point, and callers `jax.vmap` them.
 
-A row holds all features of a vertex. Measured on one core, 10,000 points in a plane of
-64 x 64, 16 features, forward and with the gradient: 0.43 and 3.2 ms as one row, 0.47
-and 5.0 as eight rows of two, 0.57 and 2.3 as sixteen of one, in as many tables. What
-all points read at one time is a line and takes 0.12 and 0.48 ms: `at_time`.
+A row holds all features of a vertex. On one core, 10,000 points in a plane of 64 x 64
+with 16 features take, forward and with the gradient, 0.43 and 3.2 ms as one row, 0.47
+and 5.0 as eight rows of two, and 0.57 and 2.3 as sixteen rows of one in as many tables.
+Features that all points read at one time are a line and take 0.12 and 0.48 ms
+(`at_time`).
 """
 
 import dataclasses
@@ -32,13 +33,14 @@ FIRST = {"product": (0.1, 0.5), "sum": (-0.1, 0.1)}
 
 @dataclasses.dataclass(frozen=True)
 class PlanesSpec:
-    """Levels of planes over [0, 1]^3, or over [0, 1]^4 where there are `moments`.
+    """Settings of feature planes over [0, 1]^3, or [0, 1]^4 if there are `moments`.
 
-    `vertices` are those along an axis of space at the first level, of which every level
-    has a multiple; all levels have as many `moments`. "product" multiplies the planes
-    of a level, so that one plane can switch off what another has, "sum" adds them.
-    Beyond the box a point has the features of the nearest point in it ("clamp"), or
-    none: "refuse" makes them NaN, at which a run stops with the name of the array.
+    `vertices` counts those along an axis of space at the first level. Every level has
+    one of the `multiples` of it, and all levels have as many `moments`. "product"
+    multiplies the planes of a level, so that one plane can switch off the features of
+    another. "sum" adds them. Outside the box a point has the features of the nearest
+    point in it ("clamp"), or NaN ("refuse"), at which a run stops with the name of the
+    array.
     """
 
     vertices: int = 64
@@ -72,11 +74,21 @@ class PlanesSpec:
 
     @property
     def levels(self) -> int:
-        """What is opened one by one, coarse to fine."""
+        """Number of levels, which open one by one from coarse to fine."""
         return len(self.multiples)
 
     def width(self, dimensions: int) -> int:
-        """Features made of a point, which has three coordinates, or four with time."""
+        """Return the number of features of a point.
+
+        Args:
+          dimensions: Number of coordinates of the point, 3 or, with time, 4.
+
+        Returns:
+          The length of `encode`'s result.
+
+        Raises:
+          ValueError: If the planes have another number of dimensions.
+        """
         wanted = 3 if self.moments is None else 4
         if dimensions != wanted:
             raise ValueError(
@@ -92,12 +104,21 @@ class Level(NamedTuple):
     time: tuple[Float[Array, "moments vertices features"], ...]  # of x, y, z; or none
 
 
-# Of all levels at one time, the three lines of each.
+# The three lines of each level at one time.
 Lines = tuple[tuple[Float[Array, "_ features"], ...], ...]
 
 
 def init(spec: PlanesSpec, key: Key[Array, ""], dtype=jnp.float32) -> tuple[Level, ...]:
-    """Planes of space drawn evenly; planes of time of ones, or for a sum of zeros."""
+    """Initialize the planes: space uniformly, time to the neutral element.
+
+    Args:
+      spec: Settings of the planes.
+      key: PRNG key.
+      dtype: Floating-point type of the planes.
+
+    Returns:
+      The planes of each level. Those of time are ones, or zeros for a sum.
+    """
     low, high = FIRST[spec.combination]
     levels = []
     for level_key, multiple in zip(
@@ -118,10 +139,17 @@ def init(spec: PlanesSpec, key: Key[Array, ""], dtype=jnp.float32) -> tuple[Leve
 def encode(
     spec: PlanesSpec, levels: tuple[Level, ...], place: Float[Array, " dimensions"]
 ) -> Float[Array, " encoded"]:
-    """Features of one place in the unit cube, the first level first.
+    """Interpolate the features of one place, the first level first.
 
-    `place` has a fourth coordinate where the planes have a time. Where many points
-    share one time, `at_time` and `features` give the same for less.
+    If many points share one time, `at_time` and `features` give the same faster.
+
+    Args:
+      spec: Settings of the planes.
+      levels: The planes.
+      place: Position in the unit cube, [3], or [4] with the time last.
+
+    Returns:
+      Features, [levels * features].
     """
     spec.width(len(place))
     found = space_features(spec, levels, place[:3])
@@ -140,7 +168,16 @@ def encode(
 def space_features(
     spec: PlanesSpec, levels: tuple[Level, ...], place: Float[Array, "3"]
 ) -> Float[Array, "levels features"]:
-    """What the planes of space alone say of one place: the same at all times."""
+    """Interpolate the planes of space alone, which are the same at all times.
+
+    Args:
+      spec: Settings of the planes.
+      levels: The planes.
+      place: Position in the unit cube, [3].
+
+    Returns:
+      Features, [levels, features].
+    """
     found = [
         [
             bilinear(plane, place[one], place[other])
@@ -153,14 +190,31 @@ def space_features(
 
 
 def at_time(levels: tuple[Level, ...], moment: Float[Array, ""]) -> Lines:
-    """The planes of time at one time in [0, 1], the same for every point."""
+    """Evaluate the planes of time at one time, which all points can share.
+
+    Args:
+      levels: The planes.
+      moment: Time in [0, 1].
+
+    Returns:
+      Three lines [vertices, features] of each level.
+    """
     return tuple(tuple(linear(p, moment) for p in level.time) for level in levels)
 
 
 def time_features(
     spec: PlanesSpec, lines: Lines, place: Float[Array, "3"]
 ) -> Float[Array, "levels features"]:
-    """What the planes of time say of one place, from what `at_time` made of them."""
+    """Interpolate the planes of time at one place.
+
+    Args:
+      spec: Settings of the planes.
+      lines: Lines from `at_time`.
+      place: Position in the unit cube, [3].
+
+    Returns:
+      Features, [levels, features].
+    """
     found = [
         [linear(line, x) for line, x in zip(level, place, strict=True)]
         for level in lines
@@ -173,7 +227,16 @@ def features(
     space: Float[Array, "levels features"],
     time: Float[Array, "levels features"],
 ) -> Float[Array, " encoded"]:
-    """All features of one place at one time, as `encode` gives them."""
+    """Combine features of space and time, as `encode` does.
+
+    Args:
+      spec: Settings of the planes.
+      space: Result of `space_features`, [levels, features].
+      time: Result of `time_features`, [levels, features].
+
+    Returns:
+      Features, [levels * features].
+    """
     return _combined(spec, [space, time]).reshape(-1)
 
 
@@ -182,11 +245,19 @@ def bilinear(
     down: Float[Array, ""],
     across: Float[Array, ""],
 ) -> Float[Array, " features"]:
-    """Between the four vertices around a place in [0, 1]^2, from end to end.
+    """Interpolate bilinearly between the four vertices around a position.
 
-    Exact at a vertex and continuous across the sides of a cell, where the slope jumps;
-    at a side it is that of the cell above. A place outside has what its nearest has,
-    and no slope across the end.
+    The result is exact at a vertex and continuous across the edges of a cell, where the
+    gradient jumps. On an edge it is that of the cell above. A position outside is
+    clamped to the nearest inside, with zero gradient across the end.
+
+    Args:
+      plane: Features of the vertices, [first, second, features].
+      down: Position along the first axis, in [0, 1].
+      across: Position along the second axis, in [0, 1].
+
+    Returns:
+      Features, [features].
     """
     first, second, _ = plane.shape
     row, down = _cell(down, first)
@@ -202,15 +273,33 @@ def bilinear(
 def linear(
     line: Float[Array, "vertices *rest"], place: Float[Array, ""]
 ) -> Float[Array, "*rest"]:
-    """Between the two vertices around a place in [0, 1], as `bilinear`."""
+    """Interpolate linearly between the two vertices around a position.
+
+    Args:
+      line: Values at the vertices, [vertices, ...].
+      place: Position in [0, 1]. It is clamped as in `bilinear`.
+
+    Returns:
+      Values, [...].
+    """
     row, share = _cell(place, len(line))
     return (1 - share) * line[row] + share * line[row + 1]
 
 
 def total_variation(plane: Float[Array, "first second features"]) -> Float[Array, ""]:
-    """Squared differences of neighboring vertices, the mean along each axis added.
+    """Compute the squared differences of neighboring vertices, averaged along each
+    axis.
 
-    K-Planes, equation 3. 4DGS has `time_smoothness` along one axis under this name.
+    4DGS uses this name for `time_smoothness` along one axis.
+
+    Args:
+      plane: A plane, [first, second, features].
+
+    Returns:
+      The sum of the means of the two axes, a scalar.
+
+    References:
+      K-Planes, arXiv:2301.10241, equation 3.
     """
     return sum(jnp.mean(jnp.square(jnp.diff(plane, axis=axis))) for axis in (0, 1))
 
@@ -218,9 +307,16 @@ def total_variation(plane: Float[Array, "first second features"]) -> Float[Array
 def time_smoothness(
     plane: Float[Array, "moments vertices features"],
 ) -> Float[Array, ""]:
-    """Mean squared second difference along the first axis: how unsteady in time.
+    """Compute the mean squared second difference along time.
 
-    K-Planes, equation 4; zero for what changes evenly, as two moments do.
+    Args:
+      plane: A plane of time, [moments, vertices, features].
+
+    Returns:
+      A scalar, zero for features that change linearly and for fewer than three rows.
+
+    References:
+      K-Planes, arXiv:2301.10241, equation 4.
     """
     if plane.shape[0] < 3:
         return jnp.zeros((), plane.dtype)  # of nothing the mean is NaN
@@ -231,9 +327,18 @@ def time_smoothness(
 def l1_time_planes(
     plane: Float[Array, "moments vertices features"],
 ) -> Float[Array, ""]:
-    """Mean distance from one, at which a plane of time in a product changes nothing.
+    """Compute the mean absolute distance from one, the neutral element of a product.
 
-    K-Planes, equation 5 (L1): space explains what it can.
+    This encourages static features to be explained by the planes of space.
+
+    Args:
+      plane: A plane of time, [moments, vertices, features].
+
+    Returns:
+      A scalar.
+
+    References:
+      K-Planes, arXiv:2301.10241, equation 5 (L1).
     """
     off = plane - 1
     # Not `abs`, whose slope at zero is one: planes start at one, and all that rests

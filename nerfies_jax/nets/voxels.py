@@ -1,12 +1,12 @@
-"""Features of a point from one dense grid, read at several distances.
+"""Dense voxel grid with multi-distance interpolation, as in TiNeuVox.
 
-Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, "multi-distance interpolation". The text
-with its equations was not at hand; its code (hustvl/TiNeuVox, `mult_dist_interp`) is
-followed: the grid is read between its own vertices, between every second and between
-every fourth, so that one sample trains vertices far enough away to learn from points
-that a small network moves. The three share one table, whose size is that of the finest,
-and which has it from the first step: the code's grid grows, here strides may open one
-after the other (`encode`).
+Fang et al. 2022, arXiv:2205.15285. The text with its equations was not at hand, so its
+code (hustvl/TiNeuVox, `mult_dist_interp`) is followed. The grid is interpolated between
+its own vertices, between every second and between every fourth, so that one sample
+trains vertices far enough away to learn from points that a small network moves. The
+three share one table, which has the size of the finest from the first step. The
+published grid grows during training. Here strides may open one after the other
+(`encode`).
 """
 
 import dataclasses
@@ -24,12 +24,13 @@ MOST_ROWS = 2**26  # 1.6 GB of six floats
 
 @dataclasses.dataclass(frozen=True)
 class VoxelGridSpec:
-    """A dense grid over a box; the defaults are TiNeuVox-B's.
+    """Settings of a dense grid over a box. The defaults are those of TiNeuVox-B.
 
-    `strides` are from coarse to fine. Each feature is followed by `bands` waves of
-    itself, as coordinates are. The box is that of `grids.HashGridSpec`; a point beyond
-    it has the features of the nearest in it, where the paper drops it, or with
-    `contract` space is contracted, which leaves the box half the vertices of a side.
+    `strides` are from coarse to fine. Features are followed by their positional
+    encoding with `bands` bands, like coordinates. The box is that of
+    `grids.HashGridSpec`. A point outside has the features of the nearest point in the
+    box, where the paper drops it. With `contract` space is contracted, which leaves the
+    box half the vertices along a side.
     """
 
     cells: int = 160  # along an axis
@@ -58,18 +59,37 @@ class VoxelGridSpec:
 
     @property
     def levels(self) -> int:
-        """What is opened one by one, coarse to fine."""
+        """Number of strides, which open one by one from coarse to fine."""
         return len(self.strides)
 
     def width(self, dimensions: int) -> int:
-        """Features made of a point, which has three coordinates."""
+        """Return the number of features of a point.
+
+        Args:
+          dimensions: Number of coordinates of the point, which must be 3.
+
+        Returns:
+          The length of `encode`'s result.
+
+        Raises:
+          ValueError: If `dimensions` is not 3.
+        """
         if dimensions != 3:
             raise ValueError(f"a voxel grid is of 3 dimensions, not of {dimensions}")
         return EncodingSpec(self.bands).width(self.levels * self.features)
 
 
 def init(spec: VoxelGridSpec, key=None, dtype=jnp.float32) -> Tables:
-    """Nothing anywhere, as published; no key is used."""
+    """Initialize the grid with zeros, as published.
+
+    Args:
+      spec: Settings of the grid.
+      key: Not used.
+      dtype: Floating-point type of the table.
+
+    Returns:
+      A tuple of one table, [(cells + 1)**3, features].
+    """
     return (jnp.zeros(((spec.cells + 1) ** 3, spec.features), dtype),)
 
 
@@ -79,9 +99,17 @@ def encode(
     point: Float[Array, "3"],
     window: Float[Array, " levels"] | None = None,
 ) -> Float[Array, " encoded"]:
-    """Features of one point in units of the field, the widest stride first.
+    """Interpolate the features of one point, the widest stride first.
 
-    `window` weighs the strides (`encoding.anneal`); None leaves them all open.
+    Args:
+      spec: Settings of the grid.
+      tables: The table, in a tuple.
+      point: Point in units of the field, [3].
+      window: Weights of the strides (`encoding.anneal`), [levels]. None is a weight of
+        one for all strides.
+
+    Returns:
+      Features [spec.width(3)], followed by their positional encoding.
     """
     (table,) = tables
     place = grids.unit_place(point, spec.half_side, spec.contract)
