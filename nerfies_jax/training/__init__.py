@@ -1,4 +1,4 @@
-"""Floor 4: how anything is fitted."""
+"""Training: losses, schedules, the loop, checkpoints and small solvers."""
 
 import lazy_loader
 

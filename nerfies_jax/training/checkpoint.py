@@ -1,4 +1,4 @@
-"""Save and restore a run: orbax directories that carry what they were made with."""
+"""Save and restore runs as orbax directories with metadata about their origin."""
 
 import concurrent.futures
 import contextlib
@@ -30,7 +30,7 @@ _STATE, _ABOUT = "state", "about.json"
 
 
 class Restored(NamedTuple):
-    """A run as it was when it was saved."""
+    """State and metadata of a saved run."""
 
     state: PyTree
     step: int
@@ -39,16 +39,16 @@ class Restored(NamedTuple):
 
 
 class SaveError(ValueError):
-    """A checkpoint that could not be written; those before it are whole."""
+    """A checkpoint could not be written. Earlier checkpoints are intact."""
 
 
 class Checkpoints:
-    """Writes the checkpoints of one run; the newest `keep` stay.
+    """Writer of the checkpoints of one run, which keeps the newest `keep`.
 
-    A directory appears under its final name only once everything in it is on disk, so
-    a killed process leaves the previous checkpoint intact. Saving copies the arrays and
-    writes in the background; a write that fails is a SaveError of the next `save`,
-    `wait` or `close`, unless `failure` has told it.
+    A directory appears under its final name only once everything in it is on disk, so a
+    killed process leaves the previous checkpoint intact. Saving copies the arrays and
+    writes in the background. A write that fails raises SaveError at the next `save`,
+    `wait` or `close`, unless `failure` has returned it.
     """
 
     def __init__(
@@ -85,7 +85,16 @@ class Checkpoints:
         self._writing: concurrent.futures.Future | None = None
 
     def save(self, state: PyTree, step: int, record: Any = None) -> None:
-        """Save the state after `step` completed steps; nothing where it exists."""
+        """Save the state after `step` completed steps, unless that is already saved.
+
+        Args:
+          state: Training state, a pytree of arrays.
+          step: Number of completed steps, the name of the checkpoint.
+          record: JSON values that are stored with the state, such as the history.
+
+        Raises:
+          SaveError: If the save before this one failed.
+        """
         self.wait()
         if latest(self.folder) == step and not self._is_orphaned():
             return
@@ -94,20 +103,36 @@ class Checkpoints:
         self._writing = self._writer.submit(self._write, step, leaves, about)
 
     def failure(self, wait: bool = False) -> SaveError | None:
-        """Why the last save failed, told once; None where it did not, or not yet."""
+        """Return the error of the last save, once.
+
+        Args:
+          wait: True to wait until the write has ended.
+
+        Returns:
+          The error, or None if the save did not fail, has not ended or was already
+          reported.
+        """
         if self._writing is None or not (wait or self._writing.done()):
             return None
         error, self._writing = self._writing.exception(), None
         return error
 
     def wait(self) -> None:
-        """Until everything saved is on disk."""
+        """Wait until everything saved is on disk.
+
+        Raises:
+          SaveError: If the last save failed.
+        """
         error = self.failure(wait=True)
         if error is not None:
             raise error
 
     def close(self) -> None:
-        """Wait, and let go of the folder."""
+        """Wait for the last save and stop the writer.
+
+        Raises:
+          SaveError: If the last save failed.
+        """
         self._writer.shutdown()
         self.wait()
 
@@ -211,7 +236,14 @@ def _write_text(path, text):
 
 
 def steps(folder) -> list[int]:
-    """Steps of the finished checkpoints in a folder, in order."""
+    """List the finished checkpoints of a folder.
+
+    Args:
+      folder: Folder of the checkpoints, which may be missing.
+
+    Returns:
+      Their steps, in ascending order.
+    """
     folder = pathlib.Path(folder)
     if not folder.is_dir():
         return []
@@ -221,17 +253,36 @@ def steps(folder) -> list[int]:
 
 
 def latest(folder) -> int | None:
-    """Step of the newest finished checkpoint, or None."""
+    """Return the newest finished checkpoint of a folder.
+
+    Args:
+      folder: Folder of the checkpoints, which may be missing.
+
+    Returns:
+      Its step, or None if there is none.
+    """
     return max(steps(folder), default=None)
 
 
 def restore(folder, example: PyTree, spec, *, step: int | None = None) -> Restored:
-    """The newest checkpoint that can be read, or the one of `step`.
+    """Restore the newest checkpoint that can be read, or the one of a step.
 
-    `example` gives the structure alone (a state, or `jax.eval_shape` of one): the first
-    axis of an array, such as the capacity in Gaussians, comes from the checkpoint. One
-    of another spec is a ValueError that lists the fields; one that is damaged is passed
-    over with a warning.
+    A damaged checkpoint is skipped with a warning.
+
+    Args:
+      folder: Folder of the checkpoints.
+      example: A state, or `jax.eval_shape` of one, which gives the tree structure. The
+        first axis of an array, such as the capacity in Gaussians, comes from the
+        checkpoint.
+      spec: The settings with which the run must have been made.
+      step: Number of completed steps. None for the newest.
+
+    Returns:
+      The state with its metadata.
+
+    Raises:
+      ValueError: If there is no checkpoint, none can be read, or it has another spec.
+        The message lists the fields that differ.
     """
     folder = pathlib.Path(folder).absolute()
     present = steps(folder)
@@ -264,7 +315,7 @@ def restore(folder, example: PyTree, spec, *, step: int | None = None) -> Restor
 
 
 class _Damaged(Exception):
-    """A checkpoint that is not what was written."""
+    """The contents of a checkpoint are not those that were written."""
 
 
 class _Foreign(ValueError):
@@ -291,7 +342,9 @@ def _checksum(array):
 
 
 def _text_checksum(about):
-    """Of the notes but for their own checksum; the same before and after JSON."""
+    """Checksum of the metadata without its own entry, the same before and after
+    JSON.
+    """
     rest = {key: value for key, value in about.items() if key != "crc32"}
     return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
 
@@ -309,7 +362,7 @@ def _read_about(folder):
 
 
 def _read(folder):
-    """Leaves and notes of one checkpoint; _Damaged unless every byte is as written."""
+    """Leaves and metadata of one checkpoint. Raises _Damaged if a byte has changed."""
     try:
         about = _read_about(folder)
         notes = about["leaves"]

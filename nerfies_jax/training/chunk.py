@@ -1,4 +1,4 @@
-"""Steps of training as compiled scans."""
+"""Training steps as compiled scans."""
 
 import functools
 import time
@@ -25,7 +25,7 @@ FEW_STEPS = 100  # a run of fewer has single steps
 
 
 class Outcome(NamedTuple):
-    """What a chunk reports beside its state; scalars."""
+    """Scalars that a chunk of steps reports next to its state."""
 
     done: Any  # steps run, the first with a non-finite metric included
     metrics: Any  # means over the steps asked for
@@ -39,10 +39,21 @@ def scan_steps(
     frames: PyTree,
     length: int,
 ) -> tuple[PyTree, dict[str, Array]]:
-    """The state after `length` steps, and the metrics of each, stacked: [length].
+    """Run a number of steps as one scan.
 
-    `step(state, frames) -> (state, metrics)` is pure: so is this, and it can be
-    differentiated. ValueError where a step changes the shape or dtype of an array.
+    It is pure if `step` is, and it can be differentiated.
+
+    Args:
+      step: Pure function `step(state, frames) -> (state, metrics)`.
+      state: State before the first step, a pytree of arrays.
+      frames: Training frames, the same in all steps.
+      length: Number of steps.
+
+    Returns:
+      The state after the last step, and each metric of all steps, [length].
+
+    Raises:
+      ValueError: If a step changes the shape or dtype of an array.
     """
     accumulate = jnp.result_type(float)
 
@@ -90,7 +101,9 @@ def _strong(leaf):
 
 
 def _check_same(before, after):
-    """Name the array whose shape or dtype a step changes; XLA would name none."""
+    """Raise ValueError with the name of the array whose shape or dtype a step
+    changes.
+    """
     old, old_structure = jax.tree_util.tree_flatten_with_path(before)
     new, new_structure = jax.tree_util.tree_flatten_with_path(after)
     if old_structure != new_structure:
@@ -109,15 +122,16 @@ def _check_same(before, after):
 
 
 class Program:
-    """Any number of steps for arrays of the same shapes: scans, and single steps.
+    """Compiled training steps for arrays of fixed shapes: scans and single steps.
 
-    Compiled are one scan of `length` steps, LENGTH or fewer of large ones, and, only
-    where there is a remainder, one of a single step: a step has the same bits wherever
-    chunks of LENGTH end. (A scan of each length would be compiled anew; one that skips
-    steps copies the state for each.)
-    Called with (state, frames, count) it gives the state and the `Outcome`; the state
-    given is overwritten. Of a step that works on several devices, state and outcome are
-    on the first of them, `frames` on all (`data_parallel.replicate`).
+    Two programs are compiled: one scan of `length` steps (LENGTH, or fewer for
+    expensive steps), and, only if there is a remainder, a single step. A step therefore
+    gives the same bits wherever chunks of LENGTH end. (A scan of each length would need
+    its own compilation, and one that skips steps copies the state for each.)
+
+    Called with (state, frames, count) it returns the state and the `Outcome`. The state
+    passed in is overwritten. If a step works on several devices, state and outcome are
+    on the first of them and `frames` on all (`data_parallel.replicate`).
     """
 
     def __init__(self, model: Model, state: TrainState, frames: Frames, steps: int):
@@ -135,9 +149,10 @@ class Program:
         return next(fit, 1)
 
     def _flops(self):
-        """Of a step: what XLA counts, where the loops' bodies count once, or products.
+        """Operations of a step, by XLA's count, in which loop bodies count once, or by
+        products.
 
-        Of a step in micro-batches, or in slabs of pixels, each has a part.
+        A step in micro-batches, or in slabs of pixels, is split into parts.
         """
         counted = self._lower(LENGTH).cost_analysis() or {}
         products = matrix_flops.count(self._step, *self._shapes).flops
@@ -154,7 +169,14 @@ class Program:
         return data_parallel.replicate(state, self._devices)
 
     def prepare(self, count: int) -> float:
-        """Seconds of compiling what so many steps need; 0 where it is there."""
+        """Compile the programs that a number of steps needs.
+
+        Args:
+          count: Number of steps.
+
+        Returns:
+          Seconds of compilation, 0 if nothing was missing.
+        """
         missing = set(self._lengths(count)) - self._programs.keys()
         if not missing:
             return 0.0
@@ -192,7 +214,17 @@ def _abstract(leaf):
 def program(
     model: Model, state: TrainState, frames: Frames, steps: int
 ) -> tuple[Program, float]:
-    """For these shapes and a run of `steps` in all, and the seconds of lowering it."""
+    """Return the program for the shapes of a state and frames, traced but not compiled.
+
+    Args:
+      model: The model, whose `step` is compiled.
+      state: Training state.
+      frames: Training frames.
+      steps: Number of steps of the whole run.
+
+    Returns:
+      The program, and the seconds of tracing, 0 if it was cached.
+    """
     programs = _programs(model.step)
     leaves, structure = jax.tree.flatten((state, frames))
     shapes = tuple((x.shape, x.dtype, x.sharding) for x in leaves)
@@ -208,7 +240,18 @@ def program(
 def compiled(
     model: Model, state: TrainState, frames: Frames, steps: int
 ) -> tuple[Program, Frames, float]:
-    """The program of a run with its scan compiled, what it reads, and the seconds."""
+    """Return the program of a run with its scan compiled.
+
+    Args:
+      model: The model.
+      state: Training state.
+      frames: Training frames.
+      steps: Number of steps of the whole run.
+
+    Returns:
+      The program, the frames as it takes them, and the seconds of tracing and
+      compiling.
+    """
     made, frames, seconds = _lowered(model, state, frames, steps)
     return made, frames, seconds + made.prepare(made.length)
 
@@ -216,9 +259,16 @@ def compiled(
 def compiling(
     model: Model, state: TrainState, frames: Frames, steps: int
 ) -> Future[float]:
-    """Have the scan of a run ready by the time `compiled` or `program` is called.
+    """Compile the scan of a run in the background, for `compiled` or `program` to find.
 
-    Compiles in the background; the result is the seconds that making it took.
+    Args:
+      model: The model.
+      state: Training state.
+      frames: Training frames.
+      steps: Number of steps of the whole run.
+
+    Returns:
+      A future of the seconds of tracing and compiling.
     """
     made, _, seconds = _lowered(model, state, frames, steps)
     return compiler.begun(lambda: seconds + made.prepare(made.length))

@@ -1,9 +1,10 @@
-"""Small solves around a trained field: cameras and latent codes; `tracks` for warps.
+"""Small optimization problems around a trained field: cameras and latent codes.
 
-Everything takes plain functions, runs under `jit`, and says by a flag, never by an
-exception, whether it got there. Flags are computed from the result: a solver's own word
-is about its last step only. jaxopt is imported in this file and nowhere else; it and
-optimistix where a solver of theirs is called for.
+Inverse warps are in `tracks`. Everything takes plain functions, runs under `jit`, and
+reports convergence by a flag, never by an exception. Flags are computed from the
+result, since a solver's own report is about its last step only. jaxopt is imported in
+this file and nowhere else. Both jaxopt and optimistix are imported only if one of their
+solvers is requested.
 """
 
 import dataclasses
@@ -27,7 +28,7 @@ Scalar = Float[Array, ""]
 
 
 class Fit(NamedTuple):
-    """The outcome of one solve; leading axes where it was vmapped."""
+    """Result of one solve, with leading axes if it was vmapped."""
 
     value: PyTree  # finite where the start is, whether or not it converged
     converged: Bool[Array, "*batch"]
@@ -36,26 +37,40 @@ class Fit(NamedTuple):
 
 
 def check_positive(**values):
-    """Raise ValueError with name and value for what is not positive and finite."""
+    """Check that numbers are positive and finite.
+
+    Args:
+      **values: Numbers by name.
+
+    Raises:
+      ValueError: If one is not, with its name and value.
+    """
     for name, value in values.items():
         if not 0 < value < math.inf:
             raise ValueError(f"{name}={value} must be positive and finite")
 
 
 def counted(steps) -> Int[Array, "*batch"]:
-    """Steps as int32: solvers count in whatever is the default."""
+    """Convert step counts to int32, since solvers count in the default integer type.
+
+    Args:
+      steps: Step counts, [...].
+
+    Returns:
+      The counts as int32, [...].
+    """
     return jnp.asarray(steps, jnp.int32)
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraSpec:
-    """Which of a camera's numbers are refined, and when they count as found.
+    """Settings of the refinement of a camera, and its convergence criteria.
 
-    They do when one more Gauss-Newton step would turn the camera by less than
-    `tolerance` (rad; of other unknowns, what moves the residuals as much), when the
-    residuals tell all unknowns apart, and when their root mean square is at most
-    `max_residual`. Give that bound wherever wrong minima exist: photometric residuals
-    are flat there too.
+    A fit has converged if one more Gauss-Newton step would rotate the camera by less
+    than `tolerance` (rad, and for other unknowns a step that changes the residuals as
+    much), if the residuals determine all unknowns, and if their root mean square is at
+    most `max_residual`. Set that bound wherever wrong minima exist: photometric
+    residuals are flat there too.
     """
 
     unknowns: tuple[str, ...] = ("angular", "linear")  # and "focal"
@@ -85,10 +100,21 @@ def refine_camera(
     camera: Camera,
     spec: CameraSpec = CameraSpec(),
 ) -> Fit:
-    """The camera nearby with the least sum of squared `residuals`.
+    """Minimize the sum of squared residuals over a camera near the given one.
 
-    By Levenberg-Marquardt. `residual` is their root mean square. The result carries no
-    derivatives.
+    The solver is Levenberg-Marquardt. The result carries no derivatives.
+
+    Args:
+      residuals: Function from a camera to residuals of any shape.
+      camera: Initial camera.
+      spec: Unknowns and convergence criteria.
+
+    Returns:
+      The fit, with the camera as `value`. `residual` is the root mean square of the
+      residuals.
+
+    Raises:
+      ValueError: If there are fewer residuals than unknowns.
     """
     camera = jax.tree.map(lambda leaf: lax.stop_gradient(jnp.asarray(leaf)), camera)
     start = jnp.zeros(
@@ -138,12 +164,25 @@ def fit_code(
     max_steps: int = 100,
     tolerance: float = 1e-4,
 ) -> Fit:
-    """A latent code (any pytree of floats of one dtype) that makes `loss` small.
+    """Minimize a loss over a latent code.
 
-    `residual` is the length of the loss's gradient; at most `tolerance` (loss per unit
-    of code) counts as converged. The code returned is never worse than the start, which
-    is what comes back where the loss is not finite there. No derivatives. The solvers
-    are `CODE_SOLVERS`; experiments.solver_table measures them. "lbfgs" is optax's.
+    The code returned is never worse than `start`, which is returned if the loss is not
+    finite there. The result carries no derivatives. `experiments.solver_table` compares
+    the solvers.
+
+    Args:
+      loss: Function from a code to a scalar.
+      start: Initial code, any pytree of floats of one dtype.
+      solver: Name of one of `CODE_SOLVERS`. "lbfgs" is that of optax.
+      max_steps: Largest number of steps.
+      tolerance: Norm of the gradient (loss per unit of code) that counts as converged.
+
+    Returns:
+      The fit, with the code as `value`. `residual` is the norm of the gradient.
+
+    Raises:
+      ValueError: If the solver is unknown, a bound is not positive, or the code has
+        mixed or integer types.
     """
     check_positive(max_steps=max_steps, tolerance=tolerance)
     if solver not in CODE_SOLVERS:
@@ -218,7 +257,9 @@ def _optimistix(name):
 
 
 def _optax(transformation):
-    """Descent by an optax transformation; the best code of the way, not the last."""
+    """Descent by an optax transformation. Returns the best code of all steps, not the
+    last.
+    """
 
     def solve(loss, start, max_steps, tolerance):
         rule = optax.with_extra_args_support(transformation(max_steps))
@@ -278,7 +319,7 @@ def _stepped(camera, step, unknowns):
 
 
 def _settled(residuals, step, tolerance):
-    """Whether the next Gauss-Newton step is small and well determined."""
+    """Test if the next Gauss-Newton step is small and well determined."""
     grads = jax.jacfwd(residuals)(step)
     basis, triangle = jnp.linalg.qr(grads)
     values = jnp.linalg.svd(triangle, compute_uv=False)

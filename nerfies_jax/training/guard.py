@@ -1,4 +1,4 @@
-"""What a run falls back to when a step is not finite, and what was wrong in it."""
+"""Recovery of a run after a non-finite step: the last good state, and a diagnosis."""
 
 import time
 from collections.abc import Callable
@@ -15,7 +15,7 @@ RENEW_SHARE = 0.05  # of the time may go into copies
 
 
 class Snapshot:
-    """The last good state in host memory, so that the device holds it only once."""
+    """Last good state in host memory, so that the device holds it only once."""
 
     def __init__(self, step: int, state: TrainState):
         began = time.monotonic()
@@ -26,15 +26,29 @@ class Snapshot:
         self._cost = self.taken - began
 
     def state(self) -> TrainState:
-        """A fresh copy on the device."""
+        """Return a copy of the state on the device.
+
+        Returns:
+          The training state.
+        """
         return jax.tree.unflatten(
             self._structure, [_to_device(*leaf) for leaf in self._leaves]
         )
 
     def renewed(self, step: int, state: TrainState, after_event: bool) -> "Snapshot":
-        """A new one if that is cheap by now, and always after an event.
+        """Return a newer snapshot if copying is cheap enough by now, and always after
+        an event.
 
-        A replay from here is steps alone, so no event may lie in between.
+        A replay from a snapshot consists of steps alone, so no event may lie in
+        between.
+
+        Args:
+          step: Number of completed steps.
+          state: Training state after these steps.
+          after_event: True if an event has changed the state since the snapshot.
+
+        Returns:
+          A new snapshot, or this one.
         """
         if not after_event:
             wait = max(RENEW_SECONDS, self._cost / RENEW_SHARE)
@@ -66,13 +80,23 @@ def last_good(
     good_step: int,
     bad_step: int,
 ) -> tuple[TrainState, int, str]:
-    """The state before the first bad step, that step's number, and what was bad in it.
+    """Find the state before the first step that is not finite.
 
-    Metrics are looked at after every step and the state after every scan of steps, so
-    the first bad step is found by bisection between `good_step`, the end of the last
-    good chunk, and `bad_step`, where something was not finite; steps are deterministic,
-    and are repeated from the last copy. `program(state, frames, count)` is a
-    `chunk.Program`; steps count from the start of the run.
+    Metrics are checked after every step and the state after every scan of steps, so the
+    first bad step is found by bisection. Steps are deterministic, and are repeated from
+    the last snapshot.
+
+    Args:
+      program: A `chunk.Program`, `program(state, frames, count)`.
+      snapshot: Last copy of a good state.
+      frames: Training frames.
+      good_step: Step at the end of the last good chunk, counted from the start of the
+        run.
+      bad_step: Step at which something was not finite.
+
+    Returns:
+      The last good state, its step, and a description of the values that were not
+      finite.
     """
 
     def replay(step):
@@ -105,12 +129,26 @@ def _kept(snapshot):
 
 
 def listed(names):
-    """The first few of the names, the first to be computed first."""
+    """Join the first few of several names, the first to be computed first.
+
+    Args:
+      names: Names.
+
+    Returns:
+      Up to four names, and the number of the others.
+    """
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if names[4:] else "")
 
 
 def bad_arrays(state):
-    """Paths of the arrays of a state that are not finite, and how much of them."""
+    """Find the arrays of a state that are not finite.
+
+    Args:
+      state: Training state.
+
+    Returns:
+      A line for each, with its path and the number of its values that are not finite.
+    """
     descriptions = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):

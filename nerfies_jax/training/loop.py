@@ -1,4 +1,4 @@
-"""Fit a model: compiled chunks of steps between events on the host."""
+"""Training loop: compiled chunks of steps between events on the host."""
 
 import math
 import time
@@ -29,9 +29,9 @@ class Hook(NamedTuple):
     """A callback between chunks of steps that does not change the state.
 
     `call(state, step, metrics)` receives the state after `step` steps and the mean
-    metrics of the last chunk, as `{"loss": 0.01, "mse": 0.002}`; they are empty where
-    no step was taken. The numbers that it returns are kept in the history. Its time
-    does not count as training, and it must not keep the state: the next chunk
+    metrics of the last chunk, for example `{"loss": 0.01, "mse": 0.002}`. They are
+    empty if no step was taken. The numbers that it returns are kept in the history. Its
+    time does not count as training, and it must not keep the state: the next chunk
     overwrites it. It also runs once when the run is complete.
     """
 
@@ -42,7 +42,9 @@ class Hook(NamedTuple):
 
 
 class History(NamedTuple):
-    """What a run did so far; JSON values, and it travels with the checkpoints."""
+    """Metrics and times of a run so far, as JSON values that are saved with
+    checkpoints.
+    """
 
     rows: tuple[dict[str, float], ...] = ()  # per chunk: step, seconds, mean metrics
     evaluations: tuple[dict[str, Any], ...] = ()  # hook, step, seconds, its numbers
@@ -51,7 +53,7 @@ class History(NamedTuple):
 
 
 class FitResult(NamedTuple):
-    """Where a run ended and why."""
+    """Final state of a run and the reason why it ended."""
 
     state: TrainState
     history: History
@@ -67,7 +69,10 @@ class FitResult(NamedTuple):
 
     @property
     def training_share(self) -> float:
-        """Of the time of training and compiling: the processor tells only both."""
+        """Training time as a share of training and compilation.
+
+        Processor time is measured only for both together.
+        """
         both = self.seconds + self.compile_seconds
         return self.seconds / both if both else 0.0
 
@@ -78,7 +83,14 @@ class FitResult(NamedTuple):
 
 
 def step_key(state: TrainState) -> Key[Array, ""]:
-    """The key of the coming step, a function of the run's key and the step alone."""
+    """Return the PRNG key of the next step, a function of the run's key and the step.
+
+    Args:
+      state: Training state.
+
+    Returns:
+      The key.
+    """
     return jax.random.fold_in(state.key, state.step)
 
 
@@ -96,21 +108,37 @@ def fit(
     history: History = History(),
     console: rich.console.Console | None = None,
 ) -> FitResult:
-    """Train until `steps` steps are completed in all, from wherever `state` is.
+    """Train a model until a number of steps is completed in all.
 
-    `seconds` bounds the training of this call: chunks and events, neither compiling nor
-    hooks. Ctrl-C, SIGTERM, SIGHUP and a number that is
-    not finite, in a metric or anywhere in the state, end it too; whatever ends it, the
-    last good state is saved to `checkpoints` and returned. A save that fails is told
-    and tried again with the next; it ends nothing. An event happens when its
-    step is completed, before a checkpoint of that step, so a resumed run repeats the
-    uninterrupted one bit for bit (on XLA:CPU with the same PJRT_NPROC). Pass the
-    restored history on. Progress goes to the sinks of `nerfies_jax.events`: `train`
-    events, of hooks that return numbers `evaluation` events, and to the terminal, or
-    the `console` that is passed.
+    Training also ends at Ctrl-C, SIGTERM, SIGHUP, or a number that is not finite in a
+    metric or anywhere in the state. In each case the last good state is saved to
+    `checkpoints` and returned. A save that fails is reported and retried with the next
+    one. It does not end the run.
 
-    Steps are scanned; one program serves all chunks of a shape, and a second one what
-    is left over where events or the end fall between them (`chunk.Program`).
+    An event happens when its step is completed, before a checkpoint of that step, so a
+    resumed run repeats the uninterrupted one bit for bit (on XLA:CPU with the same
+    PJRT_NPROC). Progress goes to the sinks of `nerfies_jax.events`: `train` events, and
+    `evaluation` events of hooks that return numbers.
+
+    Steps are scanned. One program serves all chunks of a shape, and a second one the
+    remainder where events or the end fall between them (`chunk.Program`).
+
+    Args:
+      model: The model.
+      state: Initial or restored state. It is overwritten.
+      frames: Training frames on the device.
+      steps: Number of steps of the whole run, counted from its very beginning.
+      events: Events in addition to those of the model.
+      hooks: Callbacks that do not change the state.
+      seconds: Bound on the training time of this call, which counts chunks and events
+        but neither compilation nor hooks. None for no bound.
+      checkpoints: Writer of checkpoints. None saves nothing.
+      checkpoint_seconds: Training seconds between two checkpoints.
+      history: History of the run so far, which a restored run must pass on.
+      console: Console that shows progress. None for the terminal.
+
+    Returns:
+      The last state with its history and the reason why training ended.
     """
     run = _Run(model, state, frames, steps, (*model.events, *events), tuple(hooks))
     run.history, run.checkpoints = history, checkpoints
@@ -175,7 +203,9 @@ class _Run:
         return "steps"
 
     def _chunk(self, program, count) -> bool:
-        """Run one chunk and the events at its end; false where something blew up."""
+        """Run one chunk and the events at its end. False if something became
+        non-finite.
+        """
         began = time.perf_counter()
         self.state, outcome = program(self.state, self.spread_frames, count)
         done = outcome.done
@@ -209,7 +239,7 @@ class _Run:
         return True
 
     def _happen(self, happening, step) -> bool:
-        """Let the events of a step happen; false where one made something blow up."""
+        """Apply the events of a step. False if one made something non-finite."""
         for event in happening:
             self.state = _distinct(event.apply(self.state, self.frames))
             if int(self.state.step) != step:
@@ -246,11 +276,13 @@ class _Run:
         return self.limits[0] - (self.history.seconds - self.trained_before)
 
     def _half_a_scan(self, length: int) -> float:
-        """Seconds; with less time left than this, no other scan is begun."""
+        """Seconds of half a scan. With less time left than this, no other scan
+        begins.
+        """
         return length * self.step_seconds / 2 if self.step_seconds < math.inf else 0.0
 
     def _after_chunk(self) -> None:
-        """Hooks and display; none of it is training time."""
+        """Run hooks and update the display, none of which is training time."""
         for hook in self.hooks:
             if self._due(hook):
                 self._call(hook)
@@ -282,7 +314,7 @@ class _Run:
         )
 
     def _metrics(self) -> dict[str, float]:
-        """The mean metrics of the last chunk; empty before the first."""
+        """Mean metrics of the last chunk, empty before the first."""
         row = self.history.rows[-1] if self.history.rows else {}
         return {k: v for k, v in row.items() if k not in ("step", "seconds")}
 

@@ -1,7 +1,7 @@
-"""Residuals, robust penalties and structural dissimilarity.
+"""Photometric losses, robust penalties and structural dissimilarity.
 
-Huber on single residuals is `optax.losses.huber_loss`; here it takes a squared length,
-because the length itself has no gradient at zero.
+Use `optax.losses.huber_loss` for the Huber loss of single residuals. The one here takes
+a squared norm, because the norm itself has no gradient at zero.
 """
 
 import functools
@@ -26,7 +26,15 @@ LEAST_MSE = 1e-10
 def psnr(
     mse: Float[Array, "*batch"], value_range: float = 1.0
 ) -> Float[Array, "*batch"]:
-    """Decibels of a mean squared error; at most 100 for a range of one."""
+    """Compute the PSNR of a mean squared error.
+
+    Args:
+      mse: Mean squared errors, [...].
+      value_range: Difference between the largest and the smallest possible value.
+
+    Returns:
+      PSNR in dB, at most 100.
+    """
     least = LEAST_MSE * value_range**2
     mse = widened(mse)
     # max, not `mse + eps`: the sum would read 79.957 dB where 80 is right.
@@ -54,7 +62,15 @@ def _only_valid(
 def masked_mean(
     values: Float[Array, "*pixels channels"], valid: Bool[Array, "*pixels"] | None
 ) -> Float[Array, ""]:
-    """Mean over the valid pixels, float32 at least; zero where there are none."""
+    """Compute the mean over the valid pixels.
+
+    Args:
+      values: Values, [..., channels].
+      valid: True for pixels that count, [...]. None for all.
+
+    Returns:
+      The mean in float32 or float64, zero if no pixel is valid.
+    """
     values = widened(values)
     if valid is None:
         return jnp.mean(values)
@@ -69,7 +85,16 @@ def l1(
     target: Float[Array, "*pixels channels"],
     valid: Bool[Array, "*pixels"] | None = None,
 ) -> Float[Array, ""]:
-    """Mean absolute difference over the valid pixels."""
+    """Compute the mean absolute difference over the valid pixels.
+
+    Args:
+      image: Rendered values, [..., channels].
+      target: Ground truth of the same shape.
+      valid: True for pixels that count, [...]. None for all.
+
+    Returns:
+      A scalar, zero if no pixel is valid.
+    """
     image, target = _only_valid(image, target, valid)
     return masked_mean(jnp.abs(image - target), valid)
 
@@ -80,7 +105,16 @@ def mse(
     target: Float[Array, "*pixels channels"],
     valid: Bool[Array, "*pixels"] | None = None,
 ) -> Float[Array, ""]:
-    """Mean squared difference over the valid pixels."""
+    """Compute the mean squared difference over the valid pixels.
+
+    Args:
+      image: Rendered values, [..., channels].
+      target: Ground truth of the same shape.
+      valid: True for pixels that count, [...]. None for all.
+
+    Returns:
+      A scalar, zero if no pixel is valid.
+    """
     image, target = _only_valid(image, target, valid)
     return masked_mean(jnp.square(image - target), valid)
 
@@ -90,9 +124,20 @@ def mse(
 def charbonnier(
     residual_sq: Float[Array, "*batch"], width: float
 ) -> Float[Array, "*batch"]:
-    """sqrt(s + width^2) - width for s = |residual|^2: the length, rounded at zero.
+    """Compute the Charbonnier loss sqrt(s + width²) - width of s = |residual|².
 
-    Charbonnier et al. 1994, with the offset taken out so that it is zero at zero.
+    Args:
+      residual_sq: Squared norms s, non-negative, [...].
+      width: Norm below which the loss is quadratic, positive.
+
+    Returns:
+      Losses [...], zero at zero.
+
+    Raises:
+      ValueError: If `width` is not positive.
+
+    References:
+      Charbonnier et al. 1994, with the offset subtracted.
     """
     _positive(width)
     # The difference of roots would be 0 below s = 1e-8 at width 1e-2 in float32, and
@@ -106,7 +151,20 @@ def charbonnier(
 @checked
 @at_least_float32
 def huber(residual_sq: Float[Array, "*batch"], width: float) -> Float[Array, "*batch"]:
-    """s / 2 up to |residual| = width, then width (|residual| - width / 2)."""
+    """Compute the Huber loss of s = |residual|².
+
+    It is s / 2 up to |residual| = width, then width (|residual| - width / 2).
+
+    Args:
+      residual_sq: Squared norms s, non-negative, [...].
+      width: Norm at which the loss becomes linear, positive.
+
+    Returns:
+      Losses, [...].
+
+    Raises:
+      ValueError: If `width` is not positive.
+    """
     _positive(width)
     near = residual_sq < width**2
     length = jnp.sqrt(jnp.where(near, width**2, residual_sq))
@@ -120,11 +178,23 @@ def geman_mcclure(
     width: float,
     scaling: str = "paper",
 ) -> Float[Array, "*batch"]:
-    """2 s / (s + 4 width^2) for s = |residual|^2; saturates at two.
+    """Compute the Geman-McClure loss 2 s / (s + 4 width²) of s = |residual|².
 
-    Park et al. 2021 (Nerfies), arXiv:2011.12948, section 3.3. Their code multiplies it
-    with `width`, so that its elastic weight acts as 0.03 of what it says and the
-    background weight as 0.001: `scaling="official"`.
+    Args:
+      residual_sq: Squared norms s, non-negative, [...].
+      width: Norm at which the loss leaves the parabola, positive.
+      scaling: "paper", or "official" to multiply with `width` as the published code
+        does. There the elastic weight acts as 0.03 of its value and the background
+        weight as 0.001.
+
+    Returns:
+      Losses [...], which saturate at two, or at 2 `width` for "official".
+
+    Raises:
+      ValueError: If a setting is out of range.
+
+    References:
+      Park et al. 2021 (Nerfies), arXiv:2011.12948, section 3.3.
     """
     check_geman_mcclure(width, scaling)
     factor = 2.0 if scaling == "paper" else 2.0 * width
@@ -132,7 +202,15 @@ def geman_mcclure(
 
 
 def check_geman_mcclure(width: float, scaling: str) -> None:
-    """Raise ValueError for settings that `geman_mcclure` cannot have; no JAX."""
+    """Check the settings of `geman_mcclure`, without JAX.
+
+    Args:
+      width: As for `geman_mcclure`.
+      scaling: As for `geman_mcclure`.
+
+    Raises:
+      ValueError: If a setting is out of range.
+    """
     _positive(width)
     if scaling not in ("paper", "official"):
         raise ValueError(
@@ -180,21 +258,20 @@ def dssim_map(
     padding: str = "zero",
     value_range: float = 1.0,
 ) -> Float[Array, "rows columns channels"]:
-    """1 - SSIM around every pixel; exactly zero, with zero gradient, for equal images.
+    """Compute 1 - SSIM around every pixel.
 
-    `padding="zero"` is what INRIA's 3DGS and its descendants train on and report: the
-    window reaches into zeros outside the frame. `"valid"` leaves those 5 border pixels
-    out, which is scikit-image's Gaussian form (`gaussian_weights=True, sigma=1.5,
-    use_sample_covariance=False`) and reads 0.002 to 0.011 lower on photographs.
+    It is exactly zero, with zero gradient, for equal images. Forward mode, reverse mode
+    and forward over reverse (Hessian-vector products) work.
 
-    With d = image - target and local means m and variances v,
-    1 - SSIM = a + b - ab, a = m_d^2 / (m_i^2 + m_t^2 + C1), b = v_d / (v_i + v_t + C2):
-    no difference of nearly equal numbers, and four windows instead of five. Variances
-    are taken about the target's mean, which they do not depend on; uncentered, a pair
-    of constant images at 0.9 reads 4e-5 too low in float32, and 1000 +- 1 is 2e-3 off.
+    With d = image - target and local means m and variances v, 1 - SSIM = a + b - ab, a
+    = m_d² / (m_i² + m_t² + C1), b = v_d / (v_i + v_t + C2). This avoids differences of
+    nearly equal numbers, and takes four windows instead of five. Variances are taken
+    about the target's mean, which they do not depend on. Uncentered, a pair of constant
+    images at 0.9 gives 4e-5 too low in float32, and 1000 ± 1 is 2e-3 off.
 
     The window is eleven shifted sums along each axis with one of the four maps in
-    flight. CPU ms of forward and backward at 160x120x3 and 480x270x3, one core:
+    flight. Milliseconds of forward and backward on one CPU core at 160x120x3 and
+    480x270x3:
 
         this form                               1.7    11
         banded matrix products, in blocks       2.7    28
@@ -203,8 +280,27 @@ def dssim_map(
         dm-pix                                   42   251
         XLA's depthwise convolution              75   443
 
-    The window is its own transpose, so backward is the same code. Forward mode and
-    forward over reverse (Hessian-vector products) work as well.
+    The window is its own transpose, so the backward pass is the same code.
+
+    Args:
+      image: Rendered image, [height, width, channels].
+      target: Ground truth of the same shape.
+      padding: "zero" is the form that INRIA's 3DGS and its descendants train on and
+        report: the window reaches into zeros outside the frame. "valid" leaves those 5
+        border pixels out. It is scikit-image's Gaussian form (`gaussian_weights=True,
+        sigma=1.5, use_sample_covariance=False`), which is 0.002 to 0.011 lower on
+        photographs.
+      value_range: Difference between the largest and the smallest possible value.
+
+    Returns:
+      Dissimilarities of the same shape, without the border for "valid".
+
+    Raises:
+      ValueError: If shapes differ, the image is smaller than the window, or the padding
+        is unknown.
+
+    References:
+      Wang et al. 2004.
     """
     image, target = _comparable(image, target, padding)
     constant = value_range**2
@@ -237,7 +333,17 @@ def ssim(
     padding: str = "zero",
     value_range: float = 1.0,
 ) -> Float[Array, ""]:
-    """Mean structural similarity of one pair of images; see `dssim_map`."""
+    """Compute the mean structural similarity of two images.
+
+    Args:
+      image: Rendered image, [height, width, channels].
+      target: Ground truth of the same shape.
+      padding: "zero" or "valid", as for `dssim_map`.
+      value_range: Difference between the largest and the smallest possible value.
+
+    Returns:
+      SSIM, a scalar of at most 1.
+    """
     dissimilarity = dssim_map(image, target, padding=padding, value_range=value_range)
     return 1 - jnp.mean(dissimilarity)
 
@@ -250,11 +356,26 @@ def photometric(
     *,
     dssim_weight: float = 0.2,
 ) -> Float[Array, ""]:
-    """(1 - w) L1 + w (1 - SSIM), Kerbl et al. 2023, arXiv:2308.04079, equation 7.
+    """Compute the loss of 3DGS, (1 - w) L1 + w (1 - SSIM).
 
-    SSIM is zero-padded as in their code, and 1 - SSIM is not halved. Where `valid` is
-    false both images read zero, so nothing there is learned; windows that overlap the
-    edge of the mask see that zero in both. `dssim_weight=0` builds no windows.
+    SSIM is zero-padded as in the published code, and 1 - SSIM is not halved.
+
+    Args:
+      image: Rendered image, [height, width, channels].
+      target: Ground truth of the same shape.
+      valid: True for pixels that count, [height, width]. The others are zero in both
+        images and have no gradient. Windows that overlap the edge of the mask see that
+        zero in both. None for all.
+      dssim_weight: Weight w in [0, 1]. At 0 no windows are computed.
+
+    Returns:
+      The loss, a scalar.
+
+    Raises:
+      ValueError: If `dssim_weight` is out of range.
+
+    References:
+      Kerbl et al. 2023, arXiv:2308.04079, equation 7.
     """
     if not 0 <= dssim_weight <= 1:
         raise ValueError(
@@ -270,11 +391,19 @@ def photometric(
 
 @checked
 def middle_level(target: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """The mean to 12 bits, without a slope; variances may be taken about it.
+    """Compute the mean, rounded to 12 bits, as a center for variances. Without
+    gradient.
 
-    The compiler may contract x - sum * (1 / count) into one operation, in one place and
-    not in another, and so take E[x] and E[x^2] about two centers that are half an ulp
-    of the level apart: 4e-5 of SSIM at level 1000 in float32. Rounded, it is one.
+    The compiler may fuse x - sum * (1 / count) into one operation in one place and not
+    in another, and so compute E[x] and E[x²] about two centers that are half an ulp of
+    the level apart, which is 4e-5 of SSIM at level 1000 in float32. Rounding makes them
+    equal.
+
+    Args:
+      target: Values of any shape.
+
+    Returns:
+      A scalar.
     """
     mean = lax.stop_gradient(jnp.mean(target))
     return lax.reduce_precision(mean, jnp.finfo(mean.dtype).nexp, 12)
@@ -302,7 +431,8 @@ def _blur(
     outside: Float[Array, " maps"],
     channels: int,
 ) -> Float[Array, "maps height columns"]:
-    """Every map under the window; beyond the frame each reads its value of `outside`.
+    """Filter every map with the window. Outside the frame each has its value of
+    `outside`.
 
     Channels are folded into the columns, so that every shift is contiguous. `outside`
     gets no gradient.

@@ -1,4 +1,4 @@
-"""What a representation must offer the loop, the renderer and the report."""
+"""Interface of a representation to the training loop, the renderer and the report."""
 
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ PyTree = Any
 
 
 class Frames(NamedTuple):
-    """The frames to learn from, on the device, one row each."""
+    """Training frames on the device, one row each."""
 
     images: Any  # [frames, height, width, 3] uint8
     cameras: Camera
@@ -31,7 +31,7 @@ class Frames(NamedTuple):
 
 
 class View(NamedTuple):
-    """What to render: from where, and when."""
+    """Viewpoint and time of an image to render."""
 
     camera: Camera
     time: Float[Array, ""]
@@ -39,7 +39,7 @@ class View(NamedTuple):
 
 
 class Rendering(NamedTuple):
-    """One whole frame."""
+    """A rendered image with its opacity and depth."""
 
     color: Float[Array, "height width 3"]  # sRGB; not clipped
     alpha: Float[Array, "height width"]
@@ -48,10 +48,10 @@ class Rendering(NamedTuple):
 
 
 class TrainState(NamedTuple):
-    """Everything a run needs to continue bit for bit; arrays only, all of them finite.
+    """Everything needed to continue a run bit for bit, as finite arrays.
 
-    Where an array would start at infinity, such as one that keeps a least value, let it
-    start at the largest number: the loop stops at whatever is not finite.
+    If an array would start at infinity, such as one that tracks a minimum, start it at
+    the largest number: the loop stops at anything that is not finite.
     """
 
     params: PyTree
@@ -62,10 +62,17 @@ class TrainState(NamedTuple):
 
 
 def in_default_precision(tree: PyTree) -> PyTree:
-    """A pytree on the device, its floating arrays as `jax_enable_x64` says.
+    """Move a pytree to the device with floating-point arrays in JAX's default
+    precision.
 
-    float32, or float64 where it is on; what is drawn at random is drawn in float32
-    first, so both precisions start alike. Other arrays stay as they are.
+    That is float32, or float64 if `jax_enable_x64` is on. Random numbers are drawn in
+    float32 first, so both precisions start alike.
+
+    Args:
+      tree: A pytree of arrays.
+
+    Returns:
+      The pytree of JAX arrays. Arrays of other types keep their type.
     """
     default = jnp.result_type(float)
 
@@ -78,7 +85,7 @@ def in_default_precision(tree: PyTree) -> PyTree:
 
 
 class Event(NamedTuple):
-    """Something that happens on the host between two chunks.
+    """A change of the training state on the host between two chunks.
 
     Only an event may change the shape of an array.
     """
@@ -89,11 +96,11 @@ class Event(NamedTuple):
 
 
 class Stages(NamedTuple):
-    """`Model.render` in parts, so that nothing is computed twice.
+    """Stages of `Model.render` whose results can be reused.
 
-    `draw(params, deform(params, prepare(params), time), view, size, step)` is what
-    that `render` gives, to rounding. `rows(params)` is what a file holds of what
-    `deform` returns, in the same order.
+    `draw(params, deform(params, prepare(params), time), view, size, step)` equals
+    `render` up to rounding. `rows(params)` is the part of the result of `deform` that
+    an exported file holds, in the same order.
     """
 
     prepare: Callable[[PyTree], PyTree]  # once for trained parameters
@@ -103,10 +110,10 @@ class Stages(NamedTuple):
 
 
 class Surveyed(NamedTuple):
-    """`Model.render` for pictures, which need no slopes, once space is surveyed.
+    """`Model.render` accelerated by a survey of space, without gradients.
 
-    `draw(params, survey(params, step), view, size, step)` is what `render` gives but
-    for a small, tested difference.
+    `draw(params, survey(params, step), view, size, step)` equals `render` except for a
+    small, tested difference.
     """
 
     survey: Callable[[PyTree, Int[Array, ""]], PyTree]  # once for trained parameters

@@ -1,4 +1,4 @@
-"""What made a file: the revision of this library and what its last bits depend on."""
+"""Origin of a file: the revision of this library and the environment that made it."""
 
 import pathlib
 import subprocess
@@ -10,7 +10,12 @@ import numpy as np
 
 
 def provenance() -> dict[str, Any]:
-    """What made a checkpoint: revision, versions, and what its last bits depend on."""
+    """Describe the environment on which the last bits of a checkpoint depend.
+
+    Returns:
+      Revision, versions of Python, JAX and NumPy, the device and the precision, as JSON
+      values.
+    """
     return {
         "revision": revision(),
         "python": sys.version.split()[0],
@@ -22,9 +27,13 @@ def provenance() -> dict[str, Any]:
 
 
 def revision(checkout: pathlib.Path | None = None) -> str:
-    """Git revision of a checkout, with "+changes"; "unknown" outside git.
+    """Return the Git revision of a checkout.
 
-    Of none given that which this library runs from.
+    Args:
+      checkout: Folder of the checkout. None for the one that this library runs from.
+
+    Returns:
+      The revision, with "+changes" if files are modified, or "unknown" outside of Git.
     """
     here = checkout or pathlib.Path(__file__).resolve().parents[2]
     if not (here / ".git").exists():  # installed, perhaps inside another repository

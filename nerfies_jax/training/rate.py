@@ -1,4 +1,4 @@
-"""What a step of training takes, measured before a run is planned by it."""
+"""Measurement of the time of a training step, to plan a run."""
 
 import time
 from typing import NamedTuple
@@ -19,17 +19,26 @@ REPEATS, REPEAT_SECONDS = 5, 1.0  # of the scans that tell what a step takes
 
 
 class StepTime(NamedTuple):
-    """Seconds of one step, and of making its program; on the wall."""
+    """Wall-clock seconds of one step, and of compiling its program."""
 
     seconds: float
     compile_seconds: float
 
 
 def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> StepTime:
-    """The mean over a run of `steps` steps of what one takes with the first state.
+    """Measure the mean time of a step over a run, with the first state.
 
-    `state` is left as it is. Of every phase of the run, the first step is not timed.
-    Whatever grows later is not seen.
+    Steps are timed at several `PHASES` of the run, and the first of each is left out.
+    Growth of the state during the run is not accounted for.
+
+    Args:
+      model: The model.
+      state: Initial state, which is not changed.
+      frames: Training frames.
+      steps: Number of steps of the run.
+
+    Returns:
+      Seconds per step and seconds of compilation.
     """
     program, frames, compile_seconds = chunk.compiled(model, state, frames, steps)
     length = program.length
@@ -54,9 +63,19 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
 
 
 def step_ms(model: Model, state: TrainState, frames: Frames, steps: int) -> float:
-    """Median milliseconds of a step from `state` on, which is left as it is.
+    """Measure the median time of a step from a state on.
 
-    By the program of a run of `steps` steps: where that has trained, none is compiled.
+    The program is that of a run of `steps` steps, so nothing is compiled if it has
+    trained.
+
+    Args:
+      model: The model.
+      state: Training state, which is not changed.
+      frames: Training frames.
+      steps: Number of steps of the run.
+
+    Returns:
+      Milliseconds per step.
     """
     program, frames, _ = chunk.compiled(model, state, frames, steps)
     left, seconds = jax.tree.map(jnp.copy, state), []

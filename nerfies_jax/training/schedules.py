@@ -1,8 +1,8 @@
-"""What the field schedules and optax does not: functions of a traced step.
+"""Schedules of the traced step that the literature uses and optax does not have.
 
-Take constant, cosine, piecewise and joined schedules from optax. All here hold their
-last value after their last step, work on Python, NumPy and traced steps, and refuse
-nonsense when they are built.
+Use optax for constant, cosine decay, piecewise and joined schedules. All schedules here
+keep their last value after their last step, accept Python, NumPy and traced steps, and
+check their settings when they are built.
 """
 
 import math
@@ -18,7 +18,15 @@ Schedule = Callable[..., Float[Array, "*steps"]]  # of an integer step
 
 
 def check_falling(learning_rate: float, learning_rate_end: float) -> None:
-    """Raise ValueError unless a rate falls, or stays, from one positive number on."""
+    """Check that a learning rate decreases or stays, and is positive.
+
+    Args:
+      learning_rate: First learning rate.
+      learning_rate_end: Last learning rate.
+
+    Raises:
+      ValueError: If a rate is not positive and finite, or the last exceeds the first.
+    """
     if not 0 < learning_rate_end <= learning_rate < math.inf:
         raise ValueError(
             f"the rate falls from learning_rate={learning_rate} to "
@@ -30,10 +38,24 @@ def check_falling(learning_rate: float, learning_rate_end: float) -> None:
 def log_linear(
     start: float, end: float, steps: int, *, delay_steps: int = 0, delay: float = 1.0
 ) -> Schedule:
-    """From `start` to `end` along a straight line in the logarithm.
+    """Make a schedule that is linear in the logarithm, with an optional delayed
+    warm-up.
 
     Over the first `delay_steps` it is multiplied with delay + (1 - delay) sin(pi/2 t),
     t from 0 to 1, as in Mip-NeRF, 3DGS and Deformable 3DGS (their `lr_delay_mult`).
+
+    Args:
+      start: First value, positive.
+      end: Last value, positive.
+      steps: Number of steps from the first to the last value.
+      delay_steps: Number of steps of the warm-up. 0 for none.
+      delay: Factor at the first step of the warm-up, in (0, 1].
+
+    Returns:
+      The schedule, a function of the step.
+
+    Raises:
+      ValueError: If a setting is out of range.
     """
     _span("log_linear", steps)
     _ends("log_linear", start=start, end=end)
@@ -57,9 +79,21 @@ def log_linear(
 
 
 def ramp(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
-    """A straight line from `start` at step `after` to `end`, `steps` later.
+    """Make a schedule that is linear in the step.
 
-    The annealed window's alpha of Nerfies and HyperNeRF is `ramp(0, bands, 80_000)`.
+    The window's alpha of Nerfies and HyperNeRF is `ramp(0, bands, 80_000)`.
+
+    Args:
+      start: Value up to step `after`.
+      end: Last value.
+      steps: Number of steps from the first to the last value.
+      after: Step at which the ramp begins.
+
+    Returns:
+      The schedule, a function of the step.
+
+    Raises:
+      ValueError: If a setting is out of range.
     """
     _span("ramp", steps, after)
     _finite("ramp", start=start, end=end)
@@ -74,19 +108,42 @@ def ramp(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
 def band_window(
     bands: int, steps: int, step: Int[Array, ""], dtype: DTypeLike, *, after: int = 0
 ) -> Float[Array, " bands"]:
-    """Weights of bands, or levels, that open one by one over `steps`, from `after` on.
+    """Compute the coarse-to-fine window of bands or levels that open one by one.
 
-    Nerfies (Park et al. 2021), coarse to fine; at least one band.
+    Args:
+      bands: Number of bands, at least one.
+      steps: Number of steps until all are open.
+      step: Current step, traced.
+      dtype: Floating-point type of the result.
+      after: Step at which the first band begins to open.
+
+    Returns:
+      Weights in [0, 1], [bands].
+
+    References:
+      Park et al. 2021 (Nerfies), arXiv:2011.12948, equation 8.
     """
     alpha = ramp(0.0, float(bands), steps, after=after)(step)
     return encoding.anneal(bands, alpha.astype(dtype))
 
 
 def cosine(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
-    """`start` up to step `after`, then half a cosine down (or up) to `end`.
+    """Make a schedule that follows half a cosine from one value to another.
 
-    Nerfies' elastic weight is `cosine(1e-2, 1e-8, 100_000, after=50_000)`. optax's own
-    decays to a share of its first value and cannot rise.
+    The elastic weight of Nerfies is `cosine(1e-2, 1e-8, 100_000, after=50_000)`. The
+    schedule of optax decays to a share of its first value and cannot increase.
+
+    Args:
+      start: Value up to step `after`.
+      end: Last value.
+      steps: Number of steps from the first to the last value.
+      after: Step at which the value begins to change.
+
+    Returns:
+      The schedule, a function of the step.
+
+    Raises:
+      ValueError: If a setting is out of range.
     """
     _span("cosine", steps, after)
     _finite("cosine", start=start, end=end)
@@ -103,12 +160,25 @@ def cosine(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
 
 
 def time_noise(frames: int, steps: int = 20_000, scale: float = 0.1) -> Schedule:
-    """Standard deviation of the noise on time, in units of the capture's duration.
+    """Make the schedule of the noise on time of annealed smooth training.
 
-    Annealed smooth training of Yang et al. 2023 (Deformable 3DGS), arXiv:2309.13101,
-    equation 6: `scale` of one frame interval, falling linearly to nothing. Their code
-    divides by the images left in the epoch instead of `frames`, so that its noise grows
-    to a whole duration once per epoch; this is the published form.
+    It starts at `scale` of one frame interval and falls linearly to zero. The published
+    code divides by the images left in the epoch instead of `frames`, so that its noise
+    grows to the whole duration once per epoch. This is the form in the paper.
+
+    Args:
+      frames: Number of frames of the capture.
+      steps: Number of steps until the noise is zero.
+      scale: Initial standard deviation in frame intervals, non-negative.
+
+    Returns:
+      The schedule of the standard deviation, in units of the capture's duration.
+
+    Raises:
+      ValueError: If a setting is out of range.
+
+    References:
+      Yang et al. 2023 (Deformable 3DGS), arXiv:2309.13101, equation 6.
     """
     if frames < 1:
         raise ValueError(
@@ -122,9 +192,19 @@ def time_noise(frames: int, steps: int = 20_000, scale: float = 0.1) -> Schedule
 
 
 def staircase(steps: tuple[int, ...], start: int = 0) -> Schedule:
-    """`start` plus the number of `steps` that are completed, an integer.
+    """Make a schedule that increases by one at each of some steps.
 
     The spherical-harmonics degree of 3DGS is `staircase((1000, 2000, 3000))`.
+
+    Args:
+      steps: Steps in ascending order, non-negative.
+      start: Value before the first of them.
+
+    Returns:
+      The schedule, with int32 values.
+
+    Raises:
+      ValueError: If the steps are not ascending or negative.
     """
     if list(steps) != sorted(set(steps)) or any(step < 0 for step in steps):
         raise ValueError(
@@ -140,7 +220,7 @@ def staircase(steps: tuple[int, ...], start: int = 0) -> Schedule:
 
 
 def _share(step, steps, after=0):
-    """How much of the stretch has passed, from 0 to 1."""
+    """Share of the interval that has passed, from 0 to 1."""
     # Subtracted as integers: float32 counts no further than 16.7 million steps.
     passed = jnp.clip(jnp.asarray(step, jnp.int32) - after, 0, steps)
     share = passed.astype(jnp.result_type(float)) / steps

@@ -1,4 +1,4 @@
-"""What a spec has to set: each field's path, value and default, and what it is."""
+"""Listing of the fields of a spec: path, value, default, type and description."""
 
 import ast
 import dataclasses
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 
 class SpecField(NamedTuple):
-    """One field of a spec, or of a spec in it."""
+    """One field of a spec, or of a spec nested in it."""
 
     path: str  # from the outermost spec, with dots
     value: str  # as `specs.override` reads it
@@ -26,7 +26,15 @@ class SpecField(NamedTuple):
 
 
 def fields_of(spec: Any, prefix: str = "") -> Iterator[SpecField]:
-    """Each field of `spec`, and below one that holds a spec those of that."""
+    """List the fields of a spec and of the specs nested in it.
+
+    Args:
+      spec: A frozen dataclass.
+      prefix: Path of `spec` in an outer spec, with a dot at the end.
+
+    Yields:
+      The fields, each followed by those of the spec that it holds.
+    """
     kinds, words = typing.get_type_hints(type(spec)), field_words(type(spec))
     for field in dataclasses.fields(spec):
         value, path = getattr(spec, field.name), prefix + field.name
@@ -43,7 +51,14 @@ def fields_of(spec: Any, prefix: str = "") -> Iterator[SpecField]:
 
 
 def as_text(value: Any) -> str:
-    """A value as one writes it in `path.to.field=value`."""
+    """Format a value as it is written in `path.to.field=value`.
+
+    Args:
+      value: Value of a field.
+
+    Returns:
+      The text. A spec gives the name of its class.
+    """
     if value is None or isinstance(value, bool):
         return str(value).lower()
     if dataclasses.is_dataclass(value):
@@ -66,9 +81,16 @@ def _kind_text(kind):
 
 
 def field_words(kind: type) -> dict[str, str]:
-    """What the source says beside each field of a dataclass, in one line; "" for none.
+    """Collect the descriptions of the fields of a dataclass from its source.
 
-    The docstring below it, else the comment above and beside it.
+    A description is the docstring below the field, otherwise the comment above and next
+    to it.
+
+    Args:
+      kind: The dataclass.
+
+    Returns:
+      One line for each field, "" if it has no description.
     """
     words = {}
     for each in reversed(kind.__mro__):
@@ -107,7 +129,9 @@ def _own_words(kind):
 
 
 def _sentences_on(name, kind):
-    """Those of the class's docstring that have the field's name in backticks."""
+    """Return the sentences of a class's docstring with the field's name in
+    backticks.
+    """
     text = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
     sentences = re.split(r'(?<=[^.\s][.:;])\s(?=[A-Z`"])', text)
     return " ".join(one for one in sentences if f"`{name}`" in one).rstrip(";:")

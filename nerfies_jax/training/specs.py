@@ -1,7 +1,7 @@
-"""Frozen settings ("specs") as plain JSON, changed by `path.to.field=value`, compared.
+"""Frozen settings ("specs") as plain JSON: conversion, overrides and comparison.
 
 One codec serves checkpoints, run folders, model files and results of studies. Nothing
-in a file is executed or imported: a name in it only selects among the settings that the
+in a file is executed or imported. A name in it only selects among the settings that the
 reader expects.
 """
 
@@ -27,10 +27,19 @@ PACKAGES = ("gaussians_jax", "nerfies_jax")  # whose records of arrays a file ma
 
 
 def as_json(value: Any) -> Any:
-    """A spec as plain JSON values: dataclasses and NamedTuples by type and fields.
+    """Convert a spec to plain JSON values: dataclasses and NamedTuples by type and
+    fields.
 
-    `from_json` brings it back, with tuples for lists and sets. Raises ValueError for
-    what is no setting, naming its place.
+    `from_json` converts it back, with tuples in place of lists and sets.
+
+    Args:
+      value: A spec, or any nesting of specs, containers and numbers.
+
+    Returns:
+      JSON values.
+
+    Raises:
+      ValueError: If a value cannot be part of a spec, with its path.
     """
     return _plain(value, "spec")
 
@@ -123,7 +132,18 @@ def _is_record(kind):
 
 
 def build_record(kind: type, fields: dict[str, Any]) -> Any:
-    """A record of its fields; ValueError where they are not those of this version."""
+    """Build a dataclass or NamedTuple from its fields.
+
+    Args:
+      kind: The type.
+      fields: All of its fields by name.
+
+    Returns:
+      An instance of `kind`.
+
+    Raises:
+      ValueError: If the fields are not those of this version.
+    """
     if dataclasses.is_dataclass(kind):
         wanted = {field.name for field in dataclasses.fields(kind)}
     else:
@@ -138,7 +158,14 @@ def build_record(kind: type, fields: dict[str, Any]) -> Any:
 
 
 def type_name(kind: type) -> str:
-    """The full name of a type, as files hold it."""
+    """Return the full name of a type, as stored in files.
+
+    Args:
+      kind: The type.
+
+    Returns:
+      Module and qualified name, joined by a dot.
+    """
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
@@ -148,8 +175,14 @@ def record_named(name: Any) -> type:
     Only public modules of `PACKAGES` are imported, and only a NamedTuple that such a
     module defines is returned, so that no code of the file's choice runs.
 
+    Args:
+      name: Full name, as `type_name` gives it.
+
+    Returns:
+      The type.
+
     Raises:
-      ValueError: There is none of that name.
+      ValueError: If there is none of that name.
     """
     module, _, attribute = str(name).rpartition(".")
     top, *parts = module.split(".")
@@ -170,7 +203,15 @@ def record_named(name: Any) -> type:
 
 
 def differences(saved: Any, wanted: Any) -> list[str]:
-    """One line for each field in which two specs, as JSON, differ."""
+    """Compare two specs.
+
+    Args:
+      saved: First spec, as JSON.
+      wanted: Second spec, as JSON.
+
+    Returns:
+      One line for each field in which they differ.
+    """
     saved, wanted = dict(_leaves(saved, "spec")), dict(_leaves(wanted, "spec"))
     lines = []
     for path in {**saved, **wanted}:
@@ -197,12 +238,22 @@ def _leaves(value, path) -> Iterator[tuple[str, str]]:
 
 
 def override(spec: Any, assignments: Iterable[str]) -> Any:
-    """`spec` with `path.to.field=value` applied, each value read by the field's type.
+    """Apply `path.to.field=value` assignments to a spec.
 
-    A field that holds another spec is set with a dotted path, which brings it in with
-    its defaults where it is none, or removed with `none` where its type allows it. The
-    name of a spec's class, as `config.json` has it, chooses one of several kinds.
-    Raises ValueError for an unknown field or a wrong value.
+    A field that holds another spec is set by a dotted path, which creates that spec
+    with its defaults if it is None, or is removed with `none` if its type allows it.
+    The name of a spec's class, as in `config.json`, selects one of several types.
+
+    Args:
+      spec: A frozen dataclass.
+      assignments: Texts of the form `path.to.field=value`, where the type of the field
+        determines how the value is read.
+
+    Returns:
+      The changed spec.
+
+    Raises:
+      ValueError: If a field is unknown or a value is wrong.
     """
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
@@ -245,7 +296,9 @@ def _meant(name, fields, outermost):
 
 
 def _absent(spec, name):
-    """The defaults of an effect that is not there; None unless there is one choice."""
+    """Default settings of an absent part, or None if there is not exactly one
+    choice.
+    """
     options = typing.get_args(typing.get_type_hints(type(spec))[name])
     choices = [option for option in options if dataclasses.is_dataclass(option)]
     return _defaults(choices[0], name) if len(choices) == 1 else None

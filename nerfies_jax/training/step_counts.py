@@ -7,15 +7,28 @@ _MARK = "steps"
 
 
 def steps(default: Any = dataclasses.MISSING) -> Any:
-    """A field of a frozen dataclass that counts steps: `warm_up: int = steps(3000)`."""
+    """Declare a field of a frozen dataclass that counts steps.
+
+    Args:
+      default: Default value.
+
+    Returns:
+      The field, for use as `warm_up: int = steps(3000)`.
+    """
     return dataclasses.field(default=default, metadata={_MARK: True})
 
 
 def stretched(spec: Any, share: float) -> Any:
-    """The same settings with every count of steps times `share`, in all parts.
+    """Scale every step count of a spec, also in nested specs.
 
-    A count stays at least 1; 0 and None say that there is none, and stay. One that
-    was a multiple of ten is one again from a hundred on: so are the scans of a run.
+    Args:
+      spec: A frozen dataclass.
+      share: Factor.
+
+    Returns:
+      The spec with scaled counts. A count is at least 1, and 0 and None, which mean
+      that there is none, stay. Multiples of ten from a hundred on stay multiples of
+      ten, as scans need them.
     """
     changes = {}
     for field in dataclasses.fields(spec):

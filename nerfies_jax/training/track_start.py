@@ -1,19 +1,20 @@
-"""How a scene that moves starts: from tracks of the pictures, or from rest."""
+"""Settings of the initialization of motion: from point tracks, or static."""
 
 import dataclasses
 import math
 
 STARTS = ("tracks", "none")
-# As `--set` takes them.
+# In the form `path.to.field=value` of `specs.override`.
 FROM_TRACKS, FROM_REST = "start.motion=tracks", "start.motion=none"
 
 
 @dataclasses.dataclass(frozen=True)
 class TrackStartSpec:
-    """How a scene that moves starts.
+    """Settings of the initialization of motion.
 
-    `motion` "tracks" fits the motion to tracks before training, where the film allows
-    it; "none" starts from rest. `use_depths` lets paths lean on the capture's depths.
+    `motion` "tracks" fits the motion to point tracks before training if the video
+    allows it, and "none" starts from a static scene. `use_depths` lets paths use the
+    capture's depths.
     """
 
     motion: str = "none"
@@ -35,12 +36,12 @@ class TrackStartSpec:
 
 @dataclasses.dataclass(frozen=True)
 class FieldStartSpec(TrackStartSpec):
-    """How a radiance field that moves starts.
+    """Settings of the initialization of the motion of a radiance field.
 
-    A warp that was fitted to tracks, or a scene flow with a trunk of its own, learns
-    from the pictures with `first_rate` times its learning rate at first, and with all
-    of it at the end (a line in the logarithm): a template that is still blurred says
-    nothing of where things are, and led the warp back to where nothing moves.
+    A warp that was fitted to tracks, or a scene flow with a trunk of its own, starts
+    with `first_rate` times its learning rate, which grows log-linearly to the full rate
+    at the end of training. A template that is still blurred gives no information on
+    positions, and led the warp back to a static scene.
     """
 
     # Built-in scene, 900 steps of `nerfies-grid-small`, one seed: where it moves and

@@ -1,7 +1,7 @@
-"""Inverse warps, and the tracks of points through time that they give.
+"""Inverse warps, and the tracks of points through time that follow from them.
 
-A warp sends observed points to canonical ones, x + d(x) = c. It has no inverse in
-closed form, and where it folds it has several or none; flags say so.
+A warp maps observed points to canonical ones, x + d(x) = c. It has no inverse in closed
+form, and where it folds it has several or none, which flags report.
 """
 
 import dataclasses
@@ -24,12 +24,13 @@ Vector = Float[Array, "3"]
 
 @dataclasses.dataclass(frozen=True)
 class InverseSpec:
-    """How an inverse warp is sought, and when it counts as found.
+    """Settings of the inversion of a warp, and its convergence criteria.
 
-    Found means |x + d(x) - c| <= atol + rtol max|c|, in units of the field, and that
-    the warp is not turned over at x (det J > 0). With a `reach`, six more solves start
-    that far away along the axes, and if one ends at another root the flag is taken
-    away: the point is seen in several places. That costs six solves, so it is off.
+    A solve has converged if |x + d(x) - c| <= atol + rtol max|c|, in units of the
+    field, and if the warp preserves orientation at x (det J > 0). With a `reach`, six
+    more solves start that far away along the axes, and the flag becomes False if one
+    ends at another root, since the point is then observed in several places. It is off
+    by default because of its cost.
     """
 
     atol: float = 1e-5  # units of the field, as dycheck's Broyden iteration
@@ -53,13 +54,23 @@ def inverse_warp(
     start: Vector | None = None,
     spec: InverseSpec = InverseSpec(),
 ) -> Fit:
-    """The observed point x with x + displace(params, x) = `canonical_point`.
+    """Find the observed point x with x + displace(params, x) = `canonical_point`.
 
-    Without a `start`, x + s d(x) = c is followed from s = 0, where x = c, to s = 1;
-    docs/numerics.md says what that finds that a solver started at c does not.
-    `residual` is |x + d(x) - c|. Derivatives with respect to `params` and
-    `canonical_point` are those of the implicit function; zero where the flag is False.
-    What else `displace` closes over is held constant.
+    Without a `start`, x + s d(x) = c is followed from s = 0, where x = c, to s = 1.
+    docs/numerics.md compares this with a solver that starts at c. Derivatives with
+    respect to `params` and `canonical_point` are those of the implicit function, and
+    zero where the flag is False. Everything else that `displace` closes over is held
+    constant.
+
+    Args:
+      displace: Displacement d, a function of parameters and a point [3].
+      params: Parameters of the displacement.
+      canonical_point: Canonical point c in units of the field, [3].
+      start: Initial guess of x, [3], or None.
+      spec: Solver settings and convergence criteria.
+
+    Returns:
+      The fit, with x as `value`. `residual` is |x + d(x) - c|.
     """
     frozen = lax.stop_gradient((params, canonical_point))
     if start is None:
@@ -85,7 +96,7 @@ def inverse_warp(
 
 
 class Tracks(NamedTuple):
-    """Points through time, in the coordinates of the warp."""
+    """Positions of points through time, in the coordinates of the warp."""
 
     points: Float[Array, "points moments 3"]
     converged: Bool[Array, "points moments"]
@@ -99,11 +110,27 @@ def point_tracks(
     row: int | None = None,
     spec: InverseSpec = InverseSpec(),
 ) -> Tracks:
-    """Where points are at every moment; `moments` has these along its first axis.
+    """Follow points through time by inverting a warp.
 
-    `points` were observed at moment `row`, or are canonical where it is None. Going
-    outward from there, each is sought from where it was last found. Where it is lost,
-    its flag is False and its place that last one.
+    Points are tracked outward from the time at which they are known, each from its last
+    position. If a point is lost, its flag is False and its position is the last one
+    known.
+
+    Args:
+      displace: Displacement, a function of parameters, a point [3] and the conditioning
+        at one time.
+      params: Parameters of the displacement.
+      points: Points in units of the field, [points, 3].
+      moments: Conditioning at all times, a pytree with times along the first axis.
+      row: Index of the time at which the points were observed. None for canonical
+        points.
+      spec: Solver settings and convergence criteria.
+
+    Returns:
+      Positions [points, moments, 3] and convergence flags [points, moments].
+
+    Raises:
+      ValueError: If `row` is out of range.
     """
     count = jax.tree.leaves(moments)[0].shape[0]
     if row is not None and not 0 <= row < count:

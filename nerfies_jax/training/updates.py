@@ -1,4 +1,4 @@
-"""One step of descent, with a learning rate for each part of the parameters."""
+"""Gradient descent steps with a learning rate for each part of the parameters."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,9 +13,15 @@ LAST_RATE = 0.02  # of a descent's first
 
 
 def apply_updates(params: PyTree, updates: PyTree, learning_rates: PyTree) -> PyTree:
-    """`params - learning_rate * update`, each leaf in its own precision.
+    """Return `params - learning_rate * update`, each leaf in its own precision.
 
-    `learning_rates` is a prefix of `params`: a rate serves everything below it.
+    Args:
+      params: A pytree of arrays.
+      updates: Updates of the same structure.
+      learning_rates: A prefix of `params`, whose rates apply to everything below them.
+
+    Returns:
+      The updated parameters.
     """
 
     def below(learning_rate, part, part_updates):
@@ -35,9 +41,18 @@ def descended(
     key: Key[Array, ""],
     steps: int,
 ) -> PyTree:
-    """What Adam on `loss(params, key)` leads to, a key for each step.
+    """Minimize a loss with Adam.
 
-    `rates`, a prefix of `start`, fall exponentially to `LAST_RATE` of the first.
+    Args:
+      loss: Function of parameters and a PRNG key.
+      start: Initial parameters.
+      rates: First learning rates, a prefix of `start`. They decay exponentially to
+        `LAST_RATE` of these.
+      key: PRNG key, split into one for each step.
+      steps: Number of steps.
+
+    Returns:
+      The parameters after the last step.
     """
     adam = optax.scale_by_adam()
 
