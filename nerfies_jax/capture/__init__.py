@@ -1,4 +1,4 @@
-"""Floor 3: what was filmed. Host side, NumPy."""
+"""Captures: images, cameras and times of a scene, on the host in NumPy."""
 
 
 def __getattr__(name):

@@ -1,4 +1,4 @@
-"""transforms*.json: Blender's synthetic scenes, D-NeRF, nerfstudio and instant-ngp.
+"""Reader of transforms*.json: Blender's scenes, D-NeRF, nerfstudio and instant-ngp.
 
 Poses are camera-to-world with OpenGL axes (x right, y up, z back).
 """
@@ -42,13 +42,27 @@ def read(
     near: float | None = None,
     far: float | None = None,
 ) -> Capture:
-    """The capture of transforms*.json; `path` is their folder or one of them.
+    """Read a capture from transforms*.json.
 
-    Pictures with alpha are laid over `background` (sRGB). `heldout`: None for the test
-    split, else validation, else every 8th frame; "val" or "test" for that split; n for
-    every n-th frame of the file (of split files, the training one). `near` and `far`,
-    in scene units, override the defaults: 2 and 6 for Blender's cameras 4 from the
-    origin, from the points for nerfstudio.
+    Args:
+      path: The folder with the files, or one of the files.
+      factor: Read images at 1/`factor` of their full size.
+      max_side: Longest side of the images in pixels. At most one of the two can be
+        given.
+      heldout: None for the test split, else validation, else every 8th frame. "val" or
+        "test" for that split. n for every n-th frame of the file (of split files, the
+        training one).
+      missing: "refuse" or "skip" frames without an image.
+      background: sRGB color in [0, 1] behind images with alpha.
+      near: Near plane in scene units. The default is 2 for Blender's cameras 4 from the
+        origin, and follows from the points for nerfstudio.
+      far: Far plane in scene units, 6 for Blender's cameras by default.
+
+    Returns:
+      The capture.
+
+    Raises:
+      CaptureError: If the capture cannot be used.
     """
     path = pathlib.Path(path)
     root = path if path.is_dir() else path.parent
@@ -123,7 +137,7 @@ def read(
 
 
 def _placed(points, placement):
-    """Points of the file in scene units; None where there are none."""
+    """Return the points in scene units, or None if there are none."""
     if points is None:
         return None
     position = (points.position - np.array(placement.center)) * placement.scale
@@ -236,7 +250,9 @@ def _times(entries, split):
 
 
 def _camera_ids(entries, times, split, is_train):
-    """Folders, where two of them have pictures of one time; else one camera."""
+    """Number the folders if two of them have images of one time, else return one
+    camera.
+    """
     paths = [text_files.forward_slashes(entry.file_path) for entry in entries]
     names = [pathlib.PurePosixPath(path).parent.as_posix() for path in paths]
     # D-NeRF's one camera fills train and test, whose times meet.

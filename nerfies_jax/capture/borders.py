@@ -1,4 +1,4 @@
-"""Black wedges at the rim of stabilized or undistorted film: pixels never filmed."""
+"""Detection of black wedges at the border of stabilized or undistorted video."""
 
 import numpy as np
 import skimage.measure
@@ -13,10 +13,16 @@ LARGEST = 0.25  # more is a dark scene
 
 
 def black_borders(images: np.ndarray) -> np.ndarray | None:
-    """Bool [frames, height, width] of black regions that touch the rim; None if none.
+    """Find black regions that touch the border of an image.
 
-    The region grows by two pixels: its edge was mixed with black when the picture
-    was resampled.
+    The regions are grown by two pixels, since their edge was mixed with black when the
+    image was resampled.
+
+    Args:
+      images: uint8 images, [frames, height, width, 3].
+
+    Returns:
+      Booleans [frames, height, width], or None if there are no such regions.
     """
     brightest = images.max(-1)
     dark = brightest <= BLACK
@@ -38,9 +44,14 @@ def black_borders(images: np.ndarray) -> np.ndarray | None:
 def without_black_borders(
     images: np.ndarray, valid: np.ndarray | None
 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """The mask of filmed pixels without black borders, and a note where there are any.
+    """Remove black borders from the mask of observed pixels.
 
-    None, of all pixels, stays None where no frame has one.
+    Args:
+      images: uint8 images, [frames, height, width, 3].
+      valid: True for observed pixels, [frames, height, width]. None for all.
+
+    Returns:
+      The mask, None if all pixels are observed, and a note if there are borders.
     """
     blacked = black_borders(images)
     if blacked is None:

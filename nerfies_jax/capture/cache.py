@@ -1,4 +1,4 @@
-"""Where files are kept that can be made again."""
+"""Location of files that can be recreated."""
 
 import os
 import pathlib

@@ -70,7 +70,7 @@ def read(
 
 
 def _state(path):
-    """Differs for each file that ever has this name; None while none has."""
+    """Identify the file at a path, differently for each one that ever had this name."""
     with contextlib.suppress(OSError):
         found = os.lstat(path)
         return found.st_ino, found.st_mtime_ns, found.st_size
@@ -82,13 +82,13 @@ def write_arrays(
     identity: str,
     compressed: bool = False,
 ) -> None:
-    """Write a .npz with its checksum, whole or not at all.
+    """Write a .npz with its checksum, completely or not at all.
 
     Args:
-      path: The file. Its folder is made if need be.
-      arrays: By name, and none of them `SEAL`.
-      identity: What they are, with the version of the code that made them.
-      compressed: Whether to deflate them.
+      path: The file. Its folder is created if needed.
+      arrays: Arrays by name. None may be named `SEAL`.
+      identity: Identity of the content, with the version of the code that made it.
+      compressed: True to compress the file.
     """
     seal = json.dumps({"identity": identity, "crc32": checksum(arrays)})
     _make_way(path)
@@ -98,11 +98,18 @@ def write_arrays(
 
 
 def read_arrays(path: pathlib.Path, identity: str) -> dict[str, np.ndarray]:
-    """Read what `write_arrays` wrote.
+    """Read a file written by `write_arrays`.
+
+    Args:
+      path: The file.
+      identity: Identity that the content must have.
+
+    Returns:
+      Arrays by name.
 
     Raises:
-      ValueError: It holds anything else.
-      OSError: It cannot be read.
+      ValueError: If the content is anything else.
+      OSError: If it cannot be read.
     """
     arrays = npz_files.read_arrays(path)
     seal = arrays.pop(SEAL, None)
@@ -111,7 +118,14 @@ def read_arrays(path: pathlib.Path, identity: str) -> dict[str, np.ndarray]:
 
 
 def checksum(arrays: Mapping[str, np.ndarray]) -> int:
-    """CRC-32 of arrays: their names, types, shapes and bytes."""
+    """Compute the CRC-32 of arrays: their names, types, shapes and bytes.
+
+    Args:
+      arrays: Arrays by name.
+
+    Returns:
+      The checksum.
+    """
     total = 0
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -121,18 +135,31 @@ def checksum(arrays: Mapping[str, np.ndarray]) -> int:
 
 
 def write_json(path: pathlib.Path, value: dict[str, Any], identity: str) -> None:
-    """Write a JSON object with its checksum, whole or not at all."""
+    """Write a JSON object with its checksum, completely or not at all.
+
+    Args:
+      path: The file. Its folder is created if needed.
+      value: The object.
+      identity: Identity of the content, with the version of the code that made it.
+    """
     _make_way(path)
     seal = {"identity": identity, "crc32": _text_checksum(value)}
     write_plain_json(path, {**value, SEAL: seal})
 
 
 def read_json(path: pathlib.Path, identity: str) -> dict[str, Any]:
-    """Read what `write_json` wrote.
+    """Read a file written by `write_json`.
+
+    Args:
+      path: The file.
+      identity: Identity that the content must have.
+
+    Returns:
+      The object.
 
     Raises:
-      ValueError: It holds anything else.
-      OSError: It cannot be read.
+      ValueError: If the content is anything else.
+      OSError: If it cannot be read.
     """
     value = json.loads(path.read_bytes())
     seal = value.pop(SEAL, None) if isinstance(value, dict) else None
@@ -153,9 +180,14 @@ def _check(seal, identity, crc32):
 
 @contextlib.contextmanager
 def replaced_entry(path: pathlib.Path, identity: str) -> Iterator[pathlib.Path]:
-    """A temporary folder that takes the place of `path`, with checksums of its files.
+    """Replace a folder by a new one with checksums of its files.
 
-    What stands there is removed first.
+    Args:
+      path: The folder. An existing one is removed first.
+      identity: Identity of the content, with the version of the code that made it.
+
+    Yields:
+      A temporary folder that becomes `path` when the block ends without an error.
     """
     _make_way(path, folder=True)
     with new_folder(path) as folder:
@@ -165,7 +197,16 @@ def replaced_entry(path: pathlib.Path, identity: str) -> Iterator[pathlib.Path]:
 
 
 def check_entry(path: pathlib.Path, identity: str) -> None:
-    """Raise ValueError or OSError unless a folder is as `replaced_entry` left it."""
+    """Check that a folder is as `replaced_entry` left it.
+
+    Args:
+      path: The folder.
+      identity: Identity that the content must have.
+
+    Raises:
+      ValueError: If a file differs.
+      OSError: If a file cannot be read.
+    """
     for name, crc32 in read_json(path / MANIFEST, identity)["files"].items():
         if _file_checksum(path / name) != crc32:
             raise ValueError(f"{name} is not what was written: the checksum differs")

@@ -1,4 +1,4 @@
-"""Camera paths for videos: where the camera goes, and at which time of the scene."""
+"""Camera paths for videos: cameras, and the times of the scene that they show."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ LEAST_TILT, LEAST_ORBIT = 0.35, 0.01
 
 
 class CameraPath(NamedTuple):
-    """Where a camera goes, and when; NumPy."""
+    """Cameras of a video and their times, in NumPy."""
 
     cameras: Camera  # [frames], scene units
     size: tuple[int, int]  # width and height of the pictures, in pixels
@@ -32,7 +32,19 @@ class CameraPath(NamedTuple):
 
 
 def planned(kind: str, capture: Capture, count: int) -> CameraPath:
-    """A path of one of the `KINDS`, with the times that belong to its cameras."""
+    """Make a path of one of the `KINDS`, with the times that belong to its cameras.
+
+    Args:
+      kind: One of `KINDS`.
+      capture: The capture to look at.
+      count: Number of cameras.
+
+    Returns:
+      The path. Its times are None unless the kind determines them.
+
+    Raises:
+      ValueError: If the kind is unknown.
+    """
     times = None
     if kind == "captured":
         times = capture.times[_replayed(capture, count)]
@@ -42,13 +54,26 @@ def planned(kind: str, capture: Capture, count: int) -> CameraPath:
 
 
 def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
-    """`count` cameras moving around what the capture looks at.
+    """Make cameras that move around the scene.
 
-    `sway` keeps to the span of the filmed positions, where a monocular reconstruction
-    can be trusted, and so does `lemniscate`, a lying figure of eight; `orbit` circles
-    the focus point in full; `captured` repeats the training cameras in the order of
-    their times, and `stabilized` does so without their shake. Where the capture looks
-    along what is up, as a camera overhead does, its middle picture says what is up.
+    "sway" stays in the span of the captured positions, where a monocular reconstruction
+    can be trusted, and so does "lemniscate", a horizontal figure of eight. "orbit" is a
+    full circle around the focus point. "captured" repeats the training cameras in the
+    order of their times, and "stabilized" does the same without camera shake. If the
+    capture looks along the up axis, as a camera overhead does, the middle image defines
+    up.
+
+    Args:
+      kind: One of `KINDS`.
+      capture: The capture to look at.
+      count: Number of cameras.
+      turns: Number of periods of a closed path.
+
+    Returns:
+      Cameras in scene units, [count].
+
+    Raises:
+      ValueError: If the kind is unknown.
     """
     if kind not in KINDS:
         raise ValueError(f"no camera path {kind!r}; {known_names(kind, KINDS)}")
@@ -98,12 +123,20 @@ def _filmed_span(capture, count):
 
 
 def smoothed(filmed: Camera, when: np.ndarray, times: np.ndarray) -> Camera:
-    """Cameras filmed at `when`, without their shake, at `times`; pinholes.
+    """Remove the shake of a camera and resample it in time.
 
     Positions and orientations are lines fitted to the frames around each time, weighted
-    by a Gaussian `SMOOTHED_OVER` wide, or one and a half times the largest gap between
-    frames; a fitted matrix becomes the nearest rotation. A line, not a mean, which
-    would stop short of where the film begins and ends. The lens is the middle one's.
+    by a Gaussian with a standard deviation of `SMOOTHED_OVER`, or 1.5 times the largest
+    gap between frames. A fitted matrix becomes the nearest rotation. A mean in place of
+    a line would stop short of the first and last frame.
+
+    Args:
+      filmed: Captured cameras, [frames].
+      when: Their times, [frames].
+      times: Times of the result, [count].
+
+    Returns:
+      Cameras [count], with the lens of the middle one and without skew.
     """
     gaps = np.diff(np.unique(when))
     width = max(SMOOTHED_OVER, 1.5 * gaps.max(initial=0))
@@ -132,13 +165,29 @@ def smoothed(filmed: Camera, when: np.ndarray, times: np.ndarray) -> Camera:
 
 
 def times(count: int, loops: float = 1.0) -> np.ndarray:
-    """Instants in [0, 1] that play the scene forwards and back, `loops` times."""
+    """Return times that play the scene forward and back.
+
+    Args:
+      count: Number of times.
+      loops: Number of repetitions.
+
+    Returns:
+      Times in [0, 1], [count], float32.
+    """
     phase = np.linspace(0, loops, count, endpoint=False) % 1
     return (1 - np.abs(1 - 2 * phase)).astype(np.float32)
 
 
 def playing_seconds(capture: Capture) -> float:
-    """How long the scene took, where the rate of the footage is known."""
+    """Return the duration of the scene.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Seconds, clamped to `SHORTEST` and `LONGEST`, or `SECONDS` if the frame rate is
+      unknown.
+    """
     if capture.frames_per_second is None:
         return SECONDS
     moments = len(np.unique(capture.times))
@@ -146,23 +195,45 @@ def playing_seconds(capture: Capture) -> float:
 
 
 def up_axis(capture: Capture) -> np.ndarray:
-    """The capture's own upward direction, or that of its training pictures."""
+    """Return the up direction of a capture, or of its training images if it has none.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      A direction in scene axes, [3].
+    """
     if capture.up is not None:
         return np.asarray(capture.up, np.float64)
     return mean_up(cameras.take(capture.cameras, capture.train))
 
 
 def mean_up(train_cameras: Camera) -> np.ndarray:
-    """The mean of the pictures' upward directions, unit length."""
+    """Return the mean of the up directions of images.
+
+    Args:
+      train_cameras: Cameras, [frames].
+
+    Returns:
+      A unit vector, [3].
+    """
     up = -train_cameras.camera_from_world[:, 1, :].astype(np.float64).mean(axis=0)
     return up / np.linalg.norm(up)
 
 
 def focus_point(train_cameras: Camera, near: float, far: float) -> np.ndarray:
-    """The point closest to all viewing axes, kept between the near and far planes.
+    """Find the point closest to all viewing axes, between the near and far planes.
 
-    Parallel axes have no closest point; the least-squares system then is singular, and
-    the point lies halfway (in inverse depth) along the mean axis instead.
+    Parallel axes have no closest point, and the least-squares system is singular. The
+    point then lies halfway (in inverse depth) along the mean axis instead.
+
+    Args:
+      train_cameras: Cameras, [frames].
+      near: Depth of the near plane in scene units.
+      far: Depth of the far plane in scene units.
+
+    Returns:
+      The point in scene units, [3].
     """
     axes = train_cameras.camera_from_world[:, 2, :].astype(np.float64)
     centers = train_cameras.position.astype(np.float64)
@@ -182,7 +253,7 @@ def focus_point(train_cameras: Camera, near: float, far: float) -> np.ndarray:
 
 
 class _Window(NamedTuple):
-    """The middle of the filmed positions, and how far they reach across the view."""
+    """Middle of the captured positions, and their extent across the view."""
 
     middle: np.ndarray
     right: np.ndarray  # half of the 70 % span, as a vector

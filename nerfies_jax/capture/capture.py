@@ -1,4 +1,4 @@
-"""One record for what was filmed, whatever format it came in."""
+"""The record of a capture, common to all formats."""
 
 import collections
 import dataclasses
@@ -18,7 +18,7 @@ MAX_ID = 2**20  # a table of codes longer than this is a broken id, not a captur
 
 
 class CaptureError(ValueError):
-    """A capture that cannot be used as it is; one line, with the way out."""
+    """A capture that cannot be used, with a one-line message that names the remedy."""
 
 
 class PointCloud(NamedTuple):
@@ -30,11 +30,11 @@ class PointCloud(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Capture:
-    """A filmed scene on the host: NumPy only, one row per frame.
+    """A captured scene on the host, in NumPy, with one row per frame.
 
     Everything geometric is in scene units: `scene_units = (world - center) * scale`.
-    Building one checks it: shapes agree, every number is finite, the rows to learn
-    from and to score on are disjoint.
+    The constructor checks that shapes agree, every number is finite, and training and
+    held-out rows are disjoint.
     """
 
     name: str
@@ -77,9 +77,13 @@ class Capture:
 
 
 def point_depths(capture: Capture) -> np.ndarray:
-    """The z-depths of all points in all frames learned from, beyond the near plane.
+    """Compute the z-depths of all points in all training frames, beyond the near plane.
 
-    In scene units, in no order; empty where there are no points.
+    Args:
+      capture: The capture.
+
+    Returns:
+      Depths in scene units, in no particular order. Empty if the capture has no points.
     """
     if capture.points is None:
         return np.zeros(0)
@@ -90,12 +94,26 @@ def point_depths(capture: Capture) -> np.ndarray:
 
 
 def training_bytes(capture: Capture) -> int:
-    """What the pictures to learn from take on each device that learns from them."""
+    """Return the memory that the training images take on each device.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Number of bytes.
+    """
     return capture.images[:1].nbytes * len(capture.train)
 
 
 def validate(capture: Capture):
-    """Raise a one-line `CaptureError` on the first thing that cannot be right."""
+    """Check a capture.
+
+    Args:
+      capture: The capture.
+
+    Raises:
+      CaptureError: For the first inconsistency, in one line.
+    """
     where = str(capture.path or capture.name)
     frames = len(capture.ids)
     if frames < 2:
@@ -160,7 +178,17 @@ def _check_shapes(capture, where, frames):
 def check_cameras(
     cameras: Camera, ids: tuple[str, ...], size: tuple[int, int], where: str
 ):
-    """Raise, naming the frame, unless there is one usable camera for each id."""
+    """Check that there is one usable camera for each id.
+
+    Args:
+      cameras: Cameras, [frames].
+      ids: Names of the frames.
+      size: Width and height of the images in pixels.
+      where: Name of the capture in error messages.
+
+    Raises:
+      CaptureError: If a camera cannot be used, with the name of its frame.
+    """
     leaf = next((leaf for leaf in cameras if leaf.shape[:1] != (len(ids),)), None)
     if leaf is not None:
         raise CaptureError(
@@ -253,7 +281,15 @@ def _check_rows(capture, where, frames):
 
 
 def select(capture: Capture, rows: np.ndarray) -> Capture:
-    """The capture with only these rows, in this order; ids keep their meaning."""
+    """Select frames of a capture.
+
+    Args:
+      capture: The capture.
+      rows: Indices of the frames, in the order of the result.
+
+    Returns:
+      The capture of these frames, whose ids keep their meaning.
+    """
     rows = np.asarray(rows, np.int64)
     place = np.full(len(capture.ids), -1)
     place[rows] = np.arange(rows.size)
@@ -284,12 +320,23 @@ def select(capture: Capture, rows: np.ndarray) -> Capture:
 
 
 def downscale(capture: Capture, factor: int) -> Capture:
-    """The capture with pictures smaller by an integer factor, by area averaging.
+    """Shrink the images of a capture by area averaging.
 
-    What does not fill a block at the right and the bottom is trimmed. A block was
-    filmed if all its pixels were, moves if any of them does, and its depth is the mean
-    of those that are known; its flow is the mean, in the larger pixels. Colors are
-    averaged as stored (sRGB), as every published evaluation of these captures does.
+    Columns and rows that do not fill a block at the right and bottom are removed. A
+    block is observed if all its pixels are, moving if any of them is, and its depth is
+    the mean of the known depths. Its flow is the mean, in pixels of the smaller image.
+    Colors are averaged as stored (sRGB), as in every published evaluation of these
+    captures.
+
+    Args:
+      capture: The capture.
+      factor: Integer factor.
+
+    Returns:
+      The capture with smaller images and cameras to match.
+
+    Raises:
+      CaptureError: If the factor is below 1 or above the size of the images.
     """
     width, height = capture.size
     if not 1 <= factor <= min(width, height):
@@ -315,14 +362,30 @@ def downscale(capture: Capture, factor: int) -> Capture:
 
 
 def blocks(array, factor):
-    """[..., rows, factor, columns, factor] view of pictures [..., height, width]."""
+    """View images as blocks of pixels.
+
+    Args:
+      array: Images, [..., height, width].
+      factor: Side of a block in pixels.
+
+    Returns:
+      A view [..., rows, factor, columns, factor] without incomplete blocks.
+    """
     rows, columns = array.shape[-2] // factor, array.shape[-1] // factor
     trimmed = array[..., : rows * factor, : columns * factor]
     return trimmed.reshape(*array.shape[:-2], rows, factor, columns, factor)
 
 
 def shrink(image: np.ndarray, factor: int) -> np.ndarray:
-    """Area average of one uint8 picture [height, width, 3], rounded half up."""
+    """Shrink a uint8 image by area averaging, rounding half up.
+
+    Args:
+      image: uint8 image, [height, width, 3].
+      factor: Integer factor.
+
+    Returns:
+      uint8 image, [height // factor, width // factor, 3].
+    """
     parts = blocks(np.moveaxis(image, -1, 0), factor)
     total = parts.sum((-3, -1), dtype=np.uint32)
     area = factor * factor
@@ -330,7 +393,15 @@ def shrink(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def shrink_depth(depth: np.ndarray, factor: int) -> np.ndarray:
-    """Mean of the known depths of each block of [height, width]; 0 where none is."""
+    """Average the known depths of each block.
+
+    Args:
+      depth: Depths, [height, width], 0 where unknown.
+      factor: Integer factor.
+
+    Returns:
+      float32 depths [height // factor, width // factor], 0 where all are unknown.
+    """
     parts = blocks(depth, factor)
     known = (parts > 0).sum((-3, -1))
     mean = parts.sum((-3, -1), dtype=np.float64) / np.maximum(known, 1)
@@ -338,7 +409,14 @@ def shrink_depth(depth: np.ndarray, factor: int) -> np.ndarray:
 
 
 def describe(capture: Capture) -> tuple[str, ...]:
-    """What was found, in a few lines for a person."""
+    """Describe a capture in a few lines of text.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The lines, the last of which are the notes of its reader.
+    """
     width, height = capture.size
     cameras = np.unique(capture.camera_ids).size
     lines = [

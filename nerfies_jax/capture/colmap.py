@@ -1,4 +1,4 @@
-"""COLMAP reconstructions: read them through pycolmap."""
+"""Reader of COLMAP reconstructions, through pycolmap."""
 
 import pathlib
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ MAX_ERROR_PX = 2.0  # mean reprojection error of a point that is kept
 
 
 class Model(NamedTuple):
-    """What a reconstruction says, in world units and pixels of its own pictures."""
+    """Contents of a reconstruction, in world units and pixels of its own images."""
 
     names: tuple[str, ...]  # of the pictures, in natural order
     lenses: list[Any]  # one pycolmap.Camera per picture
@@ -41,14 +41,27 @@ def read(
     heldout: int | str | None = None,
     missing: str = "refuse",
 ) -> Capture:
-    """The capture that a folder with pictures and a COLMAP model holds.
+    """Read a capture from a folder with images and a COLMAP model.
 
-    The pictures may be whole fractions of those the model was made from (images_2 and
-    so on); `factor` is relative to the model's. Lenses that are not ours are
-    undistorted to a pinhole. Times come from the numbers in the names, else from their
-    order; `heldout` is a number n for every n-th frame, 8 if not given. `masks/` (black
-    moves, COLMAP's polarity) are read where they are. Where every picture has a camera
-    of its own, folders of pictures are the physical cameras.
+    The images may be integer reductions of those of the model (images_2 and so on).
+    Lens models that are not supported are undistorted to a pinhole. Times come from
+    numbers in the image names, else from their order. `masks/` are read if present
+    (black is moving, as in COLMAP). If every image has a camera of its own, folders of
+    images count as physical cameras.
+
+    Args:
+      path: The folder.
+      factor: Read images at 1/`factor` of the size of the model's.
+      max_side: Longest side of the images in pixels. At most one of the two can be
+        given.
+      heldout: n for every n-th frame. None for every 8th.
+      missing: "refuse" or "skip" frames without an image.
+
+    Returns:
+      The capture.
+
+    Raises:
+      CaptureError: If the capture cannot be used.
     """
     path = pathlib.Path(path)
     folder, notes = _best_model(path)
@@ -156,12 +169,29 @@ def _as_pinholes(path, model, files, stored, shrink_by):
 
 
 def name_of(picture: str) -> str:
-    """The id of a picture: its path without ending, fit for a file name."""
+    """Return the id of an image: its path without suffix, usable as a file name.
+
+    Args:
+      picture: Path of the image in the model.
+
+    Returns:
+      The id.
+    """
     return pathlib.PurePosixPath(picture).with_suffix("").as_posix().replace("/", "_")
 
 
 def read_model(folder: pathlib.Path) -> Model:
-    """The registered pictures and reliable points of one sparse model."""
+    """Read the registered images and reliable points of one sparse model.
+
+    Args:
+      folder: Folder of the model.
+
+    Returns:
+      The model.
+
+    Raises:
+      CaptureError: If the model cannot be read, or has too few images or points.
+    """
     model = reconstruction(folder)
     posed = [image for image in model.images.values() if image.has_pose]
     posed.sort(key=lambda image: frames.natural(image.name))

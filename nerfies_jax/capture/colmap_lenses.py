@@ -1,4 +1,4 @@
-"""Pictures of lenses that are not ours, resampled to a pinhole."""
+"""Resampling of images with unsupported lens models to a pinhole."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,11 +16,21 @@ def undistort(
     lenses: Sequence[Any],
     where: str,
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray | None], Any]:
-    """Pictures, where they exist, masks, and the pinhole (pycolmap.Camera) of them all.
+    """Resample images to one pinhole camera.
 
     The pinhole is the one that COLMAP's own undistorter chooses for the first lens.
-    Bilinear between pixel centers; a pixel that looks past the source's outermost
-    centers does not exist and is black. Masks are sampled at the nearest pixel.
+    Images are sampled bilinearly, masks at the nearest pixel. Pixels that look past the
+    outermost pixel centers of the source do not exist and are black.
+
+    Args:
+      images: uint8 images, [frames, height, width, 3].
+      masks: Masks [frames, height, width], or None, all resampled alike.
+      lenses: One pycolmap.Camera per frame.
+      where: Name of the capture in error messages.
+
+    Returns:
+      uint8 images, booleans of existing pixels [frames, height, width], the masks, and
+      the pinhole as a pycolmap.Camera.
     """
     pycolmap = library()
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lenses[0])

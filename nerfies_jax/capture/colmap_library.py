@@ -13,8 +13,12 @@ MIN_TRACK = 3  # pictures that must show a point that counts: so many are needed
 
 
 def library():
-    """The pycolmap module; imported on first use, because it takes 0.2 s.
+    """Import pycolmap on first use, which takes 0.2 s.
 
-    Raises MissingExtra where it is not installed.
+    Returns:
+      The module.
+
+    Raises:
+      MissingExtra: If it is not installed.
     """
     return extras.library("pycolmap", "sfm")

@@ -9,7 +9,7 @@ from nerfies_jax.capture import text_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
 
-# What pycolmap reads where there is no binary file of that name.
+# pycolmap reads these if there are no binary files of that name.
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt")
 _BROKEN = (ValueError, RuntimeError, IndexError, KeyError, MemoryError, OSError)
 
@@ -17,14 +17,17 @@ _BROKEN = (ValueError, RuntimeError, IndexError, KeyError, MemoryError, OSError)
 def reconstruction(folder: pathlib.Path) -> Any:
     """Read a sparse model, binary or text.
 
-    In text, image names may have spaces, and the files may be in any Unicode encoding,
-    with a byte order mark or without.
+    In text files, image names may have spaces, and the encoding may be any Unicode
+    encoding with or without a byte order mark.
+
+    Args:
+      folder: Folder of the model.
 
     Returns:
       The pycolmap.Reconstruction.
 
     Raises:
-      CaptureError: The model is not readable.
+      CaptureError: If the model cannot be read.
     """
     pycolmap = library()
     try:

@@ -1,4 +1,4 @@
-"""A capture as a COLMAP text model with its pictures."""
+"""Writer of captures as COLMAP text models with their images."""
 
 import numpy as np
 import scipy.spatial.transform
@@ -18,12 +18,22 @@ MOST_SEEN = 16
 def write(
     capture: Capture, path: AnyPath, units: Units = "scene", overwrite: bool = False
 ) -> None:
-    """`sparse/0/*.txt`, `images` and, where they are known, `masks`, or nothing of it.
+    """Write a capture as a COLMAP text model, completely or not at all.
 
-    The points are the capture's. Each is listed where it lies in a frame, exactly where
-    the camera projects it: what may hide it there is not known. Masks are COLMAP's,
-    black where something moves; pictures are transparent where nothing was filmed. The
-    format has no times: readers go by the names.
+    It writes `sparse/0/*.txt`, `images` and, if they are known, `masks`. Each of the
+    capture's points is listed in some of the frames at its projection. Occlusion is not
+    known. Masks follow COLMAP, black where something moves. Images are transparent
+    where nothing was observed. The format has no times, so readers use the names.
+
+    Args:
+      capture: The capture.
+      path: The folder.
+      units: "scene" for scene units, "world" for those of the capture's own files.
+      overwrite: True to replace an existing folder.
+
+    Raises:
+      CaptureError: If the format cannot hold the capture, or the folder cannot be
+        written.
     """
     check_names(capture, path)
     refuse_skew(capture, path, "a COLMAP model")
@@ -88,7 +98,9 @@ def _lens(capture, row):
 
 
 def _observations(capture):
-    """Which frames list which points [frames, points], and where; pixels of all."""
+    """Return the points that each frame lists [frames, points], and all pixel
+    positions.
+    """
     count = len(capture.ids)
     if capture.points is None:
         return np.zeros((count, 0), bool), np.zeros((count, 0, 2))

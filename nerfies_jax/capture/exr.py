@@ -1,4 +1,4 @@
-"""OpenEXR pictures: linear color, alpha and depth as floats."""
+"""OpenEXR images: linear color, alpha and depth as floats."""
 
 import pathlib
 from collections.abc import Mapping
@@ -30,7 +30,19 @@ class ExrPicture(NamedTuple):
 
 
 def read_exr(path: AnyPath) -> ExrPicture:
-    """The first part's data window. A luminance channel Y alone becomes gray color."""
+    """Read the data window of the first part of an EXR file.
+
+    A luminance channel Y without others becomes a gray color.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The channels.
+
+    Raises:
+      CaptureError: If the file cannot be read.
+    """
     path = _existing(path)
     try:
         origin, (width, height), display_size = _windows(path)
@@ -48,7 +60,17 @@ def read_exr(path: AnyPath) -> ExrPicture:
 
 
 def read_size(path: AnyPath) -> tuple[int, int]:
-    """Width and height of the display window in pixels, from the header alone."""
+    """Read the size of the display window from the header.
+
+    Args:
+      path: The file.
+
+    Returns:
+      Width and height in pixels.
+
+    Raises:
+      CaptureError: If the file cannot be read.
+    """
     path = _existing(path)
     try:
         return _windows(path)[2]
@@ -62,10 +84,17 @@ def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
     """Place the data window inside the display window, which cameras refer to.
 
     Renderers store a crop or overscan as a data window of another size. Pixels without
-    data become 0 and count as not finite; those beyond the display window are dropped.
+    data become 0 and count as not finite. Those beyond the display window are dropped.
+
+    Args:
+      path: The file, for error messages.
+      picture: The channels of the data window.
+
+    Returns:
+      The channels of the display window.
 
     Raises:
-        CaptureError: The windows do not meet, so no pixel of the image is stored.
+      CaptureError: If the windows do not overlap, so no pixel of the image is stored.
     """
     (left, top), (width, height) = picture.origin, picture.display_size
     tall, wide = picture.finite.shape
@@ -184,12 +213,20 @@ def write_exr(
     half: bool = False,
     header: Mapping[str, Any] | None = None,
 ):
-    """Lossless (ZIP), atomically; `color` [height, width, 3] is linear light.
+    """Write an EXR file, losslessly (ZIP) and atomically.
 
-    `header` are more attributes: numbers, texts, vectors and matrices of float32.
+    Args:
+      path: The file.
+      color: Linear light, [height, width, 3].
+      alpha: Opacity, [height, width].
+      depth: z-depth, [height, width], as channel Z.
+      extra: Other channels [height, width] by name.
+      half: True to store color and alpha in 16 bits. Depth and extra channels keep 32,
+        since 11 bits of precision would turn a depth map into steps.
+      header: Further attributes: numbers, texts, and float32 vectors and matrices.
 
-    `half` stores color and alpha in 16 bits; depth and the extra channels keep 32,
-    because a half has 11 bits and a depth map would fall into steps.
+    Raises:
+      ValueError: If a value exceeds the range of its type, or shapes differ.
     """
     path = pathlib.Path(path)
     channels = {}

@@ -1,4 +1,4 @@
-"""The camera of a picture as attributes of an OpenEXR header."""
+"""Camera of an image as attributes of an OpenEXR header."""
 
 from typing import Any
 
@@ -10,11 +10,19 @@ AXES = "x right, y down, z forward"
 
 
 def attributes(camera: Camera, size: tuple[int, int], time: float) -> dict[str, Any]:
-    """What says from where and when a picture of `size` (width, height) was taken.
+    """Return the attributes that describe camera and time of an image.
 
-    `worldToCamera` and `worldToNDC` are OpenEXR's own: they act on rows, (x, y, z, 1) M
-    divided by its fourth number, and NDC runs from (0, 0), upper left, to (1, 1). They
-    leave out the lens's distortion. Lengths are in scene units, `time` in [0, 1].
+    `worldToCamera` and `worldToNDC` are OpenEXR's own. They act on row vectors, (x, y,
+    z, 1) M divided by its fourth component, and NDC runs from (0, 0), upper left, to
+    (1, 1). They do not contain the lens distortion.
+
+    Args:
+      camera: The camera, in scene units.
+      size: Width and height of the image in pixels.
+      time: Time in [0, 1].
+
+    Returns:
+      Attributes by name.
     """
     turn = np.asarray(camera.camera_from_world, np.float64)
     focal, aspect = float(camera.focal_px), float(camera.pixel_aspect)

@@ -1,4 +1,4 @@
-"""Packages that are installed with an extra of this one, loaded where they are used."""
+"""Optional packages that are installed with an extra, imported on first use."""
 
 import importlib
 import importlib.util
@@ -6,20 +6,36 @@ import types
 
 
 class MissingExtra(ModuleNotFoundError, ValueError):
-    """A package is wanted that is installed with an extra only."""
+    """A package is needed that is installed only with an extra."""
 
 
 def library(name: str, extra: str) -> types.ModuleType:
-    """The module of an extra's package, loaded now.
+    """Import a package of an extra.
 
-    Raises MissingExtra, which names the extra, where it is not installed.
+    Args:
+      name: Name of the module.
+      extra: Name of the extra.
+
+    Returns:
+      The module.
+
+    Raises:
+      MissingExtra: If it is not installed, with the name of the extra.
     """
     check(name, extra)
     return importlib.import_module(name)
 
 
 def check(name: str, extra: str) -> None:
-    """Raise MissingExtra where the module is not installed; nothing is loaded."""
+    """Check that a package of an extra is installed, without importing it.
+
+    Args:
+      name: Name of the module.
+      extra: Name of the extra.
+
+    Raises:
+      MissingExtra: If it is not installed, with the name of the extra.
+    """
     package = name.partition(".")[0]
     if importlib.util.find_spec(package) is None:
         raise MissingExtra(

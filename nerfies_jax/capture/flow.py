@@ -10,11 +10,12 @@ SIDES = ("forward", "backward")
 
 
 class FrameFlow(NamedTuple):
-    """Flow from each frame to the next and the previous one of the same camera.
+    """Optical flow from each frame to the next and the previous one of the same camera.
 
-    From the center of a pixel to where what it shows lies in the other frame, in pixels
-    right and down; `seen` where both frames show it. A frame without a neighbor names
-    its own row, and nothing is seen. NumPy leaves in a capture, JAX in training.
+    Flow is measured from the center of a pixel to the position of the same surface
+    point in the other frame, in pixels right and down. `seen` is True where both frames
+    show the point. A frame without a neighbor refers to its own row and has no valid
+    flow. Leaves are NumPy arrays in a capture and JAX arrays in training.
     """
 
     forward: Float[Array, "frames height width 2"]
@@ -26,14 +27,31 @@ class FrameFlow(NamedTuple):
 
 
 def sides(flow: FrameFlow):
-    """("forward", shift, seen, row of the neighbor), and the same backward."""
+    """Split flow into its two directions.
+
+    Args:
+      flow: The flow.
+
+    Returns:
+      Tuples (name, shift, seen, row of the neighbor) for "forward" and "backward".
+    """
     return ((SIDES[0], *flow[:3]), (SIDES[1], *flow[3:]))
 
 
 def validate(
     flow: FrameFlow, ids: Sequence[str], size: tuple[int, int], camera_ids: np.ndarray
 ) -> None:
-    """Raise ValueError, naming frame and remedy, for what cannot be used."""
+    """Check flow against the capture that it belongs to.
+
+    Args:
+      flow: The flow, in NumPy.
+      ids: Names of the frames.
+      size: Width and height of the images in pixels.
+      camera_ids: Physical camera of each frame, [frames].
+
+    Raises:
+      ValueError: If it cannot be used, with the frame and the remedy.
+    """
     count = len(ids)
     pictures = (count, size[1], size[0])
     for name, shift, seen, rows in sides(flow):
@@ -78,7 +96,16 @@ def validate(
 
 
 def take(flow: FrameFlow, rows: np.ndarray) -> FrameFlow:
-    """Some of the frames, in this order; who loses its neighbor sees none of it."""
+    """Select frames of flow.
+
+    Args:
+      flow: The flow, in NumPy.
+      rows: Indices of the frames, in the order of the result.
+
+    Returns:
+      The flow of these frames. A frame whose neighbor is not among them has no valid
+      flow.
+    """
     rows = np.asarray(rows, np.int64)
     place = np.full(len(flow.next_row), -1)
     place[rows] = np.arange(len(rows))
@@ -94,9 +121,15 @@ def take(flow: FrameFlow, rows: np.ndarray) -> FrameFlow:
 
 
 def shrink(flow: FrameFlow, factor: int) -> FrameFlow:
-    """Flow of pictures smaller by an integer factor, in their own larger pixels.
+    """Adapt flow to images smaller by an integer factor.
 
-    The mean of each block, seen where all of it is; trimmed as the pictures are.
+    Args:
+      flow: The flow, in NumPy.
+      factor: Integer factor.
+
+    Returns:
+      The mean of each block, in pixels of the smaller images, valid where all of it is.
+      Incomplete blocks are removed as for images.
     """
     shrunk = []
     for _, shift, seen, neighbor in sides(flow):
@@ -108,7 +141,17 @@ def shrink(flow: FrameFlow, factor: int) -> FrameFlow:
 def shrink_one(
     shift: np.ndarray, seen: np.ndarray, factor: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`shrink` of one frame: [height, width, 2] pixels and where they are seen."""
+    """Adapt the flow of one frame to an image smaller by an integer factor.
+
+    Args:
+      shift: Flow in pixels, [height, width, 2].
+      seen: True where the flow is valid, [height, width].
+      factor: Integer factor.
+
+    Returns:
+      The mean of each block in its larger pixels, and True where all of the block is
+      valid.
+    """
     lines, columns = seen.shape[0] // factor, seen.shape[1] // factor
     trimmed = np.s_[: lines * factor, : columns * factor]
     parts = (lines, factor, columns, factor)
@@ -118,5 +161,12 @@ def shrink_one(
 
 
 def training_flow(capture) -> FrameFlow | None:
-    """Select the flow of the training frames; None if the capture has none."""
+    """Return the flow between the training frames.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The flow, None if the capture has none.
+    """
     return None if capture.flow is None else take(capture.flow, capture.train)

@@ -1,4 +1,4 @@
-"""Where optical flow is kept in a Nerfies directory; only we read it."""
+"""Optical flow files in a Nerfies directory, an extension of this library."""
 
 import pathlib
 from collections.abc import Sequence
@@ -15,10 +15,16 @@ NEIGHBORS = "neighbors.json"  # {"forward": {id: id of the next frame}, "backwar
 
 
 def write(flow: FrameFlow, ids: Sequence[str], folder: pathlib.Path, factor: int):
-    """Flow of the pictures at one reduction, into a capture's folder `flow`.
+    """Write flow at one reduction into the folder `flow` of a capture.
 
     `<factor>x/forward/ID.npy` is float32 [height, width, 3]: right and down in pixels
-    of that reduction, and 1 where seen. Frames without a neighbor have no file.
+    of that reduction, and 1 where valid. Frames without a neighbor have no file.
+
+    Args:
+      flow: The flow at full size, in NumPy.
+      ids: Names of the frames.
+      folder: The folder `flow`.
+      factor: Integer reduction.
     """
     neighbors = {}
     for name, shift, seen, rows in flows.sides(flows.shrink(flow, factor)):
@@ -40,10 +46,17 @@ def read(
     ids: Sequence[str],
     size: tuple[int, int],
 ) -> FrameFlow | None:
-    """What `write` wrote for the frames `ids`, whose shrunk pictures have `size`.
+    """Read flow written by `write`.
 
-    None where the folder has no flow. Neighbors that are not among the frames are
-    passed over.
+    Args:
+      folder: The folder `flow`.
+      source: Stored reduction to read.
+      shrink_by: Integer factor by which the stored flow is reduced further.
+      ids: Names of the frames. Neighbors that are not among them are ignored.
+      size: Width and height of the reduced images in pixels.
+
+    Returns:
+      The flow, None if the folder has none.
     """
     if not (folder / NEIGHBORS).is_file():
         return None

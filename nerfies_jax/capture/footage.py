@@ -1,7 +1,7 @@
-"""Pictures without cameras: a film's sharpest frames, or photographs set upright.
+"""Images without cameras: sharp frames of a video, or photographs turned upright.
 
-Either becomes a folder of PNG files of one size, and masks beside them where they are
-given.
+Both become a folder of PNG files of one size, with masks in a second folder if there
+are any.
 """
 
 import collections
@@ -41,15 +41,15 @@ FULL_FRAME_MM = 36.0  # the longer side that the 35 mm equivalent refers to
 
 
 class _Unreadable(CaptureError):
-    """What is no picture for all its name, or broken."""
+    """The file is not an image despite its name, or is damaged."""
 
 
 class _TooLarge(CaptureError):
-    """More pixels than are read, or a broken header that says so."""
+    """The image has more pixels than the limit, or a damaged header that says so."""
 
 
 class Taken(NamedTuple):
-    """What was taken of a film or of a folder of photographs."""
+    """Images taken from a video or from a folder of photographs."""
 
     names: tuple[str, ...]  # of the files written, in order
     notes: tuple[str, ...]  # what was left out, and why
@@ -58,7 +58,14 @@ class Taken(NamedTuple):
 
 
 def kind_of(path: pathlib.Path) -> str | None:
-    """What a path names: "film", "pictures" (a folder with two at least), or None."""
+    """Tell videos from folders of images.
+
+    Args:
+      path: A file or folder.
+
+    Returns:
+      "film", "pictures" (a folder with two at least), or None.
+    """
     if path.is_file() and path.suffix.lower() in FILMS:
         return "film"
     if path.is_dir() and len(pictures_in(path)) >= 2:
@@ -67,7 +74,14 @@ def kind_of(path: pathlib.Path) -> str | None:
 
 
 def pictures_in(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Files of a folder that are pictures by their ending, in natural order."""
+    """List the image files of a folder, by their suffix.
+
+    Args:
+      folder: The folder.
+
+    Returns:
+      Paths in natural order.
+    """
     files = frames.pictures_in(folder, (*PLAIN, *HEIC))
     return sorted(files, key=lambda file: frames.natural(file.name))
 
@@ -80,11 +94,24 @@ def from_film(
     max_side: int = 960,
     masks: pathlib.Path | None = None,
 ) -> Taken:
-    """Write the film's sharpest frames into `out/images`, evenly spread in time.
+    """Write the sharpest frames of a video, evenly spread in time, into `out/images`.
 
-    `count` of them or so many `per_second` of the film; names keep the milliseconds.
-    `masks` is a folder with one PNG for each frame of the film, black where something
-    moves by itself; those of the frames taken go to `out/masks`.
+    Names contain the time in milliseconds.
+
+    Args:
+      film: The video.
+      out: The folder to write to.
+      count: Number of frames.
+      per_second: Frames per second of video. At most one of the two can be given.
+      max_side: Longest side of the images in pixels.
+      masks: Folder with one PNG for each frame of the video, black where something
+        moves. Those of the selected frames go to `out/masks`.
+
+    Returns:
+      Names of the images, and notes.
+
+    Raises:
+      CaptureError: If the video cannot be used.
     """
     moments, scores = [], []
     with events.stage("decoding the video to find sharp frames") as stage:
@@ -165,11 +192,23 @@ def from_pictures(
     max_side: int = 960,
     masks: pathlib.Path | None = None,
 ) -> Taken:
-    """Write the pictures of a folder into `out/images`, upright and of one size.
+    """Write the images of a folder, upright and of one size, into `out/images`.
 
-    `masks` holds NAME.png (or NAME.jpg.png) for every picture NAME.jpg, black where
-    something moves by itself. What cannot be read or has another size than most is left
-    out, and named.
+    Images that cannot be read or differ in size from the majority are left out, and
+    named in the notes.
+
+    Args:
+      folder: The folder.
+      out: The folder to write to.
+      max_side: Longest side of the images in pixels.
+      masks: Folder with NAME.png (or NAME.jpg.png) for every image NAME.jpg, black
+        where something moves.
+
+    Returns:
+      Names of the images, and notes.
+
+    Raises:
+      CaptureError: If the images cannot be used.
     """
     sizes, notes = _readable(folder)
     usual = collections.Counter(sizes.values()).most_common(1)[0][0]
@@ -257,7 +296,7 @@ def _spoken(name):
 
 
 def _heif():
-    """Whether HEIC can be read; Pillow learns it from a package of its own."""
+    """Test if HEIC can be read, and register its package with Pillow."""
     try:
         importlib.import_module("pillow_heif").register_heif_opener()
     except ImportError:
@@ -267,7 +306,9 @@ def _heif():
 
 @contextlib.contextmanager
 def _opened(file):
-    """The picture as it lies in the file; whatever is wrong with it in one line."""
+    """Open an image as stored, and raise a one-line error for anything wrong with
+    it.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
@@ -360,7 +401,15 @@ def _write_mask(out, name, mask, shape, factor, source):
 
 
 def sharpness(gray: np.ndarray) -> float:
-    """Variance of the Laplacian of a picture [height, width]: high with sharp edges."""
+    """Compute the variance of the Laplacian of an image, which is large for sharp
+    edges.
+
+    Args:
+      gray: Gray image, [height, width].
+
+    Returns:
+      The variance.
+    """
     step = max(1, max(gray.shape) // 480)
     thinned = gray[::step, ::step].astype(np.float32)
     return float(scipy.ndimage.laplace(thinned).var())
@@ -369,10 +418,18 @@ def sharpness(gray: np.ndarray) -> float:
 def sharp_rows(
     scores: np.ndarray, seconds: np.ndarray, count: int
 ) -> tuple[np.ndarray, int]:
-    """The sharpest of each of `count` stretches of time, and how many were too blurred.
+    """Select the sharpest frame of each of several intervals of time.
 
-    Not a global threshold: a film may be sharper where the scene has more texture. (The
-    filter in Nerfies' notebook removes the sharpest frames instead.)
+    The threshold for blur is local, since a video may be sharper where the scene has
+    more texture. (The filter in Nerfies' notebook removes the sharpest frames instead.)
+
+    Args:
+      scores: Sharpness of each frame, [frames].
+      seconds: Times in ascending order, [frames].
+      count: Number of intervals.
+
+    Returns:
+      Indices of the selected frames, and the number of intervals without a sharp frame.
     """
     share = (seconds - seconds[0]) / max(np.ptp(seconds), np.finfo(float).tiny)
     # A frame stands for the time until the next one: the last has a stretch as well.
@@ -389,6 +446,8 @@ def sharp_rows(
 
 
 def _usual(scores, row):
-    """The lower of the medians just before and just after; texture may jump between."""
+    """Lower of the medians just before and just after, since texture may change
+    abruptly.
+    """
     sides = scores[max(0, row - 5) : row], scores[row + 1 : row + 6]
     return min((np.median(side) for side in sides if side.size), default=0.0)

@@ -1,4 +1,4 @@
-"""`load`: recognize what kind of capture a folder holds, and read it."""
+"""Recognition of capture formats, and `load`, which reads any of them."""
 
 import importlib
 import pathlib
@@ -12,7 +12,7 @@ from nerfies_jax.capture.json_files import AnyPath
 
 
 class Format(NamedTuple):
-    """One kind of capture and how to tell it."""
+    """A capture format and the test that recognizes it."""
 
     name: str
     looks_for: str
@@ -33,9 +33,17 @@ MODELS = ("sparse", "colmap/sparse", "distorted/sparse", "colmap", "")
 
 
 def sparse_models(path: pathlib.Path, part: str = "images") -> list[pathlib.Path]:
-    """The folders with that part of a COLMAP model, of the first place that has any.
+    """Find the COLMAP models of a capture.
 
-    No deeper: below a folder of pictures lie the captures that were made of them.
+    Folders deeper down are not searched, since captures made from the images may lie
+    below them.
+
+    Args:
+      path: Folder of the capture.
+      part: File of a model, without suffix, that must exist.
+
+    Returns:
+      Folders of the first place that has any, numbered ones in ascending order.
     """
     for place in MODELS:
         parent = path / place
@@ -127,13 +135,23 @@ def load(
     missing: str = "refuse",
     **options,
 ) -> Capture:
-    """The capture in a folder, whatever its format; `notes` says what was found.
+    """Read a capture of any format.
 
-    Pictures are read at 1/`factor` of their full size, or with no side longer than
-    `max_side` pixels. `heldout`: None for the files' own split (every 8th frame where
-    they have none), n for every n-th frame, or the name of a split. `missing`: "refuse"
-    or "skip" frames whose picture is missing. `options` are the reader's own, such as
-    `background` for Blender's.
+    Args:
+      path: Folder or file of the capture.
+      factor: Read images at 1/`factor` of their full size.
+      max_side: Longest side of the images in pixels. At most one of the two can be
+        given.
+      heldout: None for the files' own split (every 8th frame if they have none), n for
+        every n-th frame, or the name of a split.
+      missing: "refuse" or "skip" frames without an image.
+      **options: Further arguments of the reader, such as `background` of Blender's.
+
+    Returns:
+      The capture. Its `notes` say what was found, repaired or left out.
+
+    Raises:
+      CaptureError: If the capture cannot be used.
     """
     path = pathlib.Path(path)
     reader = importlib.import_module(recognize(path).module)

@@ -1,4 +1,4 @@
-"""What every reader does with its list of frames: pick, order, split, decode."""
+"""Selecting, sorting, splitting and decoding of frames, shared by all readers."""
 
 import math
 import pathlib
@@ -27,7 +27,14 @@ SUFFIXES = (".png", ".jpg", ".jpeg")  # in small letters; files may have others
 
 
 def natural(name: str) -> tuple:
-    """Sort key under which frame 9 comes before frame 10."""
+    """Return a sort key under which frame 9 comes before frame 10.
+
+    Args:
+      name: Name of the frame.
+
+    Returns:
+      The key.
+    """
     parts = re.split(r"(\d+)", name)
     return tuple((0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts)
 
@@ -39,10 +46,22 @@ def choose_source(
     max_side: int | None,
     where: str,
 ) -> tuple[int, int]:
-    """Which stored reduction to read, and by how much to shrink it further.
+    """Choose the stored reduction to read, and the further reduction.
 
-    `available` maps reductions (1, 2, 4, ...) to folders; with neither a factor nor a
-    longest side asked for it is the largest pictures there.
+    Args:
+      available: Folders by reduction (1, 2, 4, ...).
+      full_size: Width and height of the full-size images in pixels.
+      factor: Requested reduction.
+      max_side: Requested longest side in pixels. At most one of the two can be given.
+      where: Name of the capture in error messages.
+
+    Returns:
+      The stored reduction, and the integer factor to reduce it by. The largest stored
+      images if nothing is requested.
+
+    Raises:
+      CaptureError: If the request is invalid or cannot be made from the stored
+        reductions.
     """
     if factor is not None and max_side is not None:
         raise CaptureError(
@@ -67,9 +86,16 @@ def choose_source(
 
 
 def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:
-    """Find an image by its name, which may lack its ending.
+    """Find an image by its name, which may lack its suffix.
 
-    The spelling on disk may differ as `text_files.find` says.
+    The spelling on disk may differ as described in `text_files.find`.
+
+    Args:
+      folder: Folder of the image.
+      name: Name or relative path.
+
+    Returns:
+      Path of the file, or None.
     """
     suffixes = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
     return text_files.find(folder, name, suffixes)
@@ -78,9 +104,16 @@ def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:
 def pictures_in(
     folder: pathlib.Path, suffixes: Sequence[str] = SUFFIXES
 ) -> list[pathlib.Path]:
-    """Files of a folder that captures are read from, sorted letter by letter.
+    """List the image files of a folder.
 
-    Hidden ones are none: macOS puts ._A.JPG beside A.JPG, with no picture in it.
+    Hidden files do not count: macOS puts ._A.JPG next to A.JPG, with no image in it.
+
+    Args:
+      folder: The folder.
+      suffixes: Suffixes of images in lower case.
+
+    Returns:
+      Paths, sorted character by character.
     """
     return sorted(
         file
@@ -92,7 +125,15 @@ def pictures_in(
 
 
 def check_missing(missing: str, where: str) -> None:
-    """Raise for another word than those of `missing`."""
+    """Check the setting for frames without an image.
+
+    Args:
+      missing: The setting.
+      where: Name of the capture in error messages.
+
+    Raises:
+      CaptureError: If it is neither "refuse" nor "skip".
+    """
     if missing not in ("refuse", "skip"):
         raise CaptureError(f'{where}: missing={missing!r}; expected "refuse" or "skip"')
 
@@ -103,7 +144,21 @@ def keep_found(
     missing: str,
     where: str,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Rows whose file is there, and a note; an error unless `missing` is "skip"."""
+    """Select the frames whose file exists.
+
+    Args:
+      paths: Path of each frame, None if it was not found.
+      names: Names of the frames.
+      missing: "refuse" or "skip" frames without a file.
+      where: Name of the capture in error messages.
+
+    Returns:
+      Rows of the existing files, and a note if others were skipped.
+
+    Raises:
+      CaptureError: If a file is missing and `missing` is "refuse", or if all are
+        missing.
+    """
     check_missing(missing, where)
     rows = np.array([row for row, path in enumerate(paths) if path is not None], int)
     lost = [name for name, path in zip(names, paths, strict=True) if path is None]
@@ -129,13 +184,25 @@ class Frames(NamedTuple):
     notes: tuple[str, ...]
 
     def valid(self) -> np.ndarray | None:
-        """Observed pixels of a format whose alpha is 255 there."""
+        """Return the observed pixels of a format that marks them by an alpha of 255.
+
+        Returns:
+          Booleans [frames, height, width], None for all.
+        """
         opaque = None if self.alpha is None else self.alpha == 255
         return both(opaque, self.observed)
 
 
 def both(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray | None:
-    """The pixels that are in two masks; None is a mask of all pixels."""
+    """Intersect two masks.
+
+    Args:
+      first: A mask, None for all pixels.
+      second: A mask of the same shape, None for all pixels.
+
+    Returns:
+      Pixels that are in both masks, None for all.
+    """
     if first is None or second is None:
         return second if first is None else first
     return first & second
@@ -149,8 +216,20 @@ def read_frames(
 ) -> Frames:
     """Read the images of a capture.
 
-    Every size is read first: they must agree and fit. With a `background` the color is
-    laid over it at full resolution, before shrinking.
+    All sizes are checked before the first image is decoded.
+
+    Args:
+      paths: Files of equal size.
+      shrink_by: Integer reduction.
+      background: sRGB color in [0, 1] over which images with alpha are composited, at
+        full resolution. None keeps the color as stored.
+      orientation: "refuse" images that EXIF rotates, or read them as "stored".
+
+    Returns:
+      The images.
+
+    Raises:
+      CaptureError: If an image cannot be read, or sizes differ or are out of bounds.
     """
     if len(paths) > MAX_FRAMES:
         raise CaptureError(
@@ -257,16 +336,16 @@ def read_masks(
 def hold_out_in_time(
     times: ArrayLike, camera_ids: ArrayLike, every: int, where: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`hold_out_every` of frames in order of time, one camera after the other.
+    """Apply `hold_out_every` in order of time, one camera after the other.
 
     Args:
       times: Frame times, in any order.
       camera_ids: Physical camera of each frame.
       every: One of so many frames is held out.
-      where: Names the capture in errors.
+      where: Name of the capture in error messages.
 
     Returns:
-      Rows to learn from and rows to score on, each in rising order.
+      Training rows and held-out rows, each in ascending order.
     """
     order = np.lexsort((times, camera_ids))
     kept, scored = hold_out_every(len(order), every, where)
@@ -274,10 +353,21 @@ def hold_out_in_time(
 
 
 def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Rows to learn from and to score on: the middle one of every `every` frames.
+    """Hold out the middle frame of every `every` frames.
 
-    The middle, not the first: a held-out frame then has neighbors on both sides. Of
-    fewer frames than `every` one is held out, of fewer than three none.
+    With the middle one, a held-out frame has neighbors on both sides. One frame is held
+    out if there are fewer than `every`, and none if there are fewer than three.
+
+    Args:
+      count: Number of frames.
+      every: One of so many frames is held out, at least 2.
+      where: Name of the capture in error messages.
+
+    Returns:
+      Training rows and held-out rows.
+
+    Raises:
+      CaptureError: If `every` is below 2.
     """
     if every < 2:
         raise CaptureError(
@@ -292,12 +382,26 @@ def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.n
 
 
 def dense(values: ArrayLike) -> np.ndarray:
-    """0..n-1 in the order of the values, equal for equal ones; int32."""
+    """Number distinct values in ascending order.
+
+    Args:
+      values: Values, [frames].
+
+    Returns:
+      int32 numbers 0..n-1, equal for equal values.
+    """
     return np.unique(np.asarray(values), return_inverse=True)[1].astype(np.int32)
 
 
 def spread(values: ArrayLike) -> np.ndarray:
-    """Moments on any clock as float32 times in [0, 1]; zeros if they are all equal."""
+    """Normalize times to [0, 1].
+
+    Args:
+      values: Times on any clock, [frames].
+
+    Returns:
+      float32 times, zeros if all are equal.
+    """
     values = np.asarray(values, np.float64)
     first, last = values.min(), values.max()
     if last == first:
@@ -306,14 +410,28 @@ def spread(values: ArrayLike) -> np.ndarray:
 
 
 def unit(up: Sequence[float] | None) -> tuple[float, float, float] | None:
-    """A direction that a file states, of unit length; None for none or for zeros."""
+    """Normalize a direction from a file.
+
+    Args:
+      up: A direction, or None.
+
+    Returns:
+      The unit vector, or None if there is none or it is zero.
+    """
     if up is None or not np.linalg.norm(up) > 0:
         return None
     return tuple((np.array(up) / np.linalg.norm(up)).tolist())
 
 
 def up_direction(cameras: Camera) -> tuple[float, float, float] | None:
-    """Where the cameras' tops point on average; None if they cancel."""
+    """Return the mean up direction of cameras.
+
+    Args:
+      cameras: Cameras, [frames].
+
+    Returns:
+      A unit vector, or None if the directions cancel.
+    """
     mean = -cameras.camera_from_world[:, 1].astype(np.float64).mean(0)
     length = np.linalg.norm(mean)
     if length < 0.1:  # rolled every way: no common up
@@ -332,7 +450,18 @@ _project = jax.jit(
 def pixels_of(
     cameras: Camera, row: int, position: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel [points, 2], z-depth, and whether each point falls into the picture."""
+    """Project points into one frame.
+
+    Args:
+      cameras: Cameras, [frames].
+      row: Index of the frame.
+      position: Points in scene units, [points, 3].
+      size: Width and height of the image in pixels.
+
+    Returns:
+      Pixel positions [points, 2], z-depths [points], and booleans of the points inside
+      the image [points].
+    """
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), cameras)
     pixel, depth, seen = map(np.asarray, _project(one, jnp.asarray(position)))
     inside = (pixel >= 0).all(-1) & (pixel < np.asarray(size)).all(-1)
@@ -346,10 +475,19 @@ def colored_points(
     rows: np.ndarray,
     skip: np.ndarray | None,
 ) -> PointCloud:
-    """Static points with the median color of up to 16 of the frames `rows`.
+    """Color points with the median over up to 16 frames.
 
-    Occlusion is not tested; the median forgives it in a minority of the frames. Pixels
-    marked in `skip` [frames, height, width] do not count; unseen points are gray.
+    Occlusion is not tested. The median tolerates it in a minority of the frames.
+
+    Args:
+      position: Points in scene units, [points, 3].
+      images: uint8 images, [frames, height, width, 3].
+      cameras: Cameras, [frames].
+      rows: Frames to use.
+      skip: True for pixels to ignore, [frames, height, width], or None.
+
+    Returns:
+      The points with colors, gray if no frame shows them.
     """
     size = (images.shape[2], images.shape[1])
     rows = rows[np.linspace(0, len(rows) - 1, min(16, len(rows))).astype(int)]
@@ -368,8 +506,20 @@ def colored_points(
 
 
 def load_array(path: pathlib.Path, most: int) -> np.ndarray:
-    """A numeric .npy with at most `most` numbers; mapped first, so a false header that
-    claims more than the file holds allocates nothing, and never unpickled.
+    """Load a numeric .npy file.
+
+    It is memory-mapped first, so a false header that claims more than the file holds
+    allocates nothing. Pickled objects are refused.
+
+    Args:
+      path: The file.
+      most: Largest number of values.
+
+    Returns:
+      The array.
+
+    Raises:
+      CaptureError: If it is not such a file, or has more values.
     """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)

@@ -1,4 +1,4 @@
-"""Checks of every capture, whatever format it came from, by its numbers alone."""
+"""Consistency checks of every capture, independent of its format."""
 
 import dataclasses
 import pathlib
@@ -23,12 +23,15 @@ SAMPLES = 1_000_000  # of the pixels; more change no median
 def checked(capture: Capture) -> Capture:
     """Check a capture that was just read.
 
+    Args:
+      capture: The capture.
+
     Returns:
-        The capture, with a note for each finding.
+      The capture, with a note for each finding.
 
     Raises:
-        CaptureError: Nothing can be reconstructed from it, or its parts contradict each
-            other.
+      CaptureError: If nothing can be reconstructed from it, or its parts contradict
+        each other.
     """
     check_observed(capture)
     notes = (*_depth_notes(capture), *_unread_notes(capture))
@@ -40,10 +43,13 @@ def checked(capture: Capture) -> Capture:
 def check_observed(capture: Capture) -> None:
     """Refuse a capture without any static or observed pixel.
 
+    Args:
+      capture: The capture.
+
     Raises:
-        CaptureError: No pixel of the frames to learn from, or of those held out, is
-            observed, or all of those to learn from are marked as moving, by the capture
-            or by the masks of another tool.
+      CaptureError: If no pixel of the training frames, or of the held-out ones, is
+        observed, or if all pixels of the training frames are marked as moving, by the
+        capture or by external masks.
     """
     where = str(capture.path or capture.name)
     if capture.valid is not None:

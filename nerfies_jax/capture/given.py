@@ -1,4 +1,4 @@
-"""What other tools found in the pictures of a capture; taken in place of our own."""
+"""External preprocessing of a capture (tracks, masks, depth, flow), used as given."""
 
 import dataclasses
 import pathlib
@@ -27,9 +27,10 @@ class GivenFiles:
 
 
 class Given(NamedTuple):
-    """Row for row beside the capture, in pixels of `size`; None for what is not given.
+    """External preprocessing results by frame, in pixels of `size`, None where absent.
 
-    Frames that a tool did not look at hold nothing: not seen, not moving, NaN.
+    Frames that the tool did not process have no visible tracks, no moving pixels, and
+    NaN.
     """
 
     size: tuple[int, int]  # width and height
@@ -46,7 +47,15 @@ class Given(NamedTuple):
 
 
 def take(given: Given, rows: np.ndarray) -> Given:
-    """Some of the frames, in this order. Flow leads elsewhere then and is dropped."""
+    """Select frames. Flow is dropped, since its target frames change.
+
+    Args:
+      given: External preprocessing results.
+      rows: Indices of the frames, in the order of the result.
+
+    Returns:
+      The results of these frames.
+    """
     parts = given._asdict()
     del parts["size"], parts["forward"], parts["backward"]
     kept = {

@@ -1,9 +1,9 @@
-"""Film of high dynamic range (HLG, PQ) as 8-bit sRGB, the same curve for every frame.
+"""Tone mapping of HDR video (HLG, PQ) to 8-bit sRGB, with one curve for all frames.
 
-Nothing adapts to a frame: what has one brightness in two frames keeps one color. White
-paper is at 203 nits (ITU-R BT.2408), which is where sRGB ends here; what is darker than
-half of that keeps its brightness, and what is brighter is rolled off, up to 1000 nits.
-The packages of ffmpeg that do this (zscale) are not in PyAV's.
+Nothing adapts to a frame, so equal brightness in two frames gives equal color. White
+paper is at 203 nits (ITU-R BT.2408), which is where sRGB ends here. Values below half
+of that keep their brightness, and brighter ones are rolled off, up to 1000 nits. The
+filters of ffmpeg that do this (zscale) are not part of PyAV.
 """
 
 import functools
@@ -37,7 +37,15 @@ HLG_GAMMA = 1.2  # of a display of `BRIGHTEST_NITS`
 
 
 def tone_mapped(code: np.ndarray, transfer: Transfer) -> np.ndarray:
-    """uint8 sRGB [..., 3] of uint16 codes [..., 3] of a BT.2020 film."""
+    """Convert BT.2020 code values to sRGB.
+
+    Args:
+      code: uint16 code values, [..., 3].
+      transfer: "PQ" or "HLG".
+
+    Returns:
+      uint8 sRGB, [..., 3].
+    """
     if transfer == "PQ":
         nits = _nits_of_pq()[code]
     else:
@@ -45,7 +53,7 @@ def tone_mapped(code: np.ndarray, transfer: Transfer) -> np.ndarray:
         luminance = np.maximum(scene @ _LUMINANCE, np.finfo(np.float32).tiny)
         gain = BRIGHTEST_NITS * luminance ** (HLG_GAMMA - 1)
         nits = scene * gain[..., None].astype(np.float32)
-    # Of the brightest part, and the others alike: hues stay.
+    # The brightest channel sets the gain of all three, so hues are kept.
     most = nits.max(axis=-1)
     rolled = _roll_off()[_place(most, BRIGHTEST_NITS)]
     shown = nits * (rolled / np.maximum(most, 1e-3))[..., None]

@@ -1,7 +1,7 @@
-"""Pictures in and out: PNG and JPEG by scikit-image and imageio, EXR by OpenEXR.
+"""Image files: PNG and JPEG by scikit-image and imageio, EXR by OpenEXR.
 
-Sizes are bounded from the header, before anything is decoded. Colors are sRGB in 8
-bits on disk and in memory; EXR holds linear light, which is turned into them.
+Sizes are checked in the header before anything is decoded. Colors are 8-bit sRGB on
+disk and in memory. The linear light of EXR is converted to sRGB.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ _PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeEr
 
 
 class Header(NamedTuple):
-    """What a picture says about itself before it is decoded."""
+    """Properties of an image from its header."""
 
     size: tuple[int, int]  # width, height as stored
     mode: str  # Pillow's name: RGB, RGBA, L, LA, P, I;16, ...; or EXR
@@ -37,7 +37,17 @@ class Header(NamedTuple):
 
 
 def read_header(path: AnyPath) -> Header:
-    """Size and kind of a PNG, JPEG or EXR, checked against `MAX_PIXELS`."""
+    """Read size and kind of a PNG, JPEG or EXR.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The header.
+
+    Raises:
+      CaptureError: If it cannot be read or exceeds `MAX_PIXELS`.
+    """
     path = pathlib.Path(path)
     if path.suffix.lower() == EXR:
         return _checked(path, Header(exr.read_size(path), "EXR", 1))
@@ -77,12 +87,21 @@ def _orientation(image):
 
 
 def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
-    """One picture as uint8 [height, width, 1 to 4]: gray, gray+alpha, RGB or RGBA.
+    """Read an image as uint8.
 
-    A picture that a viewer would turn (EXIF) is refused, unless `orientation` is
-    "stored": then its pixels come as they lie in the file, which is what COLMAP's
-    cameras refer to. 16-bit gray is rounded to 8 bits; 16-bit color is cut to them.
-    The linear light of an EXR becomes sRGB, brighter than 1 as 1.
+    16-bit gray is rounded to 8 bits, and 16-bit color is truncated to them. The linear
+    light of an EXR becomes sRGB, with values above 1 clipped.
+
+    Args:
+      path: The file.
+      orientation: "refuse" an image that viewers rotate (EXIF), or read its pixels as
+        "stored", which is what COLMAP's cameras refer to.
+
+    Returns:
+      uint8 [height, width, 1 to 4]: gray, gray and alpha, RGB or RGBA.
+
+    Raises:
+      CaptureError: If it cannot be read or is refused.
     """
     path = pathlib.Path(path)
     header = read_header(path)
@@ -133,7 +152,17 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
 
 @contextlib.contextmanager
 def opened(path: AnyPath) -> Iterator[PIL.Image.Image]:
-    """Open an image with Pillow; what cannot be decoded raises a `CaptureError`."""
+    """Open an image with Pillow.
+
+    Args:
+      path: The file.
+
+    Yields:
+      The image.
+
+    Raises:
+      CaptureError: If it cannot be decoded.
+    """
     try:
         with PIL.Image.open(path) as image:
             yield image
@@ -144,9 +173,14 @@ def opened(path: AnyPath) -> Iterator[PIL.Image.Image]:
 
 
 def read_numbers(path: AnyPath) -> np.ndarray:
-    """The first channel of a picture as it is stored, [height, width]: no light.
+    """Read the first channel of an image as stored, for depth and other values.
 
-    Gray of 16 bits and more keeps all of them; otherwise as `read_pixels`.
+    Args:
+      path: The file.
+
+    Returns:
+      Values [height, width], with all bits for gray of 16 bits and more, else as in
+      `read_pixels`.
     """
     path = pathlib.Path(path)
     if not read_header(path).mode.startswith("I"):
@@ -156,12 +190,18 @@ def read_numbers(path: AnyPath) -> np.ndarray:
 
 
 def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read the colors of an EXR and where there are any.
+    """Read the colors of an EXR, and the pixels that have one.
+
+    Args:
+      path: The file.
 
     Returns:
-        Color, uint8 sRGB [height, width, 3] of the display window; and bool [height,
-        width], False where nothing was stored or a channel was NaN or infinite, None
-        where all pixels are known. Their color is black.
+      uint8 sRGB [height, width, 3] of the display window, and booleans [height, width]
+      that are False where nothing was stored or a channel was NaN or infinite. Their
+      color is black. None if all pixels are known.
+
+    Raises:
+      CaptureError: If it cannot be read, has no color, or is partly transparent.
     """
     stored = exr.read_exr(path)
     if stored.color is None:
@@ -184,7 +224,16 @@ def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
 def read_image(
     path: AnyPath, orientation: str = "refuse"
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Color [height, width, 3] uint8 and alpha [height, width] uint8 where stored."""
+    """Read an image as color and alpha.
+
+    Args:
+      path: The file.
+      orientation: "refuse" an image that viewers rotate (EXIF), or read it as "stored".
+
+    Returns:
+      uint8 color [height, width, 3] and uint8 alpha [height, width], None without
+      alpha.
+    """
     pixels = read_pixels(path, orientation)
     channels = pixels.shape[2]
     alpha = pixels[..., -1] if channels in (2, 4) else None
@@ -193,14 +242,33 @@ def read_image(
 
 
 def over(color: np.ndarray, alpha: np.ndarray, background: tuple) -> np.ndarray:
-    """uint8 color with straight alpha laid over one color, all as stored (sRGB)."""
+    """Composite color with straight alpha over one color, in sRGB as stored.
+
+    Args:
+      color: uint8 color, [height, width, 3].
+      alpha: uint8 alpha, [height, width].
+      background: sRGB color in [0, 1].
+
+    Returns:
+      uint8 color, [height, width, 3].
+    """
     cover = alpha[..., None].astype(np.float32) / 255
     behind = np.asarray(background, np.float32) * 255
     return np.round(color * cover + behind * (1 - cover)).astype(np.uint8)
 
 
 def write_png(path: AnyPath, pixels: np.ndarray):
-    """uint8 or uint16 [height, width(, 1 to 4)], or a bool mask, written atomically."""
+    """Write a PNG file atomically.
+
+    Args:
+      path: The file.
+      pixels: uint8 or uint16 [height, width] or [height, width, 1 to 4], or a boolean
+        mask.
+
+    Raises:
+      ValueError: If the type is another.
+      CaptureError: If the file cannot be written.
+    """
     if pixels.dtype == np.bool_:
         pixels = pixels.astype(np.uint8) * 255
     if pixels.dtype not in (np.uint8, np.uint16):
@@ -216,14 +284,28 @@ def write_png(path: AnyPath, pixels: np.ndarray):
 
 
 def srgb_from_linear(light: np.ndarray) -> np.ndarray:
-    """Display values in [0, 1] from linear light (IEC 61966-2-1); clipped to [0, 1]."""
+    """Convert linear light to sRGB values (IEC 61966-2-1).
+
+    Args:
+      light: Linear light, clipped to [0, 1].
+
+    Returns:
+      sRGB values in [0, 1].
+    """
     light = np.clip(light, 0, 1)
     power = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
     return np.where(light <= 0.0031308, 12.92 * light, power)
 
 
 def linear_from_srgb(value: ArrayLike | float) -> np.ndarray:
-    """Linear light from display values in [0, 1]; values outside keep their slope."""
+    """Convert sRGB values to linear light.
+
+    Args:
+      value: sRGB values in [0, 1]. Values outside continue with the same formulas.
+
+    Returns:
+      Linear light.
+    """
     value = np.asarray(value)
     power = ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4
     return np.where(value <= 0.04045, value / 12.92, power)

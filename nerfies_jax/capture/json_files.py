@@ -1,10 +1,10 @@
-"""JSON and file names from strangers; files and folders replaced as a whole.
+"""JSON and file names from untrusted sources, and atomic replacement of files.
 
-JSON is bounded and typed, and names never lead outside their folder. While a file or
-folder is written it has a hidden name beside its final one: `.NAME.OWNER.partial`, or
-`.NAME.OWNER.RANDOM.partial` for folders, where OWNER is the process and its machine.
-`sweep` removes what processes that were killed left under such names, before anything
-is written to the folder again.
+JSON is limited in size and typed, and names never lead outside their folder. While a
+file or folder is written it has a hidden name next to its final one:
+`.NAME.OWNER.partial`, or `.NAME.OWNER.RANDOM.partial` for folders, where OWNER is the
+process and its machine. `sweep` removes files that killed processes left under such
+names, before anything is written to the folder again.
 """
 
 import contextlib
@@ -38,7 +38,19 @@ _LEFT_BEHIND = re.compile(
 
 
 def read_json(path: AnyPath, kind: Any = Any) -> Any:
-    """The file decoded as `kind`; a NaN, a wrong type or an absent key is an error."""
+    """Read a JSON file as a type.
+
+    Args:
+      path: The file.
+      kind: Type to decode to, for msgspec.
+
+    Returns:
+      The decoded value.
+
+    Raises:
+      CaptureError: If the file cannot be read, contains NaN, or does not match the
+        type.
+    """
     path = pathlib.Path(path)
     try:
         size = path.stat().st_size
@@ -74,16 +86,24 @@ def read_json(path: AnyPath, kind: Any = Any) -> Any:
 
 
 def write_json(path: AnyPath, value: Any):
-    """Written beside and renamed, so a reader never sees half a file."""
+    """Write a JSON file atomically, so a reader never sees half a file.
+
+    Args:
+      path: The file.
+      value: JSON values, all finite.
+    """
     with replaced_file(path) as partial:
         partial.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def probe(folder: AnyPath) -> None:
-    """Write some data to a folder, where another program failed and did not say why.
+    """Write some data to a folder, to learn why another program failed to.
+
+    Args:
+      folder: The folder.
 
     Raises:
-      OSError: It cannot be written.
+      OSError: If it cannot be written.
     """
     with tempfile.TemporaryFile(dir=folder) as file:
         file.write(bytes(4096))
@@ -91,9 +111,20 @@ def probe(folder: AnyPath) -> None:
 
 
 def inside(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Path:
-    """`root / name`, unless that leaves `root`, also through a symbolic link.
+    """Join a folder and a name, and refuse names that leave the folder.
 
-    Backslashes count as separators, too.
+    Symbolic links are followed, and backslashes count as separators.
+
+    Args:
+      root: The folder.
+      name: Relative path from a file.
+      named_in: File that contains the name, for error messages.
+
+    Returns:
+      The path.
+
+    Raises:
+      CaptureError: If the name leads outside the folder.
     """
     target = root / text_files.forward_slashes(name)
     if "\0" in name or not all(
@@ -107,7 +138,19 @@ def inside(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Pat
 
 
 def named_file(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Path:
-    """`inside`, spelled as the file is on disk where that is there."""
+    """Join a folder and a name like `inside`, spelled as on disk if the file exists.
+
+    Args:
+      root: The folder.
+      name: Relative path from a file.
+      named_in: File that contains the name, for error messages.
+
+    Returns:
+      The path.
+
+    Raises:
+      CaptureError: If the name leads outside the folder.
+    """
     target = inside(root, name, named_in)
     found = text_files.find(root, name)
     if found is None:
@@ -118,10 +161,20 @@ def named_file(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib
 
 @contextlib.contextmanager
 def replaced_file(path: AnyPath):
-    """A path to write to; it takes the name `path` when the block ends well.
+    """Replace a file atomically.
 
-    What is in it is on disk before it takes the name: after a power cut the file is the
-    old one or the new one, whole.
+    The content is flushed to disk before the file takes its name. After a power failure
+    the file is either the old or the new one, complete.
+
+    Args:
+      path: The file.
+
+    Yields:
+      A temporary path to write to, which becomes `path` when the block ends without an
+      error.
+
+    Raises:
+      CaptureError: If it cannot be written.
     """
     path = pathlib.Path(path)
     _sweep_once(path.parent)
@@ -216,7 +269,14 @@ def sweep(folder: AnyPath) -> list[pathlib.Path]:
 
 @contextlib.contextmanager
 def new_folder(path: AnyPath):
-    """A temporary folder beside `path` that becomes `path` when the block ends well."""
+    """Create a folder atomically.
+
+    Args:
+      path: The folder, which may be absent or empty.
+
+    Yields:
+      A temporary folder that becomes `path` when the block ends without an error.
+    """
     with scratch_folder(path) as partial:
         yield partial
         partial.chmod(0o755)  # mkdtemp makes it private
@@ -224,7 +284,15 @@ def new_folder(path: AnyPath):
 
 
 def refuse_existing(path: AnyPath, overwrite: bool) -> None:
-    """Raise where something is at `path` already and may not be written over."""
+    """Refuse to overwrite an existing file or folder.
+
+    Args:
+      path: File or folder to be written. An empty folder does not count as existing.
+      overwrite: True to allow it.
+
+    Raises:
+      CaptureError: If it exists and `overwrite` is False.
+    """
     path = pathlib.Path(path)
     empty = path.is_dir() and not any(path.iterdir())
     if not overwrite and path.exists() and not empty:
@@ -301,7 +369,7 @@ def merged_folder(path: AnyPath):
 
 
 def _take_place(new, path):
-    """Rename the new folder to `path`; `sweep` mends it where that is cut off."""
+    """Rename the new folder to `path`. `sweep` repairs it after an interruption."""
     earlier = path.with_name(f".{path.name}.{processes.own_name()}.earlier")
     with stopping.protected():
         os.replace(path, earlier)
@@ -355,10 +423,19 @@ def _without_numbers(name):
 
 @contextlib.contextmanager
 def scratch_folder(path: AnyPath):
-    """A temporary folder beside the new folder `path`, gone when the block ends.
+    """Create a temporary folder next to a new folder, removed when the block ends.
 
-    What is renamed to `path` then must name it by its real path: neither "." nor a link
-    can be renamed to.
+    If it is renamed to `path`, use the real path, since neither "." nor a link can be a
+    target of renaming.
+
+    Args:
+      path: The new folder, which may be absent or empty.
+
+    Yields:
+      The temporary folder.
+
+    Raises:
+      CaptureError: If `path` exists or cannot be written.
     """
     path = pathlib.Path(path)
     sweep(path.resolve().parent)
@@ -375,7 +452,9 @@ def scratch_folder(path: AnyPath):
 
 @contextlib.contextmanager
 def _partial_folder(path, place):
-    """A temporary folder in `place` for what becomes `path`; it goes with the block."""
+    """Temporary folder in `place` for the contents of `path`, removed with the
+    block.
+    """
     try:
         place.mkdir(parents=True, exist_ok=True)
         prefix = f".{path.resolve().name}.{processes.own_name()}."

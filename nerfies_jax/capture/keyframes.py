@@ -1,4 +1,4 @@
-"""A camera path through a few chosen cameras, each at a time of its own."""
+"""Smooth camera paths through keyframes."""
 
 from typing import NamedTuple
 
@@ -15,19 +15,30 @@ MOST_KEYFRAMES = 24  # of a path that is to be edited by hand
 
 
 class Keyframe(NamedTuple):
-    """A camera, and which moment of the scene it shows; NumPy."""
+    """A camera and the time of the scene that it shows, in NumPy."""
 
     camera: Camera  # pinhole, scene units
     time: float  # in [0, 1]
 
 
 def through(keyframes: list[Keyframe], size: tuple[int, int], count: int) -> CameraPath:
-    """`count` cameras through all keyframes, the first and the last among them.
+    """Interpolate a camera path through keyframes.
 
-    As long from each to the next. Places, focal lengths and times follow monotone cubic
-    curves, which overshoot nothing: time does not run backwards between two keyframes,
-    and stands still between two of the same. Orientations follow a spline whose turning
-    is smooth.
+    The path takes equally long between all keyframes. Positions, log focal lengths and
+    times follow monotone cubic curves, which do not overshoot, so time never runs
+    backward between two keyframes, and stays constant between two of the same time.
+    Orientations follow a spline with smooth angular velocity.
+
+    Args:
+      keyframes: At least two keyframes.
+      size: Width and height of the images in pixels.
+      count: Number of cameras, including the first and the last keyframe.
+
+    Returns:
+      The path.
+
+    Raises:
+      ValueError: If there are fewer than two keyframes, or `count` is out of range.
     """
     if len(keyframes) < 2:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""LLFF: `poses_bounds.npy` with pictures in `images`, `images_2`, and so on."""
+"""Reader of LLFF: `poses_bounds.npy` with images in `images`, `images_2`, and so on."""
 
 import pathlib
 from typing import NamedTuple
@@ -18,7 +18,7 @@ MOST_NUMBERS = 17 * frames.MAX_FRAMES
 
 
 class Poses(NamedTuple):
-    """What the file says of each picture, in world units and full-size pixels."""
+    """Contents of the file, in world units and full-size pixels."""
 
     rotations: np.ndarray  # [frames, 3, 3] camera from world
     positions: np.ndarray  # [frames, 3]
@@ -34,13 +34,25 @@ def read(
     heldout: int | str | None = None,
     missing: str = "refuse",
 ) -> Capture:
-    """The capture in a folder of LLFF (Mildenhall et al. 2019), NSFF and others.
+    """Read a capture in the layout of LLFF (Mildenhall et al. 2019), NSFF and others.
 
-    Poses belong to the pictures in the order of their names, so none may be missing,
-    whatever `missing` says. `factor` is relative to the full-size pictures, of which
-    the file has the size. The pose's columns are the camera's down, right and backward
-    axes; the principal point is the picture's center. Times as for COLMAP's pictures;
-    `heldout` is a number n for every n-th frame, 8 if not given.
+    Poses belong to the images in the order of their names, so none may be missing. The
+    columns of a pose are the camera's down, right and backward axes. The principal
+    point is the center of the image. Times are found as for COLMAP.
+
+    Args:
+      path: The folder.
+      factor: Read images at 1/`factor` of the full size that the file states.
+      max_side: Longest side of the images in pixels. At most one of the two can be
+        given.
+      heldout: n for every n-th frame. None for every 8th.
+      missing: "refuse" or "skip", without effect here.
+
+    Returns:
+      The capture.
+
+    Raises:
+      CaptureError: If the capture cannot be used.
     """
     path = pathlib.Path(path)
     frames.check_missing(missing, str(path))
@@ -95,7 +107,9 @@ def read(
 
 
 def _placed(poses):
-    """What lies ahead of the cameras, at its bounds, stands in for scene points."""
+    """Place the scene by points at the bounds of each camera, in place of scene
+    points.
+    """
     ahead = poses.rotations[:, None, 2] * poses.bounds[..., None]
     box = (poses.positions[:, None] + ahead).reshape(-1, 3)
     return place_by_points(box, poses.positions, poses.bounds.ravel())
@@ -113,7 +127,17 @@ def _cameras(poses, placed, size):
 
 
 def read_poses(path: pathlib.Path) -> Poses:
-    """The poses, turned to axes right, down and forward."""
+    """Read the poses, rotated to axes right, down and forward.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The poses.
+
+    Raises:
+      CaptureError: If the file does not have this layout.
+    """
     table = frames.load_array(path, MOST_NUMBERS)
     if table.ndim != 2 or table.shape[1] != 17 or len(table) < 2:
         raise CaptureError(

@@ -1,7 +1,8 @@
-"""Mask images of every encoding: which pixels are white is decided for a whole set.
+"""Mask images of every encoding, in which the meaning of white is found for a whole
+set.
 
-One mask alone does not tell: a file of zeros and ones is black to the eye, and a frame
-in which nothing is marked has one value only.
+One mask alone is ambiguous: a file of zeros and ones looks black, and a frame in which
+nothing is marked has only one value.
 """
 
 import pathlib
@@ -26,7 +27,7 @@ LOSSY = (".jpg", ".jpeg")
 
 
 class Encoding(NamedTuple):
-    """How a set of mask images says white."""
+    """Encoding of white in a set of mask images."""
 
     alpha: bool  # opaque pixels are white, whatever their color
     threshold: int  # stored values from here on are white
@@ -43,7 +44,7 @@ class _Stored(NamedTuple):
 
 
 class _Survey(NamedTuple):
-    """What the values of one mask are."""
+    """Statistics of the values of one mask."""
 
     path: pathlib.Path
     counts: np.ndarray  # of pixels, by value
@@ -76,14 +77,18 @@ def read_mask(
 
 
 def find_encoding(paths: Sequence[AnyPath], orientation: str = "refuse") -> Encoding:
-    """Tell from the values of all masks of a set which of them mean white.
+    """Find the encoding of white from the values of all masks of a set.
 
     Args:
-        paths: The files of the set, at least one.
-        orientation: As in `read_mask`.
+      paths: Files of the set, at least one.
+      orientation: As in `read_mask`.
+
+    Returns:
+      The encoding.
 
     Raises:
-        CaptureError: More than one reading is possible. It names the file.
+      CaptureError: If more than one interpretation is possible, with the name of the
+        file.
     """
     with ThreadPoolExecutor(4) as pool:
         surveys = list(
@@ -109,17 +114,20 @@ def describe(
     white: float,
     black: str,
 ) -> str:
-    """Say how masks were read, for the notes of a capture.
+    """Describe how masks were read, for the notes of a capture.
 
     Args:
-        files: The masks of the set.
-        frames: The number of frames that could have one.
-        encoding: How they say white.
-        white: The share of white over all of them.
-        black: What black pixels are: "not observed", "moving".
+      files: Masks of the set.
+      frames: Number of frames that could have one.
+      encoding: Their encoding.
+      white: Share of white over all of them.
+      black: Meaning of black pixels: "not observed" or "moving".
+
+    Returns:
+      The text.
 
     Raises:
-        CaptureError: All pixels of all masks are black.
+      CaptureError: If all pixels of all masks are black.
     """
     folder = files[0].parent
     if white == 0:
@@ -214,7 +222,9 @@ def _survey(path, orientation):
 
 
 def _is_cut_out(value, alpha):
-    """Whether the color inside is no mask of its own: without black, or a photo."""
+    """Test if the color inside is not a mask itself: it has no black, or is a
+    photograph.
+    """
     inside = value[alpha] if alpha.any() else value
     if not alpha.any() and value.min() == value.max():
         return True  # nothing is marked

@@ -27,17 +27,22 @@ class Clock(NamedTuple):
 
 
 def clock(names: Sequence[str]) -> Clock:
-    """Read frame times from names without ending, which may have folders.
+    """Read frame times from names without suffix, which may contain folders.
 
-    The time is, in this order:
-    - the date and time of day at the end of the names, as those of phones, in ms;
-    - the only number that differs, as decimal seconds if it has a point, else a count;
-    - of several cameras with the same numbers in names that else differ, that number;
-    - the order of the names, with a note.
+    The time is the first of these that applies: - the date and time at the end of the
+    names, as those of phones, in ms; - the only number that differs, in seconds if it
+    has a decimal point, else a count; - that number, for several cameras with the same
+    numbers in otherwise different names; - the order of the names, with a note.
+
+    Args:
+      names: Names of the frames.
+
+    Returns:
+      The times, with cameras if the names tell several apart.
     """
     names = [forward_slashes(name) for name in names]
     dates = [_milliseconds(name) for name in names]
-    # As counts, minute and hour boundaries would be gaps of 41 and 4041 frames.
+    # Read as counts, minute and hour boundaries would be gaps of 41 and 4041 frames.
     if None not in dates and not _is_counter(names, dates):
         return Clock(dates, None, ())
     fields = _time_fields(names)
@@ -59,10 +64,10 @@ def clock(names: Sequence[str]) -> Clock:
 
 
 def _time_fields(names):
-    """Of each name the rest and the number that is the time; None where one has none.
+    """Split each name into its time and the rest, or return None if one has no number.
 
     The time is the last number that differs between names of one form, or the last of
-    names of several forms. Numbers of cameras (cam03) are taken last.
+    names of several forms. Numbers of cameras (cam03) are considered last.
     """
     numbers = [list(_NUMBER.finditer(name)) for name in names]
     if not all(numbers):
@@ -99,7 +104,7 @@ def _values(groups, numbers):
 
 
 def _are_synchronized(groups, times):
-    """Whether several cameras have mostly the same times, two at the least."""
+    """Test if several cameras share most of their times, and at least two."""
     members = collections.defaultdict(set)
     for group, moment in zip(groups, times, strict=True):
         members[group].add(moment)
@@ -113,7 +118,9 @@ def _are_synchronized(groups, times):
 
 
 def _milliseconds(name):
-    """Since 1970, of a name that ends like IMG_20240131_235959; None of others."""
+    """Milliseconds since 1970 from a name ending like IMG_20240131_235959, else
+    None.
+    """
     match = re.search(r"(?<!\d)(\d{8})[_-]?(\d{6})(\d{3})?$", name)
     if match is None:
         return None
@@ -126,7 +133,7 @@ def _milliseconds(name):
 
 
 def _is_counter(names, dates):
-    """Whether what may be a time of day after a date is an even count instead."""
+    """Test if a supposed time of day after a date is a regular count instead."""
     counts = [int(re.search(r"\d+$", pathlib.PurePath(name).name)[0]) for name in names]
     steps, gaps = set(np.diff(np.sort(counts))), set(np.diff(np.sort(dates)))
     # An interval timer is even as well, but in time.

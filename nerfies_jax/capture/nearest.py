@@ -1,13 +1,20 @@
-"""What is known, with what was probably meant, for the errors that refuse a name."""
+"""Suggestions for errors that refuse an unknown name."""
 
 import difflib
 from collections.abc import Iterable
 
 
 def known_names(name: str, known: Iterable[str]) -> str:
-    """`did you mean X? there are X, Y, Z`; without the question where nothing is near.
+    """List the known names, and the most similar one if there is any.
 
-    Near is what shares 0.6 of the letters, the bound that `difflib` has for words.
+    Similar names have a ratio of 0.6 or more, the default of `difflib`.
+
+    Args:
+      name: The unknown name.
+      known: The known names.
+
+    Returns:
+      Text such as "did you mean X? there are X, Y, Z".
     """
     known = list(known)
     listed = f"there are {', '.join(known)}" if known else "there are none"

@@ -1,4 +1,4 @@
-"""Points of the COLMAP model that a Nerfies directory was made from, beside it."""
+"""Points of the COLMAP model that a Nerfies directory was made from."""
 
 import pathlib
 
@@ -17,9 +17,15 @@ SAME_PLACE = 1e-3
 def points_beside(
     path: pathlib.Path, views: NerfiesViews
 ) -> tuple[PointCloud | None, tuple[str, ...]]:
-    """The model's points in scene units, where its cameras are those of `views`.
+    """Find the model's points, if its cameras are those of the directory.
 
-    None, and why, where they are not; None alone where there is no model.
+    Args:
+      path: The directory.
+      views: Its cameras.
+
+    Returns:
+      The points in scene units or None, and a note with the reason if a model was
+      rejected.
     """
     folders = [
         path / place

@@ -1,7 +1,7 @@
-"""Nerfies, HyperNeRF, NeRF-DS and DyCheck directories: read and write.
+"""Reader and writer of Nerfies, HyperNeRF, NeRF-DS and DyCheck directories.
 
-All four are the layout of Park et al. 2021 (arXiv:2011.12948) with additions. The files
-and their meaning are listed in docs/formats.md.
+All four are the layout of Park et al. 2021 (arXiv:2011.12948) with additions.
+docs/formats.md lists the files and their meaning.
 """
 
 import pathlib
@@ -33,12 +33,23 @@ def read(
     heldout: int | str | None = None,
     missing: str = "refuse",
 ) -> Capture:
-    """The capture in a Nerfies, HyperNeRF, NeRF-DS or DyCheck directory.
+    """Read a capture from a Nerfies, HyperNeRF, NeRF-DS or DyCheck directory.
 
-    `factor` is relative to the full-size pictures; where `rgb/<factor>x` is not stored,
-    a larger one is averaged. Without it the largest stored pictures are read, or those
-    that DyCheck's extra.json asks for. `missing`: "refuse" or "skip" frames without
-    picture. `heldout` as in `read_cameras`.
+    Args:
+      path: The directory.
+      factor: Read images at 1/`factor` of their full size. If `rgb/<factor>x` is not
+        stored, a larger one is averaged. None for the largest stored images, or those
+        that DyCheck's extra.json names.
+      max_side: Longest side of the images in pixels. At most one of the two can be
+        given.
+      heldout: As in `nerfies_views.read_cameras`.
+      missing: "refuse" or "skip" frames without an image.
+
+    Returns:
+      The capture.
+
+    Raises:
+      CaptureError: If the capture cannot be used.
     """
     path = pathlib.Path(path)
     views = read_cameras(path, heldout, missing)
@@ -117,14 +128,22 @@ def _stored_pictures(path, views, factor, max_side):
 
 
 def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
-    """The capture as a Nerfies directory, all of it or nothing.
+    """Write a capture as a Nerfies directory, completely or not at all.
 
-    Pictures go to `rgb/<factor>x`, averaged for factors above 1. Beside what Nerfies
-    knows it keeps, in files and keys that other readers pass over: exact times, depth
-    (DyCheck's place), moving masks (NeRF-DS's), masks of filmed pixels, optical flow,
-    and the colors of the points. What other tools found (`given`) stays out; of what
-    is read again, frames in neither split are missing, and where none was held out
-    every eighth is.
+    Images go to `rgb/<factor>x`, averaged for factors above 1. In addition to the
+    layout of Nerfies, exact times, depth (as in DyCheck), moving masks (as in NeRF-DS),
+    masks of observed pixels, optical flow, and colors of the points are stored in files
+    and keys that other readers ignore. External preprocessing (`given`) is not stored.
+    When the directory is read again, frames in neither split are missing, and every
+    eighth frame is held out if none was.
+
+    Args:
+      capture: The capture.
+      path: The directory, which may be absent or empty.
+      factors: Integer reductions of the images.
+
+    Raises:
+      CaptureError: If the directory cannot be written.
     """
     check_names(capture, path)
     with new_folder(path) as folder:
@@ -235,7 +254,7 @@ def _reduced(folder, total):
 
 
 def _masks(kind, ids, size, total, black):
-    """Share of white per pixel, and notes; NeRF-DS ends its names in .png.png."""
+    """Share of white per pixel, and notes. NeRF-DS ends its names in .png.png."""
     folder, shrink_by = _reduced(kind, total)
     if folder is None:
         return None, ()
@@ -247,7 +266,7 @@ def _masks(kind, ids, size, total, black):
 
 
 def _depths(path, views, size, total):
-    """z-depth in scene units; files hold world units, 0 where unknown."""
+    """Read z-depth in scene units from files in world units, with 0 where unknown."""
     folder, shrink_by = _reduced(path / "depth", total)
     if folder is None:
         return None, ()

@@ -1,4 +1,4 @@
-"""The cameras, moments and splits of a Nerfies directory, without its pictures."""
+"""Cameras, times and splits of a Nerfies directory, without its images."""
 
 import pathlib
 from collections.abc import Sequence
@@ -40,7 +40,9 @@ class CameraFile(msgspec.Struct):
 
 
 class SceneFile(msgspec.Struct):
-    """`scene.json`: near and far in scene units already, scale and center not."""
+    """`scene.json`, with near and far in scene units but scale and center in world
+    units.
+    """
 
     scale: float
     center: Triple
@@ -50,7 +52,7 @@ class SceneFile(msgspec.Struct):
 
 
 class DatasetFile(msgspec.Struct):
-    """`dataset.json`; ids may be written as numbers."""
+    """`dataset.json`, in which ids may also be numbers."""
 
     ids: list[str | int] = []
     train_ids: list[str | int] = []
@@ -76,7 +78,7 @@ class Moment(msgspec.Struct):
 
 
 class ExtraFile(msgspec.Struct):
-    """DyCheck's `extra.json`, as far as we use it."""
+    """The supported part of DyCheck's `extra.json`."""
 
     factor: int | None = None
     fps: float | None = None
@@ -84,7 +86,7 @@ class ExtraFile(msgspec.Struct):
 
 
 class NerfiesViews(NamedTuple):
-    """The cameras of a directory and what is known of each, without any picture."""
+    """Cameras and metadata of a directory, without images."""
 
     ids: tuple[str, ...]
     cameras: Camera  # scene units; pixels of the full-size picture
@@ -103,12 +105,21 @@ class NerfiesViews(NamedTuple):
 def read_cameras(
     path: AnyPath, heldout: int | str | None = None, missing: str = "refuse"
 ) -> NerfiesViews:
-    """Cameras, times, ids and splits; needs no pictures.
+    """Read cameras, times, ids and splits.
 
-    `heldout`: None for what the files say, a number n for every n-th frame, "interp"
-    for HyperNeRF's interpolation protocol (learn from ids[::4], score on ids[2::4]), or
-    the name of one of DyCheck's splits ("val", "val_intl", ...). `missing`: "refuse" or
-    "skip" frames without a camera file, as those that found no pose.
+    Args:
+      path: The directory.
+      heldout: None for the files' own split, n for every n-th frame, "interp" for
+        HyperNeRF's interpolation protocol (train on ids[::4], score on ids[2::4]), or
+        the name of one of DyCheck's splits ("val", "val_intl", ...).
+      missing: "refuse" or "skip" frames without a camera file, such as those that could
+        not be registered.
+
+    Returns:
+      The cameras, in scene units.
+
+    Raises:
+      CaptureError: If the directory cannot be used.
     """
     path = pathlib.Path(path)
     scene = read_json(path / "scene.json", SceneFile)
@@ -233,7 +244,16 @@ def _common_size(path, ids, files):
 def cameras_of(
     files: Sequence[CameraFile], scale: float, center: Sequence[float]
 ) -> Camera:
-    """Cameras in scene units from those of the files, which are in world units."""
+    """Convert camera files, in world units, to cameras in scene units.
+
+    Args:
+      files: Camera files.
+      scale: Scene units per world unit.
+      center: Origin of scene units, in world units.
+
+    Returns:
+      Cameras, [files].
+    """
 
     def column(values, dtype=np.float32):
         return np.array(values, dtype)
@@ -255,7 +275,16 @@ def cameras_of(
 
 
 def camera_entry(one: Camera, capture: Capture, size: tuple[int, int]) -> dict:
-    """What `camera/<id>.json` says of one camera of pictures of `size`."""
+    """Return the contents of `camera/<id>.json` for a camera.
+
+    Args:
+      one: The camera, in scene units.
+      capture: The capture, for its scale and center.
+      size: Width and height of the image in pixels.
+
+    Returns:
+      JSON values, in world units.
+    """
     position = one.position.astype(np.float64) / capture.scale + capture.center
     return {
         "orientation": one.camera_from_world.tolist(),
@@ -370,7 +399,15 @@ def _times(moments, path, ids):
 
 
 def only(views, rows):
-    """The views of these rows."""
+    """Select frames.
+
+    Args:
+      views: Cameras of a directory.
+      rows: Indices of the frames.
+
+    Returns:
+      The views of these frames.
+    """
     if len(rows) == len(views.ids):
         return views
     place = np.full(len(views.ids), -1)

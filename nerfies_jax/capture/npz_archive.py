@@ -1,4 +1,4 @@
-"""A capture out of an archive of arrays: images, poses, times and focal in one .npz."""
+"""Conversion of a .npz archive of images, poses, times and focal length."""
 
 import math
 import pathlib
@@ -19,13 +19,25 @@ TRIPOD_ROWS = 5  # fewer rows of one pose are no validation sweep
 def convert(
     file: AnyPath, out: AnyPath, heldout: str | None = None, train: str | None = None
 ) -> list[str]:
-    """Write transforms_train.json and transforms_val.json with their pictures.
+    """Convert an archive to transforms_train.json and transforms_val.json with images.
 
     The archive holds `images`, `poses` (OpenGL camera to world), `focal` and `times`.
-    Rows to score on and to learn from are named as "first:last+1". Where none are, and
-    rows in a row share one pose, those are a validation sweep: they are held out, the
-    rows before them are learned from and the rows after them are left out. Returns what
-    to say of it.
+    If no rows are named and consecutive rows share one pose, those are taken for a
+    validation sweep: they are held out, the rows before them are for training, and the
+    rows after them are left out.
+
+    Args:
+      file: The archive.
+      out: The folder to write.
+      heldout: Rows to hold out, as "first:last+1".
+      train: Rows for training, as "first:last+1".
+
+    Returns:
+      Lines of text about the result.
+
+    Raises:
+      CaptureError: If the archive cannot be read.
+      ValueError: If the rows are not valid.
     """
     images, poses, times, focal = read_npz(pathlib.Path(file))
     train, heldout, note = rows_of(poses, heldout, train, str(file))
@@ -53,7 +65,17 @@ def convert(
 
 
 def read_npz(path):
-    """uint8 images, poses, times or None, and the focal length in pixels."""
+    """Read the arrays of an archive.
+
+    Args:
+      path: The archive.
+
+    Returns:
+      uint8 images, poses, times or None, and the focal length in pixels.
+
+    Raises:
+      CaptureError: If it cannot be read or an array is missing or has a wrong shape.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
@@ -111,7 +133,20 @@ def read_npz(path):
 
 
 def rows_of(poses, heldout, train, where):
-    """Rows to learn from, rows to score on, and why."""
+    """Split rows into training and held-out ones.
+
+    Args:
+      poses: Camera-to-world matrices, [rows, 4, 4] or [rows, 3, 4].
+      heldout: Rows to hold out, as "first:last+1", or None.
+      train: Rows for training, as "first:last+1", or None.
+      where: Name of the archive in error messages.
+
+    Returns:
+      Training rows, held-out rows and the reason.
+
+    Raises:
+      ValueError: If the rows overlap or are out of range.
+    """
     count = len(poses)
     if heldout is not None:
         scored = _range(heldout, count, "--heldout")
@@ -156,7 +191,14 @@ def _range(text, count, name):
 
 
 def background_of(images):
-    """The color [0, 1] of the corners, if nearly all corners have the same."""
+    """Find the background color, if nearly all image corners have the same color.
+
+    Args:
+      images: uint8 images, [rows, height, width, 3].
+
+    Returns:
+      sRGB color in [0, 1], or None.
+    """
     corners = images[:, [0, 0, -1, -1], [0, -1, 0, -1]].reshape(-1, 3)
     usual = np.median(corners, axis=0)
     if (corners == usual).all(1).mean() < 0.95:

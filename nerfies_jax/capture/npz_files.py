@@ -1,4 +1,4 @@
-"""Arrays out of archives that anybody may have written, or cut short."""
+"""Safe reading of array archives, which may be damaged or untrusted."""
 
 import zipfile
 import zlib
@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfies_jax.capture.json_files import AnyPath
 
-# What zipfile, zlib and NumPy raise for damaged bytes, beside OSError. A RuntimeError
+# Errors of zipfile, zlib and NumPy for damaged bytes, besides OSError. A RuntimeError
 # is an unknown compression or a password, an AttributeError a .npy.
 DAMAGED = (
     *(ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError),
@@ -16,9 +16,17 @@ DAMAGED = (
 
 
 def read_arrays(path: AnyPath) -> dict[str, np.ndarray]:
-    """All arrays of a .npz, by name; none of Python's objects.
+    """Read all arrays of a .npz, without unpickling objects.
 
-    Raises ValueError, one line that says why it cannot be read, and OSError.
+    Args:
+      path: The file.
+
+    Returns:
+      Arrays by name.
+
+    Raises:
+      ValueError: If it is damaged, with a one-line reason.
+      OSError: If it cannot be opened.
     """
     try:
         # Opened here: where it is no archive, NumPy leaves the file open.

@@ -1,7 +1,7 @@
-"""Camera paths in files: nerfstudio's camera_path.json and Nerfies' folder of cameras.
+"""Camera path files: nerfstudio's camera_path.json and Nerfies' folder of cameras.
 
-nerfstudio's is in scene units, with a vertical field of view and centered pinholes of
-square pixels alone. Nerfies' is in world units and has whole cameras.
+nerfstudio's files are in scene units, with a vertical field of view and only centered
+pinholes with square pixels. Nerfies' are in world units and have complete cameras.
 """
 
 import math
@@ -33,7 +33,7 @@ FRAMES = 96  # of a path that is no file, where nothing is said
 
 
 class PathCamera(msgspec.Struct):
-    """One picture of `camera_path.json`."""
+    """One image of `camera_path.json`."""
 
     camera_to_world: list[float]  # 4x4, row by row; right, up, back
     fov: float  # vertical, degrees
@@ -41,7 +41,7 @@ class PathCamera(msgspec.Struct):
 
 
 class PathFile(msgspec.Struct):
-    """`camera_path.json`, as far as pictures depend on it."""
+    """`camera_path.json`, without the keys that do not affect images."""
 
     camera_path: list[PathCamera]
     render_width: float
@@ -52,7 +52,19 @@ class PathFile(msgspec.Struct):
 
 
 def named(name: str, capture: Capture, count: int | None) -> CameraPath:
-    """A path of one of the `KINDS`, of `count` pictures, or one in a file."""
+    """Return a camera path by its name or file.
+
+    Args:
+      name: One of the `KINDS`, or a file or folder of a path.
+      capture: The capture that it belongs to.
+      count: Number of cameras of a named path. None for the default.
+
+    Returns:
+      The path.
+
+    Raises:
+      CaptureError: If there is no such path.
+    """
     if name in camera_paths.KINDS:
         return camera_paths.planned(name, capture, count or FRAMES)
     if not pathlib.Path(name).exists():
@@ -64,9 +76,17 @@ def named(name: str, capture: Capture, count: int | None) -> CameraPath:
 
 
 def read(path: AnyPath, capture: Capture) -> CameraPath:
-    """The path in a file of nerfstudio's or a folder of Nerfies', in scene units.
+    """Read a camera path from nerfstudio's file or Nerfies' folder.
 
-    Times must be there for all pictures or for none.
+    Args:
+      path: File or folder.
+      capture: The capture that it belongs to.
+
+    Returns:
+      The path in scene units.
+
+    Raises:
+      CaptureError: If it cannot be read, or only some of the images have a time.
     """
     path = pathlib.Path(path)
     if path.is_dir():
@@ -188,7 +208,7 @@ def read_keyframes(path: AnyPath, capture: Capture) -> list[Keyframe]:
 
 
 def _as_camera(entry):
-    """A keyframe of nerfstudio's editor; None if it is of another layout."""
+    """Convert a keyframe of nerfstudio's editor, or return None for another layout."""
     renamed = {**entry, "camera_to_world": entry.get("matrix")}
     try:
         return msgspec.convert(renamed, PathCamera)
@@ -261,9 +281,18 @@ def _pose_and_fov(one, height):
 def write_nerfies(
     path: AnyPath, planned: CameraPath, capture: Capture, overwrite: bool = False
 ) -> None:
-    """A folder of numbered camera files, in world units, for Nerfies and ours.
+    """Write a camera path as a folder of numbered camera files, in world units.
 
-    `time` is a key of ours, which others pass over.
+    `time` is an additional key, which other readers ignore.
+
+    Args:
+      path: The folder.
+      planned: The path.
+      capture: The capture, for its scale and center.
+      overwrite: True to replace an existing folder.
+
+    Raises:
+      CaptureError: If the folder cannot be written.
     """
     with replaced_folder(path, overwrite) as folder:
         for row in range(len(planned.cameras.focal_px)):

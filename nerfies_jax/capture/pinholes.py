@@ -1,4 +1,6 @@
-"""Take the lens out of the pictures, for renderers that draw pinholes, and back in."""
+"""Undistortion of captures for renderers of pinhole cameras, and distortion of
+renders.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,12 +17,18 @@ from nerfies_jax.geometry.camera import Camera
 
 
 def as_pinholes(capture: Capture) -> Capture:
-    """The same capture as pinholes would have filmed it; itself where they did.
+    """Undistort a capture to pinhole cameras.
 
-    Focal length, principal point and size stay, so that nothing else changes; pixels
-    that the lens did not film are marked in `valid`. Color is sampled bilinearly,
-    masks and depth from the nearest pixel. Z-depth needs no change: a ray keeps its
-    points. Flow is left out: both its ends would move.
+    Focal lengths, principal points and image sizes are unchanged. Pixels that the lens
+    did not observe are marked in `valid`. Color is sampled bilinearly, masks and depth
+    at the nearest pixel. z-depth needs no change, since a ray keeps its points. Flow is
+    dropped, since both of its ends would move.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The undistorted capture, or the same one if it has no distortion.
     """
     if not has_lens(capture.cameras):
         return capture
@@ -59,12 +67,20 @@ def as_pinholes(capture: Capture) -> Capture:
 
 
 def scorable(filmed: Capture, traced: bool) -> Capture:
-    """The capture as it was filmed, to hold renders against; itself without a lens.
+    """Mark the pixels of a distorted capture that renders can be compared with.
 
-    The pictures stay. Pixels that no renderer can say anything of are no longer
-    `valid`, and their depth is unknown: where the lens model has no ray or, unless
-    rays are `traced` through the lens, where the pinhole of the same focal length and
-    size, which is drawn in its place, does not look.
+    Images stay distorted. Pixels that no renderer can predict are no longer `valid`,
+    and their depth is unknown: those for which the lens model has no ray and, unless
+    rays are traced through the lens, those outside the pinhole image of the same focal
+    length and size that is rendered instead.
+
+    Args:
+      filmed: The capture with its original images.
+      traced: True if the renderer traces rays through the lens.
+
+    Returns:
+      The capture with its masks and depth restricted, or the same one if it has no
+      distortion.
     """
     if not has_lens(filmed.cameras):
         return filmed
@@ -91,19 +107,33 @@ def scorable(filmed: Capture, traced: bool) -> Capture:
 
 
 def has_lens(camera: Camera) -> bool:
-    """Whether a camera, or any of a batch, bends what a pinhole draws straight."""
+    """Test if a camera, or any of a batch, has lens distortion.
+
+    Args:
+      camera: A camera or a batch.
+
+    Returns:
+      True if a coefficient is not zero.
+    """
     return bool(np.any(camera.radial) or np.any(camera.tangential))
 
 
 def pinhole(camera: Camera) -> Camera:
-    """The camera, or a batch of them, without lens distortion."""
+    """Remove the distortion coefficients of cameras.
+
+    Args:
+      camera: A camera or a batch.
+
+    Returns:
+      The cameras without distortion.
+    """
     return camera._replace(radial=0 * camera.radial, tangential=0 * camera.tangential)
 
 
 class Maps:
-    """Places in a picture for cameras of one size, kept by lens and intrinsics.
+    """Resampling maps for cameras of one image size, cached by intrinsics.
 
-    Frames of one physical camera share one map; the pose does not enter it.
+    Frames of one physical camera share a map, since it does not depend on the pose.
     """
 
     def __init__(self, places: Callable, size: tuple[int, int]):
@@ -111,7 +141,15 @@ class Maps:
         self._kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def of(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """What `places(camera, size)` finds: array coordinates and where there are."""
+        """Return the map of a camera.
+
+        Args:
+          camera: One camera.
+
+        Returns:
+          Array coordinates [2, height, width], and booleans of the pixels that have one
+          [height, width].
+        """
         key = b"".join(np.asarray(leaf).tobytes() for leaf in camera[2:])
         if key not in self._kept:
             self._kept[key] = self._places(camera, self._size)
@@ -121,10 +159,17 @@ class Maps:
 def pinhole_places(
     camera: Camera, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where each filmed pixel lies in the pinhole's picture, and whether it does.
+    """Locate each pixel of a distorted image in the undistorted image.
 
-    Array coordinates [2, height, width], as of `resampling.array_places`; the pinhole
-    has the focal length, the principal point and the size of the filmed picture.
+    The pinhole has the focal length, principal point and size of the distorted image.
+
+    Args:
+      camera: One camera with its distortion.
+      size: Width and height of the image in pixels.
+
+    Returns:
+      Array coordinates [2, height, width] as in `resampling.array_places`, and booleans
+      of the pixels inside the undistorted image [height, width].
     """
     slopes, single = _straight(*_lens(camera), _slopes(camera, size))
     slopes = np.where(np.asarray(single)[:, None], np.asarray(slopes), np.nan)

@@ -1,4 +1,4 @@
-"""PLY files of any program, opened by plyfile."""
+"""PLY files of any program, read by plyfile."""
 
 import io
 import pathlib
@@ -29,8 +29,14 @@ def read(path: pathlib.Path) -> plyfile.PlyData:
 
     Binary elements without lists are memory-mapped, read-only.
 
+    Args:
+      path: The file.
+
+    Returns:
+      The elements.
+
     Raises:
-      ValueError, OSError, MemoryError, plyfile.PlyParseError: The file is damaged.
+      ValueError, OSError, MemoryError, plyfile.PlyParseError: If the file is damaged.
     """
     with path.open("rb") as stream:
         head = stream.read(MAX_HEADER)

@@ -1,4 +1,4 @@
-"""Scene points: where they put the scene, and the colors they have."""
+"""Scene points: placement of the scene, and point cloud files."""
 
 import pathlib
 from typing import NamedTuple
@@ -20,7 +20,7 @@ NEAR_MARGIN = 0.5  # what moves stands before what structure from motion finds
 
 
 class Placement(NamedTuple):
-    """How the world becomes the scene, and the depths it needs, in scene units."""
+    """Transform from world to scene units, and depth range in scene units."""
 
     center: tuple[float, float, float]
     scale: float
@@ -31,11 +31,19 @@ class Placement(NamedTuple):
 def place_by_points(
     points: np.ndarray, positions: np.ndarray, depths: np.ndarray
 ) -> Placement:
-    """The box of points and cameras gets a unit diagonal and lies around the origin.
+    """Place the box of points and cameras around the origin with a unit diagonal.
 
-    As Nerfies does it, since its frequency bands are made for that size. `points` and
-    camera `positions` [n, 3] and observed `depths` are in world units. Nerfies moves
-    the near plane outwards by 25 % (it divides by 0.8); here it moves inwards, to half.
+    Nerfies does the same, since its frequency bands are made for that size. Nerfies
+    moves the near plane outward by 25 % (it divides by 0.8). Here it moves inward, to
+    half.
+
+    Args:
+      points: Scene points in world units, [n, 3].
+      positions: Camera positions in world units, [frames, 3].
+      depths: z-depths of observations in world units, [observations].
+
+    Returns:
+      The placement.
     """
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     kept = points[distance <= np.quantile(distance, INLIERS)]
@@ -52,10 +60,16 @@ def place_by_points(
 
 
 def place_by_cameras(cameras: Camera) -> Placement:
-    """A guess where no points are known: the cameras look at the scene.
+    """Guess the placement from cameras alone, assuming that they look at the scene.
 
-    The scene is centered on the point nearest to all viewing axes and as large as the
-    cameras' mean distance from it; near is a twentieth of that, far four times.
+    The scene is centered on the point nearest to all viewing axes. Its size is the
+    cameras' mean distance from it, near is a twentieth of that and far four times.
+
+    Args:
+      cameras: Cameras in world units, [frames].
+
+    Returns:
+      The placement.
     """
     axes = cameras.camera_from_world[:, 2].astype(np.float64)
     positions = cameras.position.astype(np.float64)
@@ -76,10 +90,17 @@ def place_by_cameras(cameras: Camera) -> Placement:
 
 
 def read_ply(path: pathlib.Path) -> PointCloud:
-    """Positions (as stored) and colors of a .ply point cloud; gray without colors.
+    """Read a .ply point cloud.
 
-    Raises CaptureError for what is no such file, has more than `MAX_POINTS`, or has
-    colors that are neither uchar nor floats between 0 and 1.
+    Args:
+      path: The file.
+
+    Returns:
+      Positions as stored, and colors, gray if the file has none.
+
+    Raises:
+      CaptureError: If it is not such a file, has more than `MAX_POINTS`, or has colors
+        that are neither uchar nor floats between 0 and 1.
     """
     try:
         with path.open("rb") as file:
@@ -112,7 +133,7 @@ def read_ply(path: pathlib.Path) -> PointCloud:
 
 
 def _bytes(color, path):
-    """Colors as uint8; those of floats are between 0 and 1."""
+    """Convert colors to uint8, from floats between 0 and 1 if needed."""
     if color.dtype == np.uint8:
         return color
     if color.dtype.kind == "f" and ((color >= 0) & (color <= 1)).all():

@@ -8,8 +8,8 @@ from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
-# Of the points in an image, averaged over cameras: fewer are doubtful, and another
-# convention is named where it shows at least so many.
+# Share of the points in an image, averaged over cameras. Below `DOUBTFUL`, another
+# convention is suggested if its share is at least `CONVINCING`.
 DOUBTFUL, CONVINCING = 0.05, 0.3
 MOST_CAMERAS, MOST_POINTS = 16, 2000
 _FLIP = np.diag([1.0, -1.0, -1.0])  # between OpenGL and OpenCV axes of a camera

@@ -1,4 +1,4 @@
-"""A picture read at other places than its pixel centers. Host side."""
+"""Sampling of images between pixel centers, on the host."""
 
 import numpy as np
 import scipy.ndimage
@@ -7,11 +7,16 @@ import scipy.ndimage
 def array_places(
     pixels: np.ndarray, source_size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Array coordinates of pixel positions, and whether they lie in the picture.
+    """Convert pixel positions to array coordinates.
 
-    `pixels` [height, width, 2] are positions in px, NaN where there is none; the source
-    is `source_size` (width, height). Returns row and column [2, height, width], zero
-    where the position is not between the outermost pixel centers, and that mask.
+    Args:
+      pixels: Positions (x, y) in pixels with centers at +0.5, [height, width, 2], NaN
+        where there is none.
+      source_size: Width and height of the image in pixels.
+
+    Returns:
+      Rows and columns [2, height, width], zero for positions outside of the outermost
+      pixel centers, and booleans of those inside [height, width].
     """
     place = np.moveaxis(pixels[..., ::-1], -1, 0) - 0.5  # centers lie at +0.5
     last = np.array(source_size[::-1])[:, None, None] - 1
@@ -22,7 +27,15 @@ def array_places(
 
 
 def bilinear(picture: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Color [height, width, channels] at array coordinates; uint8 is rounded."""
+    """Sample an image bilinearly.
+
+    Args:
+      picture: Image, [height, width, channels].
+      place: Array coordinates (row, column), [2, ...].
+
+    Returns:
+      Colors [..., channels], rounded if the image is uint8.
+    """
     channels = [
         scipy.ndimage.map_coordinates(
             picture[..., channel].astype(np.float32), place, order=1, mode="nearest"
@@ -34,9 +47,14 @@ def bilinear(picture: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def nearest(picture: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """A mask or a depth map [height, width] at the nearest pixel to array coordinates.
+    """Sample a mask or depth map at the nearest pixel.
 
-    `place` [2, ...] is row and column, as of `array_places`; the result is [...].
+    Args:
+      picture: Mask or depth map, [height, width].
+      place: Array coordinates (row, column), [2, ...].
+
+    Returns:
+      Values, [...].
     """
     row, column = np.round(place).astype(int)
     return picture[row, column]

@@ -1,7 +1,7 @@
-"""Cameras from pictures: COLMAP's incremental mapping, in a process of its own.
+"""Structure from motion with COLMAP's incremental mapping, in a separate process.
 
-A process of its own, because pycolmap may abort instead of raising (an exception inside
-one of its OpenMP loops), and because its libraries do not mix well with others.
+The process is separate because pycolmap may abort instead of raising (an exception
+inside one of its OpenMP loops), and because its libraries conflict with others.
 """
 
 import collections
@@ -35,7 +35,7 @@ MOST_ERROR_PX, LEAST_ANGLE_DEG, LEAST_PLACED = 1.5, 1.5, 0.9
 
 @dataclasses.dataclass(frozen=True)
 class MappingSpec:
-    """How the cameras are looked for. All pictures share one lens."""
+    """Settings of structure from motion. All images share one lens."""
 
     # OPENCV keeps the vertical focal length apart, as Nerfies' camera does.
     camera_model: str = "OPENCV"
@@ -73,11 +73,11 @@ MASK = "mask what moves in black (--masks of prepare, reconstruct's --prepare.ma
 
 
 class FewPlaced(CaptureError):
-    """Too few of the pictures found their place."""
+    """Too few of the images were registered."""
 
 
 class Poses(NamedTuple):
-    """Cameras that were found, and what the points at rest say of them."""
+    """Registered cameras, and quality measures of the static points."""
 
     folder: pathlib.Path  # with images and sparse/0
     pictures: int
@@ -87,7 +87,11 @@ class Poses(NamedTuple):
     angle_deg: float  # median between the two outer lines of sight to a point
 
     def lines(self) -> list[str]:
-        """What was found, and what there is to doubt, for a person."""
+        """Describe the result and any doubts about it.
+
+        Returns:
+          Lines of text.
+        """
         lines = [
             f"cameras: {self.placed} of {self.pictures} pictures found their place; "
             f"{self.points:,} points at rest, {self.error_px:.2f} px off, seen under "
@@ -125,13 +129,27 @@ def run_sfm(
     masks: AnyPath | None = None,
     spec: MappingSpec = MappingSpec(),
 ) -> Poses:
-    """Reconstruct the pictures in a folder; `out` becomes a folder with sparse/0.
+    """Reconstruct cameras from the images in a folder.
 
-    `masks` holds `<picture name>.png` with black where features are to be ignored: on
-    whatever moves by itself. Measured with a mover on 15 % of the picture: without
-    masks all pictures register and the reprojection error is low, but the path is 250
-    times further off. The pictures are copied to `out/images`, so `out` can be loaded.
-    Its stages are shown and emitted as events.
+    Progress is emitted as events. With something moving on 15 % of the image and no
+    masks, all images registered with a low reprojection error, but the path was 250
+    times further off.
+
+    Args:
+      images: Folder of images.
+      out: Folder to write, with `sparse/0` and a copy of the images in `images`, so
+        that it can be loaded as a capture.
+      masks: Folder with `<image name>.png`, black where features are to be ignored
+        because something moves there.
+      spec: Settings.
+
+    Returns:
+      The registered cameras.
+
+    Raises:
+      CaptureError: If there are too few images, a mask is missing, or mapping fails.
+      FewPlaced: If too few images were registered.
+      MissingExtra: If pycolmap is not installed.
     """
     extras.check("pycolmap", "sfm")  # here, not in the child, whose last line is told
     # The child runs elsewhere.
@@ -210,7 +228,7 @@ def _in_own_process(folder, masked, spec, images):
     return json.loads(last[0])
 
 
-# What COLMAP's log says of where it is, and of which stage that is.
+# Patterns of progress in COLMAP's log, and the stage that they belong to.
 STAGES = (
     (re.compile(r"Processed file \[(\d+)/(\d+)\]"), "extracting features"),
     (re.compile(r"Processing image \[(\d+)/(\d+)\]"), "matching features"),
@@ -238,7 +256,7 @@ def _follow(lines, log, images):
 
 
 def _reconstruct(folder: pathlib.Path, masked: bool, spec: MappingSpec) -> dict:
-    """In the child: fill folder/sparse/0; fields of `Poses`."""
+    """Fill folder/sparse/0 in the child process, and return fields of `Poses`."""
     pycolmap = library()
     threads = spec.threads or os.cpu_count() or 1
     database, images = folder / "database.db", folder / "images"
@@ -300,7 +318,9 @@ def _reconstruct(folder: pathlib.Path, masked: bool, spec: MappingSpec) -> dict:
 
 
 def _judged(model) -> dict:
-    """How far points at rest are off, and from how far apart they are seen."""
+    """Reprojection errors of static points, and the angles under which they are
+    observed.
+    """
     points = [p for p in model.points3D.values() if p.track.length() >= MIN_TRACK]
     if not points:
         return {"points": 0, "error_px": 0.0, "angle_deg": 0.0}

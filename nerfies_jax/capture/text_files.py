@@ -29,8 +29,14 @@ def encoding_of(head: bytes) -> str:
 def utf8(data: bytes) -> bytes:
     """Re-encode a whole text file as UTF-8 without a byte order mark.
 
+    Args:
+      data: Contents of the file.
+
+    Returns:
+      The same text as UTF-8.
+
     Raises:
-      UnicodeDecodeError: The file begins like UTF-16 or UTF-32 and is not.
+      UnicodeDecodeError: If the file begins like UTF-16 or UTF-32 and is not.
     """
     encoding = encoding_of(data)
     if encoding == "utf-8":
@@ -41,7 +47,14 @@ def utf8(data: bytes) -> bytes:
 
 
 def forward_slashes(name: str) -> str:
-    """Spell a path with the separators of POSIX; Windows writes backslashes."""
+    """Replace the backslashes of Windows paths by slashes.
+
+    Args:
+      name: A path.
+
+    Returns:
+      The path with slashes.
+    """
     return name.replace("\\", "/")
 
 
@@ -76,7 +89,7 @@ def find(
 
 
 def _respelled(folder, name):
-    """The path with each part spelled as on disk; None where none or several fit."""
+    """Spell each part of a path as on disk, or return None if none or several match."""
     path = folder
     for part in pathlib.PurePosixPath(name).parts:
         if (path / part).exists():
@@ -94,7 +107,7 @@ def _key(name):
 
 
 def _listing(folder):
-    """Names in a folder by their spelling without case; empty if it is no folder."""
+    """Names in a folder by their case-folded spelling. Empty if it is no folder."""
     try:
         changed = folder.stat().st_mtime_ns
         if time.time_ns() - changed < _SETTLED_NS:

@@ -1,4 +1,4 @@
-"""transforms*.json as they lie on disk, and which of their frames are held out."""
+"""File layout of transforms*.json, and the split into training and held-out frames."""
 
 import collections
 import pathlib
@@ -14,7 +14,7 @@ from nerfies_jax.capture.nearest import known_names
 
 
 class Lens(msgspec.Struct, kw_only=True):
-    """Intrinsics, for the whole file or for one frame; in pixels of `w` by `h`."""
+    """Intrinsics of a whole file or of one frame, in pixels of `w` by `h`."""
 
     camera_angle_x: float | None = None  # whole horizontal field of view, rad
     camera_angle_y: float | None = None  # whole vertical field of view, rad
@@ -44,7 +44,7 @@ UNITS = (FOCAL, CENTER, SIZE, MODEL, DISTORTION)
 
 
 class Frame(Lens, kw_only=True):
-    """One picture."""
+    """One image."""
 
     file_path: str
     transform_matrix: list[list[float]]
@@ -80,7 +80,7 @@ ROUNDING = 1e-6  # of times, which may be stored in float32
 
 
 class Split(msgspec.Struct):
-    """Frames to learn from and to score on."""
+    """Training and held-out frames."""
 
     file: pathlib.Path
     transforms: Transforms  # of the training file
@@ -90,7 +90,18 @@ class Split(msgspec.Struct):
 
 
 def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
-    """The frames of a folder or file; `heldout` as in `blender_format.read`."""
+    """Read the frames of a folder or file.
+
+    Args:
+      path: The folder or file.
+      heldout: As in `blender_format.read`.
+
+    Returns:
+      The split.
+
+    Raises:
+      CaptureError: If the file cannot be read or the split does not exist.
+    """
     file = path if path.is_file() else path / "transforms_train.json"
     if path.is_dir() and not file.is_file() and (path / "transforms.json").is_file():
         file = path / "transforms.json"
@@ -153,7 +164,14 @@ def _fill_file(file, entries, others):
 
 
 def stems(entries: list[Frame]) -> list[str]:
-    """Paths of images without the endings of image files."""
+    """Return the image paths of frames without image suffixes.
+
+    Args:
+      entries: The frames.
+
+    Returns:
+      Paths with forward slashes.
+    """
     paths = [text_files.forward_slashes(entry.file_path) for entry in entries]
     return [
         path.removesuffix(suffix)

@@ -1,4 +1,4 @@
-"""Intrinsics of transforms*.json, which stand at the file, at a frame, or at both."""
+"""Intrinsics of transforms*.json, which may be set per file, per frame, or both."""
 
 import math
 from typing import NamedTuple
@@ -42,18 +42,21 @@ def resolve(
 ) -> Intrinsics:
     """Resolve the intrinsics of a frame.
 
-    Size, focal lengths, principal point, camera model and distortion are one unit each:
-    a unit of which the frame has any key is the frame's, else it is the file's.
+    Size, focal lengths, principal point, camera model and distortion are one unit each.
+    A unit of which the frame has any key is the frame's, else it is the file's.
 
     Args:
       entry: The frame.
       transforms: The file.
-      size: Width and height of the frame's image.
-      label: Names the frame in errors.
+      size: Width and height of the frame's image in pixels.
+      label: Name of the frame in error messages.
+
+    Returns:
+      The intrinsics.
 
     Raises:
-      CaptureError: A focal length is missing or impossible, the camera is no pinhole,
-        or its size has not the shape of the image.
+      CaptureError: If a focal length is missing or impossible, the camera is no
+        pinhole, or its size does not match the image.
     """
     distortion = _distortion(entry, transforms, label)
     stated = _stated_size(entry) or _stated_size(transforms) or (None, None)
@@ -110,7 +113,7 @@ def _size_of(level, resolved, size):
 
 
 def _times_as_large(center, size, label):
-    """How many times as large the images of this principal point are, usually 1."""
+    """Factor by which the images of this principal point are larger, usually 1."""
     ratios = [2 * c / side for c, side in zip(center, size, strict=True)]
     times = round(sum(ratios) / 2)
     if times >= 1 and all(abs(each - times) <= CENTERED * times for each in ratios):
@@ -187,7 +190,15 @@ def _no_pinhole(label, lens):
 
 
 def notes(found: list[Intrinsics], size: tuple[int, int]) -> tuple[str, ...]:
-    """Say what was assumed of the intrinsics of all frames of images of this size."""
+    """Describe the assumptions made about intrinsics.
+
+    Args:
+      found: Intrinsics of all frames.
+      size: Width and height of the images in pixels.
+
+    Returns:
+      Notes.
+    """
     lines = ()
     sizes = {one.size for one in found if one.size != size and not one.larger}
     if sizes:

@@ -1,4 +1,4 @@
-"""A capture as nerfstudio reads it: transforms.json, pictures and points."""
+"""Writer of captures in nerfstudio's layout: transforms.json, images and points."""
 
 import pathlib
 from typing import Any
@@ -19,11 +19,22 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])  # right, up, back, from right, down, forwa
 def write(
     capture: Capture, path: AnyPath, units: Units = "scene", overwrite: bool = False
 ) -> None:
-    """The folder of transforms.json, `images`, `masks` and points, or nothing of it.
+    """Write a capture as transforms.json, `images`, `masks` and points.
 
-    All frames are in it, with their times; `train_filenames` names those learned from,
-    `val_filenames` and `test_filenames` those held out. Masks are black where nothing
-    was filmed. Axes are the capture's, whichever of them is up.
+    All frames are in it, with their times. `train_filenames` lists the training frames,
+    `val_filenames` and `test_filenames` the held-out ones. Masks are black where
+    nothing was observed. Axes are those of the capture, whichever of them is up. The
+    folder is written completely or not at all.
+
+    Args:
+      capture: The capture.
+      path: The folder.
+      units: "scene" for scene units, "world" for those of the capture's own files.
+      overwrite: True to replace an existing folder.
+
+    Raises:
+      CaptureError: If the format cannot hold the capture, or the folder cannot be
+        written.
     """
     check_names(capture, path)
     refuse_skew(capture, path, "transforms.json")
@@ -41,7 +52,15 @@ def write(
 
 
 def check_names(capture: Capture, path: AnyPath) -> None:
-    """Raise where a frame's name cannot be that of a file."""
+    """Check that all frame names can be file names.
+
+    Args:
+      capture: The capture.
+      path: The folder to write, for error messages.
+
+    Raises:
+      CaptureError: If a name cannot be one.
+    """
     for name in capture.ids:
         if name in ("", ".", "..") or set(name) & set("/\\\0"):
             raise CaptureError(
@@ -51,7 +70,16 @@ def check_names(capture: Capture, path: AnyPath) -> None:
 
 
 def refuse_skew(capture: Capture, path: AnyPath, what: str) -> None:
-    """Raise for cameras whose pixel axes are not at right angles."""
+    """Check that cameras have no skew, for formats that cannot hold it.
+
+    Args:
+      capture: The capture.
+      path: The folder to write, for error messages.
+      what: Name of the format in error messages.
+
+    Raises:
+      CaptureError: If a camera has skew.
+    """
     if np.any(capture.cameras.skew_px != 0):
         raise CaptureError(
             f"{path}: a skew of {np.abs(capture.cameras.skew_px).max():g} px has no "
@@ -60,7 +88,13 @@ def refuse_skew(capture: Capture, path: AnyPath, what: str) -> None:
 
 
 def write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
-    """The scene's points and their colors as .ply."""
+    """Write the points of a capture with their colors as .ply.
+
+    Args:
+      path: The file.
+      capture: The capture, which has points.
+      units: "scene" or "world" units.
+    """
     cloud = capture.points
     # World coordinates may be large: meters of a map need more than float32 has.
     kind = "f4" if units == "scene" else "f8"
@@ -76,7 +110,15 @@ def write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
 
 
 def opengl_pose(camera_from_world: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """World from camera [4, 4], the camera's axes right, up and back; float64."""
+    """Return the camera-to-world matrix with OpenGL axes right, up and back.
+
+    Args:
+      camera_from_world: Rotation with rows right, down, forward, [3, 3].
+      position: Camera center, [3].
+
+    Returns:
+      float64 matrix, [4, 4].
+    """
     pose = np.eye(4)
     pose[:3, :3] = camera_from_world.T.astype(np.float64) @ _OPENGL
     pose[:3, 3] = position

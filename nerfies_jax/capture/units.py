@@ -1,4 +1,4 @@
-"""Scene units, which everything here is in, and those of a capture's own files."""
+"""Conversion between scene units and the world units of a capture's own files."""
 
 from typing import Literal
 
@@ -10,7 +10,16 @@ Units = Literal["scene", "world"]
 
 
 def places_in(units: Units, capture: Capture, points: np.ndarray) -> np.ndarray:
-    """Points [..., 3] in scene units as points in `units`; float64."""
+    """Convert points from scene units.
+
+    Args:
+      units: "scene" or "world".
+      capture: The capture, for its scale and center.
+      points: Points in scene units, [..., 3].
+
+    Returns:
+      float64 points in `units`, [..., 3].
+    """
     points = np.asarray(points, np.float64)
     if units == "scene":
         return points

@@ -1,4 +1,4 @@
-"""Film in and out, by PyAV, which comes with the extra `video`."""
+"""Reading and writing of video with PyAV, which comes with the extra `video`."""
 
 import contextlib
 import itertools
@@ -27,7 +27,14 @@ LEAST_RATE = 0.001  # frames per second; rates are fractions of up to 1001 secon
 
 
 def library():
-    """PyAV; raises MissingExtra where it is not installed."""
+    """Import PyAV.
+
+    Returns:
+      The module.
+
+    Raises:
+      MissingExtra: If it is not installed.
+    """
     return extras.library("av", "video")
 
 
@@ -37,11 +44,21 @@ def write_video(
     frames_per_second: float | int = 30,
     quality: int = 18,
 ):
-    """uint8 sRGB frames [height, width, 3] as H.264, atomically.
+    """Write frames as H.264 video, atomically.
 
-    `quality` is x264's constant rate factor: 0 keeps everything, 18 looks the same, 28
-    is rough. An odd width or height grows by one repeated line, since the chroma of
-    `yuv420p`, which every player shows, comes in pairs.
+    An odd width or height grows by one repeated line, since the chroma of `yuv420p`,
+    which every player supports, is subsampled by two.
+
+    Args:
+      path: The file, .mp4, .mov or .mkv.
+      frames: uint8 sRGB frames, [height, width, 3].
+      frames_per_second: Frame rate.
+      quality: Constant rate factor of x264: 0 is lossless, 18 visually lossless, 28
+        coarse.
+
+    Raises:
+      CaptureError: If the file cannot be written.
+      ValueError: If there are no frames or the rate is too low.
     """
     path = pathlib.Path(path)
     if path.suffix not in (".mp4", ".mov", ".mkv"):
@@ -97,9 +114,14 @@ def _encode(av, partial, path, first, frames, frames_per_second, quality):
 
 
 def transfer_of(path: AnyPath) -> Transfer | None:
-    """How the brightness of a film of high dynamic range is coded; None of others.
+    """Return the transfer function of an HDR video.
 
-    Also where there is no film to be read: `read_video` says what is wrong with it.
+    Args:
+      path: The video.
+
+    Returns:
+      The transfer function, None for other videos and for files that cannot be read
+      (`read_video` reports the reason).
     """
     av = library()
     try:
@@ -185,7 +207,7 @@ def _shortfall(container, stream, count, last):
 
 
 def _decoded(av, container, stream, damaged):
-    """Frames; those that cannot be decoded are left out where damage is allowed."""
+    """Decode frames, and skip those that cannot be decoded if damage is allowed."""
     if damaged == "refuse":
         yield from container.decode(stream)
         return
@@ -246,15 +268,27 @@ def read_video(
     gray: bool = False,
     damaged: str = "refuse",
 ) -> Iterator[tuple[float, np.ndarray]]:
-    """Seconds and uint8 sRGB [height, width, 3] of every `stride`-th frame, upright.
+    """Read the frames of a video, upright and with square pixels.
 
-    Times are the film's own, so a variable frame rate stays true. A phone's rotation
-    tag is carried out, and high dynamic range is tone-mapped. `rows` are the numbers of
-    the only frames to be shown; nothing behind the last of them is decoded. `gray` is
-    for uint8 [height, width] of the light as it is coded: a frame of 3840x2160 HLG
-    costs 0.16 s of processor time, and 1.8 s in color. `damaged` is "refuse" or "skip"
-    what cannot be decoded, as the end of a download that broke off;
-    `notes_of` says how much is missing. Pixels are made square.
+    Times are the video's own, so a variable frame rate is preserved. A phone's rotation
+    tag is applied, and HDR is tone-mapped. Frames that cannot be decoded, such as the
+    end of an interrupted download, are reported by `notes_of`.
+
+    Args:
+      path: The video.
+      stride: Read every `stride`-th frame.
+      most: Largest number of frames to read.
+      rows: Numbers of the only frames to return. Nothing after the last of them is
+        decoded. None for all.
+      gray: True for coded luma, uint8 [height, width]. A frame of 3840x2160 HLG takes
+        0.16 s of processor time, compared with 1.8 s in color.
+      damaged: "refuse" or "skip" frames that cannot be decoded.
+
+    Yields:
+      Seconds, and uint8 sRGB [height, width, 3].
+
+    Raises:
+      CaptureError: If the video cannot be read.
     """
     if damaged not in ("refuse", "skip"):
         raise ValueError(f'{path}: damaged={damaged!r}; expected "refuse" or "skip"')
