@@ -104,7 +104,17 @@ def _pictures_in(path):
 
 
 def recognize(path: AnyPath) -> Format:
-    """The format of the capture at `path`; an error that lists what was looked for."""
+    """Recognize the format of a capture.
+
+    Args:
+      path: Folder or file of the capture.
+
+    Returns:
+      The format.
+
+    Raises:
+      CaptureError: If there is no capture, with a list of the formats.
+    """
     path = pathlib.Path(path)
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder; check the path")

@@ -1,8 +1,9 @@
-"""Analytic moving scenes with exact color, depth, flow, masks and point tracks.
+"""Analytic dynamic scenes with exact color, depth, flow, masks and point tracks.
 
     capture, truth = synthetic.make(synthetic.PRESETS["default"])
 
-Ray-traced in JAX; needs no download. `observe` is the true canonical-to-observed map.
+Scenes are ray-traced in JAX and need no download. `observe` is the true
+canonical-to-observed map.
 """
 
 from nerfies_jax.capture.synthetic.presets import DEFAULT, PRESETS

@@ -1,4 +1,4 @@
-"""How a synthetic scene is filmed: the hand-held arc, the schedule, the pictures."""
+"""Cameras, schedule and images of a synthetic scene."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ SHAKE_HARMONICS = 6  # the fastest tremor takes a sixth of the capture
 
 
 class Schedule(NamedTuple):
-    """What is filmed when and from where, one row per frame. NumPy leaves."""
+    """Times, cameras and exposure of all frames, in NumPy."""
 
     instant: np.ndarray  # int32
     camera_id: np.ndarray  # int32: 0 in the hand, 1 beside it
@@ -31,7 +31,7 @@ class Schedule(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One frame as filmed; what is not color belongs to the pixel's center."""
+    """One frame. Depth and hits belong to the center of each pixel."""
 
     image: Float[Array, "height width 3"]  # sRGB-coded in [0, 1], not rounded
     depth: Float[Array, "height width"]  # z-depth, scene units; 0 for nothing
@@ -39,7 +39,15 @@ class Picture(NamedTuple):
 
 
 def schedule(spec: SceneSpec, seed: int) -> Schedule:
-    """All frames: the first camera's in order of time, then the second's."""
+    """Plan all frames: those of the first camera in order of time, then the second's.
+
+    Args:
+      spec: The scene.
+      seed: Seed of the hand-held motion and the exposure.
+
+    Returns:
+      The schedule.
+    """
     instants = np.arange(spec.frames)
     looks = instants[spec.heldout_every // 2 :: spec.heldout_every]
     instant = np.concatenate([instants, looks])
@@ -73,7 +81,20 @@ def picture(
     light_gain: Float[Array, "3"],
     transient_shown: Bool[Array, ""],
 ) -> Picture:
-    """One frame, in square tiles: the cloth costs only those tiles that may show it."""
+    """Render one frame, in square tiles.
+
+    The sheet costs only in tiles that may show it.
+
+    Args:
+      spec: The scene.
+      camera: The camera, without distortion.
+      time: Time in [0, 1].
+      light_gain: Gain of linear light for each channel, [3].
+      transient_shown: True if the transient object is present.
+
+    Returns:
+      The frame.
+    """
 
     def hit(direction):
         return trace.cast(spec, camera.position, direction, time, transient_shown)
@@ -102,9 +123,16 @@ def picture(
 
 
 def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
-    """The world direction of z-depth one through a pixel of a camera.
+    """Return the world direction of a pixel, scaled to z-depth one.
 
-    These cameras have no distortion, which spares each ray an iteration.
+    The cameras here have no distortion, which saves an iteration for each ray.
+
+    Args:
+      camera: The camera, without distortion.
+      pixel: Pixel position (x, y) with centers at +0.5, [2].
+
+    Returns:
+      The direction, [3].
     """
     slopes = (pixel - camera.principal_point_px) / camera.focal_px
     in_camera = jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
@@ -112,7 +140,16 @@ def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"
 
 
 def noted_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:
-    """The cameras as a capture has them: of the first one with their error."""
+    """Return the cameras of the capture, with the pose error of the first camera.
+
+    Args:
+      spec: The scene.
+      plan: The schedule with the true cameras.
+      seed: Seed of the error.
+
+    Returns:
+      Cameras, [frames].
+    """
     if spec.pose_error is None:
         return plan.cameras
     rng = np.random.default_rng([seed, 5])
@@ -198,7 +235,9 @@ def _light_gain(spec, times, seed):
 
 
 def _smooth_noise(rng, times, columns):
-    """[times, columns] of random sums of sines; mean square one over all phases."""
+    """Random sums of sines [times, columns] with a mean square of one over all
+    phases.
+    """
     harmonics = np.arange(1, SHAKE_HARMONICS + 1)
     phase = rng.uniform(0, 2 * np.pi, (len(harmonics), columns))
     weight = np.sqrt(2 / np.sum(1.0 / harmonics**2)) / harmonics

@@ -1,7 +1,7 @@
-"""How the things of a synthetic scene move rigidly: closed forms of the time.
+"""Rigid motion of the objects of a synthetic scene, in closed form.
 
-World axes: x right, y up, z toward the camera; lengths in scene units. Time runs from
-0 to 1 over the capture. A body's own origin rests at `place` in the world.
+World axes are x right, y up, z toward the camera, and lengths are in scene units. Time
+runs from 0 to 1 over the capture. The origin of a body rests at `place` in the world.
 """
 
 import dataclasses
@@ -18,14 +18,24 @@ Vector = tuple[float, float, float]
 
 
 class Pose(NamedTuple):
-    """Where a body is: `world = rotation @ body + position`."""
+    """Pose of a body: `world = rotation @ body + position`."""
 
     rotation: Float[Array, "3 3"]
     position: Float[Array, "3"]
 
 
 def unit_axis(axis: Vector) -> Vector:
-    """The axis at length one; refuses one that has no direction."""
+    """Normalize an axis.
+
+    Args:
+      axis: A direction.
+
+    Returns:
+      The unit vector.
+
+    Raises:
+      ValueError: If the length is zero or not finite.
+    """
     length = math.hypot(*axis)
     if not 0 < length < math.inf:
         raise ValueError(f"axis={axis} has no direction; give one that is not zero")
@@ -34,7 +44,7 @@ def unit_axis(axis: Vector) -> Vector:
 
 @dataclasses.dataclass(frozen=True)
 class Path:
-    """Swings along a Lissajous path and turns about an axis through the body."""
+    """Lissajous path with a rotation about an axis through the body."""
 
     sway: Vector = (0.0, 0.0, 0.0)  # scene units to either side of the place
     cycles: Vector = (1.0, 1.0, 1.0)  # per capture, for each direction of sway
@@ -46,7 +56,15 @@ class Path:
         unit_axis(self.axis)
 
     def pose(self, place: Vector, time: Float[Array, ""]) -> Pose:
-        """Where the body is at one time."""
+        """Return the pose at a time.
+
+        Args:
+          place: Position of the body at rest, in scene units.
+          time: Time in [0, 1].
+
+        Returns:
+          The pose.
+        """
         cycles, phase, sway, rest = (
             jnp.asarray(value, time.dtype)
             for value in (self.cycles, self.phase, self.sway, place)
@@ -58,7 +76,7 @@ class Path:
 
 @dataclasses.dataclass(frozen=True)
 class Hinge:
-    """One joint; pivot and axis are those of the rest pose, in the world."""
+    """One joint, with pivot and axis in the world at the rest pose."""
 
     pivot: Vector
     axis: Vector = (0.0, 0.0, 1.0)
@@ -86,7 +104,15 @@ class Arm:
             raise ValueError("an arm needs at least one hinge; use Path() for none")
 
     def pose(self, place: Vector, time: Float[Array, ""]) -> Pose:
-        """Where the body is at one time."""
+        """Return the pose at a time.
+
+        Args:
+          place: Position of the body at rest, in scene units.
+          time: Time in [0, 1].
+
+        Returns:
+          The pose.
+        """
         rotation = jnp.eye(3, dtype=time.dtype)
         position = jnp.asarray(place, time.dtype)
         for hinge in reversed(self.hinges):
@@ -100,7 +126,7 @@ class Arm:
 
 @dataclasses.dataclass(frozen=True)
 class Glide:
-    """Straight on at constant speed between two times, at rest before and after."""
+    """Translation at constant speed between two times, at rest before and after."""
 
     travel: Vector  # scene units
     start: float = 0.0
@@ -114,7 +140,15 @@ class Glide:
             )
 
     def pose(self, place: Vector, time: Float[Array, ""]) -> Pose:
-        """Where the body is at one time."""
+        """Return the pose at a time.
+
+        Args:
+          place: Position of the body at the start, in scene units.
+          time: Time in [0, 1].
+
+        Returns:
+          The pose.
+        """
         share = jnp.clip((time - self.start) / (self.stop - self.start), 0, 1)
         travel, rest = (jnp.asarray(x, time.dtype) for x in (self.travel, place))
         return Pose(jnp.eye(3, dtype=time.dtype), rest + share * travel)
@@ -124,24 +158,57 @@ Motion = Path | Arm | Glide
 
 
 def pose(motion: Motion | None, place: Vector, time: Float[Array, ""]) -> Pose:
-    """Where a body is at one time; without a motion it stays in its place."""
+    """Return the pose of a body at a time.
+
+    Args:
+      motion: The motion. None for a body at rest.
+      place: Position of the body at rest, in scene units.
+      time: Time in [0, 1].
+
+    Returns:
+      The pose.
+    """
     if motion is None:
         return Pose(jnp.eye(3, dtype=time.dtype), jnp.asarray(place, time.dtype))
     return motion.pose(place, time)
 
 
 def to_world(pose: Pose, point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """A point of the body, in the world."""
+    """Transform a point from body to world coordinates.
+
+    Args:
+      pose: Pose of the body.
+      point: Point in body coordinates, [3].
+
+    Returns:
+      The point in world coordinates, [3].
+    """
     return exact_product(pose.rotation, point) + pose.position
 
 
 def to_body(pose: Pose, point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """A point of the world, in the body's own axes."""
+    """Transform a point from world to body coordinates.
+
+    Args:
+      pose: Pose of the body.
+      point: Point in world coordinates, [3].
+
+    Returns:
+      The point in body coordinates, [3].
+    """
     return exact_product(pose.rotation.T, point - pose.position)
 
 
 def axis_rotation(axis: Vector, angle_rad: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation about a fixed axis (Rodrigues); smooth in the angle everywhere."""
+    """Rotate about a fixed axis (Rodrigues' formula), smoothly in the angle everywhere.
+
+    Args:
+      axis: The axis, of any length.
+      angle_rad: Angle in radians.
+
+    Returns:
+      Rotation matrix, [3, 3].
+    """
     x, y, z = unit_axis(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     first = jnp.asarray(cross, angle_rad.dtype)

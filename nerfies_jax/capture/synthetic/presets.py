@@ -1,4 +1,4 @@
-"""Named synthetic scenes. Lengths fit a box of unit diagonal, cameras included."""
+"""Named synthetic scenes. Lengths fit a box with unit diagonal, including cameras."""
 
 import dataclasses
 

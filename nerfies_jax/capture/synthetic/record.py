@@ -1,4 +1,4 @@
-"""A synthetic scene as a `Capture`, in memory, as a directory, or from a cache."""
+"""Synthetic scenes as a `Capture`, in memory, as a directory, or from a cache."""
 
 import dataclasses
 import hashlib
@@ -23,11 +23,18 @@ TRUTH_FILE = "truth.npz"  # beside the Nerfies files, which other readers pass o
 
 
 def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
-    """Film a scene: what a camera would give, and what only the scene knows.
+    """Render a scene as a capture with its ground truth.
 
-    The first camera's frames are learned from, the second's scored. The seed moves the
-    hand, the exposure, and which points are drawn; never the things. The same spec and
-    seed give the same bits on the same machine and number of cores.
+    The first camera's frames are for training, the second's for evaluation. The same
+    spec and seed give the same bits on the same machine and number of cores.
+
+    Args:
+      spec: The scene.
+      seed: Seed of the hand-held motion, the exposure and the selection of points. It
+        does not affect the objects.
+
+    Returns:
+      The capture and its ground truth.
     """
     plan = film.schedule(spec, seed)
     programs = truth.programs(spec, plan)
@@ -64,7 +71,17 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
 
 
 def write(spec: SceneSpec, path: AnyPath, seed: int = 0):
-    """Film a scene into a Nerfies directory with `truth.npz` beside; all or nothing."""
+    """Render a scene into a Nerfies directory with `truth.npz`, completely or not at
+    all.
+
+    Args:
+      spec: The scene.
+      path: The directory, which may be absent or empty.
+      seed: As for `make`.
+
+    Raises:
+      CaptureError: If the directory cannot be written.
+    """
     with new_folder(path) as folder:  # refuses a path in use before it films
         _write_into(folder, spec, seed)
 
@@ -84,7 +101,16 @@ def _write_into(folder, spec, seed):
 def cached(
     spec: SceneSpec, folder: AnyPath, seed: int = 0
 ) -> tuple[Capture, SceneTruth]:
-    """The scene from a cache folder, filmed first unless it is there, whole."""
+    """Read a scene from a cache folder, and render it first if needed.
+
+    Args:
+      spec: The scene.
+      folder: The cache folder.
+      seed: As for `make`.
+
+    Returns:
+      The capture and its ground truth.
+    """
     identity = f"scene {digest(spec, seed)}"
     path = pathlib.Path(folder) / f"{spec.name.replace(' ', '-')}-{digest(spec, seed)}"
 
@@ -110,7 +136,15 @@ def cached(
 
 
 def digest(spec: SceneSpec, seed: int = 0) -> str:
-    """Twelve hex digits that name a spec, a seed and the version of this renderer."""
+    """Return the identity of a scene in a cache.
+
+    Args:
+      spec: The scene.
+      seed: As for `make`.
+
+    Returns:
+      Twelve hex digits of a hash of the spec, the seed and the version of the renderer.
+    """
     text = f"{VERSION} {seed} {spec!r}"
     if spec.pose_error is not None:
         text += f" {spec.pose_error!r}"

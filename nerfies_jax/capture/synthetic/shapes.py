@@ -1,7 +1,7 @@
-"""The shapes of a synthetic scene: where a ray meets them, and how they bend.
+"""Shapes of a synthetic scene, their ray intersections and non-rigid deformations.
 
 Each shape maps its *material* points (which carry the texture) to *body* points at a
-time, and back; both maps are exact, and defined off the surface too.
+time, and back. Both maps are exact, and defined off the surface too.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ REFINEMENTS = 5  # Newton inside the bracket
 
 
 class Crossing(NamedTuple):
-    """Where a ray first enters a shape; infinitely far where it misses."""
+    """First intersection of a ray with a shape, at infinity if it misses."""
 
     distance: Float[Array, ""]  # in lengths of the direction
     material: Float[Array, "3"]  # the point of the material that is met
@@ -39,7 +39,7 @@ class Squash:
 
 @dataclasses.dataclass(frozen=True)
 class Sphere:
-    """A ball about the body's origin; an ellipsoid where it squashes."""
+    """A ball about the body's origin, or an ellipsoid if it squashes."""
 
     radius: float
     squash: Squash | None = None
@@ -48,21 +48,50 @@ class Sphere:
         _positive(radius=self.radius)
 
     def bends(self) -> bool:
-        """Whether the material moves within the body."""
+        """Return whether the material moves within the body.
+
+        Returns:
+          True for a sphere that squashes.
+        """
         return self.squash is not None
 
     def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
-        """Body point of a material point."""
+        """Map a material point to the body.
+
+        Args:
+          material: Material point, [3].
+          time: Time in [0, 1].
+
+        Returns:
+          Body point, [3].
+        """
         scale, base = self._stretch(time)
         return base + scale * (material - base)
 
     def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
-        """Material point of a body point."""
+        """Map a body point to the material.
+
+        Args:
+          point: Body point, [3].
+          time: Time in [0, 1].
+
+        Returns:
+          Material point, [3].
+        """
         scale, base = self._stretch(time)
         return base + (point - base) / scale
 
     def cross(self, origin, direction, time) -> Crossing:
-        """The ray's first entry, solved in material coordinates, where it is a ball."""
+        """Intersect a ray, in material coordinates, where the shape is a ball.
+
+        Args:
+          origin: Origin of the ray in body coordinates, [3].
+          direction: Direction of any length, [3].
+          time: Time in [0, 1].
+
+        Returns:
+          The first intersection.
+        """
         scale, _ = self._stretch(time)
         start, along = self.undeform(origin, time), direction / scale
         speed_sq = jnp.sum(along**2)
@@ -100,19 +129,48 @@ class Box:
         _positive(half=min(self.half))
 
     def bends(self) -> bool:
-        """Whether the material moves within the body."""
+        """Return whether the material moves within the body.
+
+        Returns:
+          False.
+        """
         return False
 
     def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
-        """Body point of a material point: the same."""
+        """Map a material point to the body.
+
+        Args:
+          material: Material point, [3].
+          time: Time in [0, 1].
+
+        Returns:
+          The same point, [3].
+        """
         return material
 
     def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
-        """Material point of a body point: the same."""
+        """Map a body point to the material.
+
+        Args:
+          point: Body point, [3].
+          time: Time in [0, 1].
+
+        Returns:
+          The same point, [3].
+        """
         return point
 
     def cross(self, origin, direction, time) -> Crossing:
-        """The ray's first entry; a ray that starts inside does not meet the box."""
+        """Intersect a ray. A ray that starts inside does not meet the box.
+
+        Args:
+          origin: Origin of the ray in body coordinates, [3].
+          direction: Direction of any length, [3].
+          time: Time in [0, 1].
+
+        Returns:
+          The first intersection.
+        """
         half = jnp.asarray(self.half, time.dtype)
         distance, leave = rays.intersect_aabb(origin, direction, -half, half)
         met = (distance > 0) & (distance < leave)
@@ -152,23 +210,53 @@ class Sheet:
             raise ValueError(f"sway={self.sway} must not be negative; 0 hangs straight")
 
     def bends(self) -> bool:
-        """Whether the material moves within the body."""
+        """Return whether the material moves within the body.
+
+        Returns:
+          True.
+        """
         return True
 
     def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
-        """Body point of a material point."""
+        """Map a material point to the body.
+
+        Args:
+          material: Material point, [3].
+          time: Time in [0, 1].
+
+        Returns:
+          Body point, [3].
+        """
         u, v, w = material
         sway, billow = self._sway(v, time), self._billow(u, v, time)
         return jnp.stack([u + sway, v, w + billow])
 
     def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
-        """Material point of a body point."""
+        """Map a body point to the material.
+
+        Args:
+          point: Body point, [3].
+          time: Time in [0, 1].
+
+        Returns:
+          Material point, [3].
+        """
         x, y, z = point
         u = x - self._sway(y, time)
         return jnp.stack([u, y, z - self._billow(u, y, time)])
 
     def cross(self, origin, direction, time) -> Crossing:
-        """The first crossing: bracketed by probes, refined by Newton in the bracket."""
+        """Intersect a ray: bracketed by probes, then refined by Newton within the
+        bracket.
+
+        Args:
+          origin: Origin of the ray in body coordinates, [3].
+          direction: Direction of any length, [3].
+          time: Time in [0, 1].
+
+        Returns:
+          The first intersection.
+        """
         distance, met = self._root(origin, direction, time)
         material = self.undeform(origin + distance * direction, time)
         normal = jax.grad(lambda point: self.undeform(point, time)[2])(

@@ -1,4 +1,4 @@
-"""What a synthetic scene holds: things, cameras, effects. Frozen, hashable settings."""
+"""Settings of a synthetic scene: objects, cameras and effects. Frozen and hashable."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from nerfies_jax.capture.synthetic.texture import Texture
 
 @dataclasses.dataclass(frozen=True)
 class Thing:
-    """One body: what it looks like, where it rests and how it moves."""
+    """One object: its shape, texture, rest position and motion."""
 
     name: str
     shape: Shape
@@ -18,18 +18,22 @@ class Thing:
     motion: Motion | None = None  # None stays in its place
 
     def moves(self) -> bool:
-        """Whether any of its points ever leaves its place."""
+        """Return whether any point of the object ever moves.
+
+        Returns:
+          True for an object with a motion or a deformation.
+        """
         return self.motion is not None or self.shape.bends()
 
 
 @dataclasses.dataclass(frozen=True)
 class Cameras:
-    """A casual hand-held arc, and a second camera held beside the first.
+    """A casual hand-held arc, and a second camera next to the first.
 
-    The hand sweeps to and fro about the target and leans forward, with smooth shake. It
-    does so at another pace than the things move: a thing that swings in step with the
-    camera has no depth that one camera could tell.
-    The second camera looks at the same target; what it sees is never learned from.
+    The hand sweeps to and fro about the target and leans forward, with smooth shake.
+    Its period differs from those of the objects, since one camera cannot tell the depth
+    of an object that swings in step with it. The second camera looks at the same
+    target, and its images are never used for training.
     """
 
     distance: float = 0.66  # from the target at rest, scene units
@@ -66,10 +70,10 @@ class Exposure:
 
 @dataclasses.dataclass(frozen=True)
 class PoseError:
-    """How far the noted cameras of the first one are off, each frame by itself.
+    """Pose error of the first camera's frames, independent for each frame.
 
-    As structure from motion leaves them that was misled. The second camera, which
-    scores, is noted as it stood.
+    It stands for errors of structure from motion. The second camera, which is for
+    evaluation, has its true pose.
     """
 
     turn_px: float = 0.6  # root mean square about each axis, seen in the picture
@@ -85,9 +89,10 @@ class PoseError:
 
 @dataclasses.dataclass(frozen=True)
 class Transient:
-    """Something that passes before the first camera now and then, and is no scene.
+    """An object that passes in front of the first camera at times, and is not in the
+    scene.
 
-    It is in none of the second camera's frames, which score the scene without it.
+    It is in none of the second camera's frames, which evaluate the scene without it.
     """
 
     thing: Thing
@@ -113,7 +118,7 @@ class Specular:
 
 @dataclasses.dataclass(frozen=True)
 class SceneSpec:
-    """An analytic moving scene and how it is filmed; an effect of None is absent."""
+    """An analytic dynamic scene and its recording. An effect of None is absent."""
 
     name: str
     things: tuple[Thing, ...]
@@ -173,13 +178,27 @@ class SceneSpec:
             raise ValueError(f"ambient={self.ambient} must lie in [0, 1]")
 
     def all_things(self) -> tuple[Thing, ...]:
-        """The scene's things in the order of their ids; the transient comes last."""
+        """Return the objects in the order of their ids, with the transient last.
+
+        Returns:
+          The objects.
+        """
         if self.transient is None:
             return self.things
         return (*self.things, self.transient.thing)
 
     def id_of(self, name: str) -> int:
-        """The id of a thing, which `SceneTruth.things` holds for each pixel."""
+        """Return the id of an object, as in `SceneTruth.things`.
+
+        Args:
+          name: Name of the object.
+
+        Returns:
+          The id.
+
+        Raises:
+          ValueError: If there is no such object.
+        """
         names = [thing.name for thing in self.all_things()]
         if name not in names:
             raise ValueError(f"no thing {name!r}; there are {', '.join(names)}")
@@ -187,5 +206,5 @@ class SceneSpec:
 
     @property
     def transient_id(self) -> int:
-        """The transient's id, or -2, which no pixel has, where there is none."""
+        """Id of the transient, or -2, which no pixel has, if there is none."""
         return -2 if self.transient is None else len(self.things)

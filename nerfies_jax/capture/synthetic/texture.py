@@ -1,7 +1,7 @@
 """Procedural solid textures with detail at several scales, fixed to the material.
 
-A texture is a function of the material point alone, so it travels with the thing and
-needs no unwrapping. All things share one formula, so that a ray evaluates it once,
+A texture is a function of the material point alone, so it moves with the object and
+needs no unwrapping. All objects share one formula, so that a ray evaluates it once,
 whatever it hits.
 """
 
@@ -23,9 +23,9 @@ EDGE = 6.0  # steepness of a checker edge: it takes about a tenth of a square
 
 @dataclasses.dataclass(frozen=True)
 class Texture:
-    """Two colors mixed by checker, stripes and noise, with blots of a third.
+    """Two colors mixed by checker, stripes and noise, with spots of a third.
 
-    Colors are sRGB-coded in [0, 1]. The shares say how strongly each pattern mixes.
+    Colors are sRGB in [0, 1]. The shares set the strength of each pattern.
     """
 
     dark: Vector = (0.2, 0.2, 0.25)
@@ -58,9 +58,15 @@ class Texture:
 def albedo(
     textures: Sequence[Texture], thing: Int[Array, ""], material: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """Share of light given back at one material point, linear, for each channel.
+    """Evaluate the albedo of a material point.
 
-    `thing` says whose texture it is, from 0.
+    Args:
+      textures: Textures of all objects.
+      thing: Index of the object's texture.
+      material: Material point, [3].
+
+    Returns:
+      Linear albedo for each channel, [3].
     """
     # Scalars, not arrays of three, so that a batch of rays fills the vector registers:
     # six times faster on a CPU. Choosing among numbers is cheaper than a gather, too.
@@ -109,9 +115,18 @@ def albedo(
 def value_noise(
     point: Float[Array, "3"], seed: Int[Array, ""] | int
 ) -> Float[Array, ""]:
-    """Random values in [-1, 1] on the integer lattice, blended by smooth weights.
+    """Evaluate value noise: random values on the integer lattice with smooth
+    interpolation.
 
-    Twice differentiable; the same everywhere, since the lattice is hashed in integers.
+    It is twice differentiable, and the same on all platforms, since the lattice is
+    hashed in integers.
+
+    Args:
+      point: Position in lattice units, [3].
+      seed: Seed of the hash.
+
+    Returns:
+      A scalar in [-1, 1].
     """
     start = jnp.asarray(seed).astype(jnp.uint32) * np.uint32(0x9E3779B9)
     low_bits, high_bits, weights = [], [], []
@@ -140,7 +155,14 @@ def _mixed(bits):
 
 
 def srgb(light: Float[Array, "*any"]) -> Float[Array, "*any"]:
-    """sRGB-coded value of linear light in [0, 1]."""
+    """Convert linear light to sRGB, with a finite gradient at zero.
+
+    Args:
+      light: Linear light in [0, 1].
+
+    Returns:
+      sRGB values in [0, 1].
+    """
     low = light <= 0.0031308
     # The power's slope is infinite at zero, where the other branch is taken.
     above = jnp.where(low, 1, light)

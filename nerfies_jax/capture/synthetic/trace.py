@@ -1,6 +1,6 @@
-"""Rays through a synthetic scene: first hits, true motion, shading.
+"""Ray tracing of a synthetic scene: first hits, true motion, shading.
 
-Functions of one ray or one point; callers vmap them. `spec` is static under jit.
+Functions take one ray or one point, and callers vmap them. `spec` is static under jit.
 """
 
 from typing import NamedTuple
@@ -18,13 +18,13 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.precision import exact_product
 
 NOTHING = -1  # thing id of a ray that leaves the scene
-# How far in front of a point something must lie to hide it, scene units: float32 meets
-# surfaces to 1e-6 at grazing incidence, and a pixel at distance 0.7 is 4e-3 wide.
+# Distance in front of a point from which on a surface occludes it, scene units: float32
+# hits surfaces to 1e-6 at grazing incidence, and a pixel at distance 0.7 is 4e-3 wide.
 HIDES = 2e-4
 
 
 class Hit(NamedTuple):
-    """What a ray meets first."""
+    """First hit of a ray."""
 
     distance: Float[Array, ""]  # in lengths of the direction; infinite for nothing
     thing: Int[Array, ""]  # id, or NOTHING
@@ -39,7 +39,18 @@ def cast(
     time: Float[Array, ""],
     transient_shown: Bool[Array, ""],
 ) -> Hit:
-    """The first thing on one ray, in closed form but for the cloth."""
+    """Find the first object on a ray, in closed form except for sheets.
+
+    Args:
+      spec: The scene.
+      origin: Origin of the ray in the world, [3].
+      direction: Direction of any length, [3].
+      time: Time in [0, 1].
+      transient_shown: True if the transient object is present.
+
+    Returns:
+      The hit, at infinite distance for none.
+    """
     zero = jnp.zeros_like(origin)
     best = Hit(
         jnp.full_like(time, jnp.inf), jnp.asarray(NOTHING, jnp.int32), zero, zero
@@ -71,9 +82,17 @@ def observe(
     canonical_point: Float[Array, "3"],
     time: Float[Array, ""],
 ) -> Float[Array, "3"]:
-    """The true canonical-to-observed map: where a point of time 0 is at `time`.
+    """Map a canonical point (its position at time 0) to its position at a time.
 
-    World to world, for a surface point of one thing (or one moved along with it).
+    Args:
+      spec: The scene.
+      thing: Id of the object.
+      canonical_point: World point on the object's surface, or fixed to it, at time 0,
+        [3].
+      time: Time in [0, 1].
+
+    Returns:
+      World point at `time`, [3].
     """
     body = _thing(spec, thing)
     return _place(body, _material(body, canonical_point, jnp.zeros_like(time)), time)
@@ -85,7 +104,18 @@ def canonical(
     observed_point: Float[Array, "3"],
     time: Float[Array, ""],
 ) -> Float[Array, "3"]:
-    """Where a point seen at `time` was at time 0: the exact inverse of `observe`."""
+    """Map a point observed at a time to its position at time 0. Inverts `observe`
+    exactly.
+
+    Args:
+      spec: The scene.
+      thing: Id of the object.
+      observed_point: World point at `time`, [3].
+      time: Time in [0, 1].
+
+    Returns:
+      World point at time 0, [3].
+    """
     body = _thing(spec, thing)
     return _place(body, _material(body, observed_point, time), jnp.zeros_like(time))
 
@@ -96,7 +126,17 @@ def place(
     material: Float[Array, "3"],
     time: Float[Array, ""],
 ) -> Float[Array, "3"]:
-    """World point of a material point of whichever thing the id names."""
+    """Map a material point to the world.
+
+    Args:
+      spec: The scene.
+      thing: Id of the object, traced.
+      material: Material point, [3].
+      time: Time in [0, 1].
+
+    Returns:
+      World point, [3].
+    """
     world = jnp.zeros_like(material)
     for index, body in enumerate(spec.all_things()):
         world = jnp.where(thing == index, _place(body, material, time), world)
@@ -109,7 +149,17 @@ def shade(
     direction: Float[Array, "3"],
     light_gain: Float[Array, "3"],
 ) -> Float[Array, "3"]:
-    """Linear light of one ray, not clipped: Lambert, ambient, and any highlight."""
+    """Compute the linear light of a ray: Lambertian, ambient and specular.
+
+    Args:
+      spec: The scene.
+      hit: First hit of the ray.
+      direction: Direction of the ray, of any length, [3].
+      light_gain: Gain of linear light for each channel, [3].
+
+    Returns:
+      Linear light, not clipped, [3].
+    """
     dtype = direction.dtype
     toward_light = jnp.asarray(motion.unit_axis(spec.light), dtype)
     base = surface_color(spec, jnp.maximum(hit.thing, 0), hit.material)
@@ -130,7 +180,16 @@ def shade(
 def surface_color(
     spec: SceneSpec, thing: Int[Array, ""], material: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """Linear albedo of one material point: the texture without any light."""
+    """Evaluate the linear albedo of a material point.
+
+    Args:
+      spec: The scene.
+      thing: Id of the object, traced.
+      material: Material point, [3].
+
+    Returns:
+      Albedo for each channel, [3].
+    """
     textures = [body.texture for body in spec.all_things()]
     return texture.albedo(textures, thing, material)
 
@@ -143,9 +202,21 @@ def visible(
     time: Float[Array, ""],
     transient_shown: Bool[Array, ""],
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
-    """The pixel of a point of a thing, and whether the camera sees it there.
+    """Project a point of an object and test if the camera sees it.
 
-    Exact: a ray is cast at the point itself; no depth picture is interpolated.
+    The test is exact: a ray is cast at the point itself, and no depth image is
+    interpolated.
+
+    Args:
+      spec: The scene.
+      camera: The camera.
+      thing: Id of the object.
+      point: World point of the object, [3].
+      time: Time in [0, 1].
+      transient_shown: True if the transient object is present.
+
+    Returns:
+      Pixel position [2], and True if the point is visible.
     """
     pixel, depth = cameras.project(camera, point)
     toward = point - camera.position

@@ -1,4 +1,4 @@
-"""What is known of a synthetic scene beyond its pictures: ids, flow, point tracks."""
+"""Ground truth of a synthetic scene beyond its images: ids, flow, point tracks."""
 
 import dataclasses
 import functools
@@ -23,12 +23,12 @@ from nerfies_jax.geometry import rays
 
 
 class SceneTruth(NamedTuple):
-    """Exact answers, row for row beside the capture. NumPy leaves.
+    """Exact ground truth by frame, in NumPy.
 
-    Flow leads from the center of a pixel to where its point lies in the next (previous)
-    frame of the same camera, in pixels. It is known, and given, where that point is
-    hidden or outside, too: `seen` says where it can be compared with pictures. The last
-    (first) frame of a camera has none: zero, and nowhere seen.
+    Flow leads from the center of a pixel to the position of its point in the next
+    (previous) frame of the same camera, in pixels. It is also defined where that point
+    is occluded or outside of the image. `seen` marks where it can be compared with
+    images. The last (first) frame of a camera has none: zero, and nowhere seen.
     """
 
     ids: tuple[str, ...]  # of the capture's frames, one for each row
@@ -48,9 +48,18 @@ class SceneTruth(NamedTuple):
 
 
 def track_places(capture: Capture, truth: SceneTruth, rows: np.ndarray) -> np.ndarray:
-    """Where the points are in these frames, [tracks, rows, 3] float32, scene units.
+    """Return the positions of the tracked points in some frames.
 
-    Raises ValueError where the truth is not that of the capture.
+    Args:
+      capture: The capture.
+      truth: Its ground truth.
+      rows: Indices of the frames.
+
+    Returns:
+      float32 positions in scene units, [tracks, rows, 3].
+
+    Raises:
+      ValueError: If the truth is not that of the capture.
     """
     if truth.ids != capture.ids:
         raise ValueError(
@@ -85,17 +94,26 @@ def told(capture: Capture, truth: SceneTruth) -> Capture:
 
 
 class Flow(NamedTuple):
-    """Where the points of one frame's pixels lie in another frame."""
+    """Flow of one frame to another frame, and its visibility there."""
 
     pixel: Float[Array, "height width 2"]
     seen: Bool[Array, "height width"]
 
 
 def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flow:
-    """Pixels of material points, as another frame sees them.
+    """Compute the flow of the pixels of one frame to another frame.
 
-    `thing` [height, width] and `material` [height, width, 3] are what one frame's pixel
-    centers hit; camera, time and transient are those of the other.
+    Args:
+      spec: The scene.
+      thing: Ids of the objects that the pixel centers of the first frame hit, [height,
+        width].
+      material: Material points that they hit, [height, width, 3].
+      camera: Camera of the other frame.
+      time: Time of the other frame.
+      transient_shown: True if the other frame shows the transient object.
+
+    Returns:
+      The flow, zero where nothing was hit.
     """
 
     def one(thing, material):
@@ -110,7 +128,7 @@ def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flo
 
 
 class Programs(NamedTuple):
-    """What `flows` and `tracks` run, compiled in the background."""
+    """Programs of `flows` and `tracks`, compiled in the background."""
 
     flow: Future[jax.stages.Compiled]
     follow: Future[jax.stages.Compiled] | None = None  # where nothing moves
@@ -118,9 +136,17 @@ class Programs(NamedTuple):
 
 
 def programs(spec: SceneSpec, plan: Schedule) -> Programs:
-    """Begin to compile them: beside the pictures, of which they are asked after.
+    """Begin to compile the programs of the ground truth, while images are rendered.
 
-    Of the built-in scene 6 s of one core, and the pictures' own program 5 s.
+    For the built-in scene this takes 6 s of one core, and the program of the images 5
+    s.
+
+    Args:
+      spec: The scene.
+      plan: The schedule.
+
+    Returns:
+      Futures of the compiled programs.
     """
     shape = jax.ShapeDtypeStruct
     frames, (width, height), points = len(plan.time), spec.size, spec.tracks
@@ -144,7 +170,17 @@ def programs(spec: SceneSpec, plan: Schedule) -> Programs:
 def flows(
     spec: SceneSpec, plan: Schedule, hits: trace.Hit, programs: Programs
 ) -> tuple[Flow, Flow]:
-    """Flow of every frame to the next and to the previous one of the same camera."""
+    """Compute the flow of every frame to the next and the previous one of its camera.
+
+    Args:
+      spec: The scene.
+      plan: The schedule.
+      hits: First hits of all pixel centers, [frames, height, width].
+      programs: Compiled programs.
+
+    Returns:
+      Forward and backward flow, [frames, height, width].
+    """
     count = len(plan.time)
     width, height = spec.size
     row = np.tile(np.arange(count), 2)
@@ -171,10 +207,20 @@ def flows(
 def tracks(
     spec: SceneSpec, plan: Schedule, hits: trace.Hit, programs: Programs, seed: int
 ):
-    """Points of the moving scene, drawn where the first camera sees them.
+    """Track random points of moving objects where the first camera sees them.
 
-    Returns thing ids, canonical points, world points over the instants, pixels and
-    visibility over the frames; the transient is not tracked.
+    The transient object is not tracked.
+
+    Args:
+      spec: The scene.
+      plan: The schedule.
+      hits: First hits of all pixel centers, [frames, height, width].
+      programs: Compiled programs.
+      seed: Seed of the selection.
+
+    Returns:
+      Object ids [tracks], canonical points [tracks, 3], world points [tracks, instants,
+      3], pixels [tracks, frames, 2] and visibility [tracks, frames].
     """
     rng = np.random.default_rng([seed, 3])
     moving = np.array([thing.moves() for thing in spec.things])
@@ -226,7 +272,12 @@ def _watch(spec, thing, points, plan):
 
 
 def save(truth: SceneTruth, path: pathlib.Path):
-    """Write a truth as one .npz file."""
+    """Write ground truth as one .npz file.
+
+    Args:
+      truth: The ground truth.
+      path: The file.
+    """
     fields = truth._asdict()
     for name in ("ids", "thing_names"):
         fields[name] = np.array(fields[name])
@@ -235,7 +286,17 @@ def save(truth: SceneTruth, path: pathlib.Path):
 
 
 def load(path: pathlib.Path) -> SceneTruth:
-    """Read what `save` wrote; ValueError for what it did not write."""
+    """Read a file written by `save`.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The ground truth.
+
+    Raises:
+      ValueError: If it is not such a file.
+    """
     try:
         stored = npz_files.read_arrays(path)
     except (OSError, ValueError) as error:
