@@ -1,7 +1,7 @@
-"""Floor 9: a run and its folder, of whichever representation is installed.
+"""Runs and their folders, for any installed representation.
 
-Loaded when used: the settings of a command (`runs.config`) must not cost an import of
-JAX.
+Modules are imported on first use: the settings of a command (`runs.config`) must not
+cost an import of JAX.
 """
 
 import lazy_loader

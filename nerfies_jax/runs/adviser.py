@@ -1,4 +1,4 @@
-"""From what was found to presets and overrides, one for each representation."""
+"""Presets and overrides recommended for a capture, one for each representation."""
 
 import dataclasses
 
@@ -11,7 +11,9 @@ from nerfies_jax.runs.config import RunConfig
 
 @dataclasses.dataclass(frozen=True)
 class Advice:
-    """A preset, the fields to change in it, and what could not be decided or done."""
+    """A preset with overrides, and notes on everything that was not decided or not
+    possible.
+    """
 
     representation: str
     preset: str
@@ -19,7 +21,11 @@ class Advice:
     notes: tuple[str, ...]
 
     def arguments(self) -> str:
-        """As on the command line of `experiments.reconstruct`."""
+        """Return the arguments of `experiments.reconstruct` for this advice.
+
+        Returns:
+          Words of a command line.
+        """
         words = f"--preset {self.preset}"
         return f"{words} --set {' '.join(self.overrides)}" if self.overrides else words
 
@@ -30,13 +36,20 @@ def advise(
     full: bool = False,
     family: str | None = None,
 ) -> Advice:
-    """What to reconstruct with; `full` takes the papers' sizes, not those for a CPU.
+    """Recommend a preset of a representation for the findings about a capture.
 
-    `family`, a preset without "-small", is kept where it can do what is called for.
+    Undecided effects keep the setting of the preset. If motion itself is undecided, a
+    dynamic model is recommended: on a static scene it costs time, whereas a static
+    model of a dynamic scene loses everything that moves.
 
-    What cannot be told keeps what the preset has. Where motion itself cannot be told,
-    that is a model that moves: on a still scene it costs time, on a moving one a model
-    at rest loses whatever moves.
+    Args:
+      findings: Findings about the capture.
+      representation: The representation.
+      full: True for the sizes of the papers, False for sizes that a CPU can train.
+      family: A preset without "-small", kept if it supports the required effects.
+
+    Returns:
+      The recommendation.
     """
     wanted = {one.effect: one.wanted for one in findings}
     notes = [
@@ -54,21 +67,48 @@ def advise(
 
 
 def advise_all(findings: tuple[Finding, ...], full: bool = False) -> list[Advice]:
-    """One for each representation that is installed."""
+    """Recommend a preset of each installed representation.
+
+    Args:
+      findings: Findings about the capture.
+      full: True for the sizes of the papers.
+
+    Returns:
+      One recommendation for each representation.
+    """
     return [
         advise(findings, each, full) for each in representations.installed().values()
     ]
 
 
 def advise_for(findings: tuple[Finding, ...], preset: str) -> Advice:
-    """In the family and size of a preset."""
+    """Recommend a preset in the family and size of another preset.
+
+    Args:
+      findings: Findings about the capture.
+      preset: Name of the preset.
+
+    Returns:
+      The recommendation.
+    """
     family = preset.removesuffix("-small")
     kind = representations.of_preset(preset)
     return advise(findings, kind, full=family == preset, family=family)
 
 
 def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]]:
-    """A config that names no preset with the one its capture calls for, and why."""
+    """Choose the preset of a config that names none, by tracks in the capture.
+
+    Args:
+      config: Config without a preset.
+      capture: The capture.
+
+    Returns:
+      The config with preset and overrides, and lines of text with the reasons.
+
+    Raises:
+      ValueError: If no installed representation chooses presets.
+    """
     chooses = [
         each.default_preset
         for each in representations.installed().values()
@@ -87,10 +127,18 @@ def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]
 def follow(
     config: RunConfig, own: tuple[str, ...], findings: tuple[Finding, ...]
 ) -> tuple[RunConfig, list[str]]:
-    """A config as advised, and what to tell; the user's `own` overrides come last.
+    """Apply the recommendation to a config.
 
-    The preset asked for says which representation, which family and which size. Other
+    The requested preset determines the representation, the family and the size. Other
     overrides of the config belong to that preset, and stay only with it.
+
+    Args:
+      config: The config.
+      own: The user's own overrides, which come last.
+      findings: Findings about the capture.
+
+    Returns:
+      The changed config, and lines of text.
     """
     advice = advise_for(findings, config.preset)
     lines = [

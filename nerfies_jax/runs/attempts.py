@@ -1,4 +1,4 @@
-"""Products written one by one, so that a full disk loses as few as possible."""
+"""Independent writing of products, so that a full disk loses as few as possible."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -9,10 +9,10 @@ Result = TypeVar("Result")
 
 
 class Attempts:
-    """Calls functions that write products and remembers which could not write.
+    """Calls functions that write products, and remembers failures.
 
     Attributes:
-      failures: One line for each product that is not written, with its path and the
+      failures: One line for each product that was not written, with its path and the
         reason.
     """
 
@@ -34,6 +34,10 @@ class Attempts:
             return otherwise
 
     def finish(self) -> None:
-        """Raise an OSError that names everything that is not written."""
+        """Report the products that were not written.
+
+        Raises:
+          OSError: If there are any, with their paths.
+        """
         if self.failures:
             raise OSError("; ".join(dict.fromkeys(self.failures)))

@@ -1,7 +1,7 @@
-"""How many pictures a run can afford, from the time one takes.
+"""Number of images that a run can afford, from the time of one.
 
-Splats render in milliseconds, a radiance field takes seconds for a frame on a CPU: what
-is made beside the training shrinks so that it does not take longer than the training.
+Gaussians render in milliseconds, and a radiance field takes seconds for a frame on a
+CPU. Products of a run are reduced so that they do not take longer than training.
 """
 
 from typing import NamedTuple
@@ -21,14 +21,14 @@ LEAST_SIDE = 32  # pixels: a film is not made smaller than this
 
 
 class Evaluations(NamedTuple):
-    """How often to evaluate, and how many frames each time."""
+    """Number of frames of an evaluation, and the time between two of them."""
 
     frames: int
     every_seconds: float  # of training
 
 
 class FilmPlan(NamedTuple):
-    """How many frames of which size, shown how fast."""
+    """Number of frames of a video, their size and rate."""
 
     frames: int
     size: tuple[int, int]  # width and height in pixels
@@ -36,9 +36,17 @@ class FilmPlan(NamedTuple):
 
 
 def evaluations(frame_seconds: float, every_seconds: float, most: int) -> Evaluations:
-    """Evaluations as asked for, as far as they stay a tenth of the training time.
+    """Limit evaluations to a tenth of the training time.
 
-    A slow renderer gets fewer frames first, down to one, and then longer breaks.
+    A slow renderer first gets fewer frames, down to one, and then longer intervals.
+
+    Args:
+      frame_seconds: Seconds to render one frame.
+      every_seconds: Requested seconds of training between evaluations.
+      most: Largest number of frames.
+
+    Returns:
+      Number of frames and interval.
     """
     frames = _clamped(EVALUATION_SHARE * every_seconds, frame_seconds, 1, most)
     least = frames * frame_seconds / EVALUATION_SHARE
@@ -46,21 +54,45 @@ def evaluations(frame_seconds: float, every_seconds: float, most: int) -> Evalua
 
 
 def scored(frame_seconds: float, heldout: int) -> int:
-    """How many held-out frames to score at the end: all of them, where time allows."""
+    """Return the number of held-out frames to evaluate at the end.
+
+    Args:
+      frame_seconds: Seconds to render one frame.
+      heldout: Number of held-out frames.
+
+    Returns:
+      All of them, or as many as time allows.
+    """
     return _clamped(SCORE_SECONDS, frame_seconds, min(LEAST_SCORED, heldout), heldout)
 
 
 def halves(frame_seconds: float, share: float, heldout: int) -> int:
-    """How many held-out frames to fit codes to; a fit costs `share` of a frame."""
+    """Return the number of held-out frames to fit codes to.
+
+    Args:
+      frame_seconds: Seconds to render one frame.
+      share: Cost of a fit in rendered frames.
+      heldout: Number of held-out frames.
+
+    Returns:
+      The number of frames.
+    """
     least = min(LEAST_FITTED, heldout)
     return _clamped(FIT_SECONDS, frame_seconds * (1 + share), least, heldout)
 
 
 def still(frame_seconds: float, scored: int, size: tuple[int, int]) -> tuple[int, int]:
-    """How many scored frames to average over time, and over how many moments.
+    """Return the number of held-out frames to average over time, and of timestamps.
 
-    All frames over many moments, where time and memory allow; fewer moments first,
-    then fewer frames.
+    Time and memory limit the timestamps first, and then the frames.
+
+    Args:
+      frame_seconds: Seconds to render one frame.
+      scored: Number of evaluated frames.
+      size: Width and height of a frame in pixels.
+
+    Returns:
+      Number of frames and number of timestamps.
     """
     scored = min(scored, max(LEAST_STILL, STILL_PIXELS // (size[0] * size[1])))
     renders = STILL_SECONDS / frame_seconds if frame_seconds > 0 else float("inf")
@@ -70,10 +102,17 @@ def still(frame_seconds: float, scored: int, size: tuple[int, int]) -> tuple[int
 
 
 def film(frame_seconds: float, size: tuple[int, int]) -> FilmPlan:
-    """A film that renders within its time at `frame_seconds` for a frame of `size`.
+    """Plan a video that renders within `FILM_SECONDS`.
 
-    Fewer frames first, shown slower; then pictures of half the size, a quarter of the
-    time each, and so on.
+    It first gets fewer frames at a lower rate, and then images of half the size, which
+    take a quarter of the time each, and so on.
+
+    Args:
+      frame_seconds: Seconds to render one frame of `size`.
+      size: Width and height of a frame in pixels.
+
+    Returns:
+      The plan.
     """
     while LEAST_FILMED * frame_seconds > FILM_SECONDS and min(size) // 2 >= LEAST_SIDE:
         size, frame_seconds = (size[0] // 2, size[1] // 2), frame_seconds / 4

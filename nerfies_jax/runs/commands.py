@@ -1,4 +1,4 @@
-"""Command lines for a shell to paste: what a run was, and how it goes on.
+"""Shell commands that start, continue or render a run.
 
 With a `base`, absolute paths become relative to it, for a page that is read elsewhere.
 """
@@ -18,13 +18,30 @@ def resume(
     effects: tuple[str, ...] = (),
     base: pathlib.Path | None = None,
 ) -> str:
-    """Continue the run in a folder. Its settings are there, its `effects` repeated."""
+    """Return the command that continues a run.
+
+    Args:
+      folder: Folder of the run, which holds its settings.
+      effects: Effects of the user's own, as MODULE:NAME, which must be repeated.
+      base: Folder that paths are relative to, or None.
+
+    Returns:
+      The command line.
+    """
     words = [*_RECONSTRUCT, "--out", str(folder), "--resume", *_trusting(effects)]
     return _line(words, base)
 
 
 def reconstruct(config: RunConfig, base: pathlib.Path | None = None) -> str:
-    """Start a run with everything that `config` says."""
+    """Return the command that starts a run.
+
+    Args:
+      config: Config of the run.
+      base: Folder that paths are relative to, or None.
+
+    Returns:
+      The command line.
+    """
     words = [*_RECONSTRUCT, *config.source.arguments, "--preset", config.preset]
     if config.steps is not None:
         words += ["--steps", str(config.steps)]
@@ -40,7 +57,16 @@ def render(
     effects: tuple[str, ...] = (),
     base: pathlib.Path | None = None,
 ) -> str:
-    """Render the run in a folder from a camera that moves in a circle."""
+    """Return the command that renders a run from a camera that moves in a circle.
+
+    Args:
+      folder: Folder of the run.
+      effects: Effects of the user's own, as MODULE:NAME, which must be repeated.
+      base: Folder that paths are relative to, or None.
+
+    Returns:
+      The command line.
+    """
     words = ["python", "-m", "experiments.render", str(folder), "--path", "orbit"]
     return _line([*words, *_trusting(effects)], base)
 

@@ -1,4 +1,4 @@
-"""What a user asks for: which pictures, which scene, over how many steps; no JAX."""
+"""Settings of a run: its capture, preset and steps. Imports no JAX."""
 
 import dataclasses
 import math
@@ -9,7 +9,14 @@ from nerfies_jax.capture.given import GivenFiles
 
 
 def check_budget(preprocessing: float | None) -> None:
-    """Raise ValueError unless it is None or a positive multiple of a budget."""
+    """Check the budget of preprocessing.
+
+    Args:
+      preprocessing: Multiple of the default budget, or None.
+
+    Raises:
+      ValueError: If it is not positive and finite.
+    """
     if preprocessing is not None and not 0 < preprocessing < math.inf:
         raise ValueError(
             f"preprocessing={preprocessing}: a positive multiple of the default budget"
@@ -18,7 +25,7 @@ def check_budget(preprocessing: float | None) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class CaptureSource:
-    """Which pictures to read: a folder's, or those of a built-in scene."""
+    """Images to read: those of a folder, or of a built-in scene."""
 
     capture: pathlib.Path | str | None = None  # a path, once it is made
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF, COLMAP or LLFF layout."""
@@ -46,7 +53,7 @@ class CaptureSource:
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """The pictures as named on a command line, not quoted."""
+        """Arguments of a command line that name these images, not quoted."""
         words = ["--scene", self.scene]
         if self.capture is not None:
             words = [str(self.capture)]
@@ -63,7 +70,7 @@ class CaptureSource:
 
 @dataclasses.dataclass(frozen=True)
 class RunConfig:
-    """What fixes a run: kept in its `config.json` and enough to open it again."""
+    """Settings that determine a run, kept in its `config.json`."""
 
     # None: what the capture calls for, by its tracks; a saved run names it.
     preset: str | None = None
@@ -76,7 +83,9 @@ class RunConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Preparation:
-    """How a film or pictures without cameras become a capture."""
+    """Settings of the conversion of a video or of images without cameras to a
+    capture.
+    """
 
     frames: int | None = None
     """How many frames of a film to keep, evenly spread over it (default: 100)."""
@@ -119,7 +128,7 @@ class Preparation:
 
 @dataclasses.dataclass(frozen=True)
 class MoreMetrics:
-    """What is measured of held-out frames only where it is asked for."""
+    """Metrics of held-out frames that are computed only on request."""
 
     lpips_weights: tuple[pathlib.Path | str, ...] = ()
     """Measure LPIPS, too: files (.pth, .safetensors, .npz) with the trained classifier

@@ -1,4 +1,4 @@
-"""The PSNR of a run over its training, as a figure with a caption for the report."""
+"""Figure of the PSNR of a run during training, with a caption for the report."""
 
 import math
 import pathlib
@@ -11,9 +11,18 @@ from nerfies_jax.runs.train import Trained
 
 @events.stage("drawing the curve")
 def save(path: pathlib.Path, run: Run, trained: Trained, scored: Scored):
-    """PSNR against seconds; None where the run ended before it was evaluated.
+    """Plot PSNR against seconds of training.
 
-    Where the curve is of fewer frames than the score, that is marked, too.
+    If the curve covers fewer frames than the final metrics, those are marked too.
+
+    Args:
+      path: The image file.
+      run: The run.
+      trained: Its training.
+      scored: Its evaluated frames.
+
+    Returns:
+      The path, or None if the run ended before it was evaluated.
     """
     history = trained.result.history
     if not history.evaluations:
@@ -32,12 +41,21 @@ def save(path: pathlib.Path, run: Run, trained: Trained, scored: Scored):
 
 
 def _is_partial(trained, scored):
-    """Whether the curve is of fewer frames than the score."""
+    """Test if the curve covers fewer frames than the final metrics."""
     return len(trained.watched) < len(scored.rows)
 
 
 def caption(run, trained, scored):
-    """Which frames the curve and the score are of, and where the two end."""
+    """Describe the frames of the curve and of the final metrics, and their values.
+
+    Args:
+      run: The run.
+      trained: Its training.
+      scored: Its evaluated frames.
+
+    Returns:
+      The caption.
+    """
     score = f"{evaluation.known_mean(scored.psnr):.2f} dB"
     count = len(trained.watched)
     which = "all of the held-out frames"

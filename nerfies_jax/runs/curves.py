@@ -1,6 +1,7 @@
-"""The course of a run: losses and scores over time, from its events.
+"""Losses and metrics of a run over time, from its events.
 
-`events.jsonl` has it while the run goes on, and `curve.json` in short once it ended.
+`events.jsonl` has them while the run goes on, and `curve.json` holds a summary once it
+has ended.
 """
 
 import json
@@ -19,7 +20,7 @@ CURVE = "curve.json"
 
 
 class Curve(NamedTuple):
-    """Quality over the time of training; one entry for each evaluation."""
+    """Quality over the time of training, with one entry for each evaluation."""
 
     seconds: tuple[float, ...]  # of training, without compiling
     steps: tuple[int, ...]
@@ -31,10 +32,10 @@ class Curve(NamedTuple):
 
 
 class Course(NamedTuple):
-    """What the events of a run say of its training so far.
+    """Training of a run so far, from its events.
 
     Rows are dictionaries with `step`, `seconds` of training and the metrics, in the
-    order of steps; of steps that a resumed run repeated, the last ones.
+    order of steps. If a resumed run repeated steps, the last ones count.
     """
 
     training: tuple[dict[str, Any], ...] = ()  # mean metrics of chunks, thinned out
@@ -49,11 +50,15 @@ class Course(NamedTuple):
 
     @property
     def ended(self) -> bool:
-        """Whether training ended by itself, neither killed nor interrupted."""
+        """True if training ended by itself and was neither killed nor interrupted."""
         return self.stopped_by in ("steps", "seconds", "non-finite")
 
     def line(self) -> str:
-        """Return how far the run is, as `step 1,200 of 30,000, 21.30 dB`."""
+        """Describe the progress of the run, such as `step 1,200 of 30,000, 21.30 dB`.
+
+        Returns:
+          The text.
+        """
         words = f"step {self.step:,}"
         if self.steps is not None:
             words += f" of {self.steps:,}"
@@ -68,10 +73,10 @@ def course(events: Iterable[Event]) -> Course:
     """Summarize the events of a run.
 
     Args:
-      events: As `event_log.read_events` returns them.
+      events: Events, from `event_log.read_events`.
 
     Returns:
-      The rows of training and of evaluations, and how far the run is.
+      Rows of training and of evaluations, and the progress of the run.
     """
     training: list[dict[str, Any]] = []
     evaluations: list[dict[str, Any]] = []
@@ -88,7 +93,7 @@ def course(events: Iterable[Event]) -> Course:
                 numbers["frames"] = tuple(map(str, event["frames"]))
             elif kind == "run":
                 if event["status"] == "resume":
-                    # What came after the checkpoint is done once more.
+                    # Everything after the checkpoint is repeated.
                     training = _until(training, event["step"])
                     evaluations = _until(evaluations, event["step"])
                 numbers["stopped_by"] = event.get("stopped_by")
@@ -100,7 +105,14 @@ def course(events: Iterable[Event]) -> Course:
 
 
 def course_of(folder: pathlib.Path) -> Course | None:
-    """Return `course` of the events in a run folder; None where there are none."""
+    """Summarize the events in a run folder.
+
+    Args:
+      folder: The run folder.
+
+    Returns:
+      The summary, or None if there are no events.
+    """
     try:
         return course(event_log.read_events(folder))
     except ValueError:
@@ -128,10 +140,10 @@ def write(
     """Write `curve.json`: evaluations, mean metrics of chunks, and the machine.
 
     Args:
-      folder: Where to write it.
-      history: Of the run, which takes the place of events that were lost.
-      frames: Names of the held-out frames that the evaluations are of.
-      told: The course of the run by its events, which is what is written.
+      folder: Folder to write it to.
+      history: History of the run, which replaces events that were lost.
+      frames: Names of the held-out frames of the evaluations.
+      told: Summary of the events of the run, which is written if it is complete.
     """
     told = told or Course()
     evaluations, training = told.evaluations, told.training
@@ -217,10 +229,15 @@ def _number(value):
 
 
 def seconds_to(curve: Curve, psnr: float | int) -> float | None:
-    """Seconds of training after which the curve stays at or above a PSNR in dB.
+    """Find the seconds of training after which the curve stays at or above a PSNR.
 
-    Linear between evaluations; None where it ends below. A curve that falls back under
-    it later has not reached it.
+    Args:
+      curve: The curve.
+      psnr: PSNR in dB.
+
+    Returns:
+      Seconds, linearly interpolated between evaluations, or None if the curve ends
+      below.
     """
     if not curve.psnr or not curve.psnr[-1] >= psnr:
         return None

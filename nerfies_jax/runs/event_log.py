@@ -1,7 +1,7 @@
-"""`events.jsonl` in a run folder: the event stream of a run, written while it runs.
+"""Writer and reader of `events.jsonl`, the event stream in a run folder.
 
-One JSON object a line. A run that is resumed appends to it. Reading it never needs the
-run to have ended. docs/events.md lists the kinds of events and their fields.
+It has one JSON object per line. A run that is resumed appends to it. It can be read
+while the run goes on. docs/events.md lists the kinds of events and their fields.
 """
 
 import contextlib
@@ -49,11 +49,11 @@ class EventLog:
         self._lock = threading.RLock()
 
     def open(self, folder: pathlib.Path) -> None:
-        """Append to the file in a run folder from now on.
+        """Open the file in a run folder for appending.
 
         Args:
-          folder: The run folder, which exists. What a killed process left as the
-            beginning of a last line is removed.
+          folder: The run folder, which exists. An incomplete last line of a killed
+            process is removed.
         """
         self._path = folder / EVENTS
         try:
@@ -102,7 +102,9 @@ class EventLog:
             self._problem = problem
 
     def close(self) -> None:
-        """Write what was left out last, and say whether any event was lost."""
+        """Write the remaining events and close the file, with a warning if any were
+        lost.
+        """
         with self._lock:
             for each in self._thinned.values():
                 self._append(each)
@@ -121,7 +123,7 @@ class EventLog:
 
 
 def _thinned_by(event):
-    """What an event is one of many of; None for those that are all kept."""
+    """Group of events that is thinned out, or None for events that are all kept."""
     if event["kind"] == "train":
         return "train"
     if event["kind"] == "stage" and event["status"] == "progress":
@@ -145,7 +147,14 @@ def _drop_torn_line(descriptor):
 
 
 def json_values(value: Any) -> Any:
-    """Replace floats that are not finite by None: JSON has no word for them."""
+    """Replace floats that are not finite by None, since JSON cannot represent them.
+
+    Args:
+      value: Any nesting of mappings, lists, tuples and values.
+
+    Returns:
+      The same nesting of JSON values.
+    """
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
@@ -165,8 +174,14 @@ class EventReader:
     def new(self) -> list[Event]:
         """Return the events that were written since the last call.
 
-        A line that is not whole yet is left for the next call, and a damaged one is
-        skipped. Raises ValueError where the file is not there or cannot be read.
+        A line that is not complete yet is left for the next call, and a damaged one is
+        skipped.
+
+        Returns:
+          The events.
+
+        Raises:
+          ValueError: If the file does not exist or cannot be read.
         """
         received = []
         try:

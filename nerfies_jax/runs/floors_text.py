@@ -1,4 +1,4 @@
-"""Floors in words: how little a run did, and what to do about it."""
+"""Text about the baselines of a run, with advice if it is below them."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,14 @@ _WORSE_DB = -0.05
 
 
 def lines(numbers: Mapping[str, float]) -> list[str]:
-    """Both floors and what motion is worth, for the end of a run."""
+    """Describe the baselines and the gain from motion, for the end of a run.
+
+    Args:
+      numbers: Metrics by key.
+
+    Returns:
+      Lines of text.
+    """
     parts = []
     if "floor.neighbors" in numbers:
         parts.append(f"{numbers['floor.neighbors']:.2f} dB the mean of two neighbors")
@@ -27,7 +34,14 @@ def lines(numbers: Mapping[str, float]) -> list[str]:
 
 
 def warnings(numbers: Mapping[str, float]) -> list[str]:
-    """One line for each floor that the run is below."""
+    """Warn of each baseline that the run is below.
+
+    Args:
+      numbers: Metrics by key.
+
+    Returns:
+      One line for each.
+    """
     psnr, sentences = numbers["heldout.psnr"], []
     if psnr < numbers.get("floor.neighbors", psnr):
         sentences.append(

@@ -1,4 +1,4 @@
-"""Follow a run: its events go to its folder and to experiment trackers."""
+"""Routing of a run's events to its folder and to experiment trackers."""
 
 import contextlib
 import pathlib
@@ -15,7 +15,7 @@ from nerfies_jax.training.loop import FitResult
 
 
 class Following:
-    """The sinks of a run, which are opened once its folder is there."""
+    """Event sinks of a run, which are opened once its folder exists."""
 
     def __init__(self, held: contextlib.ExitStack, log: EventLog, names: Sequence[str]):
         self._held, self._log, self._names = held, log, names
@@ -24,12 +24,12 @@ class Following:
         """Write events to the folder and to the trackers from now on.
 
         Args:
-          folder: Of the run.
-          run: Which is about to be trained.
-          after: The step that it is resumed after; None for a new run.
+          folder: Folder of the run.
+          run: The run, which is about to be trained.
+          after: Step after which it is resumed. None for a new run.
 
         Raises:
-          ValueError: A tracker cannot be opened.
+          ValueError: If a tracker cannot be opened.
         """
         identity = None if after is None else _identity(folder)
         identity = identity or uuid.uuid4().hex[:12]
@@ -52,7 +52,12 @@ class Following:
         )
 
     def end(self, result: FitResult, errors: Sequence[str]) -> None:
-        """Record how the run ended, with all that came of it written."""
+        """Record the end of the run, once all products are written.
+
+        Args:
+          result: Result of the training.
+          errors: One line for each product that could not be written.
+        """
         events.emit(
             "run",
             status="end",
@@ -65,7 +70,7 @@ class Following:
 
 
 def _identity(folder):
-    """Under which trackers know the run; None where no event says so."""
+    """Identity by which trackers know the run, or None if no event has one."""
     with contextlib.suppress(ValueError):
         for event in read_events(folder):
             if event["kind"] == "run" and isinstance(event.get("identity"), str):
@@ -75,16 +80,16 @@ def _identity(folder):
 
 @contextlib.contextmanager
 def following(names: Sequence[str] = ()) -> Iterator[Following]:
-    """Gather the events of a run, from before it has a folder.
+    """Collect the events of a run, even before it has a folder.
 
     Args:
-      names: Of trackers, keys of `trackers.TRACKERS`.
+      names: Names of trackers, keys of `trackers.TRACKERS`.
 
     Yields:
-      What `begin` and `end` are called of.
+      An object whose `begin` and `end` are to be called.
 
     Raises:
-      ValueError: A tracker is not known or not installed.
+      ValueError: If a tracker is unknown or not installed.
     """
     trackers.check(names)
     log = EventLog()

@@ -1,4 +1,4 @@
-"""What moves by itself in pictures whose cameras were found, or not yet."""
+"""Masks of moving objects in images whose cameras may not be known yet."""
 
 import dataclasses
 
@@ -11,10 +11,13 @@ LEAST_SHARE = 0.005  # of the pixels: cameras hardly notice less
 
 
 def masks_of(pictures: Capture) -> np.ndarray | None:
-    """[frames, height, width] bool, True where something moves; None where nothing.
+    """Segment moving objects from tracks that the static points do not explain.
 
-    Frames are those of the capture, whose cameras may be off: tracks that its points
-    at rest do not explain are taken to move.
+    Args:
+      pictures: The images as a capture, whose cameras may be wrong.
+
+    Returns:
+      Booleans [frames, height, width], or None if nothing moves.
     """
     rows = np.arange(len(pictures.ids))
     every = dataclasses.replace(pictures, train=rows, heldout=rows[:0])

@@ -1,4 +1,4 @@
-"""Effects of the user's own, named as MODULE:NAME. Loading them runs their code."""
+"""User-defined effects, named as MODULE:NAME. Loading them runs their code."""
 
 import importlib
 from typing import Any
@@ -7,18 +7,18 @@ from nerfies_jax.training.effects import Effect
 
 
 def load(names: tuple[str, ...], metadata: Any) -> tuple[Effect, ...]:
-    """Import the effects of these names.
+    """Import user-defined effects.
 
     Args:
-      names: Each MODULE:NAME. NAME is an `Effect` of MODULE, or a function that returns
-        one from the scene's metadata. MODULE is looked for where Python looks.
-      metadata: What the scene knows of its capture, `SceneMetadata` of either package.
+      names: Names MODULE:NAME. NAME is an `Effect` of MODULE, or a function that
+        returns one from the scene's metadata. MODULE is found as by `import`.
+      metadata: Scene metadata, `SceneMetadata` of either package.
 
     Returns:
       The effects, in the order of their names.
 
     Raises:
-      ValueError: There is none of a name.
+      ValueError: If a name cannot be found.
     """
     return tuple(_load(name, metadata) for name in names)
 

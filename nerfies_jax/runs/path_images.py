@@ -21,18 +21,18 @@ def render(
 ) -> Iterator[int]:
     """Render views into a new folder, yielding after each image.
 
-    The folder takes its name when everything is in it. If the iteration is given up,
+    The folder takes its name when everything is in it. If the iteration is abandoned,
     nothing is left. Without the extra `video` there is no video.
 
     Args:
       out: The folder.
-      renderer: Of the model, at the size of the images.
+      renderer: Renderer of the model, at the size of the images.
       state: The trained state.
       views: One for each image.
       rate: Frames per second of the video.
 
     Yields:
-      The number of images that are written.
+      The number of images written.
     """
     with replaced_folder(out) as folder:
         places = [folder / f"{number:04d}.png" for number in range(len(views))]

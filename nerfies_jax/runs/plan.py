@@ -1,4 +1,4 @@
-"""How many steps fit into the seconds that a run is given."""
+"""Number of training steps that fit into a time budget."""
 
 import math
 
@@ -14,12 +14,21 @@ OVERRUN = 1.5
 
 @events.stage("measuring the time of a step")
 def with_seconds(run: Run, state: TrainState, seconds: float | int) -> tuple[Run, str]:
-    """The run over as many steps as take `seconds` of training, and the plan in words.
+    """Plan a run for a number of seconds of training.
 
-    Its schedules stretch with the steps; its first state does not know of them and
-    stays `state`, with which is measured what a step takes (`rate.step_time`). What is
-    expected of growth is the representation's word. Two digits of the steps are kept:
-    the program of another run as long is then found in the compilation cache.
+    Its schedules are stretched to the number of steps. The step time is measured with
+    the first state (`rate.step_time`), which does not depend on the number of steps,
+    and the representation estimates how it grows. The number of steps is rounded to two
+    digits, so that another run of the same length finds its program in the compilation
+    cache.
+
+    Args:
+      run: The run.
+      state: Its first state.
+      seconds: Seconds of training.
+
+    Returns:
+      The run with its number of steps, and a line of text about the plan.
     """
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     step = rate.step_time(run.model, state, frames, run.spec.steps)
@@ -35,7 +44,14 @@ def with_seconds(run: Run, state: TrainState, seconds: float | int) -> tuple[Run
 
 
 def rounded(steps: float | int) -> int:
-    """Steps to two digits, never more than were given but for the first."""
+    """Round a number of steps down to two digits.
+
+    Args:
+      steps: Number of steps.
+
+    Returns:
+      The rounded number, at least 1.
+    """
     whole = max(int(steps), 1)
     unit = 10 ** max(math.floor(math.log10(whole)) - 1, 0)
     return whole // unit * unit

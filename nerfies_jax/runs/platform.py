@@ -1,7 +1,7 @@
-"""Where a process computes, and what it keeps between runs.
+"""Device, number of cores and caches of a process.
 
-JAX is imported only when it is started: which platform, and how many cores XLA:CPU
-sees, is decided before its first array.
+JAX is imported only when it is started, because the platform and the number of cores
+that XLA:CPU sees must be set before the first array.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.compiler import UNDIVIDED
 
 Device = Literal["auto", "cpu", "gpu", "tpu"]
-# Whether XLA:CPU sees one core or all of them; each representation says which suits it.
+# Number of cores that XLA:CPU sees, which each representation chooses.
 Threads = Literal["one", "all"]
 _AFFINITY = hasattr(psutil.Process, "cpu_affinity")  # not on macOS
 VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # XLA:CPU's own is 256 bits
@@ -25,14 +25,21 @@ VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # XLA:CPU's own is 256 bits
 def start_jax(
     device: Device = "auto", threads: Threads = "one", shares: int = 1
 ) -> None:
-    """Choose the platform, how many cores XLA:CPU sees, and the compilation cache.
+    """Choose the platform, the number of cores that XLA:CPU sees, and the cache.
 
-    Steps that fall into equal `shares` get as many CPU devices, where there are so many
-    cores (`data_parallel`). Call it before the first array is made; it is too late
-    afterwards. `PJRT_NPROC` and `JAX_NUM_CPU_DEVICES` in the environment have the last
-    word, as has `XLA_FLAGS` on the width of vectors, 512 bits where the processor has
-    them, and on the passes that are left out: where each device sees one core, that
-    which divides loops. Raises ValueError where the device is not there.
+    Call it before the first array is made. `PJRT_NPROC` and `JAX_NUM_CPU_DEVICES` in
+    the environment take precedence. So does `XLA_FLAGS` for the width of vectors, 512
+    bits if the processor supports them, and for disabled passes: if each device sees
+    one core, the pass that divides loops is disabled.
+
+    Args:
+      device: Platform, or "auto" for JAX's own choice.
+      threads: "one" or "all" cores for XLA:CPU.
+      shares: Number of equal parts of a step, which get a CPU device each if there are
+        enough cores (`data_parallel`).
+
+    Raises:
+      ValueError: If the device is not available.
     """
     if threads == "one" and os.environ.setdefault("PJRT_NPROC", "1") == "1":
         # XLA sees a thread for each device, and would divide the loops of each among
@@ -68,7 +75,11 @@ def start_jax(
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Return the number of cores that this process may use.
+
+    Returns:
+      The number of cores.
+    """
     return len(psutil.Process().cpu_affinity()) if _AFFINITY else os.cpu_count() or 1
 
 
@@ -79,7 +90,7 @@ def _set_flag(name, value):
 
 
 def _processor_flags():
-    """What the processor can do, as Linux says it; empty elsewhere."""
+    """Features of the processor as Linux reports them. Empty elsewhere."""
     with contextlib.suppress(OSError), open("/proc/cpuinfo") as file:
         for line in file:
             if line.startswith("flags"):

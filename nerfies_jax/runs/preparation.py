@@ -1,10 +1,11 @@
-"""A film, or pictures without cameras, becomes a capture that is kept.
+"""Conversion of a video, or of images without cameras, to a capture that is kept.
 
-Cameras are found in two passes: the second without what moves, which the first tells,
-and from finer features. Two real clips with known cameras, the second pass alone and
-after the first: 87 frames of 184x240, points at rest 0.31 and 0.26 px off, positions
-0.86 and 0.67 % of the extent after the best similarity (medians); 86 of 512x384, 0.42
-and 0.35 px, 0.34 and 0.34 %. Some 30 to 60 s each on two busy cores.
+Cameras are estimated in two passes, the second of which masks what moves, as found by
+the first, and uses finer features. On two real clips with known cameras, the second
+pass alone and after the first gave: for 87 frames of 184x240, reprojection errors of
+static points of 0.31 and 0.26 px and position errors of 0.86 and 0.67 % of the extent
+after the best similarity (medians), and for 86 frames of 512x384, 0.42 and 0.35 px,
+0.34 and 0.34 %. They took some 30 to 60 s each on two busy cores.
 """
 
 import contextlib
@@ -49,7 +50,7 @@ Tell = Callable[[str], None]
 
 
 class Solved(NamedTuple):
-    """Cameras, and the masks that they were found with."""
+    """Cameras, and the masks that they were estimated with."""
 
     poses: Poses
     masked: bool
@@ -62,11 +63,23 @@ def prepare(
     how: Preparation = Preparation(),
     tell: Tell = lambda line: None,
 ) -> Capture:
-    """Write a film or a folder of pictures as a Nerfies directory with cameras.
+    """Convert a video or a folder of images to a Nerfies directory with cameras.
 
-    All or nothing; `colmap` in it is COLMAP's model, `masks_found` what was taken to
-    move, white, and `prepared.json` what was done. Raises ValueError where the cameras
-    cannot be found, with what to change.
+    The directory is written completely or not at all. Its `colmap` is the COLMAP model,
+    `masks_found` the masks of what was found to move, in white, and `prepared.json` a
+    record of the conversion.
+
+    Args:
+      source: The video or folder.
+      out: The directory to write.
+      how: Settings.
+      tell: Called with lines of text about the progress.
+
+    Returns:
+      The capture.
+
+    Raises:
+      ValueError: If the cameras cannot be estimated, with the remedy.
     """
     source, out = pathlib.Path(source), pathlib.Path(out)
     if not source.exists():
@@ -202,7 +215,8 @@ def _solve_without_movers(scratch, spec, error, tell):
 
 
 def _write_masks(scratch, moving):
-    """Of each picture, for people white on what moves, for COLMAP black with a rim.
+    """Write masks, white on moving pixels for users, and black with a margin for
+    COLMAP.
 
     Returns the folder of the latter.
     """
@@ -223,7 +237,7 @@ def _record(source, how, solved):
 
 
 def _made_of(source, how):
-    """What tells a capture from one that would come out otherwise."""
+    """Identity of a capture: its source, its contents, masks and settings."""
     _check_masks(how)
     masks = None if how.masks is None else _checksum(pathlib.Path(how.masks))
     # Threads change how long it takes.
@@ -237,9 +251,9 @@ def _made_of(source, how):
 
 
 def _checksum(path):
-    """Of the names and contents of what is read: a film, or the pictures of a folder.
+    """Checksum of the names and contents of a video or of the images of a folder.
 
-    What a file manager leaves there (.DS_Store, Thumbs.db) makes no other folder.
+    Files that file managers leave there (.DS_Store, Thumbs.db) do not count.
     """
     files = [path] if path.is_file() else sorted(footage.pictures_in(path))
     checksum = hashlib.blake2b(digest_size=12)
@@ -251,7 +265,14 @@ def _checksum(path):
 
 
 def needed(path: AnyPath) -> bool:
-    """Whether a path names a film or pictures without cameras, and no capture."""
+    """Test if a path names a video or images without cameras, and no capture.
+
+    Args:
+      path: File or folder.
+
+    Returns:
+      True if it must be converted with `prepare`.
+    """
     path = pathlib.Path(path)
     if footage.kind_of(path) is None:
         return False
@@ -264,10 +285,19 @@ def prepared(
     how: Preparation = Preparation(),
     tell: Tell = console.say,
 ) -> pathlib.Path:
-    """The folder `out` with the capture made of `source`, now or before.
+    """Return the folder of a capture made from a source, and make it if needed.
 
-    One that is there is taken as it is where it was made of the same files in the same
-    way; ValueError where it was not.
+    Args:
+      source: The video or folder of images.
+      out: The folder of the capture.
+      how: Settings.
+      tell: Called with lines of text about the progress.
+
+    Returns:
+      `out`.
+
+    Raises:
+      ValueError: If `out` was made from other files or with other settings.
     """
     source, out = pathlib.Path(source), pathlib.Path(out)
     if not (out / RECORD).is_file():

@@ -1,4 +1,6 @@
-"""What an effect adds to a step, read from a kept run of `experiments.effect_cost`."""
+"""Cost of an effect per training step, from a stored run of
+`experiments.effect_cost`.
+"""
 
 import functools
 import importlib.resources
@@ -17,14 +19,22 @@ Price = dict[str, float]  # by representation; NaN where an effect costs no step
 
 @functools.cache
 def baseline() -> Mapping[str, Metric]:
-    """The committed numbers, by key."""
+    """Read the stored measurements.
+
+    Returns:
+      Metrics by key.
+    """
     path = importlib.resources.files("nerfies_jax.runs") / EFFECT_COST
     with importlib.resources.as_file(path) as file:
         return clock.read_metrics(file)
 
 
 def legend() -> str:
-    """What the column of costs means."""
+    """Explain the column of costs.
+
+    Returns:
+      The text.
+    """
     names = " / ".join(representations.installed())
     return (
         "cost per step: a training step with the effect over one without any, of "
@@ -33,7 +43,15 @@ def legend() -> str:
 
 
 def price(effect: str, measured: Mapping[str, Metric]) -> Price:
-    """A step with the effect, over a bare one, by representation."""
+    """Return the cost of an effect as a factor of a step without effects.
+
+    Args:
+      effect: Name of the effect.
+      measured: Metrics by key.
+
+    Returns:
+      Factors by representation, NaN if the effect adds nothing to a step.
+    """
     return {
         name: _factor(each.prices.get(effect), measured)
         for name, each in representations.installed().items()
@@ -41,7 +59,14 @@ def price(effect: str, measured: Mapping[str, Metric]) -> Price:
 
 
 def format_prices(findings: tuple[Finding, ...]) -> dict[str, str]:
-    """By effect, what it costs a step, for a table."""
+    """Format the costs of effects for a table.
+
+    Args:
+      findings: Findings, one for each effect.
+
+    Returns:
+      Texts by effect.
+    """
     return {
         one.effect: " / ".join(
             f"x{factor:.2f}" if math.isfinite(factor) else "-"
@@ -52,7 +77,14 @@ def format_prices(findings: tuple[Finding, ...]) -> dict[str, str]:
 
 
 def as_json(findings: tuple[Finding, ...]) -> dict[str, dict[str, float | None]]:
-    """By effect, its factors; None where it costs nothing in a step."""
+    """Return the costs of effects as JSON values.
+
+    Args:
+      findings: Findings, one for each effect.
+
+    Returns:
+      Factors by effect and representation, None if it adds nothing to a step.
+    """
     prices = {one.effect: price(one.effect, baseline()) for one in findings}
     return {
         effect: {k: x if math.isfinite(x) else None for k, x in one.items()}

@@ -1,4 +1,4 @@
-"""What a finished run leaves behind: scores, pictures, a film, depth, a report."""
+"""Products of a finished run: metrics, images, a video, depth and a report."""
 
 import contextlib
 import dataclasses
@@ -59,11 +59,19 @@ def make(
     began: float,
     extra: quality.Extra = quality.NOTHING,
 ) -> None:
-    """Write everything into the run folder and say where it is.
+    """Write all products into the run folder and print where they are.
 
-    Raises FloatingPointError, and writes nothing, where the state draws pictures that
-    are not finite: its parameters may be finite and yet beyond use. Raises OSError
-    where products could not be written, after it has written all others.
+    Args:
+      folder: The run folder.
+      run: The run.
+      trained: Its training.
+      began: `time.perf_counter()` at the beginning of the run.
+      extra: Additional metrics.
+
+    Raises:
+      FloatingPointError: If rendered images are not finite, in which case nothing is
+        written. Parameters may be finite and yet unusable.
+      OSError: If products could not be written, after all others have been.
     """
     state, renderer = trained.result.state, trained.renderer
     run = with_found_cameras(run, state)
@@ -154,7 +162,16 @@ def _staged(folder):
 
 
 def with_extra(save: Callable[..., Any], path: pathlib.Path, *arguments):
-    """What `save` writes; None, and a line, where that needs an extra."""
+    """Save a product that may need an extra.
+
+    Args:
+      save: Function that saves the product.
+      path: Its first argument.
+      *arguments: Further arguments.
+
+    Returns:
+      Its result, or None, after a line of text, if the extra is not installed.
+    """
     try:
         return save(path, *arguments)
     except MissingExtra as error:
@@ -163,20 +180,33 @@ def with_extra(save: Callable[..., Any], path: pathlib.Path, *arguments):
 
 
 def save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
-    """Values by key; null for what is not finite."""
+    """Write metrics as JSON values by key, null for values that are not finite.
+
+    Args:
+      path: The file.
+      metrics: The metrics.
+    """
     write_json(
         path, {m.key: m.value if math.isfinite(m.value) else None for m in metrics}
     )
 
 
 def _capture_notes(run, folder):
-    """Of what was learned from, how it was preprocessed, and of what scores are of."""
+    """Notes on the training images, their preprocessing, and the evaluated images."""
     unpreprocessed = json.loads((folder / CONFIG).read_text()).get(LEFT_OUT, [])
     return dict.fromkeys([*run.capture.notes, *unpreprocessed, *run.filmed.notes])
 
 
 def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Rows of held-out frames, and a note where there is no time for all of them."""
+    """Select the held-out frames to evaluate.
+
+    Args:
+      run: The run.
+      trained: Its training.
+
+    Returns:
+      Rows of the frames, and a note if time does not allow all of them.
+    """
     heldout = run.capture.heldout
     seconds = trained.renderer.ms_per_frame(1) / 1e3
     count = budget.scored(seconds, len(heldout))
@@ -192,7 +222,18 @@ def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, 
 def measured(
     run: Run, trained: Trained, scored: Scored, ms_per_frame: float, began: float
 ) -> list[Metric]:
-    """What a run took."""
+    """Collect the metrics of time, memory and size of a run.
+
+    Args:
+      run: The run.
+      trained: Its training.
+      scored: Its evaluated frames.
+      ms_per_frame: Milliseconds to render a frame.
+      began: `time.perf_counter()` at the beginning of the run.
+
+    Returns:
+      The metrics.
+    """
     result = trained.result
     counts = run.model.counts(result.state)
     seconds, fps = time.perf_counter() - began, 1e3 / ms_per_frame
@@ -211,7 +252,7 @@ def measured(
 
 
 def _device_memory():
-    """Where the backend keeps account; that of a CPU does not."""
+    """Peak of device memory, if the backend reports it. That of a CPU does not."""
     peak = clock.device_peak_bytes()
     if peak is None:
         return []
@@ -219,7 +260,14 @@ def _device_memory():
 
 
 def model_size(saved: Saved) -> list[Metric]:
-    """The size of the file that holds all of a scene, where there is one."""
+    """Return the size of the file that holds the whole scene, if there is one.
+
+    Args:
+      saved: Exported files.
+
+    Returns:
+      One metric or none.
+    """
     size = saved.model_bytes
     return [] if size is None else [metric("file.bytes", size, 1e5)]
 
@@ -228,7 +276,17 @@ def model_size(saved: Saved) -> list[Metric]:
 def score_halves(
     run: Run, state: TrainState, scored: Scored, frame_seconds: float
 ) -> tuple[list[Metric], tuple[str, ...]]:
-    """Metrics and a note where frames have codes of their own, else neither."""
+    """Evaluate the right halves of frames after fitting codes to their left halves.
+
+    Args:
+      run: The run.
+      state: Trained state.
+      scored: Evaluated frames.
+      frame_seconds: Seconds to render a frame.
+
+    Returns:
+      Metrics and notes, both empty if frames have no codes of their own.
+    """
     width, height = run.capture.size
     if width // 2 < len(losses.WINDOW):
         return [], ()  # too narrow for the window of the SSIM
@@ -264,7 +322,16 @@ def score_halves(
 
 @events.stage("drawing the comparison")
 def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
-    """Truth, render, error and depth of a few held-out frames."""
+    """Save an image of ground truth, render, error and depth of a few held-out frames.
+
+    Args:
+      path: The file.
+      capture: The capture.
+      scored: Evaluated frames.
+
+    Returns:
+      The path.
+    """
     shown = evaluation.spread(np.arange(len(scored.rows)), SHOWN)
     captions = [
         f"frame {capture.ids[scored.rows[i]]}   {scored.psnr[i]:.2f} dB   "
@@ -293,7 +360,18 @@ def save_film(
     state: TrainState,
     frame_seconds: float,
 ) -> report.Video:
-    """Render the scene over time from a moving camera, as long as time allows."""
+    """Render a video of the scene over time from a moving camera, within a time budget.
+
+    Args:
+      path: The file.
+      run: The run.
+      renderer: Renderer at the size of the capture.
+      state: Trained state.
+      frame_seconds: Seconds to render a frame.
+
+    Returns:
+      The video for the report.
+    """
     size = run.capture.size
     film = budget.film(frame_seconds, size)
     if film.size != size:
@@ -321,7 +399,16 @@ def save_film(
 def save_player(
     folder: pathlib.Path, run: Run, trained: Trained
 ) -> tuple[list[report.Figure], list[str]]:
-    """A page that plays the scene, linked by its first picture; else a note why not."""
+    """Write an interactive page that plays the scene.
+
+    Args:
+      folder: The run folder.
+      run: The run.
+      trained: Its training.
+
+    Returns:
+      A figure that links to the page, or none and a note with the reason.
+    """
     write = run.representation.player
     if write is None:
         return [], [
@@ -356,7 +443,13 @@ def save_player(
 
 @events.stage("writing depth")
 def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
-    """Z-depth (scene units) and alpha of every held-out frame as EXR."""
+    """Write z-depth (scene units) and opacity of every evaluated frame as EXR.
+
+    Args:
+      folder: Folder to write to.
+      capture: The capture.
+      scored: Evaluated frames.
+    """
     folder.mkdir(exist_ok=True)
     for row, depth, alpha in zip(scored.rows, scored.depth, scored.alpha, strict=True):
         name = capture.ids[row].replace("/", "_")
@@ -364,7 +457,7 @@ def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
 
 
 def _next(folder, run, trained, base=None):
-    """What a user may want to run next; absolute paths become relative to a `base`."""
+    """Suggested next commands, with absolute paths relative to a `base`."""
     own = run.config.effects
     line = commands.render(folder, own, base)
     looked = report.Command("Render it from other cameras, at other times:", line)

@@ -1,4 +1,4 @@
-"""How good the held-out frames of a finished run are."""
+"""Quality of the held-out frames of a finished run."""
 
 from typing import NamedTuple
 
@@ -30,7 +30,7 @@ NETWORKS = {"alex": perceptual.ALEX, "vgg": perceptual.VGG}
 
 
 class Extra(NamedTuple):
-    """What is measured only where it was asked for."""
+    """Additional metrics that were requested."""
 
     lpips: Lpips | None
     camera_fits: int  # frames that are scored with cameras fitted to them
@@ -40,9 +40,16 @@ NOTHING = Extra(None, 0)
 
 
 def prepared(more: MoreMetrics) -> Extra:
-    """The weights read, before cameras are looked for or anything is trained.
+    """Read the weights of additional metrics, before anything is trained.
 
-    Raises ValueError where they cannot be used.
+    Args:
+      more: Requested metrics.
+
+    Returns:
+      The metrics with their weights.
+
+    Raises:
+      ValueError: If a file cannot be used.
     """
     lpips = None
     if more.lpips_weights:
@@ -52,7 +59,15 @@ def prepared(more: MoreMetrics) -> Extra:
 
 
 def check(extra: Extra, size: tuple[int, int]) -> None:
-    """Raise ValueError where pictures of (width, height) cannot be measured so."""
+    """Check that images are large enough for the additional metrics.
+
+    Args:
+      extra: Additional metrics.
+      size: Width and height of the images in pixels.
+
+    Raises:
+      ValueError: If they are too small.
+    """
     if extra.lpips is not None:
         heldout.check_large_enough(extra.lpips.network, size)
 
@@ -66,10 +81,21 @@ def measure(
     extra: Extra = NOTHING,
     frame_seconds: float = 0.0,
 ) -> tuple[dict[str, float], list[str]]:
-    """Numbers by the keys of `heldout.TOLERANCES`, and notes for the reader.
+    """Measure the quality of a run.
 
-    Points and flow are held against the truth of a built-in scene. What one frame
-    takes to render says how many are drawn for the floors.
+    Points and flow are compared with the ground truth of a built-in scene.
+
+    Args:
+      run: The run.
+      state: Trained state.
+      draw: Renderer of the frames as they were captured.
+      scored: Evaluated frames.
+      extra: Additional metrics.
+      frame_seconds: Seconds to render a frame, which limits the renders for the
+        baselines.
+
+    Returns:
+      Values by the keys of `heldout.TOLERANCES`, and notes.
     """
     known = followed = flow = fitted = None
     capture, note = moving_masks.with_masks(run.filmed, CACHE / "evidence")
@@ -128,11 +154,15 @@ def _floors(run, state, draw, rows, frame_seconds):
 
 
 def check_learned(history: History, scored: Scored) -> None:
-    """Refuse a report of a run that learned from nothing or cannot be scored.
+    """Refuse a report of a run that learned nothing or cannot be evaluated.
+
+    Args:
+      history: History of the run.
+      scored: Evaluated frames.
 
     Raises:
-        FloatingPointError: The loss was 0 in all steps, or no frame that was scored has
-            a PSNR.
+      FloatingPointError: If the loss was 0 in all steps, or no evaluated frame has a
+        PSNR.
     """
     losses = [row["loss"] for row in history.rows if "loss" in row]
     if losses and not any(losses):

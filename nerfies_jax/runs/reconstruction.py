@@ -1,4 +1,6 @@
-"""The main job as a call: a filmed scene in, a run folder out, and on from a cut."""
+"""Reconstruction in one call: from a capture to a run folder, or on from a
+checkpoint.
+"""
 
 import contextlib
 import dataclasses
@@ -46,11 +48,11 @@ Watched = Callable[[Run, pathlib.Path], contextlib.AbstractContextManager[Hook]]
 
 
 class Refused(ValueError):
-    """What was asked for cannot be done; nothing was trained."""
+    """The request cannot be fulfilled, and nothing was trained."""
 
 
 class Outcome(NamedTuple):
-    """Where a run ended and what it left behind."""
+    """Result of a run with its folder, and errors."""
 
     folder: pathlib.Path
     run: Run
@@ -71,19 +73,30 @@ def reconstruct(
     watched: Watched | None = None,
     log: Sequence[str] = (),
 ) -> Outcome:
-    """Train a run from its first step, and score, draw and film what came of it.
+    """Train a run from its first step and write its products.
 
-    Where its source is a film, or pictures without cameras, these are made a capture
-    first as `prepare` says: a folder beside `out` that is kept, `OUT-capture`.
-    Everything goes into the new folder `out`, by default `runs/CAPTURE-PRESET`, and
-    from its first moment on `resume` continues the run that is in there. `effects`
-    "auto" looks at the capture first and takes those that it calls for. `seconds` of
-    training say how many steps there are or, where the steps are given, end it early;
-    an evaluation follows after `evaluate_every` seconds of it, a checkpoint after
-    `checkpoint_every` seconds. `more` is measured at the end, and `watched`
-    looks on until then (`viewer.live`). Its events are in `events.jsonl` from its
-    beginning on (`runs.read_events`), and go to the trackers that `log` names as well:
-    "tensorboard", "wandb", "rerun". Raises Refused where it cannot begin.
+    A video or images without cameras are converted first into a folder `OUT-capture`,
+    which is kept. From the first moment on, `resume` can continue the run in `out`. Its
+    events are in `events.jsonl` from the beginning on (`runs.read_events`).
+
+    Args:
+      config: Settings of the run.
+      out: A new folder for everything. None for `runs/CAPTURE-PRESET`.
+      effects: "preset", or "auto" to enable the effects that the capture needs.
+      seconds: Seconds of training, which determine the number of steps or, if that is
+        set, end training early.
+      evaluate_every: Seconds of training between two evaluations.
+      checkpoint_every: Seconds of training between two checkpoints.
+      more: Additional metrics, computed at the end.
+      prepare: Settings of the conversion to a capture.
+      watched: Context that watches the training, such as `viewer.live`.
+      log: Trackers that receive the events: "tensorboard", "wandb", "rerun".
+
+    Returns:
+      The result.
+
+    Raises:
+      Refused: If training cannot begin.
     """
     began = time.perf_counter()
     with contextlib.ExitStack() as held:
@@ -132,16 +145,31 @@ def resume(
     watched: Watched | None = None,
     log: Sequence[str] = (),
 ) -> Outcome:
-    """Continue the run in a folder from its last checkpoint, to the same bits.
+    """Continue a run from its last checkpoint, bit for bit.
 
-    One that is complete gets its products again. `expected` and `overrides` say what
-    the run must have been started with: fields of its config and of its source by name,
-    and fields of its spec; a capture that was moved since is named where it lies now.
-    `effects` are those from outside of this package, as MODULE:NAME, that may be loaded
-    if the run was begun with them: the folder's word alone runs no code. `log` is as in
-    `reconstruct`.
-    Raises Refused where they differ, where pictures or cameras are others than when the
-    run was begun, and where another process is at work in the folder.
+    A complete run gets its products written again.
+
+    Args:
+      folder: The run folder.
+      expected: Settings that the run must have been started with: fields of its config
+        and of its source by name. A capture that was moved since is named at its new
+        place.
+      overrides: Fields of its spec that it must have been started with, as PATH=VALUE.
+      effects: User-defined effects, as MODULE:NAME, that may be loaded if the run was
+        started with them. The folder alone cannot cause code to run.
+      seconds: Seconds of training of this call.
+      evaluate_every: Seconds of training between two evaluations.
+      checkpoint_every: Seconds of training between two checkpoints.
+      more: Additional metrics, computed at the end.
+      watched: Context that watches the training, such as `viewer.live`.
+      log: Trackers that receive the events: "tensorboard", "wandb", "rerun".
+
+    Returns:
+      The result.
+
+    Raises:
+      Refused: If settings, images or cameras differ from those at the start of the run,
+        or another process is working in the folder.
     """
     began = time.perf_counter()
     folder = pathlib.Path(folder)
@@ -167,7 +195,7 @@ def resume(
 
 @contextlib.contextmanager
 def _refusing() -> Iterator[None]:
-    """What readers of settings, captures and folders raise, as Refused."""
+    """Raise errors of readers of settings, captures and folders as Refused."""
     try:
         yield
     except (ValueError, OSError) as error:
@@ -213,7 +241,7 @@ def _with_cameras(config, out, how):
 
 
 def _steps_given(config):
-    """Whether the length of a run is the user's own word."""
+    """Test if the user has set the number of steps."""
     given = any(words.startswith("steps=") for words in config.overrides)
     return given or config.steps is not None
 
@@ -265,7 +293,7 @@ def _check_expected(folder, expected):
 
 
 def _has_moved(old, new):
-    """Whether what is not in its old place any more may be what is named now."""
+    """Test if a missing file or folder may be the one that is named now."""
     if isinstance(old, GivenFiles):
         pairs = [(x, getattr(new, name)) for name, x in vars(old).items()]
         unlike = [(x, y) for x, y in pairs if x != y]

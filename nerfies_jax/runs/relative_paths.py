@@ -1,4 +1,4 @@
-"""Paths as a report shows them: none that begins at the root of the machine."""
+"""Paths as shown in a report, none of which begins at the root of the machine."""
 
 import os
 import pathlib
@@ -9,7 +9,7 @@ _ABSOLUTE = re.compile(r"""(?<![^\s"'(=,])(?:[A-Za-z]:)?[/\\](?:[^\s"'(),:;]+)""
 
 
 def base_of(folder: str | os.PathLike) -> pathlib.Path:
-    """Choose what paths are relative to: the current folder if `folder` is in it.
+    """Choose the base of relative paths: the current folder if `folder` is in it.
 
     Args:
       folder: The folder of a run.

@@ -1,7 +1,7 @@
-"""The report of a run: one HTML page for a person; programs read `metrics.json`.
+"""Report of a run as one HTML page. Programs read `metrics.json` instead.
 
-The page is one file that fetches nothing and runs no script: images and short videos
-are inside it. It shows no path of the machine that it was made on.
+The page is one file that loads nothing and runs no script: images and short videos are
+embedded. It shows no path of the machine that it was made on.
 """
 
 import base64
@@ -145,7 +145,15 @@ def write(
 
 
 def readable(value: float | int, unit: str) -> str:
-    """A value with its unit, as a person would write it."""
+    """Format a value with its unit.
+
+    Args:
+      value: The value.
+      unit: Name of the unit.
+
+    Returns:
+      The text.
+    """
     if not math.isfinite(value):
         return "not a number"
     if unit in ("bytes", "B"):
@@ -164,7 +172,7 @@ def _rounded(value):
 
 
 def _entry(metric):
-    """How the table names a metric; one that it does not have goes by its key."""
+    """Entry of a metric in the table, or one made from its key if it has none."""
     unknown = Entry(metric.key, _OTHER, metric.unit, metric.direction, "")
     return METRICS.get(metric.key, unknown)
 
@@ -289,7 +297,7 @@ def _settings(config, base):
 
 
 def _flat(config, base, prefix=""):
-    """Dotted names and values; an empty group is shown as such."""
+    """Dotted names and values. An empty group is shown as such."""
     for name, value in config.items():
         if isinstance(value, Mapping) and value:
             yield from _flat(value, base, f"{prefix}{name}.")

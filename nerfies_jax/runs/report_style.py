@@ -1,4 +1,4 @@
-"""The style sheet of a run's report: light, dark and printed, desktop and phone."""
+"""Style sheet of a report: light, dark and printed, desktop and phone."""
 
 STYLE = """\
 :root {

@@ -1,4 +1,4 @@
-"""The representations that are installed, found by entry point."""
+"""Installed representations, found by their entry points."""
 
 import functools
 import importlib.metadata
@@ -37,7 +37,14 @@ PRESETS = (
 
 @functools.cache
 def installed() -> dict[str, "Representation"]:
-    """All representations by name, in the order of their names."""
+    """Load all installed representations.
+
+    Returns:
+      Representations by name, in the order of their names.
+
+    Raises:
+      ValueError: If there are none.
+    """
     points = importlib.metadata.entry_points(group=GROUP)
     # A checkout that is installed and also stands on the path is found twice.
     by_name = {point.name: point for point in points}
@@ -50,7 +57,17 @@ def installed() -> dict[str, "Representation"]:
 
 
 def named(name: str) -> "Representation":
-    """The representation of that name; ValueError where there is none."""
+    """Return a representation by its name.
+
+    Args:
+      name: The name.
+
+    Returns:
+      The representation.
+
+    Raises:
+      ValueError: If there is none of that name.
+    """
     if name not in installed():
         known = known_names(name, installed())
         raise ValueError(f"no representation {name!r}; {known}")
@@ -58,7 +75,17 @@ def named(name: str) -> "Representation":
 
 
 def of_preset(preset: str) -> "Representation":
-    """The representation that has a preset; ValueError names all there are."""
+    """Return the representation that has a preset.
+
+    Args:
+      preset: Name of the preset.
+
+    Returns:
+      The representation.
+
+    Raises:
+      ValueError: If there is no such preset, with the names of all.
+    """
     for representation in installed().values():
         if preset in representation.presets:
             return representation
@@ -67,9 +94,14 @@ def of_preset(preset: str) -> "Representation":
 
 
 def of_run(folder: pathlib.Path) -> "Representation | None":
-    """That of the run in a folder; None where none can be read.
+    """Return the representation of a run.
 
-    Reading the run properly, later, says what is wrong with it.
+    Args:
+      folder: The run folder.
+
+    Returns:
+      The representation, or None if it cannot be read. Reading the run itself reports
+      the reason.
     """
     try:
         stored = json.loads((folder / CONFIG).read_text())
@@ -79,24 +111,40 @@ def of_run(folder: pathlib.Path) -> "Representation | None":
 
 
 def stored_spec(representation: "Representation", stored: Any) -> Any:
-    """A spec of that representation as a run folder holds it.
+    """Convert a spec from a run folder.
 
-    Raises ValueError and TypeError for what is none.
+    Args:
+      representation: The representation.
+      stored: JSON values.
+
+    Returns:
+      A spec of that representation.
+
+    Raises:
+      ValueError, TypeError: If the values are not a spec.
     """
     return specs.from_json(stored, representation.spec_type)
 
 
 class Cores(NamedTuple):
-    """What `platform.start_jax` is told of a scene that is to be trained."""
+    """Arguments of `platform.start_jax` for a scene."""
 
     threads: Threads
     shares: int
 
 
 def cores(preset: str | None, overrides: tuple[str, ...] = ()) -> Cores:
-    """Of a preset with fields changed; ValueError where there are no such.
+    """Return the cores that training of a preset should use.
 
-    Of None, for which each capture has its own: the usual one, unchanged.
+    Args:
+      preset: Name of the preset. None for the default one.
+      overrides: Changed fields, as PATH=VALUE.
+
+    Returns:
+      The arguments of `platform.start_jax`.
+
+    Raises:
+      ValueError: If the preset or a field does not exist.
     """
     if preset is None:
         preset, overrides = USUAL, ()
@@ -106,7 +154,14 @@ def cores(preset: str | None, overrides: tuple[str, ...] = ()) -> Cores:
 
 
 def cores_of_run(folder: pathlib.Path) -> Cores:
-    """Of the run in a folder; of none where none can be read."""
+    """Return the cores that the run in a folder should use.
+
+    Args:
+      folder: The run folder.
+
+    Returns:
+      The arguments of `platform.start_jax`, default ones if the run cannot be read.
+    """
     representation = of_run(folder)
     if representation is None:
         return Cores("all", 1)

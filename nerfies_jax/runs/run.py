@@ -1,4 +1,4 @@
-"""A run: which capture, which scene, and the folder that holds what came of it."""
+"""A run: its capture, scene and model, and the settings in its folder."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ from nerfies_jax.training.provenance import provenance
 
 
 class Settings(NamedTuple):
-    """What a `config.json` says."""
+    """Contents of a `config.json`."""
 
     config: RunConfig
     representation: Representation
@@ -41,7 +41,7 @@ class Settings(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Everything that a run is made of before its first step."""
+    """Everything that a run consists of before its first step."""
 
     config: RunConfig
     capture: Capture  # what is learned from: with pinholes where only they are drawn
@@ -54,9 +54,17 @@ class Run(NamedTuple):
 
 
 def new_run(config: RunConfig, stored: Capture | None = None) -> Run:
-    """A run as it is asked for; ValueErrors name what the user can mend.
+    """Open a run for its settings.
 
-    `stored` is its `stored_capture` where that has been read already.
+    Args:
+      config: Settings of the run.
+      stored: Its `stored_capture`, if that has already been read.
+
+    Returns:
+      The run.
+
+    Raises:
+      ValueError: If it cannot be opened, or has no held-out frames.
     """
     representation = representations.of_preset(config.preset)
     run = open_run(config, representation, scene_spec(config), stored)
@@ -74,7 +82,17 @@ def open_run(
     spec: Any,
     stored: Capture | None = None,
 ) -> Run:
-    """Read the capture and build the model."""
+    """Read the capture and build the model.
+
+    Args:
+      config: Settings of the run.
+      representation: Representation of its preset.
+      spec: Spec of the representation.
+      stored: Its `stored_capture`, if that has already been read.
+
+    Returns:
+      The run.
+    """
     stored = stored or stored_capture(config.source, config.seed)
     filmed = pinholes.scorable(stored, representation.traces_lenses)
     capture = filmed if representation.traces_lenses else pinholes.as_pinholes(stored)
@@ -86,8 +104,9 @@ def open_run(
 
 
 def _completed(capture, wanted):
-    """With flow and masks found in the pictures where they are wanted; what else lacks
-    is noted.
+    """Add flow and masks computed from the images if they are required.
+
+    Other missing data is noted.
     """
     if "flow" in wanted and capture.flow is None:
         capture = frame_flow.with_flow(capture)
@@ -100,7 +119,15 @@ def _completed(capture, wanted):
 
 
 def with_steps(run: Run, steps: int) -> Run:
-    """The run over another number of steps, of the same pictures."""
+    """Change the number of steps of a run.
+
+    Args:
+      run: The run.
+      steps: Number of steps.
+
+    Returns:
+      The run with its schedules stretched.
+    """
     config = dataclasses.replace(run.config, steps=steps)
     spec = scene_spec(config)
     return _built(config, run.representation, spec, run.capture, run.filmed)
@@ -115,7 +142,15 @@ def _built(config, representation, spec, capture, filmed):
 
 
 def with_found_cameras(run: Run, state: TrainState) -> Run:
-    """The run with its cameras as training found them; as it is where they stay."""
+    """Replace the cameras of a run by those that training has refined.
+
+    Args:
+      run: The run.
+      state: Trained state.
+
+    Returns:
+      The run, unchanged if its cameras are not trained.
+    """
     capture = as_found(run.model, state, run.capture)
     if run.filmed is run.capture:
         return run._replace(capture=capture, filmed=capture)
@@ -124,14 +159,29 @@ def with_found_cameras(run: Run, state: TrainState) -> Run:
 
 
 def drawer(run: Run, renderer: Renderer) -> Draw:
-    """What draws the views of `run.filmed`: the renderer, through a lens if need be."""
+    """Return the renderer of the frames as they were captured.
+
+    Args:
+      run: The run.
+      renderer: Renderer of the model.
+
+    Returns:
+      A renderer of `run.filmed`, with lens distortion if needed.
+    """
     if run.representation.traces_lenses or run.filmed is run.capture:
         return renderer
     return ThroughLens(renderer, run.filmed.size)
 
 
 def scene_spec(config: RunConfig) -> Any:
-    """The preset with its steps and overrides; with either's, schedules stretch."""
+    """Return the spec of a preset with its steps and overrides.
+
+    Args:
+      config: Settings of the run.
+
+    Returns:
+      The spec, with schedules stretched to the number of steps.
+    """
     representation = representations.of_preset(config.preset)
     spec = representation.presets[config.preset]
     steps = config.steps
@@ -150,11 +200,21 @@ def load_capture(
     max_side: int | None = None,
     heldout: int | str | None = None,
 ) -> Capture:
-    """A capture of any known format, for a pinhole renderer; host side.
+    """Read a capture of any supported format, undistorted to pinhole cameras.
 
-    `factor` and `max_side` (pixels) make the pictures smaller; `heldout` chooses the
-    frames to judge by, every n-th or a split by its name. Raises ValueError where it
-    cannot be read.
+    Args:
+      folder: Folder of the capture.
+      factor: Read images at 1/`factor` of their full size.
+      max_side: Longest side of the images in pixels. At most one of the two can be
+        given.
+      heldout: Frames to evaluate: n for every n-th, or the name of a split. None for
+        the files' own split.
+
+    Returns:
+      The capture, on the host.
+
+    Raises:
+      ValueError: If it cannot be read.
     """
     chosen = None if heldout is None else str(heldout)
     return read_capture(
@@ -168,19 +228,46 @@ def load_capture(
 
 
 def built_in_scene(name: str = "default", seed: int = 0) -> Capture:
-    """A film of a built-in scene; ValueError names those there are."""
+    """Render the capture of a built-in synthetic scene.
+
+    Args:
+      name: Name of the scene, a key of `nerfies_jax.capture.synthetic.PRESETS`.
+      seed: Seed of the hand-held camera motion.
+
+    Returns:
+      The capture.
+
+    Raises:
+      ValueError: If there is no scene of that name.
+    """
     return read_capture(CaptureSource(scene=name), seed)
 
 
 def read_capture(source: CaptureSource, seed: int = 0) -> Capture:
-    """The capture asked for, for a pinhole renderer."""
+    """Read a capture, undistorted to pinhole cameras.
+
+    Args:
+      source: The capture and the way to read it.
+      seed: Seed of a built-in scene.
+
+    Returns:
+      The capture.
+    """
     return pinholes.as_pinholes(stored_capture(source, seed))
 
 
 def stored_capture(source: CaptureSource, seed: int = 0) -> Capture:
-    """The capture asked for, with the lens that filmed it; host side.
+    """Read a capture with its lens distortion.
 
-    `seed` makes a built-in scene. Raises ValueError where it cannot be read as asked.
+    Args:
+      source: The capture and the way to read it.
+      seed: Seed of a built-in scene.
+
+    Returns:
+      The capture, on the host.
+
+    Raises:
+      ValueError: If it cannot be read as requested.
     """
     capture = given_files.attached(_filmed(source, seed), source.files)
     gate.check_observed(capture)
@@ -222,9 +309,12 @@ def _built_in(source, seed):
 
 
 def save_config(folder: pathlib.Path, run: Run, left_out: Sequence[str] = ()) -> None:
-    """`config.json`: the config, the whole spec it led to, and what made it.
+    """Write `config.json`: the settings, the complete spec, and the environment.
 
-    With notes on what preprocessing `left_out`, if it did.
+    Args:
+      folder: The run folder.
+      run: The run.
+      left_out: Notes on parts of preprocessing that were left out.
     """
     stored = {
         "config": specs.as_json(run.config),
@@ -290,7 +380,17 @@ def saved_run(
 
 
 def read_settings(folder: pathlib.Path) -> Settings:
-    """The settings of the run in a folder; ValueError where they cannot be read."""
+    """Read the settings of a run.
+
+    Args:
+      folder: The run folder.
+
+    Returns:
+      The settings.
+
+    Raises:
+      ValueError: If they cannot be read.
+    """
     path = folder / CONFIG
     if not path.is_file():
         raise ValueError(
@@ -313,7 +413,17 @@ def read_settings(folder: pathlib.Path) -> Settings:
 
 @events.stage("initializing the scene")
 def first_state(run: Run) -> TrainState:
-    """The state before the first step; ValueError where it would not fit in memory."""
+    """Initialize the training state.
+
+    Args:
+      run: The run.
+
+    Returns:
+      The state before the first step.
+
+    Raises:
+      ValueError: If it would not fit in memory.
+    """
     needed = run.representation.estimate_memory_bytes(run.spec, run.capture)
     free = free_memory()
     if needed > free:
@@ -326,13 +436,25 @@ def first_state(run: Run) -> TrainState:
 
 
 def free_memory() -> int:
-    """Bytes of memory that programs may still take."""
+    """Return the available memory.
+
+    Returns:
+      Bytes that programs may still allocate.
+    """
     return psutil.virtual_memory().available
 
 
 @events.stage("restoring the checkpoint")
 def restore(folder: pathlib.Path, run: Run) -> checkpoint.Restored:
-    """The newest state saved in a run folder."""
+    """Restore the newest checkpoint of a run.
+
+    Args:
+      folder: The run folder.
+      run: The run.
+
+    Returns:
+      The state with its metadata.
+    """
     model = run.model
     example = (model.example or model.init)(run.capture, jax.random.key(0))
     return checkpoint.restore(folder / CHECKPOINTS, example, model.spec)

@@ -1,4 +1,4 @@
-"""The folder of a run: a new one, its one owner, and the names of what is in it."""
+"""Folder of a run: its creation, its exclusive owner, and the names of its files."""
 
 import contextlib
 import datetime
@@ -22,9 +22,17 @@ OWNER = ".owner.json"  # beside the lock: Windows lets nobody read a locked file
 
 
 def new_run_folder(out: pathlib.Path | None, stem: str) -> pathlib.Path:
-    """An empty writable folder for a run: `out`, or `runs/STEM[-n]`.
+    """Create an empty writable folder for a run.
 
-    Raises ValueError if `out` holds something already or cannot be written.
+    Args:
+      out: The folder. None for `runs/STEM[-n]`.
+      stem: Beginning of the name of a default folder.
+
+    Returns:
+      The folder.
+
+    Raises:
+      ValueError: If `out` is not empty or cannot be written.
     """
     if out is None:
         return _numbered(pathlib.Path("runs"), stem)
@@ -37,9 +45,17 @@ def new_run_folder(out: pathlib.Path | None, stem: str) -> pathlib.Path:
 
 
 def newest_of(source: pathlib.Path, above: pathlib.Path | None = None) -> pathlib.Path:
-    """The run in `above` (runs) that was begun last of a capture, or of a film.
+    """Find the newest run of a capture or video.
 
-    Raises ValueError where there is none.
+    Args:
+      source: The capture or video.
+      above: Folder that contains the runs. None for `runs`.
+
+    Returns:
+      The run folder.
+
+    Raises:
+      ValueError: If there is none.
     """
     refuse_run(source)
     above = pathlib.Path("runs") if above is None else above
@@ -58,7 +74,15 @@ def newest_of(source: pathlib.Path, above: pathlib.Path | None = None) -> pathli
 
 
 def is_of(capture: pathlib.Path, source: pathlib.Path) -> bool:
-    """Whether a capture is what `source` names, or was prepared of that."""
+    """Test if a capture is the one at `source`, or was made from it.
+
+    Args:
+      capture: Folder of the capture.
+      source: Capture, video or folder of images.
+
+    Returns:
+      True if it is.
+    """
     if capture.absolute() == source.absolute():
         return True
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
@@ -68,7 +92,14 @@ def is_of(capture: pathlib.Path, source: pathlib.Path) -> bool:
 
 
 def refuse_run(source: pathlib.Path) -> None:
-    """Raise ValueError where what is given as a capture is a run."""
+    """Refuse a run folder where a capture is expected.
+
+    Args:
+      source: Folder of the capture.
+
+    Raises:
+      ValueError: If it is a run folder.
+    """
     if (source / CONFIG).is_file() and (source / CHECKPOINTS).is_dir():
         raise ValueError(
             f"{source}: the folder of a run, not of a capture; continue the run with "
@@ -77,7 +108,14 @@ def refuse_run(source: pathlib.Path) -> None:
 
 
 def check_free(out: pathlib.Path) -> None:
-    """Raise ValueError where a run cannot begin in `out`; nothing is made."""
+    """Check that a run can begin in a folder, without creating anything.
+
+    Args:
+      out: The folder.
+
+    Raises:
+      ValueError: If it is not empty or cannot be written.
+    """
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: the run folder is a file; name another --out")
     if not out.is_dir():
@@ -101,10 +139,18 @@ def check_free(out: pathlib.Path) -> None:
 
 @contextlib.contextmanager
 def owned(folder: pathlib.Path) -> Iterator[None]:
-    """Be the one process that writes into a run folder.
+    """Lock a run folder for writing by this process.
 
-    Raises ValueError naming the owner while there is another one. The system gives the
-    folder free when this process ends, however it does.
+    The operating system releases the lock when the process ends, however it does.
+
+    Args:
+      folder: The run folder.
+
+    Yields:
+      None, while the lock is held.
+
+    Raises:
+      ValueError: If another process holds the lock, with its identity.
     """
     lock = filelock.FileLock(folder / LOCK)
     try:

@@ -1,7 +1,7 @@
-"""Whether a capture is still the one that a run was begun with.
+"""Test that a capture is still the one that a run was started with.
 
-Numbers with tolerances and no digest: read by another decoder, or made smaller by
-another processor, the same pictures differ by a level, the same cameras by rounding.
+It compares numbers with tolerances instead of a digest, because other decoders or
+processors change images by a level and cameras by rounding.
 """
 
 import pathlib
@@ -19,16 +19,27 @@ TOLERANCE = 1e-3  # of cameras, times and bounds: relative, and in their own uni
 
 
 def record(folder: pathlib.Path, capture: Capture) -> None:
-    """Keep in a run folder what tells its capture from another one."""
+    """Store in a run folder the numbers that identify its capture.
+
+    Args:
+      folder: The run folder.
+      capture: The capture.
+    """
     with replaced_file(folder / KEPT) as partial, open(partial, "wb") as file:
         np.savez_compressed(file, **_told(capture))
 
 
 def check(folder: pathlib.Path, capture: Capture) -> None:
-    """Raise CaptureError where the capture is not that of the run in a folder.
+    """Check that a capture is the one that a run was started with.
 
-    It names what differs and the first frame that does. A run that kept nothing, as
-    those of former versions, is taken at its word.
+    Runs of former versions, which stored nothing, are not checked.
+
+    Args:
+      folder: The run folder.
+      capture: The capture.
+
+    Raises:
+      CaptureError: If it differs, with the first frame that does.
     """
     path = folder / KEPT
     if not path.is_file():
@@ -66,7 +77,7 @@ def _told(capture):
 
 
 def _means(image):
-    """Of the blocks of a picture [height, width, 3]: [blocks, blocks, 3], in levels."""
+    """Means over the blocks of an image [height, width, 3]: [blocks, blocks, 3]."""
     rows, columns = (
         np.linspace(0, side, min(BLOCKS, side), endpoint=False, dtype=int)
         for side in image.shape[:2]
@@ -79,7 +90,7 @@ def _means(image):
 
 
 def _unlike(before, now):
-    """What is not alike, in words; None where all is."""
+    """Describe the first difference, or return None if there is none."""
     for name, new in now.items():
         old = before[name]
         if old.dtype.kind == "U" or old.shape != new.shape:

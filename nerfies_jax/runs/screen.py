@@ -1,4 +1,4 @@
-"""Images of a run for an interactive viewer: any view, effects on or off."""
+"""Images of a run for an interactive viewer: any view, with effects on or off."""
 
 import collections
 import statistics
@@ -26,7 +26,7 @@ TIMED = 5  # tiles whose median says how long the next one takes
 class Screen:
     """Renders a run's trained state in tiles, level by level of `pyramid`.
 
-    Each combination of effects is compiled when it is first looked at.
+    Each combination of effects is compiled when it is first viewed.
     """
 
     def __init__(self, run: Run, full: tuple[int, int]):
@@ -47,22 +47,38 @@ class Screen:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Channels of this run: motion only where something moves points."""
+        """Channels of this run. "motion" exists only if the model moves points."""
         static = self._move is None
         return tuple(c for c in interactive.CHANNELS if not (static and c == "motion"))
 
     @property
     def in_browser(self) -> bool:
-        """Whether a browser can render the colors of this run itself."""
+        """True if a browser can render the colors of this run itself."""
         return self.run.representation.splatting is not None
 
     def is_compiled(self, look: Look) -> bool:
-        """Whether the program for this look was used before."""
+        """Return whether the program for a look was used before.
+
+        Args:
+          look: The requested channel and variant.
+
+        Returns:
+          True if rendering needs no compilation.
+        """
         in_browser = self.in_browser and look.channel == "color"
         return look.without in (self._splatting if in_browser else self._renderers)
 
     def splats(self, state: TrainState, eye: Eye, look: Look) -> SplatCloud:
-        """Return the Gaussians of a run that is `in_browser`, for its rasterizer."""
+        """Return the Gaussians of a run that is `in_browser`, for its rasterizer.
+
+        Args:
+          state: Trained state.
+          eye: Viewpoint.
+          look: Requested time, appearance and variant.
+
+        Returns:
+          The Gaussians.
+        """
         if look.without not in self._splatting:
             run = self.run
             self._splatting[look.without] = run.representation.splatting(
@@ -72,17 +88,34 @@ class Screen:
         return splatting(state, look.time, look.appearance, np.asarray(eye.position))
 
     def tile_seconds(self, look: Look) -> float | None:
-        """Return the seconds a tile takes, without compiling; None before the first."""
+        """Return the time of a tile, without compilation.
+
+        Args:
+          look: The requested channel and variant.
+
+        Returns:
+          Median seconds, or None before the first tile.
+        """
         known = self._seconds.get((look.without, look.channel))
         return None if known is None else statistics.median(known)
 
     def draw(
         self, state: TrainState, eye: Eye, look: Look, level: int, cell: tuple[int, int]
     ) -> np.ndarray:
-        """Render one tile of a level as an image [height, width, 3] uint8.
+        """Render one tile of a level.
 
         Depth is colored over the range of the first coarse image that has any, motion
         over the largest distance in any coarse image so far.
+
+        Args:
+          state: Trained state.
+          eye: Viewpoint.
+          look: Requested time, channel and variant.
+          level: Level of the pyramid.
+          cell: Column and row of the tile.
+
+        Returns:
+          uint8 image, [height, width, 3].
         """
         began, key = time.perf_counter(), (look.without, look.channel)
         renderer = self._renderer(look.without)
@@ -113,7 +146,14 @@ class Screen:
         return image.picture
 
     def model(self, without: tuple[str, ...]) -> Model:
-        """Return the model with some effects left out."""
+        """Return the model with some effects left out.
+
+        Args:
+          without: Names of the effects.
+
+        Returns:
+          The model.
+        """
         if without not in self._models:
             run, model = self.run, self.run.model
             if without:
@@ -124,11 +164,25 @@ class Screen:
         return self._models[without]
 
     def has_range(self, channel: str) -> bool:
-        """Whether the colors of a channel span a range that images determine."""
+        """Return whether the colors of a channel span a range that images determine.
+
+        Args:
+          channel: Name of the channel.
+
+        Returns:
+          True for depth and motion.
+        """
         return channel in ("depth", "motion")
 
     def legend(self, channel: str) -> str:
-        """Return what the colors of a channel stand for; empty if that is plain."""
+        """Explain the colors of a channel.
+
+        Args:
+          channel: Name of the channel.
+
+        Returns:
+          The text, empty if the colors need no explanation.
+        """
         low, high = self._limits.get(channel, (0.0, 0.0))
         if channel == "depth":
             return f"bright {low:.3g}, dark {high:.3g} scene units away"
@@ -151,7 +205,9 @@ class Screen:
 
 
 def _pixel_length(capture: Capture) -> float:
-    """How long a pixel is at what the training cameras look at, scene units."""
+    """Length of a pixel at the point that the training cameras look at, in scene
+    units.
+    """
     train = cameras.take(capture.cameras, capture.train)
     focus = camera_paths.focus_point(train, capture.near, capture.far)
     away = np.linalg.norm(train.position - focus, axis=-1)

@@ -1,4 +1,4 @@
-"""Where the time of a step goes, measured after a run for its report."""
+"""Time of the parts of a training step, measured after a run for its report."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from nerfies_jax.training.model import TrainState
 
 
 class Profile(NamedTuple):
-    """Where the time of a step goes."""
+    """Time of a training step by part."""
 
     step_ms: dict[str, float]  # by part
     notes: list[str]  # why it is not known
@@ -18,10 +18,17 @@ class Profile(NamedTuple):
 
 @contextlib.contextmanager
 def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
-    """Compile the parts of a step meanwhile; the call that it gives times them.
+    """Compile the parts of a step in the background, to time them later.
 
-    Whatever fails in that becomes a note: the run keeps all its other products. Left by
-    an error, what is not compiled yet is dropped.
+    A failure becomes a note, so the run keeps all its other products. If the block ends
+    with an error, pending compilations are dropped.
+
+    Args:
+      run: The run.
+      state: Trained state.
+
+    Yields:
+      A function that measures the times.
     """
 
     def refused(error):

@@ -16,7 +16,7 @@ PROJECT = "nerfies-jax"
 
 
 class TrackedRun(NamedTuple):
-    """What a tracker is told of a run when it opens."""
+    """Description of a run for a tracker."""
 
     folder: pathlib.Path
     identity: str  # the same whenever the run is resumed
@@ -40,7 +40,14 @@ class Tracker(Protocol):
 
 
 def scalars(event: Event) -> dict[str, float]:
-    """Return the numbers of an event by name, as `train/loss` or `held_out/psnr`."""
+    """Collect the numbers of an event.
+
+    Args:
+      event: An event.
+
+    Returns:
+      Numbers by name, such as `train/loss` or `held_out/psnr`.
+    """
     if event["kind"] == "train":
         named = {
             "psnr": event["psnr"],
@@ -145,10 +152,13 @@ PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "rerun": "rerun"}
 
 
 def check(names: Sequence[str]) -> None:
-    """Raise ValueError for a tracker that is not known or not installed.
+    """Check that trackers are known and installed.
 
     Args:
       names: Keys of `TRACKERS`.
+
+    Raises:
+      ValueError: If one is not.
     """
     for name in names:
         if name not in TRACKERS:
@@ -164,7 +174,7 @@ def opened(name: str, run: TrackedRun) -> Iterator[Tracker]:
 
     Args:
       name: A key of `TRACKERS`.
-      run: What it is told of the run.
+      run: Description of the run.
 
     Yields:
       The sink, to be subscribed to the events.

@@ -1,4 +1,4 @@
-"""Train a run, with held-out scores along the way."""
+"""Training of a run, with held-out metrics along the way."""
 
 import dataclasses
 import pathlib
@@ -20,7 +20,9 @@ EVALUATED = 4  # held-out frames in the curve; all of them are scored at the end
 
 @dataclasses.dataclass(frozen=True)
 class Pace:
-    """How long to train and how often to do what else there is to do, in seconds."""
+    """Duration of training, and intervals of evaluations and checkpoints, in
+    seconds.
+    """
 
     seconds: float | int | None = None  # no bound but the steps
     evaluate_every: float | int = 20.0
@@ -45,7 +47,19 @@ class Trained(NamedTuple):
 
 
 def open_checkpoints(folder: pathlib.Path, run: Run, after: int | None) -> Checkpoints:
-    """Where this run saves; ValueError where it cannot."""
+    """Open the checkpoints of a run for writing.
+
+    Args:
+      folder: The run folder.
+      run: The run.
+      after: Step after which it is resumed. None for a new run.
+
+    Returns:
+      The writer.
+
+    Raises:
+      ValueError: If they cannot be written.
+    """
     return Checkpoints(
         folder / run_folder.CHECKPOINTS,
         run.model.spec,
@@ -62,7 +76,19 @@ def train(
     pace: Pace,
     hooks: tuple[Hook, ...] = (),
 ) -> Trained:
-    """Fit the model; its PSNR and SSIM on a few held-out frames go into the history."""
+    """Fit the model, with PSNR and SSIM of a few held-out frames in its history.
+
+    Args:
+      run: The run.
+      state: First or restored state.
+      record: Stored history of a restored run, or None.
+      checkpoints: Writer of checkpoints.
+      pace: Duration and intervals.
+      hooks: Further callbacks.
+
+    Returns:
+      The result with the renderer.
+    """
     renderer = Renderer(run.model, run.capture.size)
     draw = drawer(run, renderer)
     few, evaluate_every = run.capture.heldout, pace.evaluate_every
@@ -105,7 +131,7 @@ def train(
 
 
 def _compiled(run, state, frames, renderer, view) -> float:
-    """Seconds of making the scan of a run; the renderer is compiled meanwhile."""
+    """Seconds of compiling the scan of a run, with the renderer compiled meanwhile."""
     scan = None
     if run.spec.steps - int(state.step) >= chunk.LENGTH:
         scan = chunk.compiling(run.model, state, frames, run.spec.steps)

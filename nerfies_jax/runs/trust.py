@@ -1,4 +1,4 @@
-"""Run folders of strangers: nothing is imported because a file says so."""
+"""Trust in run folders: nothing is imported just because a file names it."""
 
 import pathlib
 from collections.abc import Collection
@@ -22,16 +22,16 @@ class UntrustedEffects(ValueError):
 
 
 def check_effects(folder: pathlib.Path, wanted: Any, trusted: Collection[str]) -> None:
-    """Refuse the effects that a run folder asks for and its reader did not name.
+    """Refuse effects of a run folder that its reader did not name.
 
     Args:
       folder: The run folder.
-      wanted: The effects that its settings name, as MODULE:NAME.
-      trusted: The effects that the caller named. They are compared as text.
+      wanted: Effects that its settings name, as MODULE:NAME.
+      trusted: Effects that the caller named. They are compared as text.
 
     Raises:
-      UntrustedEffects: Some of `wanted` are not in `trusted`.
-      ValueError: `wanted` are no names.
+      UntrustedEffects: If some of `wanted` are not in `trusted`.
+      ValueError: If `wanted` are no names.
     """
     if not isinstance(wanted, tuple | list) or not all(
         isinstance(name, str) for name in wanted

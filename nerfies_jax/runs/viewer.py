@@ -1,8 +1,8 @@
-"""A page in the browser to look around in a run, served by viser.
+"""Interactive viewer of a run in the browser, served by viser.
 
-Callbacks of viser only note what was pressed, with the camera and the controls of that
-moment. Everything else happens in `Viewer.serve`, in the thread of its caller, so that
-nothing is computed beside a training step.
+Callbacks of viser only record clicks, with the camera and the controls at that time.
+Everything else happens in `Viewer.serve`, in the thread of its caller, so that nothing
+is computed concurrently with a training step.
 """
 
 import contextlib
@@ -39,7 +39,11 @@ FRUSTUM_PX = 2.0
 
 
 def check_installed() -> None:
-    """Raise MissingExtra, which names the extra, where viser is not installed."""
+    """Check that viser is installed.
+
+    Raises:
+      MissingExtra: If it is not, with the name of the extra.
+    """
     extras.check("viser", "view")
 
 
@@ -48,10 +52,10 @@ class Viewer:
 
     Args:
       run: The run.
-      full: Width and height in pixels of images of a resting view.
-      port: Port on `HOST`; the next free one is taken.
+      full: Width and height in pixels of images of a static view.
+      port: Port on `HOST`, or the next free one.
       folder: The run's folder. Camera paths are saved and rendered into it.
-      in_training: Whether the run is being trained, so that it can be paused.
+      in_training: True if the run is being trained, so that it can be paused.
     """
 
     def __init__(
@@ -91,12 +95,14 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """To be opened in a browser."""
+        """Address to open in a browser."""
         return f"http://{HOST}:{self._server.get_port()}"
 
     @property
     def holds_training(self) -> bool:
-        """Whether training is to wait: it is paused, or a path is being rendered."""
+        """True if training must wait, because it is paused or a path is being
+        rendered.
+        """
         held = self.training.held(len(self._server.get_clients()))
         return held or self.path.rendering is not None
 
@@ -107,25 +113,39 @@ class Viewer:
             self._server.stop()
 
     def serve(self, state: TrainState, step: int, seconds: float) -> None:
-        """Answer every browser for some time, once at least.
+        """Update every browser for some time, at least once.
 
-        Returns early where nothing is left to do.
+        Returns early if nothing is left to do.
+
+        Args:
+          state: Training state to show.
+          step: Its step.
+          seconds: Time limit.
         """
         until = time.monotonic() + seconds
         while self._round(state, step) and time.monotonic() < until:
             pass
 
     def add_metrics(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Add the metrics of a step to the curve."""
+        """Add the metrics of a step to the curve.
+
+        Args:
+          step: The step.
+          metrics: Metrics by name.
+        """
         self.training.add(step, metrics)
 
     def add_history(self, rows: Sequence[Mapping[str, float]]) -> None:
-        """Add the metrics of an earlier training, rows with "step", to the curve."""
+        """Add the metrics of an earlier training to the curve.
+
+        Args:
+          rows: Metrics by name, with "step".
+        """
         for row in rows:
             self.training.add(int(row["step"]), row)
 
     def _round(self, state, step) -> bool:
-        """Bring each browser a little closer to the state; whether more is to do."""
+        """Update each browser by a bounded amount of work. True if more is left."""
         with contextlib.suppress(queue.Empty):
             while True:
                 self._orders.get_nowait()()
@@ -261,11 +281,19 @@ def _quiet():
 
 @contextlib.contextmanager
 def live(run: Run, folder: pathlib.Path, port: int) -> Iterator[Hook]:
-    """Serve the page while the run is trained; yields the hook that does so.
+    """Serve the page while the run is trained.
 
-    Training waits `LIVE_SECONDS` at most between two chunks of steps for whoever looks
-    around, and as long as somebody pauses it or renders a camera path. It goes on when
-    every browser has left, and ends at a signal as always.
+    Training waits at most `LIVE_SECONDS` between two chunks of steps for a user who
+    looks around, and as long as someone pauses it or renders a camera path. It
+    continues when every browser has left, and ends at a signal as always.
+
+    Args:
+      run: The run.
+      folder: The run folder.
+      port: Port to listen on.
+
+    Yields:
+      The training hook that serves the page.
     """
     viewer = Viewer(run, run.capture.size, port, folder, in_training=True)
     console.say(f"look around while it trains: {viewer.address}")

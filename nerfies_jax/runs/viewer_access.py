@@ -1,4 +1,4 @@
-"""Who may talk to the viewer: pages that it served itself, from this machine.
+"""Access control of the viewer: only pages that it served itself, from this machine.
 
 viser listens on the loopback address and checks nothing else. A page of any web site
 that is open in the same browser could then connect to it, directly or under a name that
@@ -20,13 +20,16 @@ _patching = threading.Lock()
 
 
 def refusal(host: str | None, origin: str | None, port: int) -> str | None:
-    """Return why a request is refused, None if it is the viewer's own page.
+    """Decide whether a request is refused.
 
     Args:
       host: The Host header.
       origin: The Origin header. Browsers send it with every websocket and with requests
-        of other sites; programs that are no browser may leave it out.
+        of other sites. Programs that are not browsers may leave it out.
       port: Port of the viewer.
+
+    Returns:
+      The reason, or None for a request of the viewer's own page.
     """
     own = [f"{name}:{port}" for name in NAMES]
     if port == 80:
@@ -50,9 +53,12 @@ def refusal(host: str | None, origin: str | None, port: int) -> str | None:
 def guarded() -> Iterator[None]:
     """Check the requests of every viser server that is started in this block.
 
-    viser hands its request handler to `websockets` in its own thread and offers no
-    place for another one, so the function that it calls is replaced until the server
-    listens.
+    viser passes its request handler to `websockets` in its own thread and cannot be
+    configured with another one, so the function that it calls is replaced until the
+    server listens.
+
+    Yields:
+      None.
     """
     import websockets.asyncio.server as websockets_server
 
@@ -93,10 +99,10 @@ def _checked(process_request):
 
 
 class _Departures(logging.Filter):
-    """Drops the record of a connection that was closed before it asked for anything.
+    """Drops the record of a connection that was closed before its first request.
 
-    Browsers open connections in advance and close tabs in the middle of a request:
-    neither is an error of the server.
+    Browsers open connections in advance and close tabs in the middle of a request.
+    Neither is an error of the server.
     """
 
     def filter(self, record):

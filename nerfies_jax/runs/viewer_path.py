@@ -1,4 +1,4 @@
-"""The viewer's editor of camera paths: keyframes, preview, files and rendering."""
+"""Editor of camera paths in the viewer: keyframes, preview, files and rendering."""
 
 import pathlib
 import shlex
@@ -40,11 +40,11 @@ _NAME = "/path"
 
 
 class PathPanel:
-    """Keyframes, and what can be done with the path through them.
+    """Keyframes, and the controls of the path through them.
 
-    viser's threads call nothing here: `ordered` makes a callback of an action
-    `(client, eye, look)` that runs in the thread that serves the viewer, with the
-    camera and the controls as they were when the browser's click arrived.
+    viser's threads call nothing here. `ordered` makes a callback of an action `(client,
+    eye, look)` that runs in the thread that serves the viewer, with the camera and the
+    controls as they were when the browser's click arrived.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class PathPanel:
             loading = gui.add_upload_button(
                 "load", mime_type="application/json,.json", color="gray"
             )
-            # Of this click: the next one replaces the handle's value.
+            # Value of this click: the next one replaces it in the handle.
             loading.on_upload(ordered(self._load, lambda: loading.value.content))
             self._render = self._button("render", self._toggle_render)
             self._progress = gui.add_progress_bar(0.0, visible=False)
@@ -93,13 +93,21 @@ class PathPanel:
         return button
 
     def close(self) -> None:
-        """Give up what is being rendered, and leave nothing of it."""
+        """Stop rendering, and remove its incomplete result."""
         if self.rendering is not None:
             self.rendering.close()
             self.rendering = None
 
     def advance(self, state: TrainState, clients) -> bool:
-        """Move the preview and render one image; return whether either goes on."""
+        """Move the preview and render one image.
+
+        Args:
+          state: Trained state.
+          clients: Connected browsers.
+
+        Returns:
+          True if either continues.
+        """
         if self._preview is not None:
             self._advance_preview(clients)
         if self.rendering is not None:
@@ -335,7 +343,15 @@ class PathPanel:
 
 
 def vertical_fov(camera: Camera, size: tuple[int, int]) -> float:
-    """Return the vertical field of view in radians of images of `size`."""
+    """Return the vertical field of view of a camera.
+
+    Args:
+      camera: The camera.
+      size: Width and height of its images in pixels.
+
+    Returns:
+      The angle in radians.
+    """
     vertical_px = float(camera.focal_px) * float(camera.pixel_aspect)
     return 2 * float(np.arctan2(size[1], 2 * vertical_px))
 

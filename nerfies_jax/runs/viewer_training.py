@@ -1,4 +1,4 @@
-"""The viewer's part for a run in training: its loss, and a button that holds it."""
+"""Panel of the viewer for a run in training: its loss, and a button that pauses it."""
 
 import math
 import time
@@ -14,12 +14,12 @@ _LOSS = "loss"
 
 
 class TrainingPanel:
-    """The loss curve, and whether training is paused.
+    """The loss curve, and the pause button of training.
 
     Args:
       server: viser's server.
       ordered: As in `viewer_path.PathPanel`.
-      pausable: Whether training is in progress, so that it can be paused.
+      pausable: True if training is in progress, so that it can be paused.
     """
 
     def __init__(self, server: Any, ordered: Callable, pausable: bool):
@@ -37,7 +37,12 @@ class TrainingPanel:
                 self._button.on_click(ordered(lambda *_: self._pause(not self.paused)))
 
     def add(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Add a point to the curve; metrics without a finite loss add none."""
+        """Add a point to the curve.
+
+        Args:
+          step: The step.
+          metrics: Metrics by name. Those without a positive, finite loss are ignored.
+        """
         loss = float(metrics.get(_LOSS, math.nan))
         # The axis is logarithmic.
         if not (0 < loss < math.inf):
@@ -71,9 +76,15 @@ class TrainingPanel:
             )
 
     def held(self, browsers: int) -> bool:
-        """Return whether training is to wait, given the number of browsers.
+        """Return whether training must wait.
 
-        A pause ends by itself when nobody is there who could end it.
+        A pause ends by itself when no browser is left that could end it.
+
+        Args:
+          browsers: Number of connected browsers.
+
+        Returns:
+          True while training is paused.
         """
         now = time.monotonic()
         if browsers:

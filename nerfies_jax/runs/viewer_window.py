@@ -1,4 +1,4 @@
-"""What one browser shows: Gaussians that it renders itself, or images rendered here."""
+"""Contents of one browser: Gaussians that it renders itself, or rendered images."""
 
 import contextlib
 import time
@@ -27,7 +27,14 @@ _NAME = "/splats"
 
 
 def eye_of(camera) -> Eye | None:
-    """Convert viser's camera; None until the browser has reported one."""
+    """Convert viser's camera.
+
+    Args:
+      camera: Camera of a browser.
+
+    Returns:
+      The viewpoint, or None until the browser has reported one.
+    """
     if camera.update_timestamp == 0 or not camera.image_height:
         return None
     return Eye(
@@ -40,10 +47,16 @@ def eye_of(camera) -> Eye | None:
 
 @contextlib.contextmanager
 def departing(client):
-    """Accept that the browser leaves while something is sent to it.
+    """Tolerate that the browser leaves while something is sent to it.
 
     It may do so at any time, and viser warns of messages that nobody receives. Only
-    those that are sent in this block are meant.
+    messages sent in this block are affected.
+
+    Args:
+      client: The browser.
+
+    Yields:
+      None.
     """
     buffer = client._websock_connection.get_message_buffer()
     with buffer.sanctioned_dead_writes():
@@ -53,7 +66,7 @@ def departing(client):
 class Window:
     """The scene in one browser, kept up to date by calls of `update`.
 
-    `tell` shows a line about it in the page.
+    `tell` shows a line of text in the page.
     """
 
     def __init__(self, client, screen: Screen, tell: Callable[[str], None]):
@@ -67,9 +80,17 @@ class Window:
         self._image = _Image()
 
     def update(self, state: TrainState, step: int, look: Look) -> bool:
-        """Bring the browser closer to the state; return whether more is to be done.
+        """Bring the browser closer to the state by a bounded amount of work.
 
-        Renders one tile at most, so that what happens meanwhile is soon answered.
+        It renders at most one tile, so that the viewer stays responsive.
+
+        Args:
+          state: Trained state.
+          step: Its step.
+          look: Requested time, channel and variant.
+
+        Returns:
+          True if more is left to do.
         """
         eye = eye_of(self._client.camera)
         if eye is None:

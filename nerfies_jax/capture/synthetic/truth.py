@@ -78,9 +78,18 @@ def track_places(capture: Capture, truth: SceneTruth, rows: np.ndarray) -> np.nd
 
 
 def told(capture: Capture, truth: SceneTruth) -> Capture:
-    """The capture with true tracks, places and masks, as if a tool had found them.
+    """Attach the true tracks, positions and masks to a capture, as external
+    preprocessing.
 
-    Raises ValueError where the truth is not that of the capture.
+    Args:
+      capture: The capture.
+      truth: Its ground truth.
+
+    Returns:
+      The capture with `given` set.
+
+    Raises:
+      ValueError: If the truth is not that of the capture.
     """
     place = track_places(capture, truth, np.arange(len(capture.ids)))
     found = Given(
