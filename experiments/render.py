@@ -61,7 +61,7 @@ class Render:
     appearance ids."""
     knots: int | None = None
     """Evaluate the motion of Gaussians at so many instants only and interpolate between
-    them; experiments.deformation_cost shows what that costs and saves."""
+    them; docs/results/deformation_cost.md shows what that costs and saves."""
     interpolation: Literal["linear", "cubic"] = "linear"
     """Between the knots."""
     static_threshold: Annotated[float | None, cli.formerly("--still-below")] = None

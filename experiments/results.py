@@ -29,7 +29,7 @@ written from that file: `python -m experiments.results` writes all of them, and 
 holds each against its file. The command beside a page measures anew; where a page has
 rows of several captures or presets, the same command was run for each, as its rows say.
 What it writes is named by its `--out`, a file or a folder with one; `python -m
-experiments.results kan_local --measured kan_local.json`, say, keeps that file and
+experiments.results benchmark --measured benchmark.json`, say, keeps that file and
 renews the page.
 
 {pages}
@@ -66,6 +66,13 @@ skip in [ablate_lazy.md](ablate_lazy.md). What deformation, solvers and local ke
 cost stands in [deformation_cost.md](deformation_cost.md),
 [solver_table.md](solver_table.md) and [kan_local.md](kan_local.md) again, and how far
 one basis or another can follow a motion in [motion_rank.md](motion_rank.md).
+
+## Finished studies
+
+These studies answered their question. Their pages and numbers stay, and their code is
+in revision {revision} of this repository, which can run the command on each page.
+
+{finished}
 """
 
 MISSING = """\
@@ -101,14 +108,8 @@ def _package(name, words="", page="page", of=None, measured=None):
 
 
 _BOOKSHELF = "--capture CAPTURE --max-side 256 --heldout 8"
-_SPLAT_AXES = "steps gaussians views harmonics dssim raster motion splat-precision"
-_CODES = "--steps 1000 --seeds 3"
 STUDIES = {
     "benchmark": _package("benchmark", "--seeds 3"),
-    "accuracy_time": _package(
-        "accuracy_time",
-        f"--axes {_SPLAT_AXES} --share 0.5 --seeds 3 --jobs 2",
-    ),
     "effect_cost": _package(
         "effect_cost", measured="nerfies_jax/runs/effect_cost.json"
     ),
@@ -173,29 +174,10 @@ STUDIES = {
     "ablate_lazy": _package(
         "ablate_lazy", "--suite lazy --steps 600 --jobs 2", of="ablate"
     ),
-    "deformation_cost": _package("deformation_cost", "--out deformation_cost.json"),
-    "spectral_bias": _package(
-        "spectral_bias", "--steps 3000 --out spectral_bias", page="report"
-    ),
-    "motion_rank": _package(
-        "motion_rank", "--seeds 3 --out motion_rank", page="report"
-    ),
     "nerf_speed": _study("nerf_speed", "--out nerf_speed.json"),
-    "solver_table": _package(
-        "solver_table", "--out solver_table.json", page="__main__"
-    ),
-    "solver_table_poses": _package(
-        "solver_table_poses",
-        "--fit poses --out solver_table_poses.json",
-        of="solver_table",
-        page="__main__",
-    ),
-    "elastic_points": _study("elastic_points", "--out elastic_points.json"),
-    "camera_masks": _study("camera_masks", "--out camera_masks.json"),
     "field_speed": _study(
         "field_speed", "--captures CAPTURE CAPTURE --out field_speed.json"
     ),
-    "kan_local": _study("kan_local", "--out kan_local.json"),
     "speed": _package(
         "speed", "--job --beside CHECKOUT --yardstick PATH/run.py --out speed"
     ),
@@ -213,16 +195,14 @@ STUDIES = {
     "faults": _package("faults", "--trials 200 --jobs 2"),
     "mutants": _package("mutants", "--count 44"),
     "mutants_unseen": _package("mutants_unseen", "--count 24 --seed 1", of="mutants"),
-    "frequency_gates": _study("frequency_gates", "--out frequency_gates"),
-    "appearance_codes": _study(
-        "appearance_codes", f"--scene exposure {_CODES} --out appearance_codes"
-    ),
-    "transient_medium": _study(
-        "transient_medium",
-        f"--scene transient {_CODES} --out transient_medium",
-        module="appearance_codes",
-    ),
 }
+# Studies that answered their question: the page and its numbers stay, without the code.
+REVISION = "99f3f69"  # the last revision with all of them
+FINISHED = (
+    *("accuracy_time", "appearance_codes", "camera_masks", "deformation_cost"),
+    *("elastic_points", "frequency_gates", "kan_local", "motion_rank"),
+    *("solver_table", "solver_table_poses", "spectral_bias", "transient_medium"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,7 +285,7 @@ def _check_of(name, stored, measured):
     words = STUDIES[name].command.split()
     about = stored.get("about", {})
     told = stored | about | about.get("settings", {})
-    for option in ("suite", "scene", "fit"):
+    for option in ("suite", "scene"):
         if f"--{option}" in words and option in told:
             wanted = words[words.index(f"--{option}") + 1]
             if told[option] != wanted:
@@ -340,6 +320,11 @@ def index() -> str:
     return INDEX.format(
         pages=markdown.table(heads, rows, words=3),
         missing=MISSING.format(commands=markdown.bullets(missing)) if missing else "",
+        revision=REVISION,
+        finished=markdown.bullets(
+            f"[{name}.md]({name}.md), numbers in `docs/results/{name}.json`"
+            for name in FINISHED
+        ),
     )
 
 

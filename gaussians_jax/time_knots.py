@@ -2,7 +2,7 @@
 
 The deformation is evaluated once for each knot and never again; an instant then costs
 reading two or four rows of a table, whatever the network that made it. The error falls
-with the knots, as experiments.deformation_cost measures, and the table takes 40
+with the knots, as docs/results/deformation_cost.md shows, and the table takes 40
 bytes (ten float32) for each knot and each Gaussian that moves: 10 000 of them at 32
 knots are 13 MB, while a Gaussian that stands still is stored once.
 """

@@ -65,7 +65,6 @@ LONGEST = {
     "test_contracts.py": (),
     "test_effect_cost.py": (),
     "test_inspection_truth.py": ("name",),
-    "test_appearance_codes.py": (),
 }
 
 

@@ -30,15 +30,12 @@ class Ablate:
         "rate",
         "views",
         "lazy",
-        "settings",
-        "advice",
         "league",
     ] = "fields"
     """Radiance fields; motions of splats from tracks and from rest; the parts of
     splats-tracked-small; cameras refined while it trains; the ablations of Sonata or
     MoBa-GS, and what these leave open; bits of ADC-GS; views in a step; elastic
-    penalties at some steps; the settings of experiments.accuracy_time; what
-    experiments.inspect_scene can advise; or every small preset."""
+    penalties at some steps; or every small preset."""
     arms: tuple[str, ...] = ()
     """Which arms of the suite (default: all)."""
     source: cli.SourceOptions = CaptureSource()

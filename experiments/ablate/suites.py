@@ -5,7 +5,6 @@ import functools
 from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
 from experiments.ablate.open_arms import LAZY, OPEN, RATE
 from experiments.ablate.start_arms import POSES, START, TRACKED_PARTS, VIEWS
-from experiments.accuracy_time.axes import SETTINGS
 
 KEPT = {
     "fields": FIELDS,
@@ -18,17 +17,12 @@ KEPT = {
     "rate": RATE,
     "views": VIEWS,
     "lazy": LAZY,
-    "settings": SETTINGS,
 }
 
 
 @functools.cache
 def named(name: str) -> Suite:
     """The suite of that name."""
-    if name == "advice":  # asks every representation what it would advise
-        from experiments.inspect_pays.arms import advice
-
-        return advice()
     if name == "league":
         from experiments.league.rows import suite
 

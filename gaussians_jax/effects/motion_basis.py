@@ -330,32 +330,6 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
     )
 
 
-def multiply_adds(spec: BasisMotionSpec) -> dict[str, int]:
-    """Of the matrix products for one Gaussian at one time, by network.
-
-    `prepared` is the part that `prepare` does: the whole basis network, and the base
-    network's first layer as far as it reads the mean. What reads the time is summed
-    once for all Gaussians and not counted.
-    """
-    position = spec.position.width(3)
-    basis = 0
-    if spec.count is not None:
-        basis = spec.basis_width * (position + 3 * spec.count)
-    first = position * spec.base_width
-    base = first + spec.base_width * (spec.base_width * (spec.base_depth - 1) + 3)
-    reads = spec.width * position * (1 + len(spec.skips))
-    hidden = spec.width**2 * (spec.depth - 1)
-    heads = spec.width * ((spec.count or 3) + 6)
-    weights = reads + hidden + heads + 3 * (spec.count or 0)
-    return {
-        "base": base,
-        "basis": basis,
-        "weights": weights,
-        "prepared": basis + first,
-        "all": base + basis + weights,
-    }
-
-
 def effect(spec: BasisMotionSpec, steps: int, frames: int) -> Effect:
     """The seams that this motion fills, for a run of `steps` over `frames`."""
 

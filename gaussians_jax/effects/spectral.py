@@ -82,8 +82,8 @@ class SpectralSpec:
     `gate` "learned" is equation 16. The loss grows with the gate, so descent can only
     shut it: it acts as an annealing that paces itself by `learning_rate`, whatever the
     losses are. "floor" stops at `floor` of `most`, "fixed" stays at its opening,
-    "schedule" falls to zero along half a cosine. `experiments.frequency_gates` compares
-    them.
+    "schedule" falls to zero along half a cosine. docs/results/frequency_gates.md
+    compares them.
     """
 
     wavelet: WaveletSpec | None = WaveletSpec()

@@ -170,7 +170,7 @@ def draw(
     The sum is unbiased: a sample is drawn in proportion to its weight, and all that
     are drawn share the ray's total. Deviation of the gradient of 24 rays of 16 samples
     through surfaces, as a share of its length: 0.67 for one draw, 0.21 for four, 1.6
-    for four samples taken evenly (`experiments.elastic_points`).
+    for four samples taken evenly (docs/results/elastic_points.md).
     """
     weight = jax.lax.stop_gradient(level.static_weight)
     if points is None or points >= weight.shape[-1]:

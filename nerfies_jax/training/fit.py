@@ -167,8 +167,8 @@ def fit_code(
     """Minimize a loss over a latent code.
 
     The code returned is never worse than `start`, which is returned if the loss is not
-    finite there. The result carries no derivatives. `experiments.solver_table` compares
-    the solvers.
+    finite there. The result carries no derivatives. docs/results/solver_table.md
+    compares the solvers.
 
     Args:
       loss: Function from a code to a scalar.
@@ -297,7 +297,7 @@ CODE_SOLVERS: Mapping[str, CodeSolver] = {
     "optimistix-lbfgs": _optimistix("LBFGS"),
     "jaxopt-lbfgs": _jaxopt_lbfgs,
     # Rates of 0.01, 0.03, 0.1, 0.3 end 200 steps 6e-4, 5e-5, 1e-6, 6e-10 above the
-    # least loss of experiments.solver_table; beyond, 50 steps get worse.
+    # least loss in docs/results/solver_table.md; beyond, 50 steps get worse.
     "adam": _optax(lambda steps: optax.adam(optax.cosine_decay_schedule(0.2, steps))),
 }
 

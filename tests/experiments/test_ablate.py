@@ -78,12 +78,13 @@ def test_arms_one_after_the_other_have_all_cores(tiny, monkeypatch):
     nothing = types.SimpleNamespace(run=list, budgets=(), missing=list)
     monkeypatch.setattr(ablate_job, "Job", lambda _: nothing)
     monkeypatch.setattr(platform, "start_jax", lambda *given: started.append(given))
-    arms = ("--suite", "settings", "--arms", "views-1", "views-4", "samples-8+8")
-    assert run(*tiny, *arms[:4]) == 0
-    assert run(*tiny, *arms[:5]) == 0
-    assert run(*tiny, *arms) == 0
-    assert run(*tiny, *arms[:5], "--jobs", "2") == 0
-    wanted = [("one", 1), ("one", 4), ("all", 4), ("one", 1)]
+    views = ("--suite", "views", "--arms", "one", "four")
+    presets = ("--suite", "league", "--arms", "splats-static-small", "nerf-small")
+    assert run(*tiny, *views[:4]) == 0
+    assert run(*tiny, *views) == 0
+    assert run(*tiny, *presets) == 0
+    assert run(*tiny, *views, "--jobs", "2") == 0
+    wanted = [("one", 1), ("one", 4), ("all", 2), ("one", 1)]
     assert started == [("auto", *cores) for cores in wanted]
 
 

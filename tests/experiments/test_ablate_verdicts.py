@@ -84,7 +84,7 @@ def test_columns_without_numbers_are_left_out_with_their_legend():
     assert "scikit-image" in legend
 
 
-@pytest.mark.parametrize("name", [*suites.KEPT, "advice"])
+@pytest.mark.parametrize("name", suites.KEPT)
 def test_claims_are_about_arms_and_measures_that_there_are(name):
     suite = suites.named(name)
     for claim in suite.claims:
@@ -93,8 +93,7 @@ def test_claims_are_about_arms_and_measures_that_there_are(name):
     assert set(suite.pictured) <= set(suite.arms)
     # Every arm is part of a claim, but those that only stand beside.
     judged = {arm for claim in suite.claims for arm in (claim.better, claim.worse)}
-    if suite.claims:  # "settings" and "advice" claim nothing: they say what there is
-        assert set(suite.arms) - judged <= {"d-nerf", "static"}
+    assert set(suite.arms) - judged <= {"d-nerf", "static"}
 
 
 def test_depths_that_are_estimated_of_a_real_capture_judge_nothing():

@@ -144,12 +144,8 @@ def test_every_command_is_listed_with_a_line(capsys):
 
 # Their options are made of what they study.
 NEED_JAX = {
-    "frequency_gates",
     "hard_cases",
-    "motion_rank",
     "raster_speed",
-    "solver_table",
-    "spectral_bias",
 }
 ASK_FOR_HELP = """
 import contextlib, io, sys

@@ -6,7 +6,6 @@ import json
 import os
 import pathlib
 import shutil
-import types
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,12 +18,9 @@ from experiments.ablate import results
 from experiments.ablate.measures import MEASURES
 from experiments.ablate.results import ArmResult
 from experiments.benchmark.job import SCORED
-from experiments.inspect_pays.job import Trial
 from nerfies_jax.capture import cache_files, synthetic
 from nerfies_jax.capture.synthetic import record as scenes_record
-from nerfies_jax.evidence import inspection, record
-from nerfies_jax.evidence.findings import CERTAIN, MOTION, Finding
-from nerfies_jax.runs.config import CaptureSource
+from nerfies_jax.evidence import record
 from tests import scenes
 
 pytestmark = pytest.mark.slow
@@ -86,12 +82,6 @@ def finished(folder):
     return kept.one(path, SCORED)
 
 
-def findings(folder):
-    args = dataclasses.make_dataclass("Args", ["out"])(folder)
-    source = CaptureSource(scene="default")
-    return Trial(args, "film", source, scenes.tiny_capture()).findings()
-
-
 KINDS = {
     "evidence": Kind(evidence, "*.npz", "*.npz"),
     "truth of a scene": Kind(scene, "*/truth.npz", "*"),
@@ -101,7 +91,6 @@ KINDS = {
     "numbers of a cell": Kind(cell, "static-0.json", "static-0.json"),
     "arrays of a cell": Kind(cell, "static-0.npz", "static-0.json"),
     "settled steps": Kind(settled, "steps.json", "steps.json"),
-    "findings": Kind(findings, "film/inspected.json", "film/inspected.json"),
     "a finished run": Kind(finished, "metrics.json", "metrics.json", sealed=False),
     "rows of a study": Kind(rows, "rows.json", "rows.json", True, False),
 }
@@ -130,15 +119,6 @@ def quick(monkeypatch, written):
         "_write_into",
         lambda folder, *_: shutil.copytree(written, folder, dirs_exist_ok=True),
     )
-    looked = Finding(MOTION, "it moves", "1 %", True, CERTAIN, {"share": 0.25})
-    sheet = np.zeros((9, 9, 3), np.uint8)
-    found = types.SimpleNamespace(findings=(looked,), sheet=sheet)
-    monkeypatch.setattr(inspection, "inspect", lambda *_, **__: found)
-    monkeypatch.setattr("experiments.inspect_scene.as_json", _as_json)
-
-
-def _as_json(capture, inspected, advice):
-    return {"findings": [dataclasses.asdict(one) for one in inspected.findings]}
 
 
 def flipped(content, place):

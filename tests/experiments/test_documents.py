@@ -7,10 +7,14 @@ import shlex
 
 import pytest
 
-from experiments import cli
+from experiments import cli, results
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+# Not the pages of finished studies, whose commands an older revision runs.
+PAGES = sorted(
+    {*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")}
+    - {results.PAGES / f"{name}.md" for name in results.FINISHED}
+)
 COMMAND = re.compile(r"python -m experiments\.([a-z_]+)([^\n#&;]*)")
 
 

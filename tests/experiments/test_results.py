@@ -5,7 +5,7 @@ import json
 import pytest
 
 from experiments import results
-from experiments.results import PAGES, ROOT, STUDIES
+from experiments.results import FINISHED, PAGES, REVISION, ROOT, STUDIES
 
 
 @pytest.mark.parametrize("name", results.kept())
@@ -16,10 +16,18 @@ def test_a_page_is_what_its_kept_numbers_make(name):
 def test_the_index_lists_every_page_there_is():
     assert (PAGES / "README.md").read_text() == results.index()
     there = {path.stem for path in PAGES.glob("*.md")} - {"README"}
-    assert there == set(results.kept())
+    assert there == {*results.kept(), *FINISHED}
     measured = {path.name for path in (ROOT / "experiments/measured").iterdir()}
     known = {study.measured.rpartition("/")[2] for study in STUDIES.values()}
     assert measured <= known
+
+
+@pytest.mark.parametrize("name", FINISHED)
+def test_a_finished_page_has_its_numbers_and_names_the_revision(name):
+    last = (PAGES / f"{name}.md").read_text().splitlines()[-1]
+    assert f"the numbers are in `docs/results/{name}.json`" in last
+    assert f"revision {REVISION} can run it." in last
+    assert json.loads((PAGES / f"{name}.json").read_text())
 
 
 def test_new_numbers_are_kept_only_where_they_make_a_page(
@@ -28,35 +36,38 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
     monkeypatch.setattr(results, "ROOT", tmp_path)
     monkeypatch.setattr(results, "PAGES", tmp_path)
     monkeypatch.setitem(
-        STUDIES, "kan_local", STUDIES["kan_local"]._replace(measured="kept.json")
+        STUDIES, "benchmark", STUDIES["benchmark"]._replace(measured="kept.json")
     )
     new = tmp_path / "new.json"
-    row = {"kernels": 8, "nearest": 4, "error": 8e-3, "seconds": 0.1, "over_dense": 5.3}
+    runs = {"default": {"0": {"preset": "nerf", "metrics": {"heldout.psnr": 21.5}}}}
     machine = {"cpu": "a core", "backend": "cpu", "jax": "0"}
-    new.write_text(json.dumps({"machine": machine, "rows": [row]}))
-    results.main(["kan_local", "--measured", str(new)])
-    assert "| 8 | 4 | 0.008 | 100.0 | 5.30 |" in (tmp_path / "kan_local.md").read_text()
-    assert "[kan_local.md]" in (tmp_path / "README.md").read_text()
-    new.write_text(json.dumps({"machine": machine, "rows": [{}]}))
+    new.write_text(json.dumps({"machine": machine, "runs": runs}))
+    results.main(["benchmark", "--measured", str(new)])
+    assert "| `default` | nerf | 1 | 21.50 |" in (tmp_path / "benchmark.md").read_text()
+    assert "[benchmark.md]" in (tmp_path / "README.md").read_text()
+    new.write_text(json.dumps({"machine": machine, "runs": {"default": {"0": {}}}}))
     with pytest.raises(SystemExit) as stop:
-        results.main(["kan_local", "--measured", str(new)])
+        results.main(["benchmark", "--measured", str(new)])
     assert stop.value.code == 2
-    assert "not what python -m experiments.kan_local" in capsys.readouterr().err
-    assert json.loads((tmp_path / "kept.json").read_text())["rows"] == [row]
+    assert "not what python -m experiments.benchmark" in capsys.readouterr().err
+    assert json.loads((tmp_path / "kept.json").read_text())["runs"] == runs
 
 
 @pytest.mark.parametrize(
     ("page", "text", "words"),
     [
-        ("kan_local", "words", "not JSON"),
-        ("kan_local", '{"machine": {}, "rows": []}', "holds no rows"),
-        ("transient_medium", '{"scene": "exposure"}', "of scene exposure, and the"),
+        ("benchmark", "words", "not JSON"),
+        ("benchmark", '{"machine": {}, "rows": []}', "holds no rows"),
+        (
+            "ablate_poses",
+            '{"about": {"settings": {"scene": "fast"}}}',
+            "of scene fast, and the",
+        ),
         (
             "ablate_moba",
             '{"about": {"settings": {"suite": "sonata"}}}',
             "the page ablate_moba is of moba",
         ),
-        ("solver_table_poses", '{"about": {"fit": "codes"}}', "of fit codes"),
     ],
 )
 def test_numbers_of_another_page_are_refused(

@@ -47,7 +47,6 @@ OPENING = {
     "view": ("view", "RUN"),
     "compare": ("compare", "RUN", "OTHER", "--out", "compared"),
     "resume": ("reconstruct", "--out", "RUN", "--resume"),
-    "cost": ("deformation_cost", "--run", "RUN", "--gaussians", "9"),
 }
 
 

@@ -10,9 +10,8 @@ import pytest
 
 from gaussians_jax.effects import motion_basis
 from gaussians_jax.effects.motion_basis import BasisMotionSpec, Offsets
-from nerfies_jax.measure import clock
 from tests.gaussians.motions import BASIS as SMALL
-from tests.gaussians.motions import MOTIONS, deformed, strong
+from tests.gaussians.motions import deformed, strong
 from tests.gaussians.shared import finite, full, jitted, some_gaussians
 from tests.oracles import networks
 
@@ -173,23 +172,3 @@ def test_the_networks_are_as_large_as_the_papers_storage_says():
     numbers = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     assert numbers == 589_225
     assert 2.11 < 4 * numbers / 2**20 < 2.26
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(
-    ("spec", "share"),
-    [(BasisMotionSpec(), 0.053), (BasisMotionSpec(count=None), 0.014)],
-)
-def test_what_is_prepared_spares_a_small_share_of_the_arithmetic(spec, share):
-    """The paper's "dot product" leaves base and weight networks to run every frame."""
-    counts = motion_basis.multiply_adds(spec)
-    assert abs(counts["prepared"] / counts["all"] - share) < 0.01
-    params = jax.eval_shape(lambda key: motion_basis.init(key, spec), jax.random.key(0))
-    mean = jax.ShapeDtypeStruct((spec.block, 3), jnp.float32)
-    time = jax.ShapeDtypeStruct((), jnp.float32)
-    # One round of the loop over blocks, which the compiler counts once.
-    flops = clock.cost(
-        lambda p, m, t: MOTIONS["basis"].deform(p, spec, m, t), params, mean, time
-    ).flops
-    products = 2 * spec.block * counts["all"]
-    assert products < flops < 1.6 * products
