@@ -1,4 +1,4 @@
-"""Pictures of a trained scene for compositing: OpenEXR with camera and motion."""
+"""Rendered OpenEXR sequences for compositing, with cameras and optical flow."""
 
 from collections.abc import Sequence
 
@@ -20,9 +20,19 @@ def write(
     move: Move | None = None,
     overwrite: bool = False,
 ) -> None:
-    """`0000.exr`, ... of the views in turn, or none of them; with flow given a `move`.
+    """Render views to `0000.exr`, `0001.exr`, ..., all of them or none.
 
-    Flow goes to the next picture; that of the last is zero.
+    Args:
+      folder: The folder.
+      draw: Renderer.
+      state: Trained state.
+      views: The views, in order.
+      move: Motion of points, to add flow to the next image (zero for the last). None
+        for no flow.
+      overwrite: True to replace earlier files of this kind.
+
+    Raises:
+      CaptureError: If the folder may not be replaced or cannot be written.
     """
     names = [f"{place:04d}.exr" for place in range(len(views))]
     with replaced_folder(folder, overwrite, alike(folder, names)) as partial:
@@ -38,10 +48,15 @@ def write(
 def write_frame(
     path: AnyPath, rendering: Rendering, view: View, flow: np.ndarray | None = None
 ) -> None:
-    """Linear color (RGB), alpha (A) and z-depth (Z), and what saw it in the header.
+    """Write linear color (RGB), opacity (A) and z-depth (Z), with the camera in the
+    header.
 
-    `flow` [height, width, 2], pixels right and down, goes to `flow.x` and `flow.y`;
-    where it is NaN they are 0, and so is `flow.A`.
+    Args:
+      path: The file.
+      rendering: The rendered image.
+      view: Its view.
+      flow: Flow in pixels right and down, [height, width, 2], for the channels `flow.x`
+        and `flow.y`. Where it is NaN they are 0, and so is `flow.A`.
     """
     extra = {}
     if flow is not None:

@@ -1,4 +1,4 @@
-"""Figures with axes, drawn by matplotlib, which comes with the extra `report`."""
+"""Figures with axes, made by matplotlib, which comes with the extra `report`."""
 
 import functools
 from typing import Any
@@ -9,10 +9,18 @@ library = functools.partial(extras.library, extra="report")
 
 
 def new_figure(**options: Any) -> Any:
-    """A `matplotlib.figure.Figure` that can be saved, without pyplot.
+    """Create a `matplotlib.figure.Figure` that can be saved, without pyplot.
 
-    pyplot keeps every figure and a global state. Raises MissingExtra where matplotlib
-    is not installed.
+    pyplot keeps every figure and a global state.
+
+    Args:
+      **options: Arguments of the figure.
+
+    Returns:
+      The figure.
+
+    Raises:
+      MissingExtra: If matplotlib is not installed.
     """
     figure = library("matplotlib.figure").Figure(**options)
     library("matplotlib.backends.backend_agg").FigureCanvasAgg(figure)

@@ -1,8 +1,8 @@
-"""Cameras fitted to frames that were never learned from, the scene as it is.
+"""Camera refinement for held-out frames, with the scene frozen.
 
-A wrong camera costs a good scene several dB. By the colors alone: the squared error of
-the rendered frame falls along its slope with respect to the camera, a screw in the
-camera's own frame.
+A wrong camera costs a good scene several dB. The camera is fitted to the colors alone,
+by the gradient of the squared error of the rendered frame with respect to a twist in
+the camera's own frame.
 """
 
 import dataclasses
@@ -27,12 +27,13 @@ LEVELS = 255.0  # of an 8-bit picture, the unit of the error
 
 @dataclasses.dataclass(frozen=True)
 class CameraFitSpec:
-    """How a camera is fitted, and when it counts as found.
+    """Settings of the camera refinement, and its convergence criterion.
 
-    The unknowns are a turn and a shift that move a picture at `depth` by so many
-    pixels, so that one step length suits all. Found means that the mean squared error,
-    in gray levels of 255, changes by at most `tolerance` a pixel: where pictures have
-    slopes of two levels a pixel, that is 0.001 pixel from the least.
+    The unknowns are a rotation and a translation, scaled such that they move an image
+    at `depth` by so many pixels, so that one step size suits all. A fit has converged
+    if the gradient of the mean squared error, in gray levels of 255, is at most
+    `tolerance` per pixel. For images with gradients of two levels per pixel, that is
+    0.001 pixel from the minimum.
     """
 
     max_steps: int = 100  # of L-BFGS
@@ -49,7 +50,7 @@ class CameraFitSpec:
 
 
 class FittedCameras(NamedTuple):
-    """Frames scored with cameras that were fitted to them."""
+    """Fitted cameras, and the metrics of the frames with these cameras."""
 
     cameras: Camera  # NumPy leaves, leading axis frames
     converged: np.ndarray  # [frames] bool
@@ -64,9 +65,18 @@ def photometric_loss(
     valid: Bool[Array, "height width"] | None,
     depth: Float[Array, ""],
 ) -> Callable[[Float[Array, "6"]], Float[Array, ""]]:
-    """Mean squared error in gray levels of a frame whose camera is moved by a screw.
+    """Make the loss of a camera: the mean squared error of a frame in gray levels.
 
-    The screw is (turn, shift) in pixels, for what lies at z-depth `depth`.
+    Args:
+      model: The model.
+      state: Trained state.
+      view: View of the frame with its initial camera.
+      picture: The frame, [height, width, 3].
+      valid: True for observed pixels, [height, width], or None.
+      depth: z-depth in scene units at which twists are measured in pixels.
+
+    Returns:
+      A function from a twist (rotation, translation) in pixels, [6], to the loss.
     """
     size = picture.shape[1], picture.shape[0]
     truth = picture.astype(view.camera.position.dtype) / LEVELS
@@ -88,10 +98,22 @@ def fit_camera(
     depth: Float[Array, ""],
     spec: CameraFitSpec = CameraFitSpec(),
 ) -> Fit:
-    """The camera near `view`'s whose rendering is closest to `picture`.
+    """Refine the camera of a view so that its rendering matches an image. Runs under
+    `jit`.
 
-    Under `jit`. `residual` is the length of the slope, squared gray levels per pixel. A
-    picture that does not depend on the camera is never converged.
+    Args:
+      model: The model.
+      state: Trained state.
+      view: View of the frame with its initial camera.
+      picture: The frame, [height, width, 3].
+      valid: True for observed pixels, [height, width], or None.
+      depth: z-depth in scene units at which twists are measured in pixels.
+      spec: Settings.
+
+    Returns:
+      The fit, with the camera as `value`. `residual` is the norm of the gradient in
+      squared gray levels per pixel. An image that does not depend on the camera never
+      converges.
     """
     loss = photometric_loss(model, state, view, picture, valid, depth)
     start = jnp.zeros(6, view.camera.position.dtype)
@@ -113,17 +135,27 @@ def fit_cameras(
     spec: CameraFitSpec = CameraFitSpec(),
     filmed: Capture | None = None,
 ) -> FittedCameras:
-    """Fit the cameras of some rows of a capture, and score these frames with them.
+    """Refine the cameras of some frames, and evaluate these frames with them.
 
-    `draw` and the scores are of `filmed`, the capture with its lens where `capture` is
-    of the pinholes that the model draws; the same capture by default.
+    Args:
+      model: The model.
+      draw: Renderer of `filmed`.
+      state: Trained state.
+      capture: The capture, undistorted if the model renders pinhole cameras.
+      rows: Indices of the frames.
+      spec: Settings.
+      filmed: The capture with its lens distortion, which the metrics are computed on.
+        None for `capture` itself.
+
+    Returns:
+      The cameras, convergence flags and metrics.
     """
     factor = 1
     while capture.images[0, ::factor, ::factor].size > 3 * spec.most_pixels:
         factor += 1
     width, height = capture.size
     size = width // factor, height // factor
-    # What is trimmed at the right and the bottom is no part of the smaller picture.
+    # Pixels trimmed at the right and the bottom are not part of the smaller image.
     whole = size[0] * factor, size[1] * factor
     program = jax.jit(
         lambda params, step, view, picture, valid, depth: fit_camera(
@@ -167,7 +199,7 @@ def fit_cameras(
 
 
 def _drawer(model, state, view, size):
-    """Camera -> color; what does not depend on the camera is computed once."""
+    """Function from a camera to colors, with everything else computed once."""
     if model.stages is None:
         return lambda camera: (
             model.render(

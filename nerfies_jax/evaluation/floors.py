@@ -1,9 +1,8 @@
-"""What held-out frames are worth without a scene, and without its motion.
+"""Baselines of held-out frames: neighboring frames, and the scene without its motion.
 
-Two pictures that cost nothing to make: the mean of the neighboring frames, and the
-mean of a scene's own renders over time. A scene below the first shows less than two
-frames laid over each other do, and one below the second is better with its motion
-left out.
+One baseline is the mean of the two neighboring frames, the other the mean of the
+scene's own renders over time. A scene below the first is worse than two superimposed
+frames, and one below the second is better without its motion.
 """
 
 from typing import NamedTuple
@@ -19,7 +18,7 @@ NEIGHBORS = 2
 
 
 class Averages(NamedTuple):
-    """Held-out frames made of other pictures; NumPy, one row for each."""
+    """Baseline images of held-out frames, in NumPy, with one row for each."""
 
     places: np.ndarray  # which of the scored frames
     color: np.ndarray  # [places, height, width, 3] float32 in [0, 1]
@@ -27,17 +26,24 @@ class Averages(NamedTuple):
 
 
 class Floors(NamedTuple):
-    """Both floors of one run; None where there is nothing to take the mean of."""
+    """Both baselines of one run, None where they do not exist."""
 
     neighbors: Averages | None
     still: Averages | None
 
 
 def neighbor_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
-    """The two frames learned from that are nearest to a frame in time, nearest first.
+    """Find the two training frames nearest in time to a frame, nearest first.
 
-    Of its own camera where that has two to learn from, else of all cameras; of frames
-    equally near, the first in the capture.
+    They are of the same camera if that has at least two training frames, else of any
+    camera. Ties go to the first in the capture.
+
+    Args:
+      capture: The capture.
+      row: Index of the frame.
+
+    Returns:
+      Indices of the frames.
     """
     rows = capture.train
     same = rows[capture.camera_ids[rows] == capture.camera_ids[row]]
@@ -48,11 +54,15 @@ def neighbor_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
 
 
 def neighbor_means(capture: Capture, rows: np.ndarray) -> Averages | None:
-    """The mean of the neighbors (`neighbor_rows`) of each row, as filmed.
+    """Compute the mean of the neighboring frames of each row, as captured.
 
-    Each pixel is the mean of those neighbors that filmed it, and unknown where none
-    did. None where there are not two frames to learn from at different times: nothing
-    is nearest then.
+    Args:
+      capture: The capture.
+      rows: Indices of the frames.
+
+    Returns:
+      The means over those neighbors that observed a pixel, unknown where none did. None
+      if there are no two training frames at different times.
     """
     if len(capture.train) < NEIGHBORS or not np.ptp(capture.times[capture.train]):
         return None
@@ -82,11 +92,24 @@ def time_averages(
     frames: int,
     moments: int,
 ) -> Averages:
-    """The mean over time of what a scene draws from the cameras of some rows.
+    """Average renders over time, from the cameras of some frames.
 
-    Of at most `frames` of the rows, at most `moments` of the times that were learned
-    from, both evenly spread. All else of the view (its camera, its appearance) stays.
-    Colors are clipped, then averaged as stored (sRGB).
+    Cameras and appearance stay the same. Colors are clipped, then averaged as stored
+    (sRGB).
+
+    Args:
+      draw: Renderer.
+      state: Trained state.
+      capture: The capture.
+      rows: Indices of the frames.
+      frames: Largest number of frames, evenly spread over the rows.
+      moments: Largest number of times, evenly spread over those of training frames.
+
+    Returns:
+      The means.
+
+    Raises:
+      ValueError: If `frames` or `moments` is below 1.
     """
     if frames < 1 or moments < 1:
         raise ValueError(

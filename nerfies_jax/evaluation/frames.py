@@ -1,4 +1,4 @@
-"""The frames of a capture on the device, and views to render."""
+"""Frames of a capture on the device, and views to render."""
 
 from collections.abc import Set
 
@@ -19,7 +19,16 @@ from nerfies_jax.training.model import (
 
 
 def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames:
-    """The training frames on the device, with what of `required_data` there is."""
+    """Move the training frames of a capture to the device.
+
+    Args:
+      capture: The capture.
+      required_data: Names of further data to include if the capture has it: "depths",
+        "points", "flow", "moving".
+
+    Returns:
+      The frames.
+    """
     rows = capture.train
     extras = {}
     if "depths" in required_data and capture.depths is not None:
@@ -42,10 +51,15 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
 
 
 def as_found(model: Model, state: TrainState, capture: Capture) -> Capture:
-    """A capture with the cameras that training found; as it is where it looks for none.
+    """Replace the cameras of a capture by those that training has refined.
 
-    It need not be the one that was learned from: with a lens, or without, of the same
-    frames.
+    Args:
+      model: The model.
+      state: Trained state.
+      capture: A capture of the same frames, with or without lens distortion.
+
+    Returns:
+      The capture, unchanged if the model does not refine cameras.
     """
     if model.found is None:
         return capture
@@ -53,7 +67,15 @@ def as_found(model: Model, state: TrainState, capture: Capture) -> Capture:
 
 
 def view_of(capture: Capture, row: int | np.integer) -> View:
-    """The view in which a frame was filmed."""
+    """Return the view of a frame.
+
+    Args:
+      capture: The capture.
+      row: Index of the frame.
+
+    Returns:
+      Camera, time and appearance id of the frame, on the device.
+    """
     view = View(
         cameras.take(capture.cameras, row),
         capture.times[row],
@@ -63,14 +85,32 @@ def view_of(capture: Capture, row: int | np.integer) -> View:
 
 
 def resized(view: View, old: tuple[int, int], new: tuple[int, int]) -> View:
-    """The same view as a picture of another (width, height)."""
+    """Adapt a view to another image size.
+
+    Args:
+      view: The view.
+      old: Width and height of its image in pixels.
+      new: New width and height in pixels.
+
+    Returns:
+      The view with its camera adapted.
+    """
     if old == new:
         return view
     return view._replace(camera=cameras.resize(view.camera, old, new))
 
 
 def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
-    """Views along a camera path, one for each time; codes as in `like`."""
+    """Return the views along a camera path.
+
+    Args:
+      path: Cameras, [frames].
+      times: Times in [0, 1], [frames].
+      like: View whose appearance is used.
+
+    Returns:
+      One view for each time.
+    """
     return [
         like._replace(
             camera=in_default_precision(cameras.take(path, row)),
@@ -81,6 +121,14 @@ def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
 
 
 def spread(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most `most` of the rows [rows, ...], evenly spread and in their order."""
+    """Select evenly spread rows, in their order.
+
+    Args:
+      rows: Rows, [rows, ...].
+      most: Largest number to select.
+
+    Returns:
+      The selected rows.
+    """
     picked = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
     return rows[picked]

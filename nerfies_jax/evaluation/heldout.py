@@ -1,4 +1,4 @@
-"""All that is measured of frames that were never learned from; a table of the keys."""
+"""All metrics of held-out frames, and a table of their keys."""
 
 import functools
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from nerfies_jax.training.model import in_default_precision
 MS_SSIM_SIDE = 160  # pixels that the shorter side must exceed
 
 
-# How much worse a later run may be, in the unit of `metric_table.METRICS`.
+# Tolerated decline in a later run, in the unit of `metric_table.METRICS`.
 TOLERANCES = {
     "heldout.psnr": 0.2,
     "heldout.ssim": 0.01,
@@ -77,7 +77,15 @@ class Lpips(NamedTuple):
 
 
 def check_large_enough(network: Network, size: tuple[int, int]) -> None:
-    """Raise ValueError where pictures of (width, height) are too small for LPIPS."""
+    """Check that images are large enough for LPIPS.
+
+    Args:
+      network: Network of LPIPS.
+      size: Width and height of the images in pixels.
+
+    Raises:
+      ValueError: If they are too small.
+    """
     if min(size) < network.smallest:
         raise ValueError(
             f"LPIPS with {network.name} needs {network.smallest} pixels on the shorter "
@@ -96,12 +104,24 @@ def heldout_metrics(
     fitted: FittedCameras | None = None,
     floors: Floors = Floors(None, None),
 ) -> dict[str, float]:
-    """Everything that can be measured, by the keys of `TOLERANCES`.
+    """Compute all metrics of held-out frames for which there is data.
 
-    PSNR and SSIM are always there; anything else where the capture has what it is held
-    against (masks of what moves, depths), or where it is passed: `known` and `followed`
-    points, `flow`, `fitted` cameras, `floors`. What has nothing to be a mean of is left
+    PSNR and SSIM are always computed. Others need data of the capture (masks of moving
+    pixels, depths) or an argument. Metrics that would be a mean over nothing are left
     out.
+
+    Args:
+      scored: Rendered frames.
+      capture: The capture.
+      lpips: Weights of LPIPS, or None.
+      known: Ground truth of point tracks, or None.
+      followed: Predicted point tracks, or None.
+      flow: Predicted and true optical flow, or None.
+      fitted: Frames rendered with fitted cameras, or None.
+      floors: Baselines.
+
+    Returns:
+      Values by the keys of `TOLERANCES`.
     """
     scores = {
         "heldout.psnr": known_mean(scored.psnr),
@@ -125,7 +145,14 @@ def heldout_metrics(
 
 
 def metrics(numbers: Mapping[str, float]) -> list[Metric]:
-    """Numbers by the keys of `TOLERANCES` as metrics, in its order."""
+    """Convert values to metrics with tolerances.
+
+    Args:
+      numbers: Values by the keys of `TOLERANCES`.
+
+    Returns:
+      Metrics in the order of `TOLERANCES`.
+    """
     return [
         metric(key, numbers[key], tolerance)
         for key, tolerance in TOLERANCES.items()
@@ -167,7 +194,7 @@ def _floors(floors, scored, capture):
 
 
 def _floor_psnr(averages, scored, capture):
-    """[places, 2] PSNR of all that was filmed and of what of it moves; NaN of none."""
+    """PSNR of all observed pixels and of the moving ones, [places, 2], NaN for none."""
     psnrs = []
     for number, (place, color) in enumerate(
         zip(averages.places, averages.color, strict=True)
@@ -248,7 +275,9 @@ def _depths(scored, capture):
 
 
 def _flow(flow):
-    """End-point errors of the pixels that have an answer; none is an outlier, too."""
+    """End-point errors of the pixels with a prediction. The others count as
+    outliers.
+    """
     answered = np.isfinite(flow.predicted).all(axis=-1)
     both = in_default_precision((flow.predicted, flow.truth))
 
@@ -266,9 +295,9 @@ def _flow(flow):
 
 
 def _cameras(fitted, capture, exact):
-    """PSNR with fitted cameras; where those of the capture are `exact`, their errors.
+    """PSNR with fitted cameras, and their errors if the capture's cameras are `exact`.
 
-    Without alignment's scale: the cameras were fitted to a scene in scene units.
+    The alignment has no scale, since cameras were fitted to a scene in scene units.
     """
     numbers = {"heldout.camera_fitted_psnr": known_mean(fitted.scored.psnr)}
     true = cameras.take(capture.cameras, fitted.scored.rows)

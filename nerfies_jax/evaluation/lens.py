@@ -1,4 +1,4 @@
-"""Renders of pinholes as a lens would have filmed them, to hold them against film."""
+"""Distortion of rendered pinhole images, to compare them with captured images."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from nerfies_jax.training.model import Rendering, TrainState, View
 
 
 class ThroughLens:
-    """What a renderer of pinholes draws, on the pixel grid of the filmed picture.
+    """Renderer of distorted images, on top of a renderer of pinhole images.
 
-    The render of the camera without its lens is read where each filmed pixel looks:
-    color and alpha bilinearly, depth, which must not be mixed over an edge, from the
-    nearest pixel. Everything is 0 where the pinhole does not look; those pixels are
-    not `valid` in `pinholes.scorable`. A view without a lens is passed on.
+    The render of the undistorted camera is sampled where each distorted pixel looks:
+    color and opacity bilinearly, and depth, which must not be mixed across edges, at
+    the nearest pixel. Everything is 0 outside of the pinhole image. Those pixels are
+    not `valid` in `pinholes.scorable`. Views without distortion are passed through.
     """
 
     def __init__(self, draw: Draw, size: tuple[int, int]):
@@ -21,7 +21,7 @@ class ThroughLens:
         self._maps = pinholes.Maps(pinholes.pinhole_places, size)
 
     def __call__(self, state: TrainState, view: View) -> Rendering:
-        """One picture, of (width, height) `size`; NumPy."""
+        """Render one image of the size (width, height) given by `size`, in NumPy."""
         if not pinholes.has_lens(view.camera):
             return self._draw(state, view)
         straight = view._replace(camera=pinholes.pinhole(view.camera))

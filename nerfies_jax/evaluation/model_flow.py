@@ -1,4 +1,4 @@
-"""Optical flow of a trained scene: where what a pixel shows goes, by learned motion."""
+"""Optical flow of a trained scene, from its learned motion."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -25,7 +25,7 @@ FRAMES = 4
 
 
 class Moved(NamedTuple):
-    """Points of one instant at another; NumPy."""
+    """Positions of points at another time, in NumPy."""
 
     points: np.ndarray  # [points, 3] scene units; where they were, if not found
     found: np.ndarray  # [points] bool
@@ -38,7 +38,7 @@ Mover = Callable[..., Move | None]
 
 
 class Flow(NamedTuple):
-    """Flow of a few pixels of a few frames, in pixels right and down; NumPy."""
+    """Predicted and true flow of some pixels of some frames, in NumPy."""
 
     predicted: np.ndarray  # [pixels, 2]; NaN where the model has no answer
     truth: np.ndarray  # [pixels, 2]
@@ -53,10 +53,21 @@ def pixel_flow(
     pixels: np.ndarray,
     depth: np.ndarray,
 ) -> np.ndarray:
-    """Flow [pixels, 2] of pixel positions [pixels, 2] from one view to another.
+    """Compute the flow of pixels from one view to another.
 
-    What lies at z-depth `depth` behind each is moved, and projected where it is then.
-    NaN where there is no depth, the point is lost, or it is behind the other camera.
+    The point at the depth of each pixel is moved and projected to the other view.
+
+    Args:
+      move: Motion of points.
+      state: Trained state.
+      here: View of the pixels.
+      there: The other view.
+      pixels: Pixel positions (x, y) with centers at +0.5, [pixels, 2].
+      depth: z-depths in scene units, [pixels].
+
+    Returns:
+      Flow in pixels [pixels, 2], NaN where there is no depth, the point is lost, or it
+      is behind the other camera.
     """
     known = np.isfinite(depth) & (depth > 0)
     pixels = np.asarray(in_default_precision(pixels))
@@ -70,9 +81,18 @@ def pixel_flow(
 def picture_flow(
     move: Move, state: TrainState, here: View, there: View, rendering: Rendering
 ) -> np.ndarray:
-    """Flow [height, width, 2] of a whole drawn picture to another view.
+    """Compute the flow of a whole rendered image to another view.
 
-    NaN where less than half of a pixel is drawn, beside where `pixel_flow` is.
+    Args:
+      move: Motion of points.
+      state: Trained state.
+      here: View of the image.
+      there: The other view.
+      rendering: The rendered image.
+
+    Returns:
+      Flow in pixels [height, width, 2], NaN where opacity is below one half or
+      `pixel_flow` has no result.
     """
     pixels = _pixels(rendering)
     depth = np.where(rendering.alpha > 0.5, rendering.depth, 0)
@@ -83,10 +103,18 @@ def picture_flow(
 def picture_distance(
     move: Move, state: TrainState, here: View, there: View, rendering: Rendering
 ) -> np.ndarray:
-    """How far what a drawn picture shows is from where it is in another view.
+    """Compute how far the surface in a rendered image has moved between two times.
 
-    [height, width] in scene units, at the times of the two views. NaN where less than
-    half of a pixel is drawn, or the point is lost.
+    Args:
+      move: Motion of points.
+      state: Trained state.
+      here: View of the image.
+      there: View with the other time.
+      rendering: The rendered image.
+
+    Returns:
+      Distances in scene units [height, width], NaN where opacity is below one half or
+      the point is lost.
     """
     depth = rendering.depth.ravel()
     known = (rendering.alpha.ravel() > 0.5) & np.isfinite(depth) & (depth > 0)
@@ -105,7 +133,16 @@ def _pixels(rendering):
 
 
 def surface(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Points [pixels, 3] at z-depths `depth` [pixels] behind pixels [pixels, 2]."""
+    """Unproject pixels to z-depths.
+
+    Args:
+      camera: The camera.
+      pixels: Pixel positions (x, y) with centers at +0.5, [pixels, 2].
+      depth: z-depths in scene units, [pixels].
+
+    Returns:
+      Points in scene units, [pixels, 3].
+    """
     return np.asarray(
         _surface(camera, in_default_precision(pixels), in_default_precision(depth))
     )
@@ -131,10 +168,19 @@ def _project(
 def heldout_flow(
     move: Move, state: TrainState, capture: Capture, scored: Scored
 ) -> Flow | None:
-    """Flow of rendered frames to the next of their camera, beside the capture's.
+    """Compute the flow of rendered frames to the next of their camera, with its truth.
 
-    At most `FRAMES` frames and `PIXELS` pixels of each, of those whose point both
-    frames show. None where the capture has no flow or none of its flow is of `scored`.
+    At most `FRAMES` frames and `PIXELS` pixels of each are used, where both frames show
+    the point.
+
+    Args:
+      move: Motion of points.
+      state: Trained state.
+      capture: The capture, with its flow.
+      scored: Rendered frames.
+
+    Returns:
+      Predicted and true flow. None if the capture has no flow for these frames.
     """
     if capture.flow is None:
         return None

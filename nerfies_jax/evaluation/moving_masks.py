@@ -1,4 +1,6 @@
-"""Which pixels of the held-out frames move, where a capture does not say it itself."""
+"""Masks of moving pixels in held-out frames, for captures without masks of their
+own.
+"""
 
 import dataclasses
 import math
@@ -16,12 +18,18 @@ MOST_PIXELS = 4_000_000  # of all frames looked at: 45 s on one core
 
 
 def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
-    """A capture with masks of what moves, and a note where they are not its own.
+    """Add masks of moving pixels to a capture that has none.
 
-    They are those of `evidence.record` of the frames that scores are of and of those
-    learned from together, kept in `folder`. Held-out pictures enter it, so it is for
-    scores alone, never for training. Only the masks of held-out rows are to be read.
-    Without masks where the capture has none and flow cannot follow it.
+    They are computed by preprocessing all frames together, including held-out ones, so
+    they are for evaluation only, never for training. Only the masks of held-out rows
+    may be read.
+
+    Args:
+      filmed: The capture.
+      folder: Cache folder of preprocessing.
+
+    Returns:
+      The capture and a note. The capture has no masks if tracking fails.
     """
     if filmed.moving is not None or not len(filmed.heldout):
         return filmed, ""

@@ -1,6 +1,6 @@
-"""Pictures that let a person judge a run: comparisons, color codes, sheets, a curve.
+"""Images to inspect a run: comparisons, color maps, contact sheets, a curve.
 
-Everything takes NumPy arrays and gives uint8 [height, width, 3], or writes one PNG.
+Functions take NumPy arrays and return uint8 [height, width, 3], or write one PNG.
 """
 
 import functools
@@ -33,7 +33,7 @@ STRAY_SHARE = 0.01
 
 
 class Colored(NamedTuple):
-    """A quantity as a picture, and the values its two ends stand for."""
+    """A quantity as a color-mapped image, with the values of the map's two ends."""
 
     picture: np.ndarray  # [..., height, width, 3] uint8
     low: float
@@ -41,7 +41,7 @@ class Colored(NamedTuple):
 
 
 class History(NamedTuple):
-    """How a run went, one entry for each evaluation."""
+    """PSNR over the course of a run, with one entry for each evaluation."""
 
     seconds: Sequence[float]  # of training, without compiling
     psnr: Sequence[float]  # dB, held-out frames
@@ -52,10 +52,19 @@ def color_depth(
     known: np.ndarray | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Colored:
-    """Depth in the colors of viridis, near bright and far dark; unknown gray.
+    """Map depth to viridis, near bright and far dark, unknown gray.
 
-    One range for all pictures given, `limits` or the 1st to 99th percentile of what is
-    known (finite, positive and `known`), so that frames can be compared.
+    All images share one range, so that frames can be compared.
+
+    Args:
+      depth: Depths, [..., height, width].
+      known: True where depth is known, of the same shape. None for all. Depths that are
+        not finite and positive are unknown in any case.
+      limits: Lowest and highest value. None for the 1st and 99th percentile of known
+        depths.
+
+    Returns:
+      The image and the range.
     """
     depth = np.asarray(depth, np.float32)
     shown = np.isfinite(depth) & (depth > 0)
@@ -68,9 +77,18 @@ def color_depth(
 
 
 def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> Colored:
-    """Mean absolute difference over the channels of pictures in [0, 1].
+    """Map the mean absolute difference over channels to inferno.
 
-    Black is 0, light yellow `largest` and more; gray where either is not finite.
+    Args:
+      image: Images in [0, 1] or uint8, [..., height, width, 3].
+      truth: Ground truth of the same shape.
+      largest: Error shown in light yellow, as are larger ones.
+
+    Returns:
+      The image, black for 0 and gray where either is not finite.
+
+    Raises:
+      ValueError: If `largest` is not positive.
     """
     if not largest > 0:
         raise ValueError(
@@ -84,9 +102,15 @@ def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> C
 
 
 def color_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Colored:
-    """How far things moved, scene units: black is not at all, gray is unknown.
+    """Map displacements to inferno, black for none and gray for unknown.
 
-    Light yellow is the 99th percentile, or `at_least` where that is farther.
+    Args:
+      distance: Displacements in scene units, [..., height, width].
+      at_least: Smallest value for the bright end of the map, which is otherwise the
+        99th percentile.
+
+    Returns:
+      The image and the range.
     """
     shown = np.isfinite(distance)
     largest = max(float(at_least), _limits(distance[shown])[1] if shown.any() else 0.0)
@@ -95,11 +119,17 @@ def color_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Colored
 
 
 def color_flow(flow: np.ndarray, largest: float | int | None = None) -> Colored:
-    """Image motion [..., height, width, 2]: direction as hue, length as saturation.
+    """Map optical flow to colors: direction as hue, length as saturation.
 
-    Still is white, right is red, down yellow-green, left cyan and up violet; full
-    color from `largest` pixels on (the 99th percentile of the lengths by default).
-    Unknown is gray.
+    Static is white, right is red, down yellow-green, left cyan, up violet, and unknown
+    gray.
+
+    Args:
+      flow: Flow in pixels, [..., height, width, 2].
+      largest: Length of full saturation in pixels. None for the 99th percentile.
+
+    Returns:
+      The image and the range.
     """
     flow = np.asarray(flow, np.float32)
     shown = np.all(np.isfinite(flow), axis=-1)
@@ -126,11 +156,21 @@ def comparison(
     largest_error: float = 0.2,
     known_depth: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Truth, render, error and depth side by side, one row for each frame.
+    """Show ground truth, render, error and depth side by side, one row for each frame.
 
-    Pictures [frames, height, width, 3] (uint8, or floats in [0, 1]), depth [frames,
-    height, width] in scene units with one color range over all rows. `captions` stand
-    above the rows; the bars below say what the colors mean.
+    Args:
+      truth: Images in [0, 1] or uint8, [frames, height, width, 3].
+      render: Renders of the same shape.
+      depth: Depths in scene units, [frames, height, width], with one color range.
+      captions: One caption above each row.
+      largest_error: Error shown in light yellow.
+      known_depth: True where depth is known, [frames, height, width]. None for all.
+
+    Returns:
+      The image, with color bars below.
+
+    Raises:
+      ValueError: If the numbers of frames differ.
     """
     frames = len(truth)
     if not (len(render) == len(depth) == len(captions) == frames > 0):
@@ -167,7 +207,19 @@ def comparison(
 def contact_sheet(
     pictures: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
 ) -> np.ndarray:
-    """Captioned pictures of one size in a grid, read row by row."""
+    """Arrange captioned images of one size in a grid, row by row.
+
+    Args:
+      pictures: Images, [height, width, 3].
+      captions: One for each image.
+      columns: Number of columns.
+
+    Returns:
+      The image.
+
+    Raises:
+      ValueError: If the numbers of images and captions differ.
+    """
     if not len(pictures) == len(captions) > 0:
         raise ValueError(
             f"a contact sheet needs one caption for each picture, got {len(pictures)} "
@@ -185,7 +237,7 @@ def contact_sheet(
 
 
 class Final(NamedTuple):
-    """The score of a finished run, over more frames than its history is of."""
+    """Final PSNR of a run, over more frames than its history."""
 
     seconds: float  # of training
     psnr: float  # dB
@@ -260,12 +312,24 @@ def _mark_final(axes, final):
 
 
 def save(picture: np.ndarray, path: str | pathlib.Path):
-    """As a PNG, written atomically."""
+    """Write an image as PNG, atomically.
+
+    Args:
+      picture: uint8 image.
+      path: The file.
+    """
     images.write_png(path, picture)
 
 
 def as_bytes(picture: np.ndarray) -> np.ndarray:
-    """uint8 of a picture that is uint8 or has floats in [0, 1]; NaN is black."""
+    """Convert an image to uint8.
+
+    Args:
+      picture: uint8, or floats in [0, 1].
+
+    Returns:
+      uint8 values, black for NaN.
+    """
     if picture.dtype == np.uint8:
         return picture
     return np.round(np.clip(np.nan_to_num(picture, nan=0.0), 0, 1) * 255).astype(
@@ -274,7 +338,14 @@ def as_bytes(picture: np.ndarray) -> np.ndarray:
 
 
 def as_unit(picture: np.ndarray) -> np.ndarray:
-    """float32 in [0, 1] of a picture that is uint8 or has floats already."""
+    """Convert an image to floats.
+
+    Args:
+      picture: uint8, or floats in [0, 1].
+
+    Returns:
+      float32 values in [0, 1].
+    """
     if picture.dtype == np.uint8:
         return picture.astype(np.float32) / 255
     return np.clip(picture, 0, 1).astype(np.float32)

@@ -1,6 +1,6 @@
-"""What a trained scene is held against, and points followed by its learned motion.
+"""Ground truth of a trained scene, and point tracks by its learned motion.
 
-Everything is in scene units. `heldout.heldout_metrics` measures all.
+Everything is in scene units. `heldout.heldout_metrics` computes the metrics.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ STATIC_POINTS = 500  # of the capture's static points, to see whether they drift
 
 
 class GroundTruth(NamedTuple):
-    """What all arms are held against; NumPy. Without a truth there are no tracks."""
+    """Ground truth of all variants, in NumPy. A real capture has no tracks."""
 
     rows: np.ndarray  # held-out frames of the capture that are rendered
     moments: np.ndarray  # frames learned from, in time: when points are looked for
@@ -37,12 +37,12 @@ class GroundTruth(NamedTuple):
 
     @property
     def start_points(self) -> np.ndarray:
-        """[tracks, 3] where the points are known to be, scene units."""
+        """Known positions of the points at the start, [tracks, 3], in scene units."""
         return self.path[:, self.start]
 
 
 class PointTracks(NamedTuple):
-    """Points as a learned warp moves them."""
+    """Points as moved by a learned warp."""
 
     path: np.ndarray  # [tracks, moments, 3] scene units; the start where not found
     found: np.ndarray  # [tracks, moments] bool
@@ -56,9 +56,16 @@ class PointTracks(NamedTuple):
 
 
 def stored_truth(capture: Capture) -> SceneTruth | None:
-    """The truth beside the files of a built-in scene; None for what a camera filmed.
+    """Read the ground truth stored with a built-in scene.
 
-    Raises ValueError where it cannot be read.
+    Args:
+      capture: The capture.
+
+    Returns:
+      The ground truth, None for a real capture.
+
+    Raises:
+      ValueError: If it cannot be read.
     """
     path = None if capture.path is None else capture.path / TRUTH_FILE
     return None if path is None or not path.is_file() else truths.load(path)
@@ -67,9 +74,19 @@ def stored_truth(capture: Capture) -> SceneTruth | None:
 def ground_truth(
     capture: Capture, truth: SceneTruth, frames: int, tracks: int
 ) -> GroundTruth:
-    """At most `frames` held-out frames and `tracks` points seen at the start.
+    """Select held-out frames, and points visible at the start.
 
-    Raises ValueError where the truth is not that of the capture.
+    Args:
+      capture: The capture.
+      truth: Its ground truth.
+      frames: Largest number of frames.
+      tracks: Largest number of points.
+
+    Returns:
+      The selected ground truth.
+
+    Raises:
+      ValueError: If the truth is not that of the capture.
     """
     moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     path = truths.track_places(capture, truth, moments)
@@ -87,10 +104,20 @@ def ground_truth(
 
 
 def held_out_only(capture: Capture, frames: int) -> GroundTruth:
-    """What is known of a real capture: how at most `frames` held-out frames look.
+    """Select held-out frames of a real capture, which has no ground truth for points.
 
-    Its depths and masks, if it has any, are estimates: depths judge nothing, and masks
-    only say where pictures are compared.
+    Depths and masks, if any, are estimates. Depths are not evaluated, and masks only
+    select the pixels of images.
+
+    Args:
+      capture: The capture.
+      frames: Largest number of frames.
+
+    Returns:
+      The selected ground truth, without tracks.
+
+    Raises:
+      ValueError: If the capture has no held-out frames.
     """
     if not len(capture.heldout):
         raise ValueError(
@@ -109,9 +136,14 @@ def held_out_only(capture: Capture, frames: int) -> GroundTruth:
 
 
 def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, float]:
-    """End-point errors over the seen points of all moments but the start.
+    """Evaluate point tracks over the visible points of all times but the start.
 
-    Without anything followed, or anything to follow, all are NaN.
+    Args:
+      known: Ground truth.
+      followed: Predicted tracks, or None.
+
+    Returns:
+      Metrics by name, NaN without tracks.
     """
     names = ("track_error", "track_correct", "track_lost", "drift", "strain")
     if followed is None or not len(known.path):
@@ -123,7 +155,14 @@ def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, 
 
 
 def static_error(known: GroundTruth) -> float:
-    """The end-point error of points that are said not to move; NaN without any."""
+    """Compute the end-point error of the prediction that nothing moves.
+
+    Args:
+      known: Ground truth.
+
+    Returns:
+      The error in scene units, NaN without tracks.
+    """
     if not len(known.path):
         return float("nan")
     return float(

@@ -48,8 +48,7 @@ class Renderer:
         return rendering
 
     def compiled(self, state: TrainState, view: View | tuple) -> Any:
-        """Return the compiled programs for a state and a view, and compile them if
-        needed.
+        """Return the compiled programs for a state and a view, compiling on first use.
 
         Args:
           state: Training state, of which parameters and step are read.

@@ -1,4 +1,4 @@
-"""What a run must know of a representation; each package fills one record.
+"""Interface of a representation to runs, which each package fills in one record.
 
 `nerfies_jax.runs` finds the records by the entry points of the group
 "nerfies_jax.representations", so it imports no package that has one.
@@ -22,7 +22,7 @@ MODEL = "model.npz"  # in a run folder: all of a trained scene of Gaussians
 
 
 class Saved(NamedTuple):
-    """The files of a trained scene, beside its checkpoint."""
+    """Files of a trained scene, besides its checkpoint."""
 
     model_bytes: int | None = None  # of the one file that holds all of it
     notes: tuple[str, ...] = ()  # what the reader should know of them
@@ -32,16 +32,16 @@ class Saved(NamedTuple):
 
 
 class Player(NamedTuple):
-    """A page that plays a trained scene by itself, and what is in it."""
+    """A page that plays a trained scene, and a description of its contents."""
 
     path: pathlib.Path
     about: str
 
 
 class Choice(NamedTuple):
-    """A preset, and what to change in it.
+    """A preset with overrides.
 
-    Advice names it without "-small", a default preset as it is.
+    Advice names the preset without "-small", a default preset as it is.
     """
 
     preset: str
@@ -50,7 +50,7 @@ class Choice(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """Two scenes of a preset that differ in what a decision switches on.
+    """Two scenes of a preset that differ in one decision.
 
     The names are those of the keys of `experiments.effect_cost`.
     """
@@ -61,7 +61,7 @@ class Pair(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What of a trained scene can be chosen when it is drawn."""
+    """Choices that a trained scene offers when it is rendered."""
 
     removable: tuple[str, ...]  # effects that it can be drawn without
     appearance: bool  # whether it looks otherwise for each appearance id
@@ -83,9 +83,10 @@ Splatting = Callable[[TrainState, float, int, np.ndarray], SplatCloud]
 
 
 class Representation(NamedTuple):
-    """How its scenes are named, built, followed, timed and saved.
+    """Constructors and functions of a representation's scenes.
 
-    What takes a spec and its metadata takes `effects`, those of the user's own, too.
+    Functions that take a spec and its metadata take `effects` as well, which are
+    user-defined.
     """
 
     name: str
@@ -134,7 +135,15 @@ class Representation(NamedTuple):
 
 
 def check_there(without: tuple[str, ...], there: tuple[str, ...]) -> None:
-    """Raise ValueError for effects that a trained scene cannot be drawn without."""
+    """Check that a trained scene can be rendered without some effects.
+
+    Args:
+      without: Names of the effects to leave out.
+      there: Names of the removable effects.
+
+    Raises:
+      ValueError: If one of them is not removable.
+    """
     for name in without:
         if name not in there:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Scores of frames that were never learned from."""
+"""Metrics of held-out frames."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ Draw = Callable[[TrainState, View], Rendering]  # as a `Renderer` does
 
 
 class Scored(NamedTuple):
-    """Frames as rendered, and their scores; NumPy, one row per frame."""
+    """Rendered frames and their metrics, in NumPy, with one row per frame."""
 
     rows: np.ndarray  # of the capture
     color: np.ndarray  # [frames, height, width, 3] float32, clipped to [0, 1]
@@ -27,7 +27,9 @@ class Scored(NamedTuple):
 
 
 class Halves(NamedTuple):
-    """Scores of the right halves of frames whose codes were fitted to the left ones."""
+    """Metrics of the right halves of frames whose codes were fitted to the left
+    halves.
+    """
 
     rows: np.ndarray  # of the capture
     psnr: np.ndarray  # dB, of the 8-bit picture
@@ -37,10 +39,21 @@ class Halves(NamedTuple):
 def score(
     renderer: Draw, state: TrainState, capture: Capture, rows: np.ndarray
 ) -> Scored:
-    """Render frames of a capture and compare them with what was filmed.
+    """Render frames of a capture and compare them with the captured images.
 
-    Scores are of the picture as an 8-bit file would hold it, over the filmed pixels.
-    Raises ValueError for no frames.
+    Metrics are those of the image after rounding to 8 bits, over the observed pixels.
+
+    Args:
+      renderer: The renderer.
+      state: Trained state.
+      capture: The capture.
+      rows: Indices of the frames.
+
+    Returns:
+      The rendered frames and their metrics.
+
+    Raises:
+      ValueError: If there are no frames.
     """
     _check_some(rows, capture)
     renderings, scores = [], []
@@ -69,12 +82,23 @@ def score_halves(
     capture: Capture,
     rows: np.ndarray,
 ) -> Halves:
-    """Score frames whose appearance was never learned, by NeRF-W's protocol.
+    """Evaluate frames with unknown appearance by the protocol of NeRF-W.
 
-    `fit_code(view, left, valid)` finds the codes of a frame from its left half alone,
-    uint8 [height, width // 2, 3] and which of it was filmed (or None), with the network
-    frozen; `render(view, codes)` draws the whole frame with them, and its right half
-    is scored (Martin-Brualla et al. 2021).
+    Codes are fitted to the left half of a frame with the network frozen, and the right
+    half is evaluated.
+
+    Args:
+      fit_code: Function of a view, the left half of its image (uint8 [height, width //
+        2, 3]) and its observed pixels (or None), which returns codes.
+      render: Function of a view and codes, which renders the whole frame.
+      capture: The capture.
+      rows: Indices of the frames.
+
+    Returns:
+      The metrics of the right halves.
+
+    References:
+      Martin-Brualla et al. 2021 (NeRF-W), arXiv:2008.02268.
     """
     colors = []
     for row in rows:
@@ -89,9 +113,18 @@ def score_halves(
 def score_right_halves(
     capture: Capture, rows: np.ndarray, colors: np.ndarray | Sequence[np.ndarray]
 ) -> Halves:
-    """Scores of the right halves of rendered frames [height, width, 3].
+    """Evaluate the right halves of rendered frames.
 
-    Raises ValueError for no frames.
+    Args:
+      capture: The capture.
+      rows: Indices of the frames.
+      colors: Rendered frames, [height, width, 3].
+
+    Returns:
+      The metrics.
+
+    Raises:
+      ValueError: If there are no frames.
     """
     _check_some(rows, capture)
     scores = []
@@ -115,9 +148,16 @@ def _check_some(rows, capture):
 def known_mean(
     values: np.ndarray, mean: Callable[[np.ndarray], Any] = np.mean
 ) -> float:
-    """The mean of what is not NaN, as a frame without a filmed pixel scores.
+    """Compute the mean of the values that are not NaN.
 
-    NaN over nothing. `mean` may be another statistic.
+    NaN is the metric of a frame without observed pixels.
+
+    Args:
+      values: Values.
+      mean: Another statistic in place of the mean.
+
+    Returns:
+      The mean, NaN over nothing.
     """
     values = values[~np.isnan(values)]
     return float(mean(values)) if values.size else float("nan")

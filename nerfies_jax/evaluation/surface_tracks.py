@@ -1,4 +1,4 @@
-"""Points of what a trained scene shows at one instant, followed through all others."""
+"""Point tracks on the surfaces that a trained scene shows at one time."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ DEPTH_SLACK = 0.1
 
 
 class SurfaceTracks(NamedTuple):
-    """Points over frames that were learned from, in the order of time; NumPy."""
+    """Points over training frames in the order of time, in NumPy."""
 
     positions: np.ndarray  # [points, frames, 3] scene units; the start where lost
     # [points, frames] bool: followed, in the picture, and not behind what is drawn
@@ -42,9 +42,22 @@ def follow(
     frames: int | None = None,
     time: float = 0.5,
 ) -> SurfaceTracks:
-    """At most `count` points, evenly spread over the picture nearest to `time`.
+    """Track points on the rendered surface through all frames.
 
-    Followed over all frames learned from, or `frames` of them, evenly spread.
+    Args:
+      move: Motion of points.
+      draw: Renderer.
+      state: Trained state.
+      capture: The capture.
+      count: Largest number of points, evenly spread over the image.
+      frames: Number of frames, evenly spread over the training frames. None for all.
+      time: Time at which the points are selected, in the frame nearest to it.
+
+    Returns:
+      The tracks.
+
+    Raises:
+      ValueError: If nothing is rendered at `time`.
     """
     rows = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     rows = spread(rows, frames or len(rows))
@@ -91,7 +104,18 @@ def write(
     units: Units = "scene",
     overwrite: bool = False,
 ) -> None:
-    """An npz of all of it, whole or not at all, with the frames' names for rows."""
+    """Write tracks and the names of their frames as an .npz file, atomically.
+
+    Args:
+      path: The file.
+      tracks: The tracks.
+      capture: The capture.
+      units: "scene" for scene units, "world" for those of the capture's own files.
+      overwrite: True to replace an existing file.
+
+    Raises:
+      CaptureError: If the file exists or cannot be written.
+    """
     refuse_existing(path, overwrite)
     arrays = tracks._asdict()
     rows = arrays.pop("rows")

@@ -1,1 +1,1 @@
-"""Floor 5: how good, how long."""
+"""Metrics of quality, time and memory."""

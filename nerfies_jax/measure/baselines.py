@@ -1,4 +1,4 @@
-"""What got worse since an earlier run: `--check BASELINE`."""
+"""Comparison of metrics with those of an earlier run."""
 
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,18 @@ from nerfies_jax.measure.clock import Metric
 
 
 def read(path: pathlib.Path, name: str) -> dict[str, Metric]:
-    """The metrics of an earlier run's file `name`; ValueError where there are none."""
+    """Read the metrics of an earlier run.
+
+    Args:
+      path: The file.
+      name: Usual name of such a file, for the error message.
+
+    Returns:
+      Metrics by key.
+
+    Raises:
+      ValueError: If the file cannot be read.
+    """
     try:
         return clock.read_metrics(path)
     except OSError as error:
@@ -21,9 +32,17 @@ def read(path: pathlib.Path, name: str) -> dict[str, Metric]:
 
 
 def changes(metrics: Sequence[Metric], before: Mapping[str, Metric]) -> list[str]:
-    """One line for each number that is worse than before by more than its tolerance.
+    """List the metrics that are worse than before by more than their tolerance.
 
-    Only what both runs have is held; a number that was unknown before never is worse.
+    Only metrics of both runs are compared. A metric that was not finite before never
+    counts as worse.
+
+    Args:
+      metrics: Metrics of the later run.
+      before: Metrics of the earlier run by key.
+
+    Returns:
+      One line for each.
     """
     lines = []
     for metric in metrics:

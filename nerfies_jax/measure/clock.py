@@ -1,4 +1,4 @@
-"""How long, how much memory, how many operations; and numbers as records."""
+"""Measurements of time, memory and operations, and records of metrics."""
 
 import dataclasses
 import json
@@ -23,10 +23,10 @@ DIRECTIONS = ("lower", "higher", "equal")
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """One measured number that a later run can be held against.
+    """A measured value that a later run can be compared with.
 
-    `direction` says which way is better: "lower", "higher" or "equal". `tolerance` is
-    how much worse it may become before that counts, in the metric's own unit.
+    `direction` is the better direction: "lower", "higher" or "equal". `tolerance` is
+    the decline that is accepted, in the unit of the metric.
     """
 
     key: str  # "heldout.psnr"
@@ -52,9 +52,14 @@ class Metric:
             )
 
     def holds(self, before: float) -> bool:
-        """Whether the value is no worse than `before` by more than the tolerance.
+        """Return whether the value is no worse than an earlier one within the
+        tolerance.
 
-        A value that is not a number never holds.
+        Args:
+          before: The earlier value.
+
+        Returns:
+          True if it holds. NaN never does.
         """
         change = self.value - before
         if self.direction == "lower":
@@ -67,16 +72,31 @@ class Metric:
 def write_metrics(
     path, metrics: Iterable[Metric], about: Mapping[str, Any] = {}
 ) -> None:
-    """All metrics as `{"about": ..., "metrics": {key: {value, unit, ...}}}`.
+    """Write metrics as `{"about": ..., "metrics": {key: {value, unit, ...}}}`,
+    atomically.
 
-    What is not finite is written as null, for JSON has no word for it. The file appears
-    whole or not at all.
+    Values that are not finite are written as null, since JSON cannot represent them.
+
+    Args:
+      path: The file.
+      metrics: The metrics.
+      about: JSON values about the measurement.
     """
     write_json(path, {"about": dict(about), "metrics": metric_rows(metrics)})
 
 
 def metric_rows(metrics: Iterable[Metric]) -> dict[str, dict[str, Any]]:
-    """What `read_metrics` reads under "metrics"; ValueError for a key that is twice."""
+    """Convert metrics to JSON values by key.
+
+    Args:
+      metrics: The metrics.
+
+    Returns:
+      The rows that `read_metrics` reads under "metrics".
+
+    Raises:
+      ValueError: If a key occurs twice.
+    """
     rows: dict[str, Any] = {}
     for metric in metrics:
         if metric.key in rows:
@@ -91,7 +111,17 @@ def metric_rows(metrics: Iterable[Metric]) -> dict[str, dict[str, Any]]:
 
 
 def read_metrics(path) -> dict[str, Metric]:
-    """Metrics by key, as `write_metrics` wrote them; null is NaN."""
+    """Read a file written by `write_metrics`.
+
+    Args:
+      path: The file.
+
+    Returns:
+      Metrics by key, with NaN for null.
+
+    Raises:
+      ValueError: If it is not such a file.
+    """
     try:
         rows = json.loads(pathlib.Path(path).read_text())["metrics"]
         return {
@@ -121,7 +151,7 @@ class Timing(NamedTuple):
 
     @property
     def median_cpu(self) -> float:
-        """Median processor time: what to compare on a machine shared with others."""
+        """Median processor time, to compare on a machine shared with others."""
         return float(np.median(self.cpu))
 
     @property
@@ -134,17 +164,37 @@ class Timing(NamedTuple):
 def measure(
     function: Callable[[], Any], *, repeats: int = 10, warm_up: int = 2
 ) -> Timing:
-    """Time warm calls of `function`, each until its results are there."""
+    """Time warm calls of a function, each until its results are ready.
+
+    Args:
+      function: The function.
+      repeats: Number of timed calls.
+      warm_up: Number of calls before them.
+
+    Returns:
+      The times.
+    """
     return compare({"it": function}, repeats=repeats, warm_up=warm_up)["it"]
 
 
 def compare(
     functions: Mapping[str, Callable[[], Any]], *, repeats: int = 10, warm_up: int = 2
 ) -> dict[str, Timing]:
-    """Time several functions in turn, so that a busy minute hits all of them.
+    """Time several functions in turn, so that load on the machine affects all of them.
 
     Compare `median_cpu` on a shared machine, and ratios within one run rather than
-    seconds of two: absolute times wander by a quarter.
+    seconds of two runs, since absolute times vary by a quarter.
+
+    Args:
+      functions: Functions by name.
+      repeats: Number of timed calls of each.
+      warm_up: Number of calls before them.
+
+    Returns:
+      Times by name.
+
+    Raises:
+      ValueError: If there are no repeats or a negative warm-up.
     """
     if repeats < 1 or warm_up < 0:
         raise ValueError(
@@ -168,7 +218,7 @@ def compare(
 
 
 class Cost(NamedTuple):
-    """What the compiler says of one program, per call."""
+    """Cost of one call of a program, as the compiler reports it."""
 
     flops: float  # NaN where the backend does not count
     bytes_accessed: float  # read and written; NaN where it does not count
@@ -179,9 +229,18 @@ class Cost(NamedTuple):
 
 
 def cost(function: Callable, *args, **kwargs) -> Cost:
-    """Compile `function` for these arguments and ask what a call takes.
+    """Compile a function for some arguments and return the cost of a call.
 
-    A loop's body counts once, however often it runs: XLA does not know how often.
+    The body of a loop counts once, however often it runs, since XLA does not know how
+    often.
+
+    Args:
+      function: The function, jitted or not.
+      *args: Its arguments.
+      **kwargs: Its keyword arguments.
+
+    Returns:
+      The cost.
     """
     began = time.perf_counter()
     lower = function.lower if hasattr(function, "lower") else jax.jit(function).lower
@@ -190,7 +249,15 @@ def cost(function: Callable, *args, **kwargs) -> Cost:
 
 
 def cost_of(compiled: jax.stages.Compiled, compile_seconds: float) -> Cost:
-    """What a call of a program takes that is compiled already."""
+    """Return the cost of a call of a compiled program.
+
+    Args:
+      compiled: The program.
+      compile_seconds: Seconds that its compilation took.
+
+    Returns:
+      The cost.
+    """
     counted = compiled.cost_analysis() or {}
     if isinstance(counted, list):  # one per computation on some backends
         counted = counted[0] if counted else {}
@@ -206,7 +273,11 @@ def cost_of(compiled: jax.stages.Compiled, compile_seconds: float) -> Cost:
 
 
 def peak_bytes() -> int:
-    """Largest resident memory of this program so far."""
+    """Return the largest resident memory of this process so far.
+
+    Returns:
+      Number of bytes.
+    """
     # psutil knows the peak on Windows alone, and getrusage on Linux also remembers the
     # process that started this one: a small program under a large one would read its
     # parent's memory.
@@ -226,13 +297,21 @@ def peak_bytes() -> int:
 
 
 def device_peak_bytes() -> int | None:
-    """Largest memory of the first device so far, None where the backend keeps none."""
+    """Return the largest memory use of the first device so far.
+
+    Returns:
+      Number of bytes, None if the backend does not report it.
+    """
     stats = jax.devices()[0].memory_stats() or {}
     return stats.get("peak_bytes_in_use")
 
 
 def machine() -> dict[str, Any]:
-    """What a timing depends on, for the file it is written into."""
+    """Describe the machine and environment that a timing depends on.
+
+    Returns:
+      JSON values.
+    """
     device = jax.devices()[0]
     return {
         "cpu": _cpu_model(),
@@ -252,9 +331,14 @@ def machine() -> dict[str, Any]:
 
 
 def beside(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
-    """`now` with the processors of `before` named as well, for a file that keeps both.
+    """Add the processors of an earlier description, for a file that keeps both timings.
 
-    Each once; `before` may be empty.
+    Args:
+      now: Description of this machine.
+      before: Earlier description, which may be empty.
+
+    Returns:
+      `now` with all processors, each once.
     """
     names = [*filter(None, before.get("cpu", "").split("; ")), now["cpu"]]
     return now | {"cpu": "; ".join(dict.fromkeys(names))}

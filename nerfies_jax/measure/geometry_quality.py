@@ -1,8 +1,8 @@
-"""How right depth, flow, tracks and camera paths are.
+"""Metrics of depth, optical flow, point tracks and camera paths.
 
-Depth, flow and tracks are pure JAX, in float32 at least. Camera paths are compared on
-the host in float64: an alignment decides by rank what can be determined at all, and is
-not for training.
+Depth, flow and tracks are pure JAX, in float32 or float64. Camera paths are compared on
+the host in float64. The alignment decides by rank whether it is determined, and is not
+for training.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ FLAT_BELOW = 1e-6
 
 
 class DepthErrors(NamedTuple):
-    """Over the pixels where both depths are known; NaN where there are none."""
+    """Errors over the pixels where both depths are known, NaN if there are none."""
 
     abs_rel: Float[Array, ""]  # mean |d - truth| / truth
     rmse: Float[Array, ""]  # scene units
@@ -32,7 +32,7 @@ class DepthErrors(NamedTuple):
 
 
 class Line(NamedTuple):
-    """`scale * depth + shift`; the scale is 0 where it is not determined."""
+    """Alignment `scale * depth + shift`, with a scale of 0 if it is not determined."""
 
     scale: Float[Array, ""]
     shift: Float[Array, ""]
@@ -44,7 +44,16 @@ def known_depth(
     truth: Float[Array, "*pixels"],
     mask: Bool[Array, "*pixels"] | None = None,
 ) -> Bool[Array, "*pixels"]:
-    """Where two depths can be compared: finite, the truth positive (0 is unknown)."""
+    """Find the pixels where two depths can be compared.
+
+    Args:
+      depth: Predicted depths, [...].
+      truth: True depths, 0 where unknown, [...].
+      mask: True for pixels to compare, [...]. None for all.
+
+    Returns:
+      Booleans [...], True where both are finite and the truth is positive.
+    """
     known = jnp.isfinite(depth) & jnp.isfinite(truth) & (truth > 0)
     return known if mask is None else known & mask
 
@@ -54,10 +63,21 @@ def depth_errors(
     truth: Float[Array, "*pixels"],
     mask: Bool[Array, "*pixels"] | None = None,
 ) -> DepthErrors:
-    """Errors of z-depth in scene units, Eigen et al. 2014, arXiv:1406.2283.
+    """Compute errors of z-depth.
 
-    A depth that is not positive counts in full in the first two and as wrong in the
-    third. For monocular depth, pass `align_depth`'s result first.
+    A depth that is not positive counts in full in the first two metrics and as wrong in
+    the third. For monocular depth, pass the result of `align_depth`.
+
+    Args:
+      depth: Predicted depths in scene units, [...].
+      truth: True depths, 0 where unknown, [...].
+      mask: True for pixels to compare, [...]. None for all.
+
+    Returns:
+      The errors.
+
+    References:
+      Eigen et al. 2014, arXiv:1406.2283.
     """
     depth, truth = widened(depth), widened(truth)
     known = known_depth(depth, truth, mask)
@@ -80,11 +100,21 @@ def align_depth(
     truth: Float[Array, "*pixels"],
     mask: Bool[Array, "*pixels"] | None = None,
 ) -> Line:
-    """The scale and shift with the least squared error over the known pixels.
+    """Fit scale and shift by least squares over the known pixels.
 
-    Ranftl et al. 2020 (MiDaS), arXiv:1907.01341, equation 4, who align inverse depths:
-    pass those for their protocol. Solved about the means, where the normal equations of
-    a depth of 1000 +- 1 would lose six digits.
+    The protocol of MiDaS aligns inverse depths, so pass those. The fit is solved about
+    the means. The normal equations of a depth of 1000 ± 1 would lose six digits.
+
+    Args:
+      depth: Predicted depths or inverse depths, [...].
+      truth: True values, 0 where unknown, [...].
+      mask: True for pixels to use, [...]. None for all.
+
+    Returns:
+      Scale and shift.
+
+    References:
+      Ranftl et al. 2020 (MiDaS), arXiv:1907.01341, equation 4.
     """
     depth, truth = widened(depth), widened(truth)
     known = known_depth(depth, truth, mask)
@@ -103,7 +133,7 @@ def align_depth(
 
 
 class FlowErrors(NamedTuple):
-    """Over the pixels whose true flow is known; NaN where there are none."""
+    """Errors over the pixels whose true flow is known, NaN if there are none."""
 
     endpoint: Float[Array, ""]  # mean distance, pixels
     outliers: Float[Array, ""]  # share beyond 3 px and 5 % (KITTI's Fl)
@@ -115,10 +145,16 @@ def flow_errors(
     truth: Float[Array, "*pixels 2"],
     mask: Bool[Array, "*pixels"] | None = None,
 ) -> FlowErrors:
-    """End-point error of optical flow in pixels; unknown true flow is not finite.
+    """Compute the end-point error of optical flow.
 
-    A flow that is not finite where the truth is known makes the mean infinite and
-    counts as an outlier: a missing answer is a wrong one.
+    Args:
+      flow: Predicted flow in pixels, [..., 2]. If it is not finite where the truth is
+        known, the mean is infinite and the pixel counts as an outlier.
+      truth: True flow, not finite where unknown, [..., 2].
+      mask: True for pixels to compare, [...]. None for all.
+
+    Returns:
+      The errors.
     """
     flow, truth = widened(flow), widened(truth)
     known = jnp.all(jnp.isfinite(truth), axis=-1)
@@ -134,7 +170,7 @@ def flow_errors(
 
 
 class TrackErrors(NamedTuple):
-    """Over the visible points; NaN where there are none."""
+    """Errors over the visible points, NaN if there are none."""
 
     endpoint: Float[Array, ""]  # mean distance, in the points' unit
     correct: Float[Array, ""]  # share of correct keypoints (PCK)
@@ -147,11 +183,23 @@ def track_errors(
     visible: Bool[Array, "*points"],
     threshold: float,
 ) -> TrackErrors:
-    """Point tracks against the truth; a point is correct closer than `threshold`.
+    """Compute the errors of point tracks.
 
-    DyCheck's PCK-T (arXiv:2210.13445) takes 0.05 of the longer side of the picture in
-    pixels, 3-D tracks a length in scene units. A lost track is not finite and counts as
-    wrong.
+    DyCheck's PCK-T (arXiv:2210.13445) uses a threshold of 0.05 of the longer side of
+    the image in pixels. 3D tracks use a length in scene units.
+
+    Args:
+      tracks: Predicted positions, [..., axes], not finite for lost points, which count
+        as wrong.
+      truth: True positions, [..., axes].
+      visible: True for points to compare, [...].
+      threshold: Distance below which a point is correct, in the unit of the positions.
+
+    Returns:
+      The errors.
+
+    Raises:
+      ValueError: If the threshold is not positive.
     """
     if not threshold > 0:
         raise ValueError(
@@ -203,18 +251,32 @@ class PathErrors(NamedTuple):
 
 
 class RelativeErrors(NamedTuple):
-    """Motion between frames that lie `stride` apart."""
+    """Errors of the motion between frames that are `stride` apart."""
 
     translation_rmse: float  # units of the path
     rotation_deg: float  # mean angle
 
 
 def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similarity:
-    """The similarity (`scaled`) or rigid motion that takes `points` closest to `truth`.
+    """Find the similarity or rigid motion that aligns points with their truth.
 
-    Both are [points, 3]. Umeyama 1991, equations 34-43. Points on a line leave a
-    rotation open, and the residual does not show it: `determined` does. Reflections are
-    never returned; a planar or mirrored set gets the best rotation.
+    Points on a line leave a rotation undetermined, which the residual does not show but
+    `determined` does. The result is never a reflection. A planar or mirrored set gets
+    the best rotation.
+
+    Args:
+      points: Points, [points, 3].
+      truth: Their true positions, [points, 3].
+      scaled: True for a similarity, False for a rigid motion.
+
+    Returns:
+      The alignment.
+
+    Raises:
+      ValueError: If the numbers of points differ.
+
+    References:
+      Umeyama 1991, equations 34-43.
     """
     points, truth = _positions(points, "points"), _positions(truth, "truth")
     if points.shape != truth.shape:
@@ -254,10 +316,20 @@ def _rank(points):
 def path_errors(
     positions: np.ndarray, truth: np.ndarray, scaled: bool = True
 ) -> PathErrors:
-    """Absolute trajectory error of camera positions [frames, 3] after alignment.
+    """Compute the absolute trajectory error of camera positions after alignment.
 
-    Sturm et al. 2012; `scaled` because a path from pictures alone has no unit. Read
-    `alignment.determined` before believing a small error.
+    Check `alignment.determined` before trusting a small error.
+
+    Args:
+      positions: Camera positions, [frames, 3].
+      truth: True positions, [frames, 3].
+      scaled: True to align the scale too, since a path from images alone has none.
+
+    Returns:
+      The errors.
+
+    References:
+      Sturm et al. 2012.
     """
     alignment = align_points(positions, truth, scaled)
     moved = alignment.scale * np.asarray(positions, float) @ alignment.rotation.T
@@ -277,11 +349,26 @@ def relative_errors(
     true_positions: np.ndarray,
     stride: int = 1,
 ) -> RelativeErrors:
-    """Relative pose error between frames `stride` apart, Sturm et al. 2012.
+    """Compute the relative pose error between frames.
 
-    Rotations [frames, 3, 3], positions [frames, 3] of the camera in world coordinates.
-    Independent of where the world's origin lies, not of its scale: scale the positions
+    It does not depend on the origin of the world, but on its scale. Scale the positions
     first (`align_points`).
+
+    Args:
+      camera_from_world: Rotations, [frames, 3, 3].
+      positions: Camera positions, [frames, 3].
+      true_camera_from_world: True rotations, [frames, 3, 3].
+      true_positions: True positions, [frames, 3].
+      stride: Distance of the compared frames.
+
+    Returns:
+      The errors.
+
+    Raises:
+      ValueError: If `stride` is out of range.
+
+    References:
+      Sturm et al. 2012.
     """
     frames = len(positions)
     if not 1 <= stride < frames:
@@ -313,7 +400,7 @@ def _motions(camera_from_world, positions, stride):
 
 
 def _angle(rotation):
-    """Of rotation matrices, in radians; exact near 0 and near pi, unlike arccos."""
+    """Angles of rotation matrices in radians, exact near 0 and π, unlike arccos."""
     skew = rotation - rotation.swapaxes(-1, -2)
     axis = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1)
     trace = np.trace(rotation, axis1=-2, axis2=-1)

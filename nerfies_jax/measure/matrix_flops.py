@@ -1,4 +1,4 @@
-"""Operations of the matrix products in a function, every round of its loops counted."""
+"""Operations of the matrix products in a function, with loops counted in full."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -20,11 +20,18 @@ class Counted(NamedTuple):
 
 
 def count(function: Callable, *args: Any) -> Counted:
-    """What the matrix products of `function` take for these arguments; nothing runs.
+    """Count the operations of the matrix products of a function, without running it.
 
-    XLA's own count has a loop's body once, also where the number of rounds is known,
-    as in `lax.map` over blocks of Gaussians. Of the branches of a condition the dearest
-    counts, and what nothing reads does not.
+    XLA's own count contains a loop's body once, even if the number of iterations is
+    known, as in `lax.map` over blocks of Gaussians. Of the branches of a condition the
+    most expensive counts, and unused results do not count.
+
+    Args:
+      function: The function.
+      *args: Its arguments.
+
+    Returns:
+      The count.
     """
     return _of_jaxpr(jax.make_jaxpr(function)(*args).jaxpr)
 

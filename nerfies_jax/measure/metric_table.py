@@ -10,7 +10,7 @@ GROUPS = ("Quality", "Geometry", "Motion", "Time", "Memory", "Size")
 
 
 class Entry(NamedTuple):
-    """What a person needs in order to read one metric."""
+    """Name, group, unit, direction and explanation of a metric."""
 
     name: str
     group: str  # one of GROUPS
@@ -224,10 +224,13 @@ def metric(key: str, value: float | int, tolerance: float = 0.0) -> Metric:
     Args:
       key: A key of `METRICS`.
       value: The measured value, in the unit of the table.
-      tolerance: How much worse a later value may be, in the same unit.
+      tolerance: Accepted decline of a later value, in the same unit.
+
+    Returns:
+      The metric.
 
     Raises:
-      ValueError: The table has no such key.
+      ValueError: If the table has no such key.
     """
     if key not in METRICS:
         raise ValueError(f"metric {key}: not in the table of metrics; add it there")

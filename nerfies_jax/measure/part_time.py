@@ -1,4 +1,4 @@
-"""What the parts of a training step take."""
+"""Times of the parts of a training step."""
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, wait
@@ -28,22 +28,41 @@ class StepParts(NamedTuple):
     with_rest: Callable[[dict[str, float]], dict[str, float]]
 
     def ms(self) -> dict[str, float]:
-        """Milliseconds of each part and of what they leave of the step, by name."""
+        """Measure all parts.
+
+        Returns:
+          Milliseconds of each part and of the rest of the step, by name.
+        """
         return self.with_rest(parts_ms(self.parts))
 
     def drop(self) -> None:
-        """What is not compiled yet will not be."""
+        """Cancel pending compilations."""
         for one in self.parts.values():
             one.compiled.cancel()
 
 
 def part(function: Callable[..., Any], *args: Any) -> Part:
-    """A call, compiled in the background; its arrays are inputs, not constants."""
+    """Compile a call in the background, with its arrays as inputs, not constants.
+
+    Args:
+      function: The function.
+      *args: Its arguments.
+
+    Returns:
+      The part.
+    """
     return Part(compiler.begun(jax.jit(function).lower(*args).compile), args)
 
 
 def parts_ms(parts: Mapping[str, Part]) -> dict[str, float]:
-    """Median milliseconds of each call, warm, once all of them are compiled."""
+    """Measure calls, once all of them are compiled.
+
+    Args:
+      parts: Parts by name.
+
+    Returns:
+      Median milliseconds of warm calls, by name.
+    """
     wait(one.compiled for one in parts.values())
     return {name: _median_ms(one) for name, one in parts.items()}
 

@@ -1,8 +1,8 @@
-"""LPIPS: distance between pictures in the features of a trained image classifier.
+"""LPIPS: distance of images in the features of a trained image classifier.
 
-Zhang et al. 2018, arXiv:1801.03924, version 0.1 of their code. The layers are here; the
-trained weights are not, and nothing stands in for them: `load` raises `WeightsMissing`,
-whose message says why the metric is not computed and where the weights come from.
+Zhang et al. 2018, arXiv:1801.03924, version 0.1 of their code. The layers are here, the
+trained weights are not. Without weights `load` raises `WeightsMissing`, whose message
+says where they come from.
 """
 
 import dataclasses
@@ -47,7 +47,8 @@ class LpipsParams(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """Convolutions up to one of the compared feature maps; pooled before, or not.
+    """Convolutions up to one of the compared feature maps, with optional pooling
+    before.
 
     Each convolution is (index in torchvision's `features`, kernel width, output
     channels, stride, padding) and is followed by a ReLU.
@@ -68,7 +69,7 @@ class Network:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """Of each compared feature map."""
+        """Number of channels of each compared feature map."""
         return tuple(stage.convolutions[-1][2] for stage in self.stages)
 
 
@@ -99,7 +100,7 @@ VGG = Network(
 
 
 class WeightsMissing(ValueError):
-    """LPIPS cannot be computed; the message is one line that says why."""
+    """LPIPS cannot be computed. The message is one line with the reason."""
 
 
 def lpips(
@@ -109,11 +110,25 @@ def lpips(
     truth: Float[Array, "height width 3"],
     scaling: Scaling = "standard",
 ) -> Float[Array, ""]:
-    """Learned perceptual distance of two pictures in [0, 1]; equation 1.
+    """Compute the learned perceptual distance of two images.
 
-    "standard" moves [0, 1] to the [-1, 1] that LPIPS was trained on. "unscaled" feeds
-    [0, 1] as it is: the slip in the metrics of Deformable-3DGS, 4DGS and E-D3DGS, for
-    comparison with their tables alone.
+    Args:
+      params: Trained weights.
+      network: Their network.
+      image: Rendered image in [0, 1], [height, width, 3].
+      truth: Ground truth of the same shape.
+      scaling: "standard" maps [0, 1] to [-1, 1], on which LPIPS was trained. "unscaled"
+        passes [0, 1] unchanged, a mistake in the metrics of Deformable-3DGS, 4DGS and
+        E-D3DGS, and is only for comparison with their tables.
+
+    Returns:
+      The distance, a scalar.
+
+    Raises:
+      ValueError: If the image is too small for the network.
+
+    References:
+      Zhang et al. 2018, arXiv:1801.03924, equation 1.
     """
     distances = _stage_distances(params, network, image, truth, scaling)
     return sum(jnp.mean(distance) for distance in distances)
@@ -126,7 +141,18 @@ def lpips_map(
     truth: Float[Array, "height width 3"],
     scaling: Scaling = "standard",
 ) -> Float[Array, "height width"]:
-    """LPIPS of each pixel: the stages' maps enlarged bilinearly and added."""
+    """Compute the LPIPS of each pixel: the stages' maps resized bilinearly and added.
+
+    Args:
+      params: Trained weights.
+      network: Their network.
+      image: Rendered image in [0, 1], [height, width, 3].
+      truth: Ground truth of the same shape.
+      scaling: As for `lpips`.
+
+    Returns:
+      Distances, [height, width].
+    """
     distances = _stage_distances(params, network, image, truth, scaling)
     return sum(jax.image.resize(d, image.shape[:2], "bilinear") for d in distances)
 
@@ -138,9 +164,22 @@ def masked_lpips(
     truth: Float[Array, "height width 3"],
     mask: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
-    """mLPIPS of DyCheck (arXiv:2210.13445); NaN for an empty mask.
+    """Compute the mLPIPS of DyCheck.
 
-    Both pictures are black outside the mask, and the map is averaged inside it.
+    Both images are black outside the mask, and the map is averaged inside it.
+
+    Args:
+      params: Trained weights.
+      network: Their network.
+      image: Rendered image in [0, 1], [height, width, 3].
+      truth: Ground truth of the same shape.
+      mask: True for the pixels to compare, [height, width].
+
+    Returns:
+      The distance, NaN for an empty mask.
+
+    References:
+      Gao et al. 2022 (DyCheck), arXiv:2210.13445.
     """
     image, truth = (jnp.where(mask[..., None], x, 0.0) for x in (image, truth))
     distance = lpips_map(params, network, image, truth)
@@ -151,7 +190,19 @@ def masked_lpips(
 def features(
     params: LpipsParams, network: Network, signed: Float[Array, "height width 3"]
 ) -> tuple[Float[Array, "rows columns channels"], ...]:
-    """The five compared feature maps of a picture in [-1, 1], after their ReLUs."""
+    """Compute the five compared feature maps of an image, after their ReLUs.
+
+    Args:
+      params: Trained weights.
+      network: Their network.
+      signed: Image in [-1, 1], [height, width, 3].
+
+    Returns:
+      Feature maps, [rows, columns, channels].
+
+    Raises:
+      ValueError: If the image is too small for the network.
+    """
     if min(signed.shape[:2]) < network.smallest:
         raise ValueError(
             f"LPIPS with {network.name} needs {network.smallest} pixels on the shorter "
@@ -214,12 +265,21 @@ def _unit(x):
 
 
 def load(network: Network, files: Iterable[str | pathlib.Path] = ()) -> LpipsParams:
-    """The trained weights, from `files` or from where their packages keep them.
+    """Load trained weights.
 
-    `files` (`.pth`, `.safetensors`, `.npz`) hold, together, torchvision's classifier
-    (`features.0.weight`), the LPIPS heads (`lin0.model.1.weight`), or a saved
-    `lpips.LPIPS` module with both. What they lack is looked for in the torch hub cache
-    (classifier) and in an installed `lpips` package (heads); neither is imported.
+    Args:
+      network: The network.
+      files: Files (`.pth`, `.safetensors`, `.npz`) that together hold torchvision's
+        classifier (`features.0.weight`) and the LPIPS heads (`lin0.model.1.weight`), or
+        a saved `lpips.LPIPS` module with both. Missing parts are looked for in the
+        torch hub cache (classifier) and in an installed `lpips` package (heads),
+        neither of which is imported.
+
+    Returns:
+      The weights.
+
+    Raises:
+      WeightsMissing: If they cannot be found.
     """
     files, tensors = tuple(files), {}
     for path in files:

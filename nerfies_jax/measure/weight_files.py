@@ -1,4 +1,4 @@
-"""Tensors out of files that other tools wrote, without running anything in them.
+"""Safe reading of weight files of other tools, without running anything in them.
 
 A `.pth` is a pickle, and unpickling may run code. Here the unpickler knows three names
 (an ordered dictionary, a tensor over a storage, a storage of numbers) and refuses every
@@ -43,10 +43,17 @@ _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 
 
 def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
-    """Name -> array of an `.npz`, `.safetensors`, `.pth` or `.pt` state dict.
+    """Read the tensors of an `.npz`, `.safetensors`, `.pth` or `.pt` state dict.
 
-    Raises `ValueError` with the file's name where it is damaged, of another kind, or
-    asks for anything but tensors.
+    Args:
+      path: The file.
+
+    Returns:
+      Arrays by name.
+
+    Raises:
+      ValueError: If the file is damaged, of another kind, or contains anything but
+        tensors.
     """
     path = pathlib.Path(path)
     readers = {
@@ -151,7 +158,7 @@ class _View:
         self.shape, self.strides = shape, strides
 
     def array(self):
-        """The tensor's own copy; ValueError where it reaches out of its storage."""
+        """Return a copy of the tensor. Raises ValueError if it exceeds its storage."""
         read, key, dtype = self.storage
         flat = np.frombuffer(read(key), dtype)
         last = self.offset + sum(
@@ -175,7 +182,7 @@ class _Unpickler(pickle.Unpickler):
         self._read, self.dtypes = read, {}
 
     def find_class(self, module, name):
-        """What a file may ask for by name; UnpicklingError for all else."""
+        """Return one of the allowed classes. Raises UnpicklingError for any other."""
         if (module, name) == ("collections", "OrderedDict"):
             return collections.OrderedDict
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):

@@ -1,1 +1,1 @@
-"""Floor 6: a static radiance field."""
+"""Static radiance fields: sampling, networks and volume rendering."""

@@ -1,10 +1,10 @@
-"""What a ray sees of the samples on it.
+"""Volume rendering along one ray.
 
-Everything is for one ray, from its origin outwards; callers `jax.vmap`. The *optical
-depth* of a sample is its density times the length it stands for. Light that meets a
-depth d gets through with probability exp(-d). Preconditions: densities are finite and
-not negative, distances are sorted. Sums over a ray are made in float32 at least: in
-bfloat16 the weights of a ray of 128 samples would be off by 1e-2.
+Everything is for one ray, from its origin outward, and callers `jax.vmap`. The *optical
+depth* of a sample is its density times the length of its interval. Light is transmitted
+through a depth d with probability exp(-d). Densities must be finite and non-negative,
+and distances sorted. Sums over a ray are made in float32 or float64. In bfloat16 the
+weights of a ray of 128 samples would be off by 1e-2.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ THIN_BELOW = 0.25
 
 
 class Composite(NamedTuple):
-    """What one ray sees."""
+    """Color, opacity and distances of one ray."""
 
     color: Float[Array, "3"]
     alpha: Float[Array, ""]  # share of the light that stops; may round to 1 + 1e-6
@@ -39,10 +39,14 @@ class Composite(NamedTuple):
 def intervals(
     distances: Float[Array, " samples"], last: float | Float[Array, ""]
 ) -> Float[Array, " samples"]:
-    """The length each sample stands for: from itself to the next one.
+    """Return the lengths of the intervals of samples, from each to the next one.
 
-    `last` is the length of the last one: `AT_INFINITY`, or what is left of the ray.
-    Distances are along unit directions.
+    Args:
+      distances: Sorted distances along a unit direction, [samples].
+      last: Length of the last interval: `AT_INFINITY`, or the rest of the ray.
+
+    Returns:
+      Lengths, [samples].
     """
     last = jnp.broadcast_to(jnp.asarray(last, distances.dtype), (1,))
     return jnp.concatenate([jnp.diff(distances), last])
@@ -50,9 +54,17 @@ def intervals(
 
 @at_least_float32
 def weights(optical_depth: Float[Array, " samples"]) -> Float[Array, " samples"]:
-    """How much of the light stops at each sample; sums to at most one (up to 1e-6).
+    """Compute the volume rendering weights of samples.
 
-    Equation 3 of Mildenhall et al. 2020, arXiv:2003.08934.
+    Args:
+      optical_depth: Density times interval length, non-negative, [samples].
+
+    Returns:
+      Share of the light that stops at each sample, [samples]. They sum to at most one
+      (up to 1e-6).
+
+    References:
+      Mildenhall et al. 2020, arXiv:2003.08934, equation 3.
     """
     # 1 - exp(-x) would round to 0 in thin air. (JAX's slope of expm1 is exp(-x) to 6e-8
     # of one; with all its digits behind walls the gradient takes 1.8 times as long.)
@@ -63,14 +75,24 @@ def weights(optical_depth: Float[Array, " samples"]) -> Float[Array, " samples"]
 def media_weights(
     optical_depth: Float[Array, "media samples"],
 ) -> Float[Array, "media samples"]:
-    """How much each of several media on one ray adds to its color.
+    """Compute the weights of samples of several media on one ray.
 
     Light reaches a sample through all the media before it, and at the sample each
-    medium counts as if it were alone: the transient objects of NeRF-W (Martin-Brualla
-    et al. 2021, arXiv:2008.02268) and, after `thinned`, the blending of NSFF (Li et al.
-    2021, arXiv:2011.13084). Where two media overlap in one sample their weights sum to
-    more than `weights` of their joint depth, up to as often as there are media; opacity
-    and distances are therefore read from the joint depth (`composite_media`).
+    medium counts as if it were alone, as for the transient objects of NeRF-W and, after
+    `thinned`, the blending of NSFF. Where media overlap in one sample, their weights
+    sum to more than `weights` of their joint depth, at most by the number of media.
+    Opacity and distances are therefore computed from the joint depth
+    (`composite_media`).
+
+    Args:
+      optical_depth: Density times interval length, non-negative, [media, samples].
+
+    Returns:
+      Weights, [media, samples].
+
+    References:
+      Martin-Brualla et al. 2021 (NeRF-W), arXiv:2008.02268. Li et al. 2021 (NSFF),
+      arXiv:2011.13084.
     """
     reaching = _transmittance(jnp.sum(optical_depth, axis=0))
     return reaching * -jnp.expm1(-optical_depth)
@@ -80,10 +102,17 @@ def media_weights(
 def thinned(
     optical_depth: Float[Array, "*samples"], share_logit: Float[Array, "*samples"]
 ) -> Float[Array, "*samples"]:
-    """Optical depth whose opacity is sigmoid(`share_logit`) times that of another.
+    """Scale the opacity of samples: -log(1 - v (1 - exp(-d))) for v = sigmoid(l).
 
-    -log(1 - v (1 - exp(-d))): NSFF multiplies opacities by its blending weight v, which
-    as a depth can share the transmittance of other media.
+    NSFF multiplies opacities by its blending weight v. As an optical depth it can share
+    the transmittance of other media.
+
+    Args:
+      optical_depth: Optical depth d, non-negative, [...].
+      share_logit: Logit l of the factor v, [...].
+
+    Returns:
+      Optical depths, [...].
     """
     share = jax.nn.sigmoid(share_logit)
     # log1p keeps all digits of thin air but has 1 - v exp(..) → 0 for v → 1; the sum
@@ -105,13 +134,20 @@ def composite(
     distances: Float[Array, " samples"],
     background: Float[Array, "3"] | None,
 ) -> Composite:
-    """Color, opacity and distances of a ray.
+    """Composite color, opacity and distances of a ray.
 
-    A `background` shines through what the samples let pass. `None` says that the last
-    sample is the background, its interval being `AT_INFINITY`: its color counts but
-    `alpha`, `distance` and `median_distance` leave it out, as `alpha` does in the
-    Nerfies code. (That code also adds white behind such a sample, where none can be
-    seen.)
+    Args:
+      weights: Weights of the samples, [samples].
+      colors: Colors of the samples, [samples, 3].
+      distances: Sorted distances of the samples, [samples].
+      background: Color behind the ray, [3]. None if the last sample is the background,
+        with an interval of `AT_INFINITY`. Its color then counts, but `alpha`,
+        `distance` and `median_distance` leave it out, as `alpha` does in the Nerfies
+        code. (That code also adds white behind such a sample, where none can be
+        visible.)
+
+    Returns:
+      The composited ray.
     """
     # Sums of products: a matrix product may be rounded to ten bits on a GPU.
     color = jnp.sum(weights[:, None] * colors, axis=0)
@@ -124,7 +160,17 @@ def composite_media(
     distances: Float[Array, " samples"],
     background: Float[Array, "3"] | None,
 ) -> Composite:
-    """`composite` of several media by `media_weights`; `alpha` is of all together."""
+    """Composite several media by `media_weights`.
+
+    Args:
+      optical_depth: Density times interval length, [media, samples].
+      colors: Colors of the samples, [media, samples, 3].
+      distances: Sorted distances of the samples, [samples].
+      background: As for `composite`.
+
+    Returns:
+      The composited ray, whose opacity is that of all media together.
+    """
     each = media_weights(optical_depth)
     color = jnp.sum(each[..., None] * colors, axis=(0, 1))
     joint = weights(jnp.sum(optical_depth, axis=0))
@@ -136,10 +182,18 @@ def expected_distance(
     distances: Float[Array, " samples"],
     far: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Mean of `distances` by `weights`; `far` where nothing is hit.
+    """Compute the mean distance by weights.
 
-    Rays of less than `EMPTY_BELOW` opacity get the rest of it at `far`, so that value
-    and slope stay bounded down to weights of zero.
+    Rays with an opacity below `EMPTY_BELOW` get the rest of it at `far`, so that value
+    and gradient stay bounded down to weights of zero.
+
+    Args:
+      weights: Weights of the samples, [samples].
+      distances: Distances of the samples, [samples].
+      far: Distance of an empty ray.
+
+    Returns:
+      The distance, a scalar.
     """
     alpha = jnp.sum(weights)
     missing = jnp.maximum(EMPTY_BELOW - alpha, 0)
@@ -147,7 +201,14 @@ def expected_distance(
 
 
 def median_index(weights: Float[Array, " samples"]) -> Int[Array, ""]:
-    """The first sample by which half the light has stopped; the last if none."""
+    """Find the first sample by which half of the light has stopped.
+
+    Args:
+      weights: Weights of the samples, [samples].
+
+    Returns:
+      Index of the sample, the last one if less than half of the light stops.
+    """
     passed = _running_sum(weights) >= 0.5
     return jnp.where(jnp.any(passed), jnp.argmax(passed), weights.shape[0] - 1)
 

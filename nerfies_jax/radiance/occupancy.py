@@ -1,9 +1,9 @@
-"""Where a field may be dense: cells of space that samples need not skip.
+"""Occupancy grid: cells of space in which samples must not be skipped.
 
-The cells are even in contracted space (`nets.grids.contract`): even in the filmed
-volume, and growing around it up to twice its half-side. What is beyond counts as
-occupied. The idea is that of Müller et al. 2022, arXiv:2201.05989, appendix E.2; theirs
-are kept up while training, these are surveyed anew of the field as it is.
+Cells are uniform in contracted space (`nets.grids.contract`): uniform in the captured
+volume, and growing around it up to twice its half side. Space outside counts as
+occupied. The idea is that of Müller et al. 2022, arXiv:2201.05989, appendix E.2. Their
+grid is updated during training, this one is recomputed from the current field.
 """
 
 import dataclasses
@@ -21,14 +21,15 @@ Cells = Bool[Array, "cells cells cells"]
 
 @dataclasses.dataclass(frozen=True)
 class OccupancySpec:
-    """When space is surveyed, and how many rays there are to choose from.
+    """Settings of the occupancy grid, for static scenes.
 
-    Of a scene at rest: what moves is empty nowhere for good. After `start` steps and
-    then every so many, whatever the length of the run: a survey takes as long as six
-    steps of a small field on a grid. `candidates` rays are drawn for each of a step.
-    `anywhere` is the share of a step's rays that need not meet anything: what appears
-    in empty space is seen by these. The first samples of every ray are in filled cells,
-    but for `empty` of them to one, over the same length.
+    No region of a dynamic scene stays empty. The grid is recomputed after `start` steps
+    and then at every multiple of `every`, for any length of the run, since it takes as
+    long as six steps of a small field on a grid. `candidates` rays are drawn for each
+    ray of a step. `anywhere` is the share of a step's rays that need not meet an
+    occupied cell, so that surfaces which appear in empty space are found. The first
+    samples of every ray are in occupied cells, except for `empty` of them to one, over
+    the same length.
     """
 
     start: int = 100
@@ -60,7 +61,18 @@ def random_points(
     half_side: float,
     dtype: DTypeLike,
 ) -> Float[Array, "*cells 3"]:
-    """A random point in each of some cells, by their flat index; units of the field."""
+    """Draw a random point in each of some cells.
+
+    Args:
+      key: PRNG key.
+      index: Flat indices of the cells, [...].
+      cells: Number of cells along an axis.
+      half_side: Half side of the box in units of the field.
+      dtype: Floating-point type of the result.
+
+    Returns:
+      Points in units of the field, [..., 3].
+    """
     corner = jnp.stack(jnp.unravel_index(index, (cells,) * 3), axis=-1)
     jitter = jax.random.uniform(key, corner.shape, dtype)
     return _placed((corner.astype(dtype) + jitter) / cells, half_side)
@@ -69,7 +81,16 @@ def random_points(
 def corners(
     cells: int, half_side: float, dtype: DTypeLike
 ) -> Float[Array, "corners corners corners 3"]:
-    """Where the corners of all cells are, units of the field."""
+    """Return the corners of all cells.
+
+    Args:
+      cells: Number of cells along an axis.
+      half_side: Half side of the box in units of the field.
+      dtype: Floating-point type of the result.
+
+    Returns:
+      Points in units of the field, [cells + 1, cells + 1, cells + 1, 3].
+    """
     share = jnp.arange(cells + 1, dtype=dtype) / cells
     return _placed(jnp.stack(jnp.meshgrid(*3 * [share], indexing="ij"), -1), half_side)
 
@@ -84,7 +105,14 @@ def _placed(share, half_side):
 
 
 def dilated(occupied: Cells) -> Cells:
-    """With every cell that touches an occupied one, at a side, an edge or a corner."""
+    """Add every cell that touches an occupied one, at a face, an edge or a corner.
+
+    Args:
+      occupied: Occupied cells, [cells, cells, cells].
+
+    Returns:
+      The enlarged set of cells.
+    """
     window = (3, 3, 3)
     return jax.lax.reduce_window(
         occupied, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME"
@@ -94,7 +122,16 @@ def dilated(occupied: Cells) -> Cells:
 def at(
     occupied: Cells, point: Float[Array, "*points 3"], half_side: float
 ) -> Bool[Array, "*points"]:
-    """Whether each point, in units of the field, lies in an occupied cell or beyond."""
+    """Look up points in the occupancy grid.
+
+    Args:
+      occupied: Occupied cells, [cells, cells, cells].
+      point: Points in units of the field, [..., 3].
+      half_side: Half side of the box in units of the field.
+
+    Returns:
+      Booleans [...], True in an occupied cell or outside of the grid.
+    """
     cells = occupied.shape[0]
     # Coordinate by coordinate: a point in three lanes of a vector takes twice the time.
     scaled = [point[..., axis] / half_side for axis in range(3)]

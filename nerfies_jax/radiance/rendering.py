@@ -1,6 +1,6 @@
-"""Volume rendering with any network: sample points along rays, composite what it says.
+"""Volume rendering with any network: sample points along rays, and composite.
 
-`sample_along_rays` and `composite` take any leading axes and know nothing of the
+`sample_along_rays` and `composite` take any leading axes and do not depend on the
 network between them.
 """
 

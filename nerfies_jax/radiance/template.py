@@ -17,16 +17,23 @@ from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.step_counts import steps
 
-# Of a density: beyond it the exponential goes on along its tangent, finite and with a
-# slope that brings it back.
+# Logarithm of a density above which the exponential continues along its tangent, finite
+# and with a gradient that brings it back.
 LARGEST_LOG = 15.0
 
 
 def exponential(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """exp(raw) up to e^15, and its tangent from there on; per unit of the field.
+    """Compute exp(raw) up to e^15, and its tangent from there on.
 
-    The density of Müller et al. 2022, arXiv:2201.05989, whose code clips the slope
-    there and not the value.
+    Args:
+      raw: Log densities, [...].
+
+    Returns:
+      Densities per unit of the field, [...].
+
+    References:
+      Müller et al. 2022, arXiv:2201.05989, whose code clips the gradient and not the
+      value.
     """
     beyond = jnp.maximum(raw - LARGEST_LOG, 0)
     return jnp.exp(jnp.minimum(raw, LARGEST_LOG)) * (1 + beyond)
@@ -39,19 +46,19 @@ DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu, "exp": exponentia
 
 @dataclasses.dataclass(frozen=True)
 class TemplateSpec:
-    """Size and activations of the network; the defaults are Mildenhall et al. 2020.
+    """Size and activations of the network. The defaults are those of NeRF.
 
-    `direction` is None where color does not depend on the view. "relu" densities are
-    the first paper's; a ray that starts with none of them positive never learns, and
-    under an interval at infinity the slope is 1e10 (softplus: at most 6e-3). "exp"
-    becomes a wall in the fewest steps, which is what a grid of features wants.
-    `anneal_steps` opens the bands of the position, or the levels of its tables, one by
-    one, coarse to fine, as Nerfies those of its warp; None has all open.
+    `direction` is None if color does not depend on the view. "relu" densities are those
+    of the first paper. A ray that starts with none of them positive never learns, and
+    under an interval at infinity the gradient is 1e10 (softplus: at most 6e-3). "exp"
+    becomes opaque in the fewest steps, which suits a grid of features. `anneal_steps`
+    opens the bands of the position, or the levels of its tables, one by one, coarse to
+    fine, as Nerfies those of its warp. None has all open.
 
-    A position may be read from tables: of a grid, or of planes, which span the cube
-    [-1, 1]^3 of the field and, contracted, all space around it. On planes of `moments`
-    the network reads a point at a time, as the medium of a scene flow does; a template
-    has none.
+    A position may be read from tables of a grid or of planes, which span the cube [-1,
+    1]^3 of the field and, contracted, all space around it. With planes of `moments` the
+    network reads a point at a time, as the medium of a scene flow does. A template has
+    none.
     """
 
     position: EncodingSpec | HashGridSpec | VoxelGridSpec | PlanesSpec = EncodingSpec(
@@ -93,12 +100,12 @@ class TemplateSpec:
 
     @property
     def reads_time(self) -> bool:
-        """Whether its tables are those of a point at a time."""
+        """True if its tables are those of a point at a time."""
         return isinstance(self.position, PlanesSpec) and bool(self.position.moments)
 
     @property
     def encoded_width(self) -> int:
-        """Features of a point, and of its time where that is read."""
+        """Number of features of a point, and of its time if that is read."""
         return self.position.width(4 if self.reads_time else 3)
 
 
@@ -112,7 +119,7 @@ class Template(NamedTuple):
 
 
 class Radiance(NamedTuple):
-    """What the field is at one point."""
+    """Density and color of the field at one point."""
 
     density: Float[Array, ""]  # per unit of the field, not negative
     color: Float[Array, "3"]  # sRGB in (0, 1)
@@ -120,13 +127,29 @@ class Radiance(NamedTuple):
 
 
 def trunk_spec(spec: TemplateSpec, inputs: int) -> MLPSpec:
-    """The network that reads `inputs` features of a point."""
+    """Return the settings of the trunk.
+
+    Args:
+      spec: Settings of the template.
+      inputs: Number of features of a point.
+
+    Returns:
+      Settings of an MLP with the heads "density" and "bottleneck".
+    """
     heads = (("density", HeadSpec(1)), ("bottleneck", HeadSpec(spec.width)))
     return MLPSpec(inputs, spec.depth, spec.width, heads, spec.skips)
 
 
 def color_spec(spec: TemplateSpec, condition: int) -> MLPSpec:
-    """The branch that reads the bottleneck and `condition` features of the ray."""
+    """Return the settings of the color branch.
+
+    Args:
+      spec: Settings of the template.
+      condition: Number of features of a ray, which are read after the bottleneck.
+
+    Returns:
+      Settings of an MLP with the head "color".
+    """
     inputs = spec.width + condition
     return MLPSpec(inputs, 1, spec.color_width, (("color", HeadSpec(3)),))
 
@@ -138,7 +161,18 @@ def init(
     condition: int,
     dtype=jnp.float32,
 ) -> Template:
-    """Glorot weights; `inputs` and `condition` are the widths that `apply` will get."""
+    """Initialize the parameters with Glorot weights.
+
+    Args:
+      spec: Settings of the template.
+      key: PRNG key.
+      inputs: Number of features that `apply` will get.
+      condition: Number of features of a ray that `apply` will get.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters.
+    """
     trunk_key, color_key = jax.random.split(key)
     tables, grid = None, GRIDS.get(type(spec.position))
     if grid is not None:
@@ -158,10 +192,21 @@ def encode(
     step: Int[Array, ""] | None,
     time: Float[Array, ""] | None = None,
 ) -> Float[Array, " features"]:
-    """What the trunk reads of a point in units of the field.
+    """Encode a point for the trunk.
 
-    `step` says how far the bands or levels are open; None opens all. `time`, in
-    [0, 1], counts where `spec.reads_time`; there ValueError without it.
+    Args:
+      spec: Settings of the template.
+      params: Parameters.
+      point: Point in units of the field, [3].
+      step: Training step, which determines how far the bands or levels are open. None
+        opens all.
+      time: Time in [0, 1]. Needed if `spec.reads_time`.
+
+    Returns:
+      Features, [spec.encoded_width].
+
+    Raises:
+      ValueError: If a time is needed but missing.
     """
     position, grid = spec.position, GRIDS.get(type(spec.position))
     parts = position.bands if grid is None else position.levels
@@ -184,7 +229,16 @@ def encode(
 def raw_density(
     spec: TemplateSpec, params: Template, features: Float[Array, " inputs"]
 ) -> tuple[Float[Array, ""], Float[Array, " width"]]:
-    """The density before its activation, and the trunk's last layer."""
+    """Evaluate the trunk.
+
+    Args:
+      spec: Settings of the template.
+      params: Parameters.
+      features: Encoded point, [inputs].
+
+    Returns:
+      The density before its activation, and the trunk's last layer [width].
+    """
     trunk = trunk_spec(spec, features.shape[-1])
     hidden = mlp.hidden_features(trunk, params.trunk, features)
     raw = mlp.affine(params.trunk.heads["density"], hidden)[0] + spec.density_bias
@@ -198,12 +252,25 @@ def apply(
     condition: Float[Array, " condition"],
     density_noise: Float[Array, ""] | None = None,
 ) -> Radiance:
-    """Density and color at one point (Mildenhall et al. 2020, figure 7).
+    """Evaluate density and color at one point.
 
-    `features` are the point's encoding and what effects add to it; `condition` is the
-    encoded view direction and codes, the same along a ray. `density_noise` is added
-    before the activation. The density never depends on `condition`. ValueError where
-    the color branch reads another number of them.
+    The density never depends on `condition`.
+
+    Args:
+      spec: Settings of the template.
+      params: Parameters.
+      features: Encoding of the point and the features that effects add to it, [inputs].
+      condition: Encoded view direction and codes, the same along a ray, [condition].
+      density_noise: Noise added before the activation of the density, or None.
+
+    Returns:
+      The density per unit of the field and the color.
+
+    Raises:
+      ValueError: If the color branch reads another number of features of the ray.
+
+    References:
+      Mildenhall et al. 2020, arXiv:2003.08934, figure 7.
     """
     read = len(params.color.hidden[0].weight) - spec.width
     if len(condition) != read:
@@ -220,9 +287,17 @@ def apply(
 def color_offset(
     spec: TemplateSpec, params: Template, condition: Float[Array, " condition"]
 ) -> Float[Array, " color_width"]:
-    """What the first layer of color makes of `condition`, its bias included.
+    """Compute the contribution of a ray to the first layer of color, with its bias.
 
-    The same for all samples of a ray.
+    It is the same for all samples of a ray.
+
+    Args:
+      spec: Settings of the template.
+      params: Parameters.
+      condition: Features of the ray, [condition].
+
+    Returns:
+      The contribution, [color_width].
     """
     bottleneck, first = params.trunk.heads["bottleneck"], params.color.hidden[0]
     ours, rest = jnp.split(first.weight, [spec.width])
@@ -237,9 +312,19 @@ def colored(
     offset: Float[Array, " color_width"],
     more: Float[Array, " more"] | None = None,
 ) -> Radiance:
-    """What `raw_density` found, with its color.
+    """Add color to the result of `raw_density`.
 
-    `offset` is the `color_offset` of the ray; `more` is read behind its condition.
+    Args:
+      spec: Settings of the template.
+      params: Parameters.
+      raw: Density before its activation.
+      hidden: The trunk's last layer, [width].
+      offset: `color_offset` of the ray.
+      more: Further features of the sample, which are read after those of the ray, or
+        None.
+
+    Returns:
+      The density per unit of the field and the color.
     """
     bottleneck, first = params.trunk.heads["bottleneck"], params.color.hidden[0]
     # Nothing bends between the bottleneck and this layer: all samples meet the product
