@@ -20,6 +20,7 @@ kept in --out, and the same command goes on.
 import concurrent.futures
 import dataclasses
 import pathlib
+import signal
 import threading
 
 from experiments import cli
@@ -66,6 +67,11 @@ def main(args):
     from nerfies_jax.measure import clock
     from nerfies_jax.training.provenance import revision
 
+    # A campaign in the background of a script, or under nohup, was started with these
+    # ignored, and every job would inherit that.
+    for number in (signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
     with cli.user_errors():
         args.out.mkdir(parents=True, exist_ok=True)
         bench = jobs.Bench(args.out.resolve())

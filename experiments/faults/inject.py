@@ -26,6 +26,7 @@ REASONS = {
 FROM_THE_START = ("full log", "closed stderr")
 BOUND_SECONDS = 240.0  # for a job that goes on after the fault, on a busy machine
 END_SECONDS = 60.0  # after a signal
+IGNORED_SECONDS = 5.0  # a job that completes later than this ignored its signal
 ORPHAN_SECONDS = 15.0
 POLL_SECONDS = 0.01
 # Of the processor, for Python to start. Until then SIGINT is Python's own affair.
@@ -97,7 +98,7 @@ def disturbed(
     happened = fault in FROM_THE_START or _wait(process, max(after, START_SECONDS))
     if happened:
         _happen(process, fault, reader, switch)
-    problem = ""
+    problem, began = "", time.monotonic()
     ends = fault in (*KINDS["kill"], *KINDS["signal"])
     try:
         code = process.wait(END_SECONDS if happened and ends else BOUND_SECONDS)
@@ -105,6 +106,8 @@ def disturbed(
         problem = "it did not end"
         process.kill()
         code = process.wait()
+    if ends and happened and code == 0 and time.monotonic() - began > IGNORED_SECONDS:
+        problem = f"{fault} was ignored"
     if reader is not None:
         reader.close()
     for each in SWITCHES.values():

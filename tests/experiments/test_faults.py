@@ -106,6 +106,15 @@ def test_what_a_careless_job_loses_is_noticed(problem, campaign):
     assert problem in row["lost"]
 
 
+def test_a_signal_that_is_ignored_is_noticed(campaign, monkeypatch):
+    monkeypatch.setattr(inject, "IGNORED_SECONDS", 0.05)
+    monkeypatch.setitem(inject.KINDS, "signal", ("SIGINT",))
+    ignoring = "signal.signal(signal.SIGINT, signal.SIG_IGN); time.sleep(0.1)"
+    monkeypatch.setattr(f"{__name__}.SETUP", SETUP.replace("stopping.install()", ""))
+    rows = campaign("signal", f"import signal; {ignoring}")
+    assert "SIGINT was ignored" in [row["lost"] for row in rows]
+
+
 def test_a_traceback_is_a_loss():
     for said, lost in (("Traceback (most", "a traceback"), ("warning: x", "")):
         assert inject._wrong(0, "disk full", True, said) == lost
