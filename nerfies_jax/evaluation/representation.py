@@ -68,7 +68,7 @@ class Parts(NamedTuple):
 
 
 class SplatCloud(NamedTuple):
-    """Gaussians at one time in world coordinates, for a rasterizer; NumPy."""
+    """Gaussians at one time in world coordinates, for a rasterizer, in NumPy."""
 
     centers: np.ndarray  # [gaussians, 3], scene units
     covariances: np.ndarray  # [gaussians, 3, 3], scene units squared

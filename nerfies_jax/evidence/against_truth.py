@@ -1,7 +1,7 @@
-"""How well a film was followed where the truth is known.
+"""Errors of preprocessing against the ground truth of a synthetic scene.
 
-Points of the truth are followed from where they are first seen, by the flow that was
-gathered, aligned, and placed in space, as the tracks of the evidence are.
+Ground truth points are followed from where they are first visible, by the computed
+flow, realigned, and placed in space, like the tracks of preprocessing.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ LATER = 24  # frames after which a track is held against the truth
 
 
 class TruePoints(NamedTuple):
-    """Points that move, in the frames and pixels of the evidence."""
+    """Moving points, in the frames and pixels of preprocessing."""
 
     pixel: np.ndarray  # [points, frames, 2]
     seen: np.ndarray  # [points, frames] bool
@@ -29,7 +29,7 @@ class TruePoints(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """NaN where there is nothing to measure."""
+    """Errors of masks, tracks and paths, NaN where there is nothing to measure."""
 
     mask_iou: float  # of what moves
     false_share: float  # of all pixels, marked as moving and at rest
@@ -39,7 +39,19 @@ class Errors(NamedTuple):
 
 
 def true_points(capture: Capture, truth: SceneTruth, evidence: Evidence) -> TruePoints:
-    """The truth's moving points; ValueError where it is not that of the capture."""
+    """Return the moving points of the ground truth.
+
+    Args:
+      capture: The capture.
+      truth: Its ground truth.
+      evidence: Its preprocessing, which determines frames and pixels.
+
+    Returns:
+      The points.
+
+    Raises:
+      ValueError: If the truth is not that of the capture.
+    """
     position = truths.track_places(capture, truth, evidence.row)
     scale = evidence.moving.shape[2] / truth.things.shape[2]
     return TruePoints(
@@ -50,7 +62,16 @@ def true_points(capture: Capture, truth: SceneTruth, evidence: Evidence) -> True
 
 
 def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
-    """Of masks, tracks and paths; `capture` has the true masks of what moves."""
+    """Compute the errors of masks, tracks and paths.
+
+    Args:
+      capture: The capture with its true masks of moving pixels.
+      evidence: Its preprocessing.
+      points: Ground truth points.
+
+    Returns:
+      The errors.
+    """
     small = record.looked_at(capture, evidence.factor)
     true = small.moving[evidence.row]
     either = (evidence.moving | true).sum()

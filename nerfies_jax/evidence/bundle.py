@@ -1,8 +1,9 @@
-"""One rigid thing seen by cameras that are known: its points and its pose per frame.
+"""Bundle adjustment of one rigid object with known cameras.
 
-Bundle adjustment (Triggs et al. 2000, "Bundle adjustment - a modern synthesis") by
-Levenberg and Marquardt, points eliminated by Schur's complement. What is found is right
-but for one factor of all distances to the cameras, which stays nearly as it was given.
+It finds the points of the object and its pose in each frame (Triggs et al. 2000,
+"Bundle adjustment - a modern synthesis") by Levenberg-Marquardt, with points eliminated
+by the Schur complement. The result is determined up to one factor of all distances to
+the cameras, which stays nearly as initialized.
 """
 
 import math
@@ -17,8 +18,8 @@ from nerfies_jax.evidence.view_set import Views
 
 ROUNDS = 40
 SOFT_PX = 0.5  # misses beyond it count less and less (Cauchy)
-# Of the second differences of the poses, in pixels over the distance: next to nothing,
-# and enough where nothing of the thing is seen.
+# Penalty on second differences of the poses, in pixels over the distance: negligible,
+# but sufficient in frames that do not show the object.
 BEND_PX = 0.1
 POINT_PRIOR = 1e-3  # of what the observations of a typical point say
 DAMPING, LEAST_DAMPING, TRIES = 1e-4, 1e-8, 8
@@ -27,19 +28,23 @@ NEAR = 1e-6  # z-depth over the typical one: what comes nearer is held there
 
 
 class Body(NamedTuple):
-    """Points of a thing, and where it is: world = rotation @ body + shift."""
+    """Points of a rigid object, and its poses: world = rotation @ body + shift."""
 
     point: np.ndarray  # [points, 3] scene units, body axes
     rotation: np.ndarray  # [frames, 3, 3]
     shift: np.ndarray  # [frames, 3] scene units
 
     def world(self) -> np.ndarray:
-        """[points, frames, 3]."""
+        """Return the positions of the points in all frames.
+
+        Returns:
+          Positions in scene units, [points, frames, 3].
+        """
         return np.einsum("fij,nj->nfi", self.rotation, self.point) + self.shift
 
 
 class Sight(NamedTuple):
-    """Where tracks were seen, one entry for each track and frame."""
+    """Observations of tracks, one entry for each track and frame."""
 
     track: np.ndarray  # [entries]
     frame: np.ndarray  # [entries]
@@ -48,7 +53,16 @@ class Sight(NamedTuple):
 
 
 def sight(views: Views, tracks: Tracks, known: np.ndarray) -> Sight:
-    """Of the tracks where they are `known` [tracks, frames]."""
+    """Collect the observations of tracks.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      known: True for observations to use, [tracks, frames].
+
+    Returns:
+      The observations.
+    """
     track, frame = np.nonzero(known)
     center = views.intrinsics[frame, :2, 2]
     to_px = views.intrinsics[frame, :2].copy()
@@ -57,7 +71,16 @@ def sight(views: Views, tracks: Tracks, known: np.ndarray) -> Sight:
 
 
 def misses(views: Views, seen: Sight, body: Body) -> np.ndarray:
-    """[entries] px."""
+    """Compute reprojection errors.
+
+    Args:
+      views: The frames.
+      seen: Observations.
+      body: The object.
+
+    Returns:
+      Errors in pixels, [entries].
+    """
     return np.linalg.norm(_projected(views, seen, body)[0], axis=-1)
 
 
@@ -75,12 +98,30 @@ def _projected(views, seen, body):
 
 
 def adjusted(views: Views, seen: Sight, body: Body) -> Body:
-    """The body that fits what was seen of it, from one nearby."""
+    """Adjust points and poses to the observations.
+
+    Args:
+      views: The frames.
+      seen: Observations.
+      body: Initial object.
+
+    Returns:
+      The adjusted object.
+    """
     return _descended(views, seen, body, _moved)
 
 
 def posed(views: Views, seen: Sight, body: Body) -> Body:
-    """The poses that fit what was seen of a body whose points are right."""
+    """Adjust the poses alone.
+
+    Args:
+      views: The frames.
+      seen: Observations.
+      body: Object whose points are correct.
+
+    Returns:
+      The object with adjusted poses.
+    """
     return _descended(views, seen, body, _turned)
 
 
@@ -154,7 +195,9 @@ def _system(views, seen, body, bend):
 
 
 def _weights(miss):
-    """Of observations [entries] in the next round, by how far off [entries, 2] px."""
+    """Weights of observations [entries] in the next round, from errors [entries, 2] in
+    px.
+    """
     return 1 / (1 + (miss**2).sum(-1) / SOFT_PX**2)
 
 
@@ -211,7 +254,16 @@ def _by(body, pose):
 
 
 def placed(views: Views, seen: Sight, body: Body) -> Body:
-    """The points that fit best where the thing is taken to be."""
+    """Adjust the points alone.
+
+    Args:
+      views: The frames.
+      seen: Observations.
+      body: Object whose poses are correct.
+
+    Returns:
+      The object with adjusted points.
+    """
     point = body.point.copy()
     for _ in range(ROUNDS // 4):
         miss, slope, _ = _projected(views, seen, body._replace(point=point))
@@ -229,13 +281,31 @@ def placed(views: Views, seen: Sight, body: Body) -> Body:
 
 
 def scaled(views: Views, body: Body, factor: float) -> Body:
-    """The same pictures from a thing so many times as large and as far away."""
+    """Scale size and distance of an object, which leaves its projections unchanged.
+
+    Args:
+      views: The frames.
+      body: The object.
+      factor: The factor.
+
+    Returns:
+      The scaled object.
+    """
     shift = views.position + factor * (body.shift - views.position)
     return Body(factor * body.point, body.rotation, shift)
 
 
 def typical_misses(seen: Sight, miss: np.ndarray, tracks: int) -> np.ndarray:
-    """[tracks] the median of each track's misses, px; infinite where never seen."""
+    """Compute the median reprojection error of each track.
+
+    Args:
+      seen: Observations.
+      miss: Their errors in pixels, [entries].
+      tracks: Number of tracks.
+
+    Returns:
+      Medians in pixels [tracks], infinite for tracks without observations.
+    """
     if not len(miss):
         return np.full(tracks, np.inf)
     ordered = np.lexsort((miss, seen.track))

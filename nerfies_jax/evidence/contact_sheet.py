@@ -1,4 +1,4 @@
-"""A contact sheet: frames with what moves marked and tracks drawn."""
+"""Contact sheet of frames with moving pixels marked and tracks overlaid."""
 
 import cv2
 import numpy as np
@@ -14,10 +14,17 @@ AT_REST, BY_ITSELF = (150, 200, 255), (255, 230, 0)
 
 
 def followed(views: Views, evidence: Evidence) -> np.ndarray:
-    """Frames with what moves in red, and tracks with their tails.
+    """Show frames with moving pixels in red, and tracks with their recent positions.
 
-    Yellow tracks move by themselves, blue ones are points at rest: their tails are the
-    camera's motion. Frames alone where there was nothing to follow.
+    Yellow tracks move, blue ones are static points, whose traces are the camera motion.
+    If preprocessing was not possible, the frames are shown alone.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+
+    Returns:
+      uint8 image, [height, width, 3].
     """
     frames = len(views.row)
     shown = np.unique(np.linspace(0, frames - 1, FOLLOWED).round().astype(int))

@@ -1,9 +1,9 @@
-"""Dense flow between neighboring frames that follow each other in time, both ways.
+"""Dense optical flow between frames that are neighbors in time, in both directions.
 
-OpenCV's DIS (Kroeger et al. 2016, arXiv:1603.03590) on pictures brought to one mean and
-contrast. Only neighbors are compared: over longer gaps patterns that repeat are taken
-for each other. Where an area is lost even so, or jumps, it is looked for where its last
-motion would take it.
+It is OpenCV's DIS (Kroeger et al. 2016, arXiv:1603.03590) on images normalized to one
+mean and contrast. Only neighbors are compared, since repetitive patterns are confused
+over longer intervals. An area that is nevertheless lost, or jumps, is searched for
+again at the position that its last motion predicts.
 """
 
 import threading
@@ -26,20 +26,22 @@ CLOSED_PX, CLOSED_SHARE = 0.5, 0.02
 
 # Searches that a second look at a wide step takes: one for each plane, and comparing.
 SECOND_LOOK = 8
-# Of the width: the side of an area whose flow is looked for again where it was carried
-# to a frame and is lost there. Patterns that repeat are taken for each other in some
+# Share of the width: the side of an area whose flow is searched for again if it leads
+# to a frame and is lost there. Repetitive patterns are confused in some
 # frames: the turning cube of the built-in scenes lost all its tracks in one of them.
 LOST_SHARE = 0.06
-# Of the width, from one frame to the next: what turns that sharply is looked at again,
-# and goes on as it came where that looks as alike. A checker of the fast cube is 0.06.
+# Share of the width, from one frame to the next: flow that changes so abruptly is
+# tested against constant motion, which wins if it matches as well. A checker of the
+# fast cube is 0.06.
 JUMP_SHARE, AS_ALIKE = 0.03, 1.1
 
 
 class NeighborFlow(NamedTuple):
     """Flow of each frame to the next and to the previous one in time.
 
-    From pixel centers, in pixels right and down; `seen` where going there and back ends
-    at the start. The last frame has no next one, the first none before: zero, unseen.
+    It starts at pixel centers and is in pixels right and down. `seen` marks where
+    forward and backward flow are consistent. The last frame has no next one, the first
+    no previous one: zero, and not seen.
     """
 
     forward: np.ndarray  # [frames, height, width, 2] float32
@@ -49,14 +51,28 @@ class NeighborFlow(NamedTuple):
 
 
 def enlarged(views: Views) -> int:
-    """How many times larger than the views' own the pictures are compared."""
+    """Return the factor by which images are enlarged before they are compared.
+
+    Args:
+      views: The frames.
+
+    Returns:
+      An integer factor.
+    """
     return ENLARGED if max(views.size) <= ENLARGED_BELOW_PX else 1
 
 
 def leveled(views: Views, times: int | None = None) -> np.ndarray:
-    """[frames, height, width] uint8: gray pictures of one mean and spread, enlarged.
+    """Normalize gray images to one mean and standard deviation, and enlarge them.
 
-    Without it a film of varying exposure has 79 % of its pixels marked as moving.
+    Without it a video of varying exposure has 79 % of its pixels marked as moving.
+
+    Args:
+      views: The frames.
+      times: Factor of enlargement. None for `enlarged`.
+
+    Returns:
+      uint8 images, [frames, times height, times width].
     """
     gray = 255 * views.gray
     mean, spread = gray.mean((1, 2)), np.maximum(gray.std((1, 2)), 1e-3)
@@ -68,13 +84,29 @@ def leveled(views: Views, times: int | None = None) -> np.ndarray:
 
 
 def searched_pixels(views: Views, pictures: np.ndarray) -> int:
-    """Pixels of the finest level of one search between such pictures."""
+    """Return the number of pixels on the finest level of one search.
+
+    Args:
+      views: The frames.
+      pictures: Their images, as made by `leveled`.
+
+    Returns:
+      The number of pixels.
+    """
     pixels = pictures[0].size
     return pixels if enlarged(views) > 1 else pixels // 4
 
 
 def larger(picture: np.ndarray, times: int) -> np.ndarray:
-    """A picture [height, width] uint8 with so many pixels for one of its own."""
+    """Enlarge an image.
+
+    Args:
+      picture: uint8 image, [height, width].
+      times: Integer factor.
+
+    Returns:
+      uint8 image, [times height, times width].
+    """
     if times == 1:
         return picture
     size = times * picture.shape[1], times * picture.shape[0]
@@ -82,7 +114,15 @@ def larger(picture: np.ndarray, times: int) -> np.ndarray:
 
 
 def reduced(shift: np.ndarray, times: int) -> np.ndarray:
-    """Flow [height, width, 2] between enlarged pictures, in pixels of their own."""
+    """Convert flow between enlarged images to flow between the original images.
+
+    Args:
+      shift: Flow, [times height, times width, 2].
+      times: Integer factor of the enlargement.
+
+    Returns:
+      Flow in pixels of the original images, [height, width, 2].
+    """
     if times == 1:
         return shift
     size = shift.shape[1] // times, shift.shape[0] // times
@@ -90,9 +130,14 @@ def reduced(shift: np.ndarray, times: int) -> np.ndarray:
 
 
 def enlarged_flow(shift: np.ndarray, times: int) -> np.ndarray:
-    """Flow [height, width, 2] in px, as between pictures that are enlarged so much.
+    """Convert flow to flow between enlarged images. Inverts `reduced`.
 
-    [times height, times width, 2], in pixels of those; `reduced` is the way back.
+    Args:
+      shift: Flow in pixels, [height, width, 2].
+      times: Integer factor of the enlargement.
+
+    Returns:
+      Flow in pixels of the enlarged images, [times height, times width, 2].
     """
     size = times * shift.shape[1], times * shift.shape[0]
     return times * cv2.resize(np.ascontiguousarray(shift), size)
@@ -104,9 +149,13 @@ def _smaller(picture, times):
 
 
 def dis(times: int) -> Callable[..., np.ndarray]:
-    """Finds flow between pictures that were enlarged so many times.
+    """Make a search for optical flow between enlarged images.
 
-    A third argument is a guess of it, in pixels of the enlarged pictures.
+    Args:
+      times: Integer factor of the enlargement.
+
+    Returns:
+      A function of two images and, optionally, an initial flow, all enlarged.
     """
     # Two: after a search from a guess, OpenCV 4.x finds something else without one.
     plain, guided = (
@@ -127,11 +176,19 @@ def between_neighbors(
     span: tuple[float, float] | None = None,
     room_for: Callable[[int], int] = lambda count: count,
 ) -> NeighborFlow:
-    """Flow between all frames that follow each other, both ways, and checked.
+    """Compute the flow between all neighboring frames in both directions, and check it.
 
-    `pictures` are the views' as `leveled` makes them. With `span`, the nearest and
-    farthest z-depth, wide steps are looked at again from where a still scene would be,
-    the first ones of them if there is no `room_for` all.
+    Args:
+      views: The frames.
+      pictures: Their images, as made by `leveled`.
+      span: Nearest and farthest z-depth of the scene in scene units. Large
+        displacements are then searched for again from the flow that a static scene
+        would have.
+      room_for: Function of the number of such searches, which returns how many of them
+        are done.
+
+    Returns:
+      The flow.
     """
     (width, height), frames = views.size, len(views.row)
     times = pictures.shape[2] // width
@@ -191,9 +248,14 @@ def between_neighbors(
 
 
 def checked(forward: np.ndarray, backward: np.ndarray) -> NeighborFlow:
-    """Flow [frames, height, width, 2] to the next and the previous frame, as `closed`.
+    """Check the consistency of forward and backward flow.
 
-    The last frame's forward flow and the first one's backward flow are not seen.
+    Args:
+      forward: Flow to the next frame, [frames, height, width, 2].
+      backward: Flow to the previous frame, [frames, height, width, 2].
+
+    Returns:
+      The flow with the pixels where it is consistent.
     """
     forward_seen, backward_seen = np.zeros((2, *forward.shape[:3]), bool)
     for frame in range(len(forward) - 1):
@@ -204,12 +266,12 @@ def checked(forward: np.ndarray, backward: np.ndarray) -> NeighborFlow:
 
 
 def _lost(flow, frame):
-    """Whether a coherent area was carried to a frame and not from there."""
+    """Test if a coherent area was tracked to a frame but not beyond it."""
     return _covers_patch(flow.backward_seen[frame] & ~flow.forward_seen[frame])
 
 
 def _jumps(flow, frame):
-    """Whether a coherent area leaves a frame otherwise than it came."""
+    """Test if a coherent area changes its motion abruptly at a frame."""
     turned = np.linalg.norm(flow.forward[frame] + flow.backward[frame], axis=-1)
     both = flow.backward_seen[frame] & flow.forward_seen[frame]
     return _covers_patch(both & (turned > JUMP_SHARE * turned.shape[1]))
@@ -223,7 +285,7 @@ def _covers_patch(area):
 
 
 def _go_on(flow, frame, pictures, search):
-    """Look again, from the guess that all goes on as it came; keep what closes."""
+    """Search again, starting from constant motion, and keep flow that is consistent."""
     height, width = flow.forward.shape[1:3]
     times = pictures.shape[2] // width
 
@@ -248,7 +310,16 @@ def _go_on(flow, frame, pictures, search):
 
 
 def closed(there: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """[height, width]: where `back` leads from the end of `there` to its start."""
+    """Find the pixels where forward and backward flow are consistent.
+
+    Args:
+      there: Flow in pixels, [height, width, 2].
+      back: Flow in the opposite direction, [height, width, 2].
+
+    Returns:
+      Booleans [height, width], True where `back` leads from the end of `there` to its
+      start.
+    """
     height, width = there.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     to = (x + there[..., 0], y.astype(np.float32) + there[..., 1])

@@ -1,4 +1,4 @@
-"""Exposure and color: whether points at rest look alike in all frames."""
+"""Exposure and color: whether static points have the same colors in all frames."""
 
 import cv2
 import numpy as np
@@ -21,7 +21,15 @@ POLISHES = 12  # rounds of medians; the gains move by less than 1e-3 afterwards
 
 
 def exposure(views: Views, points: np.ndarray) -> Finding:
-    """Whether whole frames differ in brightness or color, by points [points, 3]."""
+    """Decide whether frames differ in brightness or color.
+
+    Args:
+      views: The frames.
+      points: Static points in scene units, [points, 3].
+
+    Returns:
+      The finding.
+    """
     threshold = f"{DRIFT_STOPS:g} stops, root mean square over frames and channels"
     if len(points) < GROUPS * MIN_POINTS:
         return cannot_tell(
@@ -41,7 +49,7 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
     count = np.isfinite(each).sum(0)
     common = np.nanmedian(each, axis=0)
     common = common - common.mean(0)
-    # Of a median over groups: 1.25 times that of their mean.
+    # Standard error of a median over groups: 1.25 times that of their mean.
     spread = np.nanmedian(np.abs(each - np.nanmedian(each, axis=0)), axis=0) * 1.48
     error = float(np.sqrt(np.mean((1.25 * spread) ** 2 / count)))
     total = float(np.sqrt(np.mean(common**2)))
@@ -65,7 +73,15 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
 
 
 def sightings(views: Views, points: np.ndarray) -> np.ndarray:
-    """[frames, points, 3]: linear light in stops; NaN where a point is not measured."""
+    """Measure the linear light of points in all frames.
+
+    Args:
+      views: The frames.
+      points: Static points in scene units, [points, 3].
+
+    Returns:
+      log2 of linear light [frames, points, 3], NaN where a point is not measured.
+    """
     light = np.full((len(views.row), len(points), 3), np.nan)
     for index in range(len(views.row)):
         pixel, depth = view_set.project(views, index, points)
@@ -83,10 +99,17 @@ def sightings(views: Views, points: np.ndarray) -> np.ndarray:
 
 
 def gains(light: np.ndarray) -> np.ndarray:
-    """Gain of each frame [frames, 3] in stops, by median polish (Tukey 1977).
+    """Estimate the gain of each frame by median polish.
 
-    `light` [frames, points, 3] is a frame's gain plus a point's color, but where the
-    point is hidden. NaN for frames that see too few.
+    Args:
+      light: log2 of linear light, [frames, points, 3], which is a frame's gain plus a
+        point's color, except where the point is occluded.
+
+    Returns:
+      Gains in stops [frames, 3], NaN for frames that show too few points.
+
+    References:
+      Tukey 1977.
     """
     gain = np.zeros((len(light), 3))
     seen = np.isfinite(light).all(-1)

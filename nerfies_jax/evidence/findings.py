@@ -1,4 +1,4 @@
-"""What an inspection found: one record for each effect, and how sure it is."""
+"""Findings of an inspection: one record for each effect, with its confidence."""
 
 import dataclasses
 import math
@@ -10,18 +10,18 @@ MOTION, LIGHT, TRANSIENT = "motion", "appearance codes", "transient objects"
 START, BACKGROUND = "start from points", "background points"
 DEPTH, MASKS, LENS = "depth", "masks of what moves", "lens distortion"
 TEXTURE = "more texture bands"
-# How far from its threshold evidence must be, as a factor. What an effect is worth is
-# known to a factor of two at best: within a quarter of the threshold nobody knows.
+# Factor by which a value must differ from its threshold. The gain of an effect is known
+# to a factor of two at best, so within a quarter of the threshold nothing is decided.
 CERTAIN_FACTOR, LIKELY_FACTOR = 2.0, 1.25
 DEVIATIONS = 2.0  # standard errors that evidence is moved toward its threshold first
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """What was seen of one effect; plain values, so that it goes into a JSON file.
+    """Observations about one effect, as plain values for a JSON file.
 
-    `wanted` is None where the evidence cannot tell, and then decides nothing. `numbers`
-    are the measured quantities by name, unit in the name.
+    `wanted` is None if the observations are inconclusive, and then decides nothing.
+    `numbers` are the measured quantities by name, with the unit in the name.
     """
 
     effect: str
@@ -40,18 +40,26 @@ class Finding:
 
     @property
     def decision(self) -> str:
-        """Yes, no, or a dash."""
+        """ "yes", "no", or a dash."""
         return {True: "yes", False: "no", None: "-"}[self.wanted]
 
 
 def judge(
     value: float | int, threshold: float | int, error: float | int
 ) -> tuple[bool | None, str]:
-    """Whether a value that is not negative passes its threshold, and how surely.
+    """Decide whether a non-negative value exceeds its threshold, with a confidence.
 
-    `error` is its standard error. The value is first moved two errors toward the
-    threshold; if it gets there, or ends within a quarter of it, nothing is decided.
-    From a factor of two on it is certain.
+    The value is first moved toward the threshold by two standard errors. If it reaches
+    the threshold, or ends within a quarter of it, nothing is decided. From a factor of
+    two on the decision is certain.
+
+    Args:
+      value: The value.
+      threshold: The threshold, positive.
+      error: Standard error of the value.
+
+    Returns:
+      The decision or None, and its confidence.
     """
     if not (threshold > 0 and value >= 0 and error >= 0):
         return None, CANNOT_TELL  # NaN included: something could not be measured
@@ -67,16 +75,31 @@ def judge(
 
 
 def cannot_tell(effect: str, reason: str, threshold: str = "") -> Finding:
-    """A finding that decides nothing, and why."""
+    """Make a finding that decides nothing.
+
+    Args:
+      effect: Name of the effect.
+      reason: The reason.
+      threshold: Description of the threshold.
+
+    Returns:
+      The finding.
+    """
     return Finding(effect, reason, threshold, None, CANNOT_TELL)
 
 
 def table(
     findings: tuple[Finding, ...], costs: Mapping[str, str], width: int = 110
 ) -> list[str]:
-    """Lines of a table for a terminal; long evidence is folded.
+    """Format findings as a table for a terminal, with long texts folded.
 
-    `costs` says by effect what it costs a step.
+    Args:
+      findings: The findings.
+      costs: Cost of each effect per step, as text.
+      width: Width of the table in characters.
+
+    Returns:
+      Lines of text.
     """
     heads = ("effect", "decision", "confidence", "cost per step")
     heads += ("evidence", "threshold")

@@ -1,4 +1,4 @@
-"""Optical flow for a capture that came without, between frames to learn from."""
+"""Optical flow between training frames, for a capture without flow."""
 
 import dataclasses
 
@@ -10,11 +10,18 @@ from nerfies_jax.evidence import dense_flow, view_set
 
 
 def with_flow(capture: Capture) -> Capture:
-    """The capture with flow to the next and the previous frame of the same camera.
+    """Compute flow to the next and the previous frame of the same camera.
 
-    Frames that are held out neither give nor get any: what they show is not known while
-    training. As `dense_flow` finds it, in the pictures as they are; wide steps of a
-    film are searched again from where a still scene would be.
+    Held-out frames neither have nor influence flow, since their contents are unknown
+    during training. Flow is computed by `dense_flow` in the images as they are. Large
+    displacements of a video are searched for again from the flow that a static scene
+    would have.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The capture with its flow.
     """
     width, height = capture.size
     count = len(capture.images)

@@ -1,4 +1,4 @@
-"""Masks of what moves for a capture that came without, on the frames learned from."""
+"""Masks of moving pixels in training frames, for a capture without masks."""
 
 import dataclasses
 import pathlib
@@ -11,10 +11,16 @@ from nerfies_jax.evidence import record
 
 
 def with_masks(capture: Capture, folder: pathlib.Path = CACHE / "evidence") -> Capture:
-    """The capture with the evidence's masks of its frames learned from; held-out ones,
-    which are not looked at, have none.
+    """Compute masks of the training frames by preprocessing.
 
-    As it was, with a note, where the film cannot be followed.
+    Held-out frames, which are not used, have none.
+
+    Args:
+      capture: The capture.
+      folder: Cache folder of preprocessing.
+
+    Returns:
+      The capture with masks, or the same with a note if tracking fails.
     """
     evidence = record.cached(capture, folder)
     if evidence.unusable:
@@ -28,9 +34,15 @@ def with_masks(capture: Capture, folder: pathlib.Path = CACHE / "evidence") -> C
 
 
 def enlarged(mask: np.ndarray, factor: int, size: tuple[int, int]) -> np.ndarray:
-    """Each pixel of [lines, columns] `factor` times as wide and high, up to `size`.
+    """Enlarge a mask by an integer factor, and pad it by its edge.
 
-    What was trimmed is like its edge.
+    Args:
+      mask: The mask, [lines, columns].
+      factor: Integer factor.
+      size: Width and height of the result in pixels.
+
+    Returns:
+      The mask, [height, width].
     """
     mask = mask.repeat(factor, 0).repeat(factor, 1)
     width, height = size

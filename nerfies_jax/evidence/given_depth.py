@@ -1,8 +1,9 @@
-"""Depth of another tool, brought to scene units by the points at rest.
+"""Alignment of external depth to scene units by static points.
 
-A network's depth has a scale and an offset of its own for each picture, or is inverse.
-Which of both it is, is what fits the points at rest better; of a plane that fills the
-picture neither the kind nor the offset can be told, and it counts as depth without one.
+The depth of a network has a scale and an offset of its own for each image, or is
+inverse. The kind that fits the static points better is chosen. If a plane fills the
+image, neither the kind nor the offset can be determined, and it counts as depth without
+an offset.
 """
 
 import numpy as np
@@ -14,7 +15,7 @@ FEWEST = 12  # points at rest in a picture
 ROUNDS = 8  # of reweighting
 USABLE = 0.1  # median relative miss; a depth worse than that says little
 SAME = 0.002  # of the relative miss: so much better an inverse depth must fit
-# Of the squared depth, on the offset: it is left out where it cannot be told.
+# Penalty on the offset, relative to squared depth: it is zero if it is undetermined.
 OFFSET_PENALTY = 1e-3
 LEAST_TOLD = 0.1  # of the depth must come from what was given, not from the offset
 
@@ -22,10 +23,16 @@ LEAST_TOLD = 0.1  # of the depth must come from what was given, not from the off
 def aligned(
     depth: np.ndarray, tracks: Tracks, rest: RestPoints
 ) -> tuple[np.ndarray, float]:
-    """z-depth in scene units [frames, height, width], and its median relative miss.
+    """Align depth to static points.
 
-    NaN where it is unknown, and in frames that show too few points at rest. `tracks`
-    and `rest` are of what stands still, in the pixels of `depth`.
+    Args:
+      depth: External depth or inverse depth, [frames, height, width].
+      tracks: Tracks of static points, in the pixels of `depth`.
+      rest: Static points of the tracks.
+
+    Returns:
+      z-depth in scene units [frames, height, width], NaN where unknown and in frames
+      with too few static points, and its median relative error.
     """
     placements, misses = [], []
     for inverse in (False, True):

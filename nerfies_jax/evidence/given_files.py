@@ -1,8 +1,8 @@
-"""Files of other tools: tracks, masks, depths and flow, checked against a capture.
+"""External preprocessing files: tracks, masks, depth and flow, checked against a
+capture.
 
-Each has as many frames as the capture, or as it has frames to learn from; either way in
-order of time. What a file does not fit in is said with the file, the bound and the way
-out.
+Each has as many frames as the capture, or as its training frames, in order of time.
+Errors name the file, the bound and the remedy.
 """
 
 import dataclasses
@@ -30,7 +30,18 @@ PICTURES, DEPTHS = (".png",), (".exr", ".png", ".npy")
 
 
 def attached(capture: Capture, files: GivenFiles) -> Capture:
-    """The capture with what the files hold; CaptureError for what does not fit."""
+    """Read external files and attach them to a capture.
+
+    Args:
+      capture: The capture.
+      files: The files.
+
+    Returns:
+      The capture with `given` set.
+
+    Raises:
+      CaptureError: If a file does not fit.
+    """
     if files == GivenFiles():
         return capture
     if capture.cameras.radial.any() or capture.cameras.tangential.any():

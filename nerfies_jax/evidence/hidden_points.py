@@ -1,8 +1,9 @@
-"""Points at rest behind what moves, where no picture shows any: guessed, not measured.
+"""Guessed static points behind moving objects, where no image shows any.
 
-What something hides in every frame is a black hole from elsewhere, or without it. The
-surfaces around go on behind it: inverse depth that is linear in the pixels is a plane,
-fitted to the known points around but for those before it, as at an edge in front.
+Regions occluded in every frame are black holes from other viewpoints, or without the
+object. The surrounding surfaces are continued behind it: inverse depth that is linear
+in the pixels is a plane, fitted to the known points around, except for those in front
+of it, as at an edge of the foreground.
 """
 
 import numpy as np
@@ -25,10 +26,18 @@ RIDGE_PX = 4.0
 
 
 def behind(views: Views, still: PointCloud, moving: np.ndarray) -> PointCloud:
-    """Places and colors on moving pixels [frames, height, width] far from any point.
+    """Place colored points on moving pixels far from any known point. Runs on the host.
 
-    Each frame takes the points of those before for known; one in which the points fill
-    fewer than `AROUND` cells of `KNOWN_PX` tells nothing. Host side.
+    Each frame counts the points of the frames before as known. A frame in which points
+    fill fewer than `AROUND` cells of `KNOWN_PX` adds none.
+
+    Args:
+      views: The frames.
+      still: Known static points.
+      moving: True for moving pixels, [frames, height, width].
+
+    Returns:
+      The additional points.
     """
     places, colors = np.asarray(still.position, np.float64), still.color
     first = len(places)

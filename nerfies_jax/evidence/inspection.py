@@ -1,4 +1,4 @@
-"""Looks at a capture and decides which effects it calls for; host side, no training."""
+"""Inspection of a capture, to decide on effects. Runs on the host, without training."""
 
 import dataclasses
 import pathlib
@@ -27,7 +27,7 @@ from nerfies_jax.evidence.view_set import Views
 
 @dataclasses.dataclass(frozen=True)
 class Inspection:
-    """What was found, the contact sheet, and how long it took."""
+    """Findings about a capture, with a contact sheet and the time taken."""
 
     findings: tuple[Finding, ...]
     sheet: np.ndarray  # [height, width, 3] uint8
@@ -37,7 +37,14 @@ class Inspection:
     evidence: Evidence
 
     def finding(self, effect: str) -> Finding:
-        """The one of an effect."""
+        """Return the finding of an effect.
+
+        Args:
+          effect: Name of the effect.
+
+        Returns:
+          The finding.
+        """
         return next(one for one in self.findings if one.effect == effect)
 
 
@@ -46,10 +53,15 @@ def inspect(
     folder: pathlib.Path | None = None,
     tell: Callable[[str], None] = lambda part: None,
 ) -> Inspection:
-    """Everything that can be told of a capture; about 20 s for 60 frames of 176x132.
+    """Inspect a capture, in about 20 s for 60 frames of 176x132.
 
-    The record of its pictures is read from `folder`, or gathered and kept there; it is
-    not kept where there is none. `tell` hears of each part when it begins.
+    Args:
+      capture: The capture.
+      folder: Cache folder of preprocessing. None to keep nothing.
+      tell: Called with the name of each part when it begins.
+
+    Returns:
+      The findings.
     """
     began = time.perf_counter()
     if folder is None:

@@ -1,11 +1,11 @@
-"""Which pixels of a film move by themselves, before its cameras are known.
+"""Masks of moving pixels in a video whose cameras are not known yet.
 
-Structure from motion needs what stands still, and a large thing that moves misleads it.
-What most tracks do from one frame to some frames later is the camera's doing: one
-epipolar geometry, or one homography where there is no parallax. What it does not
-explain moves. What moves along its epipolar lines does not show, nor what moves before
-a single plane, where it passes for something nearer: with the cameras that come of
-these masks `record.gather` sees more.
+Structure from motion needs static points and is misled by large moving objects. The
+motion of most tracks over some frames is due to the camera: one epipolar geometry, or
+one homography without parallax. Tracks that it does not explain move. Motion along
+epipolar lines is not detected, nor is motion in front of a single plane, where it looks
+like a smaller depth. With the cameras that these masks lead to, `record.gather` detects
+more.
 """
 
 import pathlib
@@ -29,10 +29,16 @@ RIM_SHARE = 0.02  # of the width that masks are widened by: features have a size
 
 
 def moving_masks(images: np.ndarray) -> np.ndarray:
-    """[frames, height, width] bool: what moves; `images` are uint8 in film order.
+    """Segment moving pixels of a video.
 
-    Of built-in scenes of 60 frames 68 % (`default`) to 100 % (`rigid`) of what moves is
-    masked, and 81 to 94 % of what stands still is not.
+    In built-in scenes of 60 frames, 68 % (`default`) to 100 % (`rigid`) of moving
+    pixels are masked, and 81 to 94 % of static pixels are not.
+
+    Args:
+      images: uint8 images in order of time, [frames, height, width, 3].
+
+    Returns:
+      Booleans, [frames, height, width].
     """
     whole = view_set.without_cameras(images)
     views = view_set.smaller(whole, view_set.times_smaller(whole))
@@ -55,9 +61,16 @@ def moving_masks(images: np.ndarray) -> np.ndarray:
 
 @events.stage("finding what moves")
 def moving_in(pictures: pathlib.Path) -> dict[str, np.ndarray]:
-    """[height, width] bool by the name of each picture of a folder: what moves.
+    """Segment moving pixels of the images in a folder.
 
-    Names follow the film. ValueError where they are too few, or of several sizes.
+    Args:
+      pictures: Folder of images whose names are in order of time.
+
+    Returns:
+      Booleans [height, width] by the name of each image.
+
+    Raises:
+      ValueError: If there are too few images, or they differ in size.
     """
     names = [file.name for file in frames.pictures_in(pictures)]
     if len(names) <= min(LATER):

@@ -1,4 +1,4 @@
-"""Whether anything moves by itself: by tracks, or by outlines where these fail."""
+"""Motion of a scene: by tracks, or by outlines if tracking fails."""
 
 import numpy as np
 
@@ -14,23 +14,31 @@ from nerfies_jax.evidence.findings import MOTION as EFFECT
 from nerfies_jax.evidence.record import MOVES, Evidence
 from nerfies_jax.evidence.view_set import Views
 
-# Of what tracks see, over all frames. Built-in scenes at rest leave 0.03 %, and those
-# in which the least moves have 4 %.
+# Share of tracks over all frames. Static built-in scenes have 0.03 %, and those with
+# the least motion 4 %.
 MOVING_SHARE = 0.005
 FALSE_SHARE = 0.001  # standard error: three times what still scenes leave
 # Where points at rest are missed by more than this, slow motion hides in it and "no"
 # cannot be said; and what cameras are off by passes for motion in some tracks, as the
 # square of it.
 CALM_PX = 0.75
-# What no track could follow may still look unlike the still scene: "no" needs a small
-# mask. Still films have up to 0.8 % (`static` at 112x84 and 40 frames).
+# Pixels that could not be tracked may still differ from the static scene: "no" needs a
+# small mask. Static videos have up to 0.8 % (`static` at 112x84 and 40 frames).
 MASKED_FOR_NO = 0.01
 # And nearly all of the textured pixels carried on, in films of some length.
 CARRIED_FOR_NO, MIN_FOR_NO = 0.8, 9
 
 
 def motion(views: Views, evidence: Evidence) -> Finding:
-    """Whether anything moves by itself."""
+    """Decide whether anything moves.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+
+    Returns:
+      The finding.
+    """
     if np.ptp(views.time) == 0:
         return Finding(
             EFFECT,
@@ -86,20 +94,41 @@ def _by_tracks(views, evidence):
 
 
 def frame_shares(evidence: Evidence) -> np.ndarray:
-    """[frames]: the share of the tracks seen in each that move by themselves."""
+    """Compute the share of moving tracks in each frame.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      Shares, [frames].
+    """
     seen = evidence.tracks.seen
     moves = seen[evidence.score > MOVES].sum(0)
     return moves / np.maximum(seen.sum(0), 1)
 
 
 def moving_share(evidence: Evidence) -> float:
-    """The same over all frames."""
+    """Compute the share of moving tracks over all frames.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The share.
+    """
     length = evidence.tracks.seen.sum(1)
     return float(length[evidence.score > MOVES].sum() / max(length.sum(), 1))
 
 
 def rest_noise(evidence: Evidence) -> float:
-    """px by which tracks at rest miss their points, in the median; inf without any."""
+    """Compute the median reprojection error of static tracks.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The error in pixels, inf without static tracks.
+    """
     still = evidence.score < MOVES
     if not still.any():
         return np.inf
@@ -107,7 +136,7 @@ def rest_noise(evidence: Evidence) -> float:
 
 
 def _why_not_no(views, evidence, noise):
-    """Why motion may be there and not show; None where it would."""
+    """Reason why motion may exist undetected, or None if it would be detected."""
     if noise > CALM_PX:
         return f"above {CALM_PX:g} px slow motion would not show"
     frames = len(views.row)
@@ -122,9 +151,14 @@ def _why_not_no(views, evidence, noise):
 
 
 def speeds(views: Views, evidence: Evidence) -> dict[str, float]:
-    """How fast the paths in space go from one frame to the next.
+    """Measure the speed of paths from one frame to the next.
 
-    In scene units, and in pixels at their depth; nothing where no path is known.
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+
+    Returns:
+      Speeds in scene units, and in pixels at their depth. Empty if no path is known.
     """
     paths = evidence.paths
     both = paths.known[:, 1:] & paths.known[:, :-1]

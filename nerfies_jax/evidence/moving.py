@@ -1,4 +1,4 @@
-"""Which tracks move by themselves, and with them which pixels."""
+"""Segmentation of moving tracks, and of moving pixels by the tracks."""
 
 import cv2
 import numpy as np
@@ -23,14 +23,22 @@ NEIGHBORS, EVERY_FRAMES, NEAR_PX, NEIGHBOR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10
 VOTES, VOTE_PX, VOTE_COLOR, REACH_PX = 8, 4.0, 20.0, 8.0
 VOTE_STEP = 2  # pixels of a side that vote as one does; the sum is smoothed anyway
 FAR_FROM_TRACKS = 0.3
-# What may move is left out of the still scene that pictures are held against.
+# Pixels that may move are left out of the static scene that images are compared with.
 OPEN, RIM_PX = 0.3, 8
 SUREST = 0.02  # votes are no surer than that
 SMOOTH_REACH, SMOOTH_PX, SMOOTH_COLOR = 4, 3.0, 15.0
 
 
 def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
-    """[tracks] in 0..1: how certainly each moves by itself."""
+    """Estimate how certainly each track moves.
+
+    Args:
+      tracks: The tracks.
+      rest: The static points that fit them best.
+
+    Returns:
+      Scores in [0, 1], [tracks].
+    """
     count = len(tracks.seen)
     if count == 0:
         return np.zeros(0)
@@ -69,10 +77,18 @@ def _neighborhood(tracks):
 
 
 def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
-    """[frames, height, width] in 0..1 that a pixel moves, by the tracks near it.
+    """Estimate the probability that a pixel moves, from the tracks near it.
 
-    Tracks that lie near and on a pixel of like color count most; a pixel far from all
-    of them is as likely as `FAR_FROM_TRACKS`.
+    Nearby tracks on pixels of similar color have the largest weights. A pixel far from
+    all tracks has `FAR_FROM_TRACKS`.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      score: Their scores, [tracks].
+
+    Returns:
+      Probabilities, [frames, height, width].
     """
     frames = len(views.row)
     width, height = views.size
@@ -101,16 +117,29 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
 
 
 def may_move(share: np.ndarray) -> np.ndarray:
-    """[frames, height, width] bool: all that votes leave open, and a rim around it."""
+    """Find all pixels that may move, with a margin.
+
+    Args:
+      share: Probabilities, [frames, height, width].
+
+    Returns:
+      Booleans, [frames, height, width].
+    """
     size = 2 * round(RIM_PX * picture_scale(share.shape[2])) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     return np.stack([cv2.dilate(np.uint8(one > OPEN), disc) > 0 for one in share])
 
 
 def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
-    """[frames, height, width] bool: votes and what colors say, alike where these are.
+    """Combine votes and colors to a mask, smoothed where colors are similar.
 
-    `odds` are those of `still_pictures.log_odds`.
+    Args:
+      views: The frames.
+      share: Probabilities from `votes`, [frames, height, width].
+      odds: Log odds from `still_pictures.log_odds`, [frames, height, width].
+
+    Returns:
+      Booleans, [frames, height, width].
     """
     share = np.clip(share, SUREST, 1 - SUREST)
     total = np.log(share / (1 - share)) + odds
@@ -122,16 +151,32 @@ def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
 
 
 def settled(tracks: Tracks, score: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """[tracks] no more certain to move than the share of its frames on moving pixels.
+    """Limit the scores of tracks to the share of their frames on moving pixels.
 
-    Flow drags along what lies beside a moving edge: in the built-in scenes up to a
-    fifth of the tracks that seem to move, and hardly one afterwards.
+    Flow drags static pixels along moving edges. In the built-in scenes they are up to a
+    fifth of the supposedly moving tracks, and hardly any after this step.
+
+    Args:
+      tracks: The tracks.
+      score: Their scores, [tracks].
+      moving: True for moving pixels, [frames, height, width].
+
+    Returns:
+      Scores, [tracks].
     """
     return np.minimum(score, share_on(tracks, moving))
 
 
 def share_on(tracks: Tracks, moving: np.ndarray) -> np.ndarray:
-    """[tracks] share of the frames in which each lies on moving pixels."""
+    """Compute the share of its frames in which each track lies on moving pixels.
+
+    Args:
+      tracks: The tracks.
+      moving: True for moving pixels, [frames, height, width].
+
+    Returns:
+      Shares, [tracks].
+    """
     row, column = pixel_of(tracks.pixel, moving.shape[1:])
     on = moving[np.arange(len(moving)), row, column] & tracks.seen
     return on.sum(1) / np.maximum(tracks.seen.sum(1), 1)
@@ -162,5 +207,12 @@ def _smooth(values, color):
 
 
 def picture_scale(width: int) -> float:
-    """Pixels of such a picture for one of 176 wide, where the constants were set."""
+    """Return the factor for constants that were tuned at a width of 176 pixels.
+
+    Args:
+      width: Width of the image in pixels.
+
+    Returns:
+      The factor, at least 1.
+    """
     return max(1.0, width / 176)

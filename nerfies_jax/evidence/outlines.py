@@ -1,8 +1,8 @@
-"""Outlines before a plain background: do all views agree on one solid thing?
+"""Outlines before a plain background, to test for one static object.
 
-Where neighboring times are far apart there is no flow, but a thing at rest has one
-visual hull (Laurentini 1994): what lies in all its outlines at once fills each of them.
-What moves is cut away by the outlines of other times.
+If neighboring times are far apart there is no flow, but a static object has one visual
+hull (Laurentini 1994): the volume inside all of its outlines fills each of them. Moving
+parts are cut away by the outlines of other times.
 """
 
 import numpy as np
@@ -27,9 +27,13 @@ BARE_SHARE = 0.01
 
 
 def outlines(views: Views) -> np.ndarray | None:
-    """[frames, height, width]: the thing before a plain background, holes filled.
+    """Segment the object before a plain background, with holes filled.
 
-    None where there is no plain background in all views.
+    Args:
+      views: The frames.
+
+    Returns:
+      Booleans [frames, height, width], or None if some view has no plain background.
     """
     shares = 1 - views.valid.mean((1, 2))
     if len(views.row) < MIN_VIEWS or np.median(shares) < PLAIN_SHARE:
@@ -40,7 +44,15 @@ def outlines(views: Views) -> np.ndarray | None:
 
 
 def motion(views: Views, shapes: np.ndarray) -> Finding:
-    """Whether anything moves, by what the outlines of all times leave bare."""
+    """Decide whether anything moves, by the parts of outlines outside the visual hull.
+
+    Args:
+      views: The frames.
+      shapes: Outlines, [frames, height, width].
+
+    Returns:
+      The finding.
+    """
     threshold = f"{BARE_SHARE:.0%} of the outlines' pixels that no still thing fills"
     box = _box(views, shapes)
     bare = np.array([]) if box is None else uncovered(views, shapes, box)
@@ -62,10 +74,18 @@ def motion(views: Views, shapes: np.ndarray) -> Finding:
 def uncovered(
     views: Views, shapes: np.ndarray, box: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """[frames]: the share of each outline that the visual hull does not fill.
+    """Compute the share of each outline that the visual hull does not fill.
 
-    The hull is made of outlines widened by `SLACK_PX`; what it must fill is narrowed by
-    as much. Cells outside a picture are not cut by it.
+    The hull is made of outlines widened by `SLACK_PX`. The outlines that it must fill
+    are narrowed by as much. Cells outside of an image are not cut by it.
+
+    Args:
+      views: The frames.
+      shapes: Outlines, [frames, height, width].
+      box: Lower and upper corner of the volume in scene units.
+
+    Returns:
+      Shares, [frames].
     """
     low, high = box
     side = (high - low).max() / SIDE

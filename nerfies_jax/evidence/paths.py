@@ -1,10 +1,10 @@
-"""Paths of moving points in space, from their tracks in the pictures.
+"""Paths of moving points in space, from their tracks in the images.
 
-The path of least acceleration along the rays of a track: trajectory triangulation (Park
-et al. 2010, "3D reconstruction of a moving point from a series of 2D projections") with
-a penalty in place of a basis. It tells depth where the camera moves at another pace
-than the things. Where it does not, the cost is flat along the rays and the paths lean
-on the depth of what stands around.
+The path has the least acceleration along the rays of a track: trajectory triangulation
+(Park et al. 2010, "3D reconstruction of a moving point from a series of 2D
+projections") with a penalty in place of a basis. Depth is determined if the camera
+moves at another pace than the objects. If it does not, the cost is flat along the rays,
+and the paths follow the depth of the surroundings.
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ SHORTEST_STEP = 0.1  # of the median time between frames: two at once are no jum
 
 
 class Paths(NamedTuple):
-    """Where points that move are over time."""
+    """Positions of moving points over time."""
 
     position: (
         np.ndarray
@@ -55,15 +55,23 @@ def least_acceleration(
     around: np.ndarray | None = None,
     measured: np.ndarray | None = None,
 ) -> Paths:
-    """Paths along the rays of the tracks; one banded linear system each.
+    """Fit paths along the rays of tracks, with one banded linear system each.
 
-    They are as smooth as the tracks allow: the penalty is the largest with which half
-    of the paths are within the error of a track, in powers of ten (Morozov's
-    discrepancy principle). How far apart in time frames are is not known otherwise.
+    The paths are as smooth as the tracks allow. The penalty is the largest with which
+    half of the paths are within the error of a track, in powers of ten (Morozov's
+    discrepancy principle), since the time between frames is not known otherwise.
 
-    `around` and `measured` [tracks, frames] are z-depths of what stands around, and of
-    the point itself where the capture has depth; NaN where unknown. `near` is the least
-    z-depth in scene units; a path that comes nearer is not known there.
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      near: Least z-depth in scene units. Path positions closer than that are not known.
+      around: z-depths of the surroundings, [tracks, frames], NaN where unknown, or
+        None.
+      measured: z-depths of the points if the capture has depth, [tracks, frames], NaN
+        where unknown, or None.
+
+    Returns:
+      The paths.
     """
     ray = track_rays(views, tracks)
     noise = TRACK_PX / np.median(views.intrinsics[:, 0, 0])
@@ -84,14 +92,24 @@ def least_acceleration(
 
 
 def certain(views: Views, tracks: Tracks, position: np.ndarray, near: float) -> Paths:
-    """Paths of tracks whose places [tracks, frames, 3] are known, scene units."""
+    """Make paths of tracks whose positions are known.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      position: Positions in scene units, [tracks, frames, 3].
+      near: Least z-depth in scene units.
+
+    Returns:
+      The paths.
+    """
     depth = views.depth_of(position)
     there = tracks.seen & (np.nan_to_num(depth, nan=-1.0) > near)
     return Paths(position, there, depth, np.zeros(len(position)))
 
 
 class _Wanted(NamedTuple):
-    """What paths are to go through."""
+    """Rays and depths that paths should pass through."""
 
     ray: np.ndarray  # [tracks, frames, 3] of z-depth one
     seen: np.ndarray  # [tracks, frames] bool
@@ -143,12 +161,13 @@ def _fitted(views, wanted, penalty, noise):
 
 
 def _deviation(stencils, path, offset, miss):
-    """Of a common factor of the depths, by what the film alone says.
+    """Standard deviation of a common factor of the depths, from the video alone.
 
-    A factor bends the path as the offsets from the camera bend. What the path bends
-    itself, and a track's error `miss` in scene units, hide it. Neighboring frames are
-    no independent witnesses: the mean over the path counts, not the sum. In the
-    built-in scenes that is 2 to 4 %, where the true errors are 0.6 to 1.1 %.
+    A factor bends the path as the offsets from the camera bend. The curvature of the
+    path itself, and a track's error `miss` in scene units, hide it. Errors of
+    neighboring frames are not independent, so the mean over the path counts, not the
+    sum. In the built-in scenes that gives 2 to 4 %, where the true errors are 0.6 to
+    1.1 %.
     """
     if not len(stencils):
         return np.inf
@@ -205,9 +224,16 @@ def _solved(blocks, bands, right):
 def depth_around(
     tracks: Tracks, still: Tracks, rest: RestPoints, near: float
 ) -> np.ndarray:
-    """[tracks, frames] median z-depth of the nearest tracks at rest; NaN without any.
+    """Compute the median z-depth of the nearest static tracks.
 
-    `rest` are the points of the `still` tracks.
+    Args:
+      tracks: Moving tracks.
+      still: Static tracks.
+      rest: Points of the static tracks.
+      near: Least z-depth in scene units.
+
+    Returns:
+      z-depths in scene units [tracks, frames], NaN without static tracks.
     """
     depth = np.full(tracks.seen.shape, np.nan)
     for frame in range(tracks.seen.shape[1]):

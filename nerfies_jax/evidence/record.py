@@ -1,9 +1,10 @@
-"""What the pictures of a capture say before any training, gathered once and kept.
+"""Preprocessing of a capture, computed once before any training and cached.
 
     evidence = record.gather(capture)
 
-Flow between neighbors in time, tracks, which of them and which pixels move, their
-paths in space, and points that stand still: host side, one core, no gradients.
+It consists of flow between neighbors in time, tracks, the tracks and pixels that move,
+their paths in space, and static points. It runs on the host, on one core, without
+gradients.
 """
 
 import contextlib
@@ -59,7 +60,7 @@ LEAST_CARRIED = 0.4
 # Shares of the budget after which there is none left for a part.
 FOR_WIDE_STEPS, FOR_TRACKS, FOR_COLORS = 0.4, 0.5, 0.6
 FOR_BODIES, FOR_POINTS = 0.7, 0.8
-# Of the near plane, which is that of what stands still: a hand may be far before it.
+# Share of the near plane, which is that of static points: a hand may be much closer.
 AT_CAMERA = 0.1
 LEAST_TEXTURED = 0.05  # of the pixels: too little to tell anything by
 MOST_UNKEPT = 2  # records in memory: of frames to learn from, and of all
@@ -73,20 +74,20 @@ def gather(
     use_depths: bool = False,
     tell: Callable[[str], None] = lambda part: None,
 ) -> Evidence:
-    """Everything; about 0.25 s a frame of 176x132 or 480x270 on one core.
+    """Preprocess a capture, in about 0.25 s a frame of 176x132 or 480x270 on one core.
 
-    What is beyond the budget of work (`capture.preprocessing`) is left out. The budget
-    is one of counted work and not of time, so that the result depends on the capture
-    alone and not on how busy the machine is.
+    Parts beyond the budget of work (`capture.preprocessing`) are left out. The budget
+    counts work and not time, so the result depends on the capture alone and not on the
+    load of the machine.
 
     Args:
-      capture: The capture. What other tools found (`capture.given`) takes the place of
-        what would be found here.
-      use_depths: Whether paths lean on the capture's own depths where it has them.
-      tell: Hears of each of `PARTS` when it begins, and of what is left out.
+      capture: The capture. External results (`capture.given`) replace those computed
+        here.
+      use_depths: True to constrain paths by the capture's own depth, if it has any.
+      tell: Called with each of `PARTS` when it begins, and with everything left out.
 
     Returns:
-      The evidence, with the names of what was left out.
+      The results, with the names of the parts left out.
     """
     with contextlib.closing(Watch(tell, capture.preprocessing * ENOUGH_WORK)) as watch:
         return _gathered(capture, use_depths, watch)
@@ -189,7 +190,7 @@ def _tracks(given, views, flow, pictures, sparser):
 
 
 def _mask(views, flow, tracks, score, watch):
-    """Which pixels move, found in small pictures and enlarged."""
+    """Segment moving pixels in reduced images, and enlarge the mask."""
     (width, height), part = views.size, view_set.times_smaller(views)
     small, near = (
         view_set.smaller(views, part),
@@ -215,7 +216,7 @@ def _enlarged(masks, height, width):
 
 
 def _depths(capture, given, views, tracks, rest, score, use_depths):
-    """[frames, height, width] z-depths to lean on; None where there are none."""
+    """z-depths [frames, height, width] that constrain paths, None if there are none."""
     depth = taken.depth(given, views)
     if depth is None:
         own = use_depths and capture.depths is not None
@@ -257,7 +258,16 @@ def _paths(capture, views, tracks, rest, score, which, depths, watch):
 
 
 def looked_at(capture: Capture, factor: int) -> Capture:
-    """The capture in whose pixels evidence is given: pinholes, made smaller."""
+    """Return the capture in whose pixels preprocessing results are: undistorted and
+    reduced.
+
+    Args:
+      capture: The capture.
+      factor: Integer reduction.
+
+    Returns:
+      The capture.
+    """
     return captures.downscale(pinholes.as_pinholes(capture), factor)
 
 
@@ -285,7 +295,16 @@ def _unusable(views, flow):
 
 
 def carried(views: Views, flow: NeighborFlow) -> float:
-    """Share of the textured pixels whose flow leads to the next frame and back."""
+    """Compute the share of textured pixels whose flow is consistent with the next
+    frame.
+
+    Args:
+      views: The frames.
+      flow: Their flow.
+
+    Returns:
+      The share.
+    """
     shown = views.textured[:-1]
     return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
 
@@ -314,7 +333,15 @@ def _measured(depths, tracks):
 
 
 def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
-    """z-depth where it is known and does not jump to a neighbor's; NaN elsewhere."""
+    """Select z-depth that is known and does not jump to that of a neighbor.
+
+    Args:
+      depth: z-depths, [height, width], 0 where unknown.
+      jump: Relative difference of a jump.
+
+    Returns:
+      z-depths [height, width], NaN elsewhere.
+    """
     least, most = nd.minimum_filter(depth, 3), nd.maximum_filter(depth, 3)
     return np.where((least > 0) & (most - least < jump * depth), depth, np.nan)
 
@@ -325,11 +352,20 @@ def cached(
     use_depths: bool = False,
     tell: Callable[[str], None] = lambda part: None,
 ) -> Evidence:
-    """`gather`, or what it found before of the same pictures and cameras.
+    """Preprocess a capture, or read its results from a cache.
 
-    Of a capture with a lens, what its pinholes' pictures say: with and without the lens
-    it is one record. Where `folder` cannot be written, which is told, the record is
-    kept in memory, so that no command gathers twice. A warning says what was left out.
+    A distorted capture is undistorted first, so both share one record. If `folder`
+    cannot be written, which is reported, the record is kept in memory, so that no
+    command computes it twice. A warning lists the parts left out.
+
+    Args:
+      capture: The capture.
+      folder: Cache folder.
+      use_depths: As for `gather`.
+      tell: As for `gather`.
+
+    Returns:
+      The results.
     """
     capture = pinholes.as_pinholes(capture)
     path = file_of(capture, folder, use_depths)
@@ -350,7 +386,14 @@ def cached(
 
 
 def left_out_note(evidence: Evidence) -> str:
-    """Say what preprocessing left out, and the way out; empty if it was nothing."""
+    """Describe the parts of preprocessing left out, and the remedy.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The text, empty if nothing was left out.
+    """
     if not evidence.left_out:
         return ""
     return (
@@ -360,7 +403,15 @@ def left_out_note(evidence: Evidence) -> str:
 
 
 def notes_on(capture: Capture, folder: pathlib.Path) -> list[str]:
-    """What `cached` found in this process to be left out of the capture's records."""
+    """List the notes of `cached` in this process about parts left out for a capture.
+
+    Args:
+      capture: The capture.
+      folder: Cache folder.
+
+    Returns:
+      The notes.
+    """
     paths = (file_of(capture, folder, use_depths) for use_depths in (False, True))
     return list(dict.fromkeys(_told_of[path] for path in paths if path in _told_of))
 
@@ -368,6 +419,15 @@ def notes_on(capture: Capture, folder: pathlib.Path) -> list[str]:
 def file_of(
     capture: Capture, folder: pathlib.Path, use_depths: bool = False
 ) -> pathlib.Path:
-    """Where `cached` keeps it."""
+    """Return the file in which `cached` stores a record.
+
+    Args:
+      capture: The capture.
+      folder: Cache folder.
+      use_depths: As for `gather`.
+
+    Returns:
+      Path of the file.
+    """
     capture = pinholes.as_pinholes(capture)
     return folder / f"{digest(capture, use_depths)}.npz"

@@ -1,4 +1,4 @@
-"""The record of what the pictures of a capture say, and its file in the cache."""
+"""Record of the preprocessing of a capture, and its file in the cache."""
 
 import hashlib
 import pathlib
@@ -19,7 +19,7 @@ VERSION = 12
 
 
 class Evidence(NamedTuple):
-    """Of the frames to learn from, in order of time."""
+    """Preprocessing results of the training frames, in order of time."""
 
     row: np.ndarray  # [frames] row of the capture
     flow: NeighborFlow
@@ -38,7 +38,15 @@ class Evidence(NamedTuple):
 
 
 def digest(capture: Capture, use_depths: bool = False) -> str:
-    """Of all that `gather` looks at."""
+    """Compute a digest of all inputs of `gather`.
+
+    Args:
+      capture: The capture.
+      use_depths: As for `gather`.
+
+    Returns:
+      Hex digits.
+    """
     checksum = hashlib.blake2b(digest_size=12)
     budget = capture.preprocessing
     checksum.update(f"evidence {VERSION} {use_depths} {budget}".encode())
@@ -59,7 +67,12 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
 
 
 def save(path: pathlib.Path, evidence: Evidence) -> None:
-    """All of it in one file, whole or not at all; flow in half precision."""
+    """Write a record into one file, atomically, with flow in half precision.
+
+    Args:
+      path: The file.
+      evidence: The record.
+    """
     arrays = {}
     for name, part in evidence._asdict().items():
         if isinstance(part, tuple):
@@ -72,12 +85,23 @@ def save(path: pathlib.Path, evidence: Evidence) -> None:
 
 
 def _identity(path):
-    """Of the record in a file: another capture's has another name."""
+    """Identity of the record in a file, whose name differs for each capture."""
     return f"evidence {VERSION} {path.stem}"
 
 
 def load(path: pathlib.Path) -> Evidence:
-    """What `save` wrote under the same name; ValueError and OSError for all else."""
+    """Read a file written by `save` under the same name.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The record.
+
+    Raises:
+      ValueError: If the content is anything else.
+      OSError: If it cannot be read.
+    """
     kinds = {
         "flow": NeighborFlow,
         "tracks": Tracks,

@@ -1,4 +1,4 @@
-"""The point at rest that explains a track best, and by how many pixels it misses."""
+"""Static points that fit tracks best, and their reprojection errors."""
 
 from typing import NamedTuple
 
@@ -18,19 +18,34 @@ AT_ONCE = 2048  # tracks: 200 bytes for each and frame
 
 
 class RestPoints(NamedTuple):
-    """One point for each track, as if it stood still."""
+    """One static point for each track."""
 
     position: np.ndarray  # [tracks, 3] scene units
     residual: np.ndarray  # [tracks, frames] px; NaN where the track is not seen
     depth: np.ndarray  # [tracks, frames] z-depth of the point
 
     def take(self, which: np.ndarray) -> "RestPoints":
-        """Those chosen by index or mask."""
+        """Select points.
+
+        Args:
+          which: Indices or mask.
+
+        Returns:
+          The selected points.
+        """
         return RestPoints(*(part[which] for part in self))
 
 
 def track_rays(views: Views, tracks: Tracks) -> np.ndarray:
-    """[tracks, frames, 3]: world directions through the tracks, of z-depth one."""
+    """Compute the world directions of tracks, scaled to z-depth one.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+
+    Returns:
+      Directions, [tracks, frames, 3].
+    """
     pixel = tracks.pixel.astype(np.float64)
     ones = np.ones((*pixel.shape[:2], 1))
     inverse = np.linalg.inv(views.intrinsics)
@@ -39,7 +54,17 @@ def track_rays(views: Views, tracks: Tracks) -> np.ndarray:
 
 
 def fit(views: Views, tracks: Tracks) -> RestPoints:
-    """Least squares of distances to the rays, over depth squared: pixels, nearly."""
+    """Fit static points by least squares of distances to rays over depth squared.
+
+    This is nearly the reprojection error in pixels.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+
+    Returns:
+      One point for each track.
+    """
     count = len(tracks.seen)
     blocks = np.split(np.arange(count), range(AT_ONCE, count, AT_ONCE))
     parts = [_fit(views, tracks.take(block)) for block in blocks]
@@ -76,8 +101,13 @@ def _fit(views, tracks):
 
 
 def miss(rest: RestPoints) -> np.ndarray:
-    """[tracks] px: by how much each misses its point in the worst frames but three
-    of ten.
+    """Compute the 70 % quantile over frames of the reprojection error of each track.
+
+    Args:
+      rest: Static points.
+
+    Returns:
+      Errors in pixels, [tracks].
     """
     # NumPy's nanquantile takes each row by itself: 2 s of a film of 60 frames.
     order = np.sort(rest.residual, axis=1)  # NaN come last

@@ -1,9 +1,9 @@
-"""What moves as one rigid thing, placed in space by that.
+"""Paths of rigidly moving objects, refined by bundle adjustment.
 
-The path of least acceleration takes each track by itself: a thing that accelerates more
-than the camera comes out too near in one frame and too far in another. Its own size in
-the pictures says better how far it is, up to one factor for the whole film; that factor
-is taken from the paths, whose errors have either sign.
+The path of least acceleration treats each track separately. An object that accelerates
+more than the camera comes out too near in one frame and too far in another. Its size in
+the images determines its distance better, up to one factor for the whole video. That
+factor is taken from the paths, whose errors have either sign.
 """
 
 from collections.abc import Callable
@@ -39,14 +39,21 @@ def refined(
     paths: Paths,
     has_room: Callable[[int], bool] = lambda terms: True,
 ) -> Paths:
-    """The paths, those on rigid things placed by these; no others change.
+    """Refine the paths on rigid objects. Other paths do not change.
 
-    `has_room` is asked before each thing and each round of its growth, with the work of
-    that: its tracks times its frames squared.
+    Only objects whose depth is badly determined by the paths are refined. Where it is
+    well determined, a nearly rigid cloth would come out four times worse. A track is no
+    longer known in frames that show too little of its object.
 
-    Only things whose depth the paths tell badly: where they tell it well, a cloth that
-    is nearly rigid comes out four times worse. A track is no longer known where too
-    little of its body is seen.
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      paths: Their paths.
+      has_room: Called before each object and each round of its growth with the work of
+        it, the number of tracks times the square of the number of frames. False stops.
+
+    Returns:
+      The paths.
     """
     position, known = paths.position.copy(), paths.known.copy()
     every = -(-len(views.time) // MOST_FRAMES)
@@ -110,10 +117,10 @@ def _in_all_frames(views, tracks, paths, own, body, every):
 
 
 def _grown(views, tracks, paths, own, rows, has_room):
-    """Which of the paths are on the rigid thing that `own` are on, and the thing.
+    """Paths on the rigid object that `own` are on, and the object, or None.
 
-    None where they are on none. From the frames in which it is known, it is followed
-    into others by the tracks that it shares with them.
+    From the frames in which it is known, the object is followed into others by the
+    tracks that they share.
     """
     body = None
     for _ in range(GROWTHS):
@@ -136,7 +143,7 @@ def _grown(views, tracks, paths, own, rows, has_room):
 
 
 def _body(views, tracks, paths, own):
-    """The one rigid thing that most of the tracks are on, and those; None for none."""
+    """Rigid object that most of the tracks are on, and those tracks, or None."""
     own = _fewer(paths, own)
     for _ in range(2):  # once more without those that are on something else
         body = _first(paths, own)

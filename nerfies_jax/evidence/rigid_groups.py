@@ -1,8 +1,8 @@
-"""Tracks that keep their distances move as one rigid thing; how each such thing moves.
+"""Rigid motion groups: tracks with constant distances, and the motion of each group.
 
-No track need live through the film: whose distance stays constant while both are seen
-belongs together, and a group is carried over time by the points that it shares with a
-frame 8, 4 or 1 before.
+No track needs to span the video. Tracks whose distance stays constant while both are
+visible belong together, and a group is propagated over time by the points that it
+shares with a frame 8, 4 or 1 earlier.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ ROUNDS = 3  # of robust Procrustes
 
 
 class RigidMotion(NamedTuple):
-    """How groups move, from where they are in one frame: x(t) = rotation x + shift."""
+    """Motion of groups from their positions in one frame: x(t) = rotation x + shift."""
 
     label: np.ndarray  # [paths] which group
     rotation: np.ndarray  # [groups, frames, 3, 3]
@@ -36,10 +36,15 @@ class RigidMotion(NamedTuple):
 
 
 def labels(position: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
-    """[paths] in 0..count-1: spectral clustering by how constant distances stay.
+    """Group paths by spectral clustering on the constancy of their distances.
 
-    `position` [paths, frames, 3], `known` [paths, frames]. Fewer groups where there are
-    fewer paths than twice the count.
+    Args:
+      position: Positions, [paths, frames, 3].
+      known: True where they are known, [paths, frames].
+      count: Number of groups. At most half the number of paths is used.
+
+    Returns:
+      Group of each path in 0..count-1, [paths].
     """
     paths = len(position)
     count = min(count, max(1, paths // 2))
@@ -98,9 +103,16 @@ def _pairs(position, known):
 def motion(
     position: np.ndarray, known: np.ndarray, label: np.ndarray, canonical: int
 ) -> RigidMotion:
-    """How each group moves, as seen from the frame `canonical`.
+    """Estimate the motion of each group from a canonical frame.
 
-    `position` [paths, frames, 3] scene units, `known` [paths, frames], `label` [paths].
+    Args:
+      position: Positions in scene units, [paths, frames, 3].
+      known: True where they are known, [paths, frames].
+      label: Group of each path, [paths].
+      canonical: Index of the canonical frame.
+
+    Returns:
+      The motion.
     """
     frames = position.shape[1]
     groups = int(label.max()) + 1 if len(label) else 0
@@ -145,10 +157,18 @@ def _carried(position, known, member, frame, sign, start):
 
 
 def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and shift that take points nearest to others, robustly (Kabsch 1976).
+    """Find the rigid motion that aligns points with others, robustly.
 
-    [3, 3] and [3], so that `target` is near rotation `source` + shift; both are
-    [points, 3] in the same unit.
+    Args:
+      source: Points, [points, 3].
+      target: Corresponding points in the same unit, [points, 3].
+
+    Returns:
+      Rotation [3, 3] and translation [3], with `target` near rotation `source` +
+      translation.
+
+    References:
+      Kabsch 1976.
     """
     weight = np.ones(len(source))
     for _ in range(ROUNDS):
@@ -168,10 +188,16 @@ def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.n
 def centers(
     position: np.ndarray, known: np.ndarray, bodies: RigidMotion
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where each path is in the canonical frame, and each group's middle there.
+    """Compute the position of each path in the canonical frame, and the centers of
+    groups.
 
-    [paths, 3] and [groups, 3], medians, in scene units as `position` [paths, frames,
-    3]; `known` [paths, frames].
+    Args:
+      position: Positions in scene units, [paths, frames, 3].
+      known: True where they are known, [paths, frames].
+      bodies: Motion of the groups.
+
+    Returns:
+      Median positions of paths [paths, 3] and of groups [groups, 3], in scene units.
     """
     canonical = np.zeros((len(position), 3))
     for row, group in enumerate(bodies.label):
@@ -186,9 +212,15 @@ def centers(
 
 
 def miss(position: np.ndarray, known: np.ndarray, count: int) -> float:
-    """How far `count` groups miss the known places in the median, scene units.
+    """Compute the median error of the paths under the motion of a number of groups.
 
-    `position` [paths, frames, 3] scene units, `known` [paths, frames].
+    Args:
+      position: Positions in scene units, [paths, frames, 3].
+      known: True where they are known, [paths, frames].
+      count: Number of groups.
+
+    Returns:
+      The error in scene units.
     """
     label = labels(position, known, count)
     bodies = motion(position, known, label, position.shape[1] // 2)
@@ -201,11 +233,16 @@ def miss(position: np.ndarray, known: np.ndarray, count: int) -> float:
 def fewest(
     position: np.ndarray, known: np.ndarray, within: float, most: int = 8
 ) -> tuple[int, float]:
-    """How many groups, up to `most`, explain the paths, and by how much they miss.
+    """Find the smallest number of groups that explains the paths.
 
-    The fewest whose motions miss the known places by less than `within` in the median;
-    `most` where that many do not. In scene units, as `position` [paths, frames, 3];
-    `known` [paths, frames].
+    Args:
+      position: Positions in scene units, [paths, frames, 3].
+      known: True where they are known, [paths, frames].
+      within: Median error in scene units that is small enough.
+      most: Largest number of groups, returned if none is enough.
+
+    Returns:
+      The number of groups, and its median error in scene units.
     """
     for count in range(1, most + 1):
         typical = miss(position, known, count)
@@ -217,11 +254,19 @@ def fewest(
 def enough(
     position: np.ndarray, known: np.ndarray, counts: Sequence[int], share: float
 ) -> int:
-    """The first of rising `counts` of groups beyond which more explain hardly more.
+    """Find the first number of groups beyond which more groups hardly help.
 
-    By how far they miss the known places in the median: less than one group does, by
-    at least `share` (0 to 1) of what the last of `counts` wins. `position` [paths,
-    frames, 3] scene units, `known` [paths, frames].
+    It reduces the median error by at least `share` of the difference between one group
+    and the last of `counts`.
+
+    Args:
+      position: Positions in scene units, [paths, frames, 3].
+      known: True where they are known, [paths, frames].
+      counts: Numbers of groups in ascending order.
+      share: Share of the reduction, in [0, 1].
+
+    Returns:
+      One of `counts`.
     """
     one, last = (miss(position, known, count) for count in (1, counts[-1]))
     limit = one - share * max(one - last, 0.0)
@@ -231,7 +276,15 @@ def enough(
 
 
 def rotation_vectors(rotation: np.ndarray, canonical: int) -> np.ndarray:
-    """[groups, frames, 3] rad, smooth over time: turns beyond half a turn go on."""
+    """Convert rotations to vectors that are continuous over time.
+
+    Args:
+      rotation: Rotations, [groups, frames, 3, 3].
+      canonical: Index of the frame in which they are the identity.
+
+    Returns:
+      Rotation vectors in radians [groups, frames, 3], whose angles may exceed π.
+    """
     groups, frames = rotation.shape[:2]
     vectors = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
     vectors = vectors.reshape(groups, frames, 3)
@@ -250,5 +303,12 @@ def rotation_vectors(rotation: np.ndarray, canonical: int) -> np.ndarray:
 
 
 def smoothed(track: np.ndarray) -> np.ndarray:
-    """[groups, frames, width] with the jitter of single frames taken out."""
+    """Filter the jitter of single frames.
+
+    Args:
+      track: Values over time, [groups, frames, width].
+
+    Returns:
+      Filtered values of the same shape.
+    """
     return nd.gaussian_filter1d(track, SMOOTHED_FRAMES, axis=1)

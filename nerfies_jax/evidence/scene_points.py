@@ -1,4 +1,4 @@
-"""Points at rest: how many there are, where they lie, and what they are good for."""
+"""Findings about a capture's static points: their number, coverage and consistency."""
 
 import numpy as np
 
@@ -31,7 +31,15 @@ STILL_SHARE = 0.8  # of the points that can be checked
 
 
 def coverage(views: Views, points: np.ndarray) -> float:
-    """The share of cells of the pictures with anything filmed that hold a point."""
+    """Compute the share of image cells with observed pixels that contain a point.
+
+    Args:
+      views: The frames.
+      points: Points in scene units, [points, 3].
+
+    Returns:
+      The share.
+    """
     across, down = CELLS
     width, height = views.size
     held = shown = 0
@@ -54,7 +62,16 @@ def coverage(views: Views, points: np.ndarray) -> float:
 
 
 def moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> float:
-    """The share of the moving pixels' cells that hold a point; NaN if nothing moves."""
+    """Compute the share of cells with moving pixels that contain a point.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+      points: Points in scene units, [points, 3].
+
+    Returns:
+      The share, NaN if nothing moves.
+    """
     across, down = CELLS
     width, height = views.size
     size = height // down, width // across
@@ -86,7 +103,17 @@ def _looked_from(views):
 def start(
     capture: Capture, views: Views, evidence: Evidence, points: np.ndarray
 ) -> Finding:
-    """Whether the capture's own points are enough to start Gaussians from."""
+    """Decide whether the capture's points are enough to initialize Gaussians.
+
+    Args:
+      capture: The capture.
+      views: Its frames.
+      evidence: Its preprocessing.
+      points: Its points in scene units, [points, 3].
+
+    Returns:
+      The finding.
+    """
     threshold = f"{MIN_POINTS} points that cover {COVERED:.0%} of the pictures"
     count = 0 if capture.points is None else len(capture.points.position)
     if count == 0:
@@ -111,7 +138,16 @@ def start(
 
 
 def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
-    """Whether the capture's points stay put, as the background prior needs."""
+    """Decide whether the capture's points are static, as the background prior needs.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+      points: Points in scene units, [points, 3].
+
+    Returns:
+      The finding.
+    """
     threshold = f"{STILL_SHARE:.0%} of them within {AGREES_PX:g} px of the film's paths"
     if not len(points):
         measurement = "the capture has no points"
@@ -142,11 +178,11 @@ def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
 
 
 def _stays(views, evidence, frame, points):
-    """Which points the flow around a frame could check, and which of them agree.
+    """Points that the flow around a frame can check, and those among them that agree.
 
-    A point behind what the flow shows is hidden there and checks nothing; one that is
-    looked through is not where it should be. Without parallax flow shows no depth, and
-    only tells whether what is seen there stays where the point does.
+    A point behind the surface that the flow shows is occluded and checks nothing. A
+    point in front of it, which is looked through, is misplaced. Without parallax flow
+    shows no depth, and only tests that the surface at the point stays with the point.
     """
     pixel, depth = view_set.project(views, frame, points)
     which = np.flatnonzero(view_set.in_picture(views, pixel, depth))

@@ -1,8 +1,8 @@
-"""How badly each pixel looks like the still scene that other frames show in its place.
+"""Dissimilarity of each pixel to the static scene as other frames show it.
 
-The depth of what stands still is known from its points, and behind what moves from the
-points around. A pixel at rest finds its own color there in most other frames, however
-its neighbors move; what moves does not.
+The depth of static regions is known from static points, and behind moving objects from
+the points around. A static pixel finds its own color in most other frames, even if its
+neighbors move. A moving pixel does not.
 """
 
 import cv2
@@ -28,9 +28,14 @@ OUTSIDE = (np.nan,) * 3
 
 
 def log_odds(views: Views, still: PointCloud) -> np.ndarray:
-    """[frames, height, width] that a pixel moves, by color; 0 where nothing is known.
+    """Compute the log odds that a pixel moves, from colors.
 
-    `still` are points at rest, none of them near what may move.
+    Args:
+      views: The frames.
+      still: Static points, none of them near pixels that may move.
+
+    Returns:
+      Log odds [frames, height, width], 0 where nothing is known.
     """
     frames = len(views.row)
     if not len(still.position):
@@ -71,9 +76,10 @@ def _slope(color):
 
 
 def _depth(views, frame, position):
-    """[height, width] z-depth of the still scene; the nearest known one in gaps.
+    """z-depth [height, width] of the static scene, with gaps filled by the nearest
+    known.
 
-    None where no point lies in the picture.
+    None if no point lies in the image.
     """
     width, height = views.size
     columns, rows = -(-width // CELL), -(-height // CELL)
@@ -96,7 +102,9 @@ def _depth(views, frame, position):
 
 
 def _unlike(views, color, depth, frame):
-    """[height, width] gray levels; NaN where too few frames show the place."""
+    """Dissimilarity [height, width] in gray levels, NaN if too few frames show the
+    place.
+    """
     width, height = views.size
     blank = np.full((height, width), np.nan, np.float32)
     if depth[frame] is None:

@@ -1,4 +1,4 @@
-"""Points that stand still, from flow over many frames: dense enough to start from."""
+"""Dense static points from flow over many frames, for initialization."""
 
 import numpy as np
 
@@ -20,16 +20,29 @@ DEPTH_DEVIATION = 0.05  # at most, as a share of the depth
 
 
 def work(views: Views) -> int:
-    """Pixels times frames that `dense` looks at, at most."""
+    """Return an upper bound of the work of `dense`.
+
+    Args:
+      views: The frames.
+
+    Returns:
+      Number of pixels times number of frames.
+    """
     frames, (width, height) = len(views.row), views.size
     each = width * height // EVERY_PX**2 * min(2 * REACH + 1, frames)
     return min(CENTERS, frames) * each
 
 
 def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
-    """Places and colors of pixels at rest in some frames, where flow tells depth.
+    """Triangulate static pixels of some frames where flow determines their depth.
 
-    `moving` [frames, height, width] are the pixels to leave out, in every frame.
+    Args:
+      views: The frames.
+      flow: Their flow.
+      moving: True for pixels to leave out, [frames, height, width].
+
+    Returns:
+      Positions and colors.
     """
     frames = len(views.row)
     reach = min(REACH, frames - 1)
@@ -56,7 +69,15 @@ def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
 
 
 def view_slice(views: Views, span: slice) -> Views:
-    """Some of the frames."""
+    """Select consecutive frames.
+
+    Args:
+      views: The frames.
+      span: The slice.
+
+    Returns:
+      The selected frames.
+    """
     return Views(*(part[span] for part in views))
 
 
@@ -72,20 +93,46 @@ def _starts(views, moving, frame):
 
 
 def without(tracks: Tracks, moving: np.ndarray) -> Tracks:
-    """The tracks where they do not lie on moving pixels."""
+    """Drop the observations of tracks on moving pixels.
+
+    Args:
+      tracks: The tracks.
+      moving: True for moving pixels, [frames, height, width].
+
+    Returns:
+      The tracks.
+    """
     row, column = tracking.pixel_of(tracks.pixel, moving.shape[1:])
     frames = np.arange(len(moving))[None]
     return tracks._replace(seen=tracks.seen & ~moving[frames, row, column])
 
 
 def placed(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
-    """[tracks] bool: explained by their point, whose depth the rays tell."""
+    """Select tracks that their point explains, with a well-determined depth.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      rest: Their static points.
+
+    Returns:
+      Booleans, [tracks].
+    """
     explained = rest_points.miss(rest) < MISS_PX
     return explained & (depth_deviation(views, tracks, rest) < DEPTH_DEVIATION)
 
 
 def depth_deviation(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
-    """[tracks] deviation of the distance, as a share of it; inf without parallax."""
+    """Compute the relative standard deviation of the distance of static points.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      rest: Their static points.
+
+    Returns:
+      Deviations as a share of the distance [tracks], inf without parallax.
+    """
     offset = rest.position[:, None] - views.position
     distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
     unit = offset / distance[..., None]

@@ -1,4 +1,4 @@
-"""What a capture brings along, and whether it can be used: depth, masks, a lens."""
+"""Findings about the data of a capture, and its usefulness: depth, masks, lens."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,16 @@ GRID = 9  # pixels across and down where a lens is asked
 
 
 def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
-    """Whether the capture's depth pictures say what parallax says, up to one scale."""
+    """Decide whether the capture's depth agrees with parallax, up to one scale.
+
+    Args:
+      capture: The capture.
+      views: Its frames.
+      evidence: Its preprocessing.
+
+    Returns:
+      The finding.
+    """
     threshold = f"{KNOWN_SHARE:.0%} of the pixels, off parallax by {DEPTH_ERROR:.0%}"
     if capture.depths is None:
         return Finding(DEPTH, "the capture has none", threshold, False, CERTAIN)
@@ -72,7 +81,15 @@ def _over_parallax(pictures, views, evidence):
 
 
 def masks(capture: Capture, evidence: Evidence) -> Finding:
-    """Whether the capture's masks hold what is seen to move."""
+    """Decide whether the capture's masks contain the observed motion.
+
+    Args:
+      capture: The capture.
+      evidence: Its preprocessing.
+
+    Returns:
+      The finding.
+    """
     threshold = f"at most {MISSED_SHARE:.0%} of what is seen to move outside them"
     if capture.moving is None:
         return Finding(MASKS, "the capture has none", threshold, False, CERTAIN)
@@ -104,7 +121,14 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
 
 
 def lens(capture: Capture) -> Finding:
-    """How far the lens bends pixels away from a pinhole's; of the capture as stored."""
+    """Measure the lens distortion of a capture as stored.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The finding, with the largest displacement of a pixel.
+    """
     threshold = f"{LENS_PX:g} px"
     cameras = capture.cameras
     width, height = capture.size

@@ -1,4 +1,4 @@
-"""What was gathered of a capture, in numbers and in plain words."""
+"""Summary of preprocessing, in numbers and in words."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ EXPLAINED = 0.01  # of the typical distance: a rigid group's paths are its motio
 
 
 class Summary(NamedTuple):
-    """NaN where there is nothing to measure."""
+    """Numbers about preprocessing, NaN where there is nothing to measure."""
 
     frames: int
     size: tuple[int, int]  # as looked at, px
@@ -39,7 +39,15 @@ class Summary(NamedTuple):
 
 
 def of(views: Views, evidence: Evidence) -> Summary:
-    """The numbers; `views` are those that were looked at."""
+    """Summarize preprocessing.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+
+    Returns:
+      The numbers.
+    """
     tracks, paths = evidence.tracks, evidence.paths
     still = np.flatnonzero(evidence.score < MOVES)
     parallax = still_points.depth_deviation(
@@ -72,7 +80,15 @@ def of(views: Views, evidence: Evidence) -> Summary:
 
 
 def lines(summary: Summary, evidence: Evidence) -> list[str]:
-    """For a person."""
+    """Describe preprocessing in sentences.
+
+    Args:
+      summary: The numbers.
+      evidence: Preprocessing.
+
+    Returns:
+      Lines of text.
+    """
     width, height = summary.size
     smaller = f", made {summary.factor} times smaller" if summary.factor > 1 else ""
     parts = [

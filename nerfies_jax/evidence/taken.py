@@ -1,4 +1,6 @@
-"""What other tools found, in the frames and pixels that are looked at."""
+"""External preprocessing results, resampled to the frames and pixels of
+preprocessing.
+"""
 
 import cv2
 import numpy as np
@@ -12,7 +14,15 @@ from nerfies_jax.evidence.view_set import Views
 
 
 def flow(given: Given, views: Views) -> NeighborFlow | None:
-    """Checked both ways, as our own is."""
+    """Resample external flow, with the same consistency check as computed flow.
+
+    Args:
+      given: External results.
+      views: The frames.
+
+    Returns:
+      The flow, None if there is none.
+    """
     if given.forward is None:
         return None
     forward, backward = (
@@ -23,14 +33,30 @@ def flow(given: Given, views: Views) -> NeighborFlow | None:
 
 
 def tracks(given: Given, views: Views) -> Tracks | None:
-    """Those that are long enough; each begins where it is first seen."""
+    """Resample external tracks, and select long ones.
+
+    Args:
+      given: External results.
+      views: The frames.
+
+    Returns:
+      The tracks, each starting where it is first visible. None if there are none.
+    """
     if given.track_pixel is None:
         return None
     return tracking.long_enough(_followed(given, views))
 
 
 def places(given: Given, views: Views) -> np.ndarray | None:
-    """[tracks, frames, 3] where those of `tracks` are, scene units."""
+    """Return the positions of the tracks from `tracks`.
+
+    Args:
+      given: External results.
+      views: The frames.
+
+    Returns:
+      Positions in scene units [tracks, frames, 3], None if there are none.
+    """
     if given.track_place is None:
         return None
     long = tracking.is_long(_followed(given, views))
@@ -45,7 +71,15 @@ def _followed(given, views):
 
 
 def moving(given: Given, views: Views) -> np.ndarray | None:
-    """[frames, height, width] bool."""
+    """Resample external masks.
+
+    Args:
+      given: External results.
+      views: The frames.
+
+    Returns:
+      Booleans [frames, height, width], None if there are none.
+    """
     if given.moving is None:
         return None
     masks = [_resized(np.float32(one), views.size) for one in given.moving[views.row]]
@@ -53,7 +87,16 @@ def moving(given: Given, views: Views) -> np.ndarray | None:
 
 
 def depth(given: Given, views: Views) -> np.ndarray | None:
-    """[frames, height, width] of whatever scale it has; NaN unknown."""
+    """Resample external depth.
+
+    Args:
+      given: External results.
+      views: The frames.
+
+    Returns:
+      Depth at its own scale [frames, height, width], NaN where unknown, None if there
+      is none.
+    """
     if given.depth is None:
         return None
     nearest = cv2.INTER_NEAREST

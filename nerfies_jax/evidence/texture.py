@@ -1,4 +1,4 @@
-"""How fine the texture is, in bands of an encoding of positions."""
+"""Detail of the texture, in bands of a positional encoding."""
 
 import math
 
@@ -17,15 +17,30 @@ SHOWN = 8  # frames whose spectrum is taken
 
 
 def bands_for(cycles_per_unit: float) -> int:
-    """Bands of sin 2^k x, k = 0 .. bands-1, whose last one is at least as fast."""
+    """Return the number of bands sin 2^k x whose last one reaches a frequency.
+
+    Args:
+      cycles_per_unit: Frequency in cycles per unit of the coordinates.
+
+    Returns:
+      The number of bands, at least 1.
+    """
     return max(1, 1 + math.ceil(math.log2(max(2 * math.pi * cycles_per_unit, 1))))
 
 
 def texture(capture: Capture, views: Views, factor: int) -> Finding:
-    """How many bands of position the texture needs in the box of a field of extent 1.
+    """Estimate the number of bands that the texture needs in a field of extent 1.
 
-    From the spectrum of the pictures at the median depth; `factor` is how much smaller
-    they are than the capture's own, which may hold finer detail.
+    It is derived from the spectrum of the images at the median depth.
+
+    Args:
+      capture: The capture.
+      views: Its frames.
+      factor: Reduction of the frames, compared with the capture's images, which may
+        hold finer detail.
+
+    Returns:
+      The finding.
     """
     threshold = f"{SMALL} bands, as the fields' small presets have"
     seen = [one for one in _shown(views) if views.valid[one].mean() > 0.5]

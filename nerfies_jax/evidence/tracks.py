@@ -1,4 +1,4 @@
-"""Points of the pictures followed through a film, and aligned with where they began."""
+"""Point tracks through a video, realigned with the frames in which they began."""
 
 import math
 from typing import NamedTuple
@@ -23,32 +23,55 @@ LEAST_EIGENVALUE = 1e-4  # of the window's structure: below it there is nothing 
 
 
 class Tracks(NamedTuple):
-    """Where points of the pictures lie in each frame."""
+    """Positions of points in each frame."""
 
     start: np.ndarray  # [tracks] frame in which each began
     pixel: np.ndarray  # [tracks, frames, 2] float32; 0 where not seen
     seen: np.ndarray  # [tracks, frames] bool
 
     def take(self, which: np.ndarray) -> "Tracks":
-        """Those chosen by index or mask."""
+        """Select tracks.
+
+        Args:
+          which: Indices or mask.
+
+        Returns:
+          The selected tracks.
+        """
         return Tracks(*(part[which] for part in self))
 
 
 def pixel_of(
     place: np.ndarray, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of the pixel in which each place [..., 2] lies, or the nearest."""
+    """Return the pixel in which each position lies, or the nearest in the image.
+
+    Args:
+      place: Positions (x, y) with centers at +0.5, [..., 2].
+      shape: Height and width of the image in pixels.
+
+    Returns:
+      Rows and columns, [...].
+    """
     column, row = np.moveaxis(np.floor(place).astype(int), -1, 0)
     return np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)
 
 
 def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
-    """[starts, 3] frame and pixel: an even grid in every third frame, each shifted.
+    """Make starting points of tracks: a regular grid in every third frame, shifted
+    randomly.
 
-    In as many frames fewer as it is to be `sparser`, or as a long film needs for its
-    tracks to have `MOST_PLACES` in all frames together.
+    Points on a plain background or on unobserved pixels are left out. A long video uses
+    fewer frames, such that tracks have at most `MOST_PLACES` positions in all frames
+    together.
 
-    Not where a picture shows its plain background or was not filmed.
+    Args:
+      views: The frames.
+      sparser: Factor by which fewer frames are used.
+      seed: Seed of the shifts.
+
+    Returns:
+      Frame, column and row in pixels, [starts, 3].
     """
     rng = np.random.default_rng(seed)
     width, height = views.size
@@ -69,14 +92,27 @@ def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
 
 
 def work(views: Views, sparser: int = 1) -> int:
-    """Starts times frames of all tracks of a grid."""
+    """Return the work of the tracks of a grid.
+
+    Args:
+      views: The frames.
+      sparser: As for `grid`.
+
+    Returns:
+      Number of starting points times number of frames.
+    """
     return len(grid(views, sparser)) * len(views.row)
 
 
 def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
-    """Points carried from frame to frame until flow cannot be trusted, both ways.
+    """Follow points from frame to frame in both directions until flow is inconsistent.
 
-    `starts` [tracks, 3]: frame, column and row in px, as of `grid`.
+    Args:
+      flow: Flow between neighboring frames.
+      starts: Frame, column and row in pixels, [tracks, 3], as from `grid`.
+
+    Returns:
+      The tracks.
     """
     frames = len(flow.forward)
     count, each = len(starts), np.arange(len(starts))
@@ -98,7 +134,9 @@ def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
 
 
 def _step(pixel, shift, usable):
-    """Pixels moved by the bilinear mean of usable flow; which can be trusted."""
+    """Move pixels by the bilinear mean of usable flow, and return which can be
+    trusted.
+    """
     height, width = usable.shape
     bound = np.array([width, height])
     kept = usable[pixel_of(pixel, usable.shape)]
@@ -120,20 +158,42 @@ def _step(pixel, shift, usable):
 
 
 def long_enough(tracks: Tracks) -> Tracks:
-    """Those that are long."""
+    """Select long tracks.
+
+    Args:
+      tracks: The tracks.
+
+    Returns:
+      The long ones, by `is_long`.
+    """
     return tracks.take(is_long(tracks))
 
 
 def is_long(tracks: Tracks) -> np.ndarray:
-    """[tracks] bool: seen in `SHORTEST` frames, or in all of a shorter film."""
+    """Find tracks visible in at least `SHORTEST` frames, or in all of a shorter video.
+
+    Args:
+      tracks: The tracks.
+
+    Returns:
+      Booleans, [tracks].
+    """
     return tracks.seen.sum(1) >= min(SHORTEST, tracks.seen.shape[1])
 
 
 def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tracks:
-    """Each point aligned with the picture in which it began; what strays is not seen.
+    """Align each point with the image in which it began, by Lucas-Kanade.
 
-    Lucas-Kanade from the chained place, without a pyramid. `pictures` are enlarged as
-    `dense_flow.leveled` does, `size` is that of the tracks' own.
+    The search starts from the chained position, without a pyramid. Points that move too
+    far become invisible.
+
+    Args:
+      tracks: The tracks.
+      pictures: Enlarged images from `dense_flow.leveled`.
+      size: Width and height in pixels of the images of the tracks.
+
+    Returns:
+      The tracks.
     """
     times = pictures.shape[2] // size[0]
     pixel, seen = tracks.pixel.copy(), tracks.seen.copy()
@@ -172,6 +232,16 @@ def _enlarged(pixel, times):
 def from_flow(
     views: Views, flow: NeighborFlow, pictures: np.ndarray, sparser: int = 1
 ) -> Tracks:
-    """All tracks of a film, from an even grid; nothing is known of what moves yet."""
+    """Track points from a regular grid through a video.
+
+    Args:
+      views: The frames.
+      flow: Flow between neighboring frames.
+      pictures: Enlarged images from `dense_flow.leveled`.
+      sparser: As for `grid`.
+
+    Returns:
+      Long tracks, static and moving ones.
+    """
     tracks = long_enough(chain(flow, grid(views, sparser)))
     return long_enough(realigned(tracks, pictures, views.size))

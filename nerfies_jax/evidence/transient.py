@@ -1,8 +1,8 @@
-"""Things that come and go between two frames: seen in one, nowhere in the next.
+"""Transient objects: visible in one frame, and nowhere in the next.
 
-What moves is still somewhere near in the next frame, and what comes from behind
-another thing comes out as a strip. What is no part of the scene, in captures whose
-frames are photographs or whose film was cut together, is suddenly there or gone.
+A moving object is still nearby in the next frame, and one that emerges from behind
+another appears as a strip. An object that is not part of the scene, in photographs or
+edited video, appears or disappears suddenly.
 """
 
 from typing import NamedTuple
@@ -27,8 +27,8 @@ REACH_SHARES = (0.05, 0.15)  # of the width: how far what was lost is looked for
 AROUND = 3  # pairs before and after: what jumps stands out among them
 ALIKE = 0.7  # correlation of a patch with where it is found again
 MOST_PATCHES = 40  # looked for, of a frame
-# Of the pixels of both frames, beyond what pairs around lose. Built-in scenes in which
-# nothing comes or goes lose up to 1.9 % once and 1.4 % twice, at 60 frames and at 40.
+# Share of the pixels of both frames, beyond the losses of pairs around. Built-in scenes
+# without transient objects lose up to 1.9 % once and 1.4 % twice, at 60 and 40 frames.
 GONE_SHARE = 0.03
 MIN_TIMES = 2  # it came and it went
 # Pairs of frames that carry less show other things to begin with, as photographs do and
@@ -39,7 +39,15 @@ LOCAL_PX = 12  # deviation of the local mean
 
 
 def transient(views: Views, evidence: Evidence) -> Finding:
-    """Whether large parts of pictures are there in one frame and gone in the next."""
+    """Decide whether large parts of images appear and disappear from frame to frame.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+
+    Returns:
+      The finding.
+    """
     threshold = (
         f"{GONE_SHARE:.0%} of a picture found nowhere near in the next, "
         f"{MIN_TIMES} times"
@@ -58,7 +66,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
     gone = gone[carried >= LEAST_CARRIED]
     if len(gone) <= 2 * MIN_TIMES:
         return cannot_tell(EFFECT, f"only {len(gone)} pairs of frames", threshold)
-    # What the other pairs lose is the noise of those that jump.
+    # The losses of the other pairs are the noise of those that jump.
     usual = float(np.sort(gone)[: -2 * MIN_TIMES].mean())
     worst = np.sort(_above_neighbors(gone))[::-1]
     wanted, confidence = judge(float(worst[MIN_TIMES - 1]), GONE_SHARE, usual)
@@ -83,7 +91,9 @@ def transient(views: Views, evidence: Evidence) -> Finding:
 
 
 def _above_neighbors(gone):
-    """What a pair loses beyond the median of its neighbors: a fast pan loses often."""
+    """Losses of pairs beyond the median of their neighbors, since a fast pan loses
+    often.
+    """
     above = []
     for at, one in enumerate(gone):
         beside = np.r_[gone[max(0, at - AROUND) : at], gone[at + 1 : at + 1 + AROUND]]
@@ -92,16 +102,22 @@ def _above_neighbors(gone):
 
 
 def _always_there(evidence):
-    """Whether something moves in most frames, or in none."""
+    """Test if something moves in most frames, or in none."""
     there = motion.frame_shares(evidence) > motion.MOVING_SHARE
     return there.mean() > 0.5 or not there.any()
 
 
 def jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
-    """[pairs]: shares of pixels that one frame shows and the next does not, or reverse.
+    """Compute the share of pixels that one frame shows and the next does not, or
+    reverse.
 
-    The lesser of both directions: what comes hides what was there. And the shares of
-    the textured pixels that flow carries to the next frame.
+    Args:
+      views: The frames.
+      flow: Their flow.
+
+    Returns:
+      The smaller share of both directions (an appearing object occludes others), and
+      the share of textured pixels that flow carries to the next frame, both [pairs].
     """
     part = view_set.times_smaller(views)
     shown = views.textured[:-1] & flow.forward_seen[:-1]
@@ -122,9 +138,9 @@ def jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Way(NamedTuple):
-    """From one frame to another, and where what is not carried there is looked for.
+    """Flow from one frame to another, and the search range for pixels without it.
 
-    By the flow that closes alone: of what is gone it is anything.
+    Only consistent flow is used, since the flow of vanished pixels is arbitrary.
     """
 
     flow: np.ndarray  # [height, width, 2] px
@@ -182,7 +198,7 @@ def _lost(views, index, picture, target, there, back):
     open_end = gap > LOST_PX + LOST_SHARE * np.linalg.norm(there.flow, axis=-1)
     changed = cv2.GaussianBlur(np.abs(picture - color), (0, 0), 1.5) > LOST_COLOR
     # Beyond the edge of the other picture under the common shift, and the patch's own.
-    # What is near moves more than the rest, and leaves where the rest stays.
+    # Near objects move more than the rest, and leave the image where the rest stays.
     rim = PATCH + there.reach
     common = grid + there.shift
     bound = np.array([width - 1, height - 1]) - rim

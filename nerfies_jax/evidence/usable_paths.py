@@ -1,4 +1,4 @@
-"""What a motion can start from: the paths that are known long enough."""
+"""Paths for the initialization of motion: those that are known long enough."""
 
 import warnings
 from typing import NamedTuple
@@ -18,7 +18,7 @@ MARKED = 0.01  # of the pixels: from here on something moves, followed or not
 
 
 class KnownPaths(NamedTuple):
-    """Where points that move were seen to be, over the frames of the evidence."""
+    """Positions of moving points over the frames of preprocessing."""
 
     position: np.ndarray  # [paths, frames, 3] scene units; any value where not known
     known: np.ndarray  # [paths, frames] bool
@@ -26,9 +26,15 @@ class KnownPaths(NamedTuple):
 
 
 def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence | None:
-    """What the pictures say of the motion, gathered or read from the cache.
+    """Preprocess a capture for the initialization of motion, or read it from the cache.
 
-    None where `start` asks for none, or the film allows none, which a warning says.
+    Args:
+      capture: The capture.
+      start: Settings of the initialization.
+
+    Returns:
+      The results. None if `start` does not ask for tracks, or if they are unusable,
+      which a warning reports.
     """
     if start.motion != "tracks":
         return None
@@ -48,7 +54,14 @@ def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence 
 
 
 def unusable(evidence: Evidence) -> str:
-    """Why a motion cannot start from these tracks; empty where it can."""
+    """Return the reason why motion cannot be initialized from tracks.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The reason, empty if it can.
+    """
     if evidence.unusable:
         return evidence.unusable
     if not evidence.told and evidence.moving.mean() < LEAST_MOVING:
@@ -60,9 +73,14 @@ def unusable(evidence: Evidence) -> str:
 
 
 def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
-    """Whether there is nothing to move: one moment, or tracks that all stand still.
+    """Return whether nothing moves: a single time, or only static tracks.
 
-    `times` are the capture's, of all its frames.
+    Args:
+      evidence: Preprocessing.
+      times: Times of all frames of the capture, [frames].
+
+    Returns:
+      True for a static scene.
     """
     if np.ptp(times[evidence.row]) == 0:
         return True
@@ -72,7 +90,14 @@ def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
 
 
 def known_paths(evidence: Evidence) -> KnownPaths:
-    """The paths known in `LEAST_SEEN` frames and more."""
+    """Select the paths that are known in at least `LEAST_SEEN` frames.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The paths.
+    """
     kept = evidence.paths.known.sum(1) >= LEAST_SEEN
     paths = evidence.paths
     return KnownPaths(
@@ -81,7 +106,14 @@ def known_paths(evidence: Evidence) -> KnownPaths:
 
 
 def scene_unit(evidence: Evidence) -> float:
-    """A typical distance: the median z-depth of points at rest, scene units."""
+    """Return a typical distance, the median z-depth of static points.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The distance in scene units, 1 if there are no points.
+    """
     depth = evidence.rest.depth[evidence.tracks.seen]
     depth = depth[np.isfinite(depth) & (depth > 0)]
     return float(np.median(depth)) if len(depth) else 1.0

@@ -1,4 +1,4 @@
-"""The frames of a capture as an inspection looks at them: small, in order, in NumPy."""
+"""Frames of a capture for preprocessing: reduced, in order of time, in NumPy."""
 
 import math
 from typing import NamedTuple
@@ -24,10 +24,9 @@ MOST_NOISE = 6.0
 
 
 class Views(NamedTuple):
-    """Frames to learn from.
+    """Training frames with pinhole cameras in float64.
 
-    Pinholes in float64. Pixels are those of the small pictures, whose centers lie
-    at +0.5.
+    Pixels are those of the reduced images, with centers at +0.5.
     """
 
     row: np.ndarray  # [frames] row of the capture
@@ -47,19 +46,41 @@ class Views(NamedTuple):
         return self.gray.shape[2], self.gray.shape[1]
 
     def depth_of(self, position: np.ndarray) -> np.ndarray:
-        """Z-depth [points, frames] of places [points, frames, 3], scene units."""
+        """Compute the z-depths of points.
+
+        Args:
+          position: Positions in scene units, [points, frames, 3].
+
+        Returns:
+          z-depths in scene units, [points, frames].
+        """
         offset = position - self.position
         return np.einsum("fj,nfj->nf", self.rotation[:, 2], offset)
 
 
 def in_time_order(capture: Capture, rows: np.ndarray | None = None) -> Views:
-    """Every frame to learn from (or of `rows`), by time, whichever camera filmed it."""
+    """Return training frames in order of time, of all cameras together.
+
+    Args:
+      capture: The capture.
+      rows: Indices of other frames. None for the training frames.
+
+    Returns:
+      The frames.
+    """
     rows = capture.train if rows is None else rows
     return _views(capture, rows[np.lexsort((rows, capture.times[rows]))])
 
 
 def without_cameras(images: np.ndarray) -> Views:
-    """Pictures [frames, height, width, 3] uint8 in order of time; cameras are NaN."""
+    """Return frames without cameras, whose parameters are NaN.
+
+    Args:
+      images: uint8 images in order of time, [frames, height, width, 3].
+
+    Returns:
+      The frames.
+    """
     frames, height, width = images.shape[:3]
     gray = np.ascontiguousarray(images.mean(-1) / 255, np.float32)
     unknown = np.full((frames, 3, 3), np.nan)
@@ -82,7 +103,7 @@ def _views(capture, rows):
     gray = np.ascontiguousarray(image.mean(-1) / 255, np.float32)
     valid = ~plain(capture, rows)
     if capture.valid is not None:
-        # What is sampled at the rim of a black corner is half black.
+        # Pixels sampled at the rim of a black corner are half black.
         valid &= nd.binary_erosion(
             capture.valid[rows], np.ones((1, 5, 5)), border_value=1
         )
@@ -102,7 +123,15 @@ def _views(capture, rows):
 
 
 def smaller(views: Views, factor: int) -> Views:
-    """The same frames with pixels so many times larger; a rest at the rim stays out."""
+    """Reduce frames by an integer factor. Incomplete blocks at the border are dropped.
+
+    Args:
+      views: The frames.
+      factor: Integer factor.
+
+    Returns:
+      The reduced frames.
+    """
     if factor == 1:
         return views
     width, height = (side // factor for side in views.size)
@@ -126,15 +155,29 @@ def smaller(views: Views, factor: int) -> Views:
 
 
 def times_smaller(views: Views) -> int:
-    """How many times smaller no side is longer than `LONGEST_SIDE_PX`."""
+    """Return the reduction at which no side is longer than `LONGEST_SIDE_PX`.
+
+    Args:
+      views: The frames.
+
+    Returns:
+      An integer factor.
+    """
     return math.ceil(max(views.size) / LONGEST_SIDE_PX)
 
 
 def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
-    """[rows, height, width]: where a picture shows one color behind everything.
+    """Find pixels that show a uniform background color.
 
-    The median of the border where nearly all of the border has it; a plain wall that
-    only fills part of the border counts as scene.
+    It is the median of the border, if nearly all of the border has it. A plain wall
+    that fills only part of the border counts as scene.
+
+    Args:
+      capture: The capture.
+      rows: Indices of the frames.
+
+    Returns:
+      Booleans, [rows, height, width].
     """
     images = capture.images[rows]
     border = np.concatenate(
@@ -158,7 +201,15 @@ def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
 
 
 def rays(views: Views, index: int) -> np.ndarray:
-    """[height, width, 3]: world directions of z-depth one through the pixel centers."""
+    """Compute the world directions of all pixel centers, scaled to z-depth one.
+
+    Args:
+      views: The frames.
+      index: Index of the frame.
+
+    Returns:
+      Directions, [height, width, 3].
+    """
     width, height = views.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixel = np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -169,7 +220,16 @@ def rays(views: Views, index: int) -> np.ndarray:
 def project(
     views: Views, index: int, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [points, 2] and z-depths [points] of world points in one view."""
+    """Project points into one frame.
+
+    Args:
+      views: The frames.
+      index: Index of the frame.
+      points: Points in scene units, [points, 3].
+
+    Returns:
+      Pixel positions [points, 2] and z-depths [points].
+    """
     inside = (points - views.position[index]) @ views.rotation[index].T
     depth = inside[:, 2]
     pixel = inside @ views.intrinsics[index].T
@@ -180,21 +240,45 @@ def project(
 def in_picture(
     views: Views, pixel: np.ndarray, depth: np.ndarray, rim: float | int = 1.0
 ):
-    """Which pixels lie in front and in the picture, `rim` pixels from its edge."""
+    """Find the pixels that lie in front of the camera and inside the image.
+
+    Args:
+      views: The frames.
+      pixel: Pixel positions, [points, 2].
+      depth: z-depths, [points].
+      rim: Least distance from the border of the image in pixels.
+
+    Returns:
+      Booleans, [points].
+    """
     bounds = np.array(views.size) - rim
     with np.errstate(invalid="ignore"):
         return (depth > 0) & ((pixel > rim) & (pixel < bounds)).all(-1)
 
 
 def own_points(capture: Capture) -> np.ndarray:
-    """At most `MOST_POINTS` of the capture's points [points, 3]; empty without any."""
+    """Return at most `MOST_POINTS` of the capture's points.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Points in scene units [points, 3], empty if there are none.
+    """
     if capture.points is None:
         return np.zeros((0, 3))
     return some(capture.points.position)
 
 
 def some(position: np.ndarray) -> np.ndarray:
-    """At most `MOST_POINTS` of the points [points, 3], in float64."""
+    """Select at most `MOST_POINTS` points at random.
+
+    Args:
+      position: Points, [points, 3].
+
+    Returns:
+      float64 points, [selected, 3].
+    """
     position = position.astype(np.float64)
     rng = np.random.default_rng(0)
     if len(position) > MOST_POINTS:
@@ -204,7 +288,16 @@ def some(position: np.ndarray) -> np.ndarray:
 
 
 def depth_span(capture: Capture, views: Views) -> tuple[float, float]:
-    """The z-depths between which a scene lies: its points', or the capture's planes."""
+    """Estimate the range of z-depth of a scene, from its points or the capture's
+    planes.
+
+    Args:
+      capture: The capture.
+      views: Its frames.
+
+    Returns:
+      Nearest and farthest z-depth in scene units.
+    """
     points = own_points(capture)
     if len(points) < MIN_POINTS:
         return capture.near, capture.far
@@ -216,7 +309,7 @@ def depth_span(capture: Capture, views: Views) -> tuple[float, float]:
     if not len(depths):
         return capture.near, capture.far
     low, high = np.quantile(depths, (OUTSIDE, 1 - OUTSIDE))
-    # What moves stands in front of what structure from motion finds.
+    # Moving objects are in front of the points of structure from motion.
     return max(capture.near, 0.5 * float(low)), 1.2 * float(high)
 
 

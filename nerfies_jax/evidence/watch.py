@@ -1,7 +1,7 @@
-"""The budget of preprocessing, in counted work, and how long its parts take.
+"""Budget of preprocessing, in counted work, and the times of its parts.
 
 Work is counted in nominal seconds: pixels, tracks and frames times the rates below. It
-is known before a part begins and the same on every machine, however busy it is.
+is known before a part begins and the same on every machine, whatever its load.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ A_BODY_TERM = 5.0  # of a track of a rigid thing times its frames squared: 4.8
 
 
 class Seconds(NamedTuple):
-    """Of the processor, by part."""
+    """Processor seconds by part."""
 
     flow: float
     tracks: float
@@ -54,7 +54,7 @@ STAGES = {
 
 
 class Watch:
-    """Says which part begins, and what is left out once a share of the work is spent.
+    """Reports each part, and leaves parts out once a share of the work is spent.
 
     Only the durations of parts, which are reported, are read from a clock.
     """
@@ -76,27 +76,51 @@ class Watch:
         self._stage.close()
 
     def begin(self, part: str) -> None:
-        """A field of `PARTS`."""
+        """Begin a part.
+
+        Args:
+          part: A field of `PARTS`.
+        """
         self._began[part] = time.process_time()
         self._tell(getattr(PARTS, part))
         self._stage.close()
         self._stage.enter_context(events.stage(STAGES[part]))
 
     def spend(self, work: float) -> None:
-        """Count work that is done in any case, in nominal seconds."""
+        """Count work that is done in any case.
+
+        Args:
+          work: Work in nominal seconds.
+        """
         self._spent += work
 
     def has_room(self, share: float, what: str, work: float) -> bool:
-        """Whether less than a share of the budget is spent; then `work` is counted.
+        """Return whether less than a share of the budget is spent, and then count the
+        work.
 
-        Otherwise `what` is left out.
+        Args:
+          share: Share of the budget.
+          what: Name of the part that is left out otherwise.
+          work: Work in nominal seconds.
+
+        Returns:
+          True if the part is to be done.
         """
         return self.room_for(1, share, what, work) == 1
 
     def room_for(self, count: int, share: float, what: str, work: float) -> int:
-        """How many of `count` equal pieces begin before a share of the budget is spent.
+        """Return how many equal pieces begin before a share of the budget is spent.
 
-        They are counted at `work` each. If not all do, `what` is left out in part.
+        They are counted at `work` each.
+
+        Args:
+          count: Number of pieces.
+          share: Share of the budget.
+          what: Name of the part that is otherwise left out in part.
+          work: Work of a piece in nominal seconds.
+
+        Returns:
+          The number of pieces to be done.
         """
         begun = 0
         while begun < count and self._spent < share * self._allowed:
@@ -110,11 +134,15 @@ class Watch:
 
     @property
     def left_out(self) -> str:
-        """Words for all that is beyond the budget; empty if it was enough."""
+        """Names of the parts beyond the budget, empty if there are none."""
         return ", ".join(self._left_out)
 
     def seconds(self) -> Seconds:
-        """From the beginning of each part to that of the next, and to now."""
+        """Return the processor time of each part so far.
+
+        Returns:
+          Seconds by part.
+        """
         ends = [*list(self._began.values())[1:], time.process_time()]
         parts = zip(self._began.items(), ends, strict=True)
         return Seconds(**{part: end - began for (part, began), end in parts})

@@ -1,9 +1,9 @@
-"""Flow between frames far apart, searched for again from where a still scene would be.
+"""Flow over large displacements, searched for again from the flow of a static scene.
 
-A search from coarse to fine takes patterns that repeat for each other, and over wide
-steps more than one place looks right from afar. Begun from the flow of planes at rest,
-which known cameras tell, it ends at each of them, and what looks most alike is taken.
-That holds for what moves as well, which then has less far to be looked for.
+A coarse-to-fine search confuses repetitive patterns, and over large displacements more
+than one position looks right at the coarse levels. Searches start from the flow of
+static planes, which known cameras determine, and the best match of all is taken. That
+helps moving objects too, which are then searched for in a smaller range.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,16 @@ Search = Callable[..., np.ndarray]  # flow from one frame to another, from a gue
 
 
 def is_wide(views: Views, pair: tuple[int, int], flow: np.ndarray) -> bool:
-    """Whether a pair's flow [height, width, 2] calls for another search."""
+    """Return whether the flow of a pair of frames calls for another search.
+
+    Args:
+      views: The frames.
+      pair: Indices of the two frames.
+      flow: Flow in pixels, [height, width, 2].
+
+    Returns:
+      True if it does.
+    """
     one, other = (views.rotation[index, 2] for index in pair)
     if one @ other < np.cos(MOST_TURN_RAD):
         return False
@@ -47,10 +56,18 @@ def improved(
     search: Search,
     span: tuple[float, float],
 ) -> np.ndarray:
-    """The flow [height, width, 2] of whichever search looks most alike around a pixel.
+    """Combine the flow of several searches by the similarity around each pixel.
 
-    `pictures` are those of the pair in the views' own pixels, `search` begins from a
-    guess in these, `span` are the nearest and farthest z-depth, scene units.
+    Args:
+      views: The frames.
+      pictures: Images of the pair, in the views' own pixels.
+      pair: Indices of the two frames.
+      flow: Flow of the first search, [height, width, 2].
+      search: Search from an initial flow.
+      span: Nearest and farthest z-depth in scene units.
+
+    Returns:
+      Flow in pixels, [height, width, 2].
     """
     near, far = (plane_flow(views, pair, depth) for depth in span)
     apart = float(np.median(np.linalg.norm(near - far, axis=-1)))
@@ -67,7 +84,16 @@ def improved(
 
 
 def plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray:
-    """[height, width, 2] px that points at rest at a z-depth of the first frame go."""
+    """Compute the flow of a static plane at a z-depth of the first frame.
+
+    Args:
+      views: The frames.
+      pair: Indices of the two frames.
+      depth: z-depth in scene units.
+
+    Returns:
+      Flow in pixels, [height, width, 2].
+    """
     one, other = pair
     width, height = views.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -82,7 +108,15 @@ def plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray:
 
 
 def unlike(pictures, flow):
-    """[height, width] gray levels by which surroundings differ along the flow."""
+    """Compute the difference of surroundings along the flow.
+
+    Args:
+      pictures: Images of the pair, [height, width].
+      flow: Flow in pixels, [height, width, 2].
+
+    Returns:
+      Differences in gray levels, [height, width].
+    """
     one, other = pictures
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
