@@ -28,7 +28,10 @@ def environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return an environment for a program that calls `end_with_parent`.
 
     Args:
-      base: What it holds besides. By default the environment of this process.
+      base: Other variables. None for the environment of this process.
+
+    Returns:
+      The variables.
     """
     return {**(os.environ if base is None else base), PARENT: str(os.getpid())}
 
@@ -38,7 +41,10 @@ def start(command: Sequence[str | os.PathLike], **options: Any) -> subprocess.Po
 
     Args:
       command: The program and its arguments.
-      **options: For `subprocess.Popen`.
+      **options: Options of `subprocess.Popen`.
+
+    Returns:
+      The process.
     """
     child = subprocess.Popen(
         command, env=environment(options.pop("env", None)), **options

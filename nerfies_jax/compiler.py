@@ -1,4 +1,4 @@
-"""XLA's compiler: what it leaves out, and its work beside what else there is to do."""
+"""Options of XLA's compiler, and compilation in the background."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,9 +17,16 @@ _COMPILER = ThreadPoolExecutor(1, "compiler")
 
 
 def begun(work: Callable[[], Result]) -> Future[Result]:
-    """`work` in a thread, after what was begun before it.
+    """Run a function in a background thread, after those begun before it.
 
-    Trace and lower before: that goes by the settings of the caller's thread (x64, the
-    precision of products) and holds Python's lock. Compiling does neither.
+    Trace and lower before calling it: both depend on the settings of the caller's
+    thread (x64, the precision of products) and hold Python's lock. Compiling does
+    neither.
+
+    Args:
+      work: The function.
+
+    Returns:
+      A future of its result.
     """
     return _COMPILER.submit(work)

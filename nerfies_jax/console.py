@@ -19,22 +19,38 @@ _above: Callable[[str], None] | None = None
 
 
 def say(text: object = "") -> None:
-    """Write a line of a command's results to stdout."""
+    """Write a line of a command's results to stdout.
+
+    Args:
+      text: The line.
+    """
     _write_line("stdout", str(text))
 
 
 def note(text: object = "") -> None:
-    """Write a line about the progress of the work to stderr."""
+    """Write a line about the progress of the work to stderr.
+
+    Args:
+      text: The line.
+    """
     _write_line("stderr", str(text))
 
 
 def warn(text: object) -> None:
-    """Write a line to stderr that begins with `warning: `."""
+    """Write a line to stderr that begins with `warning: `.
+
+    Args:
+      text: The line.
+    """
     note(f"warning: {text}")
 
 
 def error(text: object) -> None:
-    """Write a line to stderr that begins with `error: `."""
+    """Write a line to stderr that begins with `error: `.
+
+    Args:
+      text: The line.
+    """
     note(f"error: {text}")
 
 
@@ -53,6 +69,9 @@ def display(above: Callable[[str], None]) -> Iterator[None]:
 
     Args:
       above: Writes a line above the progress display that occupies the last lines.
+
+    Yields:
+      None.
     """
     global _above
     before, _above = _above, above
@@ -74,7 +93,15 @@ class SafeStream:
         self.failure: OSError | None = None
 
     def write(self, text: str) -> int:
-        """Write and, at the end of a line, flush: a pipe must not hold lines back."""
+        """Write and, at the end of a line, flush, since a pipe must not hold lines
+        back.
+
+        Args:
+          text: The text.
+
+        Returns:
+          Number of characters.
+        """
         self._attempt(self._write, text)
         if "\n" in text:
             self.flush()
@@ -89,7 +116,11 @@ class SafeStream:
             self._stream.write(plain)
 
     def writelines(self, lines) -> None:
-        """Write every line."""
+        """Write every line.
+
+        Args:
+          lines: The lines.
+        """
         for line in lines:
             self.write(line)
 
@@ -98,7 +129,11 @@ class SafeStream:
         self._attempt(lambda: self._stream.flush())
 
     def isatty(self) -> bool:
-        """Whether this is a terminal."""
+        """Return whether this is a terminal.
+
+        Returns:
+          True for a terminal.
+        """
         try:
             return self._stream is not None and self._stream.isatty()
         except ValueError:  # closed
@@ -119,8 +154,8 @@ class SafeStream:
 
     def _give_up(self, problem):
         self.failure = self.failure or problem
-        # What is still in the buffer goes there too: otherwise Python would fail on it
-        # again when it exits, with code 120.
+        # The rest of the buffer goes there too: otherwise Python would fail on it again
+        # when it exits, with code 120.
         with contextlib.suppress(OSError, ValueError):
             _point_at_null(self._stream.fileno())
             self._stream.flush()
@@ -134,6 +169,9 @@ def safe(name: str) -> SafeStream:
 
     Args:
       name: `"stdout"` or `"stderr"`.
+
+    Returns:
+      The stream.
     """
     stream = getattr(sys, name)
     return stream if isinstance(stream, SafeStream) else SafeStream(stream)
@@ -150,8 +188,8 @@ def _point_at_null(descriptor):
 def open_descriptors() -> None:
     """Open the null device in place of standard streams that are closed.
 
-    Otherwise the next file that is opened gets the number of the stream, and what a
-    native library writes to standard error lands in the middle of it.
+    Otherwise the next file that is opened gets the number of the stream, and native
+    libraries write their standard error into the middle of it.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -173,15 +211,22 @@ class Session:
         self._undelivered: OSError | None = None
 
     def deliver(self, document: str) -> None:
-        """Write to stdout what the command was run for: a loss is its failure."""
+        """Write the result of the command to stdout. If it is lost, the command fails.
+
+        Args:
+          document: The result.
+        """
         say(document)
         self._undelivered = safe("stdout").failure
 
     def lost(self) -> OSError | None:
-        """Return why output was lost, or None.
+        """Return why output was lost.
 
-        A reader of messages that has read enough, as `head` has, is no loss. A reader
+        A reader of messages that has read enough, such as `head`, is no loss. A reader
         of a document that went away before its end is one.
+
+        Returns:
+          The error, or None.
         """
         failures = (stream.failure for stream in self._streams)
         unread = [x for x in failures if x is not None and x.errno != errno.EPIPE]
@@ -195,9 +240,12 @@ _session: Session | None = None
 def session() -> Iterator[Session]:
     """Run a command whose output cannot end it.
 
-    While the block runs nothing that is written to `sys.stdout` and `sys.stderr`
-    raises, whichever library writes it. A block that ends well although output was
-    lost (a full disk, a document whose reader went away) exits with code 1.
+    While the block runs, writing to `sys.stdout` and `sys.stderr` never raises,
+    whichever library writes. If the block succeeds although output was lost (a full
+    disk, a document whose reader went away), the command exits with code 1.
+
+    Yields:
+      The session.
     """
     global _session
     if _session is not None:  # of the command that called this one

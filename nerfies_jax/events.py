@@ -1,8 +1,8 @@
-"""The event stream: what the work does, how far it is and what it measured.
+"""The event stream: current work, its progress and its measurements.
 
 Code that does work calls `stage` and `emit`. Sinks, which are functions of an event,
-receive every event of the process: the progress display of the terminal always, and
-whatever `subscribe` adds (the `events.jsonl` of a run folder, experiment trackers).
+receive every event of the process: the progress display of the terminal always, and any
+that `subscribe` adds (the `events.jsonl` of a run folder, experiment trackers).
 
 An event is a dictionary with `time` (seconds since 1970), `kind` and, inside a stage,
 `phase` (the name of the innermost stage of the thread). docs/events.md lists the kinds
@@ -35,9 +35,9 @@ class Stage:
     """A step of the work that may take longer than two seconds.
 
     Attributes:
-      name: What is done, for a person, as `structure from motion`.
-      total: Number of items, or None where it is not known.
-      done: Number of items that are finished.
+      name: Name for the user, such as `structure from motion`.
+      total: Number of items, or None if it is not known.
+      done: Number of finished items.
     """
 
     def __init__(self, name: str, total: int | None = None, done: int = 0):
@@ -49,18 +49,23 @@ class Stage:
         self._emitted = -float("inf")
 
     def advance(self, count: int = 1, text: str | None = None) -> None:
-        """Record that `count` more items are finished."""
+        """Record that more items are finished.
+
+        Args:
+          count: Number of them.
+          text: Text to show next to the numbers. None to keep the previous one.
+        """
         self.reach(self.done + count, text=text)
 
     def reach(
         self, done: int, total: int | None = None, text: str | None = None
     ) -> None:
-        """Record that `done` items are finished; a signal ends the work here.
+        """Record the number of finished items. A signal ends the work here.
 
         Args:
           done: Number of finished items.
-          total: Number of all items, where it has become known or has changed.
-          text: What to show next to the numbers; as before where None.
+          total: Number of all items, if it has become known or has changed.
+          text: Text to show next to the numbers. None to keep the previous one.
         """
         stopping.check()
         self.done = done
@@ -114,12 +119,12 @@ def _open_stages():
 def emit(kind: str, **fields: Any) -> None:
     """Send an event to every sink.
 
-    A sink that raises receives no further events, and a warning says so: following a
+    A sink that raises receives no further events, which a warning reports. Following a
     run never ends it.
 
     Args:
-      kind: What the event is about, as `train` or `evaluation`.
-      **fields: Values that JSON has, floats that are not finite among them.
+      kind: Kind of the event, such as `train` or `evaluation`.
+      **fields: JSON values, or floats that are not finite.
     """
     event: Event = {"time": round(time.time(), 3), "kind": kind}
     stages = _open_stages()
@@ -150,11 +155,14 @@ def message(text: str, level: str = "info") -> None:
 
 @contextlib.contextmanager
 def subscribe(sink: Sink) -> Iterator[None]:
-    """Send every event to `sink` while the block runs.
+    """Send every event to a sink while the block runs.
 
     Args:
-      sink: Receives events as dictionaries, in the thread that emits them, and must
-        not change them.
+      sink: Function that receives events as dictionaries, in the thread that emits
+        them, and must not change them.
+
+    Yields:
+      None.
     """
     global _sinks
     _sinks = (*_sinks, sink)
@@ -176,8 +184,11 @@ def shown_on(target: rich.console.Console | None) -> Iterator[None]:
     """Show progress on a console of rich while the block runs, or as before.
 
     Args:
-      target: Where bars and lines go. One with `quiet=True` shows nothing, and None
+      target: Console for bars and lines. One with `quiet=True` shows nothing, and None
         leaves the display as it is: stderr.
+
+    Yields:
+      None.
     """
     global _display
     if target is None:

@@ -1,4 +1,4 @@
-"""A radiance field as pure functions: render it, ask its warp, look its codes up."""
+"""A radiance field as pure functions: rendering, warping and latent codes."""
 
 import functools
 from collections.abc import Callable
@@ -38,7 +38,7 @@ Codes = dict[str, Float[Array, " code"]]
 
 
 class Field(NamedTuple):
-    """Pure functions of a field; `params` is what `init` returns."""
+    """Pure functions of a field, whose `params` are those that `init` returns."""
 
     spec: RadianceScene
     metadata: SceneMetadata
@@ -66,10 +66,19 @@ def field(
     without: tuple[str, ...] = (),
     effects: tuple[Effect, ...] = (),
 ) -> Field:
-    """The field of a spec and of more `effects`, some left out by name.
+    """Make the field of a spec and further effects, with some left out.
 
-    Without "warp" a render shows the canonical scene; without "transient" or
-    "scene_flow" only what is static. The parameters stay those of the whole field.
+    Without "warp" it renders the canonical scene, and without "transient" or
+    "scene_flow" only the static scene. The parameters stay those of the whole field.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      without: Names of effects to leave out.
+      effects: Effects in addition to those of the spec.
+
+    Returns:
+      The field.
     """
     own = specs.effects_of(spec, metadata)
     every = joined(own, effects, refused=SPLAT_SEAMS, reserved=("template", "codes"))
@@ -132,7 +141,18 @@ def field(
 def draw(
     bound: Bound, camera: Camera, condition: FrameCondition, size: tuple[int, int]
 ) -> Rendering:
-    """A whole frame by the full quadrature, with slopes; `skipping.draw` has none."""
+    """Render a whole frame by the full quadrature. Differentiable, unlike
+    `skipping.draw`.
+
+    Args:
+      bound: The field with its parameters.
+      camera: The camera.
+      condition: Conditioning of the frame.
+      size: Width and height of the image in pixels.
+
+    Returns:
+      The rendered image.
+    """
     guide = None
     if bound.spec.sampling.occupancy is not None:
         guide = skipping.survey(bound, condition)[skipping.GUIDE]
@@ -156,7 +176,14 @@ def draw(
 
 
 def feeds_networks(effect: Effect) -> bool:
-    """Whether the template or a warp reads what an effect makes."""
+    """Return whether the template or a warp reads the output of an effect.
+
+    Args:
+      effect: The effect.
+
+    Returns:
+      True if it does.
+    """
     seams = (effect.lift, effect.condition, effect.mark, effect.surface)
     return any(seam is not None for seam in seams)
 
@@ -212,7 +239,19 @@ def look_up(
     time: Scalar,
     appearance: Int[Array, ""],
 ) -> Codes:
-    """The codes of one frame: between rows where its time was not learned from."""
+    """Look up the codes of one frame, interpolated between rows at times not trained
+    on.
+
+    Args:
+      tables: The code tables.
+      metadata: Scene metadata.
+      params: Parameters of the field.
+      time: Time in [0, 1].
+      appearance: Appearance id.
+
+    Returns:
+      Codes by the name of their table.
+    """
     frame_codes = {}
     for table in tables:
         rows = params["codes"][table.name]
@@ -226,7 +265,9 @@ def look_up(
 
 
 def _place_in_time(metadata, time):
-    """Rows before and after a time, and where between them; exact at a row's own."""
+    """Rows before and after a time, and the position in between, exact at a row's
+    time.
+    """
     times = jnp.asarray(metadata.times, time.dtype)
     last = max(len(metadata.times) - 2, 0)
     left = jnp.clip(jnp.searchsorted(times, time, side="right") - 1, 0, last)

@@ -1,4 +1,4 @@
-"""One ray in units of the field, and where along it the field is asked."""
+"""Rays in units of the field, and the distances of their samples."""
 
 from typing import NamedTuple
 
@@ -29,9 +29,18 @@ class Ray(NamedTuple):
 def field_ray(
     metadata: SceneMetadata, origin: Vector, direction: Vector, cosine: Scalar
 ) -> Ray:
-    """A ray of the scene in the field's coordinates, between the near and far planes.
+    """Convert a ray to the coordinates of the field, between the near and far planes.
 
-    The planes are z-depths, so a slanted ray is sampled further out.
+    The planes are z-depths, so an oblique ray extends further out.
+
+    Args:
+      metadata: Scene metadata.
+      origin: Origin in scene units, [3].
+      direction: Unit direction, [3].
+      cosine: z-depth per distance along the ray.
+
+    Returns:
+      The ray in units of the field.
     """
     center = jnp.asarray(metadata.center, origin.dtype)
     span = metadata.scale / cosine
@@ -46,7 +55,16 @@ def field_ray(
 def field_ray_through(
     metadata: SceneMetadata, camera: Camera, pixel: Float[Array, "2"]
 ) -> tuple[Ray, Scalar]:
-    """The field's ray through one pixel position, and its z-depth per distance."""
+    """Return the ray of a pixel in units of the field.
+
+    Args:
+      metadata: Scene metadata.
+      camera: The camera.
+      pixel: Position (x, y) with centers at +0.5, [2].
+
+    Returns:
+      The ray, and its z-depth per distance.
+    """
     ray = rays.pixel_ray(camera, pixel)
     cosine = rays.depth_per_distance(camera, ray.direction)
     return field_ray(metadata, ray.origin, ray.direction, cosine), cosine
@@ -55,8 +73,15 @@ def field_ray_through(
 def filled_along(
     cells: occupancy.Cells, ray: Ray, half_side: float
 ) -> Bool[Array, " looks"]:
-    """Whether a ray is in a filled cell, or beyond them, in the middle of each of
-    `LOOKS` even parts.
+    """Look up the occupancy of the middle of each of `LOOKS` even parts of a ray.
+
+    Args:
+      cells: Occupied cells.
+      ray: The ray in units of the field.
+      half_side: Half side of the grid in units of the field.
+
+    Returns:
+      Booleans [LOOKS], True in an occupied cell or outside of the grid.
     """
     share = (jnp.arange(LOOKS, dtype=ray.near.dtype) + 0.5) / LOOKS
     distance = ray.near + (ray.far - ray.near) * share
@@ -70,7 +95,17 @@ def first_distances(
     key: Key[Array, ""] | None,
     guide: occupancy.Cells | None,
 ) -> Float[Array, " coarse"]:
-    """Where the first level is asked: all along the ray, or mostly in filled cells."""
+    """Sample distances for the first level, uniformly or mostly in occupied cells.
+
+    Args:
+      spec: The scene.
+      ray: The ray in units of the field.
+      key: PRNG key, or None.
+      guide: Occupied cells, or None for uniform samples.
+
+    Returns:
+      Sorted distances, [coarse].
+    """
     plan = spec.sampling
     if guide is None:
         return sampling.stratified(key, ray.near, ray.far, plan.coarse, plan.spacing)
@@ -86,10 +121,20 @@ def fine_distances(
     coarse: Float[Array, " coarse"],
     drawn: Float[Array, " fine"],
 ) -> Float[Array, " samples"]:
-    """Where the fine level is asked: at all distances, or at those drawn alone.
+    """Combine the distances of the fine level.
 
-    The last coarse sample is among them in any case where it stands for all behind it:
-    drawn where a surface is, the last one would hold the background behind its back.
+    They are all distances or only the new ones, depending on the spec. The last coarse
+    sample is always included if it stands for everything behind it. Otherwise the last
+    sample, on a surface, would contain the background behind it.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      coarse: Sorted distances of the coarse level, [coarse].
+      drawn: Sorted new distances, [fine].
+
+    Returns:
+      Sorted distances, [samples].
     """
     if spec.sampling.union:
         return sampling.union(coarse, drawn)

@@ -1,9 +1,9 @@
-"""What warps say, asked on a grid in the frustum of one frame and read between.
+"""Displacements of warps on a grid in the frustum of one frame, interpolated.
 
-A frame has millions of samples, and a warp is a network that is smooth in space: it is
-asked at the corners of a grid whose lines are rays of the picture, and interpolated
-straight in column, row and share of the depth. Without a lens' distortion a
-displacement that is linear in space comes back as it is.
+A frame has millions of samples, and a warp is a network that is smooth in space. It is
+evaluated at the vertices of a grid whose lines are rays of the image, and interpolated
+linearly in column, row and relative depth. Without lens distortion a displacement that
+is linear in space is reproduced exactly.
 """
 
 import math
@@ -36,10 +36,17 @@ Grid = Float[Array, "rows columns corners 3"]
 
 
 def resolves(bound: Bound) -> bool:
-    """Whether warps are all that moves a field, of waves that are long beside cells.
+    """Return whether warps alone move a field, with wavelengths much larger than cells.
 
-    Not with lifts or marks: what else a sample is asked of every point takes as long.
-    An effect says its shortest wave (`Effect.shortest_wave`), or nothing is known.
+    Fields with `lift` or `mark` hooks are excluded, since evaluating those at every
+    sample takes as long. Effects state their shortest wavelength
+    (`Effect.shortest_wave`), otherwise it is unknown.
+
+    Args:
+      bound: The field with its parameters.
+
+    Returns:
+      True if the grid can replace evaluation at every sample.
     """
     metadata = bound.metadata
     cell = (metadata.far - metadata.near) * metadata.scale / DEEP
@@ -54,7 +61,18 @@ def resolves(bound: Bound) -> bool:
 def displacements(
     bound: Bound, camera: Camera, condition: FrameCondition, size: tuple[int, int]
 ) -> Grid:
-    """Template point minus observed point at all corners between near and far; pure."""
+    """Evaluate the warps at all vertices between near and far.
+
+    Args:
+      bound: The field with its parameters.
+      camera: The camera.
+      condition: Conditioning of the frame.
+      size: Width and height of the image in pixels.
+
+    Returns:
+      Template point minus observed point in units of the field, [rows, columns,
+      corners, 3].
+    """
     cell = max(*size, ACROSS) / ACROSS  # a pixel or more
     dtype = camera.position.dtype
     columns, rows = (
@@ -79,7 +97,16 @@ def displacements(
 def column(
     grid: Grid, position: Float[Array, "2"], size: tuple[int, int]
 ) -> Float[Array, "corners 3"]:
-    """The grid along the ray through one pixel position."""
+    """Interpolate the grid along the ray through one pixel position.
+
+    Args:
+      grid: Displacements.
+      position: Pixel position (x, y), [2].
+      size: Width and height of the image in pixels.
+
+    Returns:
+      Displacements along the ray, [corners, 3].
+    """
     rows, columns, *_ = grid.shape
     across, right = _between(position[0] * ((columns - 1) / size[0]), columns)
     down, below = _between(position[1] * ((rows - 1) / size[1]), rows)
@@ -91,9 +118,15 @@ def column(
 def along(
     column: Float[Array, "corners 3"], ray: Ray, distance: Float[Array, " samples"]
 ) -> Float[Array, "samples 3"]:
-    """Displacements at distances along a ray, before near and beyond far of its ends.
+    """Interpolate displacements at distances along a ray, clamped to its ends.
 
-    A ray whose far is its near has one for all.
+    Args:
+      column: Displacements along the ray, [corners, 3].
+      ray: The ray. If its far equals its near, the displacement is the same everywhere.
+      distance: Distances, [samples].
+
+    Returns:
+      Displacements, [samples, 3].
     """
     length = ray.far - ray.near
     share = (distance - ray.near) / jnp.where(length > 0, length, 1)

@@ -1,7 +1,7 @@
-"""Appearance codes of frames that were never learned from, fitted to half of each.
+"""Appearance codes of held-out frames, fitted to one half of each.
 
-The protocol of NeRF-W (Martin-Brualla et al. 2021): the network stays as it is, the
-code is fitted to the left half of a frame, and the right half is scored.
+This is the protocol of NeRF-W (Martin-Brualla et al. 2021): the network is frozen, the
+code is fitted to the left half of a frame, and the right half is evaluated.
 """
 
 from typing import Any
@@ -37,10 +37,21 @@ def score(
     rows: np.ndarray,
     effects: tuple[Effect, ...] = (),
 ) -> evaluation.Halves | None:
-    """Scores of the right halves of frames, their codes fitted to the left ones.
+    """Evaluate the right halves of frames, with codes fitted to the left halves.
 
-    None where the field has no codes that only frames learned from own. A transient
-    medium is left out: what passed by in one frame is in no other.
+    A transient medium is left out, since a transient object of one frame is in no
+    other.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      state: Trained state.
+      capture: The capture.
+      rows: Indices of the frames.
+      effects: Effects in addition to those of the spec.
+
+    Returns:
+      The metrics. None if the field has no codes that only training frames have.
     """
     whole = scene.field(spec, metadata, effects=effects)
     names = {effect.name for effect in whole.effects}

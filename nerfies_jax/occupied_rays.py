@@ -1,11 +1,11 @@
-"""The rays of a step where something was found: empty ones have little left to teach.
+"""Selection of training rays by occupancy, since empty rays have little left to teach.
 
-Of more rays than a step has, those are learned from that meet an occupied cell, and a
-share of any (`OccupancySpec`). Space is surveyed anew as training goes on, and what was
-found empty once stays so. Müller et al. 2022, arXiv:2201.05989, appendix E.2, skip the
-samples in empty cells instead: a step then has as many rays as its samples pay for,
-here it has as many of both as always. What is drawn of a field does not depend on it;
-the losses of a step are those of its rays, which are harder than the mean.
+Of more candidate rays than a step has, those are used that meet an occupied cell, and a
+share of any (`OccupancySpec`). The grid is recomputed during training, and a cell that
+was found empty stays empty. Müller et al. 2022, arXiv:2201.05989, appendix E.2, skip
+samples in empty cells instead. A step then has as many rays as its samples pay for,
+whereas here it always has the same number of both. Rendering does not depend on the
+selection. The losses of a step are those of its rays, which are harder than the mean.
 """
 
 import functools
@@ -25,7 +25,14 @@ from nerfies_jax.training.model import Event, Frames, TrainState
 
 
 def first(field: Field) -> Cells | tuple[()]:
-    """Cells of which nothing is known: any may be occupied; none without a spec."""
+    """Return the initial cells, all of which may be occupied.
+
+    Args:
+      field: The field.
+
+    Returns:
+      Cells, or an empty tuple if the spec uses no occupancy.
+    """
     if field.spec.sampling.occupancy is None:
         return ()
     params = jax.eval_shape(field.init, jax.random.key(0))
@@ -34,9 +41,18 @@ def first(field: Field) -> Cells | tuple[()]:
 
 
 def events(field: Field) -> tuple[Event, ...]:
-    """The surveys of a run; after one, `aux_state` are the cells that are left.
+    """Return the events that recompute the occupancy grid.
 
-    ValueError for a field whose space cannot be surveyed.
+    After an event, `aux_state` are the cells that are still occupied.
+
+    Args:
+      field: The field.
+
+    Returns:
+      One event or none.
+
+    Raises:
+      ValueError: If the field's occupancy cannot be computed.
     """
     spec = field.spec.sampling.occupancy
     if spec is None:
@@ -62,28 +78,54 @@ def events(field: Field) -> tuple[Event, ...]:
 
 
 def _survey(field: Field) -> Callable[[PyTree, Int[Array, ""]], Cells]:
-    """What any level fills."""
+    """Cells that any level fills."""
     return lambda params, step: field.survey(params, step)[skipping.GUIDE]
 
 
 def meets(occupied: Cells, ray: Ray, half_side: float) -> Bool[Array, ""]:
-    """Whether a ray goes through an occupied cell, or leaves the cells."""
+    """Return whether a ray meets an occupied cell, or leaves the grid.
+
+    Args:
+      occupied: Occupied cells.
+      ray: The ray in units of the field.
+      half_side: Half side of the grid in units of the field.
+
+    Returns:
+      A boolean scalar.
+    """
     return jnp.any(filled_along(occupied, ray, half_side))
 
 
 def chosen(
     meeting: Bool[Array, " candidates"], count: int, anywhere: int
 ) -> Int[Array, " count"]:
-    """Which candidates a step learns from: the first `anywhere`, and then what meets.
+    """Choose the rays of a step: the first `anywhere`, then those that meet a cell.
 
-    Others fill up where too few do.
+    Other candidates fill up if too few do.
+
+    Args:
+      meeting: True for candidates that meet an occupied cell, [candidates].
+      count: Number of rays.
+      anywhere: Number of rays that need not meet a cell.
+
+    Returns:
+      Indices of candidates, [count].
     """
     order = jnp.argsort(~meeting[anywhere:], stable=True)[: count - anywhere]
     return jnp.concatenate([jnp.arange(anywhere), anywhere + order])
 
 
 def learned_from(field: Field, occupied: Cells, candidates: Batch) -> Batch:
-    """The rays of a step, of `OccupancySpec.candidates` times as many."""
+    """Choose the rays of a step from candidates.
+
+    Args:
+      field: The field.
+      occupied: Occupied cells.
+      candidates: `OccupancySpec.candidates` times as many rays as a step has.
+
+    Returns:
+      The rays of the step.
+    """
     spec = field.spec.sampling.occupancy
     lines = jax.vmap(functools.partial(field_ray, field.metadata))(
         candidates.origin, candidates.direction, candidates.cosine

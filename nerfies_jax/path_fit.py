@@ -1,10 +1,10 @@
-"""The motion of a field fitted to known paths of points, before any ray is traced.
+"""Initialization of a field's motion from known paths of points, before ray tracing.
 
-A warp maps what is observed back to the template; points that were followed through the
-film say where it must lead: the places of one point at all times to one place of the
-template, and points at rest to where they are. A scene flow must lead from a point's
-place to its next one and its last one, and nowhere from points at rest. Descent on
-pictures does not find that for motion of more than a few pixels.
+A warp maps observed points back to the template. Tracked points determine it: positions
+of one point at all times map to one point of the template, and static points to
+themselves. A scene flow must lead from a point's position to its next and previous
+ones, and be zero at static points. Gradient descent on images does not find this for
+motion of more than a few pixels.
 """
 
 import functools
@@ -28,16 +28,17 @@ PyTree = Any
 FRAMES_AT_ONCE, POINTS_AT_ONCE, STILL_AT_ONCE = 12, 256, 128  # of each step
 SOFT = 1e-3  # field units: distances below it count squared
 SOFT_FLOW = 0.05  # the same for flow, over the mean flow that is known
-# On the squared logarithm of how much a warp stretches what moves, beside distances in
-# field units. Without it what moves shrinks in the template, where all its places then
-# lie close: ||log Σ|| of the Jacobian is 2.75 there, and points of the built-in scene
-# that are followed 0.0176 units off; 0.15 and 0.0094 with it (0.0240 where none move).
+# Weight of the squared logarithm of how much a warp stretches moving objects, compared
+# with distances in field units. Without it moving objects shrink in the template, where
+# their positions are then close together: ||log Σ|| of the Jacobian is 2.75 there, and
+# tracked points of the built-in scene are 0.0176 units off. With it they are 0.15 and
+# 0.0094 (0.0240 if nothing moves).
 STRETCH = 0.3
 LEAST_STRETCH = 1e-6  # squared: a collapsed direction has a logarithm, too
 
 
 class FilmPaths(NamedTuple):
-    """Points followed through a film, in units of the field."""
+    """Tracked points of a video, in units of the field."""
 
     time: Float[np.ndarray, " frames"]
     appearance: np.ndarray  # [frames] ids, for codes that go by them
@@ -47,7 +48,7 @@ class FilmPaths(NamedTuple):
 
 
 class WarpFit(NamedTuple):
-    """What the fit found, and the mean distance from one place before and after."""
+    """Fitted warp, and the mean distance from one position before and after."""
 
     params: PyTree  # of the whole field
     canonical: Float[Array, "points 3"]  # field units: places in the template
@@ -56,7 +57,7 @@ class WarpFit(NamedTuple):
 
 
 class FlowFit(NamedTuple):
-    """What the fit found, and how far the flow is off on average before and after."""
+    """Fitted scene flow, and its mean error before and after."""
 
     params: PyTree  # of the whole field
     first: float  # field units from one moment to the next
@@ -64,7 +65,17 @@ class FlowFit(NamedTuple):
 
 
 def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
-    """The evidence's paths and points at rest in units of the field; host side."""
+    """Convert paths and static points of preprocessing to units of the field, on the
+    host.
+
+    Args:
+      field: The field.
+      capture: The capture.
+      evidence: Its preprocessing.
+
+    Returns:
+      The paths.
+    """
     metadata = field.metadata
 
     def inside(place):
@@ -89,12 +100,24 @@ def fit(
     key: Key[Array, ""],
     start: TrackStartSpec,
 ) -> WarpFit:
-    """Descend on how far the warp carries one point's places from one another.
+    """Fit the warp by gradient descent on the spread of each point in the template.
 
-    What descends are the warps, the codes they read, and the places in the template,
-    which begin where the points are in the middle of their own time. Points at rest
-    are held where they are, and what moves keeps its size. ValueError where no place
-    is known.
+    The optimized variables are the warps, the codes that they read, and the positions
+    in the template, which start where the points are in the middle of their own time.
+    Static points are kept in place, and moving objects keep their size.
+
+    Args:
+      field: The field.
+      params: Its initial parameters.
+      paths: Paths of points.
+      key: PRNG key.
+      start: Settings.
+
+    Returns:
+      The fitted parameters.
+
+    Raises:
+      ValueError: If no position is known.
     """
     if not paths.known.any():
         raise ValueError("no path is known anywhere: nothing to fit a warp to")
@@ -129,11 +152,24 @@ def fit_flow(
     key: Key[Array, ""],
     start: TrackStartSpec,
 ) -> FlowFit:
-    """Descend on how far the scene flow is from what one point did between two frames.
+    """Fit the scene flow to the displacements of points between frames.
 
-    Frames that are more or less than one moment apart say the flow in proportion. What
-    descends is the network of the medium, with all that its flow reads. ValueError
-    where no point is known in two frames that follow each other.
+    Displacements between frames that are not one interval apart are scaled. The
+    optimized variables are the network of the medium and everything that its flow
+    reads.
+
+    Args:
+      field: The field.
+      params: Its initial parameters.
+      paths: Paths of points.
+      key: PRNG key.
+      start: Settings.
+
+    Returns:
+      The fitted parameters.
+
+    Raises:
+      ValueError: If no point is known in two consecutive frames.
     """
     apart = np.diff(paths.time)
     both = paths.known[:, 1:] & paths.known[:, :-1] & (apart > 0)
@@ -221,7 +257,7 @@ def _distances(field, params, paths):
 
             here = position[frame][rows]
             place, stretched = jax.vmap(along)(here, _directions(key, here))
-            # Of the square: a length has no slope at zero.
+            # Computed from the square, since a norm has no gradient at zero.
             stretch = jnp.log(jnp.sum(stretched**2, axis=-1) + LEAST_STRETCH) / 2
             gap, rest = place - canonical[rows], jax.vmap(warped)(still) - still
             return _length(gap), _length(rest), stretch**2
@@ -247,7 +283,7 @@ def _length(gap, soft=SOFT):
 
 
 def _drawn(paths, frames, key):
-    """What a step looks at: some of the frames, rows of points, and points at rest."""
+    """Random frames, rows of points and static points of a step."""
     frame_key, row_key, still_key = jax.random.split(key, 3)
     together = min(FRAMES_AT_ONCE, frames)
     chosen = jax.random.choice(frame_key, frames, (together,), replace=False)

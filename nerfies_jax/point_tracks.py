@@ -1,4 +1,4 @@
-"""Points followed through time by the warp or the scene flow of a radiance field."""
+"""Point tracks by the warp or the scene flow of a radiance field."""
 
 import jax
 import jax.numpy as jnp
@@ -25,13 +25,22 @@ def follow(
     known: GroundTruth,
     effects: tuple[Effect, ...] = (),
 ) -> PointTracks | None:
-    """Points of the start at all other moments, through the template of a field.
+    """Track points from the start to all other times, through the template of a field.
 
-    A point goes to the template by the warp of the start, and from there by the inverse
-    warp of every other moment. Without a warp, a scene flow takes it from each moment
-    to the next, and nothing says how it strains. `known.start_points` [tracks, 3] and
-    the result are in scene units, `state` is that of `scene.build`. None without such
-    motion or without points.
+    A point is mapped to the template by the warp of the start, and from there by the
+    inverse warp of every other time. Without a warp, a scene flow takes it from each
+    time to the next, and the strain is not defined.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      state: Trained state, of `scene.build`.
+      capture: The capture.
+      known: Ground truth, whose start points are tracked.
+      effects: Effects in addition to those of the spec.
+
+    Returns:
+      The tracks in scene units. None without such motion or without points.
     """
     field = scene.field(spec, metadata, effects=effects)
     if not len(known.path):
@@ -92,7 +101,9 @@ def _static_points(capture):
 
 
 def _follow_flow(field, state, capture, known):
-    """From the start outward, moment by moment; None without a scene flow."""
+    """Track outward from the start, time by time, or return None without a scene
+    flow.
+    """
     move = _flow_mover(field)
     if move is None:
         return None
@@ -159,7 +170,16 @@ def _flow_mover(field) -> Move | None:
 
 
 def mover(spec, metadata, effects=()) -> Move | None:
-    """What takes points of one view's moment to another's; None without a motion."""
+    """Return the motion of points from the time of one view to that of another.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      effects: Effects in addition to those of the spec.
+
+    Returns:
+      The motion, or None if nothing in the scene moves points.
+    """
     field = scene.field(spec, metadata, effects=effects)
     if all(effect.displace is None for effect in field.effects):
         return _flow_mover(field)

@@ -1,4 +1,4 @@
-"""Names for processes that tell later whether a process has ended."""
+"""Names of processes from which it can later be told whether a process has ended."""
 
 import functools
 import hashlib
@@ -11,7 +11,11 @@ PATTERN = r"(?P<pid>\d+)-(?P<start>\d+)-(?P<machine>[0-9a-f]{6})"
 
 
 def own_name() -> str:
-    """Return the name of this process: its id, its start and its machine."""
+    """Return the name of this process: its id, its start and its machine.
+
+    Returns:
+      The name.
+    """
     pid = os.getpid()
     return f"{pid}-{_start_of(pid) or 0}-{machine()}"
 
@@ -19,10 +23,13 @@ def own_name() -> str:
 def has_ended(name: str) -> bool:
     """Return whether the process of a name has ended.
 
-    A process of another machine, or of another container, may be running.
+    A process of another machine, or of another container, counts as running.
 
     Args:
-      name: What `own_name` returned there.
+      name: Result of `own_name` in that process.
+
+    Returns:
+      True if it has ended.
     """
     parts = re.fullmatch(PATTERN, name)
     if parts is None or parts["machine"] != machine():
@@ -32,7 +39,12 @@ def has_ended(name: str) -> bool:
 
 @functools.lru_cache(maxsize=1)
 def machine() -> str:
-    """Return six hexadecimal digits of this machine and its process ids."""
+    """Return six hexadecimal digits that identify this machine and its process
+    namespace.
+
+    Returns:
+      The digits.
+    """
     try:  # containers number their processes anew
         processes = os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -41,7 +53,7 @@ def machine() -> str:
 
 
 def _start_of(pid):
-    """When a process was started, by a clock that nobody sets; None where it ended."""
+    """Start of a process by a monotonic clock, or None if it has ended."""
     try:
         stat = pathlib.Path(f"/proc/{pid}/stat").read_text()
     except OSError:

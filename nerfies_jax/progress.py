@@ -123,7 +123,7 @@ class _Shown:
         return time.monotonic() - self.began
 
     def line(self) -> str:
-        """What a log says of it."""
+        """Return the line of a log about the stage."""
         parts = []
         if self.total is not None and self.done:
             parts.append(self.counted.format(self.done, self.total))
@@ -246,14 +246,21 @@ def _bar_text(shown):
 
 
 def _seconds_left(shown):
-    """By the items that are finished; None before there are enough to tell."""
+    """Remaining time by the number of finished items, or None if there are too few."""
     if not shown.total or not shown.done or shown.seconds < FIRST_LINE_SECONDS:
         return None
     return max(0.0, shown.seconds * (shown.total / shown.done - 1))
 
 
 def training_text(event: dict[str, Any]) -> str:
-    """Describe a `train` event: speed, loss, PSNR, counts and remaining time."""
+    """Describe a `train` event: speed, loss, PSNR, counts and remaining time.
+
+    Args:
+      event: The event.
+
+    Returns:
+      The text.
+    """
     parts = [f"{event['steps_per_second']:.3g} steps/s"]
     metrics = event["metrics"]
     if "loss" in metrics:
@@ -266,7 +273,14 @@ def training_text(event: dict[str, Any]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Hours, minutes and seconds, as short as they can be read: 1:02:03, 2:05."""
+    """Format a duration as hours, minutes and seconds, such as 1:02:03 or 2:05.
+
+    Args:
+      seconds: The duration.
+
+    Returns:
+      The text.
+    """
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -1,4 +1,4 @@
-"""One ray through a radiance field: sample, warp, ask the template, composite."""
+"""Rendering of one ray of a radiance field: sample, warp, evaluate, composite."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ Features = Float[Array, " _"]
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """A field with its parameters: what all its rays have in common."""
+    """A field with its parameters, shared by all rays."""
 
     spec: RadianceScene
     metadata: SceneMetadata
@@ -34,12 +34,28 @@ class Bound:
     params: PyTree
 
     def own(self, effect: Effect) -> PyTree:
-        """The parameters of one effect, None without any."""
+        """Return the parameters of one effect.
+
+        Args:
+          effect: The effect.
+
+        Returns:
+          Its parameters, None without any.
+        """
         return self.params.get(effect.name)
 
 
 def displacement(bound: Bound, point: Vector, condition: FrameCondition) -> Vector:
-    """Template point minus observed point: what all warps do, one after the other."""
+    """Compute template point minus observed point, the sum of all warps in order.
+
+    Args:
+      bound: The field with its parameters.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      The displacement in units of the field, [3].
+    """
     return _displaced(bound, point, _marked(bound, point, condition))
 
 
@@ -64,10 +80,18 @@ def _displaced(bound, point, condition):
 def mean_flow(
     bound: Bound, point: Vector, condition: FrameCondition
 ) -> Float[Array, "2 3"]:
-    """Where what is at a point goes to by the next moment, and was before, minus it.
+    """Compute the scene flow at a point, to the next and the previous interval.
 
-    The medium of the scene flow says it of itself, and what is static stays: the mean
-    of both by their opacity there. Zero where nothing is. In units of the field.
+    It is the mean of the flow of the medium and of the static scene, weighted by their
+    opacity at the point.
+
+    Args:
+      bound: The field with its parameters.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      Displacements in units of the field [2, 3], zero in empty space.
     """
     ray = Ray(point, jnp.asarray((0, 0, 1), point.dtype), *jnp.zeros(2, point.dtype))
     samples = _samples(bound, ray, condition, jnp.zeros(1, point.dtype))
@@ -84,7 +108,7 @@ def mean_flow(
 
 
 class _Samples(NamedTuple):
-    """Samples of one ray before the template is asked."""
+    """Samples of one ray before the template is evaluated."""
 
     distance: Float[Array, " samples"]
     point: Float[Array, "samples 3"]
@@ -93,14 +117,30 @@ class _Samples(NamedTuple):
 
 
 def is_moved(effects: tuple[Effect, ...]) -> bool:
-    """Whether the template is asked elsewhere, or of more, than where a point is."""
+    """Return whether the template is evaluated at displaced or ambient coordinates.
+
+    Args:
+      effects: The effects of a field.
+
+    Returns:
+      True if any effect displaces points or adds coordinates.
+    """
     return any(e.displace is not None or e.lift is not None for e in effects)
 
 
 def asked_at(
     bound: Bound, point: Vector, condition: FrameCondition
 ) -> tuple[Vector, tuple[Features, ...]]:
-    """Where the template is asked for an observed point, and what lifts add to it."""
+    """Return the coordinates at which the template is evaluated for an observed point.
+
+    Args:
+      bound: The field with its parameters.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      The displaced point [3], and the features of each effect that adds coordinates.
+    """
     warped, condition = point, _marked(bound, point, condition)
     if any(effect.displace is not None for effect in bound.effects):
         warped = point + _displaced(bound, point, condition)
@@ -127,12 +167,21 @@ def render_ray(
     key: Key[Array, ""] | None,
     guide: occupancy.Cells | None = None,
 ) -> tuple[RayOutput, ...]:
-    """The levels of one ray, coarse to fine; without a key nothing is random.
+    """Render all levels of one ray.
 
-    A `guide` says which cells of space are filled (`OccupancySpec`).
+    Warps and ambient coordinates are evaluated once per sample. The fine level reuses
+    those of the coarse samples, which the published code computes again (a third of its
+    warps).
 
-    Warps and lifts are asked once per sample: the fine level takes those of the coarse
-    samples over, which the published code computes again (a third of its warps).
+    Args:
+      bound: The field with its parameters.
+      ray: The ray in units of the field.
+      condition: Conditioning of the frame.
+      key: PRNG key. Without a key nothing is random.
+      guide: Occupied cells (`OccupancySpec`), or None.
+
+    Returns:
+      The output of each level, coarse to fine.
     """
     spec, plan = bound.spec, bound.spec.sampling
     coarse_key, fine_key, noise_key = (
@@ -178,7 +227,17 @@ def render_ray(
 def color_offset(
     bound: Bound, name: str, direction: Vector, condition: FrameCondition
 ) -> Features:
-    """What the color branch of one level makes of a ray (`template.color_offset`)."""
+    """Compute the contribution of a ray to the color branch of one level.
+
+    Args:
+      bound: The field with its parameters.
+      name: Name of the level.
+      direction: Unit direction of the ray, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      The contribution, as of `template.color_offset`.
+    """
     one, net = template_of(bound.spec, name), bound.params["template"][name]
     inputs = []
     if one.direction is not None:
@@ -200,9 +259,18 @@ def radiance_at(
     condition: FrameCondition,
     noise: Scalar | None = None,
 ) -> template.Radiance:
-    """What the template of one level says where it is asked, by `asked_at`.
+    """Evaluate the template of one level.
 
-    `offset` is the `color_offset` of the ray, `noise` is added to the raw density.
+    Args:
+      bound: The field with its parameters.
+      name: Name of the level.
+      place: Coordinates from `asked_at`.
+      offset: `color_offset` of the ray.
+      condition: Conditioning of the frame.
+      noise: Noise added to the raw density, or None.
+
+    Returns:
+      Density and color.
     """
     warped, lifted = place
     one, net = template_of(bound.spec, name), bound.params["template"][name]
@@ -214,8 +282,8 @@ def radiance_at(
 
 
 def _radiance(bound, name, ray, condition, samples, noise):
-    """What the template of one level says at the samples of one ray, and what surfaces
-    there look like, by effect.
+    """Template of one level at the samples of one ray, and surface features by
+    effect.
     """
     offset = color_offset(bound, name, ray.direction, condition)
     surfaces = [effect for effect in bound.effects if effect.surface is not None]
@@ -233,7 +301,9 @@ def _radiance(bound, name, ray, condition, samples, noise):
 
 
 def _surface_at(bound, name, surfaces, seen, condition, noise):
-    """As `radiance_at`, with what these effects say of the surface at a point."""
+    """Same as `radiance_at`, with the features of these effects for the surface at a
+    point.
+    """
     point, (warped, lifted), offset = seen
     one, net = template_of(bound.spec, name), bound.params["template"][name]
 
@@ -249,7 +319,7 @@ def _surface_at(bound, name, surfaces, seen, condition, noise):
         def moved(point):
             return point + displacement(fixed, point, jax.lax.stop_gradient(condition))
 
-        # Of the density in the observation, f(x) = F(x + d(x)), the slope is JᵀF'.
+        # The density in the observation is f(x) = F(x + d(x)), with the gradient JᵀF'.
         return jax.vjp(moved, still_point)[1](normal)[0]
 
     def outward():
@@ -268,7 +338,7 @@ def _surface_at(bound, name, surfaces, seen, condition, noise):
 
 
 def _media(bound, effects, ray, condition, samples, radiance) -> dict[str, Medium]:
-    """What these effects put on the ray, by their names."""
+    """Media that these effects put on the ray, by name."""
     media = {}
     for effect in effects:
 
@@ -324,9 +394,17 @@ def _composite(bound, ray, samples, radiance, media):
 def says_beta(
     effects: tuple[Effect, ...], media: Mapping[str, Medium]
 ) -> Effect | None:
-    """The one effect whose medium says how uncertain a ray's color is, if any does.
+    """Find the effect whose medium provides the uncertainty of a ray's color.
 
-    ValueError where two say it, or one that has no `beta_min`.
+    Args:
+      effects: The effects of a field.
+      media: Media by the name of their effect.
+
+    Returns:
+      The effect, or None.
+
+    Raises:
+      ValueError: If two media provide it, or the effect has no `beta_min`.
     """
     said_by = None
     for effect in effects:
@@ -349,7 +427,7 @@ def says_beta(
 
 
 def _uncertainty(bound, media, media_weight):
-    """Of the ray's color; None where no medium says it."""
+    """Uncertainty of the ray's color, or None if no medium provides it."""
     effect = says_beta(bound.effects, media)
     if effect is None:
         return None

@@ -1,4 +1,4 @@
-"""Radiance fields of the NeRF family, as `nerfies_jax.runs` finds them."""
+"""The representation of radiance fields of the NeRF family, for `nerfies_jax.runs`."""
 
 from nerfies_jax import (
     held_out_codes,
@@ -20,16 +20,23 @@ from nerfies_jax.training.track_start import FROM_REST
 # Between these advice chooses by whether anything moves.
 ADVISED = ("nerf", "nerfies")
 MOTIONS = ("warp", "time", "scene_flow")
-# What goes with them, in the order in which each can be taken out.
+# Effects that depend on them, in the order in which each can be removed.
 MOTION_PARTS = ("elastic", "background", "mask", "ambient", *MOTIONS)
 
 
 def advise(
     wanted: dict[str, bool | None], full: bool, family: str | None = None
 ) -> Choice:
-    """The preset and its changes for what a capture calls for.
+    """Recommend a preset and overrides for the effects that a capture needs.
 
-    A `family` that is none of `ADVISED` stays, unless it cannot move and should.
+    Args:
+      wanted: Decision for each effect, None if undecided.
+      full: True for the sizes of the papers.
+      family: A preset without "-small". One that is not in `ADVISED` is kept, unless it
+        is static and motion is needed.
+
+    Returns:
+      The recommendation.
     """
     overrides, notes = [], []
     drifts, passes = wanted.get(LIGHT), wanted.get(TRANSIENT)

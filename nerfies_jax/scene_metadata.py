@@ -1,4 +1,4 @@
-"""What a radiance field must know of its capture before anything is compiled."""
+"""Scene metadata of a radiance field, computed from a capture before compilation."""
 
 import dataclasses
 import itertools
@@ -14,7 +14,7 @@ OUTLIERS = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class SceneMetadata:
-    """Static, hashable; `metadata_of` reads them from a capture."""
+    """Bounds, scale, times and exposures of a scene. Static and hashable."""
 
     near: float  # z-depth, scene units
     far: float
@@ -30,10 +30,15 @@ class SceneMetadata:
 
 
 def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
-    """The metadata of a capture; host side.
+    """Compute the scene metadata of a capture, on the host.
 
-    The filmed volume becomes a box whose longest half-side is `extent` units of the
-    field; None keeps the capture's own coordinates.
+    Args:
+      capture: The capture.
+      extent: Longest half side of the captured volume in units of the field. None keeps
+        the capture's own coordinates.
+
+    Returns:
+      The metadata.
     """
     near, far = _span(capture)
     center, half_side = _box(capture, near, far)
@@ -68,7 +73,7 @@ def _span(capture):
     where the first point is at 0.4), and samples there are lost.
     """
     depth = point_depths(capture)
-    # Those beyond the far plane are not filmed; were all there, near would pass far.
+    # Points beyond the far plane are not observed. If all were, near would exceed far.
     depth = depth[depth < capture.far]
     if depth.size < MIN_POINTS:
         return float(capture.near), float(capture.far)
@@ -122,7 +127,15 @@ def _frustum_points(capture, near, far, depths=8):
 
 
 def exposures(capture: Capture) -> tuple[tuple[int, int, float], ...]:
-    """`SceneMetadata.exposures`; one row for each id that is learned from."""
+    """Compute `SceneMetadata.exposures`, the position of each appearance id among the
+    trained.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Two rows of the table of trained ids and the position between them, for each id.
+    """
     ids = np.asarray(capture.appearance_ids)
     learned = np.unique(ids[capture.train])
     row_of = {int(learned_id): row for row, learned_id in enumerate(learned)}

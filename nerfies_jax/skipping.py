@@ -1,11 +1,11 @@
-"""A frame of a radiance field by the samples that count: empty space is skipped.
+"""Rendering of a frame of a radiance field with empty-space skipping.
 
-The samples are those of `render_ray`, so the picture is that of the full quadrature but
-for what skipped samples would have added. A sample is skipped in a cell that was found
-empty (`survey`) or behind what lets no light through. What is left is gathered into
-dense batches, and the networks are asked of these alone. Warps of long waves are asked
-on a `frustum_grid` of the frame, and then the cells are those of the template, the same
-at all times.
+The samples are those of `render_ray`, so the image is that of the full quadrature
+except for the contributions of skipped samples. A sample is skipped in a cell that was
+found empty (`survey`) or behind an opaque region. The others are gathered into dense
+batches, and the networks are evaluated at these alone. Warps with long wavelengths are
+evaluated on a `frustum_grid` of the frame, and then the cells are those of the
+template, the same at all times.
 """
 
 import functools
@@ -43,13 +43,13 @@ GUIDE = "guide"
 # Blender lego after 3000 steps: 67 to 72 dB from the whole quadrature, 27.515 dB from
 # the truth for 27.512, in 514 ms for 619 with 0.01, at which it was 69 to 78.
 SKIPPED_DEPTH = 0.05
-# Of what guides samples, from near to far. What is thinner is haze, which nobody has
-# looked at yet: of 0.01 two cells of three of Blender lego are filled after 1000 steps,
-# of this 3 in a hundred.
+# Optical depth from near to far above which a cell guides samples. Thinner cells are
+# haze that no ray has trained yet: with 0.01 two of three cells of Blender lego are
+# occupied after 1000 steps, with this 3 of a hundred.
 GUIDE_DEPTH = 3.0
 OPAQUE_DEPTH = 7.0  # e^-7 = 9e-4 of the light passes
-# What moves, unless by warps that are read on a grid, is surveyed anew for every frame,
-# and each look costs a warp of every cell.
+# Dynamic fields, unless their warps are read on a grid, are surveyed anew for every
+# frame, and each look costs a warp of every cell.
 STILL_CELLS, MOVING_CELLS = 64, 40
 LOOKS = 2  # at each cell
 BATCH = 2048  # points asked at once
@@ -60,10 +60,17 @@ STAGES = 4  # in which a ray is followed; behind what is opaque no further one i
 
 
 def usable(spec, effects) -> bool:
-    """Whether a field can be surveyed before its frames are drawn.
+    """Return whether a field can be surveyed before its frames are rendered.
 
-    Not where a second medium shares its rays, where color reads of surfaces, or where
-    nothing says how large what was filmed is.
+    This is not possible if a second medium shares its rays, if color depends on
+    surfaces, or if the size of the captured volume is unknown.
+
+    Args:
+      spec: The scene.
+      effects: The effects of the field.
+
+    Returns:
+      True if it can.
     """
     return (
         spec.extent is not None
@@ -77,13 +84,20 @@ def survey(
     condition: FrameCondition,
     shown: occupancy.Cells | None = None,
 ) -> Occupancy:
-    """Which cells each level's density fills at the time of one frame; pure.
+    """Find the cells that each level's density fills at the time of one frame.
 
-    A cell is filled where a random point in it is so dense that light that went from
-    near to far through nothing else would meet an optical depth above `SKIPPED_DEPTH`.
-    What guides samples (`OccupancySpec`) is any level's above `GUIDE_DEPTH`. Of cells
-    that are neither `shown` nor beside such a one nothing is asked: they count as
-    filled.
+    A cell is filled if a random point in it is so dense that light passing through
+    nothing else from near to far would meet an optical depth above `SKIPPED_DEPTH`.
+    Samples are guided (`OccupancySpec`) by the cells of any level above `GUIDE_DEPTH`.
+
+    Args:
+      bound: The field with its parameters.
+      condition: Conditioning of the frame.
+      shown: Cells that the image can show. Cells that are neither shown nor adjacent to
+        such a cell are not evaluated and count as filled. None for all.
+
+    Returns:
+      Occupied cells by level.
     """
     spec, metadata = bound.spec, bound.metadata
     cells = cells_across(bound)
@@ -127,15 +141,30 @@ def survey(
 
 
 def cells_across(bound: Bound) -> int:
-    """How many cells a survey has along each axis."""
+    """Return the number of cells of a survey along each axis.
+
+    Args:
+      bound: The field with its parameters.
+
+    Returns:
+      The number of cells.
+    """
     return MOVING_CELLS if is_moved(bound.effects) else STILL_CELLS
 
 
 def shown_cells(bound: Bound, camera: Camera, size: tuple[int, int]) -> occupancy.Cells:
-    """The cells that rays of a picture may meet between the near and far planes; pure.
+    """Find the cells that rays of an image may meet between the near and far planes.
 
-    Left out are those whose eight corners lie beyond one of six planes: these two, and
-    four that have the rays of the picture's border between them.
+    Cells are excluded if their eight corners lie beyond one of six planes: these two,
+    and four that bound the rays of the image's border.
+
+    Args:
+      bound: The field with its parameters.
+      camera: The camera.
+      size: Width and height of the image in pixels.
+
+    Returns:
+      Booleans, [cells, cells, cells].
     """
     metadata, dtype = bound.metadata, camera.position.dtype
 
@@ -173,7 +202,18 @@ def draw(
     condition: FrameCondition,
     size: tuple[int, int],
 ) -> Rendering:
-    """A whole frame; without slopes, for how much there is to ask is not known."""
+    """Render a whole frame. Not differentiable, since the number of evaluations varies.
+
+    Args:
+      bound: The field with its parameters.
+      occupied: Occupied cells from `survey`.
+      camera: The camera.
+      condition: Conditioning of the frame.
+      size: Width and height of the image in pixels.
+
+    Returns:
+      The rendered image.
+    """
     width, height = size
     pixels = width * height
     blocks = -(-pixels // BLOCK)
@@ -200,7 +240,9 @@ def draw(
 
 
 def _block(bound, occupied, camera, condition, position, columns):
-    """Some rays, through these pixel positions; `columns` of a grid, None without."""
+    """Render some rays, through these pixel positions, with `columns` of a grid if
+    any.
+    """
     plan, behind = bound.spec.sampling, bound.metadata.background
     ray, cosine = jax.vmap(lambda p: field_ray_through(bound.metadata, camera, p))(
         position
@@ -253,7 +295,7 @@ def _block(bound, occupied, camera, condition, position, columns):
 
 
 class _Asked(NamedTuple):
-    """Where the template was asked; zero for samples that were skipped."""
+    """Coordinates at which the template was evaluated, zero for skipped samples."""
 
     known: Bool[Array, "rays samples"]
     place: tuple[Float[Array, "rays samples 3"], tuple[Array, ...]]
@@ -262,11 +304,12 @@ class _Asked(NamedTuple):
 def _ask(
     bound, name, occupied, ray, condition, distance, spacing, values, before, moved
 ):
-    """[rays, samples, values] density and, of four, color; zero where skipped.
+    """Density and, if there are four values, color [rays, samples, values], zero if
+    skipped.
 
-    Where a grid says what warps displace all samples by, it is `moved`. Else what warps
-    and lifts said of samples `before` is not computed again; without it what they say
-    here is returned as well.
+    `moved` is the displacement of all samples, if warps are read on a grid. Otherwise
+    warps and ambient coordinates of the samples `before` are not computed again.
+    Without those the ones computed here are returned as well.
     """
     count, samples = distance.shape
     point = ray.origin[:, None] + distance[..., None] * ray.direction[:, None]
@@ -334,9 +377,14 @@ def _ask(
 def compacted(
     ask: Callable[[Int[Array, " batch"]], PyTree], wanted: Bool[Array, " places"]
 ) -> PyTree:
-    """`ask` of the places that are wanted, batch by batch; zero at all others.
+    """Evaluate a function only where it is wanted, batch by batch.
 
-    Its leaves have an axis of the batch in front, and an axis of all places here.
+    Args:
+      ask: Function of indices [batch], whose results have a leading axis [batch].
+      wanted: True for places to evaluate, [places].
+
+    Returns:
+      Results with a leading axis [places], zero where not wanted.
     """
     places = wanted.shape[0]
     order = jnp.cumsum(wanted, dtype=jnp.int32)

@@ -1,4 +1,4 @@
-"""Where the time of a training step of a radiance field goes."""
+"""Time of the parts of a training step of a radiance field."""
 
 import jax
 
@@ -17,11 +17,22 @@ def parts(
     frames: Frames,
     effects: tuple[Effect, ...] = (),
 ) -> StepParts:
-    """Begin to compile the parts of one step of a radiance field.
+    """Begin to compile the parts of one training step of a radiance field.
 
-    Their times are medians of warm calls, in milliseconds, each part timed by itself on
-    a micro-batch of rays, and counted for as many as a device takes in a step. "rest"
-    is what they leave of the whole step.
+    Times are medians of warm calls in milliseconds. Each part is timed by itself on a
+    micro-batch of rays, and multiplied by the number of those that a device processes
+    in a step. "rest" is the remainder of the whole step.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      model: Its model.
+      state: Training state.
+      frames: Training frames.
+      effects: Effects in addition to those of the spec.
+
+    Returns:
+      The parts.
     """
     field = scene.field(spec, metadata, effects=effects)
     batch_key, loss_key = jax.random.split(loop.step_key(state))

@@ -182,7 +182,11 @@ def install_for_program(package: str, script: str) -> None:
 
 
 def is_installed() -> bool:
-    """Return whether signals are requests in this process."""
+    """Return whether signals are requests in this process.
+
+    Returns:
+      True after `install`.
+    """
     return _PROCESS is not None
 
 
@@ -199,7 +203,11 @@ def check() -> None:
 
 
 def requested() -> bool:
-    """Return whether a signal has arrived that a loop or a safe point is to answer."""
+    """Return whether a signal has arrived that a loop or a safe point is to answer.
+
+    Returns:
+      True if one has.
+    """
     if _PROCESS is not None:
         return _PROCESS.number is not None
     return any(loop.name is not None for loop in _LOOPS)
@@ -207,7 +215,11 @@ def requested() -> bool:
 
 @contextlib.contextmanager
 def protected() -> Iterator[None]:
-    """Keep the process from being ended by the first signal while the block runs."""
+    """Keep the process from being ended by the first signal while the block runs.
+
+    Yields:
+      None.
+    """
     process = _PROCESS
     if process is None:
         yield
@@ -227,13 +239,20 @@ def at_end(clean_up: Callable[[], object]) -> None:
 
     It runs in another thread while the main thread goes on, so it must not wait for
     locks.
+
+    Args:
+      clean_up: The function.
     """
     if clean_up not in _AT_END:
         _AT_END.append(clean_up)
 
 
 def advise(line: str) -> None:
-    """Set the line that is printed when a signal ends the process, "" for none."""
+    """Set the line that is printed when a signal ends the process.
+
+    Args:
+      line: The line, "" for none.
+    """
     if _PROCESS is not None:
         _PROCESS.advice = line
 
@@ -243,6 +262,9 @@ def ending(name: str) -> list[str]:
 
     Args:
       name: Name of the signal.
+
+    Returns:
+      The lines.
     """
     lines = ["interrupted" if name == "SIGINT" else f"stopped by {name}"]
     if _PROCESS is not None and _PROCESS.advice:
@@ -251,11 +273,11 @@ def ending(name: str) -> list[str]:
 
 
 class StopRequests:
-    """Lets a loop answer signals: the first is only noted, the loop then returns.
+    """Lets a loop answer signals: the first is only noted, and the loop then returns.
 
-    Where `install` was called, a second signal ends the process. Elsewhere a second
-    SIGINT raises KeyboardInterrupt. A signal that was ignored stays ignored. Outside
-    the main thread, where Python delivers no signals, nothing is installed.
+    After `install`, a second signal ends the process. Elsewhere a second SIGINT raises
+    KeyboardInterrupt. A signal that was ignored stays ignored. Outside the main thread,
+    where Python delivers no signals, nothing is installed.
     """
 
     def __init__(self):
@@ -301,8 +323,11 @@ class StopRequests:
 def exits() -> Iterator[None]:
     """End the block by SIGTERM and SIGHUP as by Ctrl-C, with exit code 128 + signal.
 
-    For code that is called where `install` was not. The next signal of the same kind
-    ends the process.
+    For code that is called without `install`. The next signal of the same kind ends the
+    process.
+
+    Yields:
+      None.
     """
     if is_installed():
         yield
@@ -320,7 +345,7 @@ def exits() -> Iterator[None]:
 
 
 def _installed(handler, names):
-    """Install a handler; return the earlier ones by number."""
+    """Install a handler, and return the earlier ones by number."""
     before = {}
     if threading.current_thread() is threading.main_thread():
         for name in names:

@@ -1,4 +1,4 @@
-"""A trained field drawn otherwise: effects left out, appearances blended."""
+"""Variants of a trained field: effects left out, appearances blended."""
 
 from typing import NamedTuple
 
@@ -22,9 +22,18 @@ class Between(NamedTuple):
 
 
 def parts(spec, metadata, effects: tuple[Effect, ...] = ()) -> Parts:
-    """What displaces points or lies before the scene can be left out."""
+    """Return the effects that can be left out: those that displace points, and media.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      effects: Effects in addition to those of the spec.
+
+    Returns:
+      The removable effects, and whether the field has appearance codes.
+    """
     whole = scene.field(spec, metadata, effects=effects)
-    # What feeds the network's inputs is part of it; a penalty draws nothing.
+    # Effects that feed the networks are part of them. A penalty renders nothing.
     removable = tuple(
         effect.name
         for effect in whole.effects
@@ -46,7 +55,22 @@ def without_effects(
     blended: bool,
     effects: tuple[Effect, ...] = (),
 ) -> Model:
-    """The model with some effects left out of its pictures, or drawing a `Between`."""
+    """Return the model with some effects left out, or with blended appearances.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      without: Names of the effects to leave out.
+      blended: True for a model that renders a `Between` in place of a view.
+      effects: Effects in addition to those of the spec.
+
+    Returns:
+      The model.
+
+    Raises:
+      ValueError: If an effect is not removable, or there are no appearance codes to
+        blend.
+    """
     check_there(without, parts(spec, metadata, effects).removable)
     field = scene.field(spec, metadata, without, effects)
     if blended and not _has_appearance(field):
@@ -71,7 +95,18 @@ def without_effects(
 
 
 def appearance_id(capture: Capture, name: str) -> int:
-    """The appearance of a frame, by its name, or an appearance id itself."""
+    """Return the appearance id of a frame.
+
+    Args:
+      capture: The capture.
+      name: Name of the frame, or an appearance id.
+
+    Returns:
+      The id.
+
+    Raises:
+      ValueError: If there is no such frame or id.
+    """
     if name in capture.ids:
         return int(capture.appearance_ids[capture.ids.index(name)])
     known = np.unique(capture.appearance_ids)
