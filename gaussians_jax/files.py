@@ -20,6 +20,7 @@ from nerfies_jax.capture.json_files import replaced_file
 
 MOST_HEADER_BYTES = ply_files.MAX_HEADER  # 62 properties take 1.5 kB
 SUFFIXES = (".ply", ".splat", ".spz")
+MOST_ROUNDING = 0.1  # of coordinates in double, in sizes of the median Gaussian
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
@@ -143,6 +144,7 @@ def _read_ply(path):
         with np.errstate(over="ignore", invalid="ignore"):
             return np.stack([vertex[name] for name in which], -1).astype(np.float32)
 
+    _refuse_map_coordinates(vertex)
     channels = columns(*rest).reshape(len(vertex), 3, -1)  # all red, then green, blue
     rows = Splats(
         mean=columns("x", "y", "z"),
@@ -160,6 +162,26 @@ def _read_ply(path):
     if behind > 0 and not text and len(ply.elements) == 1:
         notes += (f"left out: {behind} bytes after the last row",)
     return rows, notes
+
+
+def _refuse_map_coordinates(vertex):
+    """Refuse coordinates in double that float32 would move by the size of Gaussians."""
+    axes = [axis for axis in "xyz" if vertex[axis].dtype == np.float64]
+    if not axes or not len(vertex):
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = max(
+            float(np.nanmax(np.abs(vertex[axis] - vertex[axis].astype(np.float32))))
+            for axis in axes
+        )
+        scales = [np.float64(vertex[f"scale_{number}"]) for number in range(3)]
+        size = float(np.exp(np.median(scales)))
+    if np.isfinite(moved) and moved > MOST_ROUNDING * size:
+        raise ValueError(
+            f"float32 would move its coordinates in double by up to {moved:.2g}, where "
+            f"the median Gaussian has a size of {size:.2g}; subtract an origin from "
+            "them and write the file again"
+        )
 
 
 def _ply_header(path):

@@ -16,12 +16,14 @@ import numpy as np
 from gaussians_jax import files, splats
 from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax import events
+from nerfies_jax.capture import units
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import alike, replaced_folder
 from nerfies_jax.training.model import Model, TrainState
 
 # The Gaussians at a time in [0, 1].
 At = Callable[[float], Gaussians]
+MOST_STEP_PX = 0.1  # of coordinates in float32
 NUMBERED = "frame_{:04d}"  # viewers play files whose names differ in a number alone
 
 
@@ -85,11 +87,25 @@ def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:
 
 
 def in_world(rows: Splats, capture: Capture) -> Splats:
-    """The rows in the units of the capture's own files; host side.
+    """Convert rows to the units of the capture's own files; host side.
 
     A uniform scale changes no direction, so rotations and harmonics stay.
+
+    Raises:
+      ValueError: The world's coordinates are so large, as those of maps, that float32,
+        which is what Gaussian files hold, would move Gaussians visibly.
     """
-    mean = np.asarray(rows.mean, np.float64) / capture.scale + capture.center
+    mean = units.places_in("world", capture, np.asarray(rows.mean))
+    step = units.float32_step(mean)
+    step_px = units.in_pixels(capture, step * capture.scale)
+    if step_px > MOST_STEP_PX:
+        origin = ", ".join(f"{each:.9g}" for each in capture.center)
+        raise ValueError(
+            f"world coordinates reach {np.abs(mean).max():.4g}, where float32 has "
+            f"steps of {step:.2g}: {step_px:.2g} pixels of this capture, more than "
+            f"{MOST_STEP_PX}; write scene units instead, of which world = scene * "
+            f"{1 / capture.scale:.6g} + ({origin})"
+        )
     log_scale = np.asarray(rows.log_scale, np.float64) - math.log(capture.scale)
     return rows._replace(
         mean=jnp.asarray(mean, rows.mean.dtype),

@@ -92,7 +92,7 @@ def read(
     if points is not None and len(points.position) >= 3:
         notes += pose_conventions.check(cameras, points.position, size, where)
     placement, more = _place(cameras, points, split.transforms, size)
-    offset = cameras.position.astype(np.float64) - placement.center
+    offset = cameras.position - placement.center
     times, camera_ids, when = _times(entries, split)
     if camera_ids is None:
         camera_ids = _camera_ids(entries, times, split, is_train)
@@ -163,7 +163,7 @@ def _picture(root, entry, file):
 
 
 def _cameras(entries, transforms, size, where):
-    """World cameras for the pictures of this size, and what had to be assumed."""
+    """Cameras in world units, their positions float64, and what had to be assumed."""
     cameras, lenses = [], []
     for entry in entries:
         label = f"{where}: frame {entry.file_path!r}"
@@ -171,7 +171,7 @@ def _cameras(entries, transforms, size, where):
         rotation, position = _pose(entry.transform_matrix, label)
         one = Camera(
             camera_from_world=rotation.astype(np.float32),
-            position=position.astype(np.float32),
+            position=position,
             focal_px=np.float32(lens.focal_px[0]),
             principal_point_px=np.float32(lens.principal_point_px),
             skew_px=np.float32(0),
@@ -206,13 +206,14 @@ def _pose(matrix, label):
 def _place(cameras, points, transforms, size):
     if points is not None and len(points.position) >= 3:
         depths = []
+        local, position = frames.near_origin(cameras, points.position)
         for row in range(len(cameras.focal_px)):
-            _, depth, seen = frames.pixels_of(cameras, row, points.position, size)
+            _, depth, seen = frames.pixels_of(local, row, position, size)
             depths.append(depth[seen])
         depths = np.concatenate(depths)
         if depths.size:
-            positions = cameras.position.astype(np.float64)
-            return place_by_points(points.position, positions, depths), ()
+            placed = place_by_points(points.position, cameras.position, depths)
+            return placed, ()
     if transforms.camera_angle_x is not None and transforms.fl_x is None:
         radius = float(np.median(np.linalg.norm(cameras.position, axis=1)))
         usual = 0.75 * USUAL_RADIUS < radius < 1.25 * USUAL_RADIUS or radius == 0

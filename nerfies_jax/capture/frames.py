@@ -468,6 +468,17 @@ def pixels_of(
     return pixel, depth, inside & seen & (depth > 0)
 
 
+def near_origin(cameras: Camera, position: np.ndarray) -> tuple[Camera, np.ndarray]:
+    """Move cameras and points [points, 3] of a world together, in float64.
+
+    Returns them in float32, with the median point at the origin: map coordinates of
+    millions of meters have a resolution of half a meter in float32.
+    """
+    origin = np.median(position, axis=0)
+    moved = (cameras.position - origin).astype(np.float32)
+    return cameras._replace(position=moved), (position - origin).astype(np.float32)
+
+
 def colored_points(
     position: np.ndarray,
     images: np.ndarray,

@@ -96,7 +96,7 @@ def read_ply(path: pathlib.Path) -> PointCloud:
       path: The file.
 
     Returns:
-      Positions as stored, and colors, gray if the file has none.
+      Positions as stored (float64), and colors, gray if the file has none.
 
     Raises:
       CaptureError: If it is not such a file, has more than `MAX_POINTS`, or has colors
@@ -129,7 +129,7 @@ def read_ply(path: pathlib.Path) -> PointCloud:
             f"{path}: not a readable point cloud ({reason}); export it again"
         ) from None
     finite = np.isfinite(position).all(1)
-    return PointCloud(position[finite].astype(np.float32), color[finite])
+    return PointCloud(position[finite].astype(np.float64), color[finite])
 
 
 def _bytes(color, path):

@@ -1,6 +1,5 @@
 """Conventions of poses, recognized by the share of points that fall into the images."""
 
-import jax
 import numpy as np
 
 from nerfies_jax.capture import frames
@@ -73,8 +72,7 @@ def _others(cameras):
     }
     return {
         name: cameras._replace(
-            camera_from_world=rotation.astype(np.float32),
-            position=place.astype(cameras.position.dtype),
+            camera_from_world=rotation.astype(np.float32), position=place
         )
         for name, (rotation, place) in poses.items()
     }
@@ -82,7 +80,7 @@ def _others(cameras):
 
 def _share(cameras, points, size):
     """Mean share of the points that fall into an image."""
-    cameras = jax.tree.map(np.asarray, cameras)
+    cameras, points = frames.near_origin(cameras, points)
     seen = [
         frames.pixels_of(cameras, row, points, size)[2].mean()
         for row in range(len(cameras.focal_px))

@@ -127,6 +127,12 @@ def test_the_other_two_byte_orders_and_float64_are_read(kind, tmp_path):
     assert loaded.notes == ("left out: label",)
 
 
+def test_doubles_that_float32_would_move_are_refused(tmp_path):
+    write_ply(tmp_path / "a.ply", {"x": 4_649_776.3 + np.linspace(0, 1, 20)})
+    with pytest.raises(ValueError, match="float32 would move .* subtract an"):
+        files.load(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize("value", [np.nan, *full(np.inf)])
 def test_a_broken_row_is_named_or_dropped(value, tmp_path):
     path = tmp_path / "a.ply"

@@ -93,6 +93,10 @@ def test_world_units_place_and_size_gaussians_as_the_capture_does(swaying):
     np.testing.assert_allclose(
         np.exp(world.log_scale), 4 * np.exp(rows.log_scale), 1e-5
     )
+    # In meters of a map float32 has steps of half a meter.
+    far = dataclasses.replace(capture, center=(500_000.0, 4_649_776.0, 120.0))
+    with pytest.raises(ValueError, match=r"steps of 0\.5: .* scene \* 4 \+ \(500000, "):
+        instants.in_world(rows, far)
 
 
 @pytest.mark.hard_cases
