@@ -129,7 +129,7 @@ def test_the_other_two_byte_orders_and_float64_are_read(kind, tmp_path):
 
 def test_doubles_that_float32_would_move_are_refused(tmp_path):
     write_ply(tmp_path / "a.ply", {"x": 4_649_776.3 + np.linspace(0, 1, 20)})
-    with pytest.raises(ValueError, match="float32 would move .* subtract an"):
+    with pytest.raises(ValueError, match=r"float32 would move .* subtract an"):
         files.load(tmp_path / "a.ply")
 
 
