@@ -11,14 +11,15 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import plyfile
 
 from gaussians_jax import splats, spz
 from gaussians_jax.splats import SH_DC, Splats
-from nerfies_jax.capture import ply_files, text_files
+from nerfies_jax.capture import ply_files, safe_files, text_files
+from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.json_files import replaced_file
 
 MOST_HEADER_BYTES = ply_files.MAX_HEADER  # 62 properties take 1.5 kB
+MOST_BYTES = 4 * 2**30  # of a .splat or .spz file: 100 million Gaussians
 SUFFIXES = (".ply", ".splat", ".spz")
 MOST_ROUNDING = 0.1  # of coordinates in double, in sizes of the median Gaussian
 _REQUIRED = (
@@ -42,24 +43,28 @@ def load(path: str | os.PathLike, *, drop_broken: bool = False) -> Loaded:
     """Gaussians from a .ply, .splat or .spz file; host side.
 
     A row with NaN or infinity in it is an error that names it, or is left out and
-    counted with `drop_broken`. Every complaint is a ValueError of one line that starts
-    with the path.
+    counted with `drop_broken`.
+
+    Raises:
+      FileError: The file is damaged or no such file.
     """
     path = pathlib.Path(path)
     readers = dict(zip(SUFFIXES, (_read_ply, _read_splat, _read_spz), strict=True))
     if path.suffix.lower() not in readers:
-        raise ValueError(
+        raise FileError(
             f"{path}: no reader for {path.suffix or 'a name without suffix'}; "
             f"known are {', '.join(SUFFIXES)}"
         )
     if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+        raise FileError(f"{path}: no such file")
     try:
         rows, notes = readers[path.suffix.lower()](path)
         rows, dropped = _without_broken(rows, drop_broken)
-    except (ValueError, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{path}: {reason}") from error
+    except FileError:  # it names the path already
+        raise
+    except (ValueError, OSError, MemoryError, OverflowError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FileError(f"{path}: {reason}") from error
     return Loaded(Splats(*map(jnp.asarray, rows)), dropped, notes)
 
 
@@ -120,7 +125,7 @@ def _read_ply(path):
     text = b"\nformat ascii" in header
     try:
         ply = ply_files.read(path)
-    except (plyfile.PlyParseError, ValueError, OSError, MemoryError) as error:
+    except ValueError as error:
         raise ValueError(f"damaged PLY ({error})") from error
     if "vertex" not in ply:
         raise ValueError("no element 'vertex' in it")
@@ -186,24 +191,9 @@ def _refuse_map_coordinates(vertex):
 
 def _ply_header(path):
     """The header's bytes, once it is short and its counts can be true."""
-    size = path.stat().st_size
-    with path.open("rb") as stream:
+    with safe_files.open_file(path) as stream:
         head = text_files.utf8(stream.read(MOST_HEADER_BYTES))
-    if not head.startswith(b"ply"):
-        raise ValueError("not a PLY file: it does not start with 'ply'")
-    end = re.search(rb"\nend_header\r?\n", head)
-    if end is None:
-        raise ValueError(
-            f"no end_header in its first {MOST_HEADER_BYTES} bytes: truncated, or "
-            "not the header of a Gaussian file"
-        )
-    for name, count in re.findall(rb"\nelement (\S+) (\S+)", head[: end.start()]):
-        # A row has at least a byte; plyfile trips over a negative count when it maps.
-        if not count.isdigit() or int(count) > size:
-            claim = f"{count[:20].decode(errors='replace')} of "
-            claim += name[:20].decode(errors="replace")
-            raise ValueError(f"its header claims {claim} in {size} bytes")
-    return head[: end.end()]
+    return ply_files.check_header(head, path.stat().st_size)
 
 
 def _refuse_other_ply(ply, vertex):
@@ -253,7 +243,7 @@ def _ply_bytes(rows):
 
 
 def _read_splat(path):
-    data = path.read_bytes()
+    data = safe_files.read_bytes(path, MOST_BYTES)
     if not data:
         raise ValueError("empty: no Gaussians in it")
     if len(data) % _SPLAT_ROW.itemsize:
@@ -306,5 +296,5 @@ def _nearest_byte(values):
 
 
 def _read_spz(path):
-    unpacked = spz.decode(path.read_bytes())
+    unpacked = spz.decode(safe_files.read_bytes(path, MOST_BYTES))
     return Splats(*unpacked[:-1]), unpacked.notes

@@ -29,6 +29,7 @@ from gaussians_jax import splats
 from gaussians_jax.spec import SceneMetadata, SplatScene
 from gaussians_jax.splats import Params
 from nerfies_jax.capture import npz_files
+from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.training import specs
 
@@ -70,30 +71,34 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
 def load(path: str | os.PathLike) -> tuple[Params, dict[str, Any]]:
     """Parameters and description, as they were saved; host side.
 
-    Sequences in the description come back as tuples. Every complaint is a ValueError of
-    one line that starts with the path.
+    Sequences in the description come back as tuples.
+
+    Raises:
+      FileError: The file is damaged, or not that of a model.
     """
     path = pathlib.Path(path)
     if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+        raise FileError(f"{path}: no such file")
     try:
-        with zipfile.ZipFile(path) as archive:
+        with npz_files.archive(path) as archive:
             about = _about(archive)
             params = _put_together(about["params"], archive)
         description = specs.from_json(about["description"], SplatScene, SceneMetadata)
         _check(params)
-    except zipfile.BadZipFile as error:
-        raise ValueError(
-            f"{path}: not the file of a model, or damaged ({_line(error)}); save it "
-            "again with model_file.save"
-        ) from error
+    except FileError:  # it names the path already
+        raise
     except _BROKEN as error:
-        raise ValueError(f"{path}: {_line(error)}") from error
+        if isinstance(error.__cause__, zipfile.BadZipFile):
+            raise FileError(
+                f"{path}: not the file of a model, or damaged ({_line(error)}); save "
+                "it again with model_file.save"
+            ) from error
+        raise FileError(f"{path}: {_line(error)}") from error
     return params, description
 
 
-# What reading bytes that anyone may have written can raise, beside BadZipFile.
-_BROKEN = (*npz_files.DAMAGED, OSError, MemoryError)
+# What reading bytes that anyone may have written can raise.
+_BROKEN = (*npz_files.DAMAGED, OSError, ArithmeticError)
 
 
 def _line(error):
@@ -101,12 +106,12 @@ def _line(error):
 
 
 def _about(archive):
-    if ABOUT not in {name.removesuffix(".npy") for name in archive.namelist()}:
+    if ABOUT not in archive.names:
         raise ValueError(
             "an archive, but not of a model: it has no about.json; models are written "
             "by model_file.save"
         )
-    about = json.loads(_array(archive, ABOUT).tobytes())
+    about = json.loads(archive.read(ABOUT).tobytes())
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise ValueError(f"its about.json is not that of a {FORMAT}")
     if about.get("version") != VERSION:
@@ -115,11 +120,6 @@ def _about(archive):
             f"version {VERSION}; load it with the program that wrote it"
         )
     return about
-
-
-def _array(archive, name):
-    with archive.open(f"{name}.npy") as stream:
-        return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def _check(params):
@@ -175,7 +175,7 @@ def _put_together(structure, archive):
     if structure is None:
         return None
     if "array" in structure:
-        return jnp.asarray(_array(archive, structure["array"]))
+        return jnp.asarray(archive.read(structure["array"]))
     if "dict" in structure:
         items = structure["dict"].items()
         return {key: _put_together(item, archive) for key, item in items}

@@ -23,6 +23,7 @@ FRACTION_BITS = 12  # of a mean: steps of 1/4096 scene unit, range +-2048
 # Neither deflate nor the reference reader allows more; a header that asks for more rows
 # than the file could hold is refused before anything is allocated.
 MOST_EXPANSION = 1032
+MOST_WINDOW = 1 << 27  # bytes that decompressing may allocate; zstd's own default
 SMALLEST_THREE_STEPS = 511 * math.sqrt(2)  # nine bits over 1/sqrt(2)
 
 # y and z change sign between the two systems of axes.
@@ -171,7 +172,7 @@ def _open_zstd(data):
         raise ValueError(
             f"its table of {streams} streams at byte {table} does not fit the file"
         )
-    decompressor = _zstandard().ZstdDecompressor()
+    decompressor = _zstandard().ZstdDecompressor(max_window_size=MOST_WINDOW)
     parts = []
     for index, size in enumerate(wanted):
         packed, unpacked = struct.unpack_from("<QQ", data, table + 16 * index)
@@ -183,7 +184,8 @@ def _open_zstd(data):
             )
         try:
             # Streamed, because a frame need not say its size; one byte more would show.
-            part = decompressor.decompressobj().decompress(piece)
+            with decompressor.stream_reader(piece, read_across_frames=True) as reader:
+                part = reader.read(size + 1)
         except Exception as error:
             raise ValueError(f"stream {index} is damaged ({error})") from error
         if len(part) != size:

@@ -23,6 +23,7 @@ from nerfies_jax.capture.points import (
     place_by_points,
     read_ply,
 )
+from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.capture.transforms import read_split, stems
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
@@ -32,6 +33,7 @@ WHITE = (1.0, 1.0, 1.0)
 USUAL_RADIUS, USUAL_NEAR, USUAL_FAR = 4.0, 2.0, 6.0
 
 
+@confines
 def read(
     path: AnyPath,
     factor: int | None = None,

@@ -9,16 +9,13 @@ import numpy as np
 
 from nerfies_jax.capture import flow as flows
 from nerfies_jax.capture import given as givens
+from nerfies_jax.capture.errors import CaptureError as CaptureError
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.capture.given import Given
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
 MAX_ID = 2**20  # a table of codes longer than this is a broken id, not a capture
-
-
-class CaptureError(ValueError):
-    """A capture that cannot be used, with a one-line message that names the remedy."""
 
 
 class PointCloud(NamedTuple):

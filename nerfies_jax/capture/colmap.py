@@ -15,6 +15,7 @@ from nerfies_jax.capture.colmap_models import reconstruction
 from nerfies_jax.capture.formats import sparse_models
 from nerfies_jax.capture.json_files import AnyPath, inside
 from nerfies_jax.capture.points import place_by_points
+from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.geometry.camera import Camera
 
 PICTURES = ("images", "images_2", "images_4", "images_8", "input", "rgb", "")
@@ -34,6 +35,7 @@ class Model(NamedTuple):
     depths: np.ndarray  # z-depth of every kept observation
 
 
+@confines
 def read(
     path: AnyPath,
     factor: int | None = None,

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import OpenEXR
 
-from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture import safe_files
+from nerfies_jax.capture.errors import CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
 MAX_FLOATS = (
@@ -134,7 +135,7 @@ def _existing(path):
     path = pathlib.Path(path)
     if not path.is_file():
         raise CaptureError(f"{path}: no such picture; restore it or drop its frame")
-    return path
+    return safe_files.check(path)
 
 
 def _unreadable(path, error):

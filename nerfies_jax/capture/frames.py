@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from nerfies_jax import events
 from nerfies_jax.capture import images as pictures
-from nerfies_jax.capture import masks, text_files
+from nerfies_jax.capture import masks, npz_files, safe_files, text_files
 from nerfies_jax.capture.capture import CaptureError, PointCloud, blocks, shrink
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
@@ -275,7 +275,9 @@ def read_frames(
     any_alpha, unknown = False, {}
     stage = events.stage("reading images", len(paths))
     with ThreadPoolExecutor(4) as pool, stage as reading:
-        for row, (has_alpha, known) in enumerate(pool.map(decode, range(len(paths)))):
+        for row, (has_alpha, known) in enumerate(
+            pool.map(safe_files.carried(decode), range(len(paths)))
+        ):
             any_alpha |= has_alpha
             if known is not None:
                 unknown[row] = known
@@ -517,30 +519,25 @@ def colored_points(
 
 
 def load_array(path: pathlib.Path, most: int) -> np.ndarray:
-    """Load a numeric .npy file.
-
-    It is memory-mapped first, so a false header that claims more than the file holds
-    allocates nothing. Pickled objects are refused.
+    """Read a .npy file of numbers.
 
     Args:
-      path: The file.
-      most: Largest number of values.
-
-    Returns:
-      The array.
+        path: The file.
+        most: How many numbers it may have.
 
     Raises:
-      CaptureError: If it is not such a file, or has more values.
+        CaptureError: It is damaged, larger, or no array of numbers.
     """
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        reason = " ".join(str(error).split())
+        array = npz_files.read_npy(path, 8 * most + npz_files.MAX_HEADER)
+    except CaptureError:
+        raise
+    except ValueError as error:
         raise CaptureError(
-            f"{path}: not a readable array ({reason}); save it again with numpy.save"
+            f"{path}: not a readable array ({error}); save it again with numpy.save"
         ) from None
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+    if array.dtype.kind not in "fiu":
         raise CaptureError(f"{path}: not an array of numbers; save it with numpy.save")
     if array.size > most:
         raise CaptureError(f"{path}: {array.size} numbers; at most {most} are read")
-    return np.array(array)
+    return array

@@ -16,7 +16,7 @@ import PIL.Image
 import skimage.io
 from numpy.typing import ArrayLike
 
-from nerfies_jax.capture import exr
+from nerfies_jax.capture import exr, safe_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
@@ -51,8 +51,7 @@ def read_header(path: AnyPath) -> Header:
     path = pathlib.Path(path)
     if path.suffix.lower() == EXR:
         return _checked(path, Header(exr.read_size(path), "EXR", 1))
-    if not path.is_file():
-        raise CaptureError(f"{path}: no such picture; restore it or drop its frame")
+    _existing(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
@@ -65,6 +64,13 @@ def read_header(path: AnyPath) -> Header:
     except _PILLOW_ERRORS as error:
         raise _unreadable(path, error) from None
     return _checked(path, header)
+
+
+def _existing(path):
+    """Raise unless there is an image file that may be read."""
+    if not path.is_file():
+        raise CaptureError(f"{path}: no such picture; restore it or drop its frame")
+    safe_files.check(path)
 
 
 def _checked(path, header):
@@ -163,6 +169,7 @@ def opened(path: AnyPath) -> Iterator[PIL.Image.Image]:
     Raises:
       CaptureError: If it cannot be decoded.
     """
+    safe_files.check(path)
     try:
         with PIL.Image.open(path) as image:
             yield image

@@ -20,12 +20,12 @@ from typing import Any
 import msgspec
 
 from nerfies_jax import processes, stopping
-from nerfies_jax.capture import text_files
-from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture import safe_files, text_files
+from nerfies_jax.capture.errors import CaptureError
+from nerfies_jax.capture.safe_files import AnyPath as AnyPath
 
-MAX_JSON_BYTES = 256 * 2**20  # 20 000 frames of transforms.json are 20 MB
-
-AnyPath = str | os.PathLike
+# 20 000 frames of transforms.json are 20 MB. Decoded, a file may take 20 times as much.
+MAX_JSON_BYTES = 64 * 2**20
 
 # Of this process: what is not complete, and the folders where `sweep` has looked.
 _unfinished: set[pathlib.Path] = set()
@@ -38,31 +38,18 @@ _LEFT_BEHIND = re.compile(
 
 
 def read_json(path: AnyPath, kind: Any = Any) -> Any:
-    """Read a JSON file as a type.
+    """Read a JSON file.
 
     Args:
       path: The file.
-      kind: Type to decode to, for msgspec.
-
-    Returns:
-      The decoded value.
+      kind: The type to decode it as, for msgspec.
 
     Raises:
-      CaptureError: If the file cannot be read, contains NaN, or does not match the
-        type.
+      CaptureError: It is not JSON, has a NaN or a number that float64 cannot hold, is
+        nested deeper than the decoder goes, has a wrong type or lacks a key.
     """
     path = pathlib.Path(path)
-    try:
-        size = path.stat().st_size
-        if size > MAX_JSON_BYTES:
-            raise CaptureError(
-                f"{path}: {size} bytes of JSON; at most {MAX_JSON_BYTES} are read"
-            )
-        text = path.read_bytes()
-    except OSError as error:
-        raise CaptureError(
-            f"{path}: {error.strerror or error}; check the path"
-        ) from None
+    text = safe_files.read_bytes(path, MAX_JSON_BYTES)
     try:
         text = text_files.utf8(text)
         return msgspec.json.decode(text, type=kind)
@@ -71,7 +58,7 @@ def read_json(path: AnyPath, kind: Any = Any) -> Any:
             f"{path}: not text in {error.encoding} (byte {error.start}); save the file "
             "as UTF-8"
         ) from None
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
         bad = re.search(rb"(?<![\w\"'])-?(NaN|Infinity|inf|nan)\b", text)
         if bad:
             line = text.count(b"\n", 0, bad.start()) + 1
@@ -128,13 +115,18 @@ def inside(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Pat
     """
     target = root / text_files.forward_slashes(name)
     if "\0" in name or not all(
-        path.resolve().is_relative_to(root.resolve()) for path in (root / name, target)
+        _real(path).is_relative_to(_real(root)) for path in (root / name, target)
     ):
         raise CaptureError(
             f"{named_in}: the name {name!r} leads outside {root}; names must stay in "
             "the capture's folder, so copy the file there"
         )
     return target
+
+
+def _real(path):
+    # Path.resolve raises RuntimeError where links form a circle.
+    return pathlib.Path(os.path.realpath(path))
 
 
 def named_file(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib.Path:

@@ -11,6 +11,7 @@ from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath
 from nerfies_jax.capture.points import place_by_points
+from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.geometry import camera
 
 POSES = "poses_bounds.npy"
@@ -27,6 +28,7 @@ class Poses(NamedTuple):
     bounds: np.ndarray  # [frames, 2] nearest and farthest depth
 
 
+@confines
 def read(
     path: AnyPath,
     factor: int | None = None,

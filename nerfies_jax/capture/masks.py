@@ -14,7 +14,7 @@ import numpy as np
 import PIL.Image
 import PIL.ImageOps
 
-from nerfies_jax.capture import images
+from nerfies_jax.capture import images, safe_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import AnyPath
 
@@ -91,9 +91,9 @@ def find_encoding(paths: Sequence[AnyPath], orientation: str = "refuse") -> Enco
         file.
     """
     with ThreadPoolExecutor(4) as pool:
-        surveys = list(
-            pool.map(lambda path: _survey(pathlib.Path(path), orientation), paths)
-        )
+        survey = safe_files.carried(_survey)
+        files = map(pathlib.Path, paths)
+        surveys = list(pool.map(lambda file: survey(file, orientation), files))
     transparent = [one for one in surveys if one.has_alpha and not one.opaque]
     if transparent:
         return _alpha_encoding(surveys)

@@ -20,12 +20,14 @@ from nerfies_jax.capture.capture import (
 )
 from nerfies_jax.capture.json_files import AnyPath, new_folder, write_json
 from nerfies_jax.capture.nerfies_views import camera_entry, only, read_cameras
+from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.capture.transforms_writer import check_names
 from nerfies_jax.geometry import camera
 
 MAX_POINTS = 50_000_000
 
 
+@confines
 def read(
     path: AnyPath,
     factor: int | None = None,

@@ -16,6 +16,7 @@ from nerfies_jax.capture.capture import (
 )
 from nerfies_jax.capture.json_files import AnyPath, inside, named_file, read_json
 from nerfies_jax.capture.nearest import known_names
+from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
@@ -102,6 +103,7 @@ class NerfiesViews(NamedTuple):
     notes: tuple[str, ...]
 
 
+@confines
 def read_cameras(
     path: AnyPath, heldout: int | str | None = None, missing: str = "refuse"
 ) -> NerfiesViews:

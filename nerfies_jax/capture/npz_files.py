@@ -1,37 +1,185 @@
-"""Safe reading of array archives, which may be damaged or untrusted."""
+"""NumPy arrays of files that anybody may have written, damaged or cut short.
 
+Headers are believed only as far as the bytes behind them go, sizes are bounded before
+anything is allocated, and Python objects are never loaded.
+"""
+
+import contextlib
+import io
+import math
+import os
 import zipfile
 import zlib
+from collections.abc import Iterator
 
 import numpy as np
 
-from nerfies_jax.capture.json_files import AnyPath
+from nerfies_jax.capture import safe_files
+from nerfies_jax.capture.safe_files import AnyPath
+
+MAX_BYTES = 16 * 2**30  # of all arrays of an archive, or of one .npy
+MAX_MEMBERS = 10_000
+MAX_AXES = 16
+MAX_HEADER = 2**16  # bytes of what comes before an array
+# Arrays may have so many times the bytes of their archive. Deflate can reach 1032, with
+# zeros alone. Masks that are mostly empty reach 300, but seldom with so many bytes.
+MAX_EXPANSION = 100
+FREE_BYTES = 256 * 2**20  # of arrays, however small the archive
+_CHUNK = 2**24
 
 # Errors of zipfile, zlib and NumPy for damaged bytes, besides OSError. A RuntimeError
 # is an unknown compression or a password, an AttributeError a .npy.
 DAMAGED = (
     *(ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError),
-    *(zipfile.BadZipFile, zlib.error, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, RuntimeError, OverflowError, MemoryError),
 )
 
 
-def read_arrays(path: AnyPath) -> dict[str, np.ndarray]:
-    """Read all arrays of a .npz, without unpickling objects.
+class Archive:
+    """The arrays of an open .npz file, within a budget of bytes."""
+
+    def __init__(self, archive: zipfile.ZipFile, file_bytes: int, most: int):
+        self._archive = archive
+        members = archive.infolist()
+        if len(members) > MAX_MEMBERS:
+            raise ValueError(f"{len(members)} arrays; at most {MAX_MEMBERS} are read")
+        self._members = {}
+        for member in members:
+            name = member.filename.removesuffix(".npy")
+            # Others unpack without a bound, and NumPy writes none of them.
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"{name} is compressed in a way that NumPy does not")
+            if name in self._members:
+                raise ValueError(f"{name} is in it twice")
+            self._members[name] = member
+        total = sum(member.file_size for member in members)
+        if total > most:
+            raise ValueError(f"it unpacks to {total} bytes; at most {most} are read")
+        if total > FREE_BYTES and total > MAX_EXPANSION * file_bytes:
+            raise ValueError(
+                f"{file_bytes} bytes unpack to {total}, more than {MAX_EXPANSION} "
+                "times as many; if that is meant, save it with numpy.savez, which does "
+                "not compress"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the arrays."""
+        return tuple(self._members)
+
+    def read(self, name: str) -> np.ndarray:
+        """Unpack one array.
+
+        Raises:
+          ValueError: It is damaged.
+          KeyError: There is no array of that name.
+        """
+        member = self._members[name]
+        with self._archive.open(member) as stream:
+            return read_array(stream, member.file_size)
+
+
+@contextlib.contextmanager
+def archive(path: AnyPath, most: int = MAX_BYTES) -> Iterator[Archive]:
+    """Open a .npz file whose arrays have at most `most` bytes together.
+
+    Raises:
+      ValueError: The file, or what is read from it in the block, is damaged or too
+        large; one line without the path.
+      CaptureError: It cannot be opened.
+    """
+    try:
+        with safe_files.open_file(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            with zipfile.ZipFile(file) as opened:
+                yield Archive(opened, size, most)
+    except safe_files.CaptureError:
+        raise
+    except (*DAMAGED, OSError, NotImplementedError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(reason) from error
+
+
+def read_arrays(path: AnyPath, most: int = MAX_BYTES) -> dict[str, np.ndarray]:
+    """Read all arrays of a .npz file.
 
     Args:
       path: The file.
-
-    Returns:
-      Arrays by name.
+      most: Bytes that they may have together.
 
     Raises:
-      ValueError: If it is damaged, with a one-line reason.
-      OSError: If it cannot be opened.
+      ValueError: It is damaged or too large; one line without the path.
+      CaptureError: It cannot be opened.
     """
+    with archive(path, most) as opened:
+        return {name: opened.read(name) for name in opened.names}
+
+
+def read_npy(path: AnyPath, most: int = MAX_BYTES) -> np.ndarray:
+    """Read a .npy file of at most `most` bytes.
+
+    Raises:
+      ValueError: It is damaged or too large; one line without the path.
+      CaptureError: It cannot be opened.
+    """
+    with safe_files.open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise ValueError(f"{size} bytes; at most {most} are read")
+        try:
+            return read_array(file, size)
+        except OSError as error:
+            raise ValueError(str(error.strerror or error)) from None
+
+
+def read_array(stream: io.BufferedIOBase, size: int) -> np.ndarray:
+    """Read one array in NumPy's format.
+
+    Args:
+      stream: Begins with its header.
+      size: Bytes that the stream has, header included.
+
+    Raises:
+      ValueError: The header is none, asks for Python objects, or for other than the
+        bytes behind it.
+    """
+    shape, column_major, dtype, header_bytes = _header(stream)
+    count = math.prod(shape)
+    if count * dtype.itemsize != size - header_bytes:
+        raise ValueError(
+            f"its header claims {dtype} of shape {shape}, which is not what "
+            f"{size - header_bytes} bytes hold"
+        )
+    array = np.empty(count, dtype)
+    left = memoryview(array.view(np.uint8)) if array.nbytes else memoryview(b"")
+    while left:
+        part = stream.readinto(left[:_CHUNK])
+        if not part:
+            raise ValueError(f"cut short: {len(left)} of {size} bytes are missing")
+        left = left[part:]
+    return array.reshape(shape, order="F" if column_major else "C")
+
+
+def _header(stream):
+    """Shape, order, type and the bytes that they took."""
+    head = stream.read(8)
+    if head[:6] != b"\x93NUMPY" or len(head) < 8:
+        raise ValueError("not an array in NumPy's format")
+    wide = head[6] > 1
+    size = stream.read(4 if wide else 2)
+    length = int.from_bytes(size, "little")
+    if head[6] not in (1, 2, 3) or length > MAX_HEADER:
+        raise ValueError(f"a header of version {head[6]} and {length} bytes")
+    text = stream.read(length)
+    # NumPy parses the header as Python, which raises whatever its parser does.
     try:
-        # Opened here: where it is no archive, NumPy leaves the file open.
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except DAMAGED as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(reason) from error
+        formats = np.lib.format
+        parse = formats.read_array_header_2_0 if wide else formats.read_array_header_1_0
+        shape, column_major, dtype = parse(io.BytesIO(size + text))
+    except Exception as error:
+        raise ValueError(f"its header is damaged ({type(error).__name__})") from None
+    if dtype.hasobject or not dtype.itemsize:
+        raise ValueError(f"it holds {dtype}, and no Python objects are loaded")
+    if len(shape) > MAX_AXES or any(side < 0 for side in shape):
+        raise ValueError(f"an array of shape {shape}"[:200])
+    return shape, column_major, dtype, len(head) + len(size) + length

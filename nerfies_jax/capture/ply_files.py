@@ -2,12 +2,20 @@
 
 import io
 import pathlib
+import re
 
 import plyfile
 
-from nerfies_jax.capture import text_files
+from nerfies_jax.capture import safe_files, text_files
 
 MAX_HEADER = 1 << 16  # bytes; plyfile hangs on a header line of 100 MB
+MAX_TEXT = 1 << 30  # bytes; plyfile reads text at 5 MB a second
+_TYPE_BYTES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
 
 
 class _Binary(io.BufferedReader):
@@ -36,18 +44,76 @@ def read(path: pathlib.Path) -> plyfile.PlyData:
       The elements.
 
     Raises:
-      ValueError, OSError, MemoryError, plyfile.PlyParseError: If the file is damaged.
+      ValueError: The file is damaged; one line without the path.
+      CaptureError: It cannot be opened.
     """
-    with path.open("rb") as stream:
+    with safe_files.open_file(path) as stream:
         head = stream.read(MAX_HEADER)
+    size = path.stat().st_size
     encoding = text_files.encoding_of(head)
-    if encoding != "utf-8":  # only text can be encoded otherwise
-        text = text_files.utf8(path.read_bytes()).decode("ascii", "ignore")
-        return plyfile.PlyData.read(io.StringIO(text.replace("\r\n", "\n")))
-    end = head.find(b"end_header")
-    if b"format ascii" in head[: max(end, 0)]:
-        with path.open(encoding="ascii", errors="ignore") as stream:
-            return plyfile.PlyData.read(stream)
-    with _Binary(io.FileIO(path)) as stream:
-        stream.header_bytes = end
-        return plyfile.PlyData.read(stream, mmap="r")
+    header = check_header(text_files.utf8(head), size)
+    is_text = b"format ascii" in header
+    if is_text and size > MAX_TEXT:
+        raise ValueError(f"{size} bytes of text; save it as a binary PLY")
+    try:
+        if encoding != "utf-8":  # only text can be encoded otherwise
+            text = text_files.utf8(safe_files.read_bytes(path, MAX_TEXT))
+            text = text.decode("ascii", "ignore").replace("\r\n", "\n")
+            return plyfile.PlyData.read(io.StringIO(text))
+        if is_text:
+            with path.open(encoding="ascii", errors="ignore") as stream:
+                return plyfile.PlyData.read(stream)
+        with _Binary(io.FileIO(path)) as stream:
+            stream.header_bytes = len(header)
+            return plyfile.PlyData.read(stream, mmap="r")
+    # plyfile parses with eval-like leniency and raises whatever its parts do.
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(reason) from error
+
+
+def check_header(head: bytes, size: int) -> bytes:
+    """Check that the counts of a header can be true.
+
+    Args:
+      head: The first bytes of the file.
+      size: Bytes of the file.
+
+    Returns:
+      The header alone, with its last line.
+
+    Raises:
+      ValueError: It is no header, or claims more than the file can hold.
+    """
+    if not head.startswith(b"ply"):
+        raise ValueError("not a PLY file: it does not start with 'ply'")
+    end = re.search(rb"\nend_header\r?\n", head)
+    if end is None:
+        raise ValueError(
+            f"no end_header in its first {MAX_HEADER} bytes: truncated, or not the "
+            "header of a point cloud"
+        )
+    header = head[: end.end()]
+    claimed = 0
+    for name, count, row_bytes in _elements(header):
+        claimed += count * max(row_bytes, 1)
+        if claimed > size:
+            raise ValueError(f"its header claims {count} of {name} in {size} bytes")
+    return header
+
+
+def _elements(header):
+    """Name, count and least bytes of a row of each element."""
+    is_text = b"format ascii" in header
+    elements = []
+    for line in header.decode("ascii", "replace").splitlines():
+        words = line.split()
+        if words[:1] == ["element"]:
+            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 20:
+                raise ValueError(f"its header has a line {line[:60]!r}")
+            elements.append([words[1][:20], int(words[2]), 0])
+        elif words[:1] == ["property"] and len(words) >= 3 and elements:
+            kind = words[2] if words[1] == "list" else words[1]
+            # In text a digit and what separates it from the next.
+            elements[-1][2] += 2 if is_text else _TYPE_BYTES.get(kind, 1)
+    return elements

@@ -4,9 +4,8 @@ import pathlib
 from typing import NamedTuple
 
 import numpy as np
-import plyfile
 
-from nerfies_jax.capture import ply_files, text_files
+from nerfies_jax.capture import ply_files
 from nerfies_jax.capture.capture import CaptureError, PointCloud
 from nerfies_jax.capture.frames import UNSEEN
 from nerfies_jax.geometry.camera import Camera
@@ -103,17 +102,12 @@ def read_ply(path: pathlib.Path) -> PointCloud:
         that are neither uchar nor floats between 0 and 1.
     """
     try:
-        with path.open("rb") as file:
-            head = text_files.utf8(file.read(ply_files.MAX_HEADER))
-            if b"end_header" not in head:
-                raise CaptureError(
-                    f"{path}: not a .ply file; no end of its header found"
-                )
         vertex = ply_files.read(path)["vertex"]
         if vertex.count > MAX_POINTS:
             raise CaptureError(
                 f"{path}: {vertex.count} points; at most {MAX_POINTS} are read"
             )
+        _check_numbers(vertex)
         position = np.stack([vertex[axis] for axis in "xyz"], axis=1)
         names = {each.name for each in vertex.properties}
         if {"red", "green", "blue"} <= names:
@@ -123,13 +117,27 @@ def read_ply(path: pathlib.Path) -> PointCloud:
             color = np.full(position.shape, UNSEEN, np.uint8)
     except CaptureError:
         raise
-    except (OSError, ValueError, KeyError, plyfile.PlyParseError) as error:
+    except (OSError, ValueError, KeyError, TypeError, MemoryError) as error:
         reason = " ".join(str(error).split())
         raise CaptureError(
             f"{path}: not a readable point cloud ({reason}); export it again"
         ) from None
-    finite = np.isfinite(position).all(1)
-    return PointCloud(position[finite].astype(np.float64), color[finite])
+    position = position.astype(np.float64)
+    # Most of what is computed from them is float32.
+    finite = (np.abs(position) <= np.finfo(np.float32).max).all(1)
+    return PointCloud(position[finite], color[finite])
+
+
+def _check_numbers(vertex):
+    """Raise ValueError where positions or colors are lists."""
+    names = {"x", "y", "z", "red", "green", "blue"}
+    lists = [
+        each.name
+        for each in vertex.properties
+        if each.name in names and vertex.data.dtype[each.name].kind not in "fiu"
+    ]
+    if lists:
+        raise ValueError(f"properties that are no numbers: {', '.join(lists)}")
 
 
 def _bytes(color, path):

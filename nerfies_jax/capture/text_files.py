@@ -79,11 +79,11 @@ def find(
     for spelling in dict.fromkeys((name, plain)):
         for suffix in suffixes:
             path = folder / (spelling + suffix)
-            if path.is_file():
+            if os.path.isfile(path):  # False of names too long for the system
                 return path
     for suffix in dict.fromkeys(map(str.lower, suffixes)):
         path = _respelled(folder, plain + suffix)
-        if path is not None and path.is_file():
+        if path is not None and os.path.isfile(path):
             return path
     return None
 
@@ -92,7 +92,7 @@ def _respelled(folder, name):
     """Spell each part of a path as on disk, or return None if none or several match."""
     path = folder
     for part in pathlib.PurePosixPath(name).parts:
-        if (path / part).exists():
+        if os.path.exists(path / part):
             path = path / part
             continue
         spellings = _listing(path).get(_key(part), ())

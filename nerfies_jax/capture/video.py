@@ -9,7 +9,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from nerfies_jax.capture import extras
+from nerfies_jax.capture import extras, safe_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.high_dynamic_range import (
     CODES,
@@ -296,6 +296,7 @@ def read_video(
     last = math.inf if rows is None else max(rows, default=-1)
     if not path.is_file():
         raise CaptureError(f"{path}: no such film; check the path")
+    safe_files.check(path)
     shown, av = 0, library()
     try:
         with av.open(str(path.absolute())) as container:

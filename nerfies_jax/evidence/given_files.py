@@ -11,7 +11,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerfies_jax.capture import exr, frames, images, masks, npz_files
+from nerfies_jax.capture import (
+    exr,
+    frames,
+    images,
+    masks,
+    npz_files,
+    safe_files,
+)
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.given import Given, GivenFiles
 
@@ -79,10 +86,11 @@ def _rows(count, capture, path, what):
 def _arrays(path):
     try:
         arrays = npz_files.read_arrays(path)
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())
+    except CaptureError:
+        raise
+    except ValueError as error:
         raise CaptureError(
-            f"{path}: not a readable npz ({reason}); save it with numpy.savez"
+            f"{path}: not a readable npz ({error}); save it with numpy.savez"
         ) from None
     for name, array in arrays.items():
         if array.dtype.kind not in "fiub" or array.size > MOST_NUMBERS:
@@ -292,7 +300,7 @@ def _flo_files(folder) -> Sequence[pathlib.Path]:
 
 def _flo(path):
     """Middlebury's .flo: a magic number, width, height, and right, down by pixel."""
-    raw = path.read_bytes()
+    raw = safe_files.read_bytes(path, 12 + 8 * images.MAX_PIXELS)
     head = np.frombuffer(raw[:12].ljust(12, b"\0"), "<i4")
     width, height = int(head[1]), int(head[2])
     right_magic = np.frombuffer(raw[:4].ljust(4, b"\0"), "<f4")[0] == FLO_MAGIC

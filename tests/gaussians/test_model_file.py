@@ -184,7 +184,7 @@ def test_a_text_that_fits_no_model_is_refused(saved, change, words):
     ("array", "words"),
     [
         (np.zeros((3, 5), np.float32), r"shape \(3, 5\) among the rows of"),
-        (np.array([{}], object), "allow_pickle"),
+        (np.array([{}], object), "Python objects"),
         (np.zeros((), np.float32), r"shape \(\) among the rows"),
         (None, "not finite"),
     ],

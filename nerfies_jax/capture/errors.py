@@ -1,0 +1,9 @@
+"""Errors of files that cannot be used. This module imports nothing."""
+
+
+class FileError(ValueError):
+    """A file that cannot be read. The message is one line that begins with its path."""
+
+
+class CaptureError(FileError):
+    """A capture that cannot be used as it is; one line, with the way out."""

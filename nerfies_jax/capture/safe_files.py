@@ -1,0 +1,161 @@
+"""Open files that anybody may have written: regular, inside their folder, bounded.
+
+Every reader of a capture opens its files through this module, or checks them here
+right before it gives their path to a library. A link that leads out of the capture is
+refused at that moment, so what a name was when it was looked up does not count.
+"""
+
+import contextlib
+import contextvars
+import functools
+import io
+import os
+import pathlib
+import stat
+from collections.abc import Callable, Iterator
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from nerfies_jax.capture.errors import CaptureError
+
+AnyPath = str | os.PathLike
+Parameters = ParamSpec("Parameters")
+Content = TypeVar("Content")
+
+# The real path of the folder that the files being read must lie in, if there is one.
+_folder: contextvars.ContextVar[str | None] = contextvars.ContextVar(
+    "folder", default=None
+)
+
+
+@contextlib.contextmanager
+def confined(folder: AnyPath) -> Iterator[None]:
+    """Refuse files outside a folder while the block reads.
+
+    Functions for the threads of a pool are confined by `carried`.
+    """
+    token = _folder.set(os.path.realpath(folder))
+    try:
+        yield
+    finally:
+        _folder.reset(token)
+
+
+def confines(
+    read: Callable[Concatenate[AnyPath, Parameters], Content],
+) -> Callable[Concatenate[AnyPath, Parameters], Content]:
+    """Decorate a reader of a capture: it may open files of that capture alone.
+
+    Args:
+      read: Takes the path of a folder, or of a file whose folder is the capture.
+    """
+
+    @functools.wraps(read)
+    def confined_read(
+        path: AnyPath, *args: Parameters.args, **options: Parameters.kwargs
+    ) -> Content:
+        folder = path if os.path.isdir(path) else pathlib.Path(path).parent
+        with confined(folder):
+            return read(path, *args, **options)
+
+    return confined_read
+
+
+def carried(function: Callable[..., Content]) -> Callable[..., Content]:
+    """Confine a function, in whatever thread it runs, as its caller is now."""
+    folder = _folder.get()
+
+    def run(*args: Any) -> Content:
+        token = _folder.set(folder)
+        try:
+            return function(*args)
+        finally:
+            _folder.reset(token)
+
+    return run
+
+
+def check(path: AnyPath) -> pathlib.Path:
+    """Check a file right before it is opened.
+
+    Returns:
+      The path.
+
+    Raises:
+      CaptureError: There is none, it is not a regular file, or it lies outside the
+        folder that is being read.
+    """
+    path = pathlib.Path(path)
+    _check_folder(path)
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:  # ValueError: a null character
+        raise _missing(path, error) from None
+    _check_kind(path, mode)
+    return path
+
+
+def open_file(path: AnyPath) -> io.BufferedReader:
+    """Open a file for reading, as `check` allows it.
+
+    Raises:
+      CaptureError: As for `check`.
+    """
+    path = pathlib.Path(path)
+    _check_folder(path)
+    try:
+        # A pipe in place of the file would block an ordinary open.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        opened = os.open(path, flags)
+    except (OSError, ValueError) as error:
+        raise _missing(path, error) from None
+    try:
+        _check_kind(path, os.fstat(opened).st_mode)
+        return os.fdopen(opened, "rb")
+    except BaseException:
+        os.close(opened)
+        raise
+
+
+def read_bytes(path: AnyPath, most: int) -> bytes:
+    """Read a whole file of at most `most` bytes.
+
+    Raises:
+      CaptureError: As for `check`, or it is larger.
+    """
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        try:
+            content = file.read(most + 1) if size <= most else b""
+        except OSError as error:
+            raise _missing(path, error) from None
+    if max(size, len(content)) > most:
+        raise CaptureError(
+            f"{path}: {max(size, len(content))} bytes; at most {most} are read, so "
+            "split it or make it smaller"
+        )
+    return content
+
+
+def _check_folder(path):
+    folder = _folder.get()
+    if folder is None:
+        return
+    try:
+        real = os.path.realpath(path)
+    except (OSError, ValueError) as error:
+        raise _missing(path, error) from None
+    if not pathlib.Path(real).is_relative_to(folder):
+        raise CaptureError(
+            f"{path}: leads outside the capture, to {real}; names and links must stay "
+            f"in {folder}, so copy the file there"
+        )
+
+
+def _check_kind(path, mode):
+    if not stat.S_ISREG(mode):
+        raise CaptureError(f"{path}: not a regular file; restore it or remove it")
+
+
+def _missing(path, error):
+    reason = getattr(error, "strerror", None) or error
+    return CaptureError(f"{path!s}: {reason}; check the path")
