@@ -5,12 +5,13 @@ import pathlib
 import tempfile
 from typing import Any
 
-from nerfies_jax.capture import text_files
+from nerfies_jax.capture import safe_files, text_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
 
 # pycolmap reads these if there are no binary files of that name.
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt")
+FILES = (*TEXT_FILES, *(name.replace(".txt", ".bin") for name in TEXT_FILES))
 _BROKEN = (ValueError, RuntimeError, IndexError, KeyError, MemoryError, OSError)
 
 
@@ -30,6 +31,9 @@ def reconstruction(folder: pathlib.Path) -> Any:
       CaptureError: If the model cannot be read.
     """
     pycolmap = library()
+    for name in FILES:
+        if (folder / name).is_file():
+            safe_files.check(folder / name)
     try:
         with contextlib.ExitStack() as stack:
             source = _as_utf8(folder, stack)
