@@ -121,7 +121,7 @@ print(*sorted(path.name for path in outcome.folder.iterdir()), sep="\n")
 # ## Look at it
 #
 # Held-out frames, above as filmed and below as drawn. Scores want company: beside them
-# the run prints what two neighboring frames laid over each other would score.
+# the run prints the PSNR of the mean of two neighboring frames.
 
 # %%
 run = outcome.run

@@ -10,8 +10,8 @@ import numpy as np
 
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import protocol
+from nerfies_jax.evaluation.baseline_images import Baselines
 from nerfies_jax.evaluation.fitted_cameras import FittedCameras
-from nerfies_jax.evaluation.floors import Floors
 from nerfies_jax.evaluation.model_flow import Flow
 from nerfies_jax.evaluation.protocol import GroundTruth, PointTracks
 from nerfies_jax.evaluation.scores import Scored, known_mean
@@ -34,12 +34,12 @@ TOLERANCES = {
     "heldout.lpips": 0.01,
     "heldout.moving_psnr": 0.3,
     "heldout.moving_ssim": 0.02,
-    "heldout.still_psnr": 0.2,
+    "heldout.static_psnr": 0.2,
     "heldout.unscored": 0.01,
-    "floor.neighbors": 0.05,
-    "floor.still": 0.3,
-    "motion.worth": 0.2,
-    "motion.moving_worth": 0.3,
+    "baseline.neighbor_mean": 0.05,
+    "baseline.static": 0.3,
+    "motion.gain": 0.2,
+    "motion.moving_gain": 0.3,
     "heldout.depth_abs_rel": 0.01,
     "heldout.depth_within_delta": 0.02,
     "heldout.depth_median": 0.002,
@@ -54,7 +54,7 @@ TOLERANCES = {
     "flow.missing": 0.02,
     "flow.moving_epe": 0.3,
     "tracks.epe": 0.003,
-    "tracks.still_epe": 0.0,
+    "tracks.static_epe": 0.0,
     "tracks.correct": 0.05,
     "tracks.lost": 0.02,
     "tracks.drift": 0.002,
@@ -102,7 +102,7 @@ def heldout_metrics(
     followed: PointTracks | None = None,
     flow: Flow | None = None,
     fitted: FittedCameras | None = None,
-    floors: Floors = Floors(None, None),
+    baselines: Baselines = Baselines(None, None),
 ) -> dict[str, float]:
     """Compute all metrics of held-out frames for which there is data.
 
@@ -118,7 +118,7 @@ def heldout_metrics(
       followed: Predicted point tracks, or None.
       flow: Predicted and true optical flow, or None.
       fitted: Frames rendered with fitted cameras, or None.
-      floors: Baselines.
+      baselines: Baselines.
 
     Returns:
       Values by the keys of `TOLERANCES`.
@@ -130,13 +130,13 @@ def heldout_metrics(
     more = _pictures(scored, capture, lpips)
     if capture.valid is not None:
         more["heldout.unscored"] = 1 - capture.valid[scored.rows].mean()
-    more |= _floors(floors, scored, capture)
+    more |= _baselines(baselines, scored, capture)
     if capture.depths is not None:
         more |= _depths(scored, capture)
     if known is not None and followed is not None:
         numbers = protocol.score_tracks(known, followed)
         more |= {_TRACKS[name]: value for name, value in numbers.items()}
-        more["tracks.still_epe"] = protocol.static_error(known)
+        more["tracks.static_epe"] = protocol.static_error(known)
     if flow is not None:
         more |= _flow(flow)
     if fitted is not None:
@@ -177,23 +177,23 @@ def _pictures(scored, capture, lpips):
     return {key: known_mean(np.asarray(values)) for key, values in parts.items()}
 
 
-def _floors(floors, scored, capture):
+def _baselines(baselines, scored, capture):
     """PSNR of pictures that cost nothing, and how far motion is above the second."""
     numbers = {}
-    if floors.neighbors is not None:
-        own = _floor_psnr(floors.neighbors, scored, capture)
-        numbers["floor.neighbors"] = known_mean(own[:, 0])
-    if floors.still is not None:
-        own = _floor_psnr(floors.still, scored, capture)
-        drawn = floors.still._replace(color=scored.color[floors.still.places])
-        worth = _floor_psnr(drawn, scored, capture) - own
-        numbers["floor.still"] = known_mean(own[:, 0])
-        numbers["motion.worth"] = known_mean(worth[:, 0])
-        numbers["motion.moving_worth"] = known_mean(worth[:, 1])
+    if baselines.neighbors is not None:
+        own = _baseline_psnr(baselines.neighbors, scored, capture)
+        numbers["baseline.neighbor_mean"] = known_mean(own[:, 0])
+    if baselines.static is not None:
+        own = _baseline_psnr(baselines.static, scored, capture)
+        drawn = baselines.static._replace(color=scored.color[baselines.static.places])
+        gain = _baseline_psnr(drawn, scored, capture) - own
+        numbers["baseline.static"] = known_mean(own[:, 0])
+        numbers["motion.gain"] = known_mean(gain[:, 0])
+        numbers["motion.moving_gain"] = known_mean(gain[:, 1])
     return numbers
 
 
-def _floor_psnr(averages, scored, capture):
+def _baseline_psnr(averages, scored, capture):
     """PSNR of all observed pixels and of the moving ones, [places, 2], NaN for none."""
     psnrs = []
     for number, (place, color) in enumerate(
@@ -234,7 +234,9 @@ def _score(color, truth, valid, moving):
         numbers["heldout.moving_ssim"] = image_quality.masked_ssim(
             picture, truth, moving
         )
-        numbers["heldout.still_psnr"] = image_quality.masked_psnr(picture, truth, still)
+        numbers["heldout.static_psnr"] = image_quality.masked_psnr(
+            picture, truth, still
+        )
     if valid is None and min(picture.shape[:2]) > MS_SSIM_SIDE:
         numbers["heldout.ms_ssim"] = image_quality.ms_ssim(picture, truth)
     return numbers

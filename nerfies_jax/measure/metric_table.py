@@ -47,7 +47,7 @@ METRICS: dict[str, Entry] = {
         *("SSIM, dynamic regions", "Quality", "", "higher"),
         "The SSIM of the pixels that show moving objects.",
     ),
-    "heldout.still_psnr": Entry(
+    "heldout.static_psnr": Entry(
         *("PSNR, static regions", "Quality", "dB", "higher"),
         "The PSNR of the pixels that show the static part of the scene.",
     ),
@@ -107,20 +107,20 @@ METRICS: dict[str, Entry] = {
         *("Camera rotation error", "Geometry", "deg", "lower"),
         "Mean error of the fitted rotation from each camera to the next.",
     ),
-    "floor.neighbors": Entry(
+    "baseline.neighbor_mean": Entry(
         *("Baseline: mean of two neighbors", "Motion", "dB", "equal"),
         "The PSNR of the mean of the two training frames nearest in time; a model that "
         "scores less has learned little.",
     ),
-    "floor.still": Entry(
+    "baseline.static": Entry(
         *("Baseline: static scene", "Motion", "dB", "higher"),
         "The PSNR of the model's own renders averaged over time, which have no motion.",
     ),
-    "motion.worth": Entry(
+    "motion.gain": Entry(
         *("Gain from motion", "Motion", "dB", "higher"),
         "The PSNR of the held-out frames minus that of the static baseline.",
     ),
-    "motion.moving_worth": Entry(
+    "motion.moving_gain": Entry(
         *("Gain from motion, dynamic regions", "Motion", "dB", "higher"),
         "The gain from motion of the pixels that show moving objects.",
     ),
@@ -145,7 +145,7 @@ METRICS: dict[str, Entry] = {
         *("3D track error", "Motion", "scene units", "lower"),
         "Mean distance of tracked points from their true positions.",
     ),
-    "tracks.still_epe": Entry(
+    "tracks.static_epe": Entry(
         *("Baseline: static 3D tracks", "Motion", "scene units", "equal"),
         "The 3D track error of points that are assumed not to move.",
     ),

@@ -23,11 +23,11 @@ from nerfies_jax.measure import clock
 from nerfies_jax.measure.clock import Metric
 from nerfies_jax.measure.metric_table import metric
 from nerfies_jax.runs import (
+    baselines_text,
     budget,
     commands,
     curve_figure,
     curves,
-    floors_text,
     quality,
     relative_paths,
     report,
@@ -124,7 +124,7 @@ def make(
             metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
             metrics += model_size(saved)
             attempt(None, save_metrics, place / METRICS, metrics)
-            warnings = floors_text.warnings(numbers)
+            warnings = baselines_text.warnings(numbers)
             notes = [*warnings, trained.result.message, *left_out]
             notes += _capture_notes(run, folder)
             notes += [*remarks, *gain, *saved.notes, *unplayed]
@@ -147,7 +147,7 @@ def make(
     following = _next(folder, run, trained)
     for figure in player:
         console.say(f"player:     {folder / figure.link}")
-    _log(folder, page, metrics, [*floors_text.lines(numbers), *warnings], following)
+    _log(folder, page, metrics, [*baselines_text.lines(numbers), *warnings], following)
     attempt.finish()
 
 
@@ -472,7 +472,7 @@ def _next(folder, run, trained, base=None):
     return [looked, report.Command("Train it twice as long:", line)]
 
 
-def _log(folder, page, metrics, floors, following):
+def _log(folder, page, metrics, baselines, following):
     value = {metric.key: metric.value for metric in metrics}
     console.say(
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
@@ -484,9 +484,9 @@ def _log(folder, page, metrics, floors, following):
     if "tracks.epe" in value:
         console.say(
             f"points:   {value['tracks.epe']:.4f} scene units from where they are, "
-            f"{value['tracks.still_epe']:.4f} if they stood still"
+            f"{value['tracks.static_epe']:.4f} if they stood still"
         )
-    for line in floors:
+    for line in baselines:
         console.say(line)
     if page is not None:
         console.say(f"report:     {page}")
@@ -498,8 +498,8 @@ def _log(folder, page, metrics, floors, following):
 
 
 def _parts(value):
-    """The PSNR of what moves and of what stands still, where masks tell them apart."""
-    names = {"moving": "heldout.moving_psnr", "still": "heldout.still_psnr"}
+    """Format the PSNR of moving and static regions, where masks separate them."""
+    names = {"moving": "heldout.moving_psnr", "static": "heldout.static_psnr"}
     parts = [
         f"{value[key]:.2f} dB {name}" for name, key in names.items() if key in value
     ]

@@ -8,14 +8,14 @@ from nerfies_jax import evaluation, events
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.evaluation import (
     Scored,
+    baseline_images,
     fitted_cameras,
-    floors,
     heldout,
     model_flow,
     moving_masks,
     protocol,
 )
-from nerfies_jax.evaluation.floors import Floors
+from nerfies_jax.evaluation.baseline_images import Baselines
 from nerfies_jax.evaluation.heldout import Lpips
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.measure import perceptual
@@ -140,16 +140,16 @@ def measure(
         followed=followed,
         flow=flow,
         fitted=fitted,
-        floors=_floors(run, state, draw, scored.rows, frame_seconds),
+        baselines=_baselines(run, state, draw, scored.rows, frame_seconds),
     )
     return numbers, notes
 
 
-def _floors(run, state, draw, rows, frame_seconds):
+def _baselines(run, state, draw, rows, frame_seconds):
     frames, moments = budget.still(frame_seconds, len(rows), run.filmed.size)
-    return Floors(
-        floors.neighbor_means(run.filmed, rows),
-        floors.time_averages(draw, state, run.filmed, rows, frames, moments),
+    return Baselines(
+        baseline_images.neighbor_means(run.filmed, rows),
+        baseline_images.time_averages(draw, state, run.filmed, rows, frames, moments),
     )
 
 

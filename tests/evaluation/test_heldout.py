@@ -12,7 +12,7 @@ from nerfies_jax import evaluation, runs, scene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.evaluation import heldout, model_flow, protocol
-from nerfies_jax.evaluation.floors import Averages, Floors
+from nerfies_jax.evaluation.baseline_images import Averages, Baselines
 from nerfies_jax.evaluation.heldout import heldout_metrics
 from nerfies_jax.evaluation.model_flow import Flow, Moved
 from nerfies_jax.evaluation.scores import Scored
@@ -31,10 +31,10 @@ from tests.measure.test_perceptual import TINY, state_dict
 FILM = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
 NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), jax.random.key(0))
 ALWAYS = {"heldout.psnr", "heldout.ssim"}
-MASKED = {f"heldout.{name}" for name in ("moving_psnr", "moving_ssim", "still_psnr")}
-FLOORS = {
-    *(f"floor.{name}" for name in ("neighbors", "still")),
-    *(f"motion.{name}" for name in ("worth", "moving_worth")),
+MASKED = {f"heldout.{name}" for name in ("moving_psnr", "moving_ssim", "static_psnr")}
+BASELINES = {
+    *(f"baseline.{name}" for name in ("neighbor_mean", "static")),
+    *(f"motion.{name}" for name in ("gain", "moving_gain")),
 }
 DEPTHS = {
     *(f"heldout.depth_{kind}" for kind in ("abs_rel", "within_delta")),
@@ -42,7 +42,7 @@ DEPTHS = {
 }
 TRUTH = {
     *(f"flow.{kind}" for kind in ("epe", "outliers", "missing", "moving_epe")),
-    *(f"tracks.{kind}" for kind in ("epe", "still_epe", "correct", "lost", "drift")),
+    *(f"tracks.{kind}" for kind in ("epe", "static_epe", "correct", "lost", "drift")),
 }
 
 
@@ -92,22 +92,24 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     scored = drawn(capture, rng)
     places = np.array([len(scored.rows) - 1])
     gray = Averages(places, np.full_like(scored.color[places], 0.4), None)
-    floors = Floors(gray._replace(known=~valid[scored.rows[places]]), gray)
-    numbers = heldout_metrics(scored, capture, floors=floors)
+    baselines = Baselines(gray._replace(known=~valid[scored.rows[places]]), gray)
+    numbers = heldout_metrics(scored, capture, baselines=baselines)
     unscored = {"heldout.unscored"} if filmed else set()
-    lost = {"floor.neighbors"} if filmed else set()  # what is known was not filmed
-    assert set(numbers) == (ALWAYS | MASKED | DEPTHS | FLOORS | unscored) - lost
+    lost = (
+        {"baseline.neighbor_mean"} if filmed else set()
+    )  # what is known was not filmed
+    assert set(numbers) == (ALWAYS | MASKED | DEPTHS | BASELINES | unscored) - lost
     assert numbers["heldout.psnr"] == pytest.approx(scored.psnr.mean())
     rows = capture.heldout
     picture = np.round(scored.color.astype(float) * 255) / 255
     truth = capture.images[rows] / 255
     known = valid[rows] if filmed else np.ones_like(valid[rows])
     moving = capture.moving[rows]
-    for name, mask in (("moving", moving & known), ("still", ~moving & known)):
+    for name, mask in (("moving", moving & known), ("static", ~moving & known)):
         frames = zip(picture, truth, mask, strict=True)
         exact = np.mean([psnr(*frame) for frame in frames])
         assert numbers[f"heldout.{name}_psnr"] == pytest.approx(exact, abs=1e-4)
-    for key, mask in (("worth", known[-1]), ("moving_worth", (moving & known)[-1])):
+    for key, mask in (("gain", known[-1]), ("moving_gain", (moving & known)[-1])):
         own = psnr(picture[-1], truth[-1], mask)
         gain = own - psnr(np.full_like(truth[-1], 102 / 255), truth[-1], mask)
         assert numbers[f"motion.{key}"] == pytest.approx(gain, abs=1e-4)
@@ -141,7 +143,7 @@ def test_what_a_capture_has_not_is_not_among_the_numbers(rng):
     assert set(heldout_metrics(drawn(bare, rng), bare)) == ALWAYS
     still = dataclasses.replace(capture, moving=np.zeros_like(capture.moving))
     numbers = heldout_metrics(drawn(still, rng), still)
-    assert "heldout.still_psnr" in numbers
+    assert "heldout.static_psnr" in numbers
     assert not [key for key in numbers if "moving" in key]
     listed = {metric.key: metric.value for metric in heldout.metrics(numbers)}
     assert listed == numbers
@@ -282,7 +284,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     numbers, notes = quality.measure(run, state, renderer, scored)
     assert notes == []
     strain = {"tracks.strain"} if kind == "radiance" else set()
-    assert set(numbers) == ALWAYS | MASKED | FLOORS | DEPTHS | TRUTH | strain
+    assert set(numbers) == ALWAYS | MASKED | BASELINES | DEPTHS | TRUTH | strain
 
     truth = protocol.stored_truth(capture)
     known = protocol.ground_truth(capture, truth, 2, quality.TRACKS)
@@ -292,7 +294,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
     seen[:, known.start] = False
     for key, path in (
         ("tracks.epe", followed.path),
-        ("tracks.still_epe", known.start_points[:, None]),
+        ("tracks.static_epe", known.start_points[:, None]),
     ):
         away = np.linalg.norm(path - known.path, axis=-1)[seen]
         assert numbers[key] == pytest.approx(away.mean(), rel=1e-4)
@@ -333,12 +335,12 @@ def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tm
         run._replace(filmed=elsewhere), state, renderer, scored
     )
     assert notes == []
-    assert set(numbers) == ALWAYS | MASKED | FLOORS | DEPTHS
+    assert set(numbers) == ALWAYS | MASKED | BASELINES | DEPTHS
     # A truth of another scene is no reason to lose what was trained.
     (tmp_path / synthetic.TRUTH_FILE).write_bytes(b"cut short")
     broken = dataclasses.replace(run.capture, path=tmp_path)
     numbers, notes = quality.measure(
         run._replace(filmed=broken), state, renderer, scored
     )
-    assert set(numbers) == ALWAYS | MASKED | FLOORS | DEPTHS
+    assert set(numbers) == ALWAYS | MASKED | BASELINES | DEPTHS
     assert "no scene truth" in notes[0]

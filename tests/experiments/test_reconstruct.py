@@ -16,7 +16,7 @@ from experiments import compare, export, reconstruct, render
 from gaussians_jax import step_time
 from nerfies_jax import runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
-from nerfies_jax.evaluation import floors, pictures
+from nerfies_jax.evaluation import baseline_images, pictures
 from nerfies_jax.measure import part_time
 from nerfies_jax.runs import products, quality, reconstruction, run_folder, train
 from nerfies_jax.runs.run_folder import CHECKPOINTS
@@ -95,17 +95,17 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     assert metrics["train.steps"] == runs.saved_run(out).config.steps == 2
     assert 0 < metrics["heldout.psnr"] < 60
     # Nothing moves in it, so its renders over time are all one picture.
-    assert metrics["motion.worth"] == 0
+    assert metrics["motion.gain"] == 0
     np.testing.assert_allclose(
-        metrics["floor.still"], metrics["heldout.psnr"], atol=1e-4
+        metrics["baseline.static"], metrics["heldout.psnr"], atol=1e-4
     )
     capture = scenes.tiny_capture()
-    means = floors.neighbor_means(capture, capture.heldout).color
+    means = baseline_images.neighbor_means(capture, capture.heldout).color
     error = np.square(
         np.round(255 * means) / 255 - capture.images[capture.heldout] / 255
     )
     exact = np.mean(-10 * np.log10(error.mean(axis=(1, 2, 3))))
-    np.testing.assert_allclose(metrics["floor.neighbors"], exact, atol=1e-3)
+    np.testing.assert_allclose(metrics["baseline.neighbor_mean"], exact, atol=1e-3)
     assert metrics["heldout.psnr"] < exact  # two steps
     document, printed = capsys.readouterr()
     assert json.loads(document)["metrics"] == metrics
@@ -116,7 +116,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
         assert words in printed
     assert "There is no player" not in page
     assert "plan: 2 steps for 250 s of training" in printed
-    assert "motion:   is worth +0.00 dB" in printed
+    assert "motion:   gains +0.00 dB" in printed
     told = runs.read_events(out)
     names = event_checks.ended_stages(told)
     order = ["reading images", "initializing the scene", "training"]

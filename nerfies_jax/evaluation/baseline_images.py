@@ -25,11 +25,11 @@ class Averages(NamedTuple):
     known: np.ndarray | None  # [places, height, width] bool; None where all of it is
 
 
-class Floors(NamedTuple):
+class Baselines(NamedTuple):
     """Both baselines of one run, None where they do not exist."""
 
     neighbors: Averages | None
-    still: Averages | None
+    static: Averages | None
 
 
 def neighbor_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
@@ -113,8 +113,8 @@ def time_averages(
     """
     if frames < 1 or moments < 1:
         raise ValueError(
-            f"an average over time needs a frame and a moment, got frames={frames} and "
-            f"moments={moments}; ask for one of each at least"
+            f"an average over time needs at least one frame and one time, got "
+            f"frames={frames} and moments={moments}"
         )
     places = spread(np.arange(len(rows)), frames)
     times = spread(np.unique(capture.times[capture.train]), moments)

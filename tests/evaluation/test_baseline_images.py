@@ -8,11 +8,11 @@ import pytest
 
 from nerfies_jax import evaluation
 from nerfies_jax.capture import pinholes
-from nerfies_jax.evaluation import floors, moving_masks
+from nerfies_jax.evaluation import baseline_images, moving_masks
 from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evidence import record
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.runs import floors_text
+from nerfies_jax.runs import baselines_text
 from nerfies_jax.training.model import Rendering, TrainState
 from tests.capture.test_pinholes import pattern, through_a_lens
 from tests.evidence import films
@@ -41,20 +41,20 @@ def film(frames=12, **changes):
 
 def test_neighbors_are_the_nearest_in_time_of_the_same_camera():
     capture = film()
-    assert sorted(floors.neighbor_rows(capture, 4)) == [3, 5]
-    assert list(floors.neighbor_rows(capture, 10)) == [9, 11]
+    assert sorted(baseline_images.neighbor_rows(capture, 4)) == [3, 5]
+    assert list(baseline_images.neighbor_rows(capture, 10)) == [9, 11]
     # Of the camera's own frames, however far, if it has two; else of all.
     ids = np.zeros(12, np.int32)
     ids[[0, 4, 11]] = 1
     rig = dataclasses.replace(capture, camera_ids=ids)
-    assert list(floors.neighbor_rows(rig, 4)) == [0, 11]
+    assert list(baseline_images.neighbor_rows(rig, 4)) == [0, 11]
     ids[11] = 0
-    assert sorted(floors.neighbor_rows(rig, 4)) == [3, 5]
+    assert sorted(baseline_images.neighbor_rows(rig, 4)) == [3, 5]
     # By their times, not by their rows; of equally near ones the first.
     turned = dataclasses.replace(capture, times=capture.times[::-1].copy())
-    assert sorted(floors.neighbor_rows(turned, 1)) == [0, 2]
+    assert sorted(baseline_images.neighbor_rows(turned, 1)) == [0, 2]
     still = dataclasses.replace(capture, times=np.zeros(12, np.float32))
-    assert list(floors.neighbor_rows(still, 4)) == [0, 2]
+    assert list(baseline_images.neighbor_rows(still, 4)) == [0, 2]
 
 
 def test_a_mean_of_neighbors_is_of_those_that_filmed_a_pixel():
@@ -62,7 +62,7 @@ def test_a_mean_of_neighbors_is_of_those_that_filmed_a_pixel():
     valid[3, :, :5] = False
     valid[[3, 5], 0] = False
     capture = film(valid=valid)
-    means = floors.neighbor_means(capture, np.array([4, 7]))
+    means = baseline_images.neighbor_means(capture, np.array([4, 7]))
     expected = np.full((*SIZE[::-1], 3), 40 / 255)
     expected[:, :5] = 50 / 255
     expected[0] = 0
@@ -71,9 +71,9 @@ def test_a_mean_of_neighbors_is_of_those_that_filmed_a_pixel():
     np.testing.assert_array_equal(means.known[0], expected[..., 0] > 0)
     assert means.known[1].all()
     at_once = dataclasses.replace(capture, times=np.zeros(12, np.float32))
-    assert floors.neighbor_means(at_once, capture.heldout) is None
+    assert baseline_images.neighbor_means(at_once, capture.heldout) is None
     single = dataclasses.replace(capture, train=capture.train[:1])
-    assert floors.neighbor_means(single, capture.heldout) is None
+    assert baseline_images.neighbor_means(single, capture.heldout) is None
 
 
 def test_an_average_over_time_leaves_the_rest_of_a_view():
@@ -87,7 +87,9 @@ def test_an_average_over_time_leaves_the_rest_of_a_view():
         return Rendering(color, np.ones(shape), np.ones(shape))
 
     rows = capture.heldout
-    averages = floors.time_averages(draw, NOBODY, capture, rows, frames=2, moments=3)
+    averages = baseline_images.time_averages(
+        draw, NOBODY, capture, rows, frames=2, moments=3
+    )
     np.testing.assert_array_equal(averages.places, [0, 3])
     times = capture.times[capture.train]
     times = times[[0, round((len(times) - 1) / 2), -1]]
@@ -97,27 +99,31 @@ def test_an_average_over_time_leaves_the_rest_of_a_view():
         exact = np.mean(np.clip(2 * (times.astype(float) + position), 0, 1))
         np.testing.assert_allclose(color, exact, atol=1e-6)
     with pytest.raises(ValueError, match="frames=0 and moments=3"):
-        floors.time_averages(draw, NOBODY, capture, rows, frames=0, moments=3)
+        baseline_images.time_averages(draw, NOBODY, capture, rows, frames=0, moments=3)
 
 
-def test_a_run_below_a_floor_is_told_what_to_do():
-    numbers = {"heldout.psnr": 20.0, "floor.neighbors": 19.0, "floor.still": 19.5}
-    numbers |= {"motion.worth": 0.5}
-    assert floors_text.warnings(numbers) == []
-    assert "19.00 dB the mean of two" in floors_text.lines(numbers)[0]
-    assert "+0.50 dB" in floors_text.lines(numbers)[1]
-    assert floors_text.warnings(numbers | {"motion.worth": -0.04}) == []
-    (worse,) = floors_text.warnings(numbers | {"motion.worth": -0.06})
+def test_a_run_below_a_baseline_is_told_what_to_do():
+    numbers = {
+        "heldout.psnr": 20.0,
+        "baseline.neighbor_mean": 19.0,
+        "baseline.static": 19.5,
+    }
+    numbers |= {"motion.gain": 0.5}
+    assert baselines_text.warnings(numbers) == []
+    assert "19.00 dB mean of two" in baselines_text.lines(numbers)[0]
+    assert "+0.50 dB" in baselines_text.lines(numbers)[1]
+    assert baselines_text.warnings(numbers | {"motion.gain": -0.04}) == []
+    (worse,) = baselines_text.warnings(numbers | {"motion.gain": -0.06})
     assert "0.06 dB worse" in worse
-    below, worse = floors_text.warnings(
-        numbers | {"floor.neighbors": 22.7, "motion.worth": -0.25}
+    below, worse = baselines_text.warnings(
+        numbers | {"baseline.neighbor_mean": 22.7, "motion.gain": -0.25}
     )
     assert "20.00 dB is below the 22.70 dB" in below
     assert "0.25 dB worse" in worse
     assert "--steps" in below
     assert "splats-static" in worse
-    assert floors_text.lines({"heldout.psnr": 20.0}) == []
-    assert floors_text.warnings({"heldout.psnr": 20.0}) == []
+    assert baselines_text.lines({"heldout.psnr": 20.0}) == []
+    assert baselines_text.warnings({"heldout.psnr": 20.0}) == []
 
 
 # Barrel distortion shows more than the pinhole, pincushion less.
