@@ -46,7 +46,6 @@ _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
     """Read the tensors of an `.npz`, `.safetensors`, `.pth` or `.pt` state dict.
 
-<<<<<<< HEAD
     Args:
       path: The file.
 
@@ -54,12 +53,8 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
       Arrays by name.
 
     Raises:
-      ValueError: If the file is damaged, of another kind, or contains anything but
+      FileError: If the file is damaged, of another kind, or contains anything but
         tensors.
-=======
-    Raises `FileError` with the file's name where it is damaged, of another kind, or
-    asks for anything but tensors.
->>>>>>> 8dc7f70 (Read files of strangers through one gate with budgets)
     """
     path = pathlib.Path(path)
     readers = {
