@@ -124,9 +124,6 @@ STUDIES = {
         f"--suite fields {_BOOKSHELF} --steps 600 --seeds 3 --jobs 2",
         of="ablate",
     ),
-    "ablate_start": _package(
-        "ablate_start", "--suite start --steps 900 --jobs 2", of="ablate"
-    ),
     "ablate_tracked": _package(
         "ablate_tracked", "--suite tracked --steps 900 --jobs 2", of="ablate"
     ),
@@ -156,41 +153,11 @@ STUDIES = {
         f"--suite moba {_BOOKSHELF} --steps 600 --seeds 3 --jobs 2",
         of="ablate",
     ),
-    "ablate_open": _package(
-        "ablate_open", "--suite open --steps 900 --jobs 2", of="ablate"
-    ),
-    "ablate_jumps": _package(
-        "ablate_jumps",
-        "--suite league --capture CAPTURE --seconds 60 --clock processor --jobs 2 "
-        "--arms splats-deformable-small dynmf-small+rest spacetime-small+rest",
-        of="ablate",
-    ),
-    "ablate_rate": _package(
-        "ablate_rate", "--suite rate --steps 900 --jobs 2", of="ablate"
-    ),
-    "ablate_views": _package(
-        "ablate_views", "--suite views --seconds 30 --seeds 5", of="ablate"
-    ),
-    "ablate_lazy": _package(
-        "ablate_lazy", "--suite lazy --steps 600 --jobs 2", of="ablate"
-    ),
-    "nerf_speed": _study("nerf_speed", "--out nerf_speed.json"),
-    "field_speed": _study(
-        "field_speed", "--captures CAPTURE CAPTURE --out field_speed.json"
-    ),
     "speed": _package(
         "speed", "--job --beside CHECKOUT --yardstick PATH/run.py --out speed"
     ),
     "player_speed": _study(
         "player_speed", "PLAYER.html --gsplat INDEX.es.js --out player_speed.json"
-    ),
-    "raster_speed": _package(
-        "raster_speed", "--out raster_speed.json", page="__main__"
-    ),
-    "league": _package(
-        "league",
-        "CAPTURE --heldout 8 --scenes default topology --budgets 90 --seeds 3 "
-        "--jobs 2 --keep",
     ),
     "faults": _package("faults", "--trials 200 --jobs 2"),
     "mutants": _package("mutants", "--count 44"),
@@ -199,8 +166,10 @@ STUDIES = {
 # Studies that answered their question: the page and its numbers stay, without the code.
 REVISION = "99f3f69"  # the last revision with all of them
 FINISHED = (
-    *("accuracy_time", "appearance_codes", "camera_masks", "deformation_cost"),
-    *("elastic_points", "frequency_gates", "kan_local", "motion_rank"),
+    *("ablate_jumps", "ablate_lazy", "ablate_open", "ablate_rate", "ablate_start"),
+    *("ablate_views", "accuracy_time", "appearance_codes", "camera_masks"),
+    *("deformation_cost", "elastic_points", "field_speed", "frequency_gates"),
+    *("kan_local", "league", "motion_rank", "nerf_speed", "raster_speed"),
     *("solver_table", "solver_table_poses", "spectral_bias", "transient_medium"),
 )
 

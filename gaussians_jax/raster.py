@@ -53,7 +53,6 @@ class Residuals(NamedTuple):
 
     chunks: Intersections  # leading axis: the first `kept_chunks` chunks
     count: Int[Array, ""]  # chunks there were
-    pairs: Int[Array, ""]  # (tile, Gaussian) pairs blended in all of them
 
 
 @checked
@@ -96,21 +95,6 @@ def rasterize(
         return blank, jnp.ones(shape, values.dtype)
     state = _raster(layout, *_in_depth_order(footprints, values, grid))
     return _to_image(state[:, 1:], grid), _to_image(state[:, :1], grid)[..., 0]
-
-
-def blended_pairs(
-    footprints: Footprints, size: tuple[int, int], spec: RasterSpec
-) -> Int[Array, ""]:
-    """How many (tile, Gaussian) pairs one picture takes; times tile^2 evaluations.
-
-    `size` is (width, height).
-    """
-    layout = _layout(footprints, size, spec)
-    if footprints.depth.shape[0] == 0:
-        return jnp.int32(0)
-    nothing = jnp.zeros((footprints.depth.shape[0], 1), footprints.depth.dtype)
-    rects, table = _in_depth_order(footprints, nothing, layout.grid)
-    return _stream(layout, rects, table)[1].pairs
 
 
 def _in_depth_order(footprints, values, grid):
@@ -259,11 +243,7 @@ def _stream(layout, rects, table, through=False):
         return (
             cursor,
             state,
-            Residuals(
-                chunks,
-                residuals.count + 1,
-                residuals.pairs + jnp.sum(used, dtype=jnp.int32),
-            ),
+            Residuals(chunks, residuals.count + 1),
         )
 
     keep = spec.kept_chunks
@@ -275,7 +255,7 @@ def _stream(layout, rects, table, through=False):
     start = (
         Cursor(jnp.int32(0), jnp.int32(0)),
         _blank(layout, channels, table.dtype),
-        Residuals(chunks, jnp.int32(0), jnp.int32(0)),
+        Residuals(chunks, jnp.int32(0)),
     )
     _, state, residuals = lax.while_loop(
         lambda carry: _more(carry[0], carry[1], rects), body, start

@@ -16,14 +16,7 @@ class Arm:
     preset: str
     changes: tuple[str, ...] = ()
     needs: Literal["depths"] | None = None  # in the capture, or it changes nothing
-    environment: tuple[str, ...] = ()  # of its process: NAME=VALUE
     told: bool = False  # its start is told where a built-in scene's points are
-    share: float = 1.0  # of the steps that the others make; over seconds, all alike
-
-    @property
-    def variables(self) -> dict[str, str]:
-        """The environment by name."""
-        return dict(word.split("=", 1) for word in self.environment)
 
 
 class Claim(NamedTuple):

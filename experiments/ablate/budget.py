@@ -13,7 +13,6 @@ class Budget(NamedTuple):
     steps: int | None  # without seconds: None for the preset's own
     seconds: float | None
     folder: pathlib.Path
-    share: float | None = None  # of the preset's own steps
     clock: str = "wall"  # whose seconds
 
     @property
@@ -22,8 +21,6 @@ class Budget(NamedTuple):
         if self.seconds is not None:
             whose = "processor seconds" if self.clock == "processor" else "s"
             return f"for {self.seconds:g} {whose}, in as many steps as that allows"
-        if self.share is not None:
-            return f"over {self.share:g} of its preset's own steps"
         if self.steps is None:
             return "over its preset's own steps"
         return f"over {self.steps} steps"

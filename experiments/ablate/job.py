@@ -78,8 +78,8 @@ class Job:
             stem = f"ablation-{args.source.scene}"
         self.out = args.out or pathlib.Path("runs", stem)
         self.budgets = []
-        if args.seconds is None or args.steps is not None or args.share is not None:
-            self.budgets.append(Budget(args.steps, None, self.out, args.share))
+        if args.seconds is None or args.steps is not None:
+            self.budgets.append(Budget(args.steps, None, self.out))
         if args.seconds is not None:
             kind = "processor-seconds" if args.clock == "processor" else "seconds"
             folder = self.out / f"{kind}-{args.seconds:g}"
@@ -126,9 +126,6 @@ class Job:
         arm = self.suite.arms[name]
         representation = representations.of_preset(arm.preset)
         spec = representation.presets[arm.preset]
-        share = arm.share * (1.0 if self.args.share is None else self.args.share)
-        if steps is None and share != 1:
-            steps = max(1, round(share * spec.steps))
         if steps is not None:
             spec = representation.with_steps(spec, steps)
         return specs.override(spec, (*arm.changes, *self.args.set))
@@ -175,8 +172,6 @@ class Job:
                 return
             if self.kept(name, seed, budget) is not None:
                 return
-            with cli.user_errors():
-                self._check_environment(name)
             if budget.seconds is not None and seed == 0:
                 steps, kept = self._train_for(name, budget)
             else:
@@ -187,27 +182,18 @@ class Job:
             results.write(path, identity, kept)
         log("    " + line(kept.numbers))
 
-    def _check_environment(self, name):
-        for variable, value in self.suite.arms[name].variables.items():
-            if os.environ.get(variable) != value:
-                raise ValueError(
-                    f"{name} is trained under {variable}={value}: set it, or give "
-                    "--jobs 2, which gives every arm a process and sets it there"
-                )
-
     def _train_for(self, name, budget) -> tuple[int, ArmResult]:
         """The first seed, over as many steps as can be made in the time given.
 
         What a step costs is seen on the arm's run over --steps where there is one, or
         on a short pilot. It depends on the number of steps, as Gaussians grow: where
         the first try misses the time by too much, there is a second one; what takes too
-        long is not trained to its end for that. Steps that are settled are taken.
+        long is not trained to its end for that.
         """
-        settled = results.settled_steps(budget.folder).get(name)
-        if settled is None:  # other seeds may be there: they stand next to this one
-            settled = results.steps_of(budget.folder, name)
-        if settled is not None:
-            return settled, self._train(name, 0, settled)
+        # Other seeds may be finished: this one stands next to them.
+        found = results.steps_of(budget.folder, name)
+        if found is not None:
+            return found, self._train(name, 0, found)
         other = None
         if self.budgets[0] is not budget:
             other = self.kept(name, 0, self.budgets[0])
@@ -312,10 +298,7 @@ class Job:
         ValueError where no seed is finished.
         """
         if budget.seconds is None:
-            steps, share = budget.steps, self.suite.arms[name].share
-            if steps is not None:
-                steps = max(1, round(share * steps))
-            return self.spec(name, steps).steps
+            return self.spec(name, budget.steps).steps
         steps = results.steps_of(budget.folder, name)
         if steps is None:
             raise ValueError(
@@ -334,7 +317,7 @@ class Job:
             "seconds": budget.seconds,
             # As those that were kept before there was a choice.
             **({"clock": budget.clock} if budget.clock != "wall" else {}),
-            "spec": results.without_younger(specs.as_json(self.spec(name, steps))),
+            "spec": specs.as_json(self.spec(name, steps)),
             **{k: x for k, x in self.measured_on().items() if k != "scene"},
         }
 
@@ -348,13 +331,6 @@ class Job:
             # As those that were kept before what moves was scored there, too.
             **({} if self.known.exact else {"moving": "masked"}),
         }
-
-    def required_data(self, name: str) -> frozenset[str]:
-        """What an arm learns from beside pictures and cameras."""
-        spec = self.spec(name, None)
-        representation = representations.of_preset(self.suite.arms[name].preset)
-        metadata = representation.metadata_of(self.capture, spec)
-        return representation.build(spec, metadata).required_data
 
     def path(self, name: str, seed: int, budget: Budget) -> pathlib.Path:
         """Where an arm's numbers are when it is finished; its pictures are beside."""

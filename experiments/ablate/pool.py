@@ -77,7 +77,6 @@ def start(job, name: str, seed: int) -> Running:
         "PJRT_NPROC": "1",
         "PYTHONPATH": os.pathsep.join(path),
         "COLUMNS": "88",
-        **job.suite.arms[name].variables,
     }
     with log_path.open("w") as file:
         process = children.start(

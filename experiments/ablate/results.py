@@ -14,11 +14,8 @@ from experiments.ablate.measures import MEASURES
 from nerfies_jax.capture import cache_files
 from nerfies_jax.training.provenance import provenance
 
-# Raise a number when such files are no longer what they were.
-CELL, SETTLED = "cell of an ablation 1", "steps of an ablation 1"
-STEPS = "steps.json"  # of arms that need not find out what their seconds are worth
-# Fields of specs that came after arms were kept: none, they change nothing in these.
-YOUNGER = ("poses",)
+# Raise the number when such files are no longer what they were.
+CELL = "cell of an ablation 1"
 
 
 class ArmResult(NamedTuple):
@@ -75,11 +72,6 @@ def read(path: pathlib.Path, identity: dict[str, Any]) -> ArmResult | None:
     return ArmResult(read_numbers(numbers), arrays, notes)
 
 
-def is_there(path: pathlib.Path) -> bool:
-    """Whether there are the numbers of a finished arm, of whatever settings."""
-    return cache_files.read(path, _numbers) is not None
-
-
 def _arrays_of(path):
     return path.with_suffix(".npz")
 
@@ -110,20 +102,6 @@ def steps_of(folder: pathlib.Path, name: str) -> int | None:
     return None
 
 
-def settle_steps(folder: pathlib.Path, steps: dict[str, int]) -> None:
-    """Keep over how many steps some arms of this folder are to be trained."""
-    settled = {"steps": settled_steps(folder) | steps}
-    cache_files.write_json(folder / STEPS, settled, SETTLED)
-
-
-def settled_steps(folder: pathlib.Path) -> dict[str, int]:
-    """What `settle_steps` kept, by arm; of all others the first seed finds them."""
-    stored = cache_files.read(
-        folder / STEPS, lambda path: cache_files.read_json(path, SETTLED)
-    )
-    return {} if stored is None else stored["steps"]
-
-
 @contextlib.contextmanager
 def claimed(path: pathlib.Path) -> Iterator[bool]:
     """Whether this process may make `path`; false while another one does.
@@ -143,9 +121,3 @@ def claimed(path: pathlib.Path) -> Iterator[bool]:
         with contextlib.suppress(OSError):  # Windows removes no file that is open
             name.unlink()
         lock.release()
-
-
-def without_younger(stored: dict[str, Any]) -> dict[str, Any]:
-    """A spec as JSON, as it was before there was a choice that it leaves out."""
-    absent = [name for name in YOUNGER if stored.get(name, "") is None]
-    return {name: item for name, item in stored.items() if name not in absent}

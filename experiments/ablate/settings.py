@@ -15,34 +15,18 @@ class Ablate:
 
     GROUPS: ClassVar = {
         "arms": ("suite", "arms", "set"),
-        "training": ("steps", "share", "seconds", "clock", "seeds", "seed"),
+        "training": ("steps", "seconds", "clock", "seeds", "seed"),
         "measuring": ("frames", "tracks"),
     }
 
-    suite: Literal[
-        "fields",
-        "start",
-        "tracked",
-        "poses",
-        "sonata",
-        "moba",
-        "open",
-        "rate",
-        "views",
-        "lazy",
-        "league",
-    ] = "fields"
-    """Radiance fields; motions of splats from tracks and from rest; the parts of
-    splats-tracked-small; cameras refined while it trains; the ablations of Sonata or
-    MoBa-GS, and what these leave open; bits of ADC-GS; views in a step; elastic
-    penalties at some steps; or every small preset."""
+    suite: Literal["fields", "tracked", "poses", "sonata", "moba", "presets"] = "fields"
+    """Radiance fields; the parts of splats-tracked-small; cameras that are refined in
+    training; the ablations of Sonata or of MoBa-GS; or every small preset."""
     arms: tuple[str, ...] = ()
     """Which arms of the suite (default: all)."""
     source: cli.SourceOptions = CaptureSource()
     steps: int | None = None
     """Steps of training of every arm (default: the presets' own)."""
-    share: float | None = None
-    """Steps of training of every arm as a share of its preset's own."""
     seconds: float | None = None
     """Seconds of training of every arm instead, or, with --steps, as well: each gets
     the steps that it can make in this time here, and its schedules stretch to them."""
@@ -81,16 +65,13 @@ class Ablate:
 def check(args: Ablate) -> None:
     """Raise ValueError for what cannot be run."""
     least = min(args.frames, args.tracks, args.jobs, len(args.all_seeds))
-    limits = (args.budget, args.seconds, args.steps, args.share)
+    limits = (args.budget, args.seconds, args.steps)
     if least < 1 or not all(limit is None or limit > 0 for limit in limits):
         raise ValueError(
-            "--seeds, --frames, --tracks, --jobs, --budget, --seconds, --steps and "
-            f"--share are positive, got {args.seeds}, {args.frames}, {args.tracks}, "
-            f"{args.jobs}, {args.budget}, {args.seconds}, {args.steps} and "
-            f"{args.share}"
+            "--seeds, --frames, --tracks, --jobs, --budget, --seconds and --steps are "
+            f"positive, got {args.seeds}, {args.frames}, {args.tracks}, {args.jobs}, "
+            f"{args.budget}, {args.seconds} and {args.steps}"
         )
-    if args.share is not None and args.steps is not None:
-        raise ValueError("--steps and --share say the same thing: give one of them")
     if args.seed is not None and not (args.seed >= 0 and args.jobs == 1):
         raise ValueError(
             f"--seed {args.seed}: one seed from 0 on, in one process (--jobs 1)"

@@ -1,30 +1,20 @@
 """All suites of arms by name; no JAX until one needs it."""
 
-import functools
+from experiments.ablate.arms import FIELDS, MOBA, SONATA, Arm, Suite
+from experiments.ablate.tracked_arms import POSES, TRACKED_PARTS
+from nerfies_jax.runs.representations import PRESETS
 
-from experiments.ablate.arms import FIELDS, MOBA, SONATA, Suite
-from experiments.ablate.open_arms import LAZY, OPEN, RATE
-from experiments.ablate.start_arms import POSES, START, TRACKED_PARTS, VIEWS
-
+SMALL = {name: Arm(name) for name in PRESETS if name.endswith("-small")}
 KEPT = {
     "fields": FIELDS,
-    "start": START,
     "tracked": TRACKED_PARTS,
     "poses": POSES,
     "sonata": SONATA,
     "moba": MOBA,
-    "open": OPEN,
-    "rate": RATE,
-    "views": VIEWS,
-    "lazy": LAZY,
+    "presets": Suite(arms=SMALL, claims=(), seeds=3, pictured=(), context=""),
 }
 
 
-@functools.cache
 def named(name: str) -> Suite:
     """The suite of that name."""
-    if name == "league":
-        from experiments.league.rows import suite
-
-        return suite()
     return KEPT[name]

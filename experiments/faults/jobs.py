@@ -25,7 +25,7 @@ FIELD = (
     "template.color_width=8",
 )
 SWEEP = (
-    *("--suite", "league", "--arms", "splats-static-small", "splats-mcmc-small"),
+    *("--suite", "presets", "--arms", "splats-static-small", "splats-mcmc-small"),
     *("--steps", "20", "--seeds", "1", "--frames", "1", "--tracks", "4"),
     *("--jobs", "2", "--set", "sh_degree=0", "init.extra_random=0"),
 )

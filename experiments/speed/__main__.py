@@ -9,9 +9,10 @@
 Every preset is timed in two fresh processes, one that sees one core and one that has
 the cores its steps are made for. `--job` also times the README's first command, from an
 empty cache of programs and of evidence, and `--beside` that of another checkout, an
-earlier revision, between two of ours. `--yardstick` times the rasterizer beside
-another (`experiments.raster_speed`). Times are wall clock: leave the machine alone.
-What was measured before stays in OUT/speed.json where it is not measured anew.
+earlier revision, between two of ours. `--raster` times the rasterizer on cases as
+10000@256x256, and `--yardstick` next to another (`experiments.speed.raster`). Times are
+wall clock: leave the machine alone. What was measured before stays in OUT/speed.json
+where it is not measured anew.
 `--check` holds that file against an earlier one, each number with its tolerance: a
 quarter of a time, a half of compiling, a tenth of memory, 0.15 of a ratio to the other
 rasterizer, half a decibel.
@@ -29,13 +30,11 @@ import tempfile
 import time
 
 from experiments import cli, kept
-from experiments.speed import job
+from experiments.speed import job, raster
 from nerfies_jax import children, console
 from nerfies_jax.runs import representations
 
 STORED = "speed.json"
-# Of the yardstick's cases, those that its page bounds.
-CASES = ("10000@256x256", "50000@480x270", "200000@800x800")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +49,10 @@ class Speed:
     """Also the main job, from the command to its report."""
     beside: pathlib.Path | None = None
     """Also the main job of this checkout of the library, between two of ours."""
+    raster: tuple[str, ...] = ()
+    """Also the rasterizer, on such cases (default: three beside a --yardstick)."""
     yardstick: pathlib.Path | None = None
-    """Also the rasterizer, beside the one that this script times."""
+    """Also the rasterizer, next to the one that this script times."""
     out: pathlib.Path = pathlib.Path("runs/speed")
     """Folder for speed.json."""
     check: pathlib.Path | None = None
@@ -61,6 +62,8 @@ class Speed:
         cli.check_presets(self.presets)
         if self.presets and not self.steps:
             raise ValueError("--no-steps times no preset: leave --presets out")
+        for case in self.raster:
+            raster.parsed(case)
 
 
 @cli.command(Speed)
@@ -75,6 +78,8 @@ def main(args):
             before = baselines.read(args.check, STORED)
         if args.beside is not None and not (args.beside / "experiments").is_dir():
             raise ValueError(f"--beside {args.beside}: no checkout of this library")
+        if args.yardstick is not None and not args.yardstick.is_file():
+            raise ValueError(f"--yardstick {args.yardstick}: no such file")
         args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / STORED
     small = tuple(n for n in representations.PRESETS if n.endswith("-small"))
@@ -86,8 +91,8 @@ def main(args):
         jobs = {"first": None, "beside": args.beside, "again": None}
         for name, checkout in jobs.items():
             _keep_job(path, ("jobs", name), checkout)
-    if args.yardstick is not None:
-        record = _raster(args.yardstick)
+    if args.raster or args.yardstick is not None:
+        record = _apart(raster.measure, args.raster or raster.CASES, args.yardstick)
         keep(path, record["machine"], ("raster",), {"rows": record["rows"]})
     console.say(f"kept in {path}")
     stored = cli.stored(path)
@@ -169,19 +174,6 @@ def main_job(checkout: pathlib.Path | None = None) -> dict:
         **{name: metrics.get(name) for name in (*wanted, "heldout.moving_psnr")},
         "machine": clock.machine(),
     }
-
-
-def _raster(yardstick):
-    command = [sys.executable, "-m", "experiments.raster_speed", "--json"]
-    command += ["--cases", *CASES, "--yardstick", str(yardstick)]
-    answer = subprocess.run(
-        command,
-        check=True,
-        capture_output=True,
-        text=True,
-        env=children.environment(),
-    )
-    return json.loads(answer.stdout)
 
 
 if __name__ == "__main__":

@@ -112,8 +112,8 @@ def _raster(rows):
         [
             [
                 row["case"],
-                *(markdown.number(row[name], 1) for name in names),
-                markdown.number(row["ratio"], 2),
+                *(markdown.number(row.get(name), 1) for name in names),
+                markdown.number(row.get("ratio"), 2),
             ]
             for row in rows
         ],

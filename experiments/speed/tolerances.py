@@ -35,7 +35,8 @@ def _presets(presets) -> Iterator[Metric]:
 
 def _raster(stored) -> Iterator[Metric]:
     for row in stored.get("raster", {}).get("rows", ()):
-        yield _within(f"raster.{row['case']}.ratio", row["ratio"], "", RATIO)
+        if "ratio" in row:
+            yield _within(f"raster.{row['case']}.ratio", row["ratio"], "", RATIO)
 
 
 def _job(stored) -> Iterator[Metric]:

@@ -78,12 +78,12 @@ def test_arms_one_after_the_other_have_all_cores(tiny, monkeypatch):
     nothing = types.SimpleNamespace(run=list, budgets=(), missing=list)
     monkeypatch.setattr(ablate_job, "Job", lambda _: nothing)
     monkeypatch.setattr(platform, "start_jax", lambda *given: started.append(given))
-    views = ("--suite", "views", "--arms", "one", "four")
-    presets = ("--suite", "league", "--arms", "splats-static-small", "nerf-small")
-    assert run(*tiny, *views[:4]) == 0
-    assert run(*tiny, *views) == 0
+    presets = ("--suite", "presets", "--arms", "splats-static-small", "nerf-small")
+    four = ("--set", "batch_size=4")
+    assert run(*tiny, *presets[:4]) == 0
+    assert run(*tiny, *presets[:4], *four) == 0
     assert run(*tiny, *presets) == 0
-    assert run(*tiny, *views, "--jobs", "2") == 0
+    assert run(*tiny, *presets[:4], *four, "--jobs", "2") == 0
     wanted = [("one", 1), ("one", 4), ("all", 2), ("one", 1)]
     assert started == [("auto", *cores) for cores in wanted]
 

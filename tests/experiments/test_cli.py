@@ -145,7 +145,6 @@ def test_every_command_is_listed_with_a_line(capsys):
 # Their options are made of what they study.
 NEED_JAX = {
     "hard_cases",
-    "raster_speed",
 }
 ASK_FOR_HELP = """
 import contextlib, io, sys

@@ -60,12 +60,6 @@ def cell(folder):
     return found
 
 
-def settled(folder):
-    if not results.settled_steps(folder):
-        results.settle_steps(folder, {"static": 700, "nerfies": 300})
-    return results.settled_steps(folder)
-
-
 def rows(folder):
     path = folder / "rows.json"
     found = kept.rows(path, rows=list)
@@ -90,7 +84,6 @@ KINDS = {
     "manifest of a scene": Kind(scene, "*/manifest.json", "*"),
     "numbers of a cell": Kind(cell, "static-0.json", "static-0.json"),
     "arrays of a cell": Kind(cell, "static-0.npz", "static-0.json"),
-    "settled steps": Kind(settled, "steps.json", "steps.json"),
     "a finished run": Kind(finished, "metrics.json", "metrics.json", sealed=False),
     "rows of a study": Kind(rows, "rows.json", "rows.json", True, False),
 }

@@ -37,7 +37,7 @@ def test_the_program_trains_renders_and_scores(tmp_path, monkeypatch, capsys):
 def test_the_table_of_presets_shows_kept_numbers():
     rows = re.findall(r"^\|[^|]+\| `([^`]+)` \| ([\d.]+) dB \|$", README, re.M)
     assert len(rows) >= 5
-    kept = json.loads((ROOT / "experiments/measured/league.json").read_text())
+    kept = json.loads((ROOT / "docs/results/league.json").read_text())
     (contest,) = [c for c in kept["contests"] if c["film"] == "default"]
     for preset, value in rows:
         row = preset.replace(" --set start.motion=none", "+rest")

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from experiments.speed import __main__ as speed
-from experiments.speed import tolerances
+from experiments.speed import raster, tolerances
 from nerfies_jax.measure import clock
 
 ONE = {"step_ms": 40.0, "compile_seconds": 9.0, "frame_ms": 7.0, "peak_mb": 1400.0}
@@ -77,3 +77,37 @@ def test_a_check_against_no_file_is_refused_before_anything_is_timed(tmp_path, c
     assert checked(tmp_path / "out", tmp_path / "nothing.json") == 2
     assert "nothing.json" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+# Another rasterizer, which draws nothing and says that it took a minute.
+OTHER = """
+import argparse, json
+import numpy as np
+parser = argparse.ArgumentParser()
+for name in ("--gaussians", "--size", "--scene"):
+    parser.add_argument(name)
+parser.add_argument("--json", action="store_true")
+args = parser.parse_args()
+count = int(args.gaussians)
+np.savez(
+    args.scene,
+    means2d=np.full((count, 2), 12.0),
+    covs=np.tile([4.0, 0.5, 3.0], (count, 1)),
+    depths=np.arange(1.0, count + 1),
+    opacities=np.full(count, 0.5),
+    colors=np.full((count, 3), 0.5),
+)
+print(json.dumps({"forward_ms": 30_000, "forward_backward_ms": 60_000}))
+"""
+
+
+@pytest.mark.slow
+def test_the_rasterizer_is_timed_next_to_another_on_its_scene(tmp_path, monkeypatch):
+    script = tmp_path / "other.py"
+    script.write_text(OTHER)
+    monkeypatch.setattr(raster, "REPEATS", 1)
+    row = raster.time_case("150@40x24", script)
+    assert row["forward_ms"] > 0
+    assert row["forward_backward_ms"] > 0
+    assert row["yardstick_forward_backward_ms"] == 60_000
+    assert row["ratio"] == row["forward_backward_ms"] / 60_000

@@ -1,0 +1,190 @@
+"""The rasterizer's time, alone or next to another rasterizer on the same scene.
+
+Times are medians of process CPU time in one process that sees one core, because the
+machine may be shared. The other rasterizer is a script that is called as
+`PYTHON SCRIPT --gaussians N --size WxH --scene FILE --json`. It writes the scene that
+it draws to FILE and answers with `forward_ms` and `forward_backward_ms`.
+"""
+
+import dataclasses
+import json
+import pathlib
+import subprocess
+import sys
+import tempfile
+import time
+
+from nerfies_jax.runs import platform
+
+# Those that the published comparison bounds, as GAUSSIANS@WIDTHxHEIGHT.
+CASES = ("10000@256x256", "50000@480x270", "200000@800x800")
+REPEATS = 7
+
+
+def measure(cases: tuple[str, ...], yardstick: pathlib.Path | None) -> dict:
+    """Time all cases in this process.
+
+    Args:
+      cases: Numbers of Gaussians and image sizes, as `CASES`.
+      yardstick: Script of the other rasterizer, or None.
+
+    Returns:
+      The machine and one row for each case.
+    """
+    platform.start_jax("cpu", "one")
+    from nerfies_jax.measure import clock
+
+    rows = [time_case(text, yardstick) for text in cases]
+    return {"machine": clock.machine(), "rows": rows}
+
+
+def parsed(case: str) -> tuple[int, int, int]:
+    """Gaussians, width and height of a case; ValueError where it is none."""
+    try:
+        count, size = case.split("@")
+        width, height = size.split("x")
+        return int(count), int(width), int(height)
+    except ValueError:
+        raise ValueError(
+            f"a case is GAUSSIANS@WIDTHxHEIGHT, as 10000@256x256; got {case!r}"
+        ) from None
+
+
+def compiled(text: str, scene: dict) -> tuple:
+    """Compile the rasterizer and its gradient for a scene.
+
+    Args:
+      text: The case.
+      scene: Projected Gaussians, as `make_scene` draws them.
+
+    Returns:
+      Calls without arguments: forward, and forward and backward.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    from gaussians_jax import raster
+    from gaussians_jax.raster_spec import GSPLAT
+
+    # The clamp of the other rasterizer.
+    spec = dataclasses.replace(GSPLAT, alpha_max=0.999)
+    size = parsed(text)[1:]
+    footprints = footprints_of(scene, spec.alpha_threshold)
+    colors = jnp.asarray(scene["colors"], jnp.float32)
+
+    @jax.jit
+    def forward(footprints, colors):
+        return raster.rasterize(footprints, colors, size, spec)
+
+    def loss(mean_px, whitening, opacity, colors, footprints):
+        moved = footprints._replace(
+            mean_px=mean_px, whitening=whitening, opacity=opacity
+        )
+        image, transmittance = raster.rasterize(moved, colors, size, spec)
+        return jnp.sum(image) + jnp.sum(transmittance)
+
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3)))
+    return (
+        lambda: forward(footprints, colors),
+        lambda: gradient(*footprints[:3], colors, footprints),
+    )
+
+
+def make_scene(count: int, width: int, height: int) -> dict:
+    """Half uniform, half in four clusters; three sigma about 6.5 px."""
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    size = np.array([width, height])
+    center = rng.random((4, 2))[rng.integers(0, 4, count)] * size
+    clustered = center + rng.normal(size=(count, 2)) * size * 0.06
+    spread = rng.random((count, 2)) * size
+    one, two = np.exp(rng.normal(0.3, 0.5, (2, count))) ** 2
+    angle = rng.random(count) * np.pi
+    cos, sin = np.cos(angle), np.sin(angle)
+    covariance = [
+        cos**2 * one + sin**2 * two + 0.3,
+        cos * sin * (one - two),
+        sin**2 * one + cos**2 * two + 0.3,
+    ]
+    return dict(
+        means2d=np.where(rng.random((count, 1)) < 0.5, spread, clustered),
+        covs=np.stack(covariance, 1),
+        depths=1 + 9 * rng.random(count),
+        opacities=1 / (1 + np.exp(-2 * rng.normal(size=count))),
+        colors=rng.random((count, 3)),
+    )
+
+
+def footprints_of(scene: dict, alpha_threshold: float):
+    """Footprints of a scene given by image covariances (px^2)."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from gaussians_jax.projection import Footprints
+
+    a, b, c = scene["covs"].astype(np.float64).T
+    opacity = scene["opacities"].astype(np.float64)
+    whitening = [np.sqrt(0.5 / a), b / a, np.sqrt(0.5 / (c - b * b / a))]
+    reach = 2 * np.log(np.maximum(opacity / alpha_threshold, 1))
+    extent = np.sqrt(reach[:, None] * np.stack([a, c], 1))
+    fields = (
+        scene["means2d"],
+        np.stack(whitening, 1),
+        opacity,
+        scene["depths"],
+        extent,
+    )
+    return Footprints(*(jnp.asarray(field, jnp.float32) for field in fields))
+
+
+def median_ms(call) -> float:
+    """Milliseconds of a call, the median of several after one that warms up."""
+    import jax
+    import numpy as np
+
+    jax.block_until_ready(call())
+    times = []
+    for _ in range(REPEATS):
+        start = time.process_time()
+        jax.block_until_ready(call())
+        times.append(1e3 * (time.process_time() - start))
+    return float(np.median(times))
+
+
+def yardstick_times(script: pathlib.Path, text: str, scene_file: str) -> dict:
+    """What the other rasterizer took for the scene; `text` is "COUNT@SIZE"."""
+    count, size = text.split("@")
+    command = [sys.executable, str(script), "--gaussians", count, "--size", size]
+    command += ["--scene", scene_file, "--json"]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    if answer.returncode:
+        raise ValueError(f"{script} failed on {text}: {answer.stderr.strip()[-300:]}")
+    return json.loads(answer.stdout.strip().splitlines()[-1])
+
+
+def time_case(text: str, yardstick: pathlib.Path | None) -> dict:
+    """Time one case, between two runs of the other rasterizer where there is one."""
+    import numpy as np
+
+    theirs, scene = [], make_scene(*parsed(text))
+    if yardstick is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            file = str(pathlib.Path(folder) / "scene.npz")
+            theirs.append(yardstick_times(yardstick, text, file))
+            with np.load(file) as stored:
+                scene = {name: stored[name] for name in stored.files}
+    forward, both = compiled(text, scene)
+    row = {
+        "case": text,
+        "forward_ms": median_ms(forward),
+        "forward_backward_ms": median_ms(both),
+    }
+    if yardstick is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            file = str(pathlib.Path(folder) / "scene.npz")
+            theirs.append(yardstick_times(yardstick, text, file))
+        for name in ("forward_ms", "forward_backward_ms"):
+            row[f"yardstick_{name}"] = sum(times[name] for times in theirs) / 2
+        row["ratio"] = row["forward_backward_ms"] / row["yardstick_forward_backward_ms"]
+    return row
