@@ -266,7 +266,7 @@ def _slope_difference(one, other):
 
 
 def _log_quotient_difference(excess, log_less, product):
-    """Divided difference of log x / x between y and (1 + `excess`) y, uncancelled.
+    """Divided difference of log x / x between y and (1 + `excess`) y, uncanceled.
 
     From the smaller one up: down from the larger, log1p nears log 0. In float32 the
     result was 4e-4 off at a ratio of 5e4 and NaN at 5e7.

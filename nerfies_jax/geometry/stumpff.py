@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from nerfies_jax.geometry.precision import at_least_float32
 
 # rad²: below, the series; above, the closed form. At 3 rad the closed forms of the
-# orders used here (up to 7, in second derivatives of a screw) have stopped cancelling.
+# orders used here (up to 7, in second derivatives of a screw) have stopped canceling.
 SERIES_BELOW = 9.0
 _TERMS = {"float32": 9, "float64": 15}  # leave 3e-9 and 3e-20 of the first at 9 rad²
 
@@ -67,7 +67,7 @@ def _closed(order, angle_sq):
     elif order == 0:
         return jnp.cos(angle)
     else:
-        # 2 sin²(θ/2) = 1 - cos θ, uncancelled at whole turns
+        # 2 sin²(θ/2) = 1 - cos θ, uncanceled at whole turns
         value, start = 2 * jnp.sin(angle / 2) ** 2 / angle_sq, 4
     for k in range(start, order + 1, 2):
         value = (1 / math.factorial(k - 2) - value) / angle_sq

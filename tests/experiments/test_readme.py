@@ -1,4 +1,4 @@
-"""What README says: a program that runs, numbers that are kept, links that lead on."""
+"""README.md: its programs run, its numbers equal the measured ones, its links exist."""
 
 import json
 import pathlib
@@ -6,7 +6,7 @@ import re
 import statistics
 
 import jax
-import PIL.Image
+import numpy as np
 import pytest
 
 import nerfies_jax as nj
@@ -17,21 +17,27 @@ README = (ROOT / "README.md").read_text()
 PAGES = [path for path in ROOT.glob("*.md")] + sorted(ROOT.glob("docs/**/*.md"))
 
 
+PROGRAMS = re.findall(r"```python\n(.*?)```", README, re.S)
+
+
 @pytest.mark.full
-def test_the_program_trains_renders_and_scores(tmp_path, monkeypatch, capsys):
-    (program,) = re.findall(r"```python\n(.*?)```", README, re.S)
-    assert len(program.splitlines()) <= 20
-    assert program.count(", 500)") == 1
+@pytest.mark.parametrize("program", PROGRAMS, ids=range(len(PROGRAMS)))
+def test_a_program_of_readme_runs(program, monkeypatch, capsys):
+    trains = "nj.fit(" in program
+    assert program.count(", 500)") == trains
     capture = scenes.tiny_capture()
     monkeypatch.setattr(nj, "built_in_scene", lambda name: capture)
-    monkeypatch.chdir(tmp_path)
+    names = {}
     with jax.numpy_dtype_promotion("standard"):  # JAX's own, as a user has it
-        exec(compile(program.replace(", 500)", ", 2)"), "README.md", "exec"), {})
-    scores = re.search(r"(\d+) held-out frames: (\S+) dB", capsys.readouterr().out)
-    assert int(scores[1]) == len(capture.heldout)
-    assert 0 < float(scores[2]) < 60
-    with PIL.Image.open("held_out.png") as picture:
-        assert picture.size == capture.size
+        exec(compile(program.replace(", 500)", ", 2)"), "README.md", "exec"), names)
+    if trains:
+        scores = re.search(r"(\d+) held-out frames: (\S+) dB", capsys.readouterr().out)
+        assert int(scores[1]) == len(capture.heldout)
+        assert 0 < float(scores[2]) < 60
+        assert names["image"].shape[1::-1] == capture.size
+    else:
+        assert np.all(np.isfinite(names["gradient"]))
+        assert np.any(names["gradient"] != 0)
 
 
 def test_the_table_of_presets_shows_kept_numbers():
@@ -47,8 +53,7 @@ def test_the_table_of_presets_shows_kept_numbers():
         assert f"{number:.2f}" == value, preset
 
 
-def test_readme_fits_and_every_link_leads_to_a_file():
-    assert len(README.splitlines()) <= 150
+def test_every_link_leads_to_a_file():
     dead = [
         (page.name, target)
         for page in PAGES

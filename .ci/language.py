@@ -1,0 +1,156 @@
+"""Count violations of the language rules, and fail if a count is above its bound.
+
+The rules: a docstring begins with an imperative or a noun phrase, its first paragraph
+has no semicolons, public functions document their arguments and results (Google style),
+and all text is in American spelling.
+
+    python .ci/language.py            # check
+    python .ci/language.py --list     # also list every violation
+"""
+
+import ast
+import pathlib
+import re
+import subprocess
+import sys
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+PACKAGES = ("nerfies_jax", "gaussians_jax", "experiments")
+# Percent of the docstrings of each package. Only ever lower these.
+BAD_OPENINGS = {"nerfies_jax": 2.2, "gaussians_jax": 20.5, "experiments": 20.0}
+SEMICOLONS = {"nerfies_jax": 2.0, "gaussians_jax": 23.5, "experiments": 19.5}
+UNDOCUMENTED = 10  # public functions without Args or Returns
+BRITISH = 0  # words
+
+OPENING = re.compile(r"(What|Which|Whether|How|Of|As|Those)\b")
+# Searched in single lower-case words.
+SPELLING = re.compile(
+    r"colour|neighbour|^(de|re|un)?cent(re|res|red|ring)$|grey|behaviour|favour|learnt"
+    r"|^burnt$|^towards$|catalogue|^(milli|centi|kilo)?metres?$"
+    r"|(optim(?!istix)|initial|regular|normal|stabil|material|quant|recogn|standard|factor"
+    r"|penal|minim|maxim|raster|parametr|discret|organ|summar|visual|synchron|serial"
+    r"|general|linear|local|final|character|util|memor|vector)is(e|ing|ation)"
+    r"|^analys(ed?|ing)$|(model|label|travel|level|signal|cancel|channel)l(ed|ing)$"
+)
+ALLOWED = {"minimise"}  # optimistix.minimise
+
+
+def docstrings(path):
+    """Yield (line, name, docstring) for a module, its classes and its functions."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(
+            node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+        ):
+            text = ast.get_docstring(node)
+            if text:
+                name = getattr(node, "name", path.stem)
+                yield getattr(node, "lineno", 1), name, text
+
+
+def public_functions():
+    """Yield (path, function) for all functions that the packages' stubs name."""
+    for package in PACKAGES[:2]:
+        for node in ast.parse((ROOT / package / "__init__.pyi").read_text()).body:
+            if not isinstance(node, ast.ImportFrom):
+                continue
+            base = ROOT.joinpath(package, *filter(None, (node.module or "").split(".")))
+            for alias in node.names:
+                module = base / f"{alias.name}.py"
+                if module.exists():
+                    yield from ((module, f) for f in functions(module))
+                elif base.with_suffix(".py").exists():
+                    path = base.with_suffix(".py")
+                    named = [f for f in functions(path) if f.name == alias.name]
+                    yield from ((path, f) for f in named)
+
+
+def functions(path):
+    """Return the public functions that a module defines."""
+    body = ast.parse(path.read_text()).body
+    return [
+        node
+        for node in body
+        if isinstance(node, ast.FunctionDef)
+        and not node.name.startswith("_")
+        and not any("overload" in ast.unparse(d) for d in node.decorator_list)
+    ]
+
+
+def missing_sections(function):
+    """Name the sections that a function's docstring lacks."""
+    text = ast.get_docstring(function) or ""
+    taken = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    has_result = not (
+        isinstance(function.returns, ast.Constant) and function.returns.value is None
+    )
+    missing = []
+    if taken and "\nArgs:" not in text:
+        missing.append("Args")
+    if has_result and "\nReturns:" not in text and "\nYields:" not in text:
+        missing.append("Returns")
+    return missing
+
+
+def british_words():
+    """Yield (place, word) for British spellings in all tracked text files."""
+    listed = subprocess.run(
+        ["git", "ls-files", "*.py", "*.pyi", "*.md", "*.js", "*.html", "*.toml"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    for name in listed:
+        path = ROOT / name
+        if path == pathlib.Path(__file__) or not path.exists():
+            continue
+        text = path.read_text().lower()
+        for word in set(re.findall("[a-z]+", text)) - ALLOWED:
+            if SPELLING.search(word):
+                line = text.count("\n", 0, text.index(word)) + 1
+                yield f"{name}:{line}", word
+
+
+def main():
+    """Print the counts and return 1 if any of them is above its bound."""
+    listing, failures = "--list" in sys.argv, []
+
+    def report(what, count, bound, unit, places):
+        print(f"{what}: {count:.{1 if unit else 0}f}{unit} (at most {bound}{unit})")
+        if listing or count > bound:
+            print(*(f"  {place}" for place in places), sep="\n")
+        if count > bound:
+            failures.append(what)
+
+    for package in PACKAGES:
+        found = [
+            (
+                f"{path.relative_to(ROOT)}:{line} {name}: {text.partition(chr(10))[0]}",
+                text,
+            )
+            for path in sorted((ROOT / package).rglob("*.py"))
+            for line, name, text in docstrings(path)
+        ]
+        opening = [place for place, text in found if OPENING.match(text)]
+        semicolon = [place for place, text in found if ";" in text.split("\n\n")[0]]
+        for what, places, bounds in (
+            ("docstrings that begin with a question word", opening, BAD_OPENINGS),
+            ("first paragraphs with a semicolon", semicolon, SEMICOLONS),
+        ):
+            share = 100 * len(places) / len(found)
+            report(f"{package}: {what}", share, bounds[package], " %", places)
+    undocumented = [
+        f"{path.relative_to(ROOT)}:{function.lineno} {function.name}: "
+        + " and ".join(missing_sections(function))
+        for path, function in public_functions()
+        if missing_sections(function)
+    ]
+    name = "public functions without sections"
+    report(name, len(undocumented), UNDOCUMENTED, "", undocumented)
+    words = [f"{place} {word}" for place, word in british_words()]
+    report("British spellings", len(words), BRITISH, "", words)
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
