@@ -1,9 +1,9 @@
-"""Which Gaussians touch which tiles, in depth order, one chunk of pairs at a time.
+"""Binning of Gaussians to tiles in depth order, one chunk of pairs at a time.
 
-All (Gaussian, tile) pairs form one conceptual list: nearest Gaussian first, its tiles
+All (Gaussian, tile) pairs form one conceptual list, nearest Gaussian first, its tiles
 row by row. A chunk is the next `capacity` entries of that list, sorted by tile. Each
-tile therefore meets its Gaussians in depth order whatever the capacity, and a Gaussian
-wider than a chunk simply continues in the next one: nothing can overflow.
+tile therefore meets its Gaussians in depth order for any capacity, and a Gaussian wider
+than a chunk continues in the next one. Nothing can overflow.
 """
 
 import math
@@ -22,7 +22,7 @@ EXPONENT_SLACK = 1e-4
 
 
 class Grid(NamedTuple):
-    """The image cut into square tiles; static."""
+    """Static division of the image into square tiles."""
 
     width: int  # px
     height: int
@@ -42,7 +42,7 @@ class Grid(NamedTuple):
 
 
 class TileRects(NamedTuple):
-    """Tiles that a Gaussian's rectangle covers, one row per Gaussian, nearest first."""
+    """Tiles that the rectangle of each Gaussian covers, nearest Gaussian first."""
 
     left: Int[Array, " gaussians"]
     top: Int[Array, " gaussians"]
@@ -70,7 +70,16 @@ def tile_rects(
     extent_px: Float[Array, "gaussians 2"],
     grid: Grid,
 ) -> TileRects:
-    """Tiles with a pixel center inside mean +- extent; extent 0 means not drawn."""
+    """Find the tiles with a pixel center inside mean +- extent.
+
+    Args:
+      mean_px: Projected means in pixels.
+      extent_px: Half sizes of the rectangles in pixels; 0 excludes a Gaussian.
+      grid: The tiles.
+
+    Returns:
+      The rectangle of tiles of each Gaussian.
+    """
     eps = jnp.finfo(mean_px.dtype).eps
     # Rounding of mean +- extent, so that a pixel on the edge is never lost.
     reach = extent_px + 8 * eps * (jnp.abs(mean_px) + extent_px)
@@ -137,12 +146,22 @@ def next_intersections(
     grid: Grid,
     capacity: int,
 ) -> tuple[Intersections, Cursor]:
-    """The pairs from `cursor` on, and where the chunk after them starts.
+    """Sort the next chunk of pairs by tile.
 
-    `table` holds mean (px), p, k, r and log opacity in its first six columns, a row per
-    rank; `log_cut` is the log of the alpha below which nothing is drawn. Pairs of tiles
-    that are not in `open_tiles` (all pixels done) and pairs whose ellipse misses the
-    tile are left out.
+    Pairs of saturated tiles and pairs whose ellipse misses the tile are left out.
+
+    Args:
+      cursor: Start of the chunk.
+      rects: Rectangles of tiles, in depth order.
+      table: Its first six columns are the mean (px), p, k, r and log opacity of each
+        Gaussian, in depth order.
+      open_tiles: False for tiles whose pixels are all saturated.
+      log_cut: Logarithm of the smallest alpha that is rendered.
+      grid: The tiles.
+      capacity: Number of pairs in a chunk.
+
+    Returns:
+      The pairs of the chunk, and the start of the following chunk.
     """
     rank, within, following = _expand(cursor, rects.count, capacity)
     in_use = rank >= 0
@@ -161,7 +180,16 @@ def next_intersections(
 
 
 def advance(cursor: Cursor, count: Int[Array, " gaussians"], capacity: int) -> Cursor:
-    """Where the chunk after that at `cursor` starts; `count` is that of `TileRects`."""
+    """Compute the start of the next chunk.
+
+    Args:
+      cursor: Start of this chunk.
+      count: Number of tiles of each Gaussian (`TileRects.count`).
+      capacity: Number of pairs in a chunk.
+
+    Returns:
+      The start of the next chunk.
+    """
     return _span(cursor, count, capacity)[2]
 
 
@@ -191,7 +219,7 @@ def _span(cursor, count, capacity):
 
 
 def _expand(cursor, count, capacity):
-    """Rank and number within its rectangle of each of `capacity` slots; -1 beyond."""
+    """Return each slot's rank and number within its rectangle, or -1 beyond the end."""
     begin, filled, following = _span(cursor, count, capacity)
     index = jnp.arange(count.shape[0], dtype=jnp.int32)
     marks = jnp.zeros(capacity + 1, jnp.int32).at[begin].max(index + 1)
@@ -219,11 +247,11 @@ def _running_max(marks):
 
 
 def _ellipse_meets_tile(shape, row, column, log_cut, grid):
-    """Whether the smallest exponent over the tile's pixel centers reaches the cut.
+    """Test if the smallest exponent over the tile's pixel centers reaches the cut.
 
-    The minimum of a convex form over a rectangle lies on an edge that faces the
-    center, or is zero inside: the two lines x = clip(mean x) and y = clip(mean y) hold
-    it in every case.
+    The minimum of a convex form over a rectangle is zero inside, or lies on an edge
+    that faces the center. The lines x = clip(mean x) and y = clip(mean y) contain it in
+    every case.
     """
     mean_x, mean_y, p, k, r, log_opacity = shape
     half = (grid.tile - 1) / 2
@@ -250,10 +278,20 @@ def sort_pairs(
     gaussians: int,
     grid: Grid,
 ) -> Intersections:
-    """Pairs in order of rank, sorted by tile; tile `grid.tiles` marks an unused slot.
+    """Sort pairs, given in depth order, by tile.
 
-    One unsigned sort of (tile, rank since the chunk's first) where both fit 32 bits: a
-    sort with a payload costs ten times as much on the CPU.
+    One unsigned sort of (tile, rank since the chunk's first) is used where both fit 32
+    bits. A sort with a payload costs ten times as much on the CPU.
+
+    Args:
+      tile: Tile of each slot; `grid.tiles` marks an unused slot.
+      rank: Depth rank of the Gaussian in each slot.
+      first_rank: Smallest rank of the chunk.
+      gaussians: Number of Gaussians.
+      grid: The tiles.
+
+    Returns:
+      The sorted pairs.
     """
     capacity = tile.shape[0]
     # Only Gaussians that touch no tile, and these come last, have no pair: so ranks
@@ -276,9 +314,16 @@ def sort_pairs(
 
 
 def longest_first(length: Int[Array, " tiles"]) -> Int[Array, " tiles"]:
-    """Tiles from most to fewest pairs, ties by number; empty ones are last.
+    """Order the tiles from most to fewest pairs.
 
-    Tile and length share a word of 32 bits: longer ones than fit it tie.
+    Ties go to the lower number, and empty tiles come last. Tile and length share a word
+    of 32 bits, so lengths that do not fit count as ties.
+
+    Args:
+      length: Number of pairs of each tile.
+
+    Returns:
+      Tile numbers.
     """
     tile_bits = max(1, (length.shape[0] - 1).bit_length())
     most = jnp.minimum(jnp.max(length), (1 << (32 - tile_bits)) - 1)

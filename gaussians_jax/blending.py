@@ -1,8 +1,8 @@
-"""Front-to-back compositing of sorted pairs, and its gradient, tiles in lockstep.
+"""Front-to-back compositing of sorted pairs, and its gradient, with tiles in lockstep.
 
-State of a tile: one row of transmittance and one per channel over its pixels, pixels
-last. The transmittance of a pixel that is done is kept negative, so it needs no mask of
-its own. Both passes go front to back and recompute every alpha from the same rows.
+The state of a tile is one row of transmittance and one row per channel over its pixels,
+with pixels last. The transmittance of a saturated pixel is kept negative, so that no
+mask is needed. Both passes go front to back and recompute every alpha.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ SHAPE_COLUMNS = 6  # mean x, mean y (px), p, k, r, log opacity; then channels
 
 
 class Lockstep(NamedTuple):
-    """How many tiles and Gaussians one step takes; static."""
+    """Static number of tiles and Gaussians that one loop iteration processes."""
 
     batch: int
     chunk: int
@@ -36,10 +36,20 @@ def blend(
     step: Lockstep,
     through: bool = False,
 ) -> tuple[Float[Array, "tiles rows pixels"], Int[Array, " tiles"]]:
-    """Composite a chunk of pairs onto `state`; also how many pairs each tile looked at.
+    """Composite a chunk of pairs onto the state.
 
-    The last row of `table` must be transparent (log opacity minus infinity). With
-    `through` forward-mode derivatives pass the clamp of alpha.
+    Args:
+      state: Transmittance and channels of each tile.
+      isects: Sorted pairs.
+      table: Columns of each Gaussian. The last Gaussian must be transparent (log
+        opacity minus infinity).
+      spec: Thresholds.
+      grid: The tiles.
+      step: Numbers of tiles and Gaussians per iteration.
+      through: Let forward-mode derivatives ignore the clamp of alpha.
+
+    Returns:
+      The new state, and the number of pairs that each tile evaluated.
     """
     order, batches = _by_length(isects, step.batch)
 
@@ -102,13 +112,13 @@ def blend_gradient(
 ) -> tuple[Float[Array, "tiles rows pixels"], Float[Array, "gaussians columns"]]:
     """Add a chunk's part of the gradient of every table entry.
 
-    `state` carries two rows: transmittance, and what is still to come of the loss
-    through this pixel, S = sum over the Gaussians not yet met of w (color . g), plus
-    g_T times the final transmittance. With that, going front to back,
+    `state` has two rows: the transmittance, and the part of the loss that is still to
+    come through this pixel, S = sum over the remaining Gaussians of w (color . g), plus
+    g_T times the final transmittance. Going front to back,
 
         d loss / d alpha_i = T_i (color_i . g) - S_i / (1 - alpha_i),
 
-    S_i being what remains behind Gaussian i. No image but the final one is needed.
+    where S_i is the part behind Gaussian i. Only the final image is needed.
     """
     order, batches = _by_length(isects, step.batch)
 
@@ -156,15 +166,15 @@ def blend_gradient(
 
 
 def _parts(local):
-    """Transmittance and the other rows of the tiles of a batch, an array each.
+    """Split the state of a batch of tiles into one array per row.
 
-    As one array every step of the loop would take it apart and put it together again.
+    As one array, every iteration would take it apart and assemble it again.
     """
     return local[:, 0], tuple(local[:, i] for i in range(1, local.shape[1]))
 
 
 def _any_open(transmittance):
-    """Whether some pixel of some tile still lets light through."""
+    """Test if any pixel of any tile is unsaturated."""
     # Halves with each other first, whole vectors at once: XLA:CPU reduces along an axis
     # one number after the other.
     most = transmittance.reshape(-1)
@@ -187,7 +197,7 @@ def _by_length(isects, batch):
 
 
 def _tile_rows(tiles, isects, grid, dtype):
-    """First pair, end, and center (px) of each tile of a batch; padding is empty."""
+    """Return first pair, end, and center (px) of each tile, with empty padding."""
     start = isects.starts.at[tiles].get(mode="fill", fill_value=0)
     end = isects.ends.at[tiles].get(mode="fill", fill_value=0)
     corner = jnp.stack([tiles % grid.columns, tiles // grid.columns]) * grid.tile
@@ -195,7 +205,7 @@ def _tile_rows(tiles, isects, grid, dtype):
 
 
 def _chunk(table, ranks, start, end, position, chunk):
-    """Ranks [chunk, batch], and their columns; past the end those of the last row."""
+    """Gather ranks [chunk, batch] and their columns, transparent past the end."""
     slot = start + position + jnp.arange(chunk, dtype=jnp.int32)[:, None]
     transparent = table.shape[0] - 1
     rank = ranks.at[slot].get(mode="clip")
@@ -205,14 +215,16 @@ def _chunk(table, ranks, start, end, position, chunk):
 
 
 def _pixels(grid, dtype):
-    """Pixel centers relative to the tile's, x then y, flattened row by row."""
+    """Return pixel centers relative to the tile's center: x, then y, flattened by rows.
+    """
     line = np.arange(grid.tile) - (grid.tile - 1) / 2
     y, x = np.meshgrid(line, line, indexing="ij")
     return jnp.asarray(x.ravel(), dtype), jnp.asarray(y.ravel(), dtype)
 
 
 def _whitened(rows, middle):
-    """u and v at the tile centers, and their slopes p (u in x), r, -r k (v in y, x)."""
+    """Return u and v at the tile centers, and their gradients p, r and -r k in pixels.
+    """
     mean_x, mean_y, p, k, r = rows[:5]
     dx, dy = middle[0] - mean_x, middle[1] - mean_y
     return p * dx, r * (dy - k * dx), p, r, -(r * k)
@@ -232,7 +244,7 @@ def _alphas(rows, middle, spec, grid):
 
 @jax.custom_jvp
 def _straight_through(raw, alpha):
-    """`alpha`, whose derivative is that of `raw` wherever something is drawn."""
+    """Return `alpha` with the derivative of `raw` wherever something is rendered."""
     return alpha
 
 
@@ -243,7 +255,7 @@ def _straight_through_jvp(primals, tangents):
 
 
 def _pass_through(transmittance, alpha, spec):
-    """Transmittance after one Gaussian, and whether it was drawn at each pixel."""
+    """Return the transmittance behind one Gaussian, and where it was rendered."""
     # A product, not T - alpha T: two alphas of 0.99 leave 0.99999e-4, and rounding the
     # difference could put that above the stop.
     passed = transmittance * (1 - alpha)
@@ -288,10 +300,10 @@ def _trace_back(transmittance, behind, raw, alpha, rows, toward, spec):
 
 
 def _pair_gradients(rows, middle, weight, grad, toward, grid):
-    """Gradient of the table's columns, one row per pair: [chunk, batch, columns].
+    """Compute the gradient of the table's columns per pair: [chunk, batch, columns].
 
-    Moments are taken about the tile center, where u and v of a Gaussian that is seen
-    are of order one; about a mean 1e4 px away they would cancel in float32.
+    Moments are taken about the tile center, where u and v of a visible Gaussian are of
+    order one. About a mean 1e4 px away they would cancel in float32.
     """
     moments = _moments(grad, grid)
     total, x, y, xx, xy, yy = moments
@@ -319,7 +331,7 @@ def _pair_gradients(rows, middle, weight, grad, toward, grid):
 
 
 def _moments(grad, grid):
-    """Sums over a tile's pixels of slope times 1, x, y, x^2, x y, y^2."""
+    """Sum the gradient times 1, x, y, x^2, x y and y^2 over a tile's pixels."""
     x, y = _pixels(grid, grad.dtype)
     zero = jnp.zeros_like(x)
     # One product with eight columns, two of them idle: 0.36 ns a pair and pixel against

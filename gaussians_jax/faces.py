@@ -1,9 +1,9 @@
-"""Gaussians as triangles, and triangles as Gaussians: to see and edit them as a mesh.
+"""Conversion between Gaussians and triangles, to view and edit them as a mesh.
 
 GaMeS (Waczyńska et al. 2024, arXiv:2402.01459), as D-MiSo uses it (arXiv:2405.14276,
-section 3): the first corner is the mean, the other two are where the second and the
-third axis end. The first scale, across the face, is not in a triangle (there it is
-tiny and fixed) and goes beside it.
+section 3): the first corner is the mean, and the other two are the ends of the second
+and third axes. A triangle does not contain the first scale, across the face, which is
+tiny and fixed there and is stored separately.
 """
 
 import jax
@@ -32,11 +32,20 @@ def gaussians(
     thickness: Float[Array, " gaussians"],
     opacity: Float[Array, " gaussians"],
 ) -> Gaussians:
-    """The Gaussians of triangles, `thickness` (scene units) across them.
+    """Convert triangles to Gaussians.
 
-    Of edges that are not at right angles the second is the part that is across the
-    first, as in GaMeS. Of a triangle without an area the third scale is zero, of a
-    point the second as well; axes that it does not say are any, and have no slope.
+    If the edges are not perpendicular, the second axis is the rejection of the second
+    edge from the first, as in GaMeS. Triangles without area have a third scale of zero,
+    and points a second one as well. Undetermined axes are arbitrary, without a
+    gradient.
+
+    Args:
+      corners: Corners in scene units.
+      thickness: Scale across each triangle in scene units.
+      opacity: Opacity in [0, 1].
+
+    Returns:
+      The Gaussians.
     """
     edges = corners[:, 1:] - corners[:, :1]
     turn, length = jax.vmap(_face)(edges[:, 0], edges[:, 1])
@@ -62,7 +71,7 @@ def _face(first, second):
 
 
 def _unit(vector):
-    """A direction and a length; of zero the first axis of the world, and zero."""
+    """Return direction and length; the x axis and zero for a zero vector."""
     largest = jnp.max(jnp.abs(vector))
     nothing = largest < jnp.finfo(vector.dtype).tiny
     # Scaled first: in float32 squares are lost from 1e-19 down.
@@ -73,12 +82,12 @@ def _unit(vector):
 
 
 def _rejected(vector: Vector, unit: Vector) -> Vector:
-    """What of a vector is across a direction."""
+    """Return the part of a vector that is perpendicular to a direction."""
     return vector - jnp.sum(vector * unit) * unit
 
 
 def _across(unit):
-    """Some direction across another, without a slope."""
+    """Return some direction perpendicular to another, without a gradient."""
     unit = jax.lax.stop_gradient(unit)
     least = jax.nn.one_hot(jnp.argmin(jnp.abs(unit)), 3, dtype=unit.dtype)
     return _unit(jnp.cross(unit, least))[0]

@@ -31,10 +31,16 @@ def degree_of(coefficients: int) -> int:
 
 
 def unit_direction(offset: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """`offset` at unit length; +z, with no gradient, where it is zero or not finite.
+    """Normalize vectors; +z without a gradient where a vector is zero or not finite.
 
-    Scaled by its largest component first, so 1e-30 and 3e38 keep their direction in
-    float32.
+    A vector is scaled by its largest component first, so that 1e-30 and 3e38 keep their
+    direction in float32.
+
+    Args:
+      offset: Vectors of any length.
+
+    Returns:
+      Unit vectors.
     """
     largest = jnp.max(jnp.abs(offset), axis=-1, keepdims=True)
     limits = jnp.finfo(offset.dtype)
@@ -83,9 +89,15 @@ def color_toward(
     mean: Float[Array, "*n 3"],
     camera_position: Float[Array, "3"],
 ) -> Float[Array, "*n 3"]:
-    """Color of Gaussians at `mean` seen from `camera_position`: max(SH + 1/2, 0).
+    """Evaluate spherical harmonics toward a camera: max(SH + 1/2, 0).
 
-    The degree follows from the number of coefficients.
+    Args:
+      coefficients: Coefficients, whose number (1, 4, 9 or 16) implies the degree.
+      mean: Means of the Gaussians, in world coordinates.
+      camera_position: Camera center, in world coordinates.
+
+    Returns:
+      Colors, at least zero.
     """
     degree = degree_of(coefficients.shape[-2])
     terms = basis(unit_direction(mean - camera_position), degree)

@@ -1,8 +1,8 @@
-"""A trained scene at single instants; as rows of them, for files that know no time.
+"""A trained scene at single times, as Gaussians or as raw parameters for static files.
 
-Means, rotations and scales are those of the instant. In rows the harmonics are as
-trained and do not turn with the Gaussians: that is how `rendering` draws them, by the
-direction in the world, so a viewer shows what this package renders.
+Means, rotations and scales are those of the time. Spherical harmonics are as trained
+and do not rotate with the Gaussians, because `rendering` evaluates them in world
+directions. A viewer therefore shows what this package renders.
 """
 
 import math
@@ -28,15 +28,29 @@ NUMBERED = "frame_{:04d}"  # viewers play files whose names differ in a number a
 
 
 def check_time(time: float) -> None:
-    """Raise ValueError for an instant outside the capture."""
+    """Refuse a time outside the capture.
+
+    Args:
+      time: Normalized time.
+
+    Raises:
+      ValueError: If the time is not in [0, 1].
+    """
     if not 0 <= time <= 1:
         raise ValueError(f"time {time:g}: the capture runs from 0 to 1")
 
 
 def gaussians_at(model: Model, state: TrainState) -> At:
-    """A function of the time in [0, 1] that gives all Gaussians then; host side.
+    """Return a function from normalized time to all Gaussians.
 
-    What does not change with time is computed once, now.
+    Everything that does not depend on time is computed once, now.
+
+    Args:
+      model: The model.
+      state: Its trained state.
+
+    Returns:
+      A host function of a time in [0, 1].
     """
     if model.stages is None:
         raise ValueError(
@@ -56,9 +70,16 @@ def gaussians_at(model: Model, state: TrainState) -> At:
 
 
 def splats_at(model: Model, state: TrainState) -> Callable[[float], Splats]:
-    """As `gaussians_at`, as rows that a file can be written from.
+    """Return a function from normalized time to raw parameters, for files.
 
-    Which rows are active, and their order, is the same at all times.
+    The active Gaussians and their order are the same at all times.
+
+    Args:
+      model: The model.
+      state: Its trained state.
+
+    Returns:
+      A host function of a time in [0, 1].
     """
     deformed_at, as_rows = gaussians_at(model, state), jax.jit(_as_rows)
     rows = model.stages.rows(state.params)
@@ -66,7 +87,7 @@ def splats_at(model: Model, state: TrainState) -> Callable[[float], Splats]:
 
 
 def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:
-    """What would be activated to the deformed Gaussians."""
+    """Invert the activations of the deformed Gaussians."""
     trained = splats.activate(rows)
     # What the motion leaves alone keeps its trained number: the logit of an opacity
     # that rounded to 1 would be infinite, and that of 0 marks a row as inactive, which
@@ -87,13 +108,20 @@ def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:
 
 
 def in_world(rows: Splats, capture: Capture) -> Splats:
-    """Convert rows to the units of the capture's own files; host side.
+    """Convert raw parameters to the units of the capture's files, on the host.
 
-    A uniform scale changes no direction, so rotations and harmonics stay.
+    A uniform scale changes no direction, so rotations and harmonics stay the same.
+
+    Args:
+      rows: Raw parameters in scene units.
+      capture: The capture, whose scale is inverted.
+
+    Returns:
+      Raw parameters in world units.
 
     Raises:
-      ValueError: The world's coordinates are so large, as those of maps, that float32,
-        which is what Gaussian files hold, would move Gaussians visibly.
+      ValueError: If world coordinates are so large, as those of maps, that the float32
+        of Gaussian files would move Gaussians visibly.
     """
     mean = units.places_in("world", capture, np.asarray(rows.mean))
     step = units.float32_step(mean)
@@ -121,9 +149,19 @@ def save_sequence(
     *,
     overwrite: bool = False,
 ) -> np.ndarray:
-    """`count` numbered files of evenly spread instants, 0 and 1 among them.
+    """Write numbered files of evenly spaced times, including 0 and 1.
 
-    The folder appears whole or not at all; returns the instants.
+    The folder appears when it is complete, or not at all.
+
+    Args:
+      folder: Folder to write.
+      at: Function from time to raw parameters (`splats_at`).
+      count: Number of files.
+      suffix: File format, such as ".ply".
+      overwrite: Replace an existing folder.
+
+    Returns:
+      The times.
     """
     if count < 2:
         raise ValueError(f"{count} frame(s) are no sequence; export a time instead")

@@ -1,13 +1,13 @@
-"""A Gaussian's footprint on the image: EWA projection without cancellation.
+"""EWA projection of Gaussians to the image, without cancellation.
 
-The footprint is kept as its whitening, not as a conic. With dx, dy the offset of a
+A footprint is kept as its whitening instead of a conic. With dx, dy the offset of a
 pixel from the mean,
 
     u = p dx,   v = r (dy - k dx),   exponent = u^2 + v^2 >= 0,
 
 where p = 1/sqrt(2 a), k = b/a and r = 1/sqrt(2 (c - b^2/a)) for the dilated covariance
-[[a, b], [b, c]] in px^2. The sum of squares cannot turn negative; the quadratic form of
-an inverse matrix does so in float32 from needles of about 3000 px.
+[[a, b], [b, c]] in px^2. A sum of squares cannot become negative. The quadratic form of
+an inverse matrix does so in float32 for needles of about 3000 px.
 """
 
 from typing import NamedTuple
@@ -33,11 +33,11 @@ MAX_EXTENT_PX = 1e16
 
 
 class Footprints(NamedTuple):
-    """Gaussians as seen by one camera; rows match the Gaussians they came from.
+    """Projected Gaussians of one camera, in the order of the Gaussians.
 
-    A row that cannot be drawn (outside near and far, opacity below the cut, a zero
-    quaternion, a NaN or infinity anywhere) has `extent_px` zero, finite stand-ins in
-    the other fields and passes no gradient back.
+    A Gaussian that cannot be rendered (outside the near and far planes, opacity below
+    the cut, a zero quaternion, any NaN or infinity) has `extent_px` zero, finite
+    placeholders in the other fields, and zero gradient.
     """
 
     mean_px: Float[Array, "gaussians 2"]  # x right, y down; pixel centers at +0.5
@@ -62,12 +62,24 @@ class Footprints(NamedTuple):
 def project(
     gaussians: Gaussians, camera: Camera, size: tuple[int, int], spec: RasterSpec
 ) -> Footprints:
-    """Footprints in an image of `size` (width, height) for one undistorted camera.
+    """Project Gaussians to the image of one undistorted camera.
 
-    Zwicker et al. 2002 (EWA splatting), equations 29 and 31: the covariance is T T^t +
-    dilation with T = J W R diag(scale); neither the 3D covariance nor its determinant
-    is formed. The tangents x/z and y/z are clamped in J alone, to the image widened by
-    `spec.tangent_margin` half images. Lens distortion is not modeled: undistort first.
+    Neither the 3D covariance nor its determinant is formed. The tangents x/z and y/z
+    are clamped in J alone, to the image widened by `spec.tangent_margin` half images.
+    Lens distortion is not modeled: undistort the images first.
+
+    Args:
+      gaussians: N Gaussians in world coordinates (scene units).
+      camera: The camera.
+      size: (width, height) of the image in pixels.
+      spec: Near and far planes, dilation and thresholds.
+
+    Returns:
+      N footprints.
+
+    References:
+      Zwicker et al. 2002 (EWA splatting), equations 29 and 31: the covariance is T T^t
+      + dilation with T = J W R diag(scale).
     """
     refuse_half(gaussians.mean.dtype)
 
@@ -87,7 +99,7 @@ def project(
 
 
 def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
-    """Of one Gaussian, whose vectors are given by their components."""
+    """Project one Gaussian, whose vectors are given by their components."""
     # R (x - c), not R x + t: exact far from origin
     offset = [x - camera.position[i] for i, x in enumerate(mean)]
     depth = dot(camera.camera_from_world[2], offset)
@@ -128,7 +140,7 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
 
 
 def _project_frame(offset, camera, size, spec):
-    """Mean in px, z, and the rows of J W (pixels per scene unit)."""
+    """Return the mean in px, z, and the rows of J W (pixels per scene unit)."""
     width, height = size
     world = camera.camera_from_world
     x, y, z = dot(world[0], offset), dot(world[1], offset), dot(world[2], offset)
@@ -163,7 +175,7 @@ def _clamp_tangent(tangent, focal, center, pixels, spec):
 
 
 def _footprint_rows(rows, quaternion, scale):
-    """The two rows of T = J W R diag(scale), as component lists."""
+    """Return the two rows of T = J W R diag(scale) as lists of components."""
     # keeps lengths of 1e-30 and 3e38 apart from 0 and infinity
     w, x, y, z = components(near_one(jnp.stack(quaternion))[0])
     double = 2 / (w * w + x * x + y * y + z * z)
@@ -188,10 +200,10 @@ def _footprint_rows(rows, quaternion, scale):
 
 
 def _whiten(first, second, spec):
-    """(p, k, r) and the antialiasing factor, from the rows of T.
+    """Return (p, k, r) and the antialiasing factor from the rows of T.
 
-    c - b^2/a as a sum of squares: |t1 x t2|^2/a + dilation (1 + |t2|^2/a), with t1
-    scaled by 1/sqrt(a) beforehand so that nothing of fourth order in px is formed.
+    c - b^2/a is a sum of squares, |t1 x t2|^2/a + dilation (1 + |t2|^2/a). t1 is scaled
+    by 1/sqrt(a) beforehand so that nothing of fourth order in px is formed.
     """
     dilation = spec.eps2d
     variance_x = dot(first, first) + dilation

@@ -1,14 +1,14 @@
-"""Footprints to pixels: exact, differentiable, in memory that does not grow with pairs.
+"""Exact, differentiable tile rasterizer with memory independent of the number of pairs.
 
 Front-to-back compositing over square tiles (Kerbl et al. 2023, arXiv:2308.04079,
 equation 3), streamed over chunks in depth order (`binning`), with a hand-written
 backward pass that recomputes every alpha (`blending`).
 
-On the CPU XLA splits every small operation of the loops over all cores it sees, which
-costs twice the CPU time and 1.0 to 1.9 times the wall time. A `Model` of Gaussians is
-compiled without that; so is a function of your own by `jax.jit(function,
-compiler_options=UNDIVIDED)` (`nerfies_jax.compiler`). To use several cores, draw
-several views at once, each on a CPU device (`nerfies_jax.data_parallel`).
+By default XLA:CPU splits every small operation of the loops over all cores, which costs
+twice the CPU time and 1.0 to 1.9 times the wall time. A `Model` of Gaussians is
+compiled without that. Compile your own functions with `jax.jit(function,
+compiler_options=UNDIVIDED)` (`nerfies_jax.compiler`). To use several cores, render
+several views at once, each on one CPU device (`nerfies_jax.data_parallel`).
 """
 
 import functools
@@ -64,12 +64,13 @@ def rasterize(
 ) -> tuple[Float[Array, "height width channels"], Float[Array, "height width"]]:
     """Composite per-Gaussian values front to back.
 
-    Differentiable in the mean, whitening and opacity of `footprints` and in `values`,
-    in reverse mode, in forward mode, and forward over reverse (Hessian-vector
-    products); reverse mode a second time is not available. Depth only orders. The image
-    jumps where alpha crosses `spec.alpha_threshold` and where a pixel is finished
-    (`spec.transmittance_threshold`), and its slope jumps at `spec.alpha_max`. All
-    derivatives are those between the jumps.
+    The function is differentiable in the mean, whitening and opacity of `footprints`
+    and in `values`: in reverse mode, in forward mode, and forward over reverse
+    (Hessian-vector products). A second reverse mode is not available. Depth is only
+    used for the order. The image is discontinuous where alpha crosses
+    `spec.alpha_threshold` and where a pixel is saturated
+    (`spec.transmittance_threshold`), and its gradient is discontinuous at
+    `spec.alpha_max`. Derivatives are those between the discontinuities.
 
     Args:
       footprints: N projected Gaussians.
@@ -79,11 +80,11 @@ def rasterize(
       spec: Thresholds and tile sizes.
 
     Returns:
-      The image [height, width, channels], and the transmittance that is left at each
-      pixel, [height, width].
+      The image [height, width, channels] and the remaining transmittance of each pixel
+      [height, width].
 
     Raises:
-      ValueError: The image has no pixel, or `values` has no channel.
+      ValueError: If the image has no pixels, or `values` has no channels.
     """
     layout = _layout(footprints, size, spec)
     grid = layout.grid
@@ -98,7 +99,7 @@ def rasterize(
 
 
 def _in_depth_order(footprints, values, grid):
-    """Rectangles and table, a row per rank."""
+    """Sort the tile rectangles and the table by depth."""
     rects = binning.tile_rects(
         lax.stop_gradient(footprints.mean_px), footprints.extent_px, grid
     )
@@ -193,7 +194,7 @@ def _shown(state):
 
 
 def _with_transparent_row(table):
-    """One more row that draws nothing, for the slots beyond a tile's last Gaussian."""
+    """Append a transparent Gaussian for the slots beyond a tile's last pair."""
     row = jnp.zeros((1, table.shape[1]), table.dtype)
     row = row.at[0, SHAPE_COLUMNS - 1].set(-jnp.inf)
     # Not zero: the gradient divides by p and r.
@@ -224,7 +225,7 @@ def _more(cursor, state, rects):
 
 
 def _stream(layout, rects, table, through=False):
-    """Forward over all chunks; `through`: derivatives pass the clamp of alpha."""
+    """Composite all chunks; with `through`, derivatives ignore the clamp of alpha."""
     channels = table.shape[1] - SHAPE_COLUMNS
     rows = _with_transparent_row(table)
     spec, grid, step = layout.spec, layout.grid, layout.step
@@ -264,7 +265,7 @@ def _stream(layout, rects, table, through=False):
 
 
 def _stream_back(layout, rects, table, final, residuals, cotangent):
-    """Backward over the same chunks; those not kept are sorted again."""
+    """Backpropagate through the same chunks, sorting those again that were not kept."""
     rows = _with_transparent_row(table)
     spec, grid, step = layout.spec, layout.grid, layout.step
     toward = cotangent[:, 1:]

@@ -1,4 +1,4 @@
-"""What the rasterizer is asked to do: thresholds, clamps, tiles, chunks of pairs."""
+"""Settings of the rasterizer: thresholds, clamps, tiles, chunks of pairs."""
 
 import dataclasses
 from typing import Literal
@@ -8,12 +8,12 @@ TILE_SIZES = (4, 8, 16, 32)
 
 @dataclasses.dataclass(frozen=True)
 class RasterSpec:
-    """Every threshold of the picture by name, and the sizes that only cost time.
+    """Thresholds that define the image, and sizes that only affect speed and memory.
 
-    `tile`, `capacity`, `batch`, `chunk` and `kept_chunks` never change the picture
-    beyond rounding; the others are the picture's definition. The defaults are those of
-    gsplat 1.6 (`GSPLAT`); `INRIA` is the original 3D Gaussian splatting (Kerbl et al.
-    2023, arXiv:2308.04079) as its public rasterizer runs.
+    `tile`, `capacity`, `batch`, `chunk` and `kept_chunks` never change the image beyond
+    rounding. The others define it. The defaults are those of gsplat 1.6 (`GSPLAT`).
+    `INRIA` is the original 3D Gaussian splatting (Kerbl et al. 2023, arXiv:2308.04079)
+    as its public rasterizer runs.
     """
 
     alpha_threshold: float = 1 / 255  # a Gaussian adds nothing where its alpha is below
