@@ -1,7 +1,7 @@
-"""Gaussians in and out: 3DGS .ply, antimatter15 .splat and Niantic .spz.
+"""Gaussian files: 3DGS .ply, antimatter15 .splat and Niantic .spz.
 
-docs/formats.md says what each keeps. Files are written to a temporary name beside the
-target and renamed, so a crash leaves the old one or the new one, never half.
+docs/formats.md lists what each format stores. Files are written to a temporary name
+next to the target and renamed, so a crash leaves the old file or the new one.
 """
 
 import os
@@ -40,13 +40,18 @@ class Loaded(NamedTuple):
 
 
 def load(path: str | os.PathLike, *, drop_broken: bool = False) -> Loaded:
-    """Gaussians from a .ply, .splat or .spz file; host side.
+    """Load Gaussians from a .ply, .splat or .spz file.
 
-    A row with NaN or infinity in it is an error that names it, or is left out and
-    counted with `drop_broken`.
+    Args:
+      path: The file, whose suffix selects the format.
+      drop_broken: Leave out and count Gaussians with NaN or infinity, instead of
+        refusing the file.
+
+    Returns:
+      Raw parameters and notes.
 
     Raises:
-      FileError: The file is damaged or no such file.
+      FileError: If the file is damaged or of another format.
     """
     path = pathlib.Path(path)
     readers = dict(zip(SUFFIXES, (_read_ply, _read_splat, _read_spz), strict=True))
@@ -69,9 +74,18 @@ def load(path: str | os.PathLike, *, drop_broken: bool = False) -> Loaded:
 
 
 def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
-    """Write the active Gaussians in the format of the suffix; returns how many.
+    """Save the active Gaussians in the format of the suffix.
 
-    Inactive rows are left out. A row that is not finite is refused: no viewer copes.
+    Args:
+      path: File to write, ending in .ply, .splat or .spz.
+      rows: Raw parameters. Inactive Gaussians are left out.
+      spz_version: Version of SPZ files.
+
+    Returns:
+      Number of Gaussians written.
+
+    Raises:
+      ValueError: If a Gaussian is not finite, or the format is unknown.
     """
     path = pathlib.Path(path)
     if path.suffix.lower() not in SUFFIXES:

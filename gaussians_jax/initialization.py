@@ -18,14 +18,15 @@ SOURCES = ("auto", "points", "random")
 
 @dataclasses.dataclass(frozen=True)
 class InitSpec:
-    """Where the first Gaussians come from.
+    """Settings of the initial Gaussians.
 
-    `source` "auto" takes the capture's own points where there are at least `min_points`
-    and random ones otherwise; "points" and "random" insist on one, as MoBa-GS does on
-    either (it claims to need no points from structure from motion).
+    `source` "auto" uses the capture's points if there are at least `min_points`, and
+    random ones otherwise. "points" and "random" require one of them, as MoBa-GS does
+    with either (it claims to need no points from structure from motion).
 
-    Beside the capture's own points `extra_random` are drawn in the views. None: half as
-    many as `points`, and none where tracks bring what moves (`of_start`).
+    `extra_random` points are sampled in the views in addition to the capture's points.
+    None means half as many as `points`, or none if tracks initialize the motion
+    (`of_start`).
     """
 
     points: int = 100_000  # at most so many of the capture's own points
@@ -54,7 +55,7 @@ class InitSpec:
 
 @dataclasses.dataclass(frozen=True)
 class StartSpec(TrackStartSpec):
-    """How a scene of Gaussians that moves starts."""
+    """Settings of the initial motion."""
 
     fit_steps: int = 3000
     fit_rate: float = 5e-3
@@ -73,12 +74,27 @@ class StartSpec(TrackStartSpec):
 
 
 def point_count(capture: Capture) -> int:
-    """How many points the capture has."""
+    """Count the points of a capture.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Number of points.
+    """
     return 0 if capture.points is None else len(capture.points.position)
 
 
 def uses_capture_points(spec: InitSpec, capture: Capture) -> bool:
-    """Whether the first Gaussians are the capture's own points; host side."""
+    """Test if the initial Gaussians are the capture's points, on the host.
+
+    Args:
+      spec: Settings.
+      capture: The capture.
+
+    Returns:
+      True if they are, False if they are random.
+    """
     points = point_count(capture)
     if spec.source == "points" and not points:
         raise ValueError(
@@ -91,11 +107,18 @@ def uses_capture_points(spec: InitSpec, capture: Capture) -> bool:
 
 
 def of_start(spec: InitSpec, tracked: bool, most: int | None = None) -> InitSpec:
-    """The same with a number of random points, where it leaves that to the start.
+    """Resolve the number of extra random points.
 
-    Structure from motion finds what stands still, so what moves has no points of its
-    own: tracks bring it, or random points in the volume give it something to grow from,
-    as far as `most` Gaussians go.
+    Structure from motion finds static surfaces only. Moving objects are initialized by
+    tracks, or grow from random points in the volume.
+
+    Args:
+      spec: Settings.
+      tracked: Whether tracks initialize the motion.
+      most: Largest number of Gaussians.
+
+    Returns:
+      Settings with a number for `extra_random`.
     """
     if spec.extra_random is not None:
         return spec
@@ -106,7 +129,15 @@ def of_start(spec: InitSpec, tracked: bool, most: int | None = None) -> InitSpec
 
 
 def initial_count(spec: InitSpec, capture: Capture) -> int:
-    """How many Gaussians there are at first; host side, nothing is drawn."""
+    """Compute the number of initial Gaussians, on the host.
+
+    Args:
+      spec: Settings.
+      capture: The capture.
+
+    Returns:
+      Number of Gaussians.
+    """
     if not uses_capture_points(spec, capture):
         return spec.random
     extra = of_start(spec, False).extra_random
@@ -114,9 +145,17 @@ def initial_count(spec: InitSpec, capture: Capture) -> int:
 
 
 def initial_points(spec: InitSpec, capture: Capture, seed: int):
-    """Positions and colors in [0, 1] of the first Gaussians; host side.
+    """Sample positions and colors of the initial Gaussians, on the host.
 
-    Random points alone lie between the capture's near and far, whatever points it has.
+    Random points lie between the near and far planes of the capture.
+
+    Args:
+      spec: Settings.
+      capture: The capture.
+      seed: Seed of the random points.
+
+    Returns:
+      Positions [n, 3] in scene units, and colors [n, 3] in [0, 1].
     """
     spec = of_start(spec, False)
     rng = np.random.default_rng(seed)
@@ -135,10 +174,17 @@ def initial_points(spec: InitSpec, capture: Capture, seed: int):
 def filmed_box(
     capture: Capture, span: tuple[float, float] | None = None
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """The low and the high corner of what was filmed, scene units; host side.
+    """Compute the bounding box of the observed volume, on the host.
 
-    The middle 98 % along each axis of points drawn in the views, between the depths of
-    the capture's own points: `span` where those are known already.
+    It is the central 98 % along each axis of points sampled in the views, between the
+    depths of the capture's points.
+
+    Args:
+      capture: The capture.
+      span: Smallest and largest depth, if they are known already.
+
+    Returns:
+      Low and high corner in scene units.
     """
     rng = np.random.default_rng(0)
     point, _ = _random_points(rng, capture, 4000, span or filmed_depths(capture))
@@ -153,10 +199,19 @@ def _random_points(rng, capture, count, span):
 
 
 def clamp_scales(rows: Splats, capture: Capture, max_scale: float) -> Splats:
-    """The rows, none wider than a share of its distance to the nearest camera.
+    """Limit the scale of Gaussians to a share of the distance to the nearest camera.
 
-    A lone point gets the distance to its neighbors for a scale, and close to a camera
-    it covers the picture: the first steps on a capture with such points took 2 s each.
+    An isolated point gets the distance to its neighbors as its scale. Close to a camera
+    it would cover the image: the first steps on a capture with such points took 2 s
+    each.
+
+    Args:
+      rows: Raw parameters.
+      capture: The capture.
+      max_scale: Largest scale as a share of the distance.
+
+    Returns:
+      Raw parameters with clamped scales.
     """
     cameras = scipy.spatial.cKDTree(capture.cameras.position[capture.train])
     distance, _ = cameras.query(np.asarray(rows.mean))
@@ -165,10 +220,10 @@ def clamp_scales(rows: Splats, capture: Capture, max_scale: float) -> Splats:
 
 
 def filmed_depths(capture):
-    """The z-depths between which the capture's points lie, a little widened.
+    """Compute the z-depths that contain the capture's points, slightly widened.
 
-    Its near plane is often much nearer than anything filmed (0.05 where the first point
-    is at 0.4), and a Gaussian there covers the whole picture: 20 times slower steps.
+    The near plane is often much nearer than any surface (0.05 where the first point is
+    at 0.4), and a Gaussian there covers the whole image: 20 times slower steps.
     """
     depth = point_depths(capture)
     # Points beyond the far plane are drawn, but what is filmed lies before it.

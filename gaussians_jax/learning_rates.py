@@ -1,4 +1,4 @@
-"""Learning rates of what a scene of Gaussians trains, one for each kind of row."""
+"""Learning rates of per-Gaussian parameters."""
 
 import dataclasses
 import math
@@ -49,7 +49,18 @@ def at_step(
     step: Int[Array, ""],
     annealing: AnnealingSpec | None = None,
 ) -> Splats:
-    """One rate for each kind of row, at a traced step of a run of `steps`."""
+    """Compute the learning rates at a step.
+
+    Args:
+      spec: Settings.
+      extent: Scene extent (`splats.scene_extent`), the unit of the rate of the means.
+      steps: Total number of steps.
+      step: Traced step.
+      annealing: Settings of the annealing of positions.
+
+    Returns:
+      One rate for each per-Gaussian parameter.
+    """
     if spec.mean > 0:
         decay = schedules.log_linear(spec.mean, spec.mean_end, steps)
         if annealing is not None:

@@ -1,4 +1,4 @@
-"""Adam and RAdam that count per row, and the gather that moves rows with moments."""
+"""Adam and RAdam with one step count per Gaussian, and the gather of their moments."""
 
 import math
 from collections.abc import Callable
@@ -17,7 +17,7 @@ PyTree = Any
 
 
 class RowAdamState(NamedTuple):
-    """Moments, and how many updates went into each row of them."""
+    """Moments, and the number of updates of each Gaussian."""
 
     count: PyTree  # int32, [capacity] for every leaf
     first: PyTree
@@ -27,15 +27,23 @@ class RowAdamState(NamedTuple):
 def scale_by_row_adam(
     b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15
 ) -> optax.GradientTransformation:
-    """Adam (Kingma and Ba, arXiv:1412.6980) with one step count for each row.
+    """Adam (Kingma and Ba, arXiv:1412.6980) with one step count per Gaussian.
 
-    For parameters that all have one row per Gaussian. The moments of a row born late
-    start at zero like everyone's, and so does its count. Under one shared count of 1000
-    its first five updates are 2.5, 3.4, 3.9, 4.3 and 4.6 times too large for a steady
-    gradient, which is what reference implementations run. For the same reason a row
-    starts to count at its first slope that is not zero: harmonics that are switched on
-    late and networks that wait for a warm-up to end start like everyone else. `eps` is
-    that of 3D Gaussian splatting: 1e-8 would halve the steps where gradients are 1e-8.
+    The first axis of all parameters must be that of the Gaussians. Moments and count of
+    a Gaussian that is created late start at zero. With a shared count of 1000 its first
+    five updates would be 2.5, 3.4, 3.9, 4.3 and 4.6 times too large for a steady
+    gradient, as in the reference implementations. A Gaussian starts to count at its
+    first nonzero gradient, so that harmonics that are enabled late and networks that
+    wait for a warm-up start in the same way.
+
+    Args:
+      b1: Decay of the first moment.
+      b2: Decay of the second moment.
+      eps: Added to the denominator. This is the value of 3DGS: 1e-8 would halve the
+        steps where gradients are 1e-8.
+
+    Returns:
+      An optax transformation.
     """
 
     def direction(age, first, second):
@@ -48,15 +56,23 @@ def scale_by_row_adam(
 def scale_by_row_radam(
     b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15, threshold: float = 5.0
 ) -> optax.GradientTransformation:
-    """RAdam (Liu et al. 2020, arXiv:1908.03265) with one step count for each row.
+    """RAdam (Liu et al. 2020, arXiv:1908.03265) with one step count per Gaussian.
 
-    Counts and moments are those of `scale_by_row_adam`. A row whose `moment_length` is
-    below `threshold` (its first five updates at b2 = 0.999) follows its mean gradient,
-    not divided by its size: these updates are as small or as large as the gradients
-    are. Then come Adam's, times `rectification`: 0.026 at first, half of Adam's after
-    556 updates and 0.92 after 3000. So it is for every row born late, which has 0.15
-    of Adam's step after 50 updates and 0.31 after 200. The paper switches at a length
-    of 4; 5 is what its code and optax do.
+    Counts and moments are those of `scale_by_row_adam`. A Gaussian whose
+    `moment_length` is below `threshold` (its first five updates at b2 = 0.999) follows
+    its mean gradient, not normalized by its size. After that come Adam's updates times
+    `rectification`: 0.026 at first, 0.5 after 556 updates and 0.92 after 3000. A
+    Gaussian that is created late has 0.15 of Adam's step after 50 updates and 0.31
+    after 200.
+
+    Args:
+      b1: Decay of the first moment.
+      b2: Decay of the second moment.
+      eps: Added to the denominator.
+      threshold: Length at which to switch. The paper uses 4, its code and optax use 5.
+
+    Returns:
+      An optax transformation.
     """
     _check_decays(b1, b2)
     longest = _longest(b2)
@@ -75,10 +91,17 @@ def scale_by_row_radam(
 
 
 def moment_length(updates: Float[Array, "*rows"], b2: float) -> Float[Array, "*rows"]:
-    """How many gradients the second moment stands for after so many updates.
+    """Compute the effective number of gradients in the second moment.
 
     rho_t = rho_inf - 2 t b2^t / (1 - b2^t) with rho_inf = 2 / (1 - b2) - 1, algorithm 2
-    of Liu et al. 2020, for t = `updates` >= 1. From 1 it rises to rho_inf.
+    of Liu et al. 2020. It rises from 1 to rho_inf.
+
+    Args:
+      updates: Number of updates t, at least 1.
+      b2: Decay of the second moment.
+
+    Returns:
+      The length rho_t.
     """
     # With L = -log b2 and h(x) = x coth x - 1 it is t - (2 / L) (h(tL/2) - h(L/2)).
     # As printed, float32 is off by 0.03 around t = 5, where the switch is: rho_inf is
@@ -92,10 +115,15 @@ def moment_length(updates: Float[Array, "*rows"], b2: float) -> Float[Array, "*r
 
 
 def rectification(length: Float[Array, "*rows"], b2: float) -> Float[Array, "*rows"]:
-    """What a step is multiplied with for the variance of its denominator; at most 1.
+    """Compute RAdam's variance rectification, r_t of Liu et al. 2020, algorithm 2.
 
-    r_t of Liu et al. 2020, algorithm 2, from rho_t = `length`; zero up to a length of
-    4, where the variance is not finite.
+    Args:
+      length: Length rho_t (`moment_length`).
+      b2: Decay of the second moment.
+
+    Returns:
+      Factor of the step, at most 1, and zero up to a length of 4, where the variance is
+      not finite.
     """
     longest = _longest(b2)
     usable = jnp.maximum(length, 4)
@@ -123,11 +151,11 @@ def _coth_excess(x_sq):
 
 
 def _scale_by_row_moments(b1, b2, direction):
-    """Updates made by `direction(age, mean slope, mean squared slope)` of every row.
+    """Make updates by `direction(age, mean gradient, mean squared gradient)`.
 
-    The square of a slope of more than 5e20 is infinite in float32, and what is divided
-    by it stands still for good: the loop looks at moments too, and stops. (Scaling
-    would not help: float64 forgets a slope of 1e20 after 9e4 updates.)
+    The square of a gradient above 5e20 is infinite in float32, and a parameter divided
+    by it never moves again. The loop checks moments too, and stops. (Scaling would not
+    help: float64 forgets a gradient of 1e20 after 9e4 updates.)
     """
     _check_decays(b1, b2)
 
@@ -192,7 +220,14 @@ def _count_once_started(count, grads):
 
 
 def row_leaves(params: Params) -> Params:
-    """True for every leaf that has one row per Gaussian."""
+    """Mark the leaves that have one entry per Gaussian.
+
+    Args:
+      params: All parameters.
+
+    Returns:
+      True for the leaves of `rows`, False for those of `nets`.
+    """
     return Params(
         rows=jax.tree.map(lambda _: True, params.rows),
         nets=jax.tree.map(lambda _: False, params.nets),
@@ -230,10 +265,18 @@ def gather_rows(
     fresh: Bool[Array, " capacity"],
     inactive: Bool[Array, " capacity"],
 ) -> tuple[Params, PyTree]:
-    """Row `rows[i]` of everything becomes row i, in parameters and moments alike.
+    """Gather Gaussians in parameters and moments alike.
 
-    `fresh` rows start with zero moments and a zero count, and so do `inactive` ones,
-    which lose their opacity.
+    Args:
+      optimizer: The optimizer.
+      params: All parameters.
+      moments: State of the optimizer.
+      rows: Index of the Gaussian that each slot takes.
+      fresh: Slots whose moments and count start at zero.
+      inactive: Slots to deactivate, whose moments and count start at zero as well.
+
+    Returns:
+      Parameters and optimizer state of the new capacity.
     """
     taken = splats.take_rows(params, rows)
     deactivated = splats.deactivate(taken.rows["splats"], inactive)

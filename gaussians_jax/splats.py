@@ -1,10 +1,9 @@
-"""Gaussians: the rows that are trained, and what they stand for.
+"""Gaussians: the raw parameters that are trained, and their activated values.
 
-A row that is not in use is *inactive*: its opacity logit is `INACTIVE_LOGIT`, so its
-opacity and the slope of its opacity are exactly zero in float32 and float64. It is
-culled by the renderer's cut-off, covers no tile, and no gradient can bring it back;
-only an event between two chunks activates a row. `active_mask` reads that mark and
-nothing else.
+A slot that is not in use is *inactive*: its opacity logit is `INACTIVE_LOGIT`, so its
+opacity and the gradient of its opacity are exactly zero in float32 and float64. It is
+culled by the renderer, covers no tile, and no gradient can activate it. Only an event
+between two chunks does. `active_mask` depends on the opacity logit alone.
 """
 
 import math
@@ -33,7 +32,7 @@ TREMOR = 0.1  # of a typical depth: cameras that move less stand still, nearly
 
 
 class Splats(NamedTuple):
-    """What is trained: one row per Gaussian, unconstrained."""
+    """Trained parameters of each Gaussian, unconstrained."""
 
     mean: Float[Array, "gaussians 3"]  # scene units
     log_scale: Float[Array, "gaussians 3"]  # log of the standard deviations
@@ -44,7 +43,7 @@ class Splats(NamedTuple):
 
 
 class Gaussians(NamedTuple):
-    """What is drawn: activated, in world coordinates."""
+    """Activated Gaussians in world coordinates, ready to render."""
 
     mean: Float[Array, "gaussians 3"]
     quaternion: Float[Array, "gaussians 4"]  # wxyz; normalized where it is used
@@ -53,9 +52,9 @@ class Gaussians(NamedTuple):
 
 
 class Params(NamedTuple):
-    """Trained parameters, kept apart by structure.
+    """Trained parameters, separated by structure.
 
-    Every leaf of `rows` has the capacity as its first axis; nothing in `nets` has.
+    Every leaf of `rows` has the capacity as its first axis. No leaf of `nets` has.
     """
 
     rows: dict[str, PyTree]  # {"splats": Splats, "embedding": ..., ...}
@@ -76,10 +75,19 @@ def refuse_half(dtype: Any) -> None:
 
 
 def activate(splats: Splats) -> Gaussians:
-    """Scales by exp, opacities by the logistic function; finite for every finite row.
+    """Activate raw parameters: exp for scales, the logistic function for opacities.
 
-    Kerbl et al. 2023, arXiv:2308.04079, section 5.1, with the logarithm of the scale
-    held to `LOG_SCALE_RANGE`.
+    The result is finite for all finite parameters. The logarithm of the scale is
+    clamped to `LOG_SCALE_RANGE`.
+
+    Args:
+      splats: Raw parameters.
+
+    Returns:
+      Gaussians in world coordinates.
+
+    References:
+      Kerbl et al. 2023 (arXiv:2308.04079), section 5.1.
     """
     return Gaussians(
         mean=splats.mean,
@@ -92,9 +100,14 @@ def activate(splats: Splats) -> Gaussians:
 def turned(
     gaussians: Gaussians, turn: Float[Array, "gaussians 3"]
 ) -> Float[Array, "gaussians 4"]:
-    """The rotations of Gaussians, each followed by a turn: exp(turn) q / |q|.
+    """Rotate Gaussians in world axes: exp(turn) q / |q|.
 
-    `turn` are rotation vectors (rad, world axes); the quaternions have length 1.
+    Args:
+      gaussians: The Gaussians.
+      turn: Rotation vectors (rad, world axes).
+
+    Returns:
+      Unit quaternions (wxyz).
     """
 
     def one(turn, own):
@@ -104,15 +117,30 @@ def turned(
 
 
 def active_mask(splats: Splats) -> Bool[Array, " gaussians"]:
-    """Which rows stand for a Gaussian; the others only fill the capacity.
+    """Test which slots hold a Gaussian. A NaN logit counts as active.
 
-    A logit that is not a number marks no row as inactive.
+    Args:
+      splats: Raw parameters.
+
+    Returns:
+      True for active Gaussians.
     """
     return ~(splats.opacity_logit <= INACTIVE_LOGIT / 2)
 
 
 def rows_to_write(splats: Splats, path: pathlib.Path) -> np.ndarray:
-    """[gaussians] bool: what of them a file holds; ValueError where that is none."""
+    """Select the Gaussians that a file holds, on the host.
+
+    Args:
+      splats: Raw parameters.
+      path: The file, for the error message.
+
+    Returns:
+      [gaussians] bool.
+
+    Raises:
+      ValueError: If there is none.
+    """
     active = np.asarray(active_mask(splats))
     if not active.any():
         raise ValueError(
@@ -143,12 +171,19 @@ def active_harmonics(
 
 
 def capacity_for(count: int, most: int | None = None) -> int:
-    """The smallest bucket that holds `count` rows, never above `most`.
+    """Compute the smallest bucket that holds a number of Gaussians.
 
-    Buckets are 256 and then 1.5 times the one before, rounded up to a multiple of 256,
-    so that a growing scene compiles a handful of programs and carries at most half as
-    many rows again as it uses. A cap that is not beyond the next bucket is taken at
-    once: a program takes 10 s to compile, 3000 rows that nothing uses 1 ms of a step.
+    Buckets grow from 256 by a factor of 1.5, rounded up to a multiple of 256, so that a
+    growing scene compiles a handful of programs and has at most half as many unused
+    slots as used ones. A maximum that is not beyond the next bucket is used at once: a
+    program takes 10 s to compile, and 3000 unused slots cost 1 ms of a step.
+
+    Args:
+      count: Number of Gaussians.
+      most: Largest capacity.
+
+    Returns:
+      The capacity.
     """
     if most is not None and count > most:
         raise ValueError(
@@ -162,12 +197,28 @@ def capacity_for(count: int, most: int | None = None) -> int:
 
 
 def take_rows(params: Params, rows: Int[Array, " kept"]) -> Params:
-    """The given rows of everything that has one row per Gaussian."""
+    """Gather the given Gaussians in all per-Gaussian parameters.
+
+    Args:
+      params: All parameters.
+      rows: Indices of the Gaussians.
+
+    Returns:
+      Parameters with the gathered Gaussians.
+    """
     return params._replace(rows=jax.tree.map(lambda leaf: leaf[rows], params.rows))
 
 
 def deactivate(splats: Splats, inactive: Bool[Array, " gaussians"]) -> Splats:
-    """The same splats with the given rows marked inactive."""
+    """Mark Gaussians as inactive.
+
+    Args:
+      splats: Raw parameters.
+      inactive: True for the Gaussians to deactivate.
+
+    Returns:
+      Raw parameters with their opacity logits replaced.
+    """
     mark = jnp.asarray(INACTIVE_LOGIT, splats.opacity_logit.dtype)
     return splats._replace(
         opacity_logit=jnp.where(inactive, mark, splats.opacity_logit),
@@ -175,10 +226,17 @@ def deactivate(splats: Splats, inactive: Bool[Array, " gaussians"]) -> Splats:
 
 
 def pad_rows(params: Params, capacity: int) -> Params:
-    """The same rows and inactive ones behind them, up to `capacity`.
+    """Append inactive Gaussians up to a capacity.
 
-    Inactive rows repeat the first one, so every leaf keeps values that its own code
-    knows how to handle (a unit quaternion, a finite scale).
+    They repeat the first one, so every leaf keeps values that its code can handle (a
+    unit quaternion, a finite scale).
+
+    Args:
+      params: All parameters.
+      capacity: New number of slots.
+
+    Returns:
+      Parameters of that capacity.
     """
     count = params.rows["splats"].mean.shape[0]
     if not 0 < count <= capacity:
@@ -204,14 +262,24 @@ def from_points(
     lone_scale: float = 1.0,
     dtype: Any = jnp.float32,
 ) -> Splats:
-    """One round Gaussian for each point; host side.
+    """Initialize one isotropic Gaussian per point, on the host.
 
-    `points` [n, 3] in scene units and `colors` [n, 3] in [0, 1]. The standard
-    deviation is `scale` times the root mean square distance to the three nearest points
-    that lie elsewhere (Kerbl et al. 2023, section 5.1, says the mean distance; their
-    code counts a duplicate as a neighbor at distance zero and floors the result at
-    3e-4 whatever the unit). With two or three distinct points it uses those there are;
-    where there is one, `lone_scale` is that distance.
+    The standard deviation is `scale` times the root mean square distance to the three
+    nearest points at other positions. Kerbl et al. 2023, section 5.1, use the mean
+    distance, and their code counts a duplicate as a neighbor at distance zero and
+    clamps the result to at least 3e-4 in any unit.
+
+    Args:
+      points: [n, 3] positions in scene units.
+      colors: [n, 3] colors in [0, 1].
+      degree: Degree of the spherical harmonics.
+      opacity: Initial opacity.
+      scale: Factor of the neighbor distance.
+      lone_scale: Distance to use if all points coincide, in scene units.
+      dtype: Floating-point type.
+
+    Returns:
+      Raw parameters of n Gaussians.
     """
     refuse_half(dtype)
     points = np.asarray(points, np.float64)
@@ -249,9 +317,15 @@ def from_points(
 def neighbor_distance(
     points: Float[np.ndarray, "points 3"], lone_scale: float
 ) -> Float[np.ndarray, " points"]:
-    """Root mean square distance to the three nearest points that lie elsewhere.
+    """Compute the root mean square distance to the three nearest other points, on the
+    host.
 
-    Of two or three points, to those there are; of one, `lone_scale`. Host side.
+    Args:
+      points: Positions in scene units. Duplicates are not neighbors.
+      lone_scale: Distance to use if there is only one distinct point.
+
+    Returns:
+      The distance of each point, to fewer neighbors if there are fewer.
     """
     # Distinct in float32, the precision they are trained in.
     distinct, place = np.unique(points.astype(np.float32), axis=0, return_inverse=True)
@@ -271,12 +345,22 @@ def random_in_views(
     far: np.ndarray | float,
     count: int,
 ) -> np.ndarray:
-    """`count` points [count, 3] that the cameras see between near and far; host side.
+    """Sample points that the cameras see, on the host.
 
-    Camera, pixel and z-depth are drawn evenly, so every picture starts equally dense
-    at every depth; drawn evenly over the volume, most points would lie at the far end.
-    Lens distortion is left out. `size` is (width, height); `near` and `far` are
-    z-depths in scene units, one for all cameras or one each.
+    Camera, pixel and z-depth are uniform, so every image has the same density at every
+    depth. Uniform over the volume, most points would lie at the far end. Lens
+    distortion is ignored.
+
+    Args:
+      rng: Random generator.
+      cameras: Cameras of the views.
+      size: (width, height) in pixels.
+      near: Smallest z-depth in scene units, one value or one per camera.
+      far: Largest z-depth, likewise.
+      count: Number of points.
+
+    Returns:
+      [count, 3] positions in scene units.
     """
     views = np.reshape(cameras.position, (-1, 3)).shape[0]
     near, far = (
@@ -304,13 +388,20 @@ def random_in_views(
 
 
 def scene_extent(position: np.ndarray, static: float | None = None) -> float:
-    """1.1 times the largest distance of a camera from their mean; host side.
+    """Compute 1.1 times the largest distance of a camera from their mean, on the host.
 
-    The unit of the learning rate of the means and of the thresholds of densification
-    (Kerbl et al. 2023, reference implementation). Cameras that stand still have none,
-    and a zero would stop the means from learning; `static`, a typical depth, stands in
-    for it, and a tenth of it for that of cameras that hardly move: a hand's tremor is
-    no unit for what lies meters away, and densification would prune all of it.
+    It is the unit of the learning rate of the means and of the densification thresholds
+    (Kerbl et al. 2023, reference implementation). It is zero for static cameras, which
+    would stop the means from learning. A tenth of `static` replaces the extent of
+    cameras that hardly move: the tremor of a hand is no unit for surfaces meters away,
+    and densification would prune all of them.
+
+    Args:
+      position: [cameras, 3] camera centers in scene units.
+      static: Typical depth in scene units.
+
+    Returns:
+      The extent in scene units.
     """
     position = np.asarray(position, np.float64).reshape(-1, 3)
     middle = position.mean(axis=0)

@@ -1,9 +1,10 @@
-"""`.splatv`: a moving scene in one file for antimatter15's viewer of that name.
+"""`.splatv`: a dynamic scene in one file for antimatter15's viewer of that name.
 
-Each Gaussian moves on a cubic in time, turns by a quaternion linear in time, and is as
-opaque as a bell over time makes it, as in SpacetimeGaussians (Li et al. 2024,
-arXiv:2312.16812, equations 7 to 9); it has one color from everywhere and keeps its
-size. What a run learned is fitted by that, and how well is told with the file.
+Each Gaussian moves on a cubic in time, rotates by a quaternion linear in time, and has
+an opacity that is a Gaussian in time, as in SpacetimeGaussians (Li et al. 2024,
+arXiv:2312.16812, equations 7 to 9). Its color does not depend on the direction and its
+size is constant. The trained motion is fitted by these curves, and the error is
+reported.
 """
 
 import json
@@ -51,11 +52,11 @@ _ROW = np.dtype(
 
 
 class Curves(NamedTuple):
-    """Gaussians over time, as such a file holds them; float64, scene units.
+    """Curves of the file, as float64 in scene units.
 
-    With u the time since `center`, in films: a mean is `position + motion[0] u +
-    motion[1] u² + motion[2] u³`, a rotation `quaternion + turning u` at unit length, an
-    opacity `opacity exp(-(u / width)²)`.
+    With u the time since `center`, in units of the video: a mean is `position +
+    motion[0] u + motion[1] u² + motion[2] u³`, a rotation `quaternion + turning u` at
+    unit length, and an opacity `opacity exp(-(u / width)²)`.
     """
 
     position: np.ndarray  # [gaussians, 3]
@@ -70,7 +71,7 @@ class Curves(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """How far the curves are from what the run learned."""
+    """Error of the curves with respect to the trained motion."""
 
     rms: float  # of the means at all instants, of what can be seen; scene units
     most: float  # of 99 of 100 Gaussians at their worst instant
@@ -79,9 +80,13 @@ class Fit(NamedTuple):
 
 
 def fit(instants: Instants) -> Curves:
-    """The curves nearest to the Gaussians at evenly spread instants, least squares.
+    """Fit curves to Gaussians at evenly spaced times by least squares.
 
-    Where a Gaussian is faint its place counts for less.
+    Args:
+      instants: Gaussians at evenly spaced times. Faint ones have less weight.
+
+    Returns:
+      The curves.
     """
     times = np.linspace(0, 1, len(instants.mean))
     opacity, center, width = _bells(times, instants.opacity.astype(np.float64))
@@ -108,7 +113,9 @@ def fit(instants: Instants) -> Curves:
 
 
 def _polynomials(since, weight, values, terms):
-    """Coefficients [gaussians, terms, parts] of values [instants, gaussians, parts]."""
+    """Return coefficients [gaussians, terms, parts] of values [times, gaussians,
+    parts].
+    """
     powers = since[:, None] ** np.arange(terms)
     squares = np.einsum("tn,ti,tj->nij", weight, powers, powers, optimize=True)
     right = np.einsum("tn,ti,tnd->nid", weight, powers, values, optimize=True)
@@ -116,10 +123,11 @@ def _polynomials(since, weight, values, terms):
 
 
 def _bells(times, opacity):
-    """Height, center and width of the bells nearest to opacities [instants, gaussians].
+    """Return height, center and width of the curves nearest to opacities [times,
+    gaussians].
 
-    A parabola fitted to the logarithm, where it opens downwards and comes nearer than
-    one opacity for all times.
+    A parabola is fitted to the logarithm, and used if it opens downward and is closer
+    than a constant opacity.
     """
     constant = opacity.mean(axis=0)
     logarithm = np.log(np.maximum(opacity, 1e-4))[..., None]
@@ -144,7 +152,15 @@ def _bells(times, opacity):
 
 
 def at(curves: Curves, time: float) -> Gaussians:
-    """The Gaussians at a time in [0, 1], as the viewer draws them."""
+    """Evaluate the curves as the viewer does.
+
+    Args:
+      curves: The curves.
+      time: Normalized time in [0, 1].
+
+    Returns:
+      The Gaussians.
+    """
     since = (time - curves.center)[:, None]
     first, second, third = np.moveaxis(curves.motion, 1, 0)
     mean = curves.position + since * (first + since * (second + since * third))
@@ -155,7 +171,15 @@ def at(curves: Curves, time: float) -> Gaussians:
 
 
 def encode(curves: Curves, capture: Capture) -> bytes:
-    """The file; its cameras are those that were trained on."""
+    """Encode the file.
+
+    Args:
+      curves: The curves.
+      capture: The capture, whose training cameras are stored.
+
+    Returns:
+      Bytes of the file.
+    """
     for name, values in curves._asdict().items():
         if not np.abs(values).max(initial=0) < MOST:
             raise ValueError(
@@ -197,7 +221,14 @@ def _camera(capture, row):
 
 
 def decode(data: bytes) -> Curves:
-    """What a viewer reads from the bytes of a file."""
+    """Decode the curves from the bytes of a file, as a viewer does.
+
+    Args:
+      data: Bytes of the file.
+
+    Returns:
+      The curves.
+    """
     magic, length = np.frombuffer(data[:8], "<u4")
     if magic != MAGIC:
         raise ValueError(f"begins with {magic:#x}, not {MAGIC:#x}: not a .splatv file")
@@ -211,7 +242,16 @@ def decode(data: bytes) -> Curves:
 
 
 def write(path: pathlib.Path, instants: Instants, capture: Capture) -> Curves:
-    """Write the file; returns the curves as they are read from it."""
+    """Fit curves and write the file.
+
+    Args:
+      path: File to write.
+      instants: Gaussians at evenly spaced times.
+      capture: The capture.
+
+    Returns:
+      The curves as they are read from the file.
+    """
     data = encode(fit(instants), capture)
     with replaced_file(path) as partial:
         partial.write_bytes(data)
@@ -226,10 +266,19 @@ def measured(
     raster: RasterSpec,
     capture: Capture,
 ) -> Fit:
-    """The curves against the run itself, at the instants and in filmed views.
+    """Measure the error of the curves at their times and in captured views.
 
-    In `MEASURED` views at most, the held-out ones where there are any; `draw` draws the
-    run.
+    Args:
+      curves: The curves.
+      instants: Gaussians at evenly spaced times.
+      draw: Renderer of the run.
+      state: Trained state.
+      raster: Settings of the rasterizer.
+      capture: The capture, of which at most `MEASURED` views are used, held-out ones
+        first.
+
+    Returns:
+      The errors.
     """
     times = np.linspace(0, 1, len(instants.mean))
     fitted = np.stack([np.asarray(at(curves, time).mean) for time in times])

@@ -1,9 +1,9 @@
 """SPZ, the packed format of Niantic: versions 2 and 3 (gzip) and 4 (zstd).
 
-Layout and quantization: github.com/nianticlabs/spz, README and headers. Fields follow
-one another for all Gaussians: 24-bit fixed-point means, opacities, colors, logarithms
-of scales, rotations, harmonics. Its axes are right, up, back; ours, like those of the
-PLY files of 3D Gaussian splatting, are right, down, front.
+Layout and quantization follow github.com/nianticlabs/spz, README and headers. Fields
+follow one another for all Gaussians: 24-bit fixed-point means, opacities, colors,
+logarithms of scales, rotations, harmonics. Its axes are right, up, back. Ours, like
+those of 3DGS PLY files, are right, down, front.
 """
 
 import gzip
@@ -34,7 +34,7 @@ _SH_SIGN = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.fl
 
 
 class Unpacked(NamedTuple):
-    """The raw values of the rows, in our axes; NumPy float32."""
+    """Raw parameters in our axes, as NumPy float32."""
 
     mean: np.ndarray  # [n, 3]
     log_scale: np.ndarray  # [n, 3]
@@ -46,7 +46,17 @@ class Unpacked(NamedTuple):
 
 
 def decode(data: bytes) -> Unpacked:
-    """The rows of an SPZ file; a ValueError says what is wrong with it."""
+    """Decode an SPZ file.
+
+    Args:
+      data: Bytes of the file.
+
+    Returns:
+      Raw parameters.
+
+    Raises:
+      ValueError: If the file is damaged.
+    """
     if (
         data[:4] == MAGIC
         and len(data) >= 8
@@ -78,9 +88,17 @@ def decode(data: bytes) -> Unpacked:
 
 
 def encode(rows: Unpacked, version: int = 3) -> bytes:
-    """An SPZ file of these rows; version 2 or 3, or 4 where zstandard is installed.
+    """Encode an SPZ file.
 
-    Means beyond 2048 scene units do not fit its fixed point and are refused.
+    Args:
+      rows: Raw parameters.
+      version: Version 2 or 3, or 4 if zstandard is installed.
+
+    Returns:
+      Bytes of the file.
+
+    Raises:
+      ValueError: If a mean exceeds the fixed-point range of 2048 scene units.
     """
     if version not in (2, 3, 4):
         raise ValueError(f"SPZ versions 2, 3 and 4 can be written, not {version}")

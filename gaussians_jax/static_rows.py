@@ -1,8 +1,8 @@
-"""Which Gaussians move at all, and the deformation of those alone.
+"""Separation of moving from static Gaussians, so that only the former are deformed.
 
-Most of a filmed scene stands still, and a deformation network finds that out anew for
-every Gaussian at every instant. `split` asks once, on the host, at a few instants; from
-then on `deform` evaluates the deformation of the rows that move and of no other.
+Most of a scene is static, and a deformation network would evaluate every Gaussian at
+every time. `split` evaluates it once, on the host, at a few times. From then on
+`deform` evaluates the moving Gaussians only.
 """
 
 from collections.abc import Callable
@@ -23,14 +23,14 @@ DeformRows = Callable[[Params, Float[Array, ""]], Gaussians]
 
 
 class RowIndex(NamedTuple):
-    """For each row, whether it moves, and then where it is among those that do."""
+    """Index of each Gaussian among the moving ones, and whether it moves."""
 
     moves: Bool[Array, " gaussians"]
     place: Int[Array, " gaussians"]  # 0 where it does not move
 
 
 class StaticDynamicSplit(NamedTuple):
-    """A trained scene, its moving rows apart from the static ones."""
+    """A trained scene with moving and static Gaussians separated."""
 
     static: Gaussians  # all rows, as they are at the middle instant
     index: RowIndex
@@ -38,13 +38,20 @@ class StaticDynamicSplit(NamedTuple):
 
 
 def max_displacement(before: Gaussians, after: Gaussians) -> Float[Array, " gaussians"]:
-    """How far the surface of each Gaussian moves at most; scene units.
+    """Bound the displacement of the surface of each Gaussian.
 
     A point of the one-sigma ellipsoid, mean + R S u with |u| = 1, moves by no more than
     |Δmean| + max |ΔS| + 2 sin(θ/2) max S, with θ the angle between the rotations and S
-    the scales before. Equality for a translation or a growth; an upper bound for a
-    turn, which a round Gaussian does not show. Made for choosing rows, not for
-    differentiating: its slope is undefined where nothing moves.
+    the scales before. This is exact for a translation or a growth, and an upper bound
+    for a rotation, which is invisible on an isotropic Gaussian. Its gradient is
+    undefined where nothing moves.
+
+    Args:
+      before: Gaussians.
+      after: The same Gaussians at another time.
+
+    Returns:
+      Displacement in scene units.
     """
     shift = jnp.linalg.norm(after.mean - before.mean, axis=-1)
     growth = jnp.max(jnp.abs(after.scale - before.scale), axis=-1)
@@ -62,7 +69,14 @@ def max_displacement(before: Gaussians, after: Gaussians) -> Float[Array, " gaus
 
 
 def row_index(moves: np.ndarray) -> RowIndex:
-    """The table of the rows that move, `moves` [gaussians] bool; host side."""
+    """Index the moving Gaussians, on the host.
+
+    Args:
+      moves: [gaussians] bool.
+
+    Returns:
+      The index.
+    """
     place = np.where(moves, np.cumsum(moves) - 1, 0)
     return RowIndex(jnp.asarray(moves), jnp.asarray(place, jnp.int32))
 
@@ -70,9 +84,17 @@ def row_index(moves: np.ndarray) -> RowIndex:
 def dynamic_mask(
     static: Gaussians, now: Gaussians, static_threshold: float
 ) -> np.ndarray:
-    """[gaussians] bool: the rows that move farther than `static_threshold`; host side.
+    """Select the Gaussians that move farther than a threshold, on the host.
 
-    A row that is drawn neither here nor there, of opacity zero, does not move.
+    A Gaussian with zero opacity at both times does not count as moving.
+
+    Args:
+      static: Gaussians at a reference time.
+      now: The same Gaussians at another time.
+      static_threshold: Threshold in scene units.
+
+    Returns:
+      [gaussians] bool.
     """
     if not static_threshold >= 0:
         raise ValueError(
@@ -92,14 +114,21 @@ def split(
     static_threshold: float,
     fading: bool = True,
 ) -> StaticDynamicSplit:
-    """The rows that move farther than `static_threshold` (scene units); host side.
+    """Separate moving from static Gaussians, on the host.
 
-    `times` [instants] lie in [0, 1]. Rows are compared with where they are at the
-    middle one, and drawn there from then on: at `times` no point of a Gaussian is
-    farther than `static_threshold` from where the whole deformation puts it. With
-    `fading` a row whose opacity changes by more than `FADES` counts as one that moves.
-    Between the instants nothing is promised: a row that moves only between two of them
-    has not been met.
+    Gaussians are compared with the middle time, at which static ones stay. At `times`,
+    no point of a Gaussian is farther than `static_threshold` from its deformed
+    position. A Gaussian that moves only between two of the times is not detected.
+
+    Args:
+      params: Trained parameters.
+      deform: The deformation.
+      times: Normalized times in [0, 1].
+      static_threshold: Threshold in scene units.
+      fading: Count Gaussians whose opacity changes by more than `FADES` as moving.
+
+    Returns:
+      The separated scene.
     """
     if not len(times):
         raise ValueError("no times to look for motion at; 16 over [0, 1] will do")
@@ -119,9 +148,14 @@ def split(
 
 
 def of_rows(params: Params, drawn: np.ndarray) -> np.ndarray:
-    """[rows] bool: the rows of which something in `drawn` [gaussians] is; host side.
+    """Select the Gaussians of which any child is selected, on the host.
 
-    The rows themselves where these are what is drawn.
+    Args:
+      params: Trained parameters.
+      drawn: [children] bool.
+
+    Returns:
+      [gaussians] bool; `drawn` itself if Gaussians have no children.
     """
     return np.asarray(drawn).reshape(len(params.rows["splats"].mean), -1).any(axis=1)
 
@@ -136,7 +170,16 @@ def deform(
 
 
 def merge(static: Gaussians, moved: Gaussians, table: RowIndex) -> Gaussians:
-    """The rows that move as in `moved`, which holds nothing else, the others static."""
+    """Combine moved and static Gaussians.
+
+    Args:
+      static: All Gaussians at the reference time.
+      moved: The moving Gaussians.
+      table: Index of the moving Gaussians.
+
+    Returns:
+      All Gaussians.
+    """
 
     def leaf(static, moved):
         # A gather, not a scatter: XLA:CPU runs a scatter row by row.

@@ -1,10 +1,10 @@
 """A trained motion as a table: Gaussians at knots in time, interpolated in between.
 
-The deformation is evaluated once for each knot and never again; an instant then costs
-reading two or four rows of a table, whatever the network that made it. The error falls
-with the knots, as docs/results/deformation_cost.md shows, and the table takes 40
-bytes (ten float32) for each knot and each Gaussian that moves: 10 000 of them at 32
-knots are 13 MB, while a Gaussian that stands still is stored once.
+The deformation is evaluated once per knot. A time then costs reading two or four
+entries of a table, independent of the network. The error falls with the number of knots
+(docs/results/deformation_cost.md), and the table takes 40 bytes (ten float32) per knot
+and moving Gaussian: 10 000 of them at 32 knots are 13 MB. A static Gaussian is stored
+once.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ BYTES = 40  # of a moving Gaussian at a knot, in float32
 
 
 class Track(NamedTuple):
-    """Where rows are at every knot."""
+    """Pose and opacity of the Gaussians at every knot."""
 
     mean: Float[Array, "knots moving 3"]  # scene units
     log_scale: Float[Array, "knots moving 3"]
@@ -53,11 +53,18 @@ def bake(
     static_threshold: float = 0.0,
     dtype=jnp.float32,
 ) -> Knots:
-    """The table of a motion, `deform` at every knot; host side.
+    """Evaluate a motion at all knots, on the host.
 
-    `deform` is called as it is: compile it. Rows of which no point moves farther than
-    `static_threshold` (scene units, from where it is at the middle knot) at any knot
-    are static and stored once.
+    Args:
+      deform: The motion, from a normalized time to Gaussians. It is called as it is, so
+        compile it.
+      knots: Number of knots.
+      static_threshold: Gaussians none of whose points moves farther than this from the
+        middle knot (scene units) are stored once.
+      dtype: Floating-point type of the table.
+
+    Returns:
+      The table.
     """
     if knots < MIN_KNOTS["linear"]:
         raise ValueError(
@@ -87,14 +94,21 @@ def bake(
 def at(
     knots: Knots, time: Float[Array, ""], interpolation: str = "linear"
 ) -> Gaussians:
-    """The Gaussians at one time in [0, 1]; outside it, at its nearer end.
+    """Interpolate the Gaussians at one time.
 
-    "linear" is continuous, its error falls as the square of the knots' distance;
-    "cubic" (Catmull-Rom) has a continuous velocity as well, and its error falls as the
-    third power. Both are exact at the knots, to rounding. Scales are interpolated in
-    the logarithm and stay positive. Quaternions are interpolated as vectors of one
-    sign and normalized: neighbors are at most 90 degrees apart as vectors, so what
-    lies between them is never short.
+    Scales are interpolated in the logarithm and stay positive. Quaternions are
+    interpolated as vectors of one sign and normalized. Neighbors are at most 90 degrees
+    apart as vectors, so the interpolated ones are never short.
+
+    Args:
+      knots: The table.
+      time: Normalized time, clamped to [0, 1].
+      interpolation: "linear" is continuous, with an error of second order in the
+        distance of the knots. "cubic" (Catmull-Rom) has a continuous velocity and an
+        error of third order. Both are exact at the knots, up to rounding.
+
+    Returns:
+      The Gaussians.
     """
     if not knots.track.mean.shape[1]:
         return knots.static
@@ -117,7 +131,15 @@ def at(
 
 
 def check(knots: int, interpolation: str) -> None:
-    """Refuse a table too short for its interpolation; host side."""
+    """Refuse a table too short for its interpolation, on the host.
+
+    Args:
+      knots: Number of knots.
+      interpolation: "linear" or "cubic".
+
+    Raises:
+      ValueError: If there are too few knots, or the interpolation is unknown.
+    """
     if interpolation not in MIN_KNOTS:
         raise ValueError(
             f"unknown interpolation {interpolation!r}; choose from "
@@ -176,12 +198,19 @@ def catmull_rom(
 
 
 def spline_weights(knots: int, time: Float[Array, ""]) -> Float[Array, " knots"]:
-    """What each of some even knots over [0, 1] counts in a Catmull-Rom spline.
+    """Compute the weights of evenly spaced knots over [0, 1] in a Catmull-Rom spline.
 
-    Continuous with its slope; at a knot exactly that knot. The end knots stand for
-    those beyond them, and times outside for the ends. All weights at once, four of them
-    not zero: a product with a table of few knots is cheaper than reading four of its
-    columns and adding to them in the gradient.
+    The weights and their derivative are continuous. The end knots stand for those
+    beyond them. All weights are returned, four of them nonzero: a product with a table
+    of few knots is cheaper than reading four of its columns and scattering into them in
+    the gradient.
+
+    Args:
+      knots: Number of knots.
+      time: Normalized time, clamped to [0, 1].
+
+    Returns:
+      Weights that sum to one.
     """
     last = knots - 1
     place = jnp.clip(time, 0, 1) * last
@@ -193,7 +222,7 @@ def spline_weights(knots: int, time: Float[Array, ""]) -> Float[Array, " knots"]
 
 @jax.jit
 def _track(gaussians):
-    """Gaussians as rows of the table."""
+    """Convert Gaussians to table entries."""
     # A scale that the motion took through zero is drawn by its size.
     scale = jnp.clip(jnp.abs(gaussians.scale), *np.exp(splats.LOG_SCALE_RANGE).tolist())
     return Track(

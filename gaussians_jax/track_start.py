@@ -1,8 +1,8 @@
-"""The first Gaussians and the first motion, from what tracks say of a film.
+"""Initialize Gaussians and their motion from tracks.
 
-What stands still starts from the evidence's dense points. The motion is fitted to the
-paths of moving tracks; then moving pixels of all frames are lifted by the depths of the
-tracks near them, and carried back by that motion to where it has its Gaussians.
+Static Gaussians start from the dense points of preprocessing. The motion is fitted to
+the paths of moving tracks. Then moving pixels of all frames are unprojected with the
+depths of nearby tracks, and moved back by that motion to their canonical positions.
 """
 
 from typing import Any, NamedTuple
@@ -31,7 +31,7 @@ ROUNDS = 8  # of carrying back
 
 
 class TrackStart(NamedTuple):
-    """What a scene starts from; host side."""
+    """Initial Gaussians and motion of a scene, on the host."""
 
     position: np.ndarray  # [moving, 3] canonical, scene units
     color: np.ndarray  # [moving, 3] in [0, 1]
@@ -78,7 +78,7 @@ def start(
 
 
 def _seeds(effect, points, followed, evidence, views, times, unit, spec):
-    """Moving pixels of all frames, lifted, and carried back to the canonical places."""
+    """Unproject moving pixels of all frames, and move them to canonical positions."""
     rng = np.random.default_rng(0)
     depth = moving_depths(evidence)
     frame, row, column = np.nonzero(depth > 0)
@@ -149,7 +149,14 @@ def _mixed(leaf, near, share):
 
 
 def moving_depths(evidence: Evidence) -> np.ndarray:
-    """[frames, height, width] z-depth of moving pixels by tracks near; 0 unknown."""
+    """Interpolate the z-depth of moving pixels from nearby tracks.
+
+    Args:
+      evidence: Results of preprocessing.
+
+    Returns:
+      [frames, height, width] z-depth in scene units, 0 where unknown.
+    """
     depths = np.zeros(evidence.moving.shape, np.float32)
     tracks = evidence.tracks.take(evidence.moved)
     for frame, mask in enumerate(evidence.moving):
@@ -166,11 +173,19 @@ def moving_depths(evidence: Evidence) -> np.ndarray:
 
 
 def rows_at_rest(resting: Resting, places: Float[Array, "places 3"]) -> PyTree:
-    """What the motion keeps of the points it was fitted to hold still, near each place.
+    """Return the motion parameters of static points near each position, on the host.
 
-    With rows drawn anew, of which no fit knew, Gaussians at rest moved at once: on the
-    built-in scene, where points that move go 0.023 scene units, by 0.002 with a KAN and
-    by 0.010 with the two networks of E-D3DGS; so by 0.0004 and 0.00002. Host side.
+    With newly sampled parameters, static Gaussians moved at once. On the built-in
+    scene, where moving points travel 0.023 scene units, they moved by 0.002 with a KAN
+    and by 0.010 with the two networks of E-D3DGS. With these parameters it is 0.0004
+    and 0.00002.
+
+    Args:
+      resting: Static points of the fit, and their parameters.
+      places: Positions in scene units.
+
+    Returns:
+      Per-Gaussian parameters of the motion.
     """
     still, own = jax.tree.map(np.asarray, resting)
     _, near, share = _carriers(still, np.asarray(places))
@@ -178,9 +193,17 @@ def rows_at_rest(resting: Resting, places: Float[Array, "places 3"]) -> PyTree:
 
 
 def put_in(params: Params, effects: tuple[Effect, ...], tracked: TrackStart) -> Params:
-    """Parameters with the fitted motion, the first of the effects.
+    """Insert the fitted motion, which is the first effect, into the parameters.
 
-    The tracked Gaussians are the last rows; all others are at rest.
+    The tracked Gaussians are the last ones, and all others are static.
+
+    Args:
+      params: Initial parameters.
+      effects: Effects of the scene.
+      tracked: Initial Gaussians and motion.
+
+    Returns:
+      Parameters with the motion.
     """
     rows, nets = dict(params.rows), dict(params.nets)
 
