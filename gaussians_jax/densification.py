@@ -1,9 +1,9 @@
-"""Densification: clone the small, split the large, prune the faint.
+"""Adaptive density control: clone small Gaussians, split large ones, prune faint ones.
 
 Kerbl et al. 2023, arXiv:2308.04079, section 5.2, with the constants of its reference
-implementation. Statistics are gathered inside the step (`observe`, pure); the events
-run on the host between two chunks, because they may change the capacity. They decide in
-NumPy and move the rows in one compiled gather per pair of capacities.
+implementation. Statistics are gathered inside the step (`observe`, pure). Events run on
+the host between two chunks, because they may change the capacity. They decide in NumPy
+and move parameters in one compiled gather per pair of capacities.
 """
 
 import dataclasses
@@ -62,7 +62,7 @@ class DefaultStrategySpec:
 
 
 class RowStats(NamedTuple):
-    """What the rows did since the last event."""
+    """Statistics of each Gaussian since the last event."""
 
     active: Bool[Array, " gaussians"]
     grad2d: Float[Array, " gaussians"]  # summed norms, NDC units
@@ -71,7 +71,7 @@ class RowStats(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What an event did, in Gaussians; nothing happens that is not counted here."""
+    """Numbers of Gaussians that an event cloned, split, pruned or refused."""
 
     cloned: int = 0
     split: int = 0
@@ -84,7 +84,7 @@ class Report(NamedTuple):
 
 
 class Changed(NamedTuple):
-    """Everything that has rows, after an event."""
+    """Per-Gaussian state after an event."""
 
     params: Params
     moments: PyTree
@@ -111,18 +111,28 @@ def observe(
     size: tuple[int, int],
     significance: Float[Array, " drawn"] | None = None,
 ) -> RowStats:
-    """One more view, whose picture is `size` = (width, height); pure.
+    """Add one view to the statistics.
 
-    `mean2d_gradient_px` is the slope of that view's own loss (not of a mean over a
-    batch) by the projected means in pixels; for the absolute variant, the sum of the
-    absolute slopes over the pixels. A pixel is 2/width of the NDC range, so the slope
-    per NDC unit is width/2 and height/2 times larger; the thresholds are in that unit.
-    Each view of a batch counts by itself. 4DGS, E-D3DGS and ADC-GS add up the slopes of
-    the mean loss and count a batch once: of two views that is as large where both pull
-    one way, and half where one of them alone sees the row.
-    Where rows carry several Gaussians each, these say what happened to those: a row
-    counts the mean slope of its visible ones, by their `significance` where it is
-    given, and the largest radius.
+    Thresholds are in normalized device coordinates. A pixel is 2/width of their range,
+    so gradients are multiplied by width/2 and height/2. Each view of a batch counts by
+    itself. 4DGS, E-D3DGS and ADC-GS add the gradients of the mean loss and count a
+    batch once: for two views that is as large if both agree, and half if only one sees
+    the Gaussian.
+
+    Args:
+      stats: Statistics so far.
+      mean2d_gradient_px: Gradient of that view's own loss (not of the mean over a
+        batch) with respect to the projected means in pixels. For the absolute variant,
+        the sum of its absolute values over the pixels.
+      visible: Whether the Gaussian lies in the image.
+      radius_px: Radius of the footprint in pixels.
+      size: (width, height) of the image in pixels.
+      significance: Weights of child Gaussians, if each parent has several. A parent
+        counts the weighted mean gradient of its visible children, and the largest
+        radius.
+
+    Returns:
+      The new statistics.
     """
     width, height = size
     per_ndc = jnp.asarray([width / 2, height / 2], mean2d_gradient_px.dtype)
@@ -162,13 +172,25 @@ def densify(
     step: int,
     extent: float,
 ) -> Changed:
-    """Clone, split and prune after `step` updates; host side.
+    """Clone, split and prune Gaussians, on the host.
 
-    A row grows where its mean gradient per view reaches the threshold: a small one is
-    copied, a large one is replaced by two drawn from it. Where the cap leaves room for
-    some, those with the largest gradient grow. An effect that scores rows its own way
-    scales `stats.grad2d` first. The clones and the children come back with zero
-    moments. `extent` is `splats.scene_extent`.
+    A Gaussian grows if its mean gradient per view reaches the threshold: a small one is
+    duplicated, and a large one is replaced by two samples from it. If the cap does not
+    suffice for all, those with the largest gradient grow. An effect with its own score
+    scales `stats.grad2d` first. New Gaussians have zero moments.
+
+    Args:
+      optimizer: The optimizer.
+      params: All parameters.
+      moments: State of the optimizer.
+      stats: Statistics since the last event.
+      key: Random key of the samples.
+      spec: Settings.
+      step: Number of completed steps.
+      extent: Scene extent (`splats.scene_extent`).
+
+    Returns:
+      The changed state and a report.
     """
     rows, kind, report = _plan(params.rows["splats"], stats, spec, step, extent)
     count, capacity = len(rows), stats.active.shape[0]
@@ -193,7 +215,7 @@ def densify(
 
 
 def _plan(rows, stats, spec, step, extent):
-    """Which old row each new row comes from, and what becomes of it."""
+    """Choose the source of each new Gaussian, and its role."""
     stats = jax.tree.map(np.asarray, stats)
     whole, opacity, scale = map(np.asarray, row_summary(rows))
     score = stats.grad2d / np.maximum(stats.views, 1)
@@ -241,7 +263,14 @@ def _plan(rows, stats, spec, step, extent):
 
 @jax.jit
 def row_summary(rows):
-    """Of each row: whether it is finite, its opacity, its largest scale."""
+    """Return whether each Gaussian is finite, its opacity, and its largest scale.
+
+    Args:
+      rows: Raw parameters.
+
+    Returns:
+      Three arrays [gaussians].
+    """
 
     def finite(leaf):
         return jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1)
@@ -272,7 +301,17 @@ def split_rows(
     key: Key[Array, ""],
     shrink: float,
 ) -> Splats:
-    """The `child` rows drawn from the Gaussian they are a copy of, and shrunk."""
+    """Sample children from the Gaussians that they duplicate, and shrink them.
+
+    Args:
+      rows: Raw parameters.
+      child: True for the children.
+      key: Random key.
+      shrink: Divisor of their scale.
+
+    Returns:
+      Raw parameters.
+    """
     drawn = splats.activate(rows)
     noise = jax.random.normal(key, rows.mean.shape, rows.mean.dtype)
     offset = jax.vmap(quaternion.rotate)(rows.quaternion, drawn.scale * noise)
@@ -284,10 +323,16 @@ def split_rows(
 
 
 def halve_opacity(logit: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The logit of 1 - sqrt(1 - o): two such in a row hide as much as one of o.
+    """Compute the logit of 1 - sqrt(1 - o), two of which occlude as much as one of o.
 
-    The correction of opacities after cloning of Rota Bulò et al. 2024,
-    arXiv:2404.06109.
+    Args:
+      logit: Opacity logits.
+
+    Returns:
+      Corrected logits.
+
+    References:
+      Rota Bulò et al. 2024 (arXiv:2404.06109), opacity correction after cloning.
     """
     faint = logit < FAINT_LOGIT
     # l - log 2 - e^l / 4: off by e^2l. The closed form is log 0 from -88 in float32.
@@ -304,12 +349,20 @@ def reset_opacity(
     moments: PyTree,
     spec: DefaultStrategySpec,
 ) -> tuple[Params, PyTree]:
-    """No opacity above `spec.reset_opacity`; the moments of the opacities start anew.
+    """Clamp opacities to `spec.reset_opacity`, and reset the moments of the opacities.
 
-    Of rows that carry Gaussians their common share is lowered: one of these may be
-    drawn above the bound by its own. Inactive rows stay inactive. With the renderer's
-    cut-off at 1/255 a Gaussian reset to 0.01 gets gradients only out to 1.37 standard
-    deviations.
+    If Gaussians have children, only the shared opacity is clamped, and a child may
+    exceed the bound. Inactive Gaussians stay inactive. With the renderer's cut at
+    1/255, a Gaussian reset to 0.01 gets gradients only within 1.37 standard deviations.
+
+    Args:
+      optimizer: The optimizer.
+      params: All parameters.
+      moments: State of the optimizer.
+      spec: Settings.
+
+    Returns:
+      Parameters and optimizer state.
     """
     rows = params.rows["splats"]
     bound = math.log(spec.reset_opacity / (1 - spec.reset_opacity))

@@ -33,11 +33,11 @@ _NODES = np.arange(64) * 0.1
 
 @dataclasses.dataclass(frozen=True)
 class MCMCStrategySpec:
-    """When rows move, how many are added, how much the means are shaken.
+    """Settings of 3DGS-MCMC: relocation, growth and noise.
 
-    The numbers are those of the paper's code, where `cap_max` is set for each scene to
-    what Kerbl et al. 2023 end with. The noise has no unit that follows the scene: it
-    grows with the square of the scales and with the extent, which is in the learning
+    The values are those of the paper's code, where `cap_max` is set for each scene to
+    the final number of Kerbl et al. 2023. The noise depends on the unit of the scene:
+    it grows with the square of the scales and with the extent, which is in the learning
     rate of the means.
     """
 
@@ -80,12 +80,23 @@ def compute_relocation(
     copies: Int[Array, " n"],
     least: float,
 ) -> tuple[Float[Array, " n"], Float[Array, "n 3"]]:
-    """Opacity and scale of each of `copies` Gaussians that together replace one.
+    """Compute opacity and scale of copies that together replace one Gaussian.
 
-    Equation 9 of the paper: the opacity satisfies (1 - o')^copies = 1 - o, and the
-    scale keeps the mass of the composite along a line through the middle. As in the
-    reference no copy is fainter than `least`, and the scale makes up for that; none is
-    so opaque that its logit is infinite.
+    The opacity satisfies (1 - o')^copies = 1 - o, and the scale conserves the mass of
+    the composite along a line through the center. As in the reference, no copy is
+    fainter than `least`, which the scale compensates, and none has an infinite logit.
+
+    Args:
+      opacity: Opacity of the Gaussians in [0, 1].
+      scale: Their scales in scene units.
+      copies: Number of copies that replace each.
+      least: Smallest opacity.
+
+    Returns:
+      Opacity and scales of a copy.
+
+    References:
+      Kheradmand et al. 2024 (3DGS-MCMC, arXiv:2404.09591), Equation 9.
     """
     count = copies.astype(opacity.dtype)
     most = 1 - float(jnp.finfo(opacity.dtype).epsneg)
@@ -108,13 +119,22 @@ def relocate(
     key: Key[Array, ""],
     spec: MCMCStrategySpec,
 ) -> tuple[Params, PyTree, densification.Report]:
-    """Every faint Gaussian becomes a copy of a visible one; host side.
+    """Move every faint Gaussian to a visible one, on the host.
 
-    Sources are drawn in proportion to their opacity. A source and its copies share its
-    opacity and scale as `compute_relocation` says, and start with zero moments. A row
-    that is not finite moves as the faint ones do, and is counted as broken. Where
-    nothing is visible, nothing can move and the report counts the faint ones as
-    refused.
+    Targets are sampled in proportion to their opacity. A target and its copies share
+    opacity and scale (`compute_relocation`) and start with zero moments. A Gaussian
+    that is not finite is relocated as well, and reported as broken. If nothing is
+    visible, faint ones stay, and the report counts them as refused.
+
+    Args:
+      optimizer: The optimizer.
+      params: All parameters.
+      moments: State of the optimizer.
+      key: Random key.
+      spec: Settings.
+
+    Returns:
+      Parameters, optimizer state and a report.
     """
     rows = params.rows["splats"]
     active, whole, opacity = _opacities(rows)
@@ -142,7 +162,18 @@ def refine(
     key: Key[Array, ""],
     spec: MCMCStrategySpec,
 ) -> tuple[Params, PyTree, densification.Report]:
-    """One event: the faint Gaussians move, then new ones come; host side."""
+    """Relocate faint Gaussians and add new ones, on the host.
+
+    Args:
+      optimizer: The optimizer.
+      params: All parameters.
+      moments: State of the optimizer.
+      key: Random key.
+      spec: Settings.
+
+    Returns:
+      Parameters, optimizer state and a report.
+    """
     move_key, add_key = jax.random.split(key)
     params, moments, moved = relocate(optimizer, params, moments, move_key, spec)
     params, moments, added = add(optimizer, params, moments, add_key, spec)
@@ -161,9 +192,19 @@ def add(
     key: Key[Array, ""],
     spec: MCMCStrategySpec,
 ) -> tuple[Params, PyTree, densification.Report]:
-    """`spec.growth` times as many Gaussians, as far as the cap allows; host side.
+    """Grow the number of Gaussians by `spec.growth` up to the cap, on the host.
 
-    Rounded down, as in the reference: at 1.05, of fewer than 20 none is added.
+    The number is rounded down, as in the reference: at 1.05, fewer than 20 do not grow.
+
+    Args:
+      optimizer: The optimizer.
+      params: All parameters.
+      moments: State of the optimizer.
+      key: Random key.
+      spec: Settings.
+
+    Returns:
+      Parameters, optimizer state and a report.
     """
     rows = params.rows["splats"]
     active, whole, opacity = _opacities(rows)
@@ -190,14 +231,14 @@ def add(
 
 
 def _opacities(rows):
-    """Of each row: whether it is there, whether it is finite, its opacity."""
+    """Return whether each Gaussian is active, whether it is finite, and its opacity."""
     whole, opacity, _ = densification.row_summary(rows)
     active = np.asarray(splats.active_mask(rows))
     return active, np.asarray(whole), np.asarray(opacity, np.float64)
 
 
 def _draw(key, opacity, seen, count):
-    """`count` of the `seen` rows, in proportion to their opacity."""
+    """Sample `count` of the visible Gaussians in proportion to their opacity."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
     chance = np.where(seen, opacity, 0)
     return rng.choice(len(opacity), size=count, p=chance / chance.sum())
@@ -239,11 +280,22 @@ def position_noise(
     learning_rate: Float[Array, ""] | float,
     spec: MCMCStrategySpec,
 ) -> Float[Array, "gaussians 3"]:
-    """What to add to the means after an update, in scene units; pure.
+    """Sample the noise that is added to the means after an update.
 
-    Equation 8 of the paper: Gaussian noise shaped by each covariance, in proportion to
-    the current learning rate of the means, for faint rows only.
-    Inactive rows keep still.
+    The noise has the shape of each covariance, is proportional to the learning rate of
+    the means, and affects faint Gaussians only. Inactive ones have none.
+
+    Args:
+      key: Random key.
+      rows: Raw parameters.
+      learning_rate: Current learning rate of the means.
+      spec: Settings.
+
+    Returns:
+      Displacements in scene units.
+
+    References:
+      Kheradmand et al. 2024 (3DGS-MCMC, arXiv:2404.09591), Equation 8.
     """
     drawn = splats.activate(rows)
     noise = jax.random.normal(key, rows.mean.shape, rows.mean.dtype)
@@ -264,7 +316,17 @@ def inject_noise(
     learning_rate: Float[Array, ""] | float,
     spec: MCMCStrategySpec,
 ) -> Params:
-    """The parameters with `position_noise` on their means; pure."""
+    """Add `position_noise` to the means.
+
+    Args:
+      key: Random key.
+      params: All parameters.
+      learning_rate: Current learning rate of the means.
+      spec: Settings.
+
+    Returns:
+      Parameters with displaced means.
+    """
     rows = params.rows["splats"]
     noise = position_noise(key, rows, learning_rate, spec)
     rows = rows._replace(mean=rows.mean + noise)
@@ -272,9 +334,19 @@ def inject_noise(
 
 
 def penalty(rows: Splats, spec: MCMCStrategySpec) -> Float[Array, ""]:
-    """Opacities and scales cost their mean over the active rows.
+    """Penalize the mean opacity and scale of the active Gaussians.
 
-    Equation 10 of the paper has sums; means are what its code has.
+    The paper has sums, its code has means.
+
+    Args:
+      rows: Raw parameters.
+      spec: Settings.
+
+    Returns:
+      The penalty.
+
+    References:
+      Kheradmand et al. 2024 (3DGS-MCMC, arXiv:2404.09591), Equation 10.
     """
     drawn = splats.activate(rows)
     active = splats.active_mask(rows)

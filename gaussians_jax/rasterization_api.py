@@ -25,7 +25,7 @@ MAX_RADIUS_PX = 1e9
 
 
 class _Views(NamedTuple):
-    """What differs from camera to camera; every leaf has the cameras first."""
+    """Arrays that differ between cameras, with the cameras as first axis."""
 
     viewmat: Float[Array, "cameras 4 4"]
     K: Float[Array, "cameras 3 3"]
@@ -221,7 +221,9 @@ def _index(name, value):
 
 
 def _checked(arrays: dict[str, Any], sh_degree):
-    """Gaussians, colors that all cameras share, and views; refuses wrong arrays."""
+    """Return Gaussians, colors that all cameras share, and views, after checking
+    shapes.
+    """
     arrays = {
         name: None if value is None else jnp.asarray(value)
         for name, value in arrays.items()
@@ -384,7 +386,7 @@ def _camera_image(settings, gaussians, colors, view):
 
 
 def _camera(view):
-    """The camera of a view; its position is where the viewmat gives zero."""
+    """Return the camera of a view, whose center the viewmat maps to zero."""
     rotation, shift = view.viewmat[:3, :3], view.viewmat[:3, 3]
     # By cofactors: the exact inverse of any matrix, so that the gradient with respect
     # to the viewmat is that of R x + t, not only along rotations.
@@ -418,7 +420,7 @@ def _visible_colors(settings, gaussians, colors, view):
 
 
 def _radii(footprints, size):
-    """Whole pixels around the mean that hold alpha >= cut; zero where not seen."""
+    """Return the integer radii around the mean where alpha >= cut, zero if not visible."""
     reach = jnp.ceil(jnp.minimum(footprints.extent_px, MAX_RADIUS_PX))
     # The box of whole pixels meets the image, as gsplat decides it.
     whole = lax.stop_gradient(footprints)._replace(extent_px=reach)

@@ -1,4 +1,4 @@
-"""Where a player's camera may go: where the capture looked from, with a margin."""
+"""Range of the player's camera: the captured viewpoints, with a margin."""
 
 import numpy as np
 
@@ -20,16 +20,17 @@ def camera_limits(
     """Compute the range of a player's camera from the cameras of a capture.
 
     Args:
-      train: Training cameras, the first view foremost.
-      target: Point that the first view is turned about, scene units.
+      train: Training cameras, starting with the first view.
+      target: Center of rotation of the first view, scene units.
       up: Upward direction of the scene, unit length.
       half_diagonal: Half the diagonal of the image over the focal length.
 
     Returns:
-      Lists and floats. `axes` are rows: two of the ground plane, the first toward the
-      first camera, and `up`. `azimuth` (None where the capture went all around) and
-      `elevation` are ranges in radians of the direction from the target to the camera,
-      `distance` is one in scene units, and `pan` is how far the target may move.
+      Lists and floats. `axes` are two directions in the ground plane, the first toward
+      the first camera, and `up`. `azimuth` (None if the capture surrounds the target)
+      and `elevation` are ranges in radians of the direction from the target to the
+      camera, `distance` is one in scene units, and `pan` is the largest displacement of
+      the target.
     """
     offset = train.position.astype(np.float64) - target
     distance = np.linalg.norm(offset, axis=1)
@@ -59,7 +60,9 @@ def camera_limits(
 
 
 def _azimuth(angles):
-    """The arc of all angles with its margin, which holds 0; None where it closes."""
+    """Return the arc of all angles with its margin, including 0; None if it is a full
+    circle.
+    """
     angles = np.sort(np.append(angles, 0.0))
     gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
     widest = int(np.argmax(gaps))

@@ -1,8 +1,8 @@
-"""Gaussians at a few instants as few bytes: whole numbers, and only what moves twice.
+"""Compact encoding of Gaussians at a few times: integers, and offsets of what moves.
 
-A field (mean, quaternion, ...) is stored once, at rest, and for the rows that change
-as offsets from there, one for each instant, in steps of the row's own. Rest is the
-middle of a row's range, so that no offset is longer than half of it.
+A field (mean, quaternion, ...) is stored once at its reference value. Gaussians that
+change also have an offset for each time, in steps of their own size. The reference is
+the middle of the range, so that no offset is longer than half of it.
 """
 
 from typing import Any, NamedTuple
@@ -33,10 +33,17 @@ class Packed(NamedTuple):
 
 
 def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
-    """The instants in bytes; a mean stands still within `still_distance` [gaussians].
+    """Encode Gaussians at several times.
 
-    In scene units. Means at rest are float32, so that one Gaussian far away costs the
-    near ones nothing; 16 bits for rotations, scales and colors, 8 for opacity.
+    Reference means are float32, so that one distant Gaussian costs the near ones no
+    precision. Rotations, scales and colors have 16 bits, opacity has 8.
+
+    Args:
+      instants: The Gaussians at these times, scene units.
+      still_distance: [gaussians] displacement that counts as static, scene units.
+
+    Returns:
+      The bytes and their description.
     """
     low, high = splats.LOG_SCALE_RANGE
     quantizers = {
@@ -78,7 +85,7 @@ class _Arrays:
         self._entries, self._parts, self._size = {}, [], 0
 
     def add(self, name, array, scale=1.0, shift=0.0):
-        """Behind those before; a value is `shift + scale * array`."""
+        """Append an array; a value is `shift + scale * array`."""
         content = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"))
         content = content.tobytes()
         self._entries[name] = {
@@ -98,6 +105,13 @@ class _Arrays:
 
 
 def moving_rows(packed: Packed) -> int:
-    """How many Gaussians change over time, in whatever way (at least)."""
+    """Count the Gaussians that change over time, at least.
+
+    Args:
+      packed: The encoded Gaussians.
+
+    Returns:
+      Largest number of Gaussians with offsets in any field.
+    """
     names = [name for name in packed.entries if name.endswith(".rows")]
     return max(packed.entries[name]["shape"][0] for name in names)

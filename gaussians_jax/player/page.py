@@ -1,8 +1,8 @@
-"""`player.html`: a trained moving scene in one file that any browser plays.
+"""`player.html`: a trained dynamic scene in one file that plays in any browser.
 
-Nothing is fetched: Gaussians, program and poster are inside. What is drawn has one
-color from everywhere, the mean of what the training cameras see, and straight motion
-between the instants.
+Nothing is fetched: Gaussians, program and poster are in the file. The color of a
+Gaussian does not depend on the direction, but is the mean of what the training cameras
+see. Motion is linear between the stored times.
 """
 
 import base64
@@ -58,8 +58,19 @@ def write(
 ) -> Player:
     """Write the page, which opens with the first training camera.
 
-    `degree` is that of the harmonics in use; `poster` (uint8 [height, width, 3]) is
-    shown until the first frame is drawn, and where nothing can be.
+    Args:
+      path: File to write.
+      title: Title of the page.
+      model: The model.
+      raster: Settings of the rasterizer.
+      degree: Degree of the spherical harmonics in use.
+      state: Trained state.
+      capture: The capture.
+      poster: uint8 [height, width, 3] image that is shown until the first frame is
+        rendered, and where rendering is not possible.
+
+    Returns:
+      Summary of the player.
     """
     at, rows = gaussians_at(model, state), model.stages.rows(state.params)
     seen = seen_in_training(at, rows, raster, degree, capture)
@@ -121,7 +132,16 @@ def _packed(at, rows, capture, seen, count):
 
 
 def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict:
-    """What the page must know beside the Gaussians, as JSON."""
+    """Collect everything except the Gaussians that the page needs, as JSON.
+
+    Args:
+      packed: The encoded Gaussians.
+      raster: Settings of the rasterizer.
+      capture: The capture.
+
+    Returns:
+      The header.
+    """
     train = cameras.take(capture.cameras, capture.train)
     first = cameras.take(train, 0)
     forward = first.camera_from_world[2].astype(np.float64)
@@ -158,9 +178,14 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
 
 
 def still_distance(instants: Instants, capture: Capture) -> np.ndarray:
-    """How far a Gaussian may move unnoticed, scene units: a tenth of a pixel.
+    """Compute the displacement that is invisible: a tenth of a pixel.
 
-    In the training camera that comes nearest to where it is at first.
+    Args:
+      instants: Gaussians at several times.
+      capture: The capture, whose training camera nearest to each Gaussian counts.
+
+    Returns:
+      [gaussians] distance in scene units.
     """
     train = cameras.take(capture.cameras, capture.train)
     nearest = np.full(instants.mean.shape[1], np.inf)

@@ -1,4 +1,4 @@
-"""A trained scene at a few instants: what a player that knows no model can draw."""
+"""A trained scene at a few times, for players that do not evaluate the model."""
 
 import math
 from typing import NamedTuple
@@ -41,14 +41,24 @@ class Instants(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What the training views show of each Gaussian."""
+    """Contribution of each Gaussian to the training views."""
 
     most: np.ndarray  # [gaussians] pixels, in the view that shows most of it
     color: np.ndarray  # [gaussians, 3], mean over the views by how much they show
 
 
 def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
-    """The scene at `count` instants; host side. `rows` say which are active."""
+    """Evaluate a scene at evenly spaced times, on the host.
+
+    Args:
+      at: Function from time to Gaussians.
+      rows: Raw parameters, which tell the active Gaussians.
+      seen: Contribution of each Gaussian to the training views.
+      count: Number of times.
+
+    Returns:
+      The Gaussians at these times.
+    """
     # NaN compares false: it is left out.
     (kept,) = np.nonzero(seen.most >= LEAST_SEEN_PX)
     if not kept.size:
@@ -74,7 +84,14 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
 
 
 def count_for(capture: Capture) -> int:
-    """24 to 48 instants, as many as there are moments."""
+    """Choose the number of times to store.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Number of distinct timestamps, from 24 to 48.
+    """
     moments = len(np.unique(capture.times[capture.train]))
     return int(np.clip(moments, LEAST_INSTANTS, MOST_INSTANTS))
 
@@ -87,11 +104,21 @@ def seen_in_training(
     degree: Int[Array, ""],
     capture: Capture,
 ) -> Seen:
-    """How much of the training pictures each Gaussian makes up, and in which color.
+    """Measure the contribution and the mean color of each Gaussian in the training
+    views.
 
-    Each view counts as it is, and without what moves: then it shows what that hides.
-    Where this process has two devices, each looks one way. `degree` is that of the
-    harmonics in use.
+    Every view is evaluated twice, with and without moving Gaussians, to include what
+    these occlude. If this process has two devices, each evaluates one of them.
+
+    Args:
+      at: Function from time to Gaussians.
+      rows: Raw parameters.
+      raster: Settings of the rasterizer.
+      degree: Degree of the spherical harmonics in use.
+      capture: The capture.
+
+    Returns:
+      The contributions.
     """
     factor = math.ceil(max(capture.size) / MOST_SIDE_PX)
     size = (max(1, capture.size[0] // factor), max(1, capture.size[1] // factor))
@@ -118,10 +145,10 @@ def seen_in_training(
 
 
 def _shown(how, gaussians: Gaussians, camera: Camera):
-    """[gaussians] how many pixels' worth of a picture each makes up.
+    """Sum the compositing weights of each Gaussian over the pixels.
 
-    A picture is a sum of colors with weights, so the weights of a Gaussian, summed
-    over the pixels, are the slope of the picture's sum in the Gaussian's color.
+    An image is a weighted sum of colors, so the summed weights of a Gaussian are the
+    gradient of the sum of the image with respect to the Gaussian's color.
     """
     size, raster = how
 
@@ -141,9 +168,15 @@ def _moves(at, capture):
 
 
 def steady(quaternion: np.ndarray) -> np.ndarray:
-    """Unit quaternions [instants, gaussians, 4], none opposite to the one before it.
+    """Choose signs of quaternions so that consecutive ones are on the same hemisphere.
 
-    q and -q are one rotation; between two instants a player takes the straight line.
+    q and -q are the same rotation, and a player interpolates linearly between times.
+
+    Args:
+      quaternion: Unit quaternions [times, gaussians, 4].
+
+    Returns:
+      The same rotations.
     """
     length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
     unit = quaternion / np.maximum(length, np.finfo(np.float32).tiny)
