@@ -215,14 +215,14 @@ def _chunk(table, ranks, start, end, position, chunk):
 
 
 def _pixels(grid, dtype):
-    """Return pixel centers relative to the tile's center: x, then y, flattened by rows."""
+    """Return pixel centers relative to the tile center: x, then y, row by row."""
     line = np.arange(grid.tile) - (grid.tile - 1) / 2
     y, x = np.meshgrid(line, line, indexing="ij")
     return jnp.asarray(x.ravel(), dtype), jnp.asarray(y.ravel(), dtype)
 
 
 def _whitened(rows, middle):
-    """Return u and v at the tile centers, and their gradients p, r and -r k in pixels."""
+    """Return u and v at the tile centers, and their gradients p, r and -r k."""
     mean_x, mean_y, p, k, r = rows[:5]
     dx, dy = middle[0] - mean_x, middle[1] - mean_y
     return p * dx, r * (dy - k * dx), p, r, -(r * k)

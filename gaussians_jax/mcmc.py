@@ -1,9 +1,9 @@
-"""A fixed budget of Gaussians: the faint ones move to where they are needed.
+"""3DGS-MCMC densification: a fixed budget of Gaussians that are relocated.
 
 Kheradmand et al. 2024, "3D Gaussian splatting as Markov chain Monte Carlo",
-arXiv:2404.09591. The alternative to `densification`: no thresholds on gradients, no
-resets, and therefore no statistics. Means are shaken in every step (`position_noise`),
-opacity and scale cost something (`penalty`), the events (`refine`) run on the host.
+arXiv:2404.09591, is the alternative to `densification` without gradient thresholds,
+resets and statistics. Noise is added to the means in every step (`position_noise`),
+opacity and scale are penalized (`penalty`), and events (`refine`) run on the host.
 """
 
 import dataclasses

@@ -420,7 +420,7 @@ def _visible_colors(settings, gaussians, colors, view):
 
 
 def _radii(footprints, size):
-    """Return the integer radii around the mean where alpha >= cut, zero if not visible."""
+    """Return the integer radii where alpha >= cut, zero if not visible."""
     reach = jnp.ceil(jnp.minimum(footprints.extent_px, MAX_RADIUS_PX))
     # The box of whole pixels meets the image, as gsplat decides it.
     whole = lax.stop_gradient(footprints)._replace(extent_px=reach)
