@@ -5,13 +5,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax.capture import frames, name_times
+from nerfies_jax.capture import colmap_models, frames, name_times
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.colmap_lenses import undistort
 from nerfies_jax.capture.colmap_library import MIN_TRACK, library
-from nerfies_jax.capture.colmap_models import reconstruction
 from nerfies_jax.capture.formats import sparse_models
 from nerfies_jax.capture.json_files import AnyPath, inside
 from nerfies_jax.capture.points import place_by_points
@@ -19,7 +18,6 @@ from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.geometry.camera import Camera
 
 PICTURES = ("images", "images_2", "images_4", "images_8", "input", "rgb", "")
-MAX_ERROR_PX = 2.0  # mean reprojection error of a point that is kept
 
 
 class Model(NamedTuple):
@@ -194,41 +192,37 @@ def read_model(folder: pathlib.Path) -> Model:
     Raises:
       CaptureError: If the model cannot be read, or has too few images or points.
     """
-    model = reconstruction(folder)
-    posed = [image for image in model.images.values() if image.has_pose]
-    posed.sort(key=lambda image: frames.natural(image.name))
-    if len(posed) < 2:
+    about, arrays = colmap_models.tables(folder)
+    names = about["names"]
+    if len(names) < 2:
         raise CaptureError(
-            f"{folder}: {len(posed)} pictures have a pose; a reconstruction needs at "
+            f"{folder}: {len(names)} pictures have a pose; a reconstruction needs at "
             "least 2, so run COLMAP with more overlap"
         )
-    poses = [image.cam_from_world().matrix() for image in posed]
-    rotations = np.stack([pose[:, :3] for pose in poses])
-    positions = np.stack([image.projection_center() for image in posed])
-    row_of = {image.image_id: row for row, image in enumerate(posed)}
-    kept, depths = [], []
-    for point in model.points3D.values():
-        if point.track.length() < MIN_TRACK or not point.error <= MAX_ERROR_PX:
-            continue
-        rows = [
-            row_of[e.image_id] for e in point.track.elements if e.image_id in row_of
-        ]
-        kept.append((point.xyz, point.color))
-        depths.append(((point.xyz - positions[rows]) * rotations[rows, 2]).sum(1))
-    if len(kept) < 3:
+    if len(arrays["points"]) < 3:
         raise CaptureError(
-            f"{folder}: {len(kept)} points seen in {MIN_TRACK} frames or more; the "
-            "scene cannot be placed, so keep points3D or run COLMAP again"
+            f"{folder}: {len(arrays['points'])} points seen in {MIN_TRACK} frames or "
+            "more; the scene cannot be placed, so keep points3D or run COLMAP again"
         )
-    depths = np.concatenate(depths)
+    rows = sorted(range(len(names)), key=lambda row: frames.natural(names[row]))
+    try:
+        cameras = {
+            number: library().Camera(fields)
+            for number, fields in about["cameras"].items()
+        }
+    except (ValueError, TypeError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise CaptureError(f"{folder}: cameras of no known kind ({reason})") from None
+    camera_ids = [about["camera_ids"][row] for row in rows]
+    depths = arrays["depths"]
     return Model(
-        names=tuple(image.name for image in posed),
-        lenses=[model.cameras[image.camera_id] for image in posed],
-        camera_ids=np.array([image.camera_id for image in posed]),
-        rotations=rotations,
-        positions=positions,
-        points=np.array([xyz for xyz, _ in kept]),
-        colors=np.array([color for _, color in kept], np.uint8),
+        names=tuple(names[row] for row in rows),
+        lenses=[cameras[str(number)] for number in camera_ids],
+        camera_ids=np.array(camera_ids),
+        rotations=arrays["rotations"][rows],
+        positions=arrays["positions"][rows],
+        points=arrays["points"],
+        colors=arrays["colors"],
         depths=depths[depths > 0],
     )
 
@@ -249,7 +243,7 @@ def _best_model(path):
     counts, broken = {}, {}
     for folder in places:
         try:
-            counts[folder] = reconstruction(folder).num_reg_images()
+            counts[folder] = len(colmap_models.tables(folder).about["names"])
         except CaptureError as error:
             broken[folder] = error
     if not counts:

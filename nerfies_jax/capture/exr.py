@@ -7,13 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import OpenEXR
 
-from nerfies_jax.capture import safe_files
+from nerfies_jax.capture import decoder, safe_files
 from nerfies_jax.capture.errors import CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
-MAX_FLOATS = (
-    512_000_000  # over all channels; a 4K frame with 20 channels has 166 million
-)
+SECONDS_PER_NUMBER = 1e-6  # of a slow codec on a slow machine
 _TYPES = (np.float16, np.float32, np.uint32)
 
 
@@ -45,19 +43,10 @@ def read_exr(path: AnyPath) -> ExrPicture:
       CaptureError: If the file cannot be read.
     """
     path = _existing(path)
-    try:
-        origin, (width, height), display_size = _windows(path)
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            # Copied: the arrays belong to the file, and `channels()` is empty once it
-            # closes.
-            channels = {k: np.array(v.pixels) for k, v in file.channels().items()}
-    except CaptureError:
-        raise
-    except Exception as error:  # OpenEXR raises RuntimeError, ValueError and its own
-        raise _unreadable(path, error) from None
-    if not channels or any(c.shape != (height, width) for c in channels.values()):
-        raise CaptureError(f"{path}: its pixels do not fill its window; write it again")
-    return _picture(channels, origin, display_size)
+    with decoder.session() as child:
+        about, _ = _decoded(child, path, True)
+        about, channels = _decoded(child, path, False, about["numbers"])
+    return _picture(channels, tuple(about["origin"]), tuple(about["display_size"]))
 
 
 def read_size(path: AnyPath) -> tuple[int, int]:
@@ -73,12 +62,8 @@ def read_size(path: AnyPath) -> tuple[int, int]:
       CaptureError: If the file cannot be read.
     """
     path = _existing(path)
-    try:
-        return _windows(path)[2]
-    except CaptureError:
-        raise
-    except Exception as error:  # as above
-        raise _unreadable(path, error) from None
+    with decoder.session() as child:
+        return tuple(_decoded(child, path, True).about["display_size"])
 
 
 def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
@@ -138,46 +123,22 @@ def _existing(path):
     return safe_files.check(path)
 
 
-def _unreadable(path, error):
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return CaptureError(
-        f"{path}: not a readable EXR ({reason}); it may be cut short, so write it again"
-    )
-
-
-def _windows(path):
-    """Origin and size of the data window, and the size of the display window.
-
-    The origin is relative to the display window. Both sizes are bounded before any
-    pixel is decoded.
-    """
-    with OpenEXR.File(str(path), header_only=True) as file:
-        header = file.header()  # it empties when the file closes
-        data, display = (
-            np.asarray(header[name], int) for name in ("dataWindow", "displayWindow")
+def _decoded(child, path, header_only, numbers=0):
+    try:
+        return child.request(
+            "exr",
+            cpu_seconds=numbers * SECONDS_PER_NUMBER,
+            memory_bytes=12 * numbers,
+            path=str(path.absolute()),
+            header_only=header_only,
         )
-        channels = header["channels"]
-        width, height = (data[1] - data[0] + 1).tolist()
-        shown = tuple((display[1] - display[0] + 1).tolist())
-        if not 0 < width * height * len(channels) <= MAX_FLOATS:
-            raise CaptureError(
-                f"{path}: {width}x{height} pixels of {len(channels)} channels, more "
-                f"than {MAX_FLOATS} numbers; crop it or keep fewer channels"
-            )
-        if not (min(shown) > 0 and shown[0] * shown[1] <= MAX_FLOATS):
-            raise CaptureError(
-                f"{path}: a display window of {shown[0]}x{shown[1]} pixels; expected "
-                f"1 to {MAX_FLOATS}: write it again"
-            )
-        if any(
-            channel.xSampling != 1 or channel.ySampling != 1 for channel in channels
-        ):
-            raise CaptureError(
-                f"{path}: channels of different resolution (luminance-chroma); save it "
-                "as RGB"
-            )
-    left, top = (data[0] - display[0]).tolist()
-    return (left, top), (width, height), shown
+    except decoder.DecoderError as error:
+        if error.has_advice:
+            raise CaptureError(f"{path}: {error}") from None
+        raise CaptureError(
+            f"{path}: not a readable EXR ({error}); it may be cut short, so write it "
+            "again"
+        ) from None
 
 
 def _picture(channels, origin, display_size):

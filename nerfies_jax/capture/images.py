@@ -16,13 +16,15 @@ import PIL.Image
 import skimage.io
 from numpy.typing import ArrayLike
 
-from nerfies_jax.capture import exr, safe_files
-from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture import decoder, exr, safe_files
+from nerfies_jax.capture.errors import CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
 # An 8K video frame has 33 million. Pillow itself only warns above 89 million, and at
 # 144 million a picture is 430 MB.
 MAX_PIXELS = 64_000_000
+LARGE_PIXELS = 16_000_000  # larger images are decoded in a child process
+SECONDS_PER_PIXEL, BYTES_PER_PIXEL = 1e-6, 24  # at most, of decoding
 EXR, TIFF = ".exr", (".tif", ".tiff")
 _ORIENTATION = 0x0112  # the EXIF tag; 1 is upright, 0 unknown
 _PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError)
@@ -118,6 +120,35 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
             f"{path}: its EXIF orientation is {header.orientation}, so a viewer turns "
             "it and a camera file may or may not; turn the pixels and remove the tag"
         )
+    if header.size[0] * header.size[1] > LARGE_PIXELS:
+        pixels = _decode_apart(path, header)
+    else:
+        pixels = decode(path, header)
+    if pixels.dtype == np.bool_:
+        pixels = pixels.astype(np.uint8) * 255
+    elif pixels.dtype == np.uint16:
+        pixels = ((pixels.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+    pixels = pixels if pixels.ndim == 3 else pixels[..., None]
+    if pixels.dtype != np.uint8 or pixels.shape[1::-1] != header.size:
+        raise CaptureError(
+            f"{path}: decoded to {pixels.dtype} of shape {pixels.shape}; save it as an "
+            "8-bit RGB PNG"
+        )
+    return pixels
+
+
+def decode(path: AnyPath, header: Header | None = None) -> np.ndarray:
+    """Decode an image with Pillow, as `read_pixels` needs it.
+
+    Args:
+      path: The file, which may not be an EXR.
+      header: What `read_header` returned of it.
+
+    Raises:
+      CaptureError: If it cannot be decoded.
+    """
+    path = pathlib.Path(path)
+    header = header or read_header(path)
     try:
         plain = header.mode in {"RGB", "RGBA", "L", "1", "I;16", "I;16B"}
         if plain and path.suffix.lower() in TIFF:
@@ -143,17 +174,25 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
         raise
     except _PILLOW_ERRORS as error:
         raise _unreadable(path, error) from None
-    if pixels.dtype == np.bool_:
-        pixels = pixels.astype(np.uint8) * 255
-    elif pixels.dtype == np.uint16:
-        pixels = ((pixels.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
-    pixels = pixels if pixels.ndim == 3 else pixels[..., None]
-    if pixels.dtype != np.uint8 or pixels.shape[1::-1] != header.size:
-        raise CaptureError(
-            f"{path}: decoded to {pixels.dtype} of shape {pixels.shape}; save it as an "
-            "8-bit RGB PNG"
-        )
     return pixels
+
+
+def _decode_apart(path, header):
+    """Decode a large image in a child process with limits."""
+    count = header.size[0] * header.size[1]
+    try:
+        with decoder.session() as child:
+            answer = child.request(
+                "image",
+                cpu_seconds=count * SECONDS_PER_PIXEL,
+                memory_bytes=BYTES_PER_PIXEL * count,
+                path=str(path.absolute()),
+            )
+    except decoder.DecoderError as error:
+        if error.has_advice:  # and the path
+            raise CaptureError(str(error)) from None
+        raise _unreadable(path, error) from None
+    return answer.arrays["pixels"]
 
 
 @contextlib.contextmanager

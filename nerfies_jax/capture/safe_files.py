@@ -15,6 +15,7 @@ import stat
 from collections.abc import Callable, Iterator
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
+from nerfies_jax.capture import decoder
 from nerfies_jax.capture.errors import CaptureError
 
 AnyPath = str | os.PathLike
@@ -54,7 +55,7 @@ def confines(
         path: AnyPath, *args: Parameters.args, **options: Parameters.kwargs
     ) -> Content:
         folder = path if os.path.isdir(path) else pathlib.Path(path).parent
-        with confined(folder):
+        with confined(folder), decoder.session():
             return read(path, *args, **options)
 
     return confined_read

@@ -1,0 +1,109 @@
+"""Program of `decoder`: decode files of strangers under limits of memory and time.
+
+Requests come on stdin, one JSON object a line. Each answer on stdout is a line of JSON
+and the bytes of the arrays that it lists; the last one of a request only says so.
+"""
+
+import contextlib
+import json
+import os
+import sys
+import time
+
+from nerfies_jax import children
+from nerfies_jax.capture.errors import FileError
+
+try:
+    import resource
+except ImportError:  # Windows has no such limits
+    resource = None  # type: ignore[assignment]
+
+
+def _limit(cpu_seconds, memory_bytes):
+    """Bound what this process may take from here on."""
+    if resource is None:
+        return
+    spent = time.process_time()
+    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_CPU, (int(spent + cpu_seconds) + 1, hard))
+    with contextlib.suppress(ValueError, OSError):
+        with open("/proc/self/statm") as file:
+            now = int(file.read().split()[0]) * resource.getpagesize()
+        _, hard = resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (now + int(memory_bytes), hard))
+
+
+def _colmap(folder):
+    from nerfies_jax.capture import colmap_tables
+
+    yield colmap_tables.read(folder)
+
+
+def _exr(path, header_only):
+    from nerfies_jax.capture import exr_decoding
+
+    yield exr_decoding.read(path, header_only)
+
+
+def _image(path):
+    from nerfies_jax.capture import images
+
+    yield {}, {"pixels": images.decode(path)}
+
+
+OPERATIONS = {
+    "colmap": (_colmap, "nerfies_jax.capture.colmap_tables"),
+    "exr": (_exr, "nerfies_jax.capture.exr_decoding"),
+    "image": (_image, "nerfies_jax.capture.images"),
+}
+
+
+def _answer(stream, about, arrays):
+    import numpy as np
+
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    rows = [(name, each.dtype.str, each.shape) for name, each in arrays.items()]
+    stream.write(json.dumps({"about": about, "arrays": rows}).encode() + b"\n")
+    for array in arrays.values():
+        stream.write(array.reshape(-1).view(np.uint8).data)
+    stream.flush()
+
+
+def _say(stream, about):
+    stream.write(json.dumps(about).encode() + b"\n")
+    stream.flush()
+
+
+def main() -> None:
+    """Answer requests until stdin ends."""
+    import importlib
+
+    children.end_with_parent()
+    # Libraries that print must not write into the answers.
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    for line in sys.stdin.buffer:
+        job = json.loads(line)
+        operation, module = OPERATIONS[job["operation"]]
+        importlib.import_module(module)  # its libraries are not the file's memory
+        try:
+            spent = time.process_time()
+            _limit(job["cpu_seconds"], job["memory_bytes"])
+            for about, arrays in operation(**job["arguments"]):
+                _answer(answers, about, arrays)
+                if time.process_time() - spent > 1.0:  # the limit is for one answer
+                    spent = time.process_time()
+                    _limit(job["cpu_seconds"], job["memory_bytes"])
+            _say(answers, {"end": True})
+        # Decoders raise whatever they meet; the parent names the file.
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            if isinstance(error, MemoryError):
+                reason = "it takes more memory than such a file should"
+            advice = isinstance(error, FileError)
+            _say(answers, {"error": reason[:1000], "has_advice": advice})
+
+
+if __name__ == "__main__":
+    main()
