@@ -200,7 +200,8 @@ def _next_answer(child, seconds):
         timer.cancel()
 
 
-_shared: Decoder | None = None
+_shared: Decoder | None = None  # for requests
+_spare: Decoder | None = None  # for the next stream
 _sessions = 0
 _sessions_lock = threading.Lock()
 
@@ -208,7 +209,7 @@ _sessions_lock = threading.Lock()
 @contextlib.contextmanager
 def session() -> Iterator[Decoder]:
     """Keep one child for all requests of the block, and of blocks inside it."""
-    global _shared, _sessions
+    global _shared, _spare, _sessions
     with _sessions_lock:
         _shared = _shared or Decoder()
         _sessions += 1
@@ -221,3 +222,25 @@ def session() -> Iterator[Decoder]:
             if not _sessions:
                 decoder.close()
                 _shared = None
+                if _spare is not None:
+                    _spare.close()
+                    _spare = None
+
+
+@contextlib.contextmanager
+def streaming() -> Iterator[Decoder]:
+    """Use a child for one stream, while others serve what is read in between.
+
+    Inside a `session` it is kept for the next stream.
+    """
+    global _spare
+    with _sessions_lock:
+        decoder, _spare = _spare or Decoder(), None
+    try:
+        yield decoder
+    finally:
+        with _sessions_lock:
+            if _sessions and _spare is None:
+                _spare = decoder
+            else:
+                decoder.close()

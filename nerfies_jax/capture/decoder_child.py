@@ -5,6 +5,7 @@ and the bytes of the arrays that it lists; the last one of a request only says s
 """
 
 import contextlib
+import functools
 import json
 import os
 import sys
@@ -52,9 +53,21 @@ def _image(path):
     yield {}, {"pixels": images.decode(path)}
 
 
+_VIDEO = "nerfies_jax.capture.video_decoding"
+
+
+def _video(operation, **arguments):
+    from nerfies_jax.capture import video_decoding
+
+    yield from getattr(video_decoding, operation)(**arguments)
+
+
 OPERATIONS = {
     "colmap": (_colmap, "nerfies_jax.capture.colmap_tables"),
     "exr": (_exr, "nerfies_jax.capture.exr_decoding"),
+    "video": (functools.partial(_video, "frames"), _VIDEO),
+    "video_notes": (functools.partial(_video, "notes"), _VIDEO),
+    "video_transfer": (functools.partial(_video, "transfer"), _VIDEO),
     "image": (_image, "nerfies_jax.capture.images"),
 }
 

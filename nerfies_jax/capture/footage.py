@@ -21,7 +21,7 @@ import PIL.ImageOps
 import scipy.ndimage
 
 from nerfies_jax import events
-from nerfies_jax.capture import frames
+from nerfies_jax.capture import decoder, frames
 from nerfies_jax.capture import masks as mask_files
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
 from nerfies_jax.capture.colmap_library import MIN_TRACK
@@ -86,6 +86,7 @@ def pictures_in(folder: pathlib.Path) -> list[pathlib.Path]:
     return sorted(files, key=lambda file: frames.natural(file.name))
 
 
+@decoder.session()
 def from_film(
     film: pathlib.Path,
     out: pathlib.Path,

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from nerfies_jax.capture.images import srgb_from_linear
+from nerfies_jax.capture.srgb import srgb_from_linear
 
 Transfer = Literal["HLG", "PQ"]
 # By ffmpeg's number of the transfer characteristics (ITU-T H.273, table 3).

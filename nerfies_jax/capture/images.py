@@ -14,11 +14,12 @@ import imageio.v3
 import numpy as np
 import PIL.Image
 import skimage.io
-from numpy.typing import ArrayLike
 
 from nerfies_jax.capture import decoder, exr, safe_files
 from nerfies_jax.capture.errors import CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
+from nerfies_jax.capture.srgb import linear_from_srgb as linear_from_srgb
+from nerfies_jax.capture.srgb import srgb_from_linear as srgb_from_linear
 
 # An 8K video frame has 33 million. Pillow itself only warns above 89 million, and at
 # 144 million a picture is 430 MB.
@@ -27,7 +28,7 @@ LARGE_PIXELS = 16_000_000  # larger images are decoded in a child process
 SECONDS_PER_PIXEL, BYTES_PER_PIXEL = 1e-6, 24  # at most, of decoding
 EXR, TIFF = ".exr", (".tif", ".tiff")
 _ORIENTATION = 0x0112  # the EXIF tag; 1 is upright, 0 unknown
-_PILLOW_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError)
+_PILLOW_ERRORS = (Exception,)  # its parsers raise whatever they meet
 
 
 class Header(NamedTuple):
@@ -327,34 +328,6 @@ def write_png(path: AnyPath, pixels: np.ndarray):
     encoded = imageio.v3.imwrite("<bytes>", pixels, extension=".png")
     with replaced_file(path) as partial:
         partial.write_bytes(encoded)
-
-
-def srgb_from_linear(light: np.ndarray) -> np.ndarray:
-    """Convert linear light to sRGB values (IEC 61966-2-1).
-
-    Args:
-      light: Linear light, clipped to [0, 1].
-
-    Returns:
-      sRGB values in [0, 1].
-    """
-    light = np.clip(light, 0, 1)
-    power = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.where(light <= 0.0031308, 12.92 * light, power)
-
-
-def linear_from_srgb(value: ArrayLike | float) -> np.ndarray:
-    """Convert sRGB values to linear light.
-
-    Args:
-      value: sRGB values in [0, 1]. Values outside continue with the same formulas.
-
-    Returns:
-      Linear light.
-    """
-    value = np.asarray(value)
-    power = ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4
-    return np.where(value <= 0.04045, value / 12.92, power)
 
 
 def _unreadable(path, error):

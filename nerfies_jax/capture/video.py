@@ -9,20 +9,13 @@ from fractions import Fraction
 
 import numpy as np
 
-from nerfies_jax.capture import extras, safe_files
+from nerfies_jax.capture import decoder, extras, safe_files
 from nerfies_jax.capture.capture import CaptureError
-from nerfies_jax.capture.high_dynamic_range import (
-    CODES,
-    TRANSFERS,
-    Transfer,
-    tone_mapped,
-)
-from nerfies_jax.capture.images import MAX_PIXELS
+from nerfies_jax.capture.high_dynamic_range import Transfer
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
-HD_LINES = 720  # from here on players take BT.709 where a film does not say
-_UNSAID = 2  # ffmpeg's number of a color space that is not told
-SLACK = 3  # frames by which the stated length of a whole film may be wrong
+# Of decoding, for one frame: one of 3840x2160 in high dynamic range takes 2 s.
+CPU_SECONDS, MEMORY_BYTES = 15.0, 4 * 2**30
 LEAST_RATE = 0.001  # frames per second; rates are fractions of up to 1001 seconds
 
 
@@ -123,30 +116,12 @@ def transfer_of(path: AnyPath) -> Transfer | None:
       The transfer function, None for other videos and for files that cannot be read
       (`read_video` reports the reason).
     """
-    av = library()
+    extras.check("av", "video")
     try:
-        with av.open(str(path.absolute())) as container:
-            frame = next(container.decode(_main_stream(container, path)), None)
-            return None if frame is None else TRANSFERS.get(int(frame.color_trc))
-    except (av.FFmpegError, OSError, CaptureError):
+        about = _one(path, "video_transfer").about
+    except (decoder.DecoderError, CaptureError):
         return None
-
-
-def _main_stream(container, path):
-    """The largest video of a file: covers and previews are streams of it, too."""
-    videos = [
-        stream
-        for stream in container.streams.video
-        if not stream.disposition & stream.disposition.attached_pic
-    ]
-    if not videos:
-        raise CaptureError(
-            f"{path}: holds no pictures that move, at most a cover; pass a film"
-        )
-    default = [
-        stream for stream in videos if stream.disposition.default in stream.disposition
-    ]
-    return max(default or videos, key=lambda stream: stream.width * stream.height)
+    return about["transfer"]
 
 
 def notes_of(path: pathlib.Path, count: int, last: float) -> tuple[str, ...]:
@@ -160,104 +135,32 @@ def notes_of(path: pathlib.Path, count: int, last: float) -> tuple[str, ...]:
     Returns:
       Notes: that the file is cut short or damaged, which stream of several was read,
       that its pixels are not square, that it is interlaced.
+
+    Raises:
+      CaptureError: If the video cannot be read.
     """
-    with library().open(str(path.absolute())) as container:
-        stream = _main_stream(container, path)
-        notes = _shortfall(container, stream, count, last)
-        others = len(container.streams.video) - 1
-        if others:
-            notes += (
-                f"{others} other video streams of the file, such as a cover, are not "
-                "read",
-            )
-        aspect = stream.sample_aspect_ratio
-        if aspect and aspect != 1:
-            notes += (f"pixels of shape {aspect}, made square",)
-        frame = next(container.decode(stream), None)
-        if frame is not None and frame.interlaced_frame:
-            notes += (
-                "interlaced: lines of two times alternate; deinterlace what moves fast "
-                "first (ffmpeg -vf bwdif)",
-            )
-        return notes
+    extras.check("av", "video")
+    try:
+        answer = _one(path, "video_notes", count=count, last=last)
+    except decoder.DecoderError as error:
+        raise _unreadable(path, error) from None
+    return tuple(answer.about["notes"])
 
 
-def _shortfall(container, stream, count, last):
-    """A note where the video ends before the time that its file states."""
-    interval = float(1 / stream.average_rate) if stream.average_rate else 0.0
-    slack = SLACK * interval
-    if stream.duration is not None and stream.time_base is not None:
-        start = float((stream.start_time or 0) * stream.time_base)
-        length = float(stream.duration * stream.time_base)
-    elif container.duration is not None:  # of sound, too, which may go on longer
-        start = (container.start_time or 0) / 1e6
-        length = container.duration / 1e6
-        slack = max(slack, 1.0, 0.02 * length)
-    else:
-        return ()
-    read = last - start + interval
-    if read >= length - slack:
-        return ()
-    frames = stream.frames or (round(length / interval) if interval else 0)
-    of = f"{count} of {frames}" if frames > count else f"{count}"
-    return (
-        f"the file is cut short or broken: {of} frames could be read, {read:.1f} of "
-        f"{length:.1f} s",
-    )
-
-
-def _decoded(av, container, stream, damaged):
-    """Decode frames, and skip those that cannot be decoded if damage is allowed."""
-    if damaged == "refuse":
-        yield from container.decode(stream)
-        return
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets, None)
-            if packet is None:
-                return
-        except av.FFmpegError:  # the file ends here; what the decoder holds is whole
-            with contextlib.suppress(av.FFmpegError):
-                yield from stream.codec_context.decode(None)
-            return
-        with contextlib.suppress(av.FFmpegError):
-            yield from packet.decode()
-
-
-def _square(frame, aspect):
-    """The frame with square pixels, none of them lost."""
-    if not aspect or aspect == 1:
-        return frame
-    if aspect > 1:
-        return frame.reformat(width=round(frame.width * aspect), height=frame.height)
-    return frame.reformat(width=frame.width, height=round(frame.height / aspect))
-
-
-def _pixels(frame):
-    """uint8 sRGB [height, width, 3]."""
-    transfer = TRANSFERS.get(int(frame.color_trc))
-    if transfer is None:
-        told = frame.colorspace != _UNSAID or frame.height < HD_LINES
-        space = None if told else "ITU709"  # ffmpeg would take BT.601
-        return frame.to_ndarray(
-            format="rgb24", src_colorspace=space, dst_colorspace=space
+def _one(path, operation, **arguments):
+    file = str(safe_files.check(path).absolute())
+    with decoder.session() as child:
+        return child.request(
+            operation, CPU_SECONDS, MEMORY_BYTES, path=file, **arguments
         )
-    # ffmpeg's white is 255/256 of what 16 bits hold.
-    code = frame.to_ndarray(format="rgb48le").astype(np.uint32) * 257 // 256
-    return tone_mapped(np.minimum(code, CODES - 1).astype(np.uint16), transfer)
 
 
-def _upright(pixels, frame):
-    """The picture turned and mirrored as the matrix of the film says, if it has one."""
-    matrix = frame.side_data.get("DISPLAYMATRIX")
-    if matrix is None:
-        return pixels
-    # x' = a x + c y and y' = b x + d y, of pixels (x, y) as they are stored
-    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
-    if abs(a) + abs(d) < abs(b) + abs(c):
-        pixels, a, d = pixels.swapaxes(0, 1), c, b
-    return np.ascontiguousarray(pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
+def _unreadable(path, error):
+    if error.has_advice:
+        return CaptureError(f"{path}: {error}")
+    return CaptureError(
+        f"{path}: not a readable film ({error}); copy or encode it again"
+    )
 
 
 def read_video(
@@ -293,47 +196,26 @@ def read_video(
     if damaged not in ("refuse", "skip"):
         raise ValueError(f'{path}: damaged={damaged!r}; expected "refuse" or "skip"')
     path = pathlib.Path(path)
-    last = math.inf if rows is None else max(rows, default=-1)
     if not path.is_file():
         raise CaptureError(f"{path}: no such film; check the path")
     safe_files.check(path)
-    shown, av = 0, library()
-    try:
-        with av.open(str(path.absolute())) as container:
-            stream = _main_stream(container, path)
-            if stream.width * stream.height > MAX_PIXELS:
-                raise CaptureError(
-                    f"{path}: {stream.width}x{stream.height} frames, more than "
-                    f"{MAX_PIXELS} pixels; encode it smaller"
-                )
-            stream.thread_type, size = "AUTO", None
-            aspect = stream.sample_aspect_ratio
-            decoded = _decoded(av, container, stream, damaged)
-            for number, frame in enumerate(decoded):
-                size = size or (frame.width, frame.height)
-                if (frame.width, frame.height) != size:
-                    raise CaptureError(
-                        f"{path}: the size changes from {size[0]}x{size[1]} to "
-                        f"{frame.width}x{frame.height} pixels at frame {number}; cut "
-                        "the film there"
-                    )
-                if number % stride or not (rows is None or number in rows):
-                    continue
-                if shown >= most:
-                    return
-                shown += 1
-                shown_as = _square(frame, aspect)
-                if gray:
-                    pixels = shown_as.to_ndarray(format="gray")
-                else:
-                    pixels = _pixels(shown_as)
-                yield float(frame.time or 0.0), _upright(pixels, frame)
-                if number >= last:
-                    return
-    except (av.FFmpegError, OSError) as error:
-        reason = " ".join(str(error.strerror or error).split())
-        raise CaptureError(
-            f"{path}: not a readable film ({reason}); copy or encode it again"
-        ) from None
-    if not shown:
-        raise CaptureError(f"{path}: holds no frames; copy or encode it again")
+    extras.check("av", "video")
+    with decoder.streaming() as child:
+        answers = child.stream(
+            "video",
+            CPU_SECONDS,
+            MEMORY_BYTES,
+            path=str(path.absolute()),
+            stride=int(stride),
+            most=int(most),
+            rows=None if rows is None else sorted(map(int, rows)),
+            gray=gray,
+            damaged=damaged,
+        )
+        with contextlib.closing(answers):
+            try:
+                for about, arrays in answers:
+                    if arrays:
+                        yield about["seconds"], arrays["pixels"]
+            except decoder.DecoderError as error:
+                raise _unreadable(path, error) from None

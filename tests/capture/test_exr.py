@@ -6,13 +6,19 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from nerfies_jax.capture import exr, exr_camera, formats, frames, images
+from nerfies_jax.capture import decoder, exr, exr_camera, formats, frames, images
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.geometry import camera
 
 RNG = np.random.default_rng(0)
 COLOR = RNG.uniform(0, 50, (5, 7, 3)).astype(np.float32)
 DEPTH = RNG.uniform(1, 1000, (5, 7)).astype(np.float32)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_child():
+    with decoder.session():
+        yield
 
 
 def test_float_channels_come_back_bit_for_bit(tmp_path):

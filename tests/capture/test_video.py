@@ -9,8 +9,14 @@ import av
 import numpy as np
 import pytest
 
-from nerfies_jax.capture import footage, high_dynamic_range, video
+from nerfies_jax.capture import decoder, footage, high_dynamic_range, video
 from nerfies_jax.capture.capture import CaptureError
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_child():
+    with decoder.session():
+        yield
 
 
 def film(count=8, size=(31, 45)):

@@ -1,0 +1,212 @@
+"""Decoding of video with PyAV. `decoder_child` runs this, so it imports no JAX."""
+
+import contextlib
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from nerfies_jax.capture import extras
+from nerfies_jax.capture.errors import FileError
+from nerfies_jax.capture.high_dynamic_range import CODES, TRANSFERS, tone_mapped
+
+MAX_PIXELS = 64_000_000  # of a frame
+HD_LINES = 720  # from here on players take BT.709 where a film does not say
+_UNSAID = 2  # ffmpeg's number of a color space that is not told
+SLACK = 3  # frames by which the stated length of a whole film may be wrong
+
+Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
+
+
+def frames(
+    path: str, stride: int, most: int, rows: list[int] | None, gray: bool, damaged: str
+) -> Iterator[Reply]:
+    """Decode frames; arguments as for `video.read_video`.
+
+    Yields:
+      Nothing for a frame that is passed over. Else seconds, and the pixels.
+
+    Raises:
+      FileError: The way out of a video that cannot be used, without the path.
+    """
+    av = extras.library("av", "video")
+    last = math.inf if rows is None else max(rows, default=-1)
+    wanted = None if rows is None else set(rows)
+    shown, size = 0, None
+    with _words_of(av), av.open(path) as container:
+        stream = _main_stream(container)
+        _check_size(stream.width, stream.height)
+        stream.thread_type = "AUTO"
+        aspect = stream.sample_aspect_ratio
+        for number, frame in enumerate(_decoded(av, container, stream, damaged)):
+            size = size or (frame.width, frame.height)
+            if (frame.width, frame.height) != size:
+                raise FileError(
+                    f"the size changes from {size[0]}x{size[1]} to "
+                    f"{frame.width}x{frame.height} pixels at frame {number}; cut the "
+                    "film there"
+                )
+            if number % stride or not (wanted is None or number in wanted):
+                yield {}, {}
+                continue
+            if shown >= most:
+                return
+            shown += 1
+            squared = _square(frame, aspect)
+            pixels = squared.to_ndarray(format="gray") if gray else _pixels(squared)
+            upright = _upright(pixels, frame)
+            yield {"seconds": float(frame.time or 0.0)}, {"pixels": upright}
+            if number >= last:
+                return
+    if not shown:
+        raise FileError("holds no frames; copy or encode it again")
+
+
+def transfer(path: str) -> Iterator[Reply]:
+    """Find the transfer function of an HDR video; None of other videos."""
+    av = extras.library("av", "video")
+    with _words_of(av), av.open(path) as container:
+        frame = next(container.decode(_main_stream(container)), None)
+        found = None if frame is None else TRANSFERS.get(int(frame.color_trc))
+        yield {"transfer": found}, {}
+
+
+def notes(path: str, count: int, last: float) -> Iterator[Reply]:
+    """Say what is unusual about a video; arguments as for `video.notes_of`."""
+    av = extras.library("av", "video")
+    with _words_of(av), av.open(path) as container:
+        yield {"notes": _notes(container, count, last)}, {}
+
+
+@contextlib.contextmanager
+def _words_of(av):
+    """Leave of FFmpeg's errors what they say."""
+    try:
+        yield
+    except (av.FFmpegError, OSError) as error:
+        raise ValueError(str(error.strerror or error)) from None
+
+
+def _check_size(width, height):
+    if width * height > MAX_PIXELS:
+        raise FileError(
+            f"{width}x{height} frames, more than {MAX_PIXELS} pixels; encode it smaller"
+        )
+
+
+def _main_stream(container):
+    """The largest video of a file: covers and previews are streams of it, too."""
+    videos = [
+        stream
+        for stream in container.streams.video
+        if not stream.disposition & stream.disposition.attached_pic
+    ]
+    if not videos:
+        raise FileError("holds no pictures that move, at most a cover; pass a film")
+    default = [
+        stream for stream in videos if stream.disposition.default in stream.disposition
+    ]
+    return max(default or videos, key=lambda stream: stream.width * stream.height)
+
+
+def _notes(container, count, last):
+    stream = _main_stream(container)
+    notes = _shortfall(container, stream, count, last)
+    others = len(container.streams.video) - 1
+    if others:
+        notes += (
+            f"{others} other video streams of the file, such as a cover, are not read",
+        )
+    aspect = stream.sample_aspect_ratio
+    if aspect and aspect != 1:
+        notes += (f"pixels of shape {aspect}, made square",)
+    frame = next(container.decode(stream), None)
+    if frame is not None and frame.interlaced_frame:
+        notes += (
+            "interlaced: lines of two times alternate; deinterlace what moves fast "
+            "first (ffmpeg -vf bwdif)",
+        )
+    return notes
+
+
+def _shortfall(container, stream, count, last):
+    """A note where the video ends before the time that its file states."""
+    interval = float(1 / stream.average_rate) if stream.average_rate else 0.0
+    slack = SLACK * interval
+    if stream.duration is not None and stream.time_base is not None:
+        start = float((stream.start_time or 0) * stream.time_base)
+        length = float(stream.duration * stream.time_base)
+    elif container.duration is not None:  # of sound, too, which may go on longer
+        start = (container.start_time or 0) / 1e6
+        length = container.duration / 1e6
+        slack = max(slack, 1.0, 0.02 * length)
+    else:
+        return ()
+    read = last - start + interval
+    if read >= length - slack:
+        return ()
+    frames = stream.frames or (round(length / interval) if interval else 0)
+    of = f"{count} of {frames}" if frames > count else f"{count}"
+    return (
+        f"the file is cut short or broken: {of} frames could be read, {read:.1f} of "
+        f"{length:.1f} s",
+    )
+
+
+def _decoded(av, container, stream, damaged):
+    """Decode frames, and skip those that cannot be decoded if damage is allowed."""
+    if damaged == "refuse":
+        yield from container.decode(stream)
+        return
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+            if packet is None:
+                return
+        except av.FFmpegError:  # the file ends here; what the decoder holds is whole
+            with contextlib.suppress(av.FFmpegError):
+                yield from stream.codec_context.decode(None)
+            return
+        with contextlib.suppress(av.FFmpegError):
+            yield from packet.decode()
+
+
+def _square(frame, aspect):
+    """The frame with square pixels, none of them lost."""
+    if not aspect or aspect <= 0 or aspect == 1:
+        return frame
+    width, height = frame.width, frame.height
+    if aspect > 1:
+        width = round(width * aspect)
+    else:
+        height = round(height / aspect)
+    _check_size(width, height)
+    return frame.reformat(width=width, height=height)
+
+
+def _pixels(frame):
+    """uint8 sRGB [height, width, 3]."""
+    transfer = TRANSFERS.get(int(frame.color_trc))
+    if transfer is None:
+        told = frame.colorspace != _UNSAID or frame.height < HD_LINES
+        space = None if told else "ITU709"  # ffmpeg would take BT.601
+        return frame.to_ndarray(
+            format="rgb24", src_colorspace=space, dst_colorspace=space
+        )
+    # ffmpeg's white is 255/256 of what 16 bits hold.
+    code = frame.to_ndarray(format="rgb48le").astype(np.uint32) * 257 // 256
+    return tone_mapped(np.minimum(code, CODES - 1).astype(np.uint16), transfer)
+
+
+def _upright(pixels, frame):
+    """The picture turned and mirrored as the matrix of the film says, if it has one."""
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return pixels
+    # x' = a x + c y and y' = b x + d y, of pixels (x, y) as they are stored
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    if abs(a) + abs(d) < abs(b) + abs(c):
+        pixels, a, d = pixels.swapaxes(0, 1), c, b
+    return np.ascontiguousarray(pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
