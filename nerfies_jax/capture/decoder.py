@@ -72,12 +72,11 @@ class Decoder:
         Raises:
           DecoderError: The file is damaged, or took too much.
         """
-        with contextlib.closing(
-            self.stream(operation, cpu_seconds, memory_bytes, **arguments)
-        ) as answers:
-            for answer in answers:
-                return answer
-        raise DecoderError("the decoder returned nothing")
+        # To its end: a stream that is given up takes the child with it.
+        answers = [*self.stream(operation, cpu_seconds, memory_bytes, **arguments)]
+        if not answers:
+            raise DecoderError("no answer from its decoder")
+        return answers[0]
 
     def stream(
         self,

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerfies_jax import events
+from nerfies_jax.capture import decoder, masks, npz_files, safe_files, text_files
 from nerfies_jax.capture import images as pictures
-from nerfies_jax.capture import masks, npz_files, safe_files, text_files
 from nerfies_jax.capture.capture import CaptureError, PointCloud, blocks, shrink
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
@@ -208,6 +208,7 @@ def both(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray | No
     return first & second
 
 
+@decoder.session()
 def read_frames(
     paths: Sequence[pathlib.Path],
     shrink_by: int = 1,

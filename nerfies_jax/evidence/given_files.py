@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerfies_jax.capture import (
+    decoder,
     exr,
     frames,
     images,
@@ -36,6 +37,7 @@ FLO_MAGIC = 202021.25  # of Middlebury's .flo
 PICTURES, DEPTHS = (".png",), (".exr", ".png", ".npy")
 
 
+@decoder.session()
 def attached(capture: Capture, files: GivenFiles) -> Capture:
     """Read external files and attach them to a capture.
 

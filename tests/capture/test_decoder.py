@@ -1,0 +1,108 @@
+"""Decoding in a child: its limits, its end, and what is said of both."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from nerfies_jax.capture import colmap, decoder, images
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.colmap_library import library
+from tests.capture import test_colmap
+
+
+@pytest.fixture
+def child():
+    with decoder.session() as child:
+        yield child
+
+
+def test_a_model_that_claims_more_than_it_holds_is_refused_within_limits(tmp_path):
+    root = test_colmap.make(tmp_path) or tmp_path
+    folder = root / "sparse/0"
+    library().Reconstruction(str(folder)).write_binary(str(folder))
+    for text in folder.glob("*.txt"):
+        text.unlink()
+    colmap.read_model(folder)
+    path = folder / "points3D.bin"
+    path.write_bytes((2**40).to_bytes(8, "little") + path.read_bytes()[8:])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begun = time.monotonic()
+    with pytest.raises(CaptureError, match="not a readable COLMAP model"):
+        colmap.read_model(folder)
+    assert time.monotonic() - begun < 60  # processor time is bounded to 6 s
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown < 200_000  # kB
+
+
+def test_a_child_that_was_killed_is_replaced(child, tmp_path):
+    with pytest.raises(decoder.DecoderError):
+        child.request("exr", path=str(tmp_path / "a.exr"), header_only=True)
+    first = child._child
+    os.kill(first.pid, signal.SIGKILL)
+    first.wait()
+    with pytest.raises(decoder.DecoderError, match=r"a\.exr"):
+        child.request("exr", path=str(tmp_path / "a.exr"), header_only=True)
+    assert child._child.pid != first.pid
+
+
+def test_a_file_that_takes_too_long_is_refused(child, tmp_path, monkeypatch):
+    monkeypatch.setattr(decoder, "WALL_SECONDS", 0.01)
+    os.mkfifo(tmp_path / "a.exr")  # whoever opens it waits
+    with pytest.raises(decoder.DecoderError, match="took too long"):
+        child.request("exr", path=str(tmp_path / "a.exr"), header_only=True)
+
+
+def test_memory_beyond_the_budget_is_refused(child, tmp_path, monkeypatch):
+    monkeypatch.setattr(decoder, "MEMORY_BYTES", 10 * 2**20)
+    PIL.Image.new("RGB", (6000, 3000)).save(tmp_path / "a.png")
+    with pytest.raises(decoder.DecoderError):
+        child.request("image", path=str(tmp_path / "a.png"))
+
+
+def test_large_images_are_decoded_in_the_child(tmp_path, monkeypatch):
+    pixels = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
+    PIL.Image.fromarray(pixels).save(tmp_path / "a.png")
+    monkeypatch.setattr(images, "LARGE_PIXELS", 1000)
+    monkeypatch.setattr(images, "decode", None)  # here; the child has its own
+    np.testing.assert_array_equal(images.read_pixels(tmp_path / "a.png"), pixels)
+    content = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
+    with pytest.raises(CaptureError, match=r"a\.png: not a readable picture"):
+        images.read_pixels(tmp_path / "a.png")
+
+
+def test_the_child_ends_with_its_parent():
+    """Also where the parent is killed and can clean up nothing."""
+    code = (
+        "import time\n"
+        "from nerfies_jax.capture import decoder\n"
+        "child = decoder.Decoder()\n"
+        "try:\n"
+        "    child.request('exr', path='/nowhere.exr', header_only=True)\n"
+        "except decoder.DecoderError:\n"
+        "    print(child._child.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE
+    ) as parent:
+        pid = int(parent.stdout.readline())
+        os.kill(pid, 0)
+        parent.kill()
+    for _ in range(100):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return
+        with open(f"/proc/{pid}/stat") as file:
+            if file.read().rpartition(")")[2].split()[0] in "ZX":
+                return
+        time.sleep(0.1)
+    raise AssertionError(f"process {pid} is still there")
