@@ -1,4 +1,4 @@
-"""All commands with a line each; `python -m experiments NAME ...` runs one.
+"""List all commands; `python -m experiments NAME ...` runs one.
 
 `nerfies NAME ...` is the same.
 """
@@ -22,7 +22,11 @@ HERE = pathlib.Path(__file__).resolve().parent
 
 
 def commands() -> dict[str, str]:
-    """By name, the first line of each module with a `main`; nothing is imported."""
+    """Read the first docstring line of each module with a `main`, without importing it.
+
+    Returns:
+      Lines by command name.
+    """
     files = {path.stem: path for path in HERE.glob("*.py") if path.stem != "__main__"}
     files |= {path.parent.name: path for path in HERE.glob("*/__main__.py")}
     summaries = {}
@@ -35,7 +39,12 @@ def commands() -> dict[str, str]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """List the commands, or run the one named first; exit code 2 for an unknown one."""
+    """List the commands, or run the one named first.
+
+    Args:
+      arguments: Words of the command line. None reads `sys.argv`. An unknown command
+        ends with exit code 2.
+    """
     with console.session():
         _main(arguments)
 
@@ -62,14 +71,25 @@ def _main(arguments):
 
 
 def main_of(name: str) -> Callable:
-    """The function that runs a command; its `settings` are what it is asked for."""
+    """Import the function that runs a command.
+
+    Args:
+      name: Name of the command.
+
+    Returns:
+      The function, whose `settings` is its dataclass of options.
+    """
     package = (HERE / name).is_dir()
     module = f"experiments.{name}.__main__" if package else f"experiments.{name}"
     return importlib.import_module(module).main
 
 
 def print_completion(words: list[str]) -> None:
-    """What a shell completes `nerfies` by: all commands, their options and choices."""
+    """Print the shell completion of all commands, their options and choices.
+
+    Args:
+      words: The option, and the name of the shell.
+    """
     kinds = [
         Annotated[options.offered(main_of(name).settings), tyro.conf.subcommand(name)]
         for name in commands()

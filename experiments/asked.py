@@ -1,4 +1,4 @@
-"""What a study was asked for, as its kept numbers tell it."""
+"""The options of a study, as its stored results record them."""
 
 import pathlib
 from typing import Any

@@ -40,7 +40,7 @@ Effects = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE:NAME ...")]
 
 @dataclasses.dataclass(frozen=True)
 class NamedSource(CaptureSource):
-    """Which pictures, the folder named without an option."""
+    """The capture as a positional argument."""
 
     capture: Positional[pathlib.Path | None] = None
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF, COLMAP or LLFF layout."""
@@ -76,7 +76,14 @@ def plain(source: CaptureSource) -> CaptureSource:
 
 
 def given(source: CaptureSource) -> dict[str, Any]:
-    """What the command line says of the source, by field."""
+    """Collect the options of the source that the command line sets.
+
+    Args:
+      source: The source.
+
+    Returns:
+      Values by field.
+    """
     unsaid = (None, GivenFiles())
     return {name: value for name, value in vars(source).items() if value not in unsaid}
 
@@ -152,12 +159,18 @@ class Ended(NamedTuple):
 
 
 def command(settings: Any) -> Callable[[Callable], Callable]:
-    """Make `main(arguments)` of a function of settings; it returns the result as JSON.
+    """Make `main(arguments)` of a function of settings that returns the result as JSON.
 
-    With `--json` that is printed as one document, and everything else that is printed,
-    also by processes that are started, goes to standard error. Wrong settings end it
-    with exit code 2. No output ends it: one whose reader went away changes nothing, and
-    where any other was lost a command that succeeds exits with code 1.
+    With `--json` the result is printed as one document, and all other output, also of
+    child processes, goes to standard error. Wrong settings end with exit code 2. A
+    closed pipe on stdout changes nothing. If other output is lost, a command that
+    succeeds exits with code 1.
+
+    Args:
+      settings: Dataclass of options.
+
+    Returns:
+      A decorator.
     """
 
     def decorate(run):
@@ -224,13 +237,22 @@ def _stopped_first() -> Iterator[None]:
 
 
 def parse(settings: Any, arguments: list[str] | None = None, prog: str = "") -> Any:
-    """A frozen dataclass from the command line; its docstrings are the help text."""
+    """Parse the command line into a frozen dataclass, whose docstrings are the help.
+
+    Args:
+      settings: The dataclass.
+      arguments: Words of the command line. None reads `sys.argv`.
+      prog: Name of the command in the help.
+
+    Returns:
+      The settings.
+    """
     words = sys.argv[1:] if arguments is None else list(arguments)
     return options.parse(settings, words, prog or "nerfies")
 
 
 def _called(run):
-    """How a person calls the command whose `main` this is."""
+    """Return the name that a user calls the command by."""
     name = run.__module__
     if name != "__main__":
         return f"nerfies {name.removesuffix('.__main__').removeprefix('experiments.')}"
@@ -254,7 +276,14 @@ def _words_aside() -> Iterator[None]:
 
 
 def stored(path: pathlib.Path) -> Any:
-    """What was written to a JSON file, or None where nothing was."""
+    """Read a JSON file.
+
+    Args:
+      path: The file.
+
+    Returns:
+      Its contents, None if it does not exist.
+    """
     return json.loads(path.read_text()) if path.is_file() else None
 
 
@@ -304,10 +333,13 @@ def sized(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
 
 @contextlib.contextmanager
 def user_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)):
-    """Wrong input in one line and exit code 2; our own bugs keep their traceback.
+    """Report wrong input in one line with exit code 2. Bugs keep their traceback.
 
-    Wraps the stages that read what the user gave (captures, settings, run folders),
-    which raise `ValueError` or `OSError` naming the value, the bound and the mend.
+    It wraps the stages that read user input (captures, settings, run folders), which
+    raise errors that name the value, the bound and the remedy.
+
+    Args:
+      kinds: Types of errors that are the user's.
     """
     try:
         with _stopped_first():

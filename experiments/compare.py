@@ -1,13 +1,13 @@
-"""Lay runs over each other: curves, time to a quality, pictures, a table.
+"""Compare runs of one capture: curves, time to quality, images, a table.
 
     python -m experiments.compare RUN RUN ...
     python -m experiments.compare RUN RUN --psnr 22 24 --frames 4 --out compared
 
-The runs must have learned from the same frames of the same capture. Prints a table of
-scores, times and sizes and after how many seconds of training each run reached a PSNR;
-saves compare.json, curves.png, and pictures.png with held-out frames side by side.
-Seconds are those of the machine of each run: the table says where machines differ.
-A run that is still being trained, or was killed, is compared as far as it came.
+The runs must have the same training frames of the same capture. Prints a table of
+metrics, times and sizes, and the seconds of training until each run reached a PSNR.
+Saves compare.json, curves.png, and pictures.png with held-out frames side by side.
+Seconds are those of each run's machine, and the table says where machines differ.
+Unfinished runs are compared as far as they got.
 """
 
 import dataclasses
@@ -76,7 +76,7 @@ class Compared(NamedTuple):
 
 @cli.command(Compare)
 def main(args):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         compared = read(args.runs, args.effect if args.frames else None)
         folder = run_folder.new_run_folder(args.out, "compare")
@@ -97,9 +97,17 @@ def main(args):
 
 
 def read(folders, trusted=None) -> list[Compared]:
-    """Runs of one capture; ValueErrors name the run and what is wrong with it.
+    """Read runs of one capture.
 
-    If they are to be rendered, their own effects must be among the `trusted`.
+    Args:
+      folders: Run folders.
+      trusted: Own effects that may be loaded, if the runs are to be rendered.
+
+    Returns:
+      The runs.
+
+    Raises:
+      ValueError: If a run cannot be compared, with its name.
     """
     from nerfies_jax.runs import curves
 
@@ -156,21 +164,21 @@ def _names(folders):
 
 
 def default_goals(compared) -> tuple[float, ...]:
-    """What the curves of all runs but the best ended with, in whole tenths of a dB."""
+    """Return the final PSNR of all runs except the best, in tenths of a dB."""
     ends = sorted(run.curve.psnr[-1] for run in compared if run.curve.psnr)
     ends = [math.floor(10 * psnr) / 10 for psnr in ends[:-1] if math.isfinite(psnr)]
     return tuple(dict.fromkeys(ends))
 
 
 def times(compared, goals) -> list[list[float | None]]:
-    """[runs][goals] seconds of training to each PSNR; None where not reached."""
+    """Return [runs][goals] seconds of training to each PSNR, None where not reached."""
     from nerfies_jax.runs import curves
 
     return [[curves.seconds_to(run.curve, goal) for goal in goals] for run in compared]
 
 
 def _columns(compared):
-    """Those of which any run has a number."""
+    """Return the columns for which any run has a number."""
     return [c for c in COLUMNS if any(run.metrics.get(c[0]) for run in compared)]
 
 
@@ -212,7 +220,7 @@ def _cell(value, digits, unit):
 
 
 def remarks(compared) -> list[str]:
-    """What a reader must know before he believes the table."""
+    """Report differences between the runs that affect the table."""
     sentences = [run.remark for run in compared if run.remark]
     first = compared[0]
     for run in compared:

@@ -99,12 +99,12 @@ class Export:
 
     @property
     def gaussians(self) -> bool:
-        """Whether it is Gaussians that are written."""
+        """Whether Gaussians are exported."""
         return OPTIONS[self.format] == GAUSSIANS
 
     @property
     def suffix(self) -> str:
-        """Of the file; empty where a folder is written."""
+        """Suffix of the file, empty for a folder."""
         if self.gaussians:
             return f".{self.format}" if self.frames is None else ""
         suffixes = {"path": ".json", "tracks": ".npz", "splatv": ".splatv"}
@@ -125,7 +125,7 @@ class Export:
 
 @cli.command(Export)
 def main(args):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         cli.find_effects(args.effect)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)

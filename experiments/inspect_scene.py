@@ -1,9 +1,10 @@
-"""Which effects a capture calls for, with evidence, before anything is trained.
+"""Recommend effects for a capture from its images, before any training.
 
     python -m experiments.inspect_scene CAPTURE
     python -m experiments.inspect_scene --scene transient
 
-Prints a table of decisions and commands to go on with; writes a contact sheet.
+Prints a table of decisions and the commands to continue with, and writes a contact
+sheet.
 """
 
 import dataclasses
@@ -16,7 +17,7 @@ from nerfies_jax.runs import platform
 
 @dataclasses.dataclass(frozen=True)
 class InspectScene:
-    """Say which effects a capture calls for; without one, look at a built-in scene."""
+    """Recommend effects for a capture, or for a built-in scene."""
 
     source: cli.Source = cli.NamedSource()
     seed: int = 0
@@ -36,7 +37,7 @@ class InspectScene:
 
 @cli.command(InspectScene)
 def main(args):
-    """Inspect what the command line names; exit code 2 where its input is wrong."""
+    """Inspect the capture of the command line. Wrong input ends with exit code 2."""
     with cli.user_errors():
         platform.start_jax("cpu")
         from nerfies_jax import runs

@@ -7,14 +7,16 @@ from typing import Any
 
 
 def number(value: float | int | None, digits: int = 2) -> str:
-    """A number with so many digits behind the point; empty where it is not known."""
+    """Format a number with some decimals, or an empty cell if it is None."""
     if value is None or not math.isfinite(value):
         return ""
     return f"{value:,.{digits}f}"
 
 
 def with_spread(mean: float, spread: float, digits: int) -> str:
-    """As in "21.30 ± 0.12"; the mean alone where no spread is known."""
+    """Format mean and spread, as in "21.30 ± 0.12", or the mean alone if the spread is
+    NaN.
+    """
     cell = number(mean, digits)
     return f"{cell} ± {number(spread, digits)}" if cell and spread == spread else cell
 
@@ -26,16 +28,22 @@ def over_seeds(values: Sequence[float], digits: int) -> str:
 
 
 def short(value: float | int | None) -> str:
-    """A number in three digits, as in 0.0123 or 1e-07; whole from a thousand on."""
+    """Format three digits, as in 0.0123 or 1e-07, or an integer from a thousand on."""
     if value is None or not math.isfinite(value):
         return ""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> str:
-    """A table; so many columns from the left are words, the others are numbers.
+    """Format a table, leaving out columns that are empty in every row.
 
-    Columns that are empty in every row are left out.
+    Args:
+      heads: Headings.
+      rows: Cells.
+      words: Number of leading text columns. The others are right-aligned numbers.
+
+    Returns:
+      Markdown.
     """
     rows = [[cell.replace("|", r"\|") for cell in row] for row in rows]
     kept = [k for k in range(len(heads)) if not k or any(row[k] for row in rows)]

@@ -1,8 +1,8 @@
-"""The fields of a settings class as options: read by tyro, helped as a page reads.
+"""Options from the fields of a settings class, parsed by tyro, with grouped help.
 
-A class may say in `GROUPS` which of its fields stand together, by the heading; all
-others stand with `--help`. Docstrings are the help; what they give as "(default: ...)"
-is said in the place of the value that the class holds.
+A class may list in `GROUPS` which fields belong under a heading. All others are listed
+with `--help`. Docstrings are the help, and "(default: ...)" in them replaces the value
+that the class holds.
 """
 
 import dataclasses
@@ -28,17 +28,25 @@ COMPLETION = "--tyro-print-completion"
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """For `Annotated`: the names that a shell offers; the command refuses others."""
+    """Annotation with names for shell completion. The command refuses others."""
 
     names: tuple[str, ...]
 
 
 def parse(settings: Any, arguments: list[str], prog: str) -> Any:
-    """The settings that a command line says.
+    """Parse a command line.
 
-    `settings` is a frozen dataclass, or a union of those that are commands of their
-    own. Raises ValueError where the settings do; tyro ends the process where the words
-    are no options.
+    Args:
+      settings: A frozen dataclass, or a union of those of subcommands.
+      arguments: Words of the command line.
+      prog: Name of the command in the help.
+
+    Returns:
+      The settings.
+
+    Raises:
+      ValueError: If the settings refuse a value. Tyro ends the process for unknown
+        options.
     """
     offering = any(word.startswith(COMPLETION) for word in arguments)
     by_shown = {shown(kind, offering): kind for kind in _kinds(settings)}
@@ -48,7 +56,7 @@ def parse(settings: Any, arguments: list[str], prog: str) -> Any:
 
 
 def offered(settings: Any) -> type:
-    """What a shell is told of a command that is one of many."""
+    """Return the type that completes a command among all commands."""
     kinds = [shown(kind, offering=True) for kind in _kinds(settings)]
     if len(kinds) == 1:
         return kinds[0]

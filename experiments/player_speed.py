@@ -232,7 +232,7 @@ class PlayerSpeed:
 
 @cli.command(PlayerSpeed)
 def main(args):
-    """Measure every page; exit code 2 where input is wrong."""
+    """Measure every page. Wrong input ends with exit code 2."""
     with cli.user_errors():
         for path in filter(None, (*args.pages, args.gsplat)):
             if not path.is_file():

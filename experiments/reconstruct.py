@@ -21,10 +21,11 @@ from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruct:
-    """Reconstruct a filmed, moving scene; without a capture, the built-in one.
+    """Reconstruct a dynamic scene from a capture, a video or images (default:
+    built-in).
 
-    A film, or a folder of pictures without cameras, becomes a capture first: a folder
-    beside the run's, which is kept.
+    A video, or a folder of images without cameras, becomes a capture first, in a folder
+    next to the run's, which is kept.
     """
 
     GROUPS: ClassVar = {
@@ -163,7 +164,7 @@ def _outcome(args):
 
 
 def _watched(args):
-    """What opens the page of --view, or None; ValueError where it cannot be had."""
+    """Open the viewer of --view, or return None; ValueError if it is not available."""
     if not args.view:
         return None
     from nerfies_jax.runs import viewer
@@ -202,14 +203,14 @@ def _check_resumed(args):
 
 
 def _cores(args):
-    """How many cores the representation wants XLA to see, and the shares of a step."""
+    """Return the number of cores for XLA, and the shares of a step."""
     if args.resume:
         return representations.cores_of_run(args.out)
     return representations.cores(args.preset, args.set)
 
 
 def _expected(args):
-    """What the command line says of the run that it continues, by field."""
+    """Collect the options that must agree with the run that is continued."""
     options = {"preset": args.preset, "seed": args.seed, "effects": args.effect or None}
     options = {name: value for name, value in options.items() if value is not None}
     return {**cli.given(args.source), **options}

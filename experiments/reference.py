@@ -27,7 +27,7 @@ class Reference:
 
 @cli.command(Reference)
 def main(args):
-    """Write the pages; exit code 1 where one lacks a public name."""
+    """Write the pages. A missing public name ends with exit code 1."""
     pdoc = extras.library("pdoc", "docs")
     render = extras.library("pdoc.render", "docs")
     render.configure(docformat="markdown", math=True)
@@ -67,7 +67,7 @@ def public_names() -> dict[str, list[str]]:
 
 
 def _has_face(package):
-    """Whether the names of a package are listed, and those of its modules are not."""
+    """Test if a package lists its names, and not those of its modules."""
     path = ROOT.joinpath(*package.split("."), "__init__.py")
     return not package or "__all__" in path.read_text()
 

@@ -123,7 +123,7 @@ class Render:
 
 @cli.command(Render)
 def main(args):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         cli.find_effects(args.effect)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
@@ -161,7 +161,7 @@ def main(args):
 
 
 def _made(args, restored):
-    """What decides the images of this render."""
+    """Collect the settings that determine the images."""
     from nerfies_jax.training import provenance
 
     checkpoint = {"step": restored.step, "checkpoint": restored.about["crc32"]}
@@ -177,7 +177,7 @@ def _files(args, names):
 
 
 def _model(args, run):
-    """The run's, or a variant of it; ValueError where the run has none such."""
+    """Return the run's model or a variant; ValueError if it has no such variant."""
     blended = args.appearance is not None
     if not args.without and not blended:
         return run.model
@@ -187,7 +187,7 @@ def _model(args, run):
 
 
 def _mover(args, run):
-    """What takes points from one picture to the next, where that is to be seen."""
+    """Return the function that moves points between images, if flow is shown."""
     if args.show != "flow":
         return None
     move = run.representation.mover(run.spec, run.metadata, effects=run.effects)
@@ -302,7 +302,7 @@ def _write(args, out, renderer, state, names, views, picture_of):
 
 
 def _told(out, renderer, count, files):
-    """Say where the render is; the result as JSON values."""
+    """Print the location of the render, and return the result as JSON values."""
     width, height = renderer.size
     ms = renderer.ms_per_frame(count)
     console.say(f"{count} pictures of {width}x{height}, {ms:.0f} ms each, in {out}")
@@ -339,7 +339,7 @@ class _Pictures:
         return colored.picture
 
     def _drawn_flow(self, rendering, place):
-        """To the next picture; the last one has none, and stands still."""
+        """Draw the flow to the next image; zero for the last one."""
         from nerfies_jax.evaluation import model_flow, pictures
 
         here, there = self._views[place], self._views[place : place + 2][-1]

@@ -20,7 +20,7 @@ _NOT_RENDERED = ("run", "out", "overwrite", "device")
 
 
 class Made(NamedTuple):
-    """What decides the images of a render, as JSON values."""
+    """Settings that determine the images of a render, as JSON values."""
 
     request: dict[str, Any]  # settings by name
     run: dict[str, Any]  # the checkpoint: its step and checksum
@@ -73,7 +73,7 @@ def path_name(path: str) -> str:
 
 
 def _digest(path):
-    """SHA-256 of a path's file or files; None where it is not one."""
+    """Return the SHA-256 of a file or folder, None if it does not exist."""
     place = pathlib.Path(path)
     if path in ("heldout", *cli.PATHS) or not place.exists():
         return None
@@ -87,7 +87,15 @@ def _digest(path):
 
 
 def request(args: Any) -> dict[str, Any]:
-    """Settings that decide the images, as JSON values; a path by what is in it."""
+    """Collect settings that determine the images, as JSON values, with digests of
+    paths.
+
+    Args:
+      args: Settings of `experiments.render`.
+
+    Returns:
+      The values.
+    """
     settings = dataclasses.asdict(args)
     for ignored in _NOT_RENDERED:
         del settings[ignored]
@@ -97,12 +105,12 @@ def request(args: Any) -> dict[str, Any]:
 
 
 def record(made: Made, args: Any, files: Iterable[str]) -> dict[str, Any]:
-    """What `render.json` says of a render.
+    """Assemble `render.json`.
 
     Args:
-      made: What decides its images.
+      made: Settings that determine the images.
       args: Settings of `experiments.render`.
-      files: The files, by their names in the folder.
+      files: Files by their names in the folder.
     """
     from nerfies_jax.training.provenance import provenance
 
@@ -157,7 +165,7 @@ def refuse_early(out: pathlib.Path, args: Any) -> None:
 
 
 def _earlier(out):
-    """The record in a folder; None where there is none that can be read."""
+    """Read the record of a folder, None if there is no readable one."""
     try:
         earlier = json.loads((out / RECORD).read_text())
         known = isinstance(earlier["request"], dict) and isinstance(
@@ -180,7 +188,7 @@ def _refuse_other(out, made, earlier):
 
 
 def _differs(made, earlier):
-    """The first difference from an earlier render, in words; empty where it is none."""
+    """Describe the first difference from an earlier render, or return ''."""
     for place, now in (("request", made.request), ("run", made.run)):
         for key in dict.fromkeys((*now, *earlier[place])):
             before, wanted = earlier[place].get(key), now.get(key)
@@ -196,7 +204,9 @@ def _words(value):
 
 
 def _edited(out, earlier):
-    """The first file that changed since it was rendered, in words; else empty."""
+    """Name the first file that changed since it was rendered, or return an empty
+    string.
+    """
     # The record is written last, and a rename changes no time.
     finished = (out / RECORD).stat().st_mtime_ns
     for file in earlier["files"]:

@@ -84,7 +84,7 @@ What has a command and no page has no numbers that are kept yet:
 
 
 class Study(NamedTuple):
-    """What measures the numbers of one page and what writes them down."""
+    """Measurement of the numbers of one page, and the function that formats them."""
 
     module: str  # whose docstring opens the page
     page: str  # module with `page(stored)`, the rest of it, and `draw(stored, path)`
@@ -193,7 +193,7 @@ class Results:
 
 @cli.command(Results)
 def main(args):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         if args.measured is not None:
             keep(args.pages[0], args.measured)

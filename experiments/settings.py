@@ -29,7 +29,7 @@ class Settings:
 
 @cli.command(Settings)
 def main(args):
-    """Print the fields; exit code 2 where there is no such preset."""
+    """Print the fields. An unknown preset ends with exit code 2."""
     with cli.user_errors():
         platform.start_jax("cpu")
         kind = representations.of_preset(args.preset)

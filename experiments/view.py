@@ -17,11 +17,11 @@ from nerfies_jax.runs import platform, representations
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Look around in a run, in the browser of this machine.
+    """View a run in the browser of this machine.
 
-    Orbit with the mouse; time, what is shown, effects and a camera path are on the
-    page. The browser draws Gaussians itself. Fields, depth, opacity and motion are
-    rendered here: coarse while the view moves, then finer up to the full size.
+    Orbit with the mouse. Time, the shown channel, effects and a camera path are on the
+    page. The browser renders Gaussians itself. Fields, depth, opacity and motion are
+    rendered here, coarsely while the view moves, then up to the full size.
     """
 
     run: cli.Positional[pathlib.Path]
@@ -45,7 +45,7 @@ class View:
 
 @cli.command(View)
 def main(args):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         cli.find_effects(args.effect)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)

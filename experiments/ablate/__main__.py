@@ -1,16 +1,16 @@
-"""What each part of a method is worth: the whole of it against itself without the part.
+"""Ablation of methods: each is compared with itself without one part.
 
     python -m experiments.ablate                                  # radiance fields
     python -m experiments.ablate --suite sonata --jobs 4          # Sonata's ablation
     python -m experiments.ablate --suite moba --steps 2000 --seconds 120 --jobs 4
     python -m experiments.ablate --arms static nerfies --scene fast --budget 30
-    python -m experiments.ablate --suite sonata --capture FOLDER  # pictures alone
+    python -m experiments.ablate --suite sonata --capture FOLDER  # without ground truth
 
-All arms of a suite learn the same frames from the same seeds, over as many steps
-(--steps), as much time (--seconds), or first the one and then the other; the last
-iterate counts. Prints a table and what it says of the claims, writes ablation.json and
-ablation.png. Finished arms are kept in --out: the same command goes on where it was
-stopped.
+All methods of a suite train on the same frames with the same seeds, for the same number
+of steps (--steps), the same time (--seconds), or first one and then the other. The last
+iterate is measured. Prints a table and a verdict on each claim, and writes
+ablation.json and ablation.png. Finished runs are kept in --out, and the same command
+continues where it was stopped.
 """
 
 from experiments import cli
@@ -22,7 +22,7 @@ from nerfies_jax.runs import platform, representations
 
 @cli.command(Ablate)
 def main(args):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         settings.check(args)
         platform.start_jax(args.device, *_cores(args))
@@ -35,7 +35,9 @@ def main(args):
 
 
 def _cores(args):
-    """What XLA is to see: enough for every arm, where each is trained alone."""
+    """Return the number of cores that XLA sees, enough for runs that train one at a
+    time.
+    """
     arms = suites.named(args.suite).arms
     wanted = [
         representations.cores(arm.preset, (*arm.changes, *args.set))
@@ -47,7 +49,7 @@ def _cores(args):
 
 
 def _report(job):
-    """What ablation.json has, by the budget that the arms were trained under."""
+    """Assemble ablation.json, by the budget of the runs."""
     reports = {}
     for budget in job.budgets:
         finished = job.finished(budget)

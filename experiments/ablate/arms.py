@@ -1,6 +1,6 @@
-"""What the ablations compare, and what is claimed of it; no JAX.
+"""Methods that the ablations compare, and claims about them, without JAX.
 
-A suite is a set of arms: ways to reconstruct that differ in one part.
+A suite is a set of methods (arms) that differ in one part.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""How long the arms of an ablation are trained, and how many steps that is."""
+"""Budget of the runs of an ablation, in steps or seconds."""
 
 import math
 import pathlib
@@ -8,7 +8,7 @@ from experiments.ablate.results import ArmResult
 
 
 class Budget(NamedTuple):
-    """How long every arm is trained, and where its results are."""
+    """Duration of every run, and the folder of its results."""
 
     steps: int | None  # without seconds: None for the preset's own
     seconds: float | None
@@ -17,7 +17,7 @@ class Budget(NamedTuple):
 
     @property
     def title(self) -> str:
-        """As in "each arm trained ..."."""
+        """The budget in words, as in "each arm trained ..."."""
         if self.seconds is not None:
             whose = "processor seconds" if self.clock == "processor" else "s"
             return f"for {self.seconds:g} {whose}, in as many steps as that allows"
@@ -27,7 +27,7 @@ class Budget(NamedTuple):
 
     @property
     def measure(self) -> str:
-        """Which measure of an arm the seconds limit."""
+        """Name of the measure that the seconds limit."""
         return "train_cpu_seconds" if self.clock == "processor" else "train_seconds"
 
 

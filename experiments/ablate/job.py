@@ -37,7 +37,7 @@ SAVED = "/jax/compilation_cache/compile_time_saved_sec"
 
 
 class CompiledArm(NamedTuple):
-    """An arm ready to train; kept over its seeds, so that it is compiled once."""
+    """A compiled method, reused for all of its seeds."""
 
     representation: Any
     spec: Any
@@ -91,7 +91,7 @@ class Job:
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
     def _open(self):
-        """The capture; a built-in scene comes with its truth."""
+        """Load the capture, with ground truth if it is a built-in scene."""
         args, source = self.args, self.args.source
         if source == CaptureSource(scene=source.scene) and (
             source.scene in synthetic.PRESETS
@@ -135,7 +135,11 @@ class Job:
         return [(name, seed) for seed in self.seeds for name in self.names]
 
     def run(self) -> list[tuple[str, int]]:
-        """Make what is not there yet; returns the arms and seeds that failed."""
+        """Train what is not finished yet.
+
+        Returns:
+          Methods and seeds that failed.
+        """
         if self.args.jobs > 1:
             from experiments.ablate import pool
 
@@ -158,7 +162,15 @@ class Job:
         return []
 
     def is_over(self, spent: float, longest: float) -> bool:
-        """Whether another arm might end after the --budget."""
+        """Predict if another run would exceed the --budget.
+
+        Args:
+          spent: Seconds so far.
+          longest: Seconds of the longest run.
+
+        Returns:
+          True if no further run should start.
+        """
         minutes = self.args.budget
         longest = max(longest, self.args.seconds or 0)
         return minutes is not None and spent + longest > 60 * minutes
@@ -183,12 +195,12 @@ class Job:
         log("    " + line(kept.numbers))
 
     def _train_for(self, name, budget) -> tuple[int, ArmResult]:
-        """The first seed, over as many steps as can be made in the time given.
+        """Train the first seed for as many steps as fit into the given time.
 
-        What a step costs is seen on the arm's run over --steps where there is one, or
-        on a short pilot. It depends on the number of steps, as Gaussians grow: where
-        the first try misses the time by too much, there is a second one; what takes too
-        long is not trained to its end for that.
+        The cost of a step is taken from the run over --steps, or from a short pilot. It
+        depends on the number of steps, because Gaussians grow. If the first try misses
+        the time by too much, there is a second one, and a try that takes too long is
+        stopped for it.
         """
         # Other seeds may be finished: this one stands next to them.
         found = results.steps_of(budget.folder, name)
@@ -293,9 +305,17 @@ class Job:
         return self._built[name, steps]
 
     def planned_steps(self, name: str, budget: Budget) -> int:
-        """Of every seed of an arm; over seconds those that seed 0 found.
+        """Look up the number of steps of every seed of a method.
 
-        ValueError where no seed is finished.
+        Args:
+          name: Name of the method.
+          budget: The budget. For one in seconds, seed 0 determines the steps.
+
+        Returns:
+          Number of steps.
+
+        Raises:
+          ValueError: If no seed is finished.
         """
         if budget.seconds is None:
             return self.spec(name, budget.steps).steps
@@ -308,7 +328,7 @@ class Job:
         return steps
 
     def identity(self, name, seed, steps, budget) -> dict[str, Any]:
-        """What a kept arm must have been made with to be taken over."""
+        """Settings that a stored run must share to be reused."""
         return {
             "scene": self.capture_digest,
             "arm": name,
@@ -322,7 +342,7 @@ class Job:
         }
 
     def measured_on(self) -> dict[str, Any]:
-        """What is filmed, which frames are scored and which points are followed."""
+        """Identity of the capture, the held-out frames and the tracked points."""
         return {
             "scene": self.capture_digest,
             "rows": self.known.rows.tolist(),
@@ -333,11 +353,13 @@ class Job:
         }
 
     def path(self, name: str, seed: int, budget: Budget) -> pathlib.Path:
-        """Where an arm's numbers are when it is finished; its pictures are beside."""
+        """Path of a run's numbers, with its images next to them."""
         return budget.folder / f"{name}-{seed}.json"
 
     def kept(self, name: str, seed: int, budget: Budget) -> ArmResult | None:
-        """A finished arm; exit code 2 where it is one of another experiment."""
+        """Load a finished run. One of another experiment ends the command with exit
+        code 2.
+        """
         path = self.path(name, seed, budget)
         with cli.user_errors():
             if not os.path.lexists(path):
@@ -349,7 +371,7 @@ class Job:
             return results.read(path, self.identity(name, seed, steps, budget))
 
     def is_finished(self, name: str, seed: int) -> bool:
-        """Whether an arm is there for every budget."""
+        """Test if a run is finished for every budget."""
         return all(self.kept(name, seed, b) is not None for b in self.budgets)
 
     def finished(self, budget: Budget) -> dict[tuple[str, int], ArmResult]:
@@ -363,9 +385,9 @@ class Job:
 
 
 def _model_sizes(place, arm, state):
-    """MB of the file that holds a trained scene, or of its parameters where none does.
+    """Return the size of the model file, or of the parameters if there is none, in MB.
 
-    And of the scene as it is coded; NaN where nothing says how.
+    The second number is the entropy-coded size, NaN if the model has none.
     """
     with scratch_folder(place) as folder:
         saved = arm.representation.save(folder, arm.spec, arm.metadata, state)

@@ -1,4 +1,4 @@
-"""What an ablation tells its user while it runs."""
+"""Messages of a running ablation."""
 
 from experiments.ablate.measures import MEASURES
 from nerfies_jax import console

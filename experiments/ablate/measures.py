@@ -1,4 +1,4 @@
-"""What an ablation measures of every arm; no JAX."""
+"""Measures of every run of an ablation, without JAX."""
 
 import math
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ class Measure(NamedTuple):
     share: float = 0.0  # or so much of its value, whichever is more
 
     def allowed(self, value: float) -> float:
-        """How much worse than before `value` may be; nothing where it is not known."""
+        """Tolerated deterioration of a value, zero if it is unknown."""
         return max(self.tolerance, self.share * value) if value == value else 0.0
 
 
@@ -68,10 +68,15 @@ DEPTHS = tuple(name for name in KEYS if "depth" in name)
 
 
 def quality(scores: Mapping[str, float], exact: bool) -> dict[str, float]:
-    """The measures of quality of an arm; NaN for what is not known.
+    """Compute the quality measures of a run.
 
-    Depths that are not exact judge nothing. Masks of what moves, which only say where
-    all arms are compared, may be estimates.
+    Args:
+      scores: Metrics by key.
+      exact: Whether depths and masks are ground truth. Estimated depths judge nothing.
+        Estimated masks only select the regions in which all methods are compared.
+
+    Returns:
+      Measures by name, NaN where unknown.
     """
     numbers = {name: scores.get(key, float("nan")) for name, key in KEYS.items()}
     if not exact:
@@ -135,5 +140,5 @@ def shown(numbers: Mapping[tuple[str, int], Mapping[str, float]]) -> list[str]:
 
 
 def legend(names) -> str:
-    """What the columns mean, of those that are shown."""
+    """Explain the columns that are shown."""
     return "\n".join(text for name, text in LEGENDS.items() if name in names)

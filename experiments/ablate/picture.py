@@ -22,9 +22,14 @@ TRUE, FOUND, APART = (255, 255, 255), (255, 140, 0), (230, 30, 30)
 
 
 def shown_row(known: GroundTruth, capture: Capture) -> int:
-    """Which of the rendered frames to show: where points are farthest from the start.
+    """Choose the rendered frame in which points are farthest from the start.
 
-    Without any that move, the middle one.
+    Args:
+      known: Ground truth.
+      capture: The capture.
+
+    Returns:
+      Index of the frame, the middle one if nothing moves.
     """
     if not len(known.path):
         return len(known.rows) // 2
@@ -43,11 +48,22 @@ def draw(
     captions: Mapping[str, str],
     shown: int,
 ) -> np.ndarray:
-    """The truth above, then render, error, depth and tracks of every arm in its row.
+    """Draw the ground truth above render, error, depth and tracks of every method.
 
-    `color` and `depth` are of the shown frame. White: where points are and were;
-    orange: where they are followed to; red: from one to the other. Of a real capture
-    only the pictures are known, and depths are shown between the limits of the first.
+    Points are white where they are and were, orange where a model moves them, and red
+    lines connect both. Without ground truth there are images only, and depths share the
+    limits of the first method.
+
+    Args:
+      capture: The capture.
+      known: Ground truth.
+      color: Renders of the shown frame, by method.
+      depth: Depths of the shown frame, by method.
+      path: Tracked points, by method.
+      captions: Captions, by method.
+
+    Returns:
+      The image.
     """
     row = int(known.rows[shown])
     if not known.exact:
@@ -87,12 +103,12 @@ def _enlarged(picture):
 
 
 def _moment(known, capture, row):
-    """Which of the moments is nearest in time to a frame."""
+    """Return the ground-truth time that is nearest to a frame."""
     return np.argmin(np.abs(capture.times[known.moments] - capture.times[row]))
 
 
 def _tracks(capture, known, path, row):
-    """Tracks over the darkened frame; a `path` of None does not move."""
+    """Draw tracks over the darkened frame; a `path` of None does not move."""
     picture = _enlarged(capture.images[row] // 2)
     factor = picture.shape[1] / capture.size[0]
     image = PIL.Image.fromarray(picture)
@@ -131,5 +147,5 @@ def _pixels(camera, points):
 
 
 def save(picture: np.ndarray, path: pathlib.Path) -> None:
-    """As a PNG, written atomically."""
+    """Save an image as PNG, atomically."""
     pictures.save(picture, path)

@@ -28,11 +28,13 @@ class Running(NamedTuple):
 
 
 def run(job) -> list[tuple[str, int]]:
-    """Make what is not finished, `--jobs` at a time; returns what failed.
+    """Train what is not finished, in `--jobs` processes.
 
-    Every process runs `experiments.ablate.worker` for one arm and writes its own files;
-    this one only waits. Ctrl-C and SIGTERM end them all; an arm that fails is named
-    and the others go on.
+    Every process runs `experiments.ablate.worker` for one run and writes its own files.
+    Ctrl-C and SIGTERM end them all. A failing run is reported, and the others continue.
+
+    Returns:
+      Methods and seeds that failed.
     """
     every = job.tasks()
     waiting = [task for task in every if not job.is_finished(*task)]
@@ -156,7 +158,7 @@ def _ended_by_signals():
 
 
 def _stop(running):
-    """End what still runs; what an arm writes is never seen half."""
+    """End the running processes, which leave no partial files."""
     for one in running.values():
         one.process.terminate()
     deadline = time.monotonic() + PATIENCE_SECONDS

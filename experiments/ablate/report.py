@@ -14,9 +14,13 @@ from nerfies_jax.training import specs
 
 
 def write(job, budget, finished) -> None:
-    """ablation.json and ablation.png in the budget's folder; prints table and claims.
+    """Write ablation.json and ablation.png of a budget, and print the table and the
+    claims.
 
-    `finished` holds what was kept under this budget, by arm and seed.
+    Args:
+      job: The ablation.
+      budget: The budget.
+      finished: Finished runs of this budget, by method and seed.
     """
     numbers = {key: kept.numbers for key, kept in finished.items()}
     static = protocol.static_error(job.known)
@@ -62,7 +66,9 @@ def judged(job) -> list:
 
 
 def remarks(finished) -> list[str]:
-    """What the table does not show: runs that ended early, points that were lost."""
+    """Report what the table does not show: runs that ended early, points that were
+    lost.
+    """
     sentences = []
     for (name, seed), kept in finished.items():
         if kept.notes["stopped_by"] != "steps":
@@ -79,7 +85,15 @@ def remarks(finished) -> list[str]:
 
 
 def metrics(numbers: Numbers, static: float) -> list[Metric]:
-    """Means over the seeds; their standard deviations where there are several."""
+    """Compute means over the seeds, and standard deviations if there are several.
+
+    Args:
+      numbers: Measures by method and seed.
+      static: End-point error of a static prediction.
+
+    Returns:
+      Metrics by key.
+    """
     measured = [Metric("still.track_error", static, "scene units", "equal", 1e-6)]
     for arm in dict.fromkeys(arm for arm, _ in numbers):
         rows = [row for (name, _), row in numbers.items() if name == arm]
@@ -116,7 +130,7 @@ def _claim(verdict):
 
 
 def _picture(job, finished, path):
-    """Of the first seed that each arm has; a few arms, or what there is of others."""
+    """Draw the first finished seed of a few methods."""
     first = {}
     for (name, _), kept in finished.items():
         first.setdefault(name, kept)

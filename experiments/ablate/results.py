@@ -19,7 +19,7 @@ CELL = "cell of an ablation 1"
 
 
 class ArmResult(NamedTuple):
-    """What is left of one arm and seed when it is finished."""
+    """Stored results of one method and seed."""
 
     numbers: dict[str, float]
     arrays: dict[str, Any]  # color, depth, and path where points were followed
@@ -27,7 +27,7 @@ class ArmResult(NamedTuple):
 
 
 def stored_numbers(numbers: Mapping[str, float]) -> dict[str, float | None]:
-    """As JSON has them: null for what is not finite."""
+    """Replace numbers that are not finite by None, for JSON."""
     return {k: x if math.isfinite(x) else None for k, x in numbers.items()}
 
 
@@ -37,7 +37,7 @@ def read_numbers(stored: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def write(path: pathlib.Path, identity: dict[str, Any], kept: ArmResult) -> None:
-    """`path` and its .npz; numbers last: an arm is finished when they are there."""
+    """Write a result and its .npz. The numbers come last and mark it as finished."""
     cache_files.write_arrays(_arrays_of(path), kept.arrays, CELL, compressed=True)
     numbers = stored_numbers(kept.numbers)
     stored = {
@@ -89,9 +89,16 @@ def _numbers_and_arrays(path):
 
 
 def steps_of(folder: pathlib.Path, name: str) -> int | None:
-    """Over how many steps the seeds of an arm are trained; None while none is finished.
+    """Look up the number of steps of a method.
 
-    Seed 0 finds them. If its file is damaged, those of other seeds still say so.
+    Seed 0 determines it. Files of other seeds are used if that one is damaged.
+
+    Args:
+      folder: Folder of the results.
+      name: Name of the method.
+
+    Returns:
+      Number of steps, None if no seed is finished.
     """
     first = folder / f"{name}-0.json"
     others = sorted(folder.glob(f"{glob.escape(name)}-[0-9]*.json"))
@@ -104,9 +111,13 @@ def steps_of(folder: pathlib.Path, name: str) -> int | None:
 
 @contextlib.contextmanager
 def claimed(path: pathlib.Path) -> Iterator[bool]:
-    """Whether this process may make `path`; false while another one does.
+    """Lock a result for this process.
 
-    The claim ends with the block, or with the process, however that ends.
+    Args:
+      path: The result.
+
+    Yields:
+      Whether this process holds the lock. It is released with the block or the process.
     """
     name = path.with_name(f".{path.stem}.lock")
     lock = filelock.FileLock(name)

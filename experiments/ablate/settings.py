@@ -1,4 +1,4 @@
-"""What an ablation is asked for; no JAX."""
+"""Options of an ablation, without JAX."""
 
 import dataclasses
 import pathlib

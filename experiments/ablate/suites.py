@@ -1,4 +1,4 @@
-"""All suites of arms by name; no JAX until one needs it."""
+"""All suites by name, without JAX until one needs it."""
 
 from experiments.ablate.arms import FIELDS, MOBA, SONATA, Arm, Suite
 from experiments.ablate.tracked_arms import POSES, TRACKED_PARTS

@@ -1,4 +1,4 @@
-"""What the numbers of an ablation say: the table, and a verdict on every claim."""
+"""Results of an ablation: the table, and a verdict on every claim."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ Numbers = Mapping[tuple[str, int], Mapping[str, float]]  # by arm and seed
 
 
 class Verdict(NamedTuple):
-    """One measure of one claim; `gain` is positive where the claim is right."""
+    """One measure of one claim, with a positive `gain` if the claim is right."""
 
     claim: Claim
     measure: str
@@ -29,11 +29,18 @@ class Verdict(NamedTuple):
 
 
 def verdicts(numbers: Numbers, claims: Sequence[Claim]) -> list[Verdict]:
-    """What the numbers say of every claim whose two arms were run.
+    """Judge every claim whose two methods were run.
 
-    Arms are compared seed by seed, which starts both from the same draws. An effect
-    shows where Student's interval of the mean difference leaves zero out; one seed has
-    no spread, and so cannot show any.
+    Methods are compared seed by seed, since a seed gives both the same random numbers.
+    An effect is significant if Student's interval of the mean difference excludes zero.
+    One seed has no spread, and is never significant.
+
+    Args:
+      numbers: Measures by method and seed.
+      claims: Claims to judge.
+
+    Returns:
+      Verdicts.
     """
     judged = []
     for claim in claims:
@@ -70,10 +77,16 @@ def _verdict(claim, name, pairs):
 
 
 def table(numbers: Numbers, static: float) -> str:
-    """Means over the seeds, one row for each arm; after "±" their standard deviation.
+    """Format means and standard deviations over the seeds, one line per method.
 
-    Below them the costs. `static` is the end-point error of points that do not move.
-    Columns that no arm has a number for are left out.
+    Costs are in a second table. Columns without numbers are left out.
+
+    Args:
+      numbers: Measures by method and seed.
+      static: End-point error of a static prediction.
+
+    Returns:
+      Text of the table.
     """
     names = measures.shown(numbers)
     quality = [name for name in names if name not in measures.COSTS]

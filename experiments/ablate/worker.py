@@ -16,7 +16,7 @@ from nerfies_jax.training import specs
 
 
 def main(path: str) -> None:
-    """Train what the settings in a file name; exit code 2 where they are wrong."""
+    """Train the run that a file describes. Wrong settings end with exit code 2."""
     with cli.user_errors():
         text = pathlib.Path(path).read_text()
         stored = specs.from_json(json.loads(text), Ablate)

@@ -1,1 +1,1 @@
-"""How well the main job does, and how sure that is."""
+"""Quality of the main job over several seeds."""

@@ -1,14 +1,13 @@
-"""How well the main job does on a capture: over seeds, beside doing nothing.
+"""Quality of the main job over several seeds, compared with two baselines.
 
     python -m experiments.benchmark --out runs/benchmark
     python -m experiments.benchmark --scene fast --out runs/benchmark
     python -m experiments.benchmark CAPTURE --max-side 256 --out runs/benchmark
 
-Each seed is a run of `experiments.reconstruct` in a process of its own; one at a time
-takes the cores that its preset wants, several one each.
-The seed draws the first Gaussians and the order of the frames; that of a built-in scene
-draws the hand that holds the camera as well. A run that is complete is not made again,
-and the numbers of other captures in OUT/benchmark.json stay.
+Each seed is one run of `experiments.reconstruct` in its own process. One run at a time
+uses the cores that its preset wants. The seed determines the initial Gaussians and the
+order of the frames, and the camera path of a built-in scene. Complete runs are not
+repeated, and the numbers of other captures in OUT/benchmark.json stay.
 """
 
 import concurrent.futures
@@ -55,7 +54,7 @@ class Benchmark:
 
 @cli.command(Benchmark)
 def main(args):
-    """Run all seeds and keep what they scored; exit code 2 where input is wrong."""
+    """Run all seeds and store their metrics. Wrong input ends with exit code 2."""
     with cli.user_errors():
         filmed = args.source.capture
         if filmed is not None and not filmed.exists():
@@ -125,7 +124,7 @@ def _config(args, seed):
 
 
 def _label(args):
-    """What was run, without where it lies."""
+    """Describe the run without the location of its files."""
     source = cli.plain(args.source)
     words = list(source.arguments)
     if source.capture is not None:

@@ -1,21 +1,21 @@
-"""What each effect of a scene costs, by itself and beside the others.
+"""Cost of each effect of a scene, by itself and together with the others.
 
     python -m experiments.effect_cost
     python -m experiments.effect_cost --presets sonata-small --repeats 9
     python -m experiments.effect_cost --check runs/effect_cost/effect_cost.json
 
-For every preset: the bare scene, the bare scene with each effect alone (and what that
-cannot be without), the whole preset, and the whole preset without each, or without a
-part that has a price of its own (ADC-GS' bits, EDGS' mask, SC-GS' rigidity). Of the
-loss and of the training step it tabulates what the compiler counts (flops, bytes read
-and written, temporary memory), the matrix products with every round of every loop, the
-parameters, the seconds to compile and the processor time of warm calls, all scenes of a
-preset in turn. Steps are scanned in tens, as a run does with all but large ones. A run
-is priced at `--at` of its steps, where every warm-up is over.
+For every preset: the bare scene, the bare scene with each effect alone (and its
+requirements), the whole preset, and the whole preset without each effect, or without a
+part that is priced separately (ADC-GS' bits, EDGS' mask, SC-GS' rigidity). For the loss
+and the training step it tabulates the compiler's counts (flops, bytes accessed,
+temporary memory), the matrix products with every iteration of every loop, the
+parameters, the compilation time and the processor time of warm calls, with all scenes
+of a preset in turn. Steps are scanned in tens, as a run does for all but expensive
+ones. A run is priced at `--at` of its steps, after every warm-up.
 
 The price of an effect alone is a difference from the scene without it. Prices do not
-add up exactly: the compiler joins what it finds side by side. Prints the table, saves
-effect_cost.json, effect_cost.md and effect_cost.png.
+add up exactly, because the compiler fuses neighboring operations. Prints the table,
+saves effect_cost.json, effect_cost.md and effect_cost.png.
 """
 
 import dataclasses
@@ -119,7 +119,7 @@ class PricedScene(NamedTuple):
 
 
 class Priced(NamedTuple):
-    """What one program of one scene takes."""
+    """Cost of one program of one scene."""
 
     flops: float
     bytes_accessed: float
@@ -141,7 +141,7 @@ class SceneCost(NamedTuple):
 
 @cli.command(EffectCost)
 def main(args):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         platform.start_jax(args.device, "one")
         import jax
@@ -222,9 +222,17 @@ def without(spec: Any, names: tuple[str, ...]) -> Any:
 
 
 def arms(spec: Any, parts: Mapping[str, Any]) -> list[PricedScene]:
-    """The scenes of a preset's table; ValueError where it has no effect.
+    """Assemble the scenes of a preset's table.
 
-    `parts` has the scene without each part of an effect that is priced as well.
+    Args:
+      spec: Settings of the preset.
+      parts: Settings without each separately priced part.
+
+    Returns:
+      Scenes by name.
+
+    Raises:
+      ValueError: If the preset has no effect.
     """
     names = effects_in(spec)
     if not names:

@@ -102,7 +102,7 @@ def page(stored) -> str:
 
 
 def _apart(about):
-    """Which presets another processor was asked for."""
+    """Name the presets that were measured on another processor."""
     apart = about.get("apart", {})
     if not apart:
         return ""

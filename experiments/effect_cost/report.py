@@ -32,7 +32,7 @@ WIDTHS = (21, 10, 8, 8, 9, 9, 8, 8, 8, 8, 7, 7, 8, 8)
 
 
 def heading() -> str:
-    """What the columns are, and on which machine."""
+    """Explain the columns, and name the machine."""
     machine = clock.machine()
     return (
         f"On {machine['cpu']}, {machine['backend']}, JAX {machine['jax']}, "
@@ -90,7 +90,14 @@ def _number(value):
 
 
 def metrics_of(rows) -> list[Metric]:
-    """Every number of every table; `rows` by preset."""
+    """Collect every number of every table.
+
+    Args:
+      rows: Rows by preset.
+
+    Returns:
+      Metrics by key.
+    """
     metrics = []
     for preset, scenes in rows.items():
         bare = scenes[0]
@@ -141,7 +148,7 @@ def page(metrics: Mapping[str, Metric]) -> list[str]:
 
 
 def _title(arm):
-    """As in the table, from a key of the metrics."""
+    """Convert a key of the metrics to the name in the table."""
     for word in ("only", "without"):
         if arm.startswith(f"{word}_"):
             return f"{word} {arm.removeprefix(f'{word}_')}"
@@ -149,7 +156,16 @@ def _title(arm):
 
 
 def write(folder: pathlib.Path, rows, args) -> list[Metric]:
-    """effect_cost.json, .md and .png; returns the metrics."""
+    """Write effect_cost.json, .md and .png.
+
+    Args:
+      folder: Folder to write to.
+      rows: Rows by preset.
+      args: Options.
+
+    Returns:
+      The metrics.
+    """
     metrics = metrics_of(rows)
     about = {
         "presets": list(args.presets),

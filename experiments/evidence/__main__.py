@@ -1,14 +1,13 @@
-"""What the pictures of a capture say before anything is trained.
+"""Results of preprocessing a capture: optical flow, tracks, masks, rigid groups.
 
     python -m experiments.evidence CAPTURE
     python -m experiments.evidence --scene fast --out runs/fast-evidence
     python -m experiments.evidence --scenes
 
-Prints how much of the pictures can be carried from frame to frame, what moves, the
-tracks and their paths in space, the points at rest and the groups of rigid motion;
-draws frames with what moves and with tracks. The record is kept where `reconstruct`
-finds it. Of built-in scenes, whose truth is known, it says how far off all this is.
-`--scenes` measures every built-in scene, and ways to find optical flow.
+Prints the share of pixels with flow, moving objects, tracks and their 3D paths, static
+points and rigid groups. Draws frames with masks and tracks. The result is stored where
+`reconstruct` finds it. For built-in scenes, whose ground truth is known, it reports the
+errors. `--scenes` measures every built-in scene and several flow methods.
 """
 
 import dataclasses
@@ -39,7 +38,7 @@ class EvidenceOptions:
 
 @cli.command(EvidenceOptions)
 def main(args):
-    """Look at what the command line names; exit code 2 where its input is wrong."""
+    """Preprocess the capture of the command line. Wrong input ends with exit code 2."""
     with cli.user_errors():
         platform.start_jax("cpu")
         from experiments.evidence import report, scenes

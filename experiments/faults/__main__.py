@@ -62,7 +62,7 @@ class Faults:
 
 @cli.command(Faults)
 def main(args):
-    """Run the chains; exit code 1 where anything was lost."""
+    """Run the chains. Lost results end with exit code 1."""
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.measure import clock
     from nerfies_jax.training.provenance import revision

@@ -65,7 +65,7 @@ class _Done(NamedTuple):
 
 
 def _undisturbed(bench, job, work):
-    """Run a job to its end; None where it is complete."""
+    """Run a job to its end, and return its error or None."""
     command = job.command(bench, work)
     if command is None:
         return None
@@ -153,7 +153,7 @@ def _keep(work, said):
 
 
 def _damage(job, work, before, known):
-    """What an earlier result has lost; it may be replaced by the final one."""
+    """Describe damage to an earlier result, which the final one may replace."""
     after = job.whole(work)
     if after == known.result or all(after.get(k) == x for k, x in before.items()):
         return ""
@@ -161,7 +161,7 @@ def _damage(job, work, before, known):
 
 
 def _finish(bench, job, work, known, rows):
-    """What is wrong with the job once it has been continued to its end."""
+    """Continue a job to its end, and describe its errors."""
     if not rows or not _is_same(job, work, known) or jobs.litter(work):
         done = _undisturbed(bench, job, work)
         if done is not None and done.code:

@@ -44,7 +44,14 @@ class Ended(NamedTuple):
 
 
 def compiled_disk(folder: pathlib.Path) -> pathlib.Path | None:
-    """Compile the library that makes a disk fail; None where there is no compiler."""
+    """Compile the library that makes a disk fail.
+
+    Args:
+      folder: Folder of the library.
+
+    Returns:
+      The library, None if there is no compiler.
+    """
     source = pathlib.Path(__file__).with_name("failing_disk.c")
     library = folder / "failing_disk.so"
     command = ["cc", "-shared", "-fPIC", "-o", str(library), str(source), "-ldl"]
@@ -118,7 +125,7 @@ def disturbed(
 
 
 def _wait(process, after) -> bool:
-    """Until a process has taken so many processor seconds; False where it ended."""
+    """Wait for some processor seconds of a process; False if it ended before."""
     while process.poll() is None:
         if _processor_seconds(process.pid) >= after:
             return True
@@ -177,7 +184,7 @@ class _Reader:
 
 
 def _orphans(mark):
-    """What still runs of a job whose process has ended."""
+    """List the running processes of a job that has ended."""
     until = time.monotonic() + ORPHAN_SECONDS
     while left := _marked(mark):
         if time.monotonic() > until:
@@ -199,7 +206,7 @@ def _marked(mark):
 
 
 def _wrong(code, fault, happened, said):
-    """What the exit code or the output has wrong."""
+    """Describe errors of the exit code or the output."""
     if "Traceback" in said or "Exception ignored" in said:
         return "a traceback"
     if code == 0 and fault != "full log":

@@ -82,7 +82,7 @@ class Bench:
 
 
 class Job(NamedTuple):
-    """A job that works in a folder; `out` in it is its result."""
+    """A job that works in a folder and writes its result to `out` in it."""
 
     command: Callable[[Bench, pathlib.Path], list[str] | None]  # None: it is complete
     result: Callable[[pathlib.Path], dict[str, str]]  # digests by name
@@ -151,7 +151,7 @@ def _render(bench, work, frames=5):
 
 
 def _earlier(command):
-    """What writes an earlier result, of other frames, into the folder."""
+    """Write an earlier result, of other frames, into the folder."""
 
     def write(bench, work):
         done = subprocess.run(

@@ -17,7 +17,14 @@ ABOUT = {
 
 
 def page(stored: dict) -> str:
-    """How many faults each job took, and what was lost."""
+    """Format the number of faults of each job, and its losses.
+
+    Args:
+      stored: The stored results.
+
+    Returns:
+      Markdown.
+    """
     rows = [row for rows in stored["chains"].values() for row in rows]
     lost = [row for row in rows if row["lost"]]
     faults = [fault for each in KINDS.values() for fault in each]

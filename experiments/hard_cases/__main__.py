@@ -108,7 +108,7 @@ class CaseResult(NamedTuple):
 
 @cli.command(HardCases)
 def main(args):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         chosen = choose(args.rooms, args.cases)
         folder = run_folder.new_run_folder(args.out, "hard_cases")

@@ -1,8 +1,8 @@
-"""What a hard case is, and how far a formula is from the truth there.
+"""Hard cases, and the error of a formula on them.
 
-A case sweeps a function to where its textbook form loses digits, and holds both forms
-against 60-digit arithmetic: value, slopes and, where something differentiates twice,
-curvature. `hard_cases` prints the table, the tests hold the bounds.
+A case sweeps a function to where its textbook form loses digits, and compares both
+forms with 60-digit arithmetic: value, gradient and, where something differentiates
+twice, curvature. `hard_cases` prints the table, and tests check the bounds.
 """
 
 import functools
@@ -22,10 +22,10 @@ ROWS = 16  # a program is compiled for a multiple of so many inputs
 class Case(NamedTuple):
     """One function near its hard points.
 
-    `stable` and `textbook` map one input [n] to one output [m], as jit and vmap want
-    it; `exact` maps n mpmath numbers to a list of m. Inputs are rounded to the
-    precision under test before any of them sees them, so what the rounding itself does
-    is nobody's error.
+    `stable` and `textbook` map one input [n] to one output [m], as jit and vmap
+    require. `exact` maps n mpmath numbers to a list of m. Inputs are rounded to the
+    precision under test first, so the effect of that rounding does not count as an
+    error.
     """
 
     name: str  # "screw near zero"
@@ -52,12 +52,12 @@ class Case(NamedTuple):
 
     @property
     def orders(self) -> int:
-        """How many of value, slope and curvature are held."""
+        """Number of tested derivatives, including the value."""
         return max(len(bounds) for bounds in self.bounds.values())
 
 
 def constant(values: ArrayLike, dtype: DTypeLike) -> jax.Array:
-    """As `jnp.asarray`, which compiles a program for it where nothing is jitted."""
+    """Convert to a JAX array without compiling a program, as `jnp.asarray` does."""
     return jax.device_put(np.asarray(values).astype(jnp.dtype(dtype)))
 
 
@@ -87,10 +87,10 @@ def derivatives(function: Callable, count: int) -> Callable:
 
 
 def truth(case: Case, inputs: np.ndarray, order: int, digits: int = 120) -> np.ndarray:
-    """[points, m, ...] what `derivatives` should give, as float64.
+    """Compute [points, m, ...] exact values of `derivatives` as float64.
 
-    Derivatives are central differences of `case.exact` with a step of 1e-32, good to
-    more than 30 digits; a function with a kink inside the step would be averaged.
+    Derivatives are central differences of `case.exact` with a step of 1e-32, accurate
+    to more than 30 digits. A function with a kink inside the step would be averaged.
     """
     with mpmath.workdps(digits):
         return np.array([_differences(case.exact, row, order) for row in inputs])
@@ -137,9 +137,10 @@ def rounded(inputs: np.ndarray, dtype: str) -> np.ndarray:
 
 
 def errors(case: Case, got: np.ndarray, exact: np.ndarray, order: int) -> np.ndarray:
-    """[points] largest error over the largest entry of the truth; inf where not finite.
+    """Compute the largest error over the largest exact entry of each point.
 
-    `case.floors[order]` bounds the divisor from below.
+    It is infinite where a value is not finite. `case.floors[order]` bounds the divisor
+    from below.
     """
     axes = tuple(range(1, exact.ndim))
     size = np.maximum(np.abs(exact).max(axis=axes), case.floors[order])

@@ -33,7 +33,9 @@ def _exact_moved(shares):
 
 
 def _squared_singular(matrix):
-    """Eigenvalues of JᵀJ by its cubic; a nearly equal pair costs half the digits."""
+    """Compute eigenvalues of JᵀJ by its cubic, which loses half the digits of close
+    pairs.
+    """
     a = matrix.T * matrix
     mean = (a[0, 0] + a[1, 1] + a[2, 2]) / 3
     b = a - mean * mpmath.eye(3)
@@ -73,7 +75,7 @@ def _of_displacement(form):
 
 
 def _of_jacobian(form, size=1.0):
-    """Of a multiple of the identity, moved."""
+    """Evaluate at a perturbed multiple of the identity."""
 
     def energy(shares):
         return form(size * jnp.eye(3, dtype=shares.dtype) + _moved(shares))[None]

@@ -31,7 +31,7 @@ def _features(spec):
 
 
 def _rounded_pi(x):
-    """As it stands in the papers: π is rounded in before the sine reduces."""
+    """Evaluate as in the papers, with π rounded before argument reduction."""
     angles = 2 ** jnp.arange(BANDS, dtype=x.dtype)[:, None] * jnp.pi * x
     return jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1).reshape(-1)
 

@@ -24,7 +24,7 @@ def _camera(dtype, position=(0.0, 0.0, 0.0), turn=np.eye(3)):
 
 
 def _footprint(x, spec):
-    """Of a quaternion [4] and a scale [3], straight ahead, opacity a half."""
+    """Project a centered Gaussian of quaternion [4], scale [3] and opacity 0.5."""
     ahead = constant([[0, 0, DEPTH]], x.dtype)
     half = constant([0.5], x.dtype)
     gaussians = Gaussians(ahead, x[None, :4], x[None, 4:7], half)
@@ -154,7 +154,9 @@ _PLACE = np.array([1.0, -1.0, 1.0])
 
 
 def _offset_camera(x):
-    """A camera at [3]; mean at [3] behind it in the input."""
+    """Project a Gaussian from a camera at [3]; the mean is the second part of the
+    input.
+    """
     return _camera(x.dtype, turn=_ROTATION)._replace(position=x[:3])
 
 

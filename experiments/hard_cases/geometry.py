@@ -28,7 +28,7 @@ def _pinhole(rotation, position):
 
 
 def _far_pixel(both):
-    """Of a point, seen by a camera at a position."""
+    """Project a point seen by a camera at a position."""
     return cameras.project(_pinhole(TURN, both[3:]), both[:3])[0]
 
 

@@ -103,7 +103,7 @@ _RADII = np.array([-30.0, -20 * (1 + NEAR), -20 * (1 - NEAR), -2.0, 0.0, 3.0])
 
 
 def _shares(x):
-    """Of three nodes a unit apart in a row, from some distance along it."""
+    """Weights of three nodes a unit apart, by the distance along their line."""
     row, slant = (constant(values, x.dtype) for values in (_ROW, _SLANT))
     return skinning.weights(jnp.square(x[0] + row), x[1] + slant)
 
@@ -145,7 +145,7 @@ _FAR = np.array([0, 1e-12, 0.1, 1, 3, 6, 9, 20, 40])
 
 
 def _bits(x):
-    """Of a value so many deviations from the mean, in steps so wide."""
+    """Bits of a value some deviations from the mean, by the step size."""
     none = jnp.zeros_like(x[0])
     return entropy.bits(x[0], none, none, x[1])[None]
 

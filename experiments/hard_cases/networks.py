@@ -87,7 +87,7 @@ OUTSIDE = Case(
 
 
 def _expanded(x):
-    """As a matrix product would have it, |x|² - 2xμ + μ²."""
+    """Expand the square as for a matrix product: |x|² - 2xμ + μ²."""
     center = 1024 + jnp.arange(KERNELS, dtype=x.dtype)
     squares = x**2 - 2 * x * center + center**2
     return jnp.exp(-squares) @ constant(WEIGHTS, x.dtype)[:, None]
@@ -115,7 +115,7 @@ CHOSEN = 3  # the one kernel of the next case, at x = 3
 
 
 def _trained(x):
-    """One kernel of a trained width e^s; x and s."""
+    """One kernel of a trained width e^s, with inputs x and s."""
     shape = KERNELS, 1
     center = jnp.arange(KERNELS, dtype=x.dtype)[:, None]
     kernels = (Kernels(center, jnp.broadcast_to(x[1], shape)),)
@@ -288,7 +288,7 @@ LENGTH = Case(
 
 
 def _nth_update(x):
-    """Adam's n-th update of a row with a steady slope; n and the slope."""
+    """Adam's n-th update with a constant gradient, with inputs n and the gradient."""
     count, slope = x[:1], x[1:]
     before = [slope**k * -jnp.expm1((count - 1) * math.log(b)) for k, b in _MOMENTS]
     state = optimizer.RowAdamState((count - 1).astype(jnp.int32), *before)
@@ -299,7 +299,7 @@ _MOMENTS = ((1, B1), (2, B2))
 
 
 def _update_at(count, x):
-    """As Adam's paper prints it."""
+    """Adam's update as its paper prints it."""
     slope = x[1:]
     before = [-jnp.expm1((x[:1] - 1) * math.log(b)) for _, b in _MOMENTS]
     first = B1 * slope * before[0] + (1 - B1) * slope

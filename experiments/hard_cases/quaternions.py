@@ -13,7 +13,7 @@ _SEAM = [_EDGE * (1 - 1e-6), _EDGE * (1 + 1e-6)]
 
 
 def _half_turns(angles):
-    """[angles, 4] unit quaternions; past π the scalar is negative: the other sign."""
+    """Return [angles, 4] unit quaternions, with a negative scalar part past π."""
     halves = np.asarray(angles)[:, None] / 2
     return np.concatenate([np.cos(halves), np.sin(halves) * AXIS], axis=1)
 

@@ -18,12 +18,12 @@ LINES = {"float32": "-", "float64": "--", "bfloat16": ":"}
 
 
 def worst(values) -> float:
-    """Largest error of a sweep; infinite where something was not finite."""
+    """Return the largest error of a sweep, infinite if any is not finite."""
     return float(np.max(values))
 
 
 def number(values) -> str:
-    """The worst error in short: 0, 3e-07, not finite; then the worst finite one."""
+    """Format the worst error: 0, 3e-07, or not finite and the worst finite one."""
     finite = [value for value in values if np.isfinite(value)]
     largest = max(finite, default=0.0)
     shown = "0" if largest == 0 else f"{largest:.0e}"
@@ -47,14 +47,14 @@ def block(row) -> str:
 
 
 def costs(row) -> str:
-    """As in "0.21, 0.47"."""
+    """Format costs, as in "0.21, 0.47"."""
     if not row.case.alike:
         return "not comparable"
     return f"{row.value_cost:.2f}, {row.slope_cost:.2f}"
 
 
 def summary(rows) -> str:
-    """What the whole table says, in two sentences."""
+    """Summarize the table in two sentences."""
     broken = sum(
         any(worst(x) > 1e-2 for o in row.outcomes.values() for x in o.textbook)
         for row in rows
@@ -109,7 +109,11 @@ def _errors(outcome):
 
 
 def parts(path) -> tuple[str, str]:
-    """What stands before and behind the table; ValueError without both markers."""
+    """Split a document at the markers of the table.
+
+    Raises:
+      ValueError: If it does not have both markers.
+    """
     text = path.read_text() if path.is_file() else ""
     match = re.search(f"(.*{BEGIN}\n)(.*)({END}.*)", text, re.DOTALL)
     if match is None:
@@ -121,7 +125,7 @@ def parts(path) -> tuple[str, str]:
 
 
 def renew(path, rows) -> None:
-    """Replace the table between the markers; the file appears whole or not at all."""
+    """Replace the table between the markers, atomically."""
     before, behind = parts(path)
     machine = clock.machine()
     about = (

@@ -18,7 +18,7 @@ def _screw(w):
 
 
 def _rodrigues(w):
-    """As it stands in the textbooks and in the official Nerfies code."""
+    """Rodrigues' formula as in textbooks and in the official Nerfies code."""
     linear, point = constant(LINEAR, w.dtype), constant(POINT, w.dtype)
     angle = jnp.sqrt(jnp.sum(w**2))
     sine = jnp.sin(angle) / angle
@@ -66,7 +66,7 @@ SCREW = Case(
 
 
 def _exact_stumpff(order, squared):
-    """c_k by its series, in as many digits as asked for; up to some ten rad."""
+    """Sum the series of c_k to any number of digits, for up to about ten rad."""
     total, n = mpmath.mpf(0), 0
     term = 1 / mpmath.factorial(order)
     while abs(term) > mpmath.eps**2 or n < 4:
@@ -107,7 +107,7 @@ def _textbook_displacement(w, v, x):
 
 
 def _of_screw(form):
-    """Of w and the speed: v is the speed times one direction."""
+    """Evaluate at w and v = speed times a fixed direction."""
     return lambda screw: form(
         screw[:3],
         screw[3] * constant(LINEAR, screw.dtype),

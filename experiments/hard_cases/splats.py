@@ -40,7 +40,7 @@ def _pixel(x):
 
 @jax.custom_vjp
 def _composite_dividing(alpha, values):
-    """As INRIA's kernel: the backward pass divides the transmittance back out."""
+    """Composite as INRIA's kernel, whose backward pass divides the transmittance."""
     passed = jnp.cumprod(1 - alpha)
     before = jnp.concatenate([jnp.ones_like(passed[:1]), passed[:-1]])
     return jnp.sum(before * alpha * values)

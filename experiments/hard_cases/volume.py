@@ -233,7 +233,7 @@ def _samples(weights):
 
 
 def _with_a_floor(weights):
-    """As the Nerfies code: 1e-5 on every weight, a mask for every share and edge."""
+    """Sample as the Nerfies code: 1e-5 on every weight, masks on shares and edges."""
     edges = constant(EDGES, weights.dtype)
     weights = weights + 1e-5
     share = jnp.cumsum(weights / jnp.sum(weights))
@@ -252,7 +252,7 @@ def _with_a_floor(weights):
 
 
 def _exact_samples(weights):
-    """Nothing is added but where there is nothing; the ends are the range's."""
+    """Sample without any epsilon, with the ends of the range included."""
     total = sum(weights)
     if total == 0:
         weights, total = [mpmath.mpf(1)] * len(weights), mpmath.mpf(len(weights))

@@ -1,13 +1,13 @@
-"""Which tests notice a fault: faults planted at random in both packages, one by one.
+"""Mutation tests: random faults in both packages, and the tests that detect them.
 
     python -m experiments.mutants
     python -m experiments.mutants --count 12 --seed 3 --only gaussians_jax/raster
 
 A copy of the checkout gets one fault at a time (an operator, a sign, a comparison, a
-number, two swapped arguments, somewhere in a function body; modules take turns), and
-the default tests of the files that enter the function are run until three fail; which
-files those are, a run of each without a fault says. What only a process of its own
-enters is not seen. Most of the library's faults of old were of these kinds.
+number, two swapped arguments, in some function body, with modules in turn), and the
+default tests of the files that enter the function run until three fail. A run without
+faults tells which files these are. Code that only child processes enter is not
+detected. Most of the library's past faults were of these kinds.
 """
 
 import concurrent.futures
@@ -52,7 +52,7 @@ class Mutants:
 
 @cli.command(Mutants)
 def main(args):
-    """Run the job of the command line; exit code 2 where its input is wrong."""
+    """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         faults = drawn(args.count, args.seed, args.only)
     from nerfies_jax.capture.json_files import write_json
@@ -91,7 +91,9 @@ def main(args):
 
 
 def _reached(out, workers, with_copy):
-    """What each file of tests enters, kept beside `out` for this very source."""
+    """Return the functions that each test file enters, cached next to `out` for this
+    source.
+    """
     from nerfies_jax.capture.json_files import write_json
 
     path = out.with_suffix(".reached.json")
@@ -122,7 +124,7 @@ def _name_and_bytes(name):
 
 
 def _files():
-    """What git keeps of the checkout and is there."""
+    """List the existing files that git tracks."""
     files = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
     )

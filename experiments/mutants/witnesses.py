@@ -1,4 +1,4 @@
-"""Which tests run a function, and which of them notice a fault in it."""
+"""Tests that execute a function, and tests that detect a fault in it."""
 
 import json
 import os
@@ -81,7 +81,7 @@ def tests_that_enter(fault: Fault, reached: dict[str, set[str]]) -> list[str]:
 
 
 def _failures(tests, copy, seconds):
-    """Names of up to three tests that fail; the run itself, where it does not end."""
+    """Return up to three tests that fail, or the run itself if it does not end."""
     command = [*PYTEST, "-m", DEFAULT, "-rfE", f"--maxfail={CAUGHT_BY}", *tests]
     try:
         ran = subprocess.run(

@@ -1,4 +1,4 @@
-"""How long a step, a frame, a compilation and the main job take, on this machine.
+"""Time of a step, a frame, a compilation and the main job on this machine.
 
     python -m experiments.speed --out speed
     python -m experiments.speed --presets splats-tracked-small --out speed
@@ -7,15 +7,14 @@
     python -m experiments.speed --presets splats-tracked-small --check BEFORE/speed.json
 
 Every preset is timed in two fresh processes, one that sees one core and one that has
-the cores its steps are made for. `--job` also times the README's first command, from an
-empty cache of programs and of evidence, and `--beside` that of another checkout, an
-earlier revision, between two of ours. `--raster` times the rasterizer on cases as
-10000@256x256, and `--yardstick` next to another (`experiments.speed.raster`). Times are
-wall clock: leave the machine alone. What was measured before stays in OUT/speed.json
-where it is not measured anew.
-`--check` holds that file against an earlier one, each number with its tolerance: a
-quarter of a time, a half of compiling, a tenth of memory, 0.15 of a ratio to the other
-rasterizer, half a decibel.
+the cores its steps are made for. `--job` also times the README's first command with
+empty caches, and `--beside` that of another checkout, an earlier revision, between two
+of ours. `--raster` times the rasterizer on cases such as 10000@256x256, and
+`--yardstick` compares it with another (`experiments.speed.raster`). Times are wall
+clock, so leave the machine idle. Earlier measurements stay in OUT/speed.json where they
+are not repeated. `--check` compares with an earlier file. The tolerances are a quarter
+of a time, half of a compilation, a tenth of memory, 0.15 of a ratio to the other
+rasterizer, and half a decibel.
 """
 
 import concurrent.futures
@@ -68,7 +67,7 @@ class Speed:
 
 @cli.command(Speed)
 def main(args):
-    """Measure and keep; exit code 2 where input is wrong."""
+    """Measure and store. Wrong input ends with exit code 2."""
     from experiments.speed import tolerances
     from nerfies_jax.measure import baselines
 

@@ -20,11 +20,19 @@ def prepare() -> None:
 
 
 def measure(preset: str, all_cores: bool) -> dict[str, Any]:
-    """Seconds and bytes of a preset on the built-in scene, from its first state.
+    """Measure seconds and bytes of a preset on the built-in scene, from its first
+    state.
 
-    With `all_cores` the step has the cores that its preset wants, and nothing else is
-    measured; otherwise one. Motions start as the preset says: tracks bring Gaussians of
-    their own, and longer steps.
+    Motions are initialized as in the preset: tracks bring Gaussians of their own, and
+    longer steps.
+
+    Args:
+      preset: Name of the preset.
+      all_cores: Use the cores that the preset wants, and time the step alone. Otherwise
+        use one core.
+
+    Returns:
+      Measurements by name.
     """
     wanted = representations.cores(preset)
     platform.start_jax("cpu", *(wanted if all_cores else ("one",)))

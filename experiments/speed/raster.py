@@ -39,7 +39,14 @@ def measure(cases: tuple[str, ...], yardstick: pathlib.Path | None) -> dict:
 
 
 def parsed(case: str) -> tuple[int, int, int]:
-    """Gaussians, width and height of a case; ValueError where it is none."""
+    """Parse a case such as 10000@256x256.
+
+    Returns:
+      Gaussians, width and height.
+
+    Raises:
+      ValueError: If it is not a case.
+    """
     try:
         count, size = case.split("@")
         width, height = size.split("x")
@@ -91,7 +98,7 @@ def compiled(text: str, scene: dict) -> tuple:
 
 
 def make_scene(count: int, width: int, height: int) -> dict:
-    """Half uniform, half in four clusters; three sigma about 6.5 px."""
+    """Sample Gaussians, half uniform and half in four clusters, of about 6.5 px."""
     import numpy as np
 
     rng = np.random.default_rng(0)
@@ -153,7 +160,16 @@ def median_ms(call) -> float:
 
 
 def yardstick_times(script: pathlib.Path, text: str, scene_file: str) -> dict:
-    """What the other rasterizer took for the scene; `text` is "COUNT@SIZE"."""
+    """Time the other rasterizer on a scene.
+
+    Args:
+      script: Its script.
+      text: The case, "COUNT@SIZE".
+      scene_file: File of the scene.
+
+    Returns:
+      Its measurements.
+    """
     count, size = text.split("@")
     command = [sys.executable, str(script), "--gaussians", count, "--size", size]
     command += ["--scene", scene_file, "--json"]

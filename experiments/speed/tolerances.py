@@ -1,4 +1,4 @@
-"""What of a speed.json a later one is held against, and how far it may go."""
+"""Measurements of speed.json that a later file is compared with, and tolerances."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
