@@ -42,7 +42,7 @@ class Stage:
 
     def __init__(self, name: str, total: int | None = None, done: int = 0):
         self.name, self.total, self.done = name, total, done
-        self._about = {"stage": next(_numbers)}
+        self._about: dict[str, Any] = {"stage": next(_numbers)}
         outer = _open_stages()
         if outer:
             self._about["parent"] = outer[-1]._about["stage"]

@@ -52,7 +52,7 @@ def read(
     except (FileNotFoundError, NotADirectoryError) as error:
         if not os.path.lexists(path):
             return None
-        reason = error
+        reason: Exception = error
     # Damaged bytes make readers raise whatever they meet.
     except Exception as error:
         reason = error
@@ -93,8 +93,9 @@ def write_arrays(
     seal = json.dumps({"identity": identity, "crc32": checksum(arrays)})
     _make_way(path)
     save = np.savez_compressed if compressed else np.savez
+    contents: dict[str, Any] = {**arrays, SEAL: np.array(seal)}
     with replaced_file(path) as partial:
-        save(partial, **arrays, **{SEAL: np.array(seal)})
+        save(partial, **contents)
 
 
 def read_arrays(path: pathlib.Path, identity: str) -> dict[str, np.ndarray]:

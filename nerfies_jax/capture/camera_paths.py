@@ -1,6 +1,6 @@
 """Camera paths for videos: cameras, and the times of the scene that they show."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -97,9 +97,8 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
             for position in positions
         ]
     )
-    return looking._replace(
-        pixel_aspect=np.broadcast_to(middle.pixel_aspect, (count,)).copy()
-    )
+    aspect: Any = np.broadcast_to(middle.pixel_aspect, (count,)).copy()
+    return looking._replace(pixel_aspect=aspect)
 
 
 def _across(up, train_cameras, target, least):
@@ -155,13 +154,14 @@ def smoothed(filmed: Camera, when: np.ndarray, times: np.ndarray) -> Camera:
     flip = np.ones((len(times), 3))
     flip[:, 2] = np.linalg.det(left @ right)  # a rotation, not a reflection
     lens = cameras.take(filmed, np.full(len(times), count // 2))
-    return lens._replace(
+    leaves: dict[str, Any] = dict(
         camera_from_world=((left * flip[:, None]) @ right).astype(np.float32),
         position=fitted[:, :3].astype(np.float32),
         skew_px=np.zeros_like(lens.skew_px),
         radial=np.zeros_like(lens.radial),
         tangential=np.zeros_like(lens.tangential),
     )
+    return lens._replace(**leaves)
 
 
 def times(count: int, loops: float = 1.0) -> np.ndarray:
@@ -217,7 +217,8 @@ def mean_up(train_cameras: Camera) -> np.ndarray:
     Returns:
       A unit vector, [3].
     """
-    up = -train_cameras.camera_from_world[:, 1, :].astype(np.float64).mean(axis=0)
+    down = np.asarray(train_cameras.camera_from_world, np.float64)[:, 1, :]
+    up = -down.mean(axis=0)
     return up / np.linalg.norm(up)
 
 
@@ -235,8 +236,8 @@ def focus_point(train_cameras: Camera, near: float, far: float) -> np.ndarray:
     Returns:
       The point in scene units, [3].
     """
-    axes = train_cameras.camera_from_world[:, 2, :].astype(np.float64)
-    centers = train_cameras.position.astype(np.float64)
+    axes = np.asarray(train_cameras.camera_from_world, np.float64)[:, 2, :]
+    centers = np.asarray(train_cameras.position, np.float64)
     across = across_ray(axes)
     system = across.sum(axis=0)
     mean_axis = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))

@@ -61,7 +61,7 @@ def undistort(
         exists[row] = inside
         out[row] = resampling.bilinear(images[row], place) * inside[..., None]
         for target, mask in zip(bent, masks, strict=True):
-            if target is not None:
+            if target is not None and mask is not None:
                 target[row] = resampling.nearest(mask[row], place) & inside
     return out, exists, bent, pinhole
 

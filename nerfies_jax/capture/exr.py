@@ -191,7 +191,7 @@ def write_exr(
       ValueError: If a value exceeds the range of its type, or shapes differ.
     """
     path = pathlib.Path(path)
-    channels = {}
+    channels: dict[str, np.ndarray] = {}
     if color is not None:
         channels |= dict(zip("RGB", np.moveaxis(color, -1, 0), strict=True))
     if alpha is not None:

@@ -156,7 +156,7 @@ def shrink_one(
     trimmed = np.s_[: lines * factor, : columns * factor]
     parts = (lines, factor, columns, factor)
     mean = shift[trimmed].reshape(*parts, 2).mean((1, 3), dtype=np.float64)
-    whole = seen[trimmed].reshape(parts).all((1, 3))
+    whole = np.all(seen[trimmed].reshape(parts), axis=(1, 3))
     return (mean / factor).astype(np.float32), whole
 
 

@@ -30,7 +30,7 @@ def write(flow: FrameFlow, ids: Sequence[str], folder: pathlib.Path, factor: int
     for name, shift, seen, rows in flows.sides(flows.shrink(flow, factor)):
         target = folder / f"{factor}x" / name
         target.mkdir(parents=True, exist_ok=True)
-        paired = np.flatnonzero(rows != np.arange(len(rows)))
+        paired = np.flatnonzero(rows != np.arange(len(rows))).tolist()
         neighbors[name] = {ids[row]: ids[rows[row]] for row in paired}
         for row in paired:
             both = np.concatenate([shift[row], seen[row, ..., None]], axis=-1)
@@ -76,7 +76,7 @@ def read(
             shift[row], seen[row] = _one(file, shrink_by, size)
             rows[row] = other
         leaves += [shift, seen, rows]
-    return FrameFlow(*leaves)
+    return FrameFlow._make(leaves)
 
 
 def _one(file, shrink_by, size):

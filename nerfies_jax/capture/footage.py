@@ -114,15 +114,15 @@ def from_film(
     Raises:
       CaptureError: If the video cannot be used.
     """
-    moments, scores = [], []
+    shown_at, sharpnesses = [], []
     with events.stage("decoding the video to find sharp frames") as stage:
         for seconds, gray in read_video(film, gray=True, damaged="skip"):
-            moments.append(seconds)
-            scores.append(sharpness(gray))
-            stage.advance(text=f"{len(scores):,} frames")
+            shown_at.append(seconds)
+            sharpnesses.append(sharpness(gray))
+            stage.advance(text=f"{len(shown_at):,} frames")
     # Frames come in the order in which they are shown, but .avi has only the times at
     # which they are decoded, and B-frames are not decoded in that order.
-    moments, scores = np.sort(moments), np.array(scores)
+    moments, scores = np.sort(shown_at), np.array(sharpnesses)
     stamps = np.round(1000 * moments)  # as names keep them
     # One or two of a phone's film may share one; of a film without times all do.
     if len(np.unique(stamps)) < OWN_TIMES * len(stamps):
@@ -367,7 +367,7 @@ def _focal(files: Sequence[pathlib.Path]) -> float | None:
         with _opened(file) as picture:
             value = picture.getexif().get_ifd(_EXIF).get(_FOCAL_35MM)
         # Strangers' files hold anything here: several numbers, a word, 0 for unknown.
-        if isinstance(value, numbers.Real) and 0 < value < math.inf:
+        if isinstance(value, numbers.Real) and 0 < float(value) < math.inf:
             focals.append(float(value) / FULL_FRAME_MM)
     return float(np.median(focals)) if focals else None
 

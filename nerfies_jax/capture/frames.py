@@ -350,7 +350,7 @@ def hold_out_in_time(
     Returns:
       Training rows and held-out rows, each in ascending order.
     """
-    order = np.lexsort((times, camera_ids))
+    order = np.lexsort((np.asarray(times), np.asarray(camera_ids)))
     kept, scored = hold_out_every(len(order), every, where)
     return np.sort(order[kept]), np.sort(order[scored])
 

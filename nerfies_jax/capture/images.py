@@ -260,6 +260,7 @@ def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
             "by alpha or not; lay it over its background first, or save it as a PNG"
         )
     stored = exr.in_display_window(path, stored)
+    assert stored.color is not None
     color = np.round(srgb_from_linear(stored.color) * 255).astype(np.uint8)
     known = stored.color_finite
     if known.all():

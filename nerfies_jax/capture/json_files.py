@@ -92,7 +92,7 @@ def probe(folder: AnyPath) -> None:
     Raises:
       OSError: If it cannot be written.
     """
-    with tempfile.TemporaryFile(dir=folder) as file:
+    with tempfile.TemporaryFile(dir=os.fspath(folder)) as file:
         file.write(bytes(4096))
         file.flush()
 
@@ -241,7 +241,7 @@ def sweep(folder: AnyPath) -> list[pathlib.Path]:
     Returns:
       The hidden paths that were removed or renamed.
     """
-    swept = []
+    swept: list[pathlib.Path] = []
     try:
         paths = sorted(pathlib.Path(folder).glob(".*"))
     except OSError:

@@ -1,6 +1,6 @@
 """Smooth camera paths through keyframes."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -63,11 +63,11 @@ def through(keyframes: list[Keyframe], size: tuple[int, int], count: int) -> Cam
     )
     x, y, z, log_focal, time = PchipInterpolator(knots, curve)(at).T
     lens = cameras.take(chosen, np.zeros(count, int))
-    path = lens._replace(
-        camera_from_world=RotationSpline(knots, turns)(at)
-        .as_matrix()
-        .astype(np.float32),
+    turned = RotationSpline(knots, turns)(at).as_matrix()
+    leaves: dict[str, Any] = dict(
+        camera_from_world=turned.astype(np.float32),
         position=np.stack([x, y, z], axis=1).astype(np.float32),
         focal_px=np.exp(log_focal).astype(np.float32),
     )
+    path = lens._replace(**leaves)
     return CameraPath(path, size, np.clip(time, 0, 1).astype(np.float32))

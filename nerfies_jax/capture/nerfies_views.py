@@ -287,7 +287,7 @@ def camera_entry(one: Camera, capture: Capture, size: tuple[int, int]) -> dict:
     Returns:
       JSON values, in world units.
     """
-    position = one.position.astype(np.float64) / capture.scale + capture.center
+    position = np.asarray(one.position, np.float64) / capture.scale + capture.center
     return {
         "orientation": one.camera_from_world.tolist(),
         "position": position.tolist(),

@@ -4,6 +4,7 @@ renders.
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,7 +35,7 @@ def as_pinholes(capture: Capture) -> Capture:
         return capture
     images = np.empty_like(capture.images)
     filmed = np.empty(images.shape[:3], bool)
-    masks = {
+    masks: dict[str, Any] = {
         name: None if array is None else np.empty_like(array)
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
     }

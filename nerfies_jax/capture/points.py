@@ -70,8 +70,8 @@ def place_by_cameras(cameras: Camera) -> Placement:
     Returns:
       The placement.
     """
-    axes = cameras.camera_from_world[:, 2].astype(np.float64)
-    positions = cameras.position.astype(np.float64)
+    axes = np.asarray(cameras.camera_from_world, np.float64)[:, 2]
+    positions = np.asarray(cameras.position, np.float64)
     across = across_ray(axes)
     matrix, right = across.sum(0), np.einsum("nij,nj->i", across, positions)
     # Parallel axes meet nowhere; then the cameras' own spread sets the size.

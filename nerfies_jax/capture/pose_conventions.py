@@ -43,7 +43,7 @@ def check(
     shares = {
         name: _share(other, points, size) for name, other in _others(cameras).items()
     }
-    likely = max(shares, key=shares.get)
+    likely = max(shares, key=shares.__getitem__)
     if shares[likely] >= CONVINCING:
         raise CaptureError(
             f"{where}: {share:.0%} of the points fall into the images, and "

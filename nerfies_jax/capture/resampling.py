@@ -20,9 +20,9 @@ def array_places(
     """
     place = np.moveaxis(pixels[..., ::-1], -1, 0) - 0.5  # centers lie at +0.5
     last = np.array(source_size[::-1])[:, None, None] - 1
-    inside = np.isfinite(place).all(0)
+    inside = np.all(np.isfinite(place), axis=0)
     place = np.where(inside, place, 0)
-    inside &= (place >= 0).all(0) & (place <= last).all(0)
+    inside &= np.all((place >= 0) & (place <= last), axis=0)
     return np.where(inside, place, 0), inside
 
 

@@ -199,7 +199,7 @@ def notes(found: list[Intrinsics], size: tuple[int, int]) -> tuple[str, ...]:
     Returns:
       Notes.
     """
-    lines = ()
+    lines: tuple[str, ...] = ()
     sizes = {one.size for one in found if one.size != size and not one.larger}
     if sizes:
         width, height = min(sizes)

@@ -96,6 +96,7 @@ def write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
       units: "scene" or "world" units.
     """
     cloud = capture.points
+    assert cloud is not None
     # World coordinates may be large: meters of a map need more than float32 has.
     kind = "f4" if units == "scene" else "f8"
     fields = [(axis, kind) for axis in "xyz"]

@@ -106,7 +106,7 @@ def _encode(av, partial, path, first, frames, frames_per_second, quality):
         container.mux(stream.encode())
 
 
-def transfer_of(path: AnyPath) -> Transfer | None:
+def transfer_of(path: pathlib.Path) -> Transfer | None:
     """Return the transfer function of an HDR video.
 
     Args:

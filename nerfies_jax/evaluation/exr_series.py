@@ -67,8 +67,8 @@ def write_frame(
     exr.write_exr(
         path,
         color=images.linear_from_srgb(np.clip(rendering.color, 0, 1)),
-        alpha=rendering.alpha,
-        depth=rendering.depth,
+        alpha=np.asarray(rendering.alpha),
+        depth=None if rendering.depth is None else np.asarray(rendering.depth),
         extra=extra,
         header=exr_camera.attributes(view.camera, (width, height), float(view.time)),
     )

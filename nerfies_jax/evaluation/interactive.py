@@ -1,7 +1,7 @@
 """Cameras, image sizes and channels of an interactive viewer, without any GUI."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -55,7 +55,8 @@ def camera_of(eye: Eye, size: tuple[int, int]) -> Camera:
     focal_px = width / height / eye.aspect * vertical_px
     turn = Rotation.from_quat(eye.quaternion, scalar_first=True).as_matrix()
     one = cameras.pinhole(turn.T, eye.position, focal_px, size)
-    return one._replace(pixel_aspect=np.float32(vertical_px / focal_px))
+    aspect: Any = np.float32(vertical_px / focal_px)
+    return one._replace(pixel_aspect=aspect)
 
 
 class Pyramid(NamedTuple):
@@ -111,7 +112,8 @@ def pyramid(full: tuple[int, int], tile_pixels: int) -> Pyramid:
     """
     levels = 1
     while True:
-        tile = tuple(math.ceil(side / (1 << levels - 1)) for side in full)
+        width, height = (math.ceil(side / (1 << levels - 1)) for side in full)
+        tile = width, height
         enough = math.prod(tile) <= tile_pixels
         if enough or min(tile) < 2 * SHORTEST_SIDE_PX:
             return Pyramid(tile, levels)
@@ -130,7 +132,7 @@ def tile_camera(camera: Camera, pyramid: Pyramid, cell: tuple[int, int]) -> Came
       The camera with its principal point shifted.
     """
     corner = np.multiply(cell, pyramid.tile)
-    shifted = np.asarray(camera.principal_point_px) - corner
+    shifted: Any = np.asarray(camera.principal_point_px) - corner
     return camera._replace(principal_point_px=shifted.astype(np.float32))
 
 
@@ -183,12 +185,13 @@ def as_channel(
         `distance`.
     """
     if channel == "color":
-        return Colored(as_picture(rendering.color), 0.0, 1.0)
+        return Colored(as_picture(np.asarray(rendering.color)), 0.0, 1.0)
     if channel == "opacity":
-        gray = np.repeat(as_picture(rendering.alpha)[..., None], 3, axis=-1)
-        return Colored(gray, 0.0, 1.0)
+        gray = as_picture(np.asarray(rendering.alpha))[..., None]
+        return Colored(np.repeat(gray, 3, axis=-1), 0.0, 1.0)
     if channel == "depth":
-        return pictures.color_depth(rendering.depth, rendering.alpha > 0.5, limits)
+        solid = np.asarray(rendering.alpha) > 0.5
+        return pictures.color_depth(np.asarray(rendering.depth), solid, limits)
     if channel == "motion" and distance is not None:
         return pictures.color_distance(distance, 0.0 if limits is None else limits[1])
     raise ValueError(f"channel {channel!r}: there are {', '.join(CHANNELS)}")

@@ -30,8 +30,5 @@ class ThroughLens:
         flat = np.concatenate([drawn.color, np.asarray(drawn.alpha)[..., None]], -1)
         flat = np.where(inside[..., None], resampling.bilinear(flat, place), 0)
         depth = np.asarray(drawn.depth)
-        return Rendering(
-            flat[..., :3],
-            flat[..., 3],
-            np.where(inside, resampling.nearest(depth, place), 0).astype(depth.dtype),
-        )
+        bent = np.where(inside, resampling.nearest(depth, place), 0).astype(depth.dtype)
+        return Rendering._make((flat[..., :3], flat[..., 3], bent))

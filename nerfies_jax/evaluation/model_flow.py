@@ -95,7 +95,7 @@ def picture_flow(
       `pixel_flow` has no result.
     """
     pixels = _pixels(rendering)
-    depth = np.where(rendering.alpha > 0.5, rendering.depth, 0)
+    depth = np.where(rendering.alpha > 0.5, np.asarray(rendering.depth), 0)
     flow = pixel_flow(move, state, here, there, pixels, depth.ravel())
     return flow.reshape(*rendering.alpha.shape, 2)
 
@@ -116,8 +116,9 @@ def picture_distance(
       Distances in scene units [height, width], NaN where opacity is below one half or
       the point is lost.
     """
-    depth = rendering.depth.ravel()
-    known = (rendering.alpha.ravel() > 0.5) & np.isfinite(depth) & (depth > 0)
+    depth = np.asarray(rendering.depth).ravel()
+    solid = np.asarray(rendering.alpha).ravel() > 0.5
+    known = solid & np.isfinite(depth) & (depth > 0)
     points = surface(here.camera, _pixels(rendering), np.where(known, depth, 1))
     moved = move(state, points, here, there)
     distance = np.linalg.norm(moved.points - points, axis=1)

@@ -144,7 +144,7 @@ def color_flow(flow: np.ndarray, largest: float | int | None = None) -> Colored:
     color = skimage.color.hsv2rgb(
         np.stack([hue, saturation, np.ones_like(hue)], axis=-1)
     )
-    picture = np.where(shown[..., None], as_bytes(color), np.uint8(UNKNOWN))
+    picture = np.where(shown[..., None], as_bytes(color), np.array(UNKNOWN, np.uint8))
     return Colored(picture, 0.0, float(largest))
 
 
@@ -365,7 +365,7 @@ def _span(low, high):
 def _mapped(unit, shown, row):
     table = _tables()[row]
     index = np.round(np.clip(unit, 0, 1) * 255).astype(np.uint8)
-    return np.where(shown[..., None], table[index], np.uint8(UNKNOWN))
+    return np.where(shown[..., None], table[index], np.array(UNKNOWN, np.uint8))
 
 
 @functools.cache

@@ -28,7 +28,7 @@ class Renderer:
 
     def __init__(self, model: Model, size: tuple[int, int]):
         self._model = model
-        self._programs = {}
+        self._programs: dict[tuple, Any] = {}
         self._prepared = _Memo()
         self._deformed = _Memo()
         self.size = size  # width and height in pixels

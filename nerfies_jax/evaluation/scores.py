@@ -70,7 +70,7 @@ def score(
         rows=np.asarray(rows),
         color=np.clip(np.stack([r.color for r in renderings]), 0, 1),
         alpha=np.stack([r.alpha for r in renderings]),
-        depth=np.stack([r.depth for r in renderings]),
+        depth=np.stack([np.asarray(r.depth) for r in renderings]),
         psnr=psnr,
         ssim=ssim,
     )

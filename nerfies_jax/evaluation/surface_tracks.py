@@ -65,7 +65,8 @@ def follow(
     start = rows[np.argmin(np.abs(times - time))]
     here = view_of(capture, start)
     rendering = draw(state, here)
-    shown = np.argwhere((rendering.alpha > LEAST_ALPHA) & (rendering.depth > 0))
+    surface_depth = np.asarray(rendering.depth)
+    shown = np.argwhere((rendering.alpha > LEAST_ALPHA) & (surface_depth > 0))
     if not len(shown):
         raise ValueError(
             f"nothing is drawn at time {capture.times[start]:g} to pick points from; "
@@ -73,7 +74,7 @@ def follow(
         )
     line, column = spread(shown, count).T
     pixels = np.stack([column, line], axis=1) + 0.5
-    points = model_flow.surface(here.camera, pixels, rendering.depth[line, column])
+    points = model_flow.surface(here.camera, pixels, surface_depth[line, column])
     places, seen, projected = [], [], []
     for row in rows.tolist():
         there = view_of(capture, row)
@@ -83,7 +84,8 @@ def follow(
             capture.cameras, row, moved.points.astype(np.float32), capture.size
         )
         column, line = np.where(inside[:, None], pixel, 0).astype(int).T
-        in_front = depth <= rendering.depth[line, column] * (1 + DEPTH_SLACK)
+        surface_depth = np.asarray(rendering.depth)
+        in_front = depth <= surface_depth[line, column] * (1 + DEPTH_SLACK)
         solid = rendering.alpha[line, column] > LEAST_ALPHA
         places.append(moved.points)
         seen.append(moved.found & inside & solid & in_front)

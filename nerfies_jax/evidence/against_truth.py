@@ -73,6 +73,7 @@ def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
       The errors.
     """
     small = record.looked_at(capture, evidence.factor)
+    assert small.moving is not None
     true = small.moving[evidence.row]
     either = (evidence.moving | true).sum()
     iou = (evidence.moving & true).sum() / either if true.any() else np.nan

@@ -159,7 +159,7 @@ def dis(times: int) -> Callable[..., np.ndarray]:
     """
     # Two: after a search from a guess, OpenCV 4.x finds something else without one.
     plain, guided = (
-        cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) for _ in range(2)
+        cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) for _ in range(2)
     )
     for search in (plain, guided):
         search.setFinestScale(0 if times > 1 else 1)

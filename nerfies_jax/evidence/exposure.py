@@ -90,8 +90,10 @@ def sightings(views: Views, points: np.ndarray) -> np.ndarray:
         # A pixel's blur: points are known to a fraction of one.
         picture = cv2.GaussianBlur(picture, (0, 0), 1)
         place = pixel[inside]
-        at = np.float32(place - 0.5)[:, None]
-        value = cv2.remap(picture, at, None, cv2.INTER_LINEAR)[:, 0]
+        at = (place - 0.5).astype(np.float32)[:, None]
+        # OpenCV takes one map of pairs, which its stubs do not know.
+        value = cv2.remap(picture, at, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+        value = value[:, 0]
         shown = views.valid[index][tuple(place[:, ::-1].astype(int).T)]
         usable = ((value > DARK) & (value < BRIGHT)).all(-1) & shown
         light[index, inside] = np.where(usable[:, None], np.log2(value), np.nan)

@@ -101,8 +101,8 @@ def table(
     Returns:
       Lines of text.
     """
-    heads = ("effect", "decision", "confidence", "cost per step")
-    heads += ("evidence", "threshold")
+    narrow_heads = ("effect", "decision", "confidence", "cost per step")
+    heads = (*narrow_heads, "evidence", "threshold")
     rows = [
         (
             one.effect,

@@ -27,10 +27,8 @@ def with_flow(capture: Capture) -> Capture:
     count = len(capture.images)
     shape = (count, height, width)
     own = np.arange(count, dtype=np.int32)
-    flow = FrameFlow(
-        np.zeros((*shape, 2), np.float32), np.zeros(shape, bool), own.copy(),
-        np.zeros((*shape, 2), np.float32), np.zeros(shape, bool), own.copy(),
-    )  # fmt: skip
+    one_way = np.zeros((*shape, 2), np.float32), np.zeros(shape, bool), own
+    flow = FrameFlow._make(leaf.copy() for leaf in one_way * 2)
     for camera in np.unique(capture.camera_ids[capture.train]):
         mine = capture.train[capture.camera_ids[capture.train] == camera]
         if len(mine) < 2:

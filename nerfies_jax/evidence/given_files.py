@@ -8,6 +8,7 @@ Errors name the file, the bound and the remedy.
 import dataclasses
 import pathlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +60,8 @@ def attached(capture: Capture, files: GivenFiles) -> Capture:
             "other tools are of other pixels than those looked at; undistort the "
             "capture first, as COLMAP's image_undistorter does"
         )
-    parts, notes = {}, capture.notes
+    parts: dict[str, Any] = {}
+    notes = capture.notes
     if files.tracks is not None:
         parts |= _tracks(files.tracks, capture)
     if files.masks is not None:

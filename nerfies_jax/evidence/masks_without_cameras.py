@@ -55,8 +55,10 @@ def moving_masks(images: np.ndarray) -> np.ndarray:
     width, height = whole.size
     side = 2 * round(RIM_SHARE * width) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    enlarged = (cv2.resize(np.float32(one), (width, height)) > 0.5 for one in moves)
-    return np.stack([cv2.dilate(np.uint8(one), disc) > 0 for one in enlarged])
+    enlarged = (
+        cv2.resize(one.astype(np.float32), (width, height)) > 0.5 for one in moves
+    )
+    return np.stack([cv2.dilate(one.astype(np.uint8), disc) > 0 for one in enlarged])
 
 
 @events.stage("finding what moves")

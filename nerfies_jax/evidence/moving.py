@@ -127,7 +127,8 @@ def may_move(share: np.ndarray) -> np.ndarray:
     """
     size = 2 * round(RIM_PX * picture_scale(share.shape[2])) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return np.stack([cv2.dilate(np.uint8(one > OPEN), disc) > 0 for one in share])
+    seeds = (share > OPEN).astype(np.uint8)
+    return np.stack([cv2.dilate(one, disc) > 0 for one in seeds])
 
 
 def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:

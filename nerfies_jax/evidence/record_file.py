@@ -2,7 +2,7 @@
 
 import hashlib
 import pathlib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,17 @@ class Evidence(NamedTuple):
     factor: int  # of the capture's pixels for one of these
     left_out: str  # what is beyond the budget of work; empty if that was enough
     seconds: Seconds
+
+
+# The fields that are records of arrays or numbers.
+RECORDS: dict[str, type[NamedTuple]] = {
+    "flow": NeighborFlow,
+    "tracks": Tracks,
+    "rest": RestPoints,
+    "paths": Paths,
+    "still": PointCloud,
+    "seconds": Seconds,
+}
 
 
 def digest(capture: Capture, use_depths: bool = False) -> str:
@@ -73,9 +84,9 @@ def save(path: pathlib.Path, evidence: Evidence) -> None:
       path: The file.
       evidence: The record.
     """
-    arrays = {}
+    arrays: dict[str, np.ndarray] = {}
     for name, part in evidence._asdict().items():
-        if isinstance(part, tuple):
+        if name in RECORDS:
             arrays |= {f"{name}.{key}": value for key, value in part._asdict().items()}
         else:
             arrays[name] = np.asarray(part)
@@ -102,20 +113,13 @@ def load(path: pathlib.Path) -> Evidence:
       ValueError: If the content is anything else.
       OSError: If it cannot be read.
     """
-    kinds = {
-        "flow": NeighborFlow,
-        "tracks": Tracks,
-        "rest": RestPoints,
-        "paths": Paths,
-        "still": PointCloud,
-        "seconds": Seconds,
-    }
     arrays = cache_files.read_arrays(path, _identity(path))
-    parts = {}
+    parts: dict[str, Any] = {}
     for name in Evidence._fields:
-        if name in kinds:
-            fields = kinds[name]._fields
-            parts[name] = kinds[name](*(arrays[f"{name}.{key}"] for key in fields))
+        if name in RECORDS:
+            fields = RECORDS[name]._fields
+            leaves = (arrays[f"{name}.{key}"] for key in fields)
+            parts[name] = RECORDS[name]._make(leaves)
         else:
             parts[name] = arrays[name]
     parts["seconds"] = Seconds(*(float(part) for part in parts["seconds"]))

@@ -57,8 +57,7 @@ def refined(
     """
     position, known = paths.position.copy(), paths.known.copy()
     every = -(-len(views.time) // MOST_FRAMES)
-    some = _some_frames(views, tracks, paths, every)
-    few = some[-1]
+    some_views, some_tracks, few = _some_frames(views, tracks, paths, every)
     left = few.known.sum(1) >= LEAST_KNOWN
     if left.sum() < FEWEST:
         return paths
@@ -72,7 +71,7 @@ def refined(
         if not has_room(_work(own, few)):
             break
         rows = np.flatnonzero(left)
-        grown = _grown(*some, own, rows, has_room)
+        grown = _grown(some_views, some_tracks, few, own, rows, has_room)
         if grown is None:
             continue
         own, body = grown

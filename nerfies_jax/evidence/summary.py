@@ -93,7 +93,7 @@ def lines(summary: Summary, evidence: Evidence) -> list[str]:
     smaller = f", made {summary.factor} times smaller" if summary.factor > 1 else ""
     parts = [
         f"{words} {seconds:.1f}"
-        for words, seconds in zip(PARTS, evidence.seconds, strict=True)
+        for words, seconds in zip(PARTS.values(), evidence.seconds, strict=True)
     ]
     took = f"{summary.seconds:.0f} s of the processor: " + ", ".join(parts)
     sentences = [

@@ -23,7 +23,7 @@ def flow(given: Given, views: Views) -> NeighborFlow | None:
     Returns:
       The flow, None if there is none.
     """
-    if given.forward is None:
+    if given.forward is None or given.backward is None:
         return None
     forward, backward = (
         np.stack([_resized_flow(one, views.size) for one in side[views.row]])

@@ -305,10 +305,10 @@ def depth_span(capture: Capture, views: Views) -> tuple[float, float]:
     for index in range(len(views.row)):
         pixel, depth = project(views, index, points)
         depths.append(depth[in_picture(views, pixel, depth)])
-    depths = np.concatenate(depths)
-    if not len(depths):
+    depth = np.concatenate(depths)
+    if not len(depth):
         return capture.near, capture.far
-    low, high = np.quantile(depths, (OUTSIDE, 1 - OUTSIDE))
+    low, high = np.quantile(depth, (OUTSIDE, 1 - OUTSIDE))
     # Moving objects are in front of the points of structure from motion.
     return max(capture.near, 0.5 * float(low)), 1.2 * float(high)
 

@@ -35,15 +35,14 @@ class Seconds(NamedTuple):
     still: float
 
 
-PARTS = Seconds(
-    "flow between neighbors",
-    "tracks and the points at rest that explain them best",
-    "what moves",
-    "paths in space",
-    "dense points at rest",
-)
-
-
+# By the fields of `Seconds`, in their order.
+PARTS = {
+    "flow": "flow between neighbors",
+    "tracks": "tracks and the points at rest that explain them best",
+    "moving": "what moves",
+    "paths": "paths in space",
+    "still": "dense points at rest",
+}
 STAGES = {
     "flow": "optical flow",
     "tracks": "point tracks",
@@ -79,10 +78,10 @@ class Watch:
         """Begin a part.
 
         Args:
-          part: A field of `PARTS`.
+          part: A key of `PARTS`.
         """
         self._began[part] = time.process_time()
-        self._tell(getattr(PARTS, part))
+        self._tell(PARTS[part])
         self._stage.close()
         self._stage.enter_context(events.stage(STAGES[part]))
 

@@ -75,7 +75,7 @@ class Camera(NamedTuple):
             not rigid, or the principal point lies far outside the image.
         """
         fields = matrices.camera_fields(K, camera_from_world, distortion)
-        camera = cls(**{name: value.astype(dtype) for name, value in fields.items()})
+        camera = cls._make(fields[name].astype(dtype) for name in cls._fields)
         validate(camera, (width, height), "Camera.from_K")
         return camera
 
@@ -297,7 +297,7 @@ def pinhole(
     Returns:
       A camera with NumPy leaves.
     """
-    return Camera(
+    leaves: dict[str, Any] = dict(
         camera_from_world=np.asarray(camera_from_world, dtype),
         position=np.asarray(position, dtype),
         focal_px=np.asarray(focal_px, dtype),
@@ -307,6 +307,7 @@ def pinhole(
         radial=np.zeros(3, dtype),
         tangential=np.zeros(2, dtype),
     )
+    return Camera(**leaves)
 
 
 def look_at(
@@ -389,7 +390,7 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
       ValueError: If a shape is wrong, a value is not finite, the orientation is not a
         rotation, or the intrinsics cannot belong to an image of `size`.
     """
-    shapes = Camera((3, 3), (3,), (), (2,), (), (), (3,), (2,))
+    shapes: list[tuple[int, ...]] = [(3, 3), (3,), (), (2,), (), (), (3,), (2,)]
     for field, leaf, shape in zip(Camera._fields, camera, shapes, strict=True):
         value = np.asarray(leaf)
         if value.shape[value.ndim - len(shape) :] != shape:

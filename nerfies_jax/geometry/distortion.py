@@ -140,10 +140,9 @@ def _bernstein(radial, tangential, slopes):
     along = across * jnp.arange(1, 8, dtype=slopes.dtype)
     p1, p2 = tangential[0], tangential[1]
     # The tangential Jacobian at `slopes`, linear in t, in the frame of the way.
-    xx, xy, yy = (
-        *(2 * p1 * y + 6 * p2 * x, 2 * p1 * x + 2 * p2 * y),
-        2 * p2 * x + 6 * p1 * y,
-    )
+    xx = 2 * p1 * y + 6 * p2 * x
+    xy = 2 * p1 * x + 2 * p2 * y
+    yy = 2 * p2 * x + 6 * p1 * y
     length = jnp.sqrt(jnp.where(radius_sq > 0, radius_sq, 1))
     ux, uy = jnp.where(radius_sq > 0, x, 1) / length, y / length
     first = ux * ux * xx + 2 * ux * uy * xy + uy * uy * yy

@@ -74,8 +74,9 @@ class _Pair:
         return call(leaves, argument)
 
     def swapped(self) -> "_Pair":
-        functions = dict(function=self.transpose, transpose=self.function)
-        return dataclasses.replace(self, **functions)
+        return dataclasses.replace(
+            self, function=self.transpose, transpose=self.function
+        )
 
 
 _linear_call = Primitive("linear_call_with_transpose")

@@ -168,8 +168,8 @@ def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
         *(w[1], xy, diagonal[2], yz),
         *(w[2], xz, yz, diagonal[3]),
     ]
-    rows = jnp.stack(rows).reshape(4, 4)
-    return _upper(normalize(rows[jnp.argmax(diagonal)]))
+    matrix = jnp.stack(rows).reshape(4, 4)
+    return _upper(normalize(matrix[jnp.argmax(diagonal)]))
 
 
 @checked(broadcast=True)

@@ -1,6 +1,7 @@
 """Measurements of time, memory and operations, and records of metrics."""
 
 import dataclasses
+import importlib.metadata
 import json
 import math
 import os
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jaxlib
+import jax.numpy as jnp
 import numpy as np
 import psutil
 
@@ -204,8 +205,8 @@ def compare(
     for function in functions.values():
         for _ in range(warm_up):
             jax.block_until_ready(function())
-    wall = {name: [] for name in functions}
-    cpu = {name: [] for name in functions}
+    wall: dict[str, list[float]] = {name: [] for name in functions}
+    cpu: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(repeats):
         for name, function in functions.items():
             wall_began, cpu_began = time.perf_counter(), time.process_time()
@@ -262,6 +263,8 @@ def cost_of(compiled: jax.stages.Compiled, compile_seconds: float) -> Cost:
     if isinstance(counted, list):  # one per computation on some backends
         counted = counted[0] if counted else {}
     memory = compiled.memory_analysis()
+    if memory is None:
+        raise ValueError("this backend does not report the memory of its programs")
     return Cost(
         float(counted.get("flops", math.nan)),
         float(counted.get("bytes accessed", math.nan)),
@@ -323,10 +326,10 @@ def machine() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "jax": jax.__version__,
-        "jaxlib": jaxlib.__version__,
+        "jaxlib": importlib.metadata.version("jaxlib"),
         "backend": device.platform,
         "device": device.device_kind,
-        "x64": bool(jax.config.jax_enable_x64),
+        "x64": jnp.result_type(float) == jnp.float64,
     }
 
 

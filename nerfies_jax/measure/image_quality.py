@@ -174,7 +174,7 @@ def ms_ssim(
     image, truth = widened(image), widened(truth)
     weights = SCALE_WEIGHTS[:scales]
     if scales < len(SCALE_WEIGHTS):
-        weights = [weight / sum(weights) for weight in weights]
+        weights = tuple(weight / sum(weights) for weight in weights)
     score = jnp.ones_like(image[0, 0])
     for scale, weight in enumerate(weights):
         luminance, contrast = _terms(image, truth, _window_mean)

@@ -6,7 +6,9 @@ says where they come from.
 """
 
 import dataclasses
+import functools
 import importlib.util
+import operator
 import os
 import pathlib
 from collections.abc import Iterable
@@ -131,7 +133,7 @@ def lpips(
       Zhang et al. 2018, arXiv:1801.03924, equation 1.
     """
     distances = _stage_distances(params, network, image, truth, scaling)
-    return sum(jnp.mean(distance) for distance in distances)
+    return functools.reduce(operator.add, map(jnp.mean, distances))
 
 
 def lpips_map(

@@ -181,4 +181,6 @@ def coarse_to_fine_window(
     References:
       Park et al. 2021 (Nerfies), arXiv:2011.12948, equation 8.
     """
+    if not isinstance(alpha, Array):
+        alpha = jnp.asarray(float(alpha))
     return anneal(num_frequencies, alpha)

@@ -301,7 +301,8 @@ def total_variation(plane: Float[Array, "first second features"]) -> Float[Array
     References:
       K-Planes, arXiv:2301.10241, equation 3.
     """
-    return sum(jnp.mean(jnp.square(jnp.diff(plane, axis=axis))) for axis in (0, 1))
+    along, across = (jnp.mean(jnp.square(jnp.diff(plane, axis=a))) for a in (0, 1))
+    return along + across
 
 
 def time_smoothness(

@@ -138,9 +138,12 @@ def at(
     beyond = functools.reduce(jnp.maximum, [jnp.abs(along) for along in scaled])
     beyond = jnp.maximum(beyond, 1)
     shrunk = (2 - 1 / beyond) / beyond
-    inside, place = True, []
-    for along in scaled:
-        cell = jnp.floor((along * shrunk / REACH + 1) * (cells / 2)).astype(jnp.int32)
-        inside &= (cell >= 0) & (cell < cells)
-        place.append(jnp.clip(cell, 0, cells - 1))
-    return ~inside | occupied[tuple(place)]
+    place = [
+        jnp.floor((along * shrunk / REACH + 1) * (cells / 2)).astype(jnp.int32)
+        for along in scaled
+    ]
+    inside = functools.reduce(
+        jnp.logical_and, [(cell >= 0) & (cell < cells) for cell in place]
+    )
+    nearest = tuple(jnp.clip(cell, 0, cells - 1) for cell in place)
+    return ~inside | occupied[nearest]

@@ -208,19 +208,20 @@ def encode(
     Raises:
       ValueError: If a time is needed but missing.
     """
-    position, grid = spec.position, GRIDS.get(type(spec.position))
-    parts = position.bands if grid is None else position.levels
+    position = spec.position
+    parts = position.bands if isinstance(position, EncodingSpec) else position.levels
     window = None
     if spec.anneal_steps is not None and step is not None and parts:
         window = schedules.band_window(parts, spec.anneal_steps, step, point.dtype)
-    if grid is None:
+    if isinstance(position, EncodingSpec):
         return encoding.encode(position, point, window)
-    if grid is not planes:
+    grid = GRIDS[type(position)]
+    if not isinstance(position, PlanesSpec):
         return grid.encode(position, params.tables, point, window)
     place = (grids.contract(point) + 2) / 4
     if spec.reads_time and time is not None:
         place = jnp.concatenate([place, time[None]])
-    found = planes.encode(position, params.tables, place)
+    found = grid.encode(position, params.tables, place)
     if window is not None:
         found = found * jnp.repeat(window, position.features)
     return found

@@ -3,6 +3,8 @@
 import pathlib
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from nerfies_jax.capture import images, video
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.json_files import replaced_folder
@@ -37,7 +39,7 @@ def render(
     with replaced_folder(out) as folder:
         places = [folder / f"{number:04d}.png" for number in range(len(views))]
         for number, (place, view) in enumerate(zip(places, views, strict=True), 1):
-            images.write_png(place, as_picture(renderer(state, view).color))
+            images.write_png(place, as_picture(np.asarray(renderer(state, view).color)))
             yield number
         try:
             video.library()

@@ -6,6 +6,7 @@ import sys
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -22,7 +23,7 @@ def provenance() -> dict[str, Any]:
         "jax": jax.__version__,
         "numpy": np.__version__,
         "device": jax.devices()[0].device_kind,
-        "x64": bool(jax.config.jax_enable_x64),
+        "x64": jnp.result_type(float) == jnp.float64,
     }
 
 

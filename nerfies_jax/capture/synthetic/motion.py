@@ -39,7 +39,8 @@ def unit_axis(axis: Vector) -> Vector:
     length = math.hypot(*axis)
     if not 0 < length < math.inf:
         raise ValueError(f"axis={axis} has no direction; give one that is not zero")
-    return tuple(float(part / length) for part in axis)
+    x, y, z = (float(part / length) for part in axis)
+    return x, y, z
 
 
 @dataclasses.dataclass(frozen=True)

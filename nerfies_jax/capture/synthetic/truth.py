@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import pathlib
 from concurrent.futures import Future
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +73,7 @@ def track_places(capture: Capture, truth: SceneTruth, rows: np.ndarray) -> np.nd
             f"{capture.name}: its frames lie between the {last + 1} instants of the "
             "truth; make the scene again"
         )
-    world = truth.track_world[:, instants] - np.float32(capture.center)
+    world = truth.track_world[:, instants] - np.array(capture.center, np.float32)
     return (world * capture.scale).astype(np.float32)
 
 
@@ -209,8 +209,8 @@ def flows(
     led = data_parallel.rows_on_devices(flow, spec, pairs, programs.flow.result())
     for index, result in zip(np.flatnonzero(known), led, strict=True):
         shift[index], seen[index] = result
-    forward = Flow(shift[:count], seen[:count])
-    return forward, Flow(shift[count:], seen[count:])
+    forward = Flow._make((shift[:count], seen[:count]))
+    return forward, Flow._make((shift[count:], seen[count:]))
 
 
 def tracks(
@@ -240,7 +240,8 @@ def tracks(
     thing = hits.thing.reshape(-1)[chosen].astype(np.int32)
     material = hits.material.reshape(-1, 3)[chosen]
     times = np.linspace(0, 1, spec.frames).astype(np.float32)
-    if len(chosen) == 0:  # a still scene; an empty batch would not divide into rows
+    # A static scene. An empty batch would not divide into rows.
+    if not len(chosen) or programs.follow is None or programs.watch is None:
         frames = len(plan.time)
         return (
             thing,
@@ -318,7 +319,7 @@ def load(path: pathlib.Path) -> SceneTruth:
             f"{path} holds no {sorted(missing)[0]!r}, so it is no scene truth of "
             "this version; delete it and make the scene again"
         )
-    fields = {name: stored[name] for name in SceneTruth._fields}
+    fields: dict[str, Any] = {name: stored[name] for name in SceneTruth._fields}
     for name in ("ids", "thing_names"):
         fields[name] = tuple(str(word) for word in fields[name])
     return SceneTruth(**fields)
