@@ -45,9 +45,9 @@ class NamedSource(CaptureSource):
     capture: Positional[pathlib.Path | None] = None
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF, COLMAP or LLFF layout."""
     scene: Annotated[str | None, options.Known(SCENES)] = None
-    """Which built-in scene, where no capture is given (default: default)."""
+    """Built-in scene to use if no capture is given (default: default)."""
     missing: Literal["refuse", "skip"] | None = None
-    """What to do with frames whose picture is missing (default: refuse)."""
+    """Handling of frames whose image is missing (default: refuse)."""
     files: Annotated[GivenFiles, tyro.conf.arg(name="")] = GivenFiles()
 
     def __post_init__(self):

@@ -45,7 +45,7 @@ class Compare:
     psnr: tuple[float, ...] = ()
     """Qualities in dB to wait for (default: what the runs but the best ended with)."""
     frames: int = 2
-    """Held-out frames in the picture; 0 renders none."""
+    """Held-out frames in the image. 0 renders none."""
     out: pathlib.Path | None = None
     """Folder for compare.json, curves.png and pictures.png (default: runs/compare)."""
     effect: cli.Effects = ()

@@ -46,20 +46,20 @@ class Export:
             *("path", "nerfies-path", "tracks", "exr"),
         ]
     ]
-    """Gaussians as ply, splat or spz, or with their motion, on cubics, as splatv; the
-    pictures learned from with their cameras and points as nerfstudio's transforms, a
-    colmap model or a nerfies directory; a camera path as nerfstudio's camera_path.json
-    (path) or Nerfies' folder (nerfies-path); tracks of points of a moving scene (npz);
-    exr pictures with camera and motion."""
+    """Gaussians as ply, splat or spz, or with their motion, on cubics, as splatv.
+    Training images with cameras and points as nerfstudio's transforms, a colmap model
+    or a nerfies directory. A camera path as nerfstudio's camera_path.json (path) or
+    Nerfies' folder (nerfies-path). Tracks of points of a dynamic scene (npz). exr
+    images with camera and motion."""
     time: float | None = None
     """Gaussians as they are at this time in [0, 1] (default: 0). Tracks: of what is
     seen then (default: 0.5)."""
     frames: int | None = None
-    """Gaussians: a folder of so many numbered files over the whole time. Tracks: over
-    so many of the frames learned from (default: 96 at most). Otherwise the pictures
-    along a path (default: 96)."""
+    """Gaussians: a folder of that many numbered files over the whole time. Tracks:
+    number of training frames (default: at most 96). Otherwise the images along a path
+    (default: 96)."""
     points: int | None = None
-    """How many points to track (default: 1000)."""
+    """Number of points to track (default: 1000)."""
     path: str | None = None
     """Where the camera goes, as for experiments.render (default: sway)."""
     units: Literal["scene", "world"] | None = None

@@ -21,7 +21,7 @@ class InspectScene:
 
     source: cli.Source = cli.NamedSource()
     seed: int = 0
-    """Of the built-in scene."""
+    """Seed of the built-in scene."""
     full: bool = False
     """Advise presets of the papers' sizes instead of those for a CPU."""
     picture: pathlib.Path | None = None

@@ -22,15 +22,15 @@ class MakeScene:
     """
 
     out: cli.Positional[pathlib.Path]
-    """Folder to write; must not hold anything yet."""
+    """Folder to write. It must be empty or missing."""
     preset: Literal[cli.SCENES] = "default"
-    """Which scene."""
+    """Scene to render."""
     frames: int | None = None
-    """Instants to film; the preset's own number if not given."""
+    """Number of timestamps (default: the preset's)."""
     size: tuple[int, int] | None = None
-    """Width and height in pixels; the preset's own if not given."""
+    """Width and height in pixels (default: the preset's)."""
     seed: int = 0
-    """Moves the hand and the exposure, and draws the points; not the things."""
+    """Seed of the camera path, the exposure and the points, but not of the objects."""
     set: cli.Overrides = ()
     """Any other setting of the scene, as path.to.field=value."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"

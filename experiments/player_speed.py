@@ -214,11 +214,11 @@ class PlayerSpeed:
     size: int = 600
     """Width and height of the canvases, in pixels."""
     time: float = 0.5
-    """Which time of the scene is drawn, from 0 to 1."""
+    """Time of the scene to render, from 0 to 1."""
     frames: int = 4
     """Frames in a row of one player."""
     rounds: int = 9
-    """How often each player has its turn."""
+    """Rounds of measurements, in which the players take turns."""
     out: pathlib.Path = pathlib.Path("player_speed.json")
     """Keeps the numbers."""
 

@@ -30,11 +30,11 @@ class Npz:
     file: cli.Positional[pathlib.Path]
     """The archive."""
     out: cli.Positional[pathlib.Path]
-    """Folder to write; must not hold anything yet."""
+    """Folder to write. It must be empty or missing."""
     heldout: str | None = None
     """Rows to score on, as first:last+1."""
     train: str | None = None
-    """Rows to learn from, as first:last+1; all others if not given."""
+    """Training frames as first:last+1 (default: all others)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Video:
     """A film: its sharpest frames, their cameras by COLMAP, as a Nerfies directory."""
 
     file: cli.Positional[pathlib.Path]
-    """The film."""
+    """The video."""
     out: cli.Positional[pathlib.Path]
-    """Folder to write; must not hold anything yet."""
+    """Folder to write. It must be empty or missing."""
     how: How = Preparation()
 
 
@@ -53,9 +53,9 @@ class Pictures:
     """A folder of pictures: cameras by COLMAP, as a Nerfies directory."""
 
     file: cli.Positional[pathlib.Path]
-    """Folder with the pictures, in the order of their names."""
+    """Folder of images, in the order of their names."""
     out: cli.Positional[pathlib.Path]
-    """Folder to write; must not hold anything yet."""
+    """Folder to write. It must be empty or missing."""
     how: How = Preparation()
 
 

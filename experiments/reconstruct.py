@@ -37,30 +37,29 @@ class Reconstruct:
     source: cli.Source = cli.NamedSource()
     preset: cli.Preset = None
     """Gaussian splats: splats-static, splats-mcmc, splats-tracked, splats-deformable,
-    sonata, moba, dynmf, spacetime, spline, 4dgs, e-d3dgs, sc-gs, edgs, d-miso,
-    adc-gs, motion-gs. Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies,
-    hypernerf, nsff, tineuvox, nerf-ds. Each with -small is made for a CPU; only so
-    there are nerf-grid, nerf-w-grid, d-nerf-grid, nerfies-grid, hypernerf-grid,
-    nsff-grid, on a grid of features (default: splats-tracked-small;
-    splats-static-small where nothing moves, spacetime-small from rest where what
-    moves cannot be followed)."""
+    sonata, moba, dynmf, spacetime, spline, 4dgs, e-d3dgs, sc-gs, edgs, d-miso, adc-gs,
+    motion-gs. Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff,
+    tineuvox, nerf-ds. Each has a version for a CPU with the suffix -small. nerf-grid,
+    nerf-w-grid, d-nerf-grid, nerfies-grid, hypernerf-grid and nsff-grid, on feature
+    grids, exist with -small only (default: splats-tracked-small, splats-static-small if
+    nothing moves, or spacetime-small without tracks if tracking fails)."""
     effects: Literal["preset", "auto"] = "preset"
     """auto: look at the capture first and take the effects that it calls for, in the
     representation and size of the preset (see experiments.inspect_scene)."""
     steps: int | None = None
-    """Steps of training; schedules stretch with them."""
+    """Training steps. Schedules are stretched with them."""
     seconds: float | None = None
     """Train for so many seconds, without compiling: schedules stretch with the steps
     that fit. With --steps or --resume: stop after them, whatever the step."""
     out: pathlib.Path | None = None
     """Run folder (default: runs/CAPTURE-PRESET)."""
     resume: bool = False
-    """Continue the run in --out from its last checkpoint; without --out the newest run
-    of the capture or film that is named, in the folder runs."""
+    """Continue the run in --out from its last checkpoint. Without --out, the newest run
+    of the given capture or video in the folder runs."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
     seed: int | None = None
-    """Of everything random (default: 0)."""
+    """Seed of all random numbers (default: 0)."""
     set: cli.Overrides = ()
     """Fields of the preset, densification.cap_max=20000 motion.width=128 warp=none,
     say; experiments.settings lists those there are."""
@@ -72,16 +71,16 @@ class Reconstruct:
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
     checkpoint_every: float = 60.0
-    """Seconds between two checkpoints; a run that is killed loses no more than that."""
+    """Seconds between two checkpoints, which is the most that a killed run loses."""
     view: bool = False
-    """Look around in the scene while it is trained, in the browser of this machine, as
-    experiments.view does afterwards; training waits for what is drawn."""
+    """View the scene while it trains, in the browser of this machine, as
+    experiments.view does afterwards. Training waits while it renders."""
     log: tuple[Literal["tensorboard", "wandb", "rerun"], ...] = ()
-    """Experiment trackers that receive losses and scores while the run is trained, in
-    addition to events.jsonl (docs/events.md); extra log."""
+    """Experiment trackers that receive losses and metrics during training, in addition
+    to events.jsonl (docs/events.md); extra log."""
     more: cli.More = MoreMetrics()
     prepare: Preparation = Preparation()
-    """Of a film, or a folder of pictures without cameras."""
+    """Options for a video or a folder of images without cameras."""
 
 
 @cli.command(Reconstruct)

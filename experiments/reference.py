@@ -22,7 +22,7 @@ class Reference:
     """Build the API reference."""
 
     out: pathlib.Path = pathlib.Path("build/reference")
-    """Folder for its pages; index.html is the first."""
+    """Folder of the pages, which starts with index.html."""
 
 
 @cli.command(Reference)

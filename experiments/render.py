@@ -41,14 +41,14 @@ class Render:
     run: cli.Positional[pathlib.Path]
     """Run folder that experiments.reconstruct made."""
     path: str = "heldout"
-    """heldout: the held-out frames. Or a camera moving within the filmed span (sway,
-    lemniscate), in a circle (orbit), as it was filmed (captured), or so without its
-    shake (stabilized). Or a file: nerfstudio's camera_path.json, or a folder of
+    """heldout: the held-out frames. Or a camera path within the captured viewpoints
+    (sway, lemniscate), on a circle (orbit), as captured (captured), or captured and
+    smoothed (stabilized). Or a file: nerfstudio's camera_path.json, or a folder of
     Nerfies' camera files."""
     frames: int | None = None
-    """Pictures along a camera path (default: 96; a file has its own)."""
+    """Images along a camera path (default: 96, or those of a file)."""
     freeze: float | None = None
-    """Stop the scene at this time in [0, 1]; the camera goes on."""
+    """Render at this fixed time in [0, 1], along the whole path."""
     slow: float = 1.0
     """Play so many times slower: 4 shows a quarter of the scene in the same frames."""
     without: Annotated[tuple[str, ...], tyro.conf.arg(metavar="EFFECT ...")] = ()
@@ -57,32 +57,31 @@ class Render:
     appearance: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="FROM TO")] = (
         None
     )
-    """Go from one appearance to another along the pictures: two frame names, or two
+    """Interpolate between two appearances along the path: two frame names, or two
     appearance ids."""
     knots: int | None = None
-    """Evaluate the motion of Gaussians at so many instants only and interpolate between
-    them; docs/results/deformation_cost.md shows what that costs and saves."""
+    """Evaluate the motion of Gaussians at this many times only and interpolate between
+    them; docs/results/deformation_cost.md has the error and the speedup."""
     interpolation: Literal["linear", "cubic"] = "linear"
     """Between the knots."""
     static_threshold: Annotated[float | None, cli.formerly("--still-below")] = None
-    """Do not evaluate the motion of Gaussians that move less than this, in scene units;
-    1e-4 is not seen."""
+    """Skip the deformation of Gaussians whose displacement is below this (scene units).
+    1e-4 is visually lossless."""
     hide_moving: float | None = None
-    """Leave out the Gaussians that move farther than this, in scene units: the static
-    scene. What was never filmed behind what moves is guessed where the motion started
-    from tracks, and a hole elsewhere."""
+    """Hide Gaussians that move farther than this (scene units), to show the static
+    scene. Occluded background is inpainted if the motion was initialized from tracks,
+    and empty otherwise."""
     show: Literal["color", "depth", "flow"] = "color"
-    """What the png and mp4 pictures show; depth is bright near and dark far, flow is
-    where what is seen goes up to the next picture: direction as hue, length as
-    saturation."""
+    """Channel of the png and mp4 images. Depth is bright near and dark far. Flow to the
+    next image has its direction as hue and its length as saturation."""
     out: pathlib.Path | None = None
     """Folder for the images (default: RUN/renders/NAME, named by the settings)."""
     overwrite: bool = False
     """Replace an earlier render of other settings or of another step."""
     formats: tuple[Literal["png", "mp4", "exr"], ...] = ("png", "mp4")
-    """What to write: png pictures, one mp4, exr with linear color, alpha and depth."""
+    """Formats to write: png images, one mp4, exr with linear color, alpha and depth."""
     max_side: int | None = None
-    """Longest side of the pictures, in pixels (default: as trained)."""
+    """Longest side of the images, in pixels (default: as trained)."""
     effect: cli.Effects = ()
     """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
     so they are loaded only if they are named here again."""

@@ -179,9 +179,9 @@ class Results:
     """Write pages of docs/results from the files of numbers that are kept."""
 
     pages: cli.Positional[tuple[str, ...]] = ()
-    """Which pages (default: every one whose numbers are there)."""
+    """Pages to write (default: every one with stored numbers)."""
     measured: pathlib.Path | None = None
-    """What a study wrote: kept as the numbers of the one page named."""
+    """File of a study, to store as the numbers of the one page named."""
 
     def __post_init__(self):
         unknown = [name for name in self.pages if name not in STUDIES]

@@ -24,7 +24,7 @@ class Settings:
     """List the fields of a preset that --set can change."""
 
     preset: cli.Positional[cli.Preset]
-    """As for experiments.reconstruct."""
+    """Preset, as for experiments.reconstruct."""
 
 
 @cli.command(Settings)

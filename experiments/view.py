@@ -28,7 +28,7 @@ class View:
     """Run folder that experiments.reconstruct made, or is making: then as it was last
     saved."""
     port: int = cli.VIEW_PORT
-    """Where to listen, on this machine alone; the next one that is free is taken."""
+    """Port on this machine. The next free one is used."""
     max_side: int | None = None
     """Longest side of the finest images rendered here, in pixels (default: as
     trained)."""

@@ -20,10 +20,10 @@ class Ablate:
     }
 
     suite: Literal["fields", "tracked", "poses", "sonata", "moba", "presets"] = "fields"
-    """Radiance fields; the parts of splats-tracked-small; cameras that are refined in
-    training; the ablations of Sonata or of MoBa-GS; or every small preset."""
+    """Methods to compare: radiance fields, the parts of splats-tracked-small, pose
+    refinement, the ablations of Sonata or MoBa-GS, or every small preset."""
     arms: tuple[str, ...] = ()
-    """Which arms of the suite (default: all)."""
+    """Methods of the suite (default: all)."""
     source: cli.SourceOptions = CaptureSource()
     steps: int | None = None
     """Steps of training of every arm (default: the presets' own)."""
@@ -34,14 +34,14 @@ class Ablate:
     """Whose seconds --seconds are: the processor's are those of all threads, and what
     else the machine does is not in them."""
     seeds: int | None = None
-    """How many seeds (default: 1 for fields, otherwise 3); from two on, differences
-    are held against their spread."""
+    """Number of seeds (default: 1 for fields, otherwise 3). With two or more,
+    differences are compared with their spread."""
     seed: int | None = None
     """Train this seed alone and report nothing: one share of a run over several
     machines or processes."""
     jobs: int = 1
-    """Arms to train at once, each in a process with one core; one alone spreads its
-    steps over all."""
+    """Methods to train at once, each in a process with one core. A single one uses all
+    cores."""
     out: pathlib.Path | None = None
     """Folder of results (default: runs/ablation-...). It may hold finished arms."""
     budget: float | None = None

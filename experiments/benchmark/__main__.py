@@ -32,7 +32,7 @@ class Benchmark:
 
     source: cli.Source = cli.NamedSource()
     preset: cli.Preset = None
-    """Which preset (default: what the capture calls for, by its tracks)."""
+    """Preset (default: chosen by the tracks of the capture)."""
     steps: int | None = None
     """Steps of training (default: the preset's own)."""
     seconds: float | None = None
@@ -42,7 +42,8 @@ class Benchmark:
     seeds: int = 3
     """So many, from 0 on."""
     jobs: int = 1
-    """Runs at a time, one core each from two on; one alone takes all it can use."""
+    """Runs at a time. Two or more get one core each, and a single one uses all
+    cores."""
     out: pathlib.Path = pathlib.Path("runs/benchmark")
     """Folder for the runs and benchmark.json."""
 

@@ -82,7 +82,7 @@ class EffectCost:
     """Tabulate what the effects of presets cost."""
 
     presets: tuple[str, ...] = PRESETS
-    """Which scenes, on the built-in capture."""
+    """Presets to measure on the built-in scene."""
     at: float = 0.4
     """Share of a run's steps that is behind the step that is priced."""
     rows: int | None = None
@@ -90,7 +90,7 @@ class EffectCost:
     rays: int | None = None
     """Rays of a step of a radiance field (default: the preset's)."""
     repeats: int = 5
-    """Timed calls of every program, in turn; the table shows medians."""
+    """Timed calls of every program, in turn. The table has the medians."""
     out: pathlib.Path | None = None
     """Folder for effect_cost.json, .md and .png (default: runs/effect_cost)."""
     check: pathlib.Path | None = None

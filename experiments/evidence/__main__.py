@@ -25,7 +25,7 @@ class EvidenceOptions:
     scenes: bool = False
     """Measure all built-in scenes and ways to find flow instead of one capture."""
     seed: int = 0
-    """Of the built-in scenes."""
+    """Seed of the built-in scenes."""
     out: pathlib.Path | None = None
     """Folder for tracks.png and evidence.json (default: runs/evidence-CAPTURE)."""
 

@@ -35,7 +35,7 @@ class Faults:
     """Disturb tiny jobs at random moments and check what is left of them."""
 
     trials: int = 200
-    """How many faults."""
+    """Number of faults."""
     only: str | None = None
     """Faults of this kind alone: kill, signal, pipe or disk."""
     only_job: str | None = None

@@ -68,7 +68,7 @@ class HardCases:
     numbers: int = 300_000
     """In the inputs of a timed call: fewer inputs where one holds more numbers."""
     repeats: int = 15
-    """Timed calls of each form, in turn; the table shows medians."""
+    """Timed calls of each form, in turn. The table has the medians."""
     out: pathlib.Path | None = None
     """Folder for the figures and hard_cases.json (default: runs/hard_cases)."""
     document: pathlib.Path | None = None

@@ -32,7 +32,7 @@ class Mutants:
     count: int = 60
     """Faults."""
     seed: int = 0
-    """Of their places."""
+    """Seed of their places."""
     only: str = ""
     """Only in files whose path begins so."""
     jobs: int = 2
@@ -40,7 +40,7 @@ class Mutants:
     minutes: float = 10.0
     """After which a run of tests that does not end counts as failed."""
     out: pathlib.Path = pathlib.Path("mutants.json")
-    """Where the figures go; what stands there, of the same seed, is gone on with."""
+    """File of the results. Results of the same seed in it are continued."""
 
     def __post_init__(self):
         for name in ("count", "jobs"):

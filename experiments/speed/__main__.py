@@ -41,15 +41,15 @@ class Speed:
     """Time presets, the main job, and the rasterizer beside another."""
 
     presets: tuple[str, ...] = ()
-    """Which presets (default: all small ones)."""
+    """Presets to time (default: all small ones)."""
     steps: bool = True
-    """Time their steps; without, only what the following ask for."""
+    """Time their steps. Otherwise only measure what the other options ask for."""
     job: bool = False
     """Also the main job, from the command to its report."""
     beside: pathlib.Path | None = None
     """Also the main job of this checkout of the library, between two of ours."""
     raster: tuple[str, ...] = ()
-    """Also the rasterizer, on such cases (default: three beside a --yardstick)."""
+    """Cases of the rasterizer to time as well (default: three with --yardstick)."""
     yardstick: pathlib.Path | None = None
     """Also the rasterizer, next to the one that this script times."""
     out: pathlib.Path = pathlib.Path("runs/speed")

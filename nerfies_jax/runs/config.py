@@ -30,20 +30,20 @@ class CaptureSource:
     capture: pathlib.Path | str | None = None  # a path, once it is made
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF, COLMAP or LLFF layout."""
     scene: str = "default"
-    """Which built-in scene, where no capture is given."""
+    """Built-in scene to use if no capture is given."""
     factor: int | None = None
-    """Read the pictures at 1/FACTOR of their size."""
+    """Read images at 1/FACTOR of their size."""
     max_side: int | None = None
-    """Read the pictures with no side longer than this, in pixels."""
+    """Read images with no side longer than this, in pixels."""
     heldout: str | None = None
-    """Which frames to score: n for every n-th, or the name of a split."""
+    """Frames to hold out: n for every n-th, or the name of a split."""
     missing: Literal["refuse", "skip"] = "refuse"
-    """What to do with frames whose picture is missing."""
+    """Handling of frames whose image is missing."""
     preprocessing: float | None = None
-    """How much work to spend on optical flow, tracks and masks, as a multiple of the
-    default budget. What is beyond it is left out (default: 1)."""
+    """Work to spend on optical flow, tracks and masks, as a multiple of the default
+    budget. Work beyond it is skipped (default: 1)."""
     files: GivenFiles = GivenFiles()
-    """What other tools found in the pictures."""
+    """Results of other tools."""
 
     def __post_init__(self):
         check_budget(self.preprocessing)
@@ -88,27 +88,27 @@ class Preparation:
     """
 
     frames: int | None = None
-    """How many frames of a film to keep, evenly spread over it (default: 100)."""
+    """Frames of a video to keep, evenly spaced (default: 100)."""
     fps: float | None = None
-    """How many frames to keep of each second of a film, in place of a number."""
+    """Frames to keep per second of a video, instead of a number."""
     max_side: int = 960
-    """Longest side of the pictures in pixels."""
+    """Longest side of the images in pixels."""
     masks: pathlib.Path | None = None
-    """Masks of what moves by itself, black: NAME.png for every picture NAME, or one for
-    every frame of a film, in order. Without them it is found in the pictures."""
+    """Masks of moving objects, which are black: NAME.png for every image NAME, or one
+    for every frame of a video, in order. Without them moving objects are detected."""
     passes: Literal[1, 2] = 2
-    """2: look with the first cameras for what moves, and for the cameras once more
-    without it; without cameras, where too few pictures are placed. 1: take the first
-    cameras."""
+    """2: detect moving objects with the first cameras, and estimate the cameras again
+    without them, or detect them without cameras if too few images are registered. 1:
+    use the first cameras."""
     camera_model: Literal[
         "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
     ] = "OPENCV"
-    """COLMAP's name for the lens, the same for all pictures."""
+    """COLMAP's name of the lens model, the same for all images."""
     matcher: Literal["auto", "sequential", "exhaustive"] = "auto"
-    """Which pictures to compare: neighbors, or all with all (auto: neighbors of more
-    than 40 pictures)."""
+    """Image pairs to match: neighbors, or all (auto: neighbors of more than 40
+    images)."""
     threads: int | None = None
-    """How many cores to use (default: all)."""
+    """Number of cores (default: all)."""
 
     def __post_init__(self):
         if None not in (self.frames, self.fps):
@@ -131,13 +131,13 @@ class MoreMetrics:
     """Metrics of held-out frames that are computed only on request."""
 
     lpips_weights: tuple[pathlib.Path | str, ...] = ()
-    """Measure LPIPS, too: files (.pth, .safetensors, .npz) with the trained classifier
-    and LPIPS heads; read before all else."""
+    """Also measure LPIPS: files (.pth, .safetensors, .npz) with the trained classifier
+    and the LPIPS heads."""
     lpips_network: Literal["alex", "vgg"] = "alex"
     """Whose weights these are."""
     fit_heldout_cameras: int = 0
-    """Fit the cameras of so many held-out frames to what was filmed, the scene as it is
-    after training, and score them again."""
+    """Fit the cameras of this many held-out frames to their images, with the trained
+    scene fixed, and evaluate them again."""
 
     def __post_init__(self):
         if self.lpips_network not in ("alex", "vgg"):
