@@ -24,48 +24,40 @@ PAGES = ROOT / "docs" / "results"
 INDEX = """\
 # Results
 
-Every number on these pages stands in a file of this repository, and the page is
-written from that file: `python -m experiments.results` writes all of them, and a test
-holds each against its file. The command beside a page measures anew; where a page has
-rows of several captures or presets, the same command was run for each, as its rows say.
-What it writes is named by its `--out`, a file or a folder with one; `python -m
-experiments.results benchmark --measured benchmark.json`, say, keeps that file and
-renews the page.
+Every page is written from a file of this repository by `python -m experiments.results`,
+and a test compares each page with its file. The command next to a page measures again.
+If a page has rows of several captures or presets, the command was run once for each.
+Its `--out` names the result, and `python -m experiments.results benchmark --measured
+benchmark.json`, for example, stores that file and rewrites the page.
 
 {pages}
 
-{missing}The errors and costs of single formulas are in
-[numerics.md](../numerics.md), which
-`python -m experiments.hard_cases --document docs/numerics.md` renews.
+{missing}Errors and costs of single formulas are in [numerics.md](../numerics.md), which
+`python -m experiments.hard_cases --document docs/numerics.md` rewrites.
 
-## What is gone
+## Where to find what
 
-Earlier READMEs had tables of ablations (fields, Sonata, MoBa-GS), of equal training
-time, of deformation, solvers and local kernels. They are gone because no file stood
-behind them: nobody could check them without hours of processor time. The ablations said
-little besides: what moves was found badly by every arm then (points were followed with
-nearly the error of points that do not move at all), so that hardly a difference between
-arms left the spread over seeds. From tracks it is found: what that start is worth to
-four motions of splats stands in [ablate_start.md](ablate_start.md), what the parts of
-Sonata and of MoBa-GS are worth behind it in [ablate_sonata.md](ablate_sonata.md) and
-[ablate_moba.md](ablate_moba.md), those of Nerfies in
-[ablate_fields.md](ablate_fields.md), and what the parts of our own default are, in
-[ablate_tracked.md](ablate_tracked.md). On a real film Sonata's stand in
-[ablate_sonata_bookshelf.md](ablate_sonata_bookshelf.md), MoBa-GS' in
-[ablate_moba_bookshelf.md](ablate_moba_bookshelf.md) and those of Nerfies in
-[ablate_fields_bookshelf.md](ablate_fields_bookshelf.md). The ten other systems of the
-papers' tables, and the margins that these print, stand in [league.md](league.md). What
-refined cameras are worth stands in [ablate_poses.md](ablate_poses.md) and, on a real
-film, in [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md). What the two papers
-leave open, a start from random points among it, stands in
-[ablate_open.md](ablate_open.md), which motion comes out best where a camera jumps in
-[ablate_jumps.md](ablate_jumps.md), what a law of bits saves of ADC-GS' features in
-[ablate_rate.md](ablate_rate.md), how many views a step takes best on two cores in
-[ablate_views.md](ablate_views.md), and what an elastic penalty loses that some steps
-skip in [ablate_lazy.md](ablate_lazy.md). What deformation, solvers and local kernels
-cost stands in [deformation_cost.md](deformation_cost.md),
-[solver_table.md](solver_table.md) and [kan_local.md](kan_local.md) again, and how far
-one basis or another can follow a motion in [motion_rank.md](motion_rank.md).
+- Comparison of all small presets, and the margins that the papers print:
+  [league.md](league.md).
+- Initialization from tracks, for four motions of splats:
+[ablate_start.md](ablate_start.md).
+- Parts of the default preset: [ablate_tracked.md](ablate_tracked.md).
+- Parts of Sonata, MoBa-GS and Nerfies: [ablate_sonata.md](ablate_sonata.md),
+  [ablate_moba.md](ablate_moba.md), [ablate_fields.md](ablate_fields.md), and on a real
+  video [ablate_sonata_bookshelf.md](ablate_sonata_bookshelf.md),
+  [ablate_moba_bookshelf.md](ablate_moba_bookshelf.md),
+  [ablate_fields_bookshelf.md](ablate_fields_bookshelf.md).
+- Pose refinement: [ablate_poses.md](ablate_poses.md), and on a real video
+  [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md).
+- Choices that the papers leave open: [ablate_open.md](ablate_open.md).
+- Discontinuous camera motion: [ablate_jumps.md](ablate_jumps.md).
+- Entropy coding of ADC-GS' features: [ablate_rate.md](ablate_rate.md).
+- Views per step on two cores: [ablate_views.md](ablate_views.md).
+- Lazy elastic regularization: [ablate_lazy.md](ablate_lazy.md).
+- Cost of deformation, solvers and local kernels:
+  [deformation_cost.md](deformation_cost.md), [solver_table.md](solver_table.md),
+  [kan_local.md](kan_local.md).
+- Motion bases at equal rank: [motion_rank.md](motion_rank.md).
 
 ## Finished studies
 
@@ -76,7 +68,7 @@ in revision {revision} of this repository, which can run the command on each pag
 """
 
 MISSING = """\
-What has a command and no page has no numbers that are kept yet:
+These commands have no stored numbers yet:
 
 {commands}
 

@@ -86,29 +86,27 @@ def quality(scores: Mapping[str, float], exact: bool) -> dict[str, float]:
 
 # One line and more for the columns of a group; a group is explained where it is shown.
 LEGENDS = {
-    "psnr": "PSNR, SSIM: of the 8-bit picture of a held-out camera, mean over the "
-    "frames; SSIM is\nscikit-image's Gaussian form (sigma 1.5).",
-    "moving_psnr": "moving: the same two over the pixels that show moving things; of a "
-    "film that comes\nwithout masks, where its tracks move.",
+    "psnr": "PSNR, SSIM: mean over the 8-bit images of held-out frames. SSIM is\n"
+    "scikit-image's Gaussian form (sigma 1.5).",
+    "moving_psnr": "moving: the same two for moving objects, by the capture's masks "
+    "or else by tracks.",
     "depth_median": "depth, RMSE: median and root mean square of the error, scene "
     "units; then of moving pixels.",
-    "track_error": "EPE: mean distance of points followed from the middle instant to "
-    "where they really are;\n<0.01: share nearer than that; lost: share that was not "
-    "found and counts as not moved.\nstill: the EPE of a point that does not move, all "
-    "that a scene without motion can say.",
-    "drift": "drift: how far static points wander.",
+    "track_error": "EPE: mean distance of points tracked from the middle frame time to "
+    "their true positions;\n<0.01: share nearer than that; lost: share that was not "
+    "found and counts as static.\nstill: the EPE of a static prediction.",
+    "drift": "drift: displacement of static points.",
     "strain": "strain: ||log S|| of the warp's Jacobian (root mean square).",
     "gaussians": "Gauss.: active Gaussians at the end.",
     "parameters": "params: trained numbers, 4 bytes each.",
-    "train_seconds": "train s: steps and what happens between them, without compiling "
-    "the step; CPU s: the\nsame of all threads; compile: the step's programs, as "
-    "without a cache (what one from it once took\nis added); frame ms: rendering a "
-    "held-out frame (of all threads, on a CPU);\npeak MB: most memory of the process, "
-    "where it made one arm alone.",
-    "model_mb": "model MB: the one file of a trained scene; of a field its "
-    "parameters, without\nthe optimizer.",
-    "coded_mb": "coded MB: the same scene, features by their bits where there is a "
-    "learned law and all\nother numbers at 32 bits.",
+    "train_seconds": "train s: training time without compilation; CPU s: the same over "
+    "all threads;\ncompile: compilation of the step without a cache; frame ms: "
+    "rendering a held-out frame (all\nthreads, on a CPU); peak MB: peak memory of the "
+    "process, if it trained one method only.",
+    "model_mb": "model MB: file of a trained scene; for a field its parameters, "
+    "without the optimizer.",
+    "coded_mb": "coded MB: the same scene with entropy-coded features, and 32 bits for "
+    "all other numbers.",
 }
 
 

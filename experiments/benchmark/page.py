@@ -11,32 +11,38 @@ COLUMNS = (
     ("PSNR", "heldout.psnr", 2),
     ("SSIM", "heldout.ssim", 3),
     ("moving", "heldout.moving_psnr", 2),
-    ("still", "heldout.static_psnr", 2),
+    ("static", "heldout.static_psnr", 2),
     ("neighbors", "baseline.neighbor_mean", 2),
     ("time average", "baseline.static", 2),
     ("EPE", "tracks.epe", 4),
-    ("EPE at rest", "tracks.static_epe", 4),
+    ("static EPE", "tracks.static_epe", 4),
     ("flow px", "flow.epe", 2),
     ("moving flow px", "flow.moving_epe", 2),
     ("training s", "train.seconds", 0),
     ("all s", "total.seconds", 0),
 )
 READING = """\
-PSNR (dB) and SSIM of held-out pictures as they were filmed; *moving* and *still* are
-the PSNR of pixels that move by themselves and of the others. *neighbors* is the PSNR
-of the mean of the two training pictures before and after, *time average* that of the
-run's own renders averaged over time: a run that does not stand above both did nothing.
-*EPE* is how far points that are followed are from where they truly are, in scene units,
-*EPE at rest* the same if none of them moved; *flow* is the end-point error of where
-pixels go until the camera's next frame, in pixels, of all and of those that move by
-themselves. Each number is the median over seeds, with the least and the largest in
-brackets. Seconds are wall clock, and whatever else the machine did is in them:
-*training* without compiling, *all* from the command to the report, with what the
-pictures say before training where it was not kept yet."""
+PSNR (dB) and SSIM are of the original, distorted held-out images. *moving* and *static*
+are the PSNR of moving objects and of the static background. *neighbors* is the PSNR of
+the mean of the two neighboring training images, and *time average* that of the run's
+own renders averaged over time. A run must exceed both of these baselines. *EPE* is the
+mean distance of tracked points from their true positions in scene units, and *static
+EPE* that of a prediction without motion. *flow* is the end-point error of optical flow
+to the camera's next frame in pixels, over all pixels and over moving objects. Each
+number is the median over seeds, with minimum and maximum in brackets. Seconds are wall
+clock, on a machine that may do other work: *training* excludes compilation, and *all*
+is from the command to the report, including preprocessing that was not cached."""
 
 
 def page(stored: Mapping[str, Any]) -> str:
-    """The tables: one row for what was run, over its seeds."""
+    """Format one row for each capture, over its seeds.
+
+    Args:
+      stored: The stored results.
+
+    Returns:
+      Markdown.
+    """
     heads = ("run", "preset", "seeds", *(head for head, _, _ in COLUMNS))
     runs = stored["runs"].items()
     rows = [_row(label, list(seeds.values())) for label, seeds in runs]
@@ -53,7 +59,7 @@ def _row(label: str, scored: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _spread(values, digits):
-    """The median, and the ends where there are several."""
+    """Format the median, and minimum and maximum if there are several."""
     if not values:
         return ""
     middle = markdown.number(statistics.median(values), digits)

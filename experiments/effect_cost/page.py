@@ -6,13 +6,13 @@ from experiments.effect_cost import report
 from nerfies_jax.measure.clock import Metric
 
 OFF = """\
-What a scene does not call for is `None` in its settings, and costs nothing; what it
-calls for has a price, which this page lists. [inspect.md](../inspect.md) says which
-effects a capture calls for.
+A disabled effect is `None` in the settings of a scene and costs nothing. This page
+lists the cost of enabled ones. [inspect.md](../inspect.md) describes how effects are
+recommended for a capture.
 
-## Off costs nothing
+## Disabled effects cost nothing
 
-No flag is read in a step. An effect that is `None` has no parameters, no state and no
+A step reads no flags. An effect that is `None` has no parameters, no state and no
 operations:
 
 - `tests/test_effect_leaves.py` counts out, at the presets' full sizes, each array

@@ -6,27 +6,33 @@ from nerfies_jax.evidence.against_truth import LATER
 SCENES = f"""\
 ## The built-in scenes
 
-Sixty frames of 176x132 of each, nothing but pictures and cameras. *Mask* is the
-intersection of the moving mask with the true one over their union, *false* the share of
-all pixels that are marked and stand still. *Track* is how far points of the truth that
-move are from where they should be {LATER} frames after they began (median), *lost* the
-share of those still to be seen then that are not followed any more. *Place* is how far
-their paths in space are off, as a share of the typical distance, beside *said*, the
-deviation that the paths give of themselves; *groups* the rigid motions that explain
-them to one part in a hundred."""
+Sixty frames of 176x132 of each scene, with images and cameras only. *Mask* is the
+intersection over union of the moving mask and the true one, and *false* the share of
+all pixels that are wrongly marked as moving. *Track* is the median error of moving
+ground-truth points {LATER} frames after their start, and *lost* the share of points
+that are visible then but no longer tracked. *Place* is the error of 3D paths as a share
+of the typical distance, *said* is their estimated deviation, and *groups* the number of
+rigid motions that explain them to one part in a hundred."""
 FLOWS = """\
-## Ways to find flow
+## Optical flow methods
 
-The same pairs of neighboring frames of the built-in scenes, pictures brought to one
-mean and spread, as they are and enlarged first; medians where both frames show the
-point, and the share of these pixels that are more than a pixel off. Seconds of the
-processor are for one pair, one way."""
+The same pairs of neighboring frames of the built-in scenes, normalized to one mean and
+deviation, at their size and enlarged first. Errors are medians over pixels that both
+frames show, and the share of these with an error above one pixel. Processor seconds are
+for one pair and one direction."""
 
 
 def page(stored) -> str:
-    """Everything below the docstring, from what `--scenes` wrote."""
+    """Format the tables from the results of `--scenes`.
+
+    Args:
+      stored: The stored results.
+
+    Returns:
+      Markdown.
+    """
     heads = ("scene", "mask", "false %", "track px", "lost %", "place %", "said %")
-    heads += ("tracks", "paths", "groups", "points at rest", "CPU s")
+    heads += ("tracks", "paths", "groups", "static points", "CPU s")
     scenes = [
         [
             row["scene"],
@@ -55,7 +61,7 @@ def page(stored) -> str:
         ]
         for row in stored["flows"]
     ]
-    kinds = ("way", "enlarged", "at rest px", "moving px", "off %", "CPU s")
+    kinds = ("method", "enlarged", "static px", "moving px", "off %", "CPU s")
     return "\n\n".join(
         [SCENES, markdown.table(heads, scenes), FLOWS, markdown.table(kinds, flows)]
     )

@@ -6,19 +6,21 @@ from typing import Any
 from experiments import markdown
 
 READING = """\
-One step of each preset on the built-in scene (176x132), the mean over a run's phases
-from its first state. A step of splats draws `batch_size` views, one of a field `rays`
-rays, so steps of different presets are not alike. *One core* is a process that sees
-one, *all* one that spreads a step over as many as its preset has shares for. *Compile*
-is the training program alone, from an empty cache; *frame* one picture on one core;
-*peak* all memory of the one-core process, JAX and the capture included."""
+One training step of each preset on the built-in scene (176x132), the mean over the
+phases of a run from its initial state. A step of splats renders `batch_size` views and
+one of a field `rays` rays, so steps of different presets are not comparable. *One core*
+is a process that sees one core, and *all* one that distributes a step over the cores
+that its preset can use. *Compile* is the training program alone, without a cache.
+*Frame* is one image on one core. *Peak* is all memory of the one-core process,
+including JAX and the capture."""
 
 
 PARTS = """\
-Milliseconds on one core, each part by itself on the first state, in which a motion that
-warms up (`splats-deformable-small`, `sonata-small`, `moba-small`) is not asked yet: it
-is in the step above, and in [effect_cost.md](effect_cost.md). Parts may be more than
-the step: of fields they were taken of all its rays at once."""
+Milliseconds on one core, each part by itself on the initial state. The motion of
+presets that warm up (`splats-deformable-small`, `sonata-small`, `moba-small`) is
+inactive there: its cost is in the step above, and in [effect_cost.md](effect_cost.md).
+Parts may exceed the step, because parts of fields are measured with all rays at
+once."""
 
 
 def page(stored: Mapping[str, Any]) -> str:
@@ -31,7 +33,7 @@ def page(stored: Mapping[str, Any]) -> str:
         if "jobs" in stored:
             parts.append(_beside(**stored["jobs"]))
     if "raster" in stored:
-        parts += ["## The rasterizer beside a tuned C++ one", RASTER]
+        parts += ["## The rasterizer compared with a tuned C++ one", RASTER]
         parts.append(_raster(stored["raster"]["rows"]))
     return "\n\n".join(parts)
 
@@ -57,7 +59,7 @@ def _presets(presets):
 
 
 def _parts(presets):
-    """A row for each preset: names differ from one to the next."""
+    """Format one row per preset, whose parts have different names."""
     rows = []
     for name, record in presets.items():
         parts = sorted(record["one"]["parts"].items(), key=lambda part: -part[1])
@@ -72,7 +74,7 @@ def _job(job):
         f"{job['seconds']:.0f} s from the command to its report, of which training "
         f"{job['train.seconds']:.0f} s and compiling it "
         f"{job['train.compile_seconds']:.0f} s; {job['heldout.psnr']:.2f} dB held out, "
-        f"{job['heldout.moving_psnr']:.2f} dB where something moves."
+        f"{job['heldout.moving_psnr']:.2f} dB for moving objects."
     )
 
 
@@ -93,7 +95,7 @@ def _beside(first, beside, again):
         )
     share = ours / beside["seconds"]
     return (
-        f"Beside an earlier revision on {first['cpu']}, in one sitting: {ours:.0f} s, "
+        f"An earlier revision on {first['cpu']}, in one session: {ours:.0f} s, "
         f"the mean of both, for {beside['seconds']:.0f} s, {share:.2f} of the time.\n\n"
         + markdown.table(heads, rows)
     )
