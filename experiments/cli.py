@@ -11,6 +11,7 @@ import importlib.util
 import json
 import os
 import pathlib
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -24,8 +25,14 @@ from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs import trust
-from nerfies_jax.runs.config import CaptureSource, MoreMetrics, check_budget
+from nerfies_jax.runs.config import (
+    CaptureNotFound,
+    CaptureSource,
+    MoreMetrics,
+    check_budget,
+)
 from nerfies_jax.runs.representations import PRESETS
+from nerfies_jax.training.specs import OverrideError
 
 Positional = tyro.conf.Positional
 # Those of `nerfies_jax.capture.synthetic`, which loads JAX.
@@ -33,6 +40,13 @@ SCENES = (
     *("default", "static", "rigid", "fast", "non-rigid", "articulated"),
     *("exposure", "transient", "specular", "topology", "pose-error"),
 )
+# Arguments of the library that have an option of the same name; "..." is any value.
+ARGUMENTS = ("device", "heldout", "max_side", "missing", "out", "overwrite")
+ARGUMENTS += ("scene", "train")
+_ARGUMENT = re.compile(
+    rf"\b(?P<name>{'|'.join(ARGUMENTS)})=(?P<value>\"[^\"]*\"|\.\.\.|[^\s;,)]*[^\s;:,.)])"
+)
+_RESUME = re.compile(r"runs\.resume(?:\('([^']*)'\))?")
 Preset = Annotated[str | None, options.Known(PRESETS), tyro.conf.arg(metavar="NAME")]
 Overrides = Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE ...")]
 Effects = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE:NAME ...")]
@@ -345,13 +359,38 @@ def user_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)):
         with _stopped_first():
             yield
     except kinds as error:
-        console.error(" ".join(str(error).split()) + _repeated(error))
+        console.error(as_options(" ".join(str(error).split()), error))
         sys.exit(2)
 
 
-def _repeated(error):
-    """The option that trusts the effects of a run folder, if that was refused."""
+def as_options(text: str, error: Exception) -> str:
+    """Name options in an error of the library, which knows arguments only.
+
+    Args:
+      text: The message, in one line.
+      error: The error that it is of.
+
+    Returns:
+      The message with options in place of arguments such as `max_side=640`, and with
+      the options that give a way out of some kinds of errors.
+    """
+
+    def option(match):
+        value = match["value"].strip("'\"")
+        shown = "" if value in ("...", "True") else f" {value}"
+        return f"--{match['name'].replace('_', '-')}{shown}"
+
+    text = _ARGUMENT.sub(option, text)
+    text = _RESUME.sub(
+        lambda match: f"--out {match[1]} --resume" if match[1] else "--resume", text
+    )
     for each in (error, error.__cause__):
+        if isinstance(each, OverrideError):
+            return f"--set {text}"
         if isinstance(each, trust.UntrustedEffects):
-            return f", with --effect {shlex.join(each.names)}"
-    return ""
+            return f"{text}, with --effect {shlex.join(each.names)}"
+        if isinstance(each, CaptureNotFound):
+            words = ("--out", str(each.folder), "--resume")
+            command = f"python -m experiments.reconstruct CAPTURE {shlex.join(words)}"
+            return f"{text}: {command}"
+    return text

@@ -61,7 +61,7 @@ def events(field: Field) -> tuple[Event, ...]:
         raise ValueError(
             "occupancy looks for space that is always empty, and this field cannot be "
             "surveyed once for all: it moves, has a transient medium, normals, or no "
-            "extent; leave it out with --set sampling.occupancy=none"
+            "extent; leave it out (sampling.occupancy=none)"
         )
     survey = jax.jit(_survey(field))
 

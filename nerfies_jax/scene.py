@@ -76,7 +76,7 @@ def build(
     if spec.background is not None and "points" not in metadata.available_data:
         raise ValueError(
             "the background effect holds static points still, and this capture has "
-            "none; leave it out with --set background=none"
+            "none; leave it out (background=none)"
         )
 
     devices = data_parallel.device_count(spec.micro_batches)

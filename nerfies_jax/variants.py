@@ -75,8 +75,8 @@ def without_effects(
     field = scene.field(spec, metadata, without, effects)
     if blended and not _has_appearance(field):
         raise ValueError(
-            "--appearance: this field has no appearance codes; reconstruct with a "
-            "preset that has them, as nerf-w or nerfies"
+            "this field has no appearance codes to blend; reconstruct with a preset "
+            "that has them, such as nerf-w or nerfies"
         )
 
     def plain(params, view):
@@ -113,6 +113,6 @@ def appearance_id(capture: Capture, name: str) -> int:
     if name.isdigit() and int(name) in known:
         return int(name)
     raise ValueError(
-        f"--appearance {name}: neither a frame of {capture.name}, as "
+        f"appearance {name!r} is neither a frame of {capture.name}, such as "
         f"{capture.ids[0]!r}, nor one of its appearance ids, {known[0]} to {known[-1]}"
     )

@@ -168,8 +168,7 @@ def keep_found(
     if missing == "refuse" or not rows.size:
         raise CaptureError(
             f"{where}: {len(lost)} of {len(names)} pictures are missing ({listed}); "
-            'restore them, or leave those frames out with missing="skip" (--missing '
-            "skip)"
+            'restore them, or leave those frames out with missing="skip"'
         )
     return rows, (f"{len(lost)} frames left out, their pictures are missing: {listed}",)
 

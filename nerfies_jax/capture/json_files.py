@@ -289,7 +289,7 @@ def refuse_existing(path: AnyPath, overwrite: bool) -> None:
     empty = path.is_dir() and not any(path.iterdir())
     if not overwrite and path.exists() and not empty:
         raise CaptureError(
-            f"{path}: already there; choose another name or add --overwrite"
+            f"{path}: already there; choose another name or set overwrite=True"
         )
 
 

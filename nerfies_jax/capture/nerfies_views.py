@@ -219,7 +219,7 @@ def _with_camera_files(path, names, missing):
         raise CaptureError(
             f"{path / 'dataset.json'}: {len(lost)} of {len(names)} frames have no "
             f"camera file ({listed}); restore those files, or leave the frames out "
-            'with missing="skip" (--missing skip)'
+            'with missing="skip"'
         )
     return kept, (f"{len(lost)} frames left out, they have no camera file: {listed}",)
 

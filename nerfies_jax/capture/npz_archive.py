@@ -148,18 +148,20 @@ def rows_of(poses, heldout, train, where):
     """
     count = len(poses)
     if heldout is not None:
-        scored = _range(heldout, count, "--heldout")
+        scored = _range(heldout, count, "heldout")
         others = np.setdiff1d(np.arange(count), scored)
-        learned = others if train is None else _range(train, count, "--train")
+        learned = others if train is None else _range(train, count, "train")
         both = np.intersect1d(learned, scored)
         if both.size:
             raise ValueError(
-                f"--train {train} and --heldout {heldout} share row {both[0]}; what is "
-                "scored must not be learned from"
+                f"train={train} and heldout={heldout} share row {both[0]}; held-out "
+                "frames must not be trained on"
             )
         return learned, scored, "rows as asked for"
     if train is not None:
-        raise ValueError("--train needs --heldout too, so that both are known")
+        raise ValueError(
+            f"train={train} needs heldout=FIRST:LAST too, so that both are known"
+        )
     same = np.abs(np.diff(poses, axis=0)).max((1, 2)) < SAME_POSE
     best, first = (0, 0), 0
     for row in range(1, count + 1):
@@ -183,9 +185,9 @@ def _range(text, count, name):
     try:
         first, last = (int(part) for part in text.split(":"))
     except ValueError:
-        raise ValueError(f"{name} {text}: expected first:last+1, as in 50:61") from None
+        raise ValueError(f"{name}={text}: expected first:last+1, as in 50:61") from None
     if not 0 <= first < last <= count:
-        raise ValueError(f"{name} {text}: the archive has rows 0 to {count - 1}")
+        raise ValueError(f"{name}={text}: the archive has rows 0 to {count - 1}")
     return np.arange(first, last)
 
 

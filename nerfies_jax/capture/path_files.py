@@ -69,7 +69,7 @@ def named(name: str, capture: Capture, count: int | None) -> CameraPath:
         return camera_paths.planned(name, capture, count or FRAMES)
     if not pathlib.Path(name).exists():
         raise CaptureError(
-            f"--path {name}: no such file, and no camera path of that name; "
+            f"{name}: no such file, and no camera path of that name; "
             + known_names(name, camera_paths.KINDS)
         )
     return read(name, capture)

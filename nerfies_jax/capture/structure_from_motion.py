@@ -69,7 +69,7 @@ class MappingSpec:
             raise ValueError(f"threads={self.threads}; use at least 1")
 
 
-MASK = "mask what moves in black (--masks of prepare, reconstruct's --prepare.masks)"
+MASK = "mask moving regions in black"
 
 
 class FewPlaced(CaptureError):
@@ -117,9 +117,8 @@ class Poses(NamedTuple):
 
 def _more(pictures):
     return (
-        f"take more pictures, closer together (of a film --frames {2 * pictures}, or "
-        f"reconstruct's --prepare.frames {2 * pictures}), film more slowly and with "
-        f"more texture, or {MASK}"
+        f"take more images, closer together (of a video {2 * pictures} frames), move "
+        f"the camera more slowly and past more texture, or {MASK}"
     )
 
 

@@ -121,8 +121,8 @@ def held_out_only(capture: Capture, frames: int) -> GroundTruth:
     """
     if not len(capture.heldout):
         raise ValueError(
-            f"{capture.name}: no held-out frames to judge by; choose some with "
-            "--heldout, as --heldout 8 for every eighth"
+            f"{capture.name}: no held-out frames to evaluate; choose some with "
+            "heldout=8 for every eighth"
         )
     moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     return GroundTruth(

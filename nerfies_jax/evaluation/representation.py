@@ -147,6 +147,6 @@ def check_there(without: tuple[str, ...], there: tuple[str, ...]) -> None:
     for name in without:
         if name not in there:
             raise ValueError(
-                f"--without {name}: no effect that this run can be drawn without; "
+                f"{name!r} is no effect that this run can be rendered without; "
                 f"those are: {', '.join(there) or 'none'}"
             )

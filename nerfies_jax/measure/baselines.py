@@ -26,8 +26,7 @@ def read(path: pathlib.Path, name: str) -> dict[str, Metric]:
         return clock.read_metrics(path)
     except OSError as error:
         raise ValueError(
-            f"--check {path}: cannot be read ({error.strerror}); name an earlier "
-            f"run's {name}"
+            f"{path}: cannot be read ({error.strerror}); name an earlier run's {name}"
         ) from error
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-LONGER = "train longer (--seconds, --steps) or take another preset"
+LONGER = "train for more steps or use another preset"
 
 # Rounding alone can cost a static model a little: -0.0017 dB was measured.
 _WORSE_DB = -0.05

@@ -8,6 +8,21 @@ from typing import Literal
 from nerfies_jax.capture.given import GivenFiles
 
 
+class CaptureNotFound(ValueError):
+    """The capture of a run is not where it was when the run was started.
+
+    Attributes:
+      folder: Folder of the run.
+    """
+
+    def __init__(self, folder: pathlib.Path, capture: pathlib.Path | str):
+        super().__init__(
+            f"{folder}: its capture {capture} is not there; if it was moved, name its "
+            "new path"
+        )
+        self.folder = folder
+
+
 def check_budget(preprocessing: float | None) -> None:
     """Check the budget of preprocessing.
 

@@ -63,8 +63,8 @@ def start_jax(
     except (RuntimeError, AssertionError) as error:
         reason = (str(error).splitlines() or ["JAX finds none"])[0]
         raise ValueError(
-            f"--device {device} cannot be used here ({reason}); choose --device cpu, "
-            "or install a JAX built for that device"
+            f"device={device} cannot be used here ({reason}); choose device=cpu, or "
+            "install a JAX built for that device"
         ) from error
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):

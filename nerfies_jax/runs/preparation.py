@@ -310,14 +310,14 @@ def prepared(
         # The folder may hold the user's own work by now: it is not made again unasked.
         raise ValueError(
             f"{out / RECORD}: damaged, so nothing tells what {out} was made of "
-            f"({error}); remove the folder, or name another --out"
+            f"({error}); remove the folder, or choose another one with out=..."
         ) from error
     wanted = json.loads(json.dumps(_made_of(source, how)))
     differ = [name for name, value in wanted.items() if made_of.get(name) != value]
     if differ:
         raise ValueError(
             f"{out}: a capture prepared otherwise ({', '.join(differ)} differ); remove "
-            "it, or name another --out"
+            "it, or choose another folder with out=..."
         )
     tell(f"{source} was prepared before: {out}")
     return out

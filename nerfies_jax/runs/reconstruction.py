@@ -230,7 +230,7 @@ def _with_cameras(config, out, how):
     if source is None or not preparation.needed(source):
         if how != Preparation():
             raise ValueError(
-                "--prepare is for films and pictures without cameras, and "
+                "prepare is for videos and images without cameras, and "
                 f"{source or 'a built-in scene'} has its own; leave it out"
             )
         return config
@@ -287,7 +287,7 @@ def _check_expected(folder, expected):
     if unlike:
         raise ValueError(
             f"{folder}: the run was started with other settings: {'; '.join(unlike)}; "
-            "leave them out to continue it, or start anew in another --out"
+            "leave them out to continue it, or start anew in another folder, out=..."
         )
     return moved
 
@@ -347,6 +347,6 @@ def _finished(folder, run, start, pace, hooks, began, extra):
     if result.stopped_by == "non-finite":
         errors.append(
             f"{result.message}; start anew with lower learning rates "
-            f"(--set, their names are in {folder / run_folder.CONFIG})"
+            f"(their names are in {folder / run_folder.CONFIG})"
         )
     return Outcome(folder, run, result, tuple(errors))

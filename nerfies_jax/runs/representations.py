@@ -90,7 +90,7 @@ def of_preset(preset: str) -> "Representation":
         if preset in representation.presets:
             return representation
     known = sorted(p for each in installed().values() for p in each.presets)
-    raise ValueError(f"--preset {preset}: no such preset; {known_names(preset, known)}")
+    raise ValueError(f"no preset {preset!r}; {known_names(preset, known)}")
 
 
 def of_run(folder: pathlib.Path) -> "Representation | None":

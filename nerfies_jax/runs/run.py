@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import pathlib
-import shlex
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.evidence import frame_flow, frame_masks, given_files
 from nerfies_jax.runs import own_effects, representations, same_capture, trust
-from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.runs.config import CaptureNotFound, CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG, LEFT_OUT
 from nerfies_jax.training import checkpoint, specs
 from nerfies_jax.training.effects import Effect
@@ -70,8 +69,8 @@ def new_run(config: RunConfig, stored: Capture | None = None) -> Run:
     run = open_run(config, representation, scene_spec(config), stored)
     if not len(run.capture.heldout):  # before a training that ends without a score
         raise ValueError(
-            f"{run.capture.path or run.capture.name}: no held-out frames to judge by; "
-            "give three pictures or more, or choose some with --heldout, as --heldout 8"
+            f"{run.capture.path or run.capture.name}: no held-out frames to evaluate; "
+            "use three images or more, or choose some with heldout=8"
         )
     return run
 
@@ -294,7 +293,7 @@ def _filmed(source, seed):
 def _built_in(source, seed):
     if source.scene not in synthetic.PRESETS:
         raise ValueError(
-            f"--scene {source.scene}: no such built-in scene; "
+            f"scene={source.scene}: no such built-in scene; "
             + known_names(source.scene, synthetic.PRESETS)
         )
     for name in ("factor", "max_side", "heldout"):
@@ -351,8 +350,9 @@ def saved_run(
     Raises:
       UntrustedEffects: The run uses effects that are not in `effects`. It is a
         ValueError, and nothing has been imported.
+      CaptureNotFound: The capture is not where it was. It is a ValueError.
       ValueError: `overrides` would change settings, or the capture is not the one that
-        the run was begun with.
+        the run was started with.
     """
     folder = pathlib.Path(folder)
     config, kind, spec = read_settings(folder)
@@ -362,15 +362,11 @@ def saved_run(
     if changed:
         raise ValueError(
             f"{folder}: the run was started with other settings: {'; '.join(changed)}; "
-            "leave them out to continue it, or start anew in another --out"
+            "leave them out to continue it, or start anew in another folder, out=..."
         )
     source = dataclasses.replace(config.source, **moved)
     if source.capture is not None and not source.capture.exists():
-        raise ValueError(
-            f"{folder}: its capture {source.capture} is not there; if it lies "
-            "elsewhere now, say where: python -m experiments.reconstruct CAPTURE --out "
-            f"{shlex.quote(str(folder))} --resume"
-        )
+        raise CaptureNotFound(folder, source.capture)
     run = open_run(dataclasses.replace(config, source=source), kind, spec)
     same_capture.check(folder, run.capture)
     if moved:
@@ -396,7 +392,7 @@ def read_settings(folder: pathlib.Path) -> Settings:
         raise ValueError(
             f"{folder}: no run here (there is no {CONFIG}); name the folder that "
             "experiments.reconstruct printed; a run that was killed before it had one "
-            "is started again, without --resume"
+            "must be started again"
         )
     try:
         stored = json.loads(path.read_text())
@@ -430,7 +426,7 @@ def first_state(run: Run) -> TrainState:
         raise ValueError(
             f"the first state needs about {needed / 2**30:.1f} GiB and "
             f"{free / 2**30:.1f} GiB are free; {run.representation.memory_hint}, or "
-            "read smaller pictures with --max-side"
+            "read smaller images with max_side=..."
         )
     return run.model.init(run.capture, jax.random.key(run.config.seed))
 

@@ -67,8 +67,8 @@ def newest_of(source: pathlib.Path, above: pathlib.Path | None = None) -> pathli
                 found.append((path.stat().st_mtime_ns, path.parent))
     if not found:
         raise ValueError(
-            f"{source}: no run of it in {above}; name the run's folder with --out, or "
-            "leave out --resume to begin one"
+            f"{source}: no run of it in {above}; name the run's folder with out=..., "
+            "or start a new one"
         )
     return max(found)[1]
 
@@ -103,7 +103,7 @@ def refuse_run(source: pathlib.Path) -> None:
     if (source / CONFIG).is_file() and (source / CHECKPOINTS).is_dir():
         raise ValueError(
             f"{source}: the folder of a run, not of a capture; continue the run with "
-            f"--out {source} --resume"
+            f"runs.resume({str(source)!r})"
         )
 
 
@@ -117,13 +117,15 @@ def check_free(out: pathlib.Path) -> None:
       ValueError: If it is not empty or cannot be written.
     """
     if out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: the run folder is a file; name another --out")
+        raise ValueError(
+            f"{out}: the run folder is a file; choose another one with out=..."
+        )
     if not out.is_dir():
         above = next(path for path in out.absolute().parents if path.exists())
         if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)):
             raise ValueError(
-                f"{out}: the run folder cannot be written, {above} is none that can; "
-                "name another --out"
+                f"{out}: the run folder cannot be written, since {above} cannot be; "
+                "choose another one with out=..."
             )
         return
     if (out / LOCK).exists():
@@ -132,8 +134,8 @@ def check_free(out: pathlib.Path) -> None:
     # A run that was killed before its first file leaves these.
     if any(path.name not in (LOCK, OWNER) for path in out.iterdir()):
         raise ValueError(
-            f"{out}: the run folder is not empty; name another --out, or "
-            "continue the run in it with --resume"
+            f"{out}: the run folder is not empty; choose another one with out=..., or "
+            "continue the run in it with runs.resume"
         )
 
 
@@ -203,5 +205,5 @@ def _named_if_not_writable(folder):
     except OSError as error:
         raise ValueError(
             f"{folder}: the run folder cannot be written ({error.strerror}); "
-            "name another --out"
+            "choose another one with out=..."
         ) from error

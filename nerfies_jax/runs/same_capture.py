@@ -55,7 +55,7 @@ def check(folder: pathlib.Path, capture: Capture) -> None:
     if unlike is not None:
         raise CaptureError(
             f"{capture.path or capture.name}: {unlike} than when {folder} was begun; "
-            "put back what was changed, or start anew in another --out"
+            "undo the change, or start anew in another folder, out=..."
         )
 
 

@@ -23,6 +23,11 @@ TYPE = "type"  # a spec's, in JSON; no field can have this name
 NUMBER = "number"  # around an infinity or NaN, which JSON does not have
 PACKAGES = ("gaussians_jax", "nerfies_jax")  # whose records of arrays a file may name
 
+
+class OverrideError(ValueError):
+    """An assignment names no field of a spec, or a value that it cannot have."""
+
+
 # JSON -------------------------------------------------------------------------------
 
 
@@ -253,12 +258,13 @@ def override(spec: Any, assignments: Iterable[str]) -> Any:
       The changed spec.
 
     Raises:
-      ValueError: If a field is unknown or a value is wrong.
+      OverrideError: If a field is unknown or a value cannot be read.
+      ValueError: If the spec refuses a value.
     """
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
         if not equals:
-            raise ValueError(f"--set {assignment}: expected path.to.field=value")
+            raise OverrideError(f"{assignment}: expected path.to.field=value")
         spec = _assign(spec, path.split("."), text, path, spec)
     return spec
 
@@ -267,8 +273,8 @@ def _assign(spec, names, text, path, outermost):
     fields = {field.name for field in dataclasses.fields(spec)}
     name, rest = names[0], names[1:]
     if name not in fields:
-        raise ValueError(
-            f"--set {path}: {type(spec).__name__} has no field {name!r}; "
+        raise OverrideError(
+            f"{path}: {type(spec).__name__} has no field {name!r}; "
             + _meant(names[-1], sorted(fields), outermost)
         )
     if rest:
@@ -276,7 +282,7 @@ def _assign(spec, names, text, path, outermost):
         if inner is None:
             inner = _absent(spec, name)
         if not dataclasses.is_dataclass(inner):
-            raise ValueError(f"--set {path}: {name!r} is {inner!r} and has no fields")
+            raise OverrideError(f"{path}: {name!r} is {inner!r} and has no fields")
         return dataclasses.replace(
             spec, **{name: _assign(inner, rest, text, path, outermost)}
         )
@@ -329,7 +335,7 @@ def _read(kind, text, path):
         pass
     if named:
         kind = f"one of {', '.join(named)}"
-    raise ValueError(f"--set {path}={text}: cannot be read as {kind}")
+    raise OverrideError(f"{path}={text}: cannot be read as {kind}")
 
 
 def _defaults(spec_class, path):
@@ -340,8 +346,8 @@ def _defaults(spec_class, path):
         if field.default is field.default_factory is dataclasses.MISSING
     ]
     if needed:
-        raise ValueError(
-            f"--set {path}: {spec_class.__name__} has no defaults for "
+        raise OverrideError(
+            f"{path}: {spec_class.__name__} has no defaults for "
             f"{' and '.join(needed)}; choose a preset that has it"
         )
     return spec_class()

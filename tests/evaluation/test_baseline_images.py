@@ -120,7 +120,7 @@ def test_a_run_below_a_baseline_is_told_what_to_do():
     )
     assert "20.00 dB is below the 22.70 dB" in below
     assert "0.25 dB worse" in worse
-    assert "--steps" in below
+    assert "more steps" in below
     assert "splats-static" in worse
     assert baselines_text.lines({"heldout.psnr": 20.0}) == []
     assert baselines_text.warnings({"heldout.psnr": 20.0}) == []

@@ -81,5 +81,5 @@ def test_a_real_capture_is_judged_by_its_pictures_alone():
     blind = dataclasses.replace(
         capture, train=np.arange(len(capture.ids)), heldout=np.zeros(0, int)
     )
-    with pytest.raises(ValueError, match="no held-out frames to judge by"):
+    with pytest.raises(ValueError, match="no held-out frames to evaluate"):
         protocol.held_out_only(blind, 2)

@@ -14,7 +14,9 @@ import pytest
 from experiments import __main__ as every
 from experiments import cli
 from nerfies_jax.capture import json_files
-from nerfies_jax.runs import representations
+from nerfies_jax.runs import representations, run_folder
+from nerfies_jax.runs.config import CaptureNotFound
+from nerfies_jax.training import specs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +29,39 @@ def test_user_errors_are_one_line_and_exit_code_two(capsys):
         raise ValueError("first\nsecond")
     assert stop.value.code == 2
     assert capsys.readouterr().err == "error: first second\n"
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        ('leave them out with missing="skip"', "leave them out with --missing skip"),
+        ("max_side=0; expected more", "--max-side 0; expected more"),
+        ("choose a folder with out=..., or", "choose a folder with --out, or"),
+        ("or set overwrite=True", "or set --overwrite"),
+        ("a timeout=5 is no option", "a timeout=5 is no option"),
+        ("or go on with runs.resume", "or go on with --resume"),
+        ("use runs.resume('a b')", "use --out a b --resume"),
+    ],
+)
+def test_options_stand_where_the_library_names_arguments(said, shown, capsys):
+    with pytest.raises(SystemExit), cli.user_errors():
+        raise ValueError(said)
+    assert capsys.readouterr().err == f"error: {shown}\n"
+
+
+def test_errors_of_some_kinds_are_shown_with_their_option(tmp_path, capsys):
+    refusals = [
+        (lambda: specs.override(Nothing(), ["a=1"]), "error: --set a: Nothing has no"),
+        (lambda: run_folder.check_free(tmp_path), "or continue the run in it with --"),
+    ]
+    (tmp_path / "kept").touch()
+    for refuse, words in refusals:
+        with pytest.raises(SystemExit), cli.user_errors():
+            refuse()
+        assert words in capsys.readouterr().err
+    with pytest.raises(SystemExit), cli.user_errors():
+        raise CaptureNotFound(tmp_path, "filmed")
+    assert f"CAPTURE --out {tmp_path} --resume" in capsys.readouterr().err
 
 
 def test_an_interrupted_command_ends_in_one_line(capsys):

@@ -22,7 +22,7 @@ def test_an_appearance_is_named_by_its_frame_or_its_number():
     assert variants.appearance_id(capture, name) == expected
     assert variants.appearance_id(capture, str(expected)) == expected
     for wrong in ("nobody", "-1", "1000"):
-        with pytest.raises(ValueError, match=f"--appearance {wrong}: neither a frame"):
+        with pytest.raises(ValueError, match=f"'{wrong}' is neither a frame"):
             variants.appearance_id(capture, wrong)
 
 
@@ -71,7 +71,9 @@ def test_what_cannot_be_left_out_or_blended_is_refused():
         scenes.tiny_field()[0],
         dataclasses.replace(TINY_FIELD, appearance=None),
     )
-    with pytest.raises(ValueError, match=r"--without appearance: .* those are: warp"):
+    with pytest.raises(
+        ValueError, match=r"'appearance' is no effect .* those are: warp"
+    ):
         variants.without_effects(TINY_FIELD, metadata, ("appearance",), False)
-    with pytest.raises(ValueError, match=r"--appearance: .* no appearance codes"):
+    with pytest.raises(ValueError, match="has no appearance codes"):
         variants.without_effects(plain, metadata, (), True)

@@ -227,7 +227,7 @@ def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monke
         reconstruction._with_cameras(config, tmp_path / "run", how)
     (tmp_path / "clip.mp4").write_bytes(clip)
     other = dataclasses.replace(how, passes=1)
-    with pytest.raises(ValueError, match=r"run-capture: .*how differ.*--out"):
+    with pytest.raises(ValueError, match=r"run-capture: .*how differ.*out="):
         reconstruction._with_cameras(config, tmp_path / "run", other)
 
 

@@ -35,7 +35,7 @@ def test_preset_names_are_unique_over_all_representations():
 
 
 def test_an_unknown_preset_names_those_of_every_representation():
-    with pytest.raises(ValueError, match="--preset magic: no such preset") as error:
+    with pytest.raises(ValueError, match="no preset 'magic'") as error:
         representations.of_preset("magic")
     for each in representations.installed().values():
         assert all(preset in str(error.value) for preset in each.presets)

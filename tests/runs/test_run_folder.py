@@ -17,16 +17,16 @@ def test_run_folders_are_numbered_and_never_shared(tmp_path, monkeypatch):
     first, second = (run_folder.new_run_folder(None, "ball") for _ in range(2))
     assert (first.name, second.name) == ("ball", "ball-2")
     (first / "note").write_text("kept")
-    with pytest.raises(ValueError, match=r"not empty.*--resume"):
+    with pytest.raises(ValueError, match=r"not empty.*runs\.resume"):
         run_folder.new_run_folder(first, "ball")
 
 
 def test_a_run_folder_that_cannot_be_written_is_an_early_error(tmp_path):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(ValueError, match=r"run folder .*--out"):
+        with pytest.raises(ValueError, match=r"run folder .* out="):
             run_folder.check_free(out)  # before anything is looked at
-        with pytest.raises(ValueError, match=r"run folder .*--out"):
+        with pytest.raises(ValueError, match=r"run folder .* out="):
             run_folder.new_run_folder(out, "x")
 
 
@@ -35,7 +35,7 @@ def test_a_run_is_no_capture(tmp_path):
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.json").write_text("{}")
     for look in (run_folder.newest_of, preparation.prepare):
-        with pytest.raises(ValueError, match=r"folder of a run, .* --resume"):
+        with pytest.raises(ValueError, match=r"folder of a run, .* runs\.resume\("):
             look(run, tmp_path / "out")
     with pytest.raises(reconstruction.Refused, match="folder of a run"):
         reconstruction.reconstruct(RunConfig(None, CaptureSource(run)))

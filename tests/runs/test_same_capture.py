@@ -114,7 +114,7 @@ def test_a_capture_may_be_moved(begun):
     path = folder / run_folder.CONFIG
     before = json.loads(path.read_text())
     there = source.rename(source.with_name("elsewhere"))
-    with pytest.raises(ValueError, match=f"CAPTURE --out {folder} --resume"):
+    with pytest.raises(ValueError, match="was moved, name its new path"):
         runs.saved_run(folder)
     runs.saved_run(folder, moved={"capture": there})
     assert runs.saved_run(folder).capture.path == there
