@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-# What a progress display on the terminal takes lines by, so that they stay above it.
+# Writes lines above a progress display on the terminal.
 _above: Callable[[str], None] | None = None
 
 
@@ -93,8 +93,7 @@ class SafeStream:
         self.failure: OSError | None = None
 
     def write(self, text: str) -> int:
-        """Write and, at the end of a line, flush, since a pipe must not hold lines
-        back.
+        """Write and flush at the end of a line, since a pipe must not hold lines back.
 
         Args:
           text: The text.

@@ -127,9 +127,7 @@ def checked(
 
 
 def _key(plan, values):
-    """Types and shapes of the arguments, or None if one is neither JAX array nor
-    None.
-    """
+    """Types and shapes of the arguments, None unless all are JAX arrays or None."""
     key = []
     for name, _ in plan.checks:
         value = values.get(name)

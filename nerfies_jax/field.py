@@ -239,8 +239,7 @@ def look_up(
     time: Scalar,
     appearance: Int[Array, ""],
 ) -> Codes:
-    """Look up the codes of one frame, interpolated between rows at times not trained
-    on.
+    """Look up the codes of one frame, interpolated between the training times.
 
     Args:
       tables: The code tables.
@@ -265,9 +264,7 @@ def look_up(
 
 
 def _place_in_time(metadata, time):
-    """Rows before and after a time, and the position in between, exact at a row's
-    time.
-    """
+    """Rows before and after a time, and the position in between."""
     times = jnp.asarray(metadata.times, time.dtype)
     last = max(len(metadata.times) - 2, 0)
     left = jnp.clip(jnp.searchsorted(times, time, side="right") - 1, 0, last)

@@ -65,8 +65,7 @@ class FlowFit(NamedTuple):
 
 
 def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
-    """Convert paths and static points of preprocessing to units of the field, on the
-    host.
+    """Convert paths and static points of preprocessing to units of the field.
 
     Args:
       field: The field.

@@ -101,9 +101,7 @@ def _static_points(capture):
 
 
 def _follow_flow(field, state, capture, known):
-    """Track outward from the start, time by time, or return None without a scene
-    flow.
-    """
+    """Track outward from the start. None without a scene flow."""
     move = _flow_mover(field)
     if move is None:
         return None

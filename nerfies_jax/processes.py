@@ -39,8 +39,7 @@ def has_ended(name: str) -> bool:
 
 @functools.lru_cache(maxsize=1)
 def machine() -> str:
-    """Return six hexadecimal digits that identify this machine and its process
-    namespace.
+    """Return six hexadecimal digits of this machine and its process namespace.
 
     Returns:
       The digits.

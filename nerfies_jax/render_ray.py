@@ -282,9 +282,7 @@ def radiance_at(
 
 
 def _radiance(bound, name, ray, condition, samples, noise):
-    """Template of one level at the samples of one ray, and surface features by
-    effect.
-    """
+    """Template of one level at the samples of a ray, and surface features."""
     offset = color_offset(bound, name, ray.direction, condition)
     surfaces = [effect for effect in bound.effects if effect.surface is not None]
 
@@ -301,9 +299,7 @@ def _radiance(bound, name, ray, condition, samples, noise):
 
 
 def _surface_at(bound, name, surfaces, seen, condition, noise):
-    """Same as `radiance_at`, with the features of these effects for the surface at a
-    point.
-    """
+    """Same as `radiance_at`, with the surface features of these effects."""
     point, (warped, lifted), offset = seen
     one, net = template_of(bound.spec, name), bound.params["template"][name]
 

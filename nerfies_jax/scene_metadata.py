@@ -127,8 +127,7 @@ def _frustum_points(capture, near, far, depths=8):
 
 
 def exposures(capture: Capture) -> tuple[tuple[int, int, float], ...]:
-    """Compute `SceneMetadata.exposures`, the position of each appearance id among the
-    trained.
+    """Compute `SceneMetadata.exposures`, which interpolates untrained appearances.
 
     Args:
       capture: The capture.

@@ -240,9 +240,7 @@ def draw(
 
 
 def _block(bound, occupied, camera, condition, position, columns):
-    """Render some rays, through these pixel positions, with `columns` of a grid if
-    any.
-    """
+    """Render the rays of some pixels, with `columns` of a grid if any."""
     plan, behind = bound.spec.sampling, bound.metadata.background
     ray, cosine = jax.vmap(lambda p: field_ray_through(bound.metadata, camera, p))(
         position
@@ -304,8 +302,7 @@ class _Asked(NamedTuple):
 def _ask(
     bound, name, occupied, ray, condition, distance, spacing, values, before, moved
 ):
-    """Density and, if there are four values, color [rays, samples, values], zero if
-    skipped.
+    """Density, or density and color, [rays, samples, values], zero if skipped.
 
     `moved` is the displacement of all samples, if warps are read on a grid. Otherwise
     warps and ambient coordinates of the samples `before` are not computed again.

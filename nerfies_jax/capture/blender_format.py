@@ -253,9 +253,7 @@ def _times(entries, split):
 
 
 def _camera_ids(entries, times, split, is_train):
-    """Number the folders if two of them have images of one time, else return one
-    camera.
-    """
+    """Number the folders if two have images of one time, else return one camera."""
     paths = [text_files.forward_slashes(entry.file_path) for entry in entries]
     names = [pathlib.PurePosixPath(path).parent.as_posix() for path in paths]
     # D-NeRF's one camera fills train and test, whose times meet.

@@ -98,9 +98,7 @@ def _lens(capture, row):
 
 
 def _observations(capture):
-    """Return the points that each frame lists [frames, points], and all pixel
-    positions.
-    """
+    """Return the points that each frame lists [frames, points], and all pixels."""
     count = len(capture.ids)
     if capture.points is None:
         return np.zeros((count, 0), bool), np.zeros((count, 0, 2))

@@ -6,4 +6,4 @@ class FileError(ValueError):
 
 
 class CaptureError(FileError):
-    """A capture that cannot be used as it is; one line, with the way out."""
+    """A capture that cannot be used, with a one-line message that names the remedy."""

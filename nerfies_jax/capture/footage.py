@@ -307,9 +307,7 @@ def _heif():
 
 @contextlib.contextmanager
 def _opened(file):
-    """Open an image as stored, and raise a one-line error for anything wrong with
-    it.
-    """
+    """Open an image as stored, and raise a one-line error for any defect."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
@@ -402,8 +400,7 @@ def _write_mask(out, name, mask, shape, factor, source):
 
 
 def sharpness(gray: np.ndarray) -> float:
-    """Compute the variance of the Laplacian of an image, which is large for sharp
-    edges.
+    """Compute the variance of the Laplacian of an image, large for sharp edges.
 
     Args:
       gray: Gray image, [height, width].
@@ -447,8 +444,6 @@ def sharp_rows(
 
 
 def _usual(scores, row):
-    """Lower of the medians just before and just after, since texture may change
-    abruptly.
-    """
+    """Lower of the medians before and after, since texture may change abruptly."""
     sides = scores[max(0, row - 5) : row], scores[row + 1 : row + 6]
     return min((np.median(side) for side in sides if side.size), default=0.0)

@@ -471,10 +471,16 @@ def pixels_of(
 
 
 def near_origin(cameras: Camera, position: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """Move cameras and points [points, 3] of a world together, in float64.
+    """Move cameras and points of a world to the origin together, in float64.
 
-    Returns them in float32, with the median point at the origin: map coordinates of
-    millions of meters have a resolution of half a meter in float32.
+    Map coordinates of millions of meters have a resolution of half a meter in float32.
+
+    Args:
+      cameras: Cameras with float64 positions, [frames].
+      position: Points of the same world, [points, 3].
+
+    Returns:
+      Cameras and points in float32, with the median point at the origin.
     """
     origin = np.median(position, axis=0)
     moved = (cameras.position - origin).astype(np.float32)
@@ -522,11 +528,14 @@ def load_array(path: pathlib.Path, most: int) -> np.ndarray:
     """Read a .npy file of numbers.
 
     Args:
-        path: The file.
-        most: How many numbers it may have.
+      path: The file.
+      most: Largest number of values.
+
+    Returns:
+      The array.
 
     Raises:
-        CaptureError: It is damaged, larger, or no array of numbers.
+      CaptureError: If it is damaged, larger, or no array of numbers.
     """
     try:
         array = npz_files.read_npy(path, 8 * most + npz_files.MAX_HEADER)

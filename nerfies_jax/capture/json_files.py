@@ -27,7 +27,7 @@ from nerfies_jax.capture.safe_files import AnyPath as AnyPath
 # 20 000 frames of transforms.json are 20 MB. Decoded, a file may take 20 times as much.
 MAX_JSON_BYTES = 64 * 2**20
 
-# Of this process: what is not complete, and the folders where `sweep` has looked.
+# Incomplete files of this process, and the folders that `sweep` has visited.
 _unfinished: set[pathlib.Path] = set()
 _swept: set[pathlib.Path] = set()
 
@@ -42,11 +42,14 @@ def read_json(path: AnyPath, kind: Any = Any) -> Any:
 
     Args:
       path: The file.
-      kind: The type to decode it as, for msgspec.
+      kind: Type to decode it as, for msgspec.
+
+    Returns:
+      The decoded value.
 
     Raises:
-      CaptureError: It is not JSON, has a NaN or a number that float64 cannot hold, is
-        nested deeper than the decoder goes, has a wrong type or lacks a key.
+      CaptureError: If it is not JSON, has a NaN or a number that float64 cannot hold,
+        is nested too deeply for the decoder, has a wrong type or lacks a key.
     """
     path = pathlib.Path(path)
     text = safe_files.read_bytes(path, MAX_JSON_BYTES)
@@ -444,9 +447,7 @@ def scratch_folder(path: AnyPath):
 
 @contextlib.contextmanager
 def _partial_folder(path, place):
-    """Temporary folder in `place` for the contents of `path`, removed with the
-    block.
-    """
+    """Temporary folder in `place` for the contents of `path`, removed at the end."""
     try:
         place.mkdir(parents=True, exist_ok=True)
         prefix = f".{path.resolve().name}.{processes.own_name()}."

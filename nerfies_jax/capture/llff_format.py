@@ -109,9 +109,7 @@ def read(
 
 
 def _placed(poses):
-    """Place the scene by points at the bounds of each camera, in place of scene
-    points.
-    """
+    """Place the scene by points at the bounds of each camera."""
     ahead = poses.rotations[:, None, 2] * poses.bounds[..., None]
     box = (poses.positions[:, None] + ahead).reshape(-1, 3)
     return place_by_points(box, poses.positions, poses.bounds.ravel())

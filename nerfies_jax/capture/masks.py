@@ -1,5 +1,4 @@
-"""Mask images of every encoding, in which the meaning of white is found for a whole
-set.
+"""Mask images of every encoding, which is determined for a whole set.
 
 One mask alone is ambiguous: a file of zeros and ones looks black, and a frame in which
 nothing is marked has only one value.
@@ -222,9 +221,7 @@ def _survey(path, orientation):
 
 
 def _is_cut_out(value, alpha):
-    """Test if the color inside is not a mask itself: it has no black, or is a
-    photograph.
-    """
+    """Test if the color inside is not a mask: it has no black, or is a photograph."""
     inside = value[alpha] if alpha.any() else value
     if not alpha.any() and value.min() == value.max():
         return True  # nothing is marked

@@ -118,9 +118,7 @@ def _are_synchronized(groups, times):
 
 
 def _milliseconds(name):
-    """Milliseconds since 1970 from a name ending like IMG_20240131_235959, else
-    None.
-    """
+    """Milliseconds since 1970 from a name like IMG_20240131_235959, else None."""
     match = re.search(r"(?<!\d)(\d{8})[_-]?(\d{6})(\d{3})?$", name)
     if match is None:
         return None

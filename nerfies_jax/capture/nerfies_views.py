@@ -41,7 +41,7 @@ class CameraFile(msgspec.Struct):
 
 
 class SceneFile(msgspec.Struct):
-    """`scene.json`, with near and far in scene units but scale and center in world
+    """`scene.json`, with near and far in scene units, scale and center in world
     units.
     """
 

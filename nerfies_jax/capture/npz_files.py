@@ -1,6 +1,6 @@
-"""NumPy arrays of files that anybody may have written, damaged or cut short.
+"""NumPy arrays of untrusted files, which may be damaged or cut short.
 
-Headers are believed only as far as the bytes behind them go, sizes are bounded before
+Headers are trusted only as far as the bytes behind them go, sizes are bounded before
 anything is allocated, and Python objects are never loaded.
 """
 
@@ -70,9 +70,15 @@ class Archive:
     def read(self, name: str) -> np.ndarray:
         """Unpack one array.
 
+        Args:
+          name: Name of the array.
+
+        Returns:
+          The array.
+
         Raises:
-          ValueError: It is damaged.
-          KeyError: There is no array of that name.
+          ValueError: If it is damaged.
+          KeyError: If there is no array of that name.
         """
         member = self._members[name]
         with self._archive.open(member) as stream:
@@ -81,12 +87,19 @@ class Archive:
 
 @contextlib.contextmanager
 def archive(path: AnyPath, most: int = MAX_BYTES) -> Iterator[Archive]:
-    """Open a .npz file whose arrays have at most `most` bytes together.
+    """Open a .npz file.
+
+    Args:
+      path: The file.
+      most: Largest number of bytes of all arrays together.
+
+    Yields:
+      The archive.
 
     Raises:
-      ValueError: The file, or what is read from it in the block, is damaged or too
-        large; one line without the path.
-      CaptureError: It cannot be opened.
+      ValueError: If the file, or an array read in the block, is damaged or too large,
+        with a one-line reason without the path.
+      CaptureError: If it cannot be opened.
     """
     try:
         with safe_files.open_file(path) as file:
@@ -105,22 +118,34 @@ def read_arrays(path: AnyPath, most: int = MAX_BYTES) -> dict[str, np.ndarray]:
 
     Args:
       path: The file.
-      most: Bytes that they may have together.
+      most: Largest number of bytes of all arrays together.
+
+    Returns:
+      Arrays by name.
 
     Raises:
-      ValueError: It is damaged or too large; one line without the path.
-      CaptureError: It cannot be opened.
+      ValueError: If it is damaged or too large, with a one-line reason without the
+        path.
+      CaptureError: If it cannot be opened.
     """
     with archive(path, most) as opened:
         return {name: opened.read(name) for name in opened.names}
 
 
 def read_npy(path: AnyPath, most: int = MAX_BYTES) -> np.ndarray:
-    """Read a .npy file of at most `most` bytes.
+    """Read a .npy file.
+
+    Args:
+      path: The file.
+      most: Largest number of bytes of the file.
+
+    Returns:
+      The array.
 
     Raises:
-      ValueError: It is damaged or too large; one line without the path.
-      CaptureError: It cannot be opened.
+      ValueError: If it is damaged or too large, with a one-line reason without the
+        path.
+      CaptureError: If it cannot be opened.
     """
     with safe_files.open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -136,12 +161,15 @@ def read_array(stream: io.BufferedIOBase, size: int) -> np.ndarray:
     """Read one array in NumPy's format.
 
     Args:
-      stream: Begins with its header.
-      size: Bytes that the stream has, header included.
+      stream: Stream that begins with the header of the array.
+      size: Number of bytes of the stream, including the header.
+
+    Returns:
+      The array.
 
     Raises:
-      ValueError: The header is none, asks for Python objects, or for other than the
-        bytes behind it.
+      ValueError: If there is no header, or it asks for Python objects or for more or
+        fewer bytes than there are.
     """
     shape, column_major, dtype, header_bytes = _header(stream)
     count = math.prod(shape)
@@ -161,7 +189,7 @@ def read_array(stream: io.BufferedIOBase, size: int) -> np.ndarray:
 
 
 def _header(stream):
-    """Shape, order, type and the bytes that they took."""
+    """Shape, order, type and length in bytes of a header."""
     head = stream.read(8)
     if head[:6] != b"\x93NUMPY" or len(head) < 8:
         raise ValueError("not an array in NumPy's format")

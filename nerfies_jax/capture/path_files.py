@@ -47,7 +47,7 @@ class PathFile(msgspec.Struct):
     render_width: float
     render_height: float
     camera_type: str = "perspective"
-    # Of its editor. Their layout differs between versions of nerfstudio.
+    # Keyframes of its editor, whose layout differs between versions of nerfstudio.
     keyframes: list[dict[str, Any]] = []
 
 

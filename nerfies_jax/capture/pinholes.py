@@ -1,6 +1,4 @@
-"""Undistortion of captures for renderers of pinhole cameras, and distortion of
-renders.
-"""
+"""Undistortion of captures for pinhole renderers, and distortion of renders."""
 
 import dataclasses
 from collections.abc import Callable

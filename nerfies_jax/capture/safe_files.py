@@ -1,8 +1,8 @@
-"""Open files that anybody may have written: regular, inside their folder, bounded.
+"""Safe opening of untrusted files: regular, inside their folder, bounded in size.
 
-Every reader of a capture opens its files through this module, or checks them here
-right before it gives their path to a library. A link that leads out of the capture is
-refused at that moment, so what a name was when it was looked up does not count.
+Every reader of a capture opens its files through this module, or checks them here right
+before it gives their path to a library. A link that leads out of the capture is refused
+at that moment, so the target of a name when it was looked up does not count.
 """
 
 import contextlib
@@ -33,6 +33,12 @@ def confined(folder: AnyPath) -> Iterator[None]:
     """Refuse files outside a folder while the block reads.
 
     Functions for the threads of a pool are confined by `carried`.
+
+    Args:
+      folder: The folder.
+
+    Yields:
+      None.
     """
     token = _folder.set(os.path.realpath(folder))
     try:
@@ -44,10 +50,14 @@ def confined(folder: AnyPath) -> Iterator[None]:
 def confines(
     read: Callable[Concatenate[AnyPath, Parameters], Content],
 ) -> Callable[Concatenate[AnyPath, Parameters], Content]:
-    """Decorate a reader of a capture: it may open files of that capture alone.
+    """Decorate a reader of a capture so that it can open files of that capture only.
 
     Args:
-      read: Takes the path of a folder, or of a file whose folder is the capture.
+      read: Reader that takes the path of a folder, or of a file whose folder is the
+        capture.
+
+    Returns:
+      The confined reader.
     """
 
     @functools.wraps(read)
@@ -62,7 +72,14 @@ def confines(
 
 
 def carried(function: Callable[..., Content]) -> Callable[..., Content]:
-    """Confine a function, in whatever thread it runs, as its caller is now."""
+    """Confine a function like its caller now, in whatever thread it runs.
+
+    Args:
+      function: The function.
+
+    Returns:
+      The confined function.
+    """
     folder = _folder.get()
 
     def run(*args: Any) -> Content:
@@ -78,11 +95,14 @@ def carried(function: Callable[..., Content]) -> Callable[..., Content]:
 def check(path: AnyPath) -> pathlib.Path:
     """Check a file right before it is opened.
 
+    Args:
+      path: The file.
+
     Returns:
       The path.
 
     Raises:
-      CaptureError: There is none, it is not a regular file, or it lies outside the
+      CaptureError: If it does not exist, is not a regular file, or lies outside the
         folder that is being read.
     """
     path = pathlib.Path(path)
@@ -96,7 +116,13 @@ def check(path: AnyPath) -> pathlib.Path:
 
 
 def open_file(path: AnyPath) -> io.BufferedReader:
-    """Open a file for reading, as `check` allows it.
+    """Open a file for reading, with the checks of `check`.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The open file.
 
     Raises:
       CaptureError: As for `check`.
@@ -118,10 +144,17 @@ def open_file(path: AnyPath) -> io.BufferedReader:
 
 
 def read_bytes(path: AnyPath, most: int) -> bytes:
-    """Read a whole file of at most `most` bytes.
+    """Read a whole file.
+
+    Args:
+      path: The file.
+      most: Largest number of bytes.
+
+    Returns:
+      The contents.
 
     Raises:
-      CaptureError: As for `check`, or it is larger.
+      CaptureError: As for `check`, or if the file is larger.
     """
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size

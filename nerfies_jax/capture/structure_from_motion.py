@@ -317,9 +317,7 @@ def _reconstruct(folder: pathlib.Path, masked: bool, spec: MappingSpec) -> dict:
 
 
 def _judged(model) -> dict:
-    """Reprojection errors of static points, and the angles under which they are
-    observed.
-    """
+    """Reprojection errors of static points, and their triangulation angles."""
     points = [p for p in model.points3D.values() if p.track.length() >= MIN_TRACK]
     if not points:
         return {"points": 0, "error_px": 0.0, "angle_deg": 0.0}

@@ -27,7 +27,15 @@ def places_in(units: Units, capture: Capture, points: np.ndarray) -> np.ndarray:
 
 
 def usual_depth(capture: Capture) -> float:
-    """The median z-depth of the points, or the middle of near and far without them."""
+    """Return a typical depth of a capture.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The median z-depth of its points, or without points the geometric mean of near and
+      far, in scene units.
+    """
     depths = point_depths(capture)
     if depths.size:
         return float(np.median(depths))
@@ -35,12 +43,27 @@ def usual_depth(capture: Capture) -> float:
 
 
 def float32_step(points: np.ndarray) -> float:
-    """The largest distance between neighboring float32 numbers at these coordinates."""
+    """Return the largest spacing of float32 numbers at some coordinates.
+
+    Args:
+      points: Coordinates of any shape.
+
+    Returns:
+      The distance.
+    """
     largest = np.abs(points).max(initial=0.0)
     return float(np.spacing(np.float32(largest)))
 
 
 def in_pixels(capture: Capture, length: float) -> float:
-    """A length in scene units as it appears at the usual depth, in pixels."""
+    """Convert a length in scene units to pixels at the typical depth.
+
+    Args:
+      capture: The capture.
+      length: Length in scene units.
+
+    Returns:
+      Length in pixels.
+    """
     focal = float(np.median(capture.cameras.focal_px))
     return length * focal / usual_depth(capture)

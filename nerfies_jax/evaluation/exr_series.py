@@ -48,8 +48,7 @@ def write(
 def write_frame(
     path: AnyPath, rendering: Rendering, view: View, flow: np.ndarray | None = None
 ) -> None:
-    """Write linear color (RGB), opacity (A) and z-depth (Z), with the camera in the
-    header.
+    """Write linear color (RGB), opacity (A), z-depth (Z) and the camera.
 
     Args:
       path: The file.

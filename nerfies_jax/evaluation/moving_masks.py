@@ -1,6 +1,4 @@
-"""Masks of moving pixels in held-out frames, for captures without masks of their
-own.
-"""
+"""Masks of moving pixels in held-out frames, for captures without masks."""
 
 import dataclasses
 import math

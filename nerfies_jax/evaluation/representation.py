@@ -90,17 +90,17 @@ class Representation(NamedTuple):
     """
 
     name: str
-    # How many cores XLA:CPU should see: "one" where its own threading slows the loops.
+    # Cores that XLA:CPU should see: "one" if its own threading slows the loops down.
     threads: Literal["one", "all"]
-    # Of a spec: into how many equal shares its step falls, for as many devices.
+    # Number of equal shares of a spec's step, for as many devices.
     shares: Callable[[Spec], int]
-    # Whether rays are traced through the lens; else pictures are drawn of pinholes, and
-    # held-out ones are bent as the lens does before they are scored.
+    # True if rays are traced through the lens. Otherwise pinhole images are rendered,
+    # and distorted before held-out frames are evaluated.
     traces_lenses: bool
     spec_type: type
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
-    # How many times a step of the first state one takes on average over a run.
+    # Mean time of a step over a run, relative to one with the first state.
     growth: Callable[[Spec, TrainState], float]
     metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[..., Model]  # (spec, metadata, effects=()) -> model
@@ -126,7 +126,7 @@ class Representation(NamedTuple):
     # ({effect: whether it is called for, None unknown}, papers' sizes, the preset that
     # the user names, without "-small", or None) -> what to take
     advise: Callable[[dict[str, bool | None], bool, str | None], Choice]
-    # What to take for a capture where the user names no preset.
+    # Preset of a capture if the user names none.
     default_preset: Callable[[Capture], Choice] | None
     prices: dict[str, Pair]  # by effect, as in `nerfies_jax.evidence.findings`
     # (spec, metadata, names left out, effects=()) -> the Gaussians of a trained scene

@@ -27,9 +27,7 @@ class Scored(NamedTuple):
 
 
 class Halves(NamedTuple):
-    """Metrics of the right halves of frames whose codes were fitted to the left
-    halves.
-    """
+    """Metrics of right halves of frames with codes fitted to their left halves."""
 
     rows: np.ndarray  # of the capture
     psnr: np.ndarray  # dB, of the 8-bit picture

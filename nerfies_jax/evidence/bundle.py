@@ -195,9 +195,7 @@ def _system(views, seen, body, bend):
 
 
 def _weights(miss):
-    """Weights of observations [entries] in the next round, from errors [entries, 2] in
-    px.
-    """
+    """Weights of observations [entries], from errors [entries, 2] in px."""
     return 1 / (1 + (miss**2).sum(-1) / SOFT_PX**2)
 
 

@@ -1,5 +1,4 @@
-"""External preprocessing files: tracks, masks, depth and flow, checked against a
-capture.
+"""External tracks, masks, depth and flow in files, checked against a capture.
 
 Each has as many frames as the capture, or as its training frames, in order of time.
 Errors name the file, the bound and the remedy.

@@ -258,8 +258,7 @@ def _paths(capture, views, tracks, rest, score, which, depths, watch):
 
 
 def looked_at(capture: Capture, factor: int) -> Capture:
-    """Return the capture in whose pixels preprocessing results are: undistorted and
-    reduced.
+    """Return the undistorted, reduced capture that preprocessing results refer to.
 
     Args:
       capture: The capture.
@@ -295,8 +294,7 @@ def _unusable(views, flow):
 
 
 def carried(views: Views, flow: NeighborFlow) -> float:
-    """Compute the share of textured pixels whose flow is consistent with the next
-    frame.
+    """Compute the share of textured pixels with consistent flow to the next frame.
 
     Args:
       views: The frames.

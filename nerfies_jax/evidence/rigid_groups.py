@@ -188,8 +188,7 @@ def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.n
 def centers(
     position: np.ndarray, known: np.ndarray, bodies: RigidMotion
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the position of each path in the canonical frame, and the centers of
-    groups.
+    """Compute the canonical position of each path, and the centers of groups.
 
     Args:
       position: Positions in scene units, [paths, frames, 3].

@@ -76,8 +76,7 @@ def _slope(color):
 
 
 def _depth(views, frame, position):
-    """z-depth [height, width] of the static scene, with gaps filled by the nearest
-    known.
+    """z-depth [height, width] of the static scene, with gaps filled.
 
     None if no point lies in the image.
     """
@@ -102,9 +101,7 @@ def _depth(views, frame, position):
 
 
 def _unlike(views, color, depth, frame):
-    """Dissimilarity [height, width] in gray levels, NaN if too few frames show the
-    place.
-    """
+    """Dissimilarity [height, width] in gray levels, NaN if unknown."""
     width, height = views.size
     blank = np.full((height, width), np.nan, np.float32)
     if depth[frame] is None:

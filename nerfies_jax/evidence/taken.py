@@ -1,6 +1,4 @@
-"""External preprocessing results, resampled to the frames and pixels of
-preprocessing.
-"""
+"""External preprocessing results, resampled to the frames of preprocessing."""
 
 import cv2
 import numpy as np

@@ -58,8 +58,7 @@ def pixel_of(
 
 
 def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
-    """Make starting points of tracks: a regular grid in every third frame, shifted
-    randomly.
+    """Make starting points of tracks: a shifted grid in every third frame.
 
     Points on a plain background or on unobserved pixels are left out. A long video uses
     fewer frames, such that tracks have at most `MOST_PLACES` positions in all frames
@@ -134,9 +133,7 @@ def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
 
 
 def _step(pixel, shift, usable):
-    """Move pixels by the bilinear mean of usable flow, and return which can be
-    trusted.
-    """
+    """Move pixels by the bilinear mean of usable flow. Also returns validity."""
     height, width = usable.shape
     bound = np.array([width, height])
     kept = usable[pixel_of(pixel, usable.shape)]

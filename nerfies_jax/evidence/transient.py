@@ -91,9 +91,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
 
 
 def _above_neighbors(gone):
-    """Losses of pairs beyond the median of their neighbors, since a fast pan loses
-    often.
-    """
+    """Losses of pairs beyond the median of their neighbors."""
     above = []
     for at, one in enumerate(gone):
         beside = np.r_[gone[max(0, at - AROUND) : at], gone[at + 1 : at + 1 + AROUND]]
@@ -108,8 +106,7 @@ def _always_there(evidence):
 
 
 def jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the share of pixels that one frame shows and the next does not, or
-    reverse.
+    """Compute the share of pixels that only one of two neighboring frames shows.
 
     Args:
       views: The frames.

@@ -288,8 +288,7 @@ def some(position: np.ndarray) -> np.ndarray:
 
 
 def depth_span(capture: Capture, views: Views) -> tuple[float, float]:
-    """Estimate the range of z-depth of a scene, from its points or the capture's
-    planes.
+    """Estimate the z-depth range of a scene from its points or the near and far planes.
 
     Args:
       capture: The capture.

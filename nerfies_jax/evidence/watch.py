@@ -94,8 +94,7 @@ class Watch:
         self._spent += work
 
     def has_room(self, share: float, what: str, work: float) -> bool:
-        """Return whether less than a share of the budget is spent, and then count the
-        work.
+        """Count work unless a share of the budget is spent.
 
         Args:
           share: Share of the budget.

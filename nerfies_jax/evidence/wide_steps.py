@@ -14,8 +14,8 @@ import numpy as np
 from nerfies_jax.evidence import view_set
 from nerfies_jax.evidence.view_set import Views
 
-# Of the picture's width: the median flow of a pair from which it is searched again. The
-# film of `static` at 112x84 and 40 frames takes such steps, and had 6.6 % of its pixels
+# Median flow, as a share of the image width, above which a pair is searched again. The
+# video of `static` at 112x84 and 40 frames has such steps, and had 6.6 % of its pixels
 # marked as moving, a checkered cube that is 15 % off in each.
 WIDE_SHARE = 0.03
 MOST_TURN_RAD = 0.8  # between viewing axes: then hardly anything looks alike

@@ -238,8 +238,7 @@ def _radial_slope(radial, radius_sq):
 
 
 def _unfolded(radial, radius_sq):
-    """Test if the radial derivative is positive from 0 to `radius_sq`, without
-    sampling.
+    """Test if the radial derivative is positive from 0 to `radius_sq`.
 
     A cubic's least value lies at an end or where its derivative 3k1 + 10k2 s + 21k3 s²
     vanishes.

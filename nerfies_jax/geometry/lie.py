@@ -181,8 +181,7 @@ def inverse_left_jacobian(angular: Vector) -> Matrix:
 @checked(broadcast=True)
 @at_least_float32
 def left_jacobian_se3(angular: Vector, linear: Vector) -> Float[Array, "6 6"]:
-    """Compute the left Jacobian of `exp_se3`, with components ordered (angular,
-    linear).
+    """Compute the left Jacobian of `exp_se3`, ordered (angular, linear).
 
     Args:
       angular: Rotation vector in radians, [3].

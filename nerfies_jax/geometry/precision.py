@@ -120,8 +120,7 @@ def near_one(
 
 
 def power_of_two(size: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return the power of two next to a value, clamped so that its reciprocal is
-    normal.
+    """Return the power of two next to a value, with a normal reciprocal.
 
     XLA:CPU divides by x by multiplying with 1 / x, which it flushes to zero from 8.5e37
     in float32 on.

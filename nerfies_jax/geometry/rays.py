@@ -109,8 +109,7 @@ def across_ray(unit: Float[np.ndarray, "*rays 3"]) -> Float[np.ndarray, "*rays 3
 def depth_per_distance(
     camera: Camera, direction: Float[Array, "*rays 3"]
 ) -> Float[Array, "*rays"]:
-    """Compute the cosine between rays and the viewing axis: z-depth = cosine ×
-    distance.
+    """Compute the cosine between rays and the viewing axis, z-depth per distance.
 
     Args:
       camera: One camera, or a batch that broadcasts with the rays.

@@ -53,8 +53,7 @@ class Metric:
             )
 
     def holds(self, before: float) -> bool:
-        """Return whether the value is no worse than an earlier one within the
-        tolerance.
+        """Return whether the value is no worse than before, within the tolerance.
 
         Args:
           before: The earlier value.
@@ -73,8 +72,7 @@ class Metric:
 def write_metrics(
     path, metrics: Iterable[Metric], about: Mapping[str, Any] = {}
 ) -> None:
-    """Write metrics as `{"about": ..., "metrics": {key: {value, unit, ...}}}`,
-    atomically.
+    """Write metrics as `{"about": ..., "metrics": {key: {value, unit, ...}}}`.
 
     Values that are not finite are written as null, since JSON cannot represent them.
 

@@ -14,7 +14,7 @@ class Counted(NamedTuple):
     """Operations of one call."""
 
     flops: float  # two for each multiply-add
-    # Whether some of them are in a loop that runs as often as its data say; its body
+    # True if some are in a loop whose number of iterations depends on data. Its body
     # counts once.
     at_least: bool
 

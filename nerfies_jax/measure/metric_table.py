@@ -1,6 +1,4 @@
-"""Every metric of a run: its name, unit, direction and meaning, by the key of
-`metrics.json`.
-"""
+"""Name, unit, direction and meaning of the metrics in `metrics.json`."""
 
 from typing import NamedTuple
 

@@ -24,7 +24,7 @@ class StepParts(NamedTuple):
     """The parts of one step, compiled in the background."""
 
     parts: dict[str, Part]
-    # Of their milliseconds; times the whole step, and says what they leave of it.
+    # Function of their milliseconds that times the whole step and adds the rest of it.
     with_rest: Callable[[dict[str, float]], dict[str, float]]
 
     def ms(self) -> dict[str, float]:

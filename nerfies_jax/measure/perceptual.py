@@ -49,8 +49,7 @@ class LpipsParams(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """Convolutions up to one of the compared feature maps, with optional pooling
-    before.
+    """Convolutions up to one of the compared feature maps, after optional pooling.
 
     Each convolution is (index in torchvision's `features`, kernel width, output
     channels, stride, padding) and is followed by a ReLU.

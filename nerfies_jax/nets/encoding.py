@@ -52,9 +52,7 @@ class EncodingSpec:
 
     @property
     def shortest_wave(self) -> float:
-        """Wavelength of the last band in units of the coordinates, or inf without
-        bands.
-        """
+        """Wavelength of the last band in coordinate units, inf without bands."""
         if self.bands == 0:
             return math.inf
         return (2 if self.times_pi else 2 * math.pi) / 2 ** (self.bands - 1)

@@ -55,8 +55,7 @@ def rounded(values: Numbers, mean: Numbers, step: Numbers) -> Numbers:
 
 
 def bits(values: Numbers, mean: Numbers, log_scale: Numbers, step: Numbers) -> Numbers:
-    """Compute -log2 of the normal probability of lying within half a step of each
-    value.
+    """Compute -log2 of the normal probability of half a step around each value.
 
     Both ends are taken on the side of the distribution where probabilities are small,
     as logarithms. As a difference of probabilities, float32 gives 0 and so infinitely

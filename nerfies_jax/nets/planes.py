@@ -287,8 +287,7 @@ def linear(
 
 
 def total_variation(plane: Float[Array, "first second features"]) -> Float[Array, ""]:
-    """Compute the squared differences of neighboring vertices, averaged along each
-    axis.
+    """Compute the mean squared difference of neighboring vertices, per axis.
 
     4DGS uses this name for `time_smoothness` along one axis.
 

@@ -109,8 +109,7 @@ def sample_pdf(
     count: int,
     floor: float | None = None,
 ) -> Float[Array, " count"]:
-    """Sample distances with a density proportional to weights (inverse transform
-    sampling).
+    """Sample distances with a density proportional to weights, by inversion.
 
     The cumulative weights, linear within a bin, are inverted at evenly spaced values
     from 0 to 1 (one sample: at a half), or with a key at one random value in each of

@@ -114,7 +114,7 @@ class Template(NamedTuple):
 
     trunk: mlp.MLP  # heads "density" and "bottleneck"
     color: mlp.MLP  # reads [bottleneck, condition]; head "color"
-    # Of a grid or of planes, where there are any.
+    # Tables of a grid or of planes, if there are any.
     tables: grids.Tables | tuple[planes.Level, ...] | None = None
 
 

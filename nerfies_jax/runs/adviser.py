@@ -11,9 +11,7 @@ from nerfies_jax.runs.config import RunConfig
 
 @dataclasses.dataclass(frozen=True)
 class Advice:
-    """A preset with overrides, and notes on everything that was not decided or not
-    possible.
-    """
+    """A preset with overrides, and notes on undecided or impossible requests."""
 
     representation: str
     preset: str

@@ -91,16 +91,14 @@ class RunConfig:
     preset: str | None = None
     source: CaptureSource = CaptureSource()
     steps: int | None = None  # the preset's own; schedules stretch with them
-    overrides: tuple[str, ...] = ()  # of the preset's fields, as for --set
+    overrides: tuple[str, ...] = ()  # of the preset's fields, as PATH=VALUE
     effects: tuple[str, ...] = ()  # of the user's own, as MODULE:NAME
     seed: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
 class Preparation:
-    """Settings of the conversion of a video or of images without cameras to a
-    capture.
-    """
+    """Settings of the conversion of a video or of plain images to a capture."""
 
     frames: int | None = None
     """Frames of a video to keep, evenly spaced (default: 100)."""

@@ -102,9 +102,7 @@ class EventLog:
             self._problem = problem
 
     def close(self) -> None:
-        """Write the remaining events and close the file, with a warning if any were
-        lost.
-        """
+        """Write the remaining events, and warn if any were lost."""
         with self._lock:
             for each in self._thinned.values():
                 self._append(each)

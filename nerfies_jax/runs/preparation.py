@@ -215,8 +215,7 @@ def _solve_without_movers(scratch, spec, error, tell):
 
 
 def _write_masks(scratch, moving):
-    """Write masks, white on moving pixels for users, and black with a margin for
-    COLMAP.
+    """Write masks: white for users, and black with a margin for COLMAP.
 
     Returns the folder of the latter.
     """

@@ -1,6 +1,4 @@
-"""Cost of an effect per training step, from a stored run of
-`experiments.effect_cost`.
-"""
+"""Cost of an effect per training step, as measured by `experiments.effect_cost`."""
 
 import functools
 import importlib.resources

@@ -1,6 +1,4 @@
-"""Reconstruction in one call: from a capture to a run folder, or on from a
-checkpoint.
-"""
+"""Reconstruction in one call, from a capture or on from a checkpoint."""
 
 import contextlib
 import dataclasses

@@ -16,7 +16,7 @@ from nerfies_jax.training import specs
 
 GROUP = "nerfies_jax.representations"
 USUAL = "splats-tracked-small"  # where none is named, and tracks tell a motion
-# What our own two have, for command lines, which do not load JAX to be read.
+# Presets of both packages, for command lines, which are parsed without JAX.
 PRESETS = (
     *("splats-static", "splats-mcmc", "splats-tracked", "splats-deformable"),
     *("sonata", "moba", "dynmf", "spacetime", "spline", "4dgs", "sc-gs", "edgs"),

@@ -205,9 +205,7 @@ class Screen:
 
 
 def _pixel_length(capture: Capture) -> float:
-    """Length of a pixel at the point that the training cameras look at, in scene
-    units.
-    """
+    """Length of a pixel at the focus point of the cameras, in scene units."""
     train = cameras.take(capture.cameras, capture.train)
     focus = camera_paths.focus_point(train, capture.near, capture.far)
     away = np.linalg.norm(train.position - focus, axis=-1)

@@ -20,9 +20,7 @@ EVALUATED = 4  # held-out frames in the curve; all of them are scored at the end
 
 @dataclasses.dataclass(frozen=True)
 class Pace:
-    """Duration of training, and intervals of evaluations and checkpoints, in
-    seconds.
-    """
+    """Duration of training and intervals of evaluations and checkpoints, in seconds."""
 
     seconds: float | int | None = None  # no bound but the steps
     evaluate_every: float | int = 20.0

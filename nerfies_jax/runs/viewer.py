@@ -100,9 +100,7 @@ class Viewer:
 
     @property
     def holds_training(self) -> bool:
-        """True if training must wait, because it is paused or a path is being
-        rendered.
-        """
+        """True if training must wait: it is paused, or a path is being rendered."""
         held = self.training.held(len(self._server.get_clients()))
         return held or self.path.rendering is not None
 

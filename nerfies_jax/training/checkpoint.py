@@ -342,9 +342,7 @@ def _checksum(array):
 
 
 def _text_checksum(about):
-    """Checksum of the metadata without its own entry, the same before and after
-    JSON.
-    """
+    """Checksum of the metadata without its own entry, unchanged by JSON."""
     rest = {key: value for key, value in about.items() if key != "crc32"}
     return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
 

@@ -101,9 +101,7 @@ def _strong(leaf):
 
 
 def _check_same(before, after):
-    """Raise ValueError with the name of the array whose shape or dtype a step
-    changes.
-    """
+    """Raise ValueError naming the array whose shape or dtype a step changes."""
     old, old_structure = jax.tree_util.tree_flatten_with_path(before)
     new, new_structure = jax.tree_util.tree_flatten_with_path(after)
     if old_structure != new_structure:
@@ -149,8 +147,7 @@ class Program:
         return next(fit, 1)
 
     def _flops(self):
-        """Operations of a step, by XLA's count, in which loop bodies count once, or by
-        products.
+        """Operations of a step: the larger of XLA's count and that of matrix products.
 
         A step in micro-batches, or in slabs of pixels, is split into parts.
         """

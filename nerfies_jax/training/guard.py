@@ -36,8 +36,7 @@ class Snapshot:
         )
 
     def renewed(self, step: int, state: TrainState, after_event: bool) -> "Snapshot":
-        """Return a newer snapshot if copying is cheap enough by now, and always after
-        an event.
+        """Return a newer snapshot if it is cheap enough, and always after an event.
 
         A replay from a snapshot consists of steps alone, so no event may lie in
         between.

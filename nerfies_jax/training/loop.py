@@ -42,9 +42,7 @@ class Hook(NamedTuple):
 
 
 class History(NamedTuple):
-    """Metrics and times of a run so far, as JSON values that are saved with
-    checkpoints.
-    """
+    """Metrics and times of a run so far, as JSON values saved with checkpoints."""
 
     rows: tuple[dict[str, float], ...] = ()  # per chunk: step, seconds, mean metrics
     evaluations: tuple[dict[str, Any], ...] = ()  # hook, step, seconds, its numbers
@@ -352,9 +350,7 @@ class _Run:
             event_stream.message(f"{failure}; training goes on", "warning")
 
     def _save_overdue(self) -> None:
-        """Only before another chunk: the last state `finish` saves, with what its hooks
-        return, and a step is saved once.
-        """
+        """Save only before another chunk, since `finish` saves the last state."""
         trained = self.step_seconds < math.inf  # in this call: there is something new
         if self.checkpoints is None or not trained:
             return

@@ -21,7 +21,7 @@ class Frames(NamedTuple):
     times: Float[Array, " frames"]
     appearance: Int[Array, " frames"]
     valid: Any  # [frames, height, width] bool, or None
-    # What a model reads only where its `required_data` says so:
+    # Data that a model reads only if its `required_data` says so:
     depths: Any = (
         None  # [frames, height, width] float32 z-depth, scene units; 0 unknown
     )
@@ -62,8 +62,7 @@ class TrainState(NamedTuple):
 
 
 def in_default_precision(tree: PyTree) -> PyTree:
-    """Move a pytree to the device with floating-point arrays in JAX's default
-    precision.
+    """Move a pytree to the device, with floating-point arrays in default precision.
 
     That is float32, or float64 if `jax_enable_x64` is on. Random numbers are drawn in
     float32 first, so both precisions start alike.
@@ -131,15 +130,15 @@ class Model(NamedTuple):
     render: Callable[[PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
     events: tuple[Event, ...]
     counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n, ...}
-    # Which of "depths", "points", "flow", "moving" it reads, where a capture has them.
+    # Subset of "depths", "points", "flow" and "moving" that it reads if available.
     required_data: frozenset[str] = frozenset()
     stages: Stages | None = None  # where rendering has parts worth keeping
     surveyed: Surveyed | None = None  # where a survey makes pictures quicker
-    # As `init`, of the same structure and quicker: what a checkpoint is read into.
+    # Faster form of `init` with the same structure, which a checkpoint is read into.
     example: Callable[[Any, Any], TrainState] | None = None
     devices: int = 1  # on which `step` works, by `data_parallel`
     # (params, capture) -> the capture with its cameras as training found them; None
     # where they stay those of the capture.
     found: Callable[[PyTree, Any], Any] | None = None
-    # Of the compiler, for steps and pictures (`nerfies_jax.compiler`).
+    # Compiler options of steps and renders (`nerfies_jax.compiler`).
     compiler_options: Mapping[str, str] | None = None

@@ -38,8 +38,7 @@ def check_falling(learning_rate: float, learning_rate_end: float) -> None:
 def log_linear(
     start: float, end: float, steps: int, *, delay_steps: int = 0, delay: float = 1.0
 ) -> Schedule:
-    """Make a schedule that is linear in the logarithm, with an optional delayed
-    warm-up.
+    """Make a schedule linear in the logarithm, with an optional delayed warm-up.
 
     Over the first `delay_steps` it is multiplied with delay + (1 - delay) sin(pi/2 t),
     t from 0 to 1, as in Mip-NeRF, 3DGS and Deformable 3DGS (their `lr_delay_mult`).

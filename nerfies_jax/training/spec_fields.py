@@ -129,9 +129,7 @@ def _own_words(kind):
 
 
 def _sentences_on(name, kind):
-    """Return the sentences of a class's docstring with the field's name in
-    backticks.
-    """
+    """Return the sentences of a class's docstring that name a field in backticks."""
     text = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
     sentences = re.split(r'(?<=[^.\s][.:;])\s(?=[A-Z`"])', text)
     return " ".join(one for one in sentences if f"`{name}`" in one).rstrip(";:")

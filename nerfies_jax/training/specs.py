@@ -32,8 +32,7 @@ class OverrideError(ValueError):
 
 
 def as_json(value: Any) -> Any:
-    """Convert a spec to plain JSON values: dataclasses and NamedTuples by type and
-    fields.
+    """Convert a spec to plain JSON values, with the type of each record.
 
     `from_json` converts it back, with tuples in place of lists and sets.
 
@@ -302,9 +301,7 @@ def _meant(name, fields, outermost):
 
 
 def _absent(spec, name):
-    """Default settings of an absent part, or None if there is not exactly one
-    choice.
-    """
+    """Default settings of an absent part, None unless there is exactly one choice."""
     options = typing.get_args(typing.get_type_hints(type(spec))[name])
     choices = [option for option in options if dataclasses.is_dataclass(option)]
     return _defaults(choices[0], name) if len(choices) == 1 else None

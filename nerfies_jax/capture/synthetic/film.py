@@ -235,9 +235,7 @@ def _light_gain(spec, times, seed):
 
 
 def _smooth_noise(rng, times, columns):
-    """Random sums of sines [times, columns] with a mean square of one over all
-    phases.
-    """
+    """Random sums of sines [times, columns] with a mean square of one."""
     harmonics = np.arange(1, SHAKE_HARMONICS + 1)
     phase = rng.uniform(0, 2 * np.pi, (len(harmonics), columns))
     weight = np.sqrt(2 / np.sum(1.0 / harmonics**2)) / harmonics

@@ -71,8 +71,7 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
 
 
 def write(spec: SceneSpec, path: AnyPath, seed: int = 0):
-    """Render a scene into a Nerfies directory with `truth.npz`, completely or not at
-    all.
+    """Render a scene into a Nerfies directory with `truth.npz`, atomically.
 
     Args:
       spec: The scene.

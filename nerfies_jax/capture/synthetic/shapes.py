@@ -246,8 +246,7 @@ class Sheet:
         return jnp.stack([u, y, z - self._billow(u, y, time)])
 
     def cross(self, origin, direction, time) -> Crossing:
-        """Intersect a ray: bracketed by probes, then refined by Newton within the
-        bracket.
+        """Intersect a ray, bracketed by probes and refined by Newton's method.
 
         Args:
           origin: Origin of the ray in body coordinates, [3].

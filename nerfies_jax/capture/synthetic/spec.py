@@ -89,8 +89,7 @@ class PoseError:
 
 @dataclasses.dataclass(frozen=True)
 class Transient:
-    """An object that passes in front of the first camera at times, and is not in the
-    scene.
+    """An object that passes in front of the first camera and is not in the scene.
 
     It is in none of the second camera's frames, which evaluate the scene without it.
     """

@@ -115,8 +115,7 @@ def albedo(
 def value_noise(
     point: Float[Array, "3"], seed: Int[Array, ""] | int
 ) -> Float[Array, ""]:
-    """Evaluate value noise: random values on the integer lattice with smooth
-    interpolation.
+    """Evaluate value noise: smoothly interpolated random values on the integers.
 
     It is twice differentiable, and the same on all platforms, since the lattice is
     hashed in integers.

@@ -78,8 +78,7 @@ def track_places(capture: Capture, truth: SceneTruth, rows: np.ndarray) -> np.nd
 
 
 def told(capture: Capture, truth: SceneTruth) -> Capture:
-    """Attach the true tracks, positions and masks to a capture, as external
-    preprocessing.
+    """Attach the true tracks, positions and masks as external preprocessing.
 
     Args:
       capture: The capture.
