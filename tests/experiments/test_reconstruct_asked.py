@@ -71,8 +71,8 @@ def test_frames_without_their_picture_are_left_out_where_asked(
         (("--heldout", "1"), "held"),
         (("--prepare.frames", "9"), "has its own"),
         (("--checkpoint-every", "-1"), "--checkpoint-every -1"),
-        (("--lpips-weights", "a.npz"), "a.npz: no such file"),
-        (("--lpips-weights", "a.npz", "--lpips-network", "vgg"), "a.npz: no such file"),
+        (("--lpips-weights", "a.npz"), "a.npz: No such file"),
+        (("--lpips-weights", "a.npz", "--lpips-network", "vgg"), "a.npz: No such file"),
     ],
 )
 def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):

@@ -272,7 +272,7 @@ def test_wrong_words_are_refused_before_cameras_are_looked_for(tmp_path, mapper)
         with pytest.raises(reconstruction.Refused):
             reconstruction.reconstruct(config, tmp_path / "run")
     more = MoreMetrics(lpips_weights=(tmp_path / "a.npz",))
-    with pytest.raises(reconstruction.Refused, match=r"a\.npz: no such file"):
+    with pytest.raises(reconstruction.Refused, match=r"a\.npz: No such file"):
         reconstruction.reconstruct(RunConfig(None, source), tmp_path / "run", more=more)
     assert mapper.calls == []
     assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]
