@@ -152,6 +152,7 @@ STUDIES = {
         "player_speed", "PLAYER.html --gsplat INDEX.es.js --out player_speed.json"
     ),
     "faults": _package("faults", "--trials 200 --jobs 2"),
+    "fuzz": _package("fuzz", "--mutations 1000000"),
     "mutants": _package("mutants", "--count 44"),
     "mutants_unseen": _package("mutants_unseen", "--count 24 --seed 1", of="mutants"),
 }

@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.metadata
-import json
 import math
 import os
 import pathlib
@@ -17,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import psutil
 
-from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.capture.errors import FileError
+from nerfies_jax.capture.json_files import read_json, write_json
 
 DIRECTIONS = ("lower", "higher", "equal")
 
@@ -119,17 +119,25 @@ def read_metrics(path) -> dict[str, Metric]:
       Metrics by key, with NaN for null.
 
     Raises:
-      ValueError: If it is not such a file.
+      FileError: If it is not such a file.
     """
     try:
-        rows = json.loads(pathlib.Path(path).read_text())["metrics"]
+        rows = read_json(path, dict[str, Any])["metrics"]
         return {
             key: Metric(key, **{**row, "value": _number(row["value"])})
             for key, row in rows.items()
         }
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(
-            f"{path} is not a file of metrics ({error!r}); write it with write_metrics"
+    except FileError:  # it names the path already
+        raise
+    except (
+        LookupError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        ArithmeticError,
+    ) as error:
+        raise FileError(
+            f"{path}: not a file of metrics ({error!r}); write it with write_metrics"
         ) from error
 
 

@@ -4,13 +4,13 @@
 has ended.
 """
 
-import json
 import math
 import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.capture.errors import FileError
+from nerfies_jax.capture.json_files import read_json, write_json
 from nerfies_jax.events import Event
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import event_log
@@ -209,7 +209,7 @@ def _curve_of(told):
 
 def _stored(path):
     try:
-        stored = json.loads(path.read_text())
+        stored = read_json(path, dict[str, Any])
         rows = stored["evaluations"]
         return Curve(
             seconds=tuple(float(row["seconds"]) for row in rows),
@@ -220,8 +220,16 @@ def _stored(path):
             compile_seconds=float(stored["compile_seconds"]),
             machine=dict(stored["machine"]),
         )
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not the curve of a run ({error!r})") from error
+    except FileError:  # it names the path already
+        raise
+    except (
+        LookupError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        ArithmeticError,
+    ) as error:
+        raise FileError(f"{path}: not the curve of a run ({error!r})") from error
 
 
 def _number(value):

@@ -15,7 +15,8 @@ from nerfies_jax import events
 from nerfies_jax.capture import gate, pinholes, synthetic
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.capture.json_files import write_json
+from nerfies_jax.capture.errors import FileError
+from nerfies_jax.capture.json_files import read_json, write_json
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.evaluation import Renderer, as_found
 from nerfies_jax.evaluation.lens import ThroughLens
@@ -395,15 +396,24 @@ def read_settings(folder: pathlib.Path) -> Settings:
             "must be started again"
         )
     try:
-        stored = json.loads(path.read_text())
+        stored = read_json(path, dict[str, Any])
         kind = representations.named(stored["representation"])
         config = specs.from_json(stored["config"], RunConfig)
         spec = representations.stored_spec(kind, stored["spec"])
         for value, wanted in ((config, RunConfig), (spec, kind.spec_type)):
             if not isinstance(value, wanted):
                 raise ValueError(f"a {type(value).__name__} for a {wanted.__name__}")
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{path}: not the settings of a run ({error})") from error
+    except FileError:  # it names the path already
+        raise
+    except (
+        LookupError,
+        TypeError,
+        AttributeError,
+        ValueError,
+        RecursionError,
+    ) as error:
+        reason = " ".join(str(error).split())
+        raise FileError(f"{path}: not the settings of a run ({reason})") from error
     return Settings(config, kind, spec)
 
 

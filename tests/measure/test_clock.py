@@ -80,7 +80,7 @@ def test_a_key_twice_or_a_foreign_file_is_refused(tmp_path):
         '{"metrics": {"x": {"unit": ""}}}',
     ):
         (tmp_path / "b.json").write_text(text)
-        with pytest.raises(ValueError, match=r"b\.json is not a file of metrics"):
+        with pytest.raises(ValueError, match=r"b\.json: "):
             clock.read_metrics(tmp_path / "b.json")
 
 

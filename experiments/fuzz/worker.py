@@ -1,0 +1,144 @@
+"""Program of `experiments.fuzz`: damage files and read them, one after the other.
+
+Arguments are a folder, a target, the first mutation and the one after the last, and a
+seed. It writes the number of the mutation at hand to a file, so that whoever started it
+knows which one never ended, and a line of JSON with what it saw in the end.
+"""
+
+import json
+import os
+import pathlib
+import random
+import shutil
+import sys
+import time
+import traceback
+import warnings
+
+from experiments.fuzz import mutate, targets
+
+MOST_SECONDS = 10.0  # of the processor, for one mutation
+MOST_BYTES = 2**30  # of growth
+KEPT = 3  # inputs of each failure
+
+
+def current(folder: pathlib.Path) -> int:
+    """Read the number of the mutation that a worker is at."""
+    try:
+        return int((folder / "current").read_text() or -1)
+    except (OSError, ValueError):
+        return -1
+
+
+def run(
+    folder: pathlib.Path, name: str, first: int, last: int, seed: int
+) -> dict[str, object]:
+    """Read files after each of the mutations `first` to `last` - 1.
+
+    Returns:
+      Counts of what was read and refused, failures, the longest processor time, and how
+      much memory it took.
+    """
+    import resource
+
+    from nerfies_jax.capture import decoder
+
+    warnings.simplefilter("ignore")
+    target, work = targets.TARGETS[name], folder / "work"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    target.make(work)
+    paths = sorted(path for path in work.rglob("*") if path.is_file())
+    whole = {path: path.read_bytes() for path in paths}
+    seen = {"read": 0, "refused": 0, "failures": [], "seconds": 0.0, "bytes": 0}
+    with decoder.session():
+        target.read(work)  # compiles, and shows that it is valid
+        before = _peak(resource)
+        with (folder / "current").open("w") as progress:
+            for number in range(first, last):
+                progress.seek(0)
+                progress.write(f"{number:<20}")
+                progress.flush()
+                draw = random.Random(f"{seed}-{name}-{number}")
+                path = draw.choice(paths)
+                damaged = mutate.mutate(whole[path], path.name, draw)
+                path.write_bytes(damaged)
+                failure, spent = _read(target, work, seen)
+                grown = max(_peak(resource) - before, 0)
+                before += grown
+                seen["seconds"] = max(seen["seconds"], spent)
+                seen["bytes"] = max(seen["bytes"], grown)
+                if spent > MOST_SECONDS:
+                    failure = f"took {spent:.1f} s"
+                elif grown > MOST_BYTES:
+                    failure = f"grew by {grown / 2**20:.0f} MB"
+                if failure:
+                    _keep(folder, name, number, path, damaged, failure, seen)
+                path.write_bytes(whole[path])
+    return seen
+
+
+def _peak(resource):
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def _read(target, work, seen):
+    """What is wrong with how a reader took its input, and the processor time."""
+    from nerfies_jax.capture.errors import FileError
+
+    begun = time.process_time()
+    failure = None
+    try:
+        target.read(work)
+        seen["read"] += 1
+    except FileError as error:
+        seen["refused"] += 1
+        if str(work) not in str(error):
+            failure = f"no path in {_place(error)}"
+        elif "\n" in str(error):
+            failure = f"several lines in {_place(error)}"
+    # What is looked for is anything that a reader lets out.
+    except (Exception, RecursionError) as error:
+        failure = f"{type(error).__name__} in {_place(error)}"
+    return failure, time.process_time() - begun
+
+
+def _place(error):
+    """The innermost function of ours that an error came through."""
+    ours = [
+        each
+        for each in traceback.extract_tb(error.__traceback__)
+        if "nerfies_jax" in each.filename or "gaussians_jax" in each.filename
+    ]
+    if not ours:
+        return "the fuzzer"
+    return f"{pathlib.Path(ours[-1].filename).name}:{ours[-1].name}"
+
+
+def _keep(folder, name, number, path, damaged, failure, seen):
+    same = [one for one in seen["failures"] if one["failure"] == failure]
+    if len(same) < KEPT:
+        kept = folder / "failures"
+        kept.mkdir(exist_ok=True)
+        label = "".join(c if c.isalnum() else "_" for c in f"{name}-{number}")
+        (kept / f"{label}-{path.name}").write_bytes(damaged)
+    seen["failures"].append({"number": number, "file": path.name, "failure": failure})
+
+
+def main() -> None:
+    """Run what the arguments say."""
+    import resource
+
+    from nerfies_jax import children
+
+    children.end_with_parent()
+    folder, name, first, last, seed = sys.argv[1:]
+    limit = int(os.environ.get("FUZZ_MEMORY", 0))
+    if limit:
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    seen = run(pathlib.Path(folder), name, int(first), int(last), int(seed))
+    sys.stdout.write(json.dumps(seen) + "\n")
+
+
+if __name__ == "__main__":
+    main()
