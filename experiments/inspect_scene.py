@@ -41,6 +41,7 @@ def main(args):
     with cli.user_errors():
         platform.start_jax("cpu")
         from nerfies_jax import runs
+        from nerfies_jax.capture import gate
         from nerfies_jax.capture.capture import describe
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.evaluation import pictures
@@ -50,7 +51,7 @@ def main(args):
 
         source = cli.plain(args.source)
         capture = runs.stored_capture(source, args.seed)
-        for line in describe(capture):
+        for line in (*describe(capture), "", *gate.table(capture), ""):
             console.say(line)
         inspected = inspection.inspect(capture, CACHE / "evidence")
         advice = adviser.advise_all(inspected.findings, args.full)
@@ -87,10 +88,12 @@ def report(inspected, advice, source):
 
 def as_json(capture, inspected, advice):
     """The same as plain data."""
+    from nerfies_jax.capture import gate
     from nerfies_jax.runs import prices
 
     return {
         "capture": capture.name,
+        "checks": [one._asdict() for one in gate.findings(capture)],
         "findings": [dataclasses.asdict(one) for one in inspected.findings],
         "cost per step": prices.as_json(inspected.findings),
         "advice": [dataclasses.asdict(one) for one in advice],

@@ -10,7 +10,6 @@ import numpy as np
 from nerfies_jax.capture import (
     frames,
     name_times,
-    pose_conventions,
     text_files,
     transforms_lens,
 )
@@ -91,8 +90,6 @@ def read(
     if split.transforms.ply_file_path is not None:
         points = read_ply(named_file(root, split.transforms.ply_file_path, split.file))
     size = images.shape[2:0:-1]
-    if points is not None and len(points.position) >= 3:
-        notes += pose_conventions.check(cameras, points.position, size, where)
     placement, more = _place(cameras, points, split.transforms, size)
     offset = cameras.position - placement.center
     times, camera_ids, when = _times(entries, split)

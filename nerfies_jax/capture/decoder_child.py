@@ -66,6 +66,7 @@ OPERATIONS = {
     "colmap": (_colmap, "nerfies_jax.capture.colmap_tables"),
     "exr": (_exr, "nerfies_jax.capture.exr_decoding"),
     "video": (functools.partial(_video, "frames"), _VIDEO),
+    "video_length": (functools.partial(_video, "length"), _VIDEO),
     "video_notes": (functools.partial(_video, "notes"), _VIDEO),
     "video_transfer": (functools.partial(_video, "transfer"), _VIDEO),
     "image": (_image, "nerfies_jax.capture.images"),

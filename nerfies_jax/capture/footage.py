@@ -25,10 +25,10 @@ from nerfies_jax.capture import decoder, frames
 from nerfies_jax.capture import masks as mask_files
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
 from nerfies_jax.capture.colmap_library import MIN_TRACK
+from nerfies_jax.capture.formats import VIDEOS
 from nerfies_jax.capture.images import MAX_PIXELS, write_png
 from nerfies_jax.capture.video import notes_of, read_video, transfer_of
 
-FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HEIC = (".heic", ".heif")  # read where pillow-heif is installed
 FRAMES = 100  # kept of a film
@@ -66,7 +66,7 @@ def kind_of(path: pathlib.Path) -> str | None:
     Returns:
       "film", "pictures" (a folder with two at least), or None.
     """
-    if path.is_file() and path.suffix.lower() in FILMS:
+    if path.is_file() and path.suffix.lower() in VIDEOS:
         return "film"
     if path.is_dir() and len(pictures_in(path)) >= 2:
         return "pictures"

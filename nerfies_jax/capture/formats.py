@@ -2,6 +2,7 @@
 
 import importlib
 import pathlib
+import re
 import shlex
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,6 +10,8 @@ from typing import NamedTuple
 from nerfies_jax.capture import gate
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath
+
+VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 
 
 class Format(NamedTuple):
@@ -68,6 +71,51 @@ def _is_llff(path):
     return (path / "poses_bounds.npy").is_file()
 
 
+def videos_in(path: pathlib.Path) -> list[pathlib.Path]:
+    """List the videos of a folder by their suffix, sorted letter by letter."""
+    files = path.glob("*") if path.is_dir() else ()
+    return sorted(
+        file
+        for file in files
+        if file.suffix.lower() in VIDEOS
+        and not file.name.startswith(".")
+        and file.is_file()
+    )
+
+
+def camera_folders(path: pathlib.Path) -> list[pathlib.Path]:
+    """List folders of images of single cameras, sorted letter by letter.
+
+    Args:
+      path: Folder of the capture. They lie in it, in `images` or in `frames`.
+
+    Returns:
+      Folders whose names end in a number, with images or with a folder `images`.
+    """
+    for place in ("", "images", "frames"):
+        found = [
+            folder
+            for folder in sorted((path / place).glob("*"))
+            if re.fullmatch(r"(?!images).*\d", folder.name)
+            and folder.is_dir()
+            and (_has_images(folder) or _has_images(folder / "images"))
+        ]
+        if len(found) > 1:
+            return found
+    return []
+
+
+def _has_images(folder):
+    suffixes = (".png", ".jpg", ".jpeg")
+    return any(file.suffix.lower() in suffixes for file in folder.glob("*"))
+
+
+def _is_rig(path):
+    return _is_llff(path) and bool(
+        len(videos_in(path)) > 1 or len(camera_folders(path)) > 1
+    )
+
+
 FORMATS = (
     Format(
         "nerfies",
@@ -80,6 +128,13 @@ FORMATS = (
         "transforms*.json (Blender, D-NeRF, nerfstudio)",
         _is_blender,
         "nerfies_jax.capture.blender_format",
+    ),
+    Format(
+        "rig",
+        "poses_bounds.npy with cam00.mp4, cam01.mp4, ... or folders cam00, cam01, ... "
+        "(Neural 3D Video)",
+        _is_rig,
+        "nerfies_jax.capture.rig_format",
     ),
     Format(
         "colmap",
@@ -132,6 +187,14 @@ def recognize(path: AnyPath) -> Format:
         raise CaptureError(
             f"{path}: {pictures} pictures without cameras; find those with python -m "
             f"experiments.prepare pictures {shlex.quote(str(path))} OUT"
+        )
+    videos = videos_in(path)
+    if len(videos) > 1:
+        raise CaptureError(
+            f"{path}: {len(videos)} videos ({videos[0].name}, ...) without cameras; of "
+            "synchronized cameras, put poses_bounds.npy of Neural 3D Video next to "
+            "them; one video alone can be prepared: python -m experiments.prepare "
+            f"video {shlex.quote(str(videos[0]))} OUT"
         )
     wanted = "; ".join(each.looks_for for each in FORMATS)
     raise CaptureError(f"{path}: no capture here; looked for {wanted}")

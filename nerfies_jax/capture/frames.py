@@ -3,7 +3,7 @@
 import math
 import pathlib
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -40,7 +40,7 @@ def natural(name: str) -> tuple:
 
 
 def choose_source(
-    available: dict[int, pathlib.Path],
+    available: Collection[int],
     full_size: tuple[int, int],
     factor: int | None,
     max_side: int | None,

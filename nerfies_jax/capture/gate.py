@@ -1,23 +1,15 @@
-"""Consistency checks of every capture, independent of its format."""
+"""Consistency checks of every capture, independent of its format.
+
+Each check measures one thing in the numbers of a capture and knows what makes it wrong:
+another convention of poses, another unit, intrinsics of other images, masks of other
+values. `checked` is called after every reader.
+"""
 
 import dataclasses
-import pathlib
 
-import numpy as np
-
-from nerfies_jax.capture.capture import Capture, CaptureError, point_depths
-
-WRONG_UNITS = 20.0  # factor between stored depths and the scene that units explain
-# Names of factors between the units of depths and of cameras.
-UNITS = (
-    (1000.0, "the depths are in millimeters and the cameras in meters"),
-    (100.0, "the depths are in centimeters and the cameras in meters"),
-    (0.001, "the depths are in meters and the cameras in millimeters"),
-    (0.01, "the depths are in meters and the cameras in centimeters"),
-)
-MASKS = ("masks", "mask", "motion_masks", "dynamic_masks")
-DEPTHS = ("depth", "depths", "depth_maps", "disp")
-SAMPLES = 1_000_000  # of the pixels; more change no median
+from nerfies_jax.capture import gate_cameras, gate_depths, gate_frames, gate_poses
+from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.gate_finding import Finding
 
 
 def checked(capture: Capture) -> Capture:
@@ -27,17 +19,51 @@ def checked(capture: Capture) -> Capture:
       capture: The capture.
 
     Returns:
-      The capture, with a note for each finding.
+      The capture, with a note for each problem.
 
     Raises:
       CaptureError: If nothing can be reconstructed from it, or its parts contradict
         each other.
     """
     check_observed(capture)
-    notes = (*_depth_notes(capture), *_unread_notes(capture))
-    if not notes:
+    problems = []
+    for finding in findings(capture):
+        if finding.refused:
+            raise CaptureError(f"{capture.path or capture.name}: {finding.problem}")
+        if finding.problem and finding.problem not in capture.notes:
+            problems.append(finding.problem)
+    if not problems:
         return capture
-    return dataclasses.replace(capture, notes=(*capture.notes, *notes))
+    return dataclasses.replace(capture, notes=(*capture.notes, *problems))
+
+
+def findings(capture: Capture) -> list[Finding]:
+    """Measure everything that can be checked in the numbers of a capture.
+
+    Args:
+      capture: A capture of any format, also one that `checked` refuses.
+
+    Returns:
+      One finding for each check that applies. Those with a `problem` need attention.
+    """
+    return [
+        *gate_poses.findings(capture),
+        *gate_cameras.findings(capture),
+        *gate_depths.findings(capture),
+        *gate_frames.findings(capture),
+    ]
+
+
+def table(capture: Capture) -> list[str]:
+    """Format the findings as lines: what was checked, its value, and any problem."""
+    found = findings(capture)
+    wide = max(len(one.subject) for one in found)
+    lines = []
+    for one in found:
+        lines.append(f"{one.subject:<{wide}}  {one.value}")
+        if one.problem:
+            lines.append(f"{'':<{wide}}  ! {one.problem}")
+    return lines
 
 
 def check_observed(capture: Capture) -> None:
@@ -71,60 +97,3 @@ def check_observed(capture: Capture) -> None:
                 "from is marked as moving, which leaves no static scene; the masks may "
                 "be inverted"
             )
-
-
-def _unread_notes(capture):
-    """Folders next to the capture whose names promise what was not read."""
-    if capture.path is None:
-        return ()
-    root = pathlib.Path(capture.path)
-    root = root if root.is_dir() else root.parent
-    notes = []
-    for names, has, way_out in (
-        (MASKS, capture.valid is not None or capture.moving is not None, "masks"),
-        (DEPTHS, capture.depths is not None, "depths"),
-    ):
-        there = [name for name in names if _has_files(root / name)]
-        if there and not has:
-            notes.append(
-                f"the folder {there[0]} is not read: nothing in the capture names its "
-                f"files; they can be given as external {way_out}"
-            )
-    return tuple(notes)
-
-
-def _has_files(folder):
-    return folder.is_dir() and any(folder.iterdir())
-
-
-def _depth_notes(capture):
-    """Findings about the units of depths, against the points or near and far."""
-    if capture.depths is None:
-        return ()
-    where = str(capture.path or capture.name)
-    known = capture.depths.ravel()[:: max(1, capture.depths.size // SAMPLES)]
-    known = known[known > 0]
-    if not capture.depths.any():
-        return ("depth is stored, but no pixel has one above 0",)
-    if not known.size:
-        return ()
-    near, far = capture.near, capture.far
-    median = float(np.median(known))
-    beyond = float(((known < near) | (known > far)).mean())
-    points = point_depths(capture)
-    usual = float(np.median(points)) if points.size else float(np.sqrt(near * far))
-    ratio = median / usual
-    stated = (
-        f"the median stored depth is {median:.3g} scene units, {ratio:.3g} times that "
-        + ("of the points" if points.size else f"between near and far ({usual:.3g})")
-        + f"; near is {near:.3g} and far {far:.3g}"
-    )
-    if 1 / WRONG_UNITS < ratio < WRONG_UNITS:
-        return (f"{beyond:.0%} of depths: {stated}",) if beyond > 0.5 else ()
-    factor, reason = min(UNITS, key=lambda one: abs(np.log(ratio / one[0])))
-    way_out = "convert the depths to the unit of the cameras or remove them"
-    if abs(np.log(ratio / capture.scale)) < abs(np.log(ratio / factor)):
-        factor, reason = capture.scale, "the depths are in scene units already"
-    if abs(np.log(ratio / factor)) < np.log(3):
-        way_out = f"probably {reason}, so multiply the depths by {1 / factor:g}"
-    raise CaptureError(f"{where}: {stated}; {way_out}")

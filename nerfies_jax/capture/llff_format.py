@@ -10,9 +10,10 @@ from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath
-from nerfies_jax.capture.points import place_by_points
+from nerfies_jax.capture.points import Placement, place_by_points
 from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.geometry import camera
+from nerfies_jax.geometry.camera import Camera
 
 POSES = "poses_bounds.npy"
 MOST_NUMBERS = 17 * frames.MAX_FRAMES
@@ -74,8 +75,8 @@ def read(
     images = stored.images
     valid, notes = without_black_borders(images, stored.valid())
     notes += stored.notes
-    placed = _placed(poses)
-    cameras = _cameras(poses, placed, (images.shape[2], images.shape[1]))
+    placement = placed(poses)
+    cameras = cameras_of(poses, placement, (images.shape[2], images.shape[1]))
     names = tuple(file.stem for file in files)
     clock = name_times.clock(names)
     times = frames.spread(clock.times)
@@ -94,28 +95,45 @@ def read(
         times=times,
         train=train,
         heldout=scored,
-        near=placed.near,
-        far=placed.far,
+        near=placement.near,
+        far=placement.far,
         warp_ids=frames.dense(times),
         appearance_ids=np.arange(len(files), dtype=np.int32),
         camera_ids=camera_ids,
         valid=valid,
-        scale=placed.scale,
-        center=placed.center,
+        scale=placement.scale,
+        center=placement.center,
         up=frames.up_direction(cameras),
         path=path,
         notes=(*notes, f"every {every}th frame is held out"),
     )
 
 
-def _placed(poses):
-    """Place the scene by points at the bounds of each camera."""
+def placed(poses: Poses) -> Placement:
+    """Place the scene by points at the bounds of each camera, for lack of others.
+
+    Args:
+      poses: The cameras.
+
+    Returns:
+      The placement.
+    """
     ahead = poses.rotations[:, None, 2] * poses.bounds[..., None]
     box = (poses.positions[:, None] + ahead).reshape(-1, 3)
     return place_by_points(box, poses.positions, poses.bounds.ravel())
 
 
-def _cameras(poses, placed, size):
+def cameras_of(poses: Poses, placed: Placement, size: tuple[int, int]) -> Camera:
+    """Make cameras in scene units for images of a size.
+
+    Args:
+      poses: The cameras, in world units and full-size pixels.
+      placed: How the world becomes the scene.
+      size: Width and height of the images.
+
+    Returns:
+      A batch of one camera for each pose.
+    """
     positions = (poses.positions - np.array(placed.center)) * placed.scale
     full = [
         camera.pinhole(rotation, position, focal, poses.size)
@@ -190,5 +208,9 @@ def _folders(path, poses):
             )
         available.setdefault(ratio, folder)
     if not available:
-        raise CaptureError(f"{path}: {POSES} but no pictures; put them into images")
+        raise CaptureError(
+            f"{path}: {POSES} but no images; put them into images, or, of synchronized "
+            "cameras, one video for each next to it (cam00.mp4, cam01.mp4, ...) or one "
+            "folder of images for each (cam00/, cam01/, ...)"
+        )
     return available

@@ -59,8 +59,13 @@ def clock(names: Sequence[str]) -> Clock:
             )
             return Clock(times, cameras, (note,))
     note = "times are the order of the pictures' names: those end in no common count"
-    order = sorted(range(len(names)), key=lambda row: frames.natural(names[row]))
-    return Clock(np.argsort(order).tolist(), None, (note,))
+    return Clock(order(names), None, (note,))
+
+
+def order(names: Sequence[str]) -> list[int]:
+    """Return the place of each name in natural order."""
+    rows = sorted(range(len(names)), key=lambda row: frames.natural(names[row]))
+    return np.argsort(rows).tolist()
 
 
 def _time_fields(names):

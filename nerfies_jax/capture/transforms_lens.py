@@ -3,8 +3,6 @@
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.transforms import (
     CENTER,
@@ -213,12 +211,5 @@ def notes(found: list[Intrinsics], size: tuple[int, int]) -> tuple[str, ...]:
         lines += (
             f"principal point far from the center of images of {size[0]}x{size[1]}: "
             f"intrinsics taken to be of {width:g}x{height:g} and scaled",
-        )
-    aspects = np.array([one.focal_px[1] / one.focal_px[0] for one in found])
-    odd = aspects[np.abs(aspects - 1) > 0.01]
-    if odd.size:
-        lines += (
-            f"{odd.size} frames have pixels that are not square: vertical over "
-            f"horizontal focal length {odd.min():.3g} to {odd.max():.3g}",
         )
     return lines

@@ -147,6 +147,25 @@ def notes_of(path: pathlib.Path, count: int, last: float) -> tuple[str, ...]:
     return tuple(answer.about["notes"])
 
 
+def stated_frames(path: pathlib.Path) -> int:
+    """Read how many frames a video states to have, or its length and rate tell.
+
+    Args:
+      path: The video.
+
+    Returns:
+      The number, which may be wrong.
+
+    Raises:
+      CaptureError: If the video cannot be read.
+    """
+    extras.check("av", "video")
+    try:
+        return _one(path, "video_length").about["frames"]
+    except decoder.DecoderError as error:
+        raise _unreadable(path, error) from None
+
+
 def _one(path, operation, **arguments):
     file = str(safe_files.check(path).absolute())
     with decoder.session() as child:

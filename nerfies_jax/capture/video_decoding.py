@@ -72,6 +72,16 @@ def transfer(path: str) -> Iterator[Reply]:
         yield {"transfer": found}, {}
 
 
+def length(path: str) -> Iterator[Reply]:
+    """Read how many frames a video states to have, or its length and rate tell."""
+    av = extras.library("av", "video")
+    with _words_of(av), av.open(path) as container:
+        stream = _main_stream(container)
+        seconds = (container.duration or 0) / 1e6
+        count = stream.frames or round(seconds * float(stream.average_rate or 0))
+        yield {"frames": count}, {}
+
+
 def notes(path: str, count: int, last: float) -> Iterator[Reply]:
     """Say what is unusual about a video; arguments as for `video.notes_of`."""
     av = extras.library("av", "video")

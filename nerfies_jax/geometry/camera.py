@@ -20,6 +20,7 @@ from nerfies_jax.geometry.precision import exact_product, refuse_half
 # below 1e-19 and the seventh power of a slope above 1e5.
 MAX_SLOPE = 1e4  # lateral offset over depth: 0.006 degrees short of sideways
 MIN_DEPTH = 1e-12  # scene units
+MAX_ASIDE = 20  # images, of the principal point from the center
 Real = int | float | np.number
 
 
@@ -427,14 +428,14 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
             )
     if min(size) < 1:
         raise ValueError(f"{name}: picture size {size} must be at least 1x1 pixels")
-    # A wrong unit or a camera of another resolution; a crop may lie a picture aside.
+    # Tiles of a large image have it far outside, of another resolution or unit farther.
     center = np.asarray(camera.principal_point_px, np.float64)
-    aside = (np.abs(center / size - 0.5) > 1.5).any(axis=-1)
+    aside = (np.abs(center / size - 0.5) > MAX_ASIDE).any(axis=-1)
     if aside.any():
         raise ValueError(
             f"{name}: the principal point {center.reshape(-1, 2)[aside.ravel()][0]} is "
-            f"more than a picture outside {size[0]}x{size[1]}{_row(aside, 0)}; resize "
-            "the camera with its picture"
+            f"more than {MAX_ASIDE} images outside {size[0]}x{size[1]}"
+            f"{_row(aside, 0)}; resize the camera with its image"
         )
 
 

@@ -88,7 +88,7 @@ def prepare(
     kind = footage.kind_of(source)
     if kind is None:
         raise CaptureError(
-            f"{source}: neither a film ({', '.join(footage.FILMS)}) nor a folder with "
+            f"{source}: neither a film ({', '.join(formats.VIDEOS)}) nor a folder with "
             f"two or more pictures ({', '.join((*footage.PLAIN, *footage.HEIC))})"
         )
     if kind == "pictures" and (how.frames or how.fps):

@@ -83,7 +83,7 @@ BROKEN = {
     "two sizes": ({"poses": changed(1, 4, 99.0)}, "several sizes"),
     "another size": ({"poses": table((100, 40))}, "24x16 pixels"),
     "a picture missing": ({"count": 8}, "8 pictures for 9 poses"),
-    "no pictures": ({"folders": ()}, "no pictures"),
+    "no pictures": ({"folders": ()}, "but no images; put them"),
 }
 
 

@@ -67,7 +67,7 @@ def scaled(matrix, factor):
         ({"K": K.astype(complex)}, "K must be real numbers"),
         ({"K": np.stack([K] * 3), "camera_from_world": [POSE] * 2}, "do not broadcast"),
         ({"distortion": np.zeros(3)}, r"distortion has shape \[3\]"),
-        ({"width": 400, "height": 3}, "principal point"),
+        ({"K": K + 1000 * np.eye(3, k=2)}, "principal point"),
         ({"width": 0}, "must be at least 1x1"),
     ],
 )

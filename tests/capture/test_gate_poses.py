@@ -6,7 +6,7 @@ import numpy as np
 import plyfile
 import pytest
 
-from nerfies_jax.capture import blender_format
+from nerfies_jax.capture import formats
 from nerfies_jax.capture.capture import CaptureError
 from tests.capture.test_blender_format import dump, make
 
@@ -39,12 +39,11 @@ def with_points(root, convert, shift=0.0):
 def test_another_convention_is_named(convention, tmp_path):
     with_points(tmp_path, CONVENTIONS[convention])
     with pytest.raises(CaptureError, match=f"transform_matrix is {convention}"):
-        blender_format.read(tmp_path)
+        formats.load(tmp_path)
 
 
-@pytest.mark.parametrize(("shift", "doubtful"), [(0.0, False), (1e4, True)])
-def test_points_of_another_world_have_a_note(shift, doubtful, tmp_path):
-    with_points(tmp_path, np.array, [0, 0, shift])
-    notes = blender_format.read(tmp_path).notes
-    assert any("of another world" in note for note in notes) == doubtful
-    assert any(note.startswith("no points in view") for note in notes) == doubtful
+def test_points_of_another_world_are_refused(tmp_path):
+    with_points(tmp_path / "a", np.array, [0, 0, 1e4])
+    with pytest.raises(CaptureError, match="points or the poses are probably of anoth"):
+        formats.load(tmp_path / "a")
+    assert formats.load(with_points(tmp_path / "b", np.array)).points is not None

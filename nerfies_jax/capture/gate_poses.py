@@ -1,0 +1,310 @@
+"""Checks of cameras against scene points, and the conventions that explain a mismatch.
+
+Everything is measured in float64 in NumPy: positions may be wrong by many orders.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.gate_finding import Finding
+from nerfies_jax.geometry.camera import Camera
+
+# Share of the points in an image, averaged over cameras. Below `DOUBTFUL`, another
+# convention is suggested if its share is at least `CONVINCING`.
+DOUBTFUL, CONVINCING = 0.05, 0.3
+NONE = 0.005  # share of the points: as good as none
+# Of more points another convention is named too if it shows so many, and so many times
+# as many.
+BETTER, FAR_BETTER = 0.6, 2.5
+SEEN = 0.5  # of the points, by any frame: a survey shows few of them in each image
+SMALL = 0.03  # of the image, across and down, in which nearly all points lie
+MOST_FRAMES, MOST_POINTS, LEAST_POINTS = 1000, 1000, 10
+MOST_BEYOND = 0.3  # of the points in view, outside near and far
+NO_PARALLAX = 1e-4  # of the depth of the points, that the cameras move
+_FLIP = np.diag([1.0, -1.0, -1.0])  # between OpenGL and OpenCV axes of a camera
+
+
+class Pose(NamedTuple):
+    """Poses of several cameras in world units, float64."""
+
+    rotation: np.ndarray  # [frames, 3, 3] camera from world; right, down, forward
+    position: np.ndarray  # [frames, 3]
+
+
+class Projected(NamedTuple):
+    """Where points lie in the images of several cameras."""
+
+    pixel: np.ndarray  # [frames, points, 2]
+    depth: np.ndarray  # [frames, points]
+    inside: np.ndarray  # [frames, points] bool: in front, and in the image
+
+
+def findings(capture: Capture) -> list[Finding]:
+    """Compare the poses and intrinsics of a capture with its points."""
+    if capture.points is None or len(capture.points.position) < LEAST_POINTS:
+        return []
+    count = len(capture.ids)
+    rows = np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).astype(int))
+    cameras = Camera(*(np.float64(leaf[rows]) for leaf in capture.cameras))
+    places = capture.points.position
+    some = np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)
+    points = np.float64(places[some]) / capture.scale + np.array(capture.center)
+    pose = Pose(
+        cameras.camera_from_world,
+        cameras.position / capture.scale + np.array(capture.center),
+    )
+    shown = _project(cameras, pose, points, capture.size)
+    share, front = shown.inside.mean(), (shown.depth > 0).mean()
+    seen = shown.inside.any(0).mean()
+    value = (
+        f"{front:.0%} in front of a camera and {share:.0%} inside its image, on average"
+    )
+    subject = "points"
+    if share < DOUBTFUL and seen < SEEN:
+        problem, refused = _explained(capture, cameras, pose, points, share)
+        return [Finding(subject, value, problem, refused)]
+    problem = ""
+    if share < CONVINCING:
+        best, reason = _best_of(_others(capture, cameras, pose), capture, points)
+        if best >= max(BETTER, FAR_BETTER * share):
+            problem = f"{share:.0%} of the points fall into the images, and " + reason
+    found = [Finding(subject, value, problem)]
+    found += _spread(capture, shown)
+    found += _parallax(pose, shown)
+    found += _near_and_far(capture, shown)
+    found += _empty_frames(capture, rows, shown)
+    return found
+
+
+def _explained(capture, cameras, pose, points, share):
+    """What explains that next to no point is seen, and whether nothing else can."""
+    others = _others(capture, cameras, pose)
+    if share < NONE:  # a tile or a survey shows some, and other units many
+        others |= _other_units(cameras, pose)
+    best, reason = _best_of(others, capture, points)
+    if best >= CONVINCING:
+        return f"{share:.0%} of the points fall into the images, and {reason}", True
+    if share >= NONE:
+        return "", False
+    return (
+        f"{share:.1%} of the points fall into an image: the points or the poses are "
+        "probably of another world or unit; export both from one program, or remove "
+        "the file of points",
+        bool(share == 0),
+    )
+
+
+def _best_of(others, capture, points):
+    """The largest share of points in the images under another reading, and which."""
+    shares = {}
+    for name, (other, placed) in others.items():
+        shown = _project(other, placed, points, capture.size)
+        # From far enough away all points are seen, as a dot.
+        dot = max(_extent(capture, shown), default=0.0) < SMALL
+        shares[name] = 0.0 if dot else float(shown.inside.mean())
+    likely = max(shares, key=shares.get)
+    return shares[likely], f"{shares[likely]:.0%} if {likely}"
+
+
+def _others(capture, cameras, pose):
+    """Cameras and poses under other readings of the same numbers, by reason."""
+    rotation, position = pose
+    back = rotation.swapaxes(1, 2)  # world from camera
+
+    def turned(matrix, vector):
+        return np.einsum("nij,nj->ni", matrix, vector)
+
+    opencv = "axes right, down, forward (OpenCV)"
+    wanted = "; convert the poses to camera to world with axes right, up, back (OpenGL)"
+    others = {}
+    if capture.source == "blender":
+        matrix = back @ _FLIP  # as it stands in the file
+        inverse = -turned(matrix.swapaxes(1, 2), position)
+        others |= {
+            f"transform_matrix is camera to world with {opencv}{wanted}": Pose(
+                _FLIP @ rotation, position
+            ),
+            f"transform_matrix is world to camera with {opencv}{wanted}": Pose(
+                matrix, inverse
+            ),
+            "transform_matrix is world to camera with axes right, up, back (OpenGL)"
+            + wanted: Pose(_FLIP @ matrix, inverse),
+        }
+    else:
+        wanted = (
+            "; convert the poses to rotations from world to camera with "
+            f"{opencv}, and positions of the cameras"
+        )
+        others |= {
+            f"the camera's axes are right, up, back (OpenGL){wanted}": Pose(
+                _FLIP @ rotation, position
+            ),
+            f"the rotations are from camera to world{wanted}": Pose(back, position),
+            f"the positions are translations from world to camera{wanted}": Pose(
+                rotation, -turned(back, position)
+            ),
+            f"the poses are the inverse, world to camera{wanted}": Pose(
+                back, -turned(rotation, position)
+            ),
+        }
+    others = {name: (cameras, other) for name, other in others.items()}
+    ratio = 2 * cameras.principal_point_px / np.array(capture.size)
+    times = float(np.median(ratio))
+    if times >= 1.5:
+        smaller = cameras._replace(
+            focal_px=cameras.focal_px / times,
+            principal_point_px=cameras.principal_point_px / times,
+        )
+        name = (
+            f"the intrinsics are of images {times:.3g} times as large; state the size "
+            "that they refer to, or scale them"
+        )
+        others[name] = smaller, pose
+    return others
+
+
+def _other_units(cameras, pose):
+    """Cameras and poses with positions in another unit than the points, by reason."""
+    others = {}
+    for factor, what in (
+        (0.001, "camera positions in millimeters and points in meters"),
+        (1000.0, "camera positions in meters and points in millimeters"),
+        (0.01, "camera positions in centimeters and points in meters"),
+        (100.0, "camera positions in meters and points in centimeters"),
+    ):
+        name = f"the units differ: {what}; export both in one unit"
+        others[name] = cameras, Pose(pose.rotation, pose.position * factor)
+    return others
+
+
+def _extent(capture, shown):
+    """Shares of width and height that nearly all points cover; empty if too few do."""
+    extents = []
+    for pixel, inside in zip(shown.pixel, shown.inside, strict=True):
+        if inside.sum() >= LEAST_POINTS:
+            low, high = np.quantile(pixel[inside], (0.05, 0.95), axis=0)
+            extents.append((high - low) / np.array(capture.size))
+    return np.median(extents, axis=0) if extents else ()
+
+
+def _spread(capture, shown):
+    """Whether all points lie in a small part of the images, as in a wrong unit."""
+    extent = _extent(capture, shown)
+    if not len(extent):
+        return []
+    across, down = extent
+    value = f"{across:.0%} of the width and {down:.0%} of the height"
+    problem = ""
+    if max(across, down) < SMALL:
+        problem = (
+            f"the points cover {across:.1%} of the width and {down:.1%} of the height "
+            "of an image: the focal length is too small (in millimeters, or of smaller "
+            "images), or camera positions and points are in different units, such as "
+            "millimeters and meters"
+        )
+    return [Finding("points cover", value, problem)]
+
+
+def _parallax(pose, shown):
+    """Whether cameras move so little that their unit must be another one."""
+    moved = float(np.linalg.norm(np.ptp(pose.position, axis=0)))
+    depths = shown.depth[shown.inside]
+    if moved == 0 or not depths.size:
+        return []
+    ratio = moved / float(np.median(depths))
+    problem = ""
+    if ratio < NO_PARALLAX:
+        problem = (
+            f"the cameras move by {ratio:.1g} of the depth of the points: camera "
+            "positions and points seem to be in different units, such as meters and "
+            "millimeters; export both in one unit"
+        )
+    return [Finding("cameras move by", f"{ratio:.2g} of the usual depth", problem)]
+
+
+def _near_and_far(capture, shown):
+    """Whether the points that are seen lie between near and far."""
+    depths = shown.depth[shown.inside] * capture.scale
+    if not depths.size:
+        return []
+    near, far = capture.near, capture.far
+    beyond = float(((depths < near) | (depths > far)).mean())
+    value = f"{near:.3g} to {far:.3g}, {beyond:.1%} of the points outside"
+    subject = "near and far"
+    if beyond <= MOST_BEYOND:
+        return [Finding(subject, value)]
+    median = float(np.median(depths))
+    reason = "set them so that they contain the scene"
+    if near <= median / capture.scale <= far:
+        reason = (
+            f"they seem to be in world units, so multiply them by {capture.scale:g}"
+        )
+    problem = (
+        f"{beyond:.0%} of the points lie outside near {near:.3g} and far {far:.3g}, at "
+        f"a usual depth of {median:.3g} scene units: {reason}"
+    )
+    return [Finding(subject, value, problem, beyond > 0.95)]
+
+
+def _empty_frames(capture, rows, shown):
+    """Frames that see next to none of the points that the others see."""
+    counts = shown.inside.sum(1)
+    usual = np.median(counts)
+    few = usual < 2 * LEAST_POINTS  # then none may be in view by chance
+    empty = rows[counts < DOUBTFUL * usual] if not few else rows[:0]
+    value = f"{len(empty)} of {len(rows)}"
+    problem = ""
+    if len(empty):
+        names = ", ".join(capture.ids[row] for row in empty[:5])
+        names += ", ..." if len(empty) > 5 else ""
+        problem = (
+            f"{len(empty)} frames see no points ({names}): their poses may be wrong; "
+            "estimate them again or leave those frames out"
+        )
+    return [Finding("frames without points", value, problem)]
+
+
+def _project(cameras, pose, points, size):
+    """Project points [points, 3] of a world into all images."""
+    origin = np.median(points, axis=0)
+    offset = (points - origin)[None] - (pose.position - origin)[:, None]
+    local = np.einsum("fij,fnj->fni", pose.rotation, offset)
+    depth = local[..., 2]
+    ahead = depth > 0
+    slope = local[..., :2] / np.where(ahead, depth, 1.0)[..., None]
+    x, y = slope[..., 0], slope[..., 1]
+    radius_sq = np.minimum(x * x + y * y, 1e8)
+    k1, k2, k3 = (cameras.radial[:, [i]] for i in range(3))
+    p1, p2 = (cameras.tangential[:, [i]] for i in range(2))
+    stretch = 1 + radius_sq * (k1 + radius_sq * (k2 + radius_sq * k3))
+    bent_x = x * stretch + 2 * p1 * x * y + p2 * (radius_sq + 2 * x * x)
+    bent_y = y * stretch + 2 * p2 * x * y + p1 * (radius_sq + 2 * y * y)
+    focal = cameras.focal_px[:, None]
+    pixel = np.stack(
+        [
+            focal * bent_x + cameras.skew_px[:, None] * bent_y,
+            focal * cameras.pixel_aspect[:, None] * bent_y,
+        ],
+        axis=-1,
+    )
+    pixel = pixel + cameras.principal_point_px[:, None]
+    within = ((pixel >= 0) & (pixel < np.array(size))).all(-1)
+    folds = fold_radius(cameras.radial)[:, None]
+    return Projected(pixel, depth, ahead & within & (radius_sq < folds**2))
+
+
+def fold_radius(radial: np.ndarray) -> np.ndarray:
+    """Undistorted radius at which each lens folds back, inf where it never does.
+
+    Args:
+      radial: k1, k2, k3 of each lens, [lenses, 3].
+    """
+    radii = {}
+    for k1, k2, k3 in np.unique(radial, axis=0).tolist():
+        # d/dr (r + k1 r^3 + k2 r^5 + k3 r^7), a polynomial in r^2
+        roots = np.roots(np.trim_zeros([7 * k3, 5 * k2, 3 * k1, 1.0], "f"))
+        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        radii[k1, k2, k3] = float(np.sqrt(real.min())) if real.size else np.inf
+    return np.array([radii[tuple(each)] for each in radial.tolist()])

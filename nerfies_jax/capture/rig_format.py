@@ -1,0 +1,276 @@
+"""Reader of synchronized cameras with `poses_bounds.npy`, as Neural 3D Video has them.
+
+Each row of `poses_bounds.npy` is a fixed camera, in the order of their names, and each
+camera has one video (`cam00.mp4`) or one folder of images (`cam00/`, `cam00/images/`).
+"""
+
+import pathlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nerfies_jax import events
+from nerfies_jax.capture import formats, frames, llff_format, name_times, video
+from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture.capture import Capture, CaptureError, shrink
+from nerfies_jax.capture.json_files import AnyPath
+from nerfies_jax.capture.safe_files import confines
+from nerfies_jax.geometry import camera
+
+SPARE = 8  # frames of a video beyond those that its file states
+
+
+class _Recorded(NamedTuple):
+    """The frames of all cameras, one camera after the other."""
+
+    images: np.ndarray  # [frames, height, width, 3] uint8
+    valid: np.ndarray | None  # [frames, height, width] bool
+    camera_ids: np.ndarray  # [frames] int32
+    numbers: np.ndarray  # [frames]: equal for frames of equal time
+    names: tuple[str, ...]
+    rate: float | None  # frames per second
+    notes: tuple[str, ...]
+
+
+@confines
+def read(
+    path: AnyPath,
+    factor: int | None = None,
+    max_side: int | None = None,
+    heldout: int | str | None = None,
+    missing: str = "refuse",
+) -> Capture:
+    """Read synchronized cameras in the layout of Neural 3D Video (Li et al. 2022).
+
+    Args:
+      path: The folder.
+      factor: Read frames at 1/`factor` of the full size that `poses_bounds.npy` states.
+      max_side: Longest side of the frames in pixels. At most one of the two can be
+        given.
+      heldout: Name of the camera to hold out, or n for every n-th frame of all
+        cameras. None for the first camera, as in the data set's own evaluation.
+      missing: "refuse" or "skip", without effect here.
+
+    Returns:
+      The capture. Frames of equal time have equal `times` and `warp_ids`.
+
+    Raises:
+      CaptureError: If the capture cannot be used.
+    """
+    path = pathlib.Path(path)
+    frames.check_missing(missing, str(path))
+    poses = llff_format.read_poses(path / llff_format.POSES)
+    available = _sources(path, poses)
+    source, shrink_by = frames.choose_source(
+        available, poses.size, factor, max_side, str(path)
+    )
+    cameras = available[source]
+    reader = _read_folders if cameras[0].is_dir() else _read_videos
+    recorded = reader(path, cameras, shrink_by)
+    names = [each.stem for each in cameras]
+    train, scored, note = _split(recorded, names, heldout, path)
+    placed = llff_format.placed(poses)
+    size = recorded.images.shape[2:0:-1]
+    fixed = llff_format.cameras_of(poses, placed, size)
+    times = frames.spread(recorded.numbers)
+    return Capture(
+        name=path.resolve().name,
+        source="rig",
+        ids=recorded.names,
+        images=recorded.images,
+        cameras=camera.take(fixed, recorded.camera_ids),
+        times=times,
+        train=train,
+        heldout=scored,
+        near=placed.near,
+        far=placed.far,
+        warp_ids=frames.dense(recorded.numbers),
+        appearance_ids=recorded.camera_ids,
+        camera_ids=recorded.camera_ids,
+        valid=recorded.valid,
+        scale=placed.scale,
+        center=placed.center,
+        up=frames.up_direction(fixed),
+        frames_per_second=recorded.rate,
+        path=path,
+        notes=(*recorded.notes, note),
+    )
+
+
+def _sources(path, poses):
+    """For each reduction stored, the video or folder of each camera."""
+    available = {}
+    for kind, found in (
+        ("videos", formats.videos_in(path)),
+        ("folders of images", formats.camera_folders(path)),
+    ):
+        if len(found) < 2:
+            continue
+        count = len(poses.positions)
+        if len(found) != count:
+            raise CaptureError(
+                f"{path}: {len(found)} {kind} ({found[0].name}, ...) for {count} "
+                f"cameras in {llff_format.POSES}; each row is the camera of one of "
+                "them, in the order of their names, so restore or remove some"
+            )
+        size = _size_of(found[0])
+        ratio = max(1, round(poses.size[0] / size[0]))
+        if np.abs(np.array(poses.size) / ratio - size).max() > 1:
+            raise CaptureError(
+                f"{found[0]}: {size[0]}x{size[1]} pixels, but {llff_format.POSES} is "
+                f"of {poses.size[0]}x{poses.size[1]}; frames must be a whole fraction "
+                "of that"
+            )
+        available.setdefault(ratio, found)
+    return available
+
+
+def _size_of(source):
+    if source.is_dir():
+        return pictures.read_header(frames.pictures_in(_images_of(source))[0]).size
+    _, first = next(video.read_video(source, most=1))
+    return first.shape[1], first.shape[0]
+
+
+def _images_of(folder):
+    inner = folder / "images"
+    return inner if inner.is_dir() else folder
+
+
+def _read_folders(path, folders, shrink_by):
+    """Read the images of all cameras; equal times are those of equal names."""
+    files = [frames.pictures_in(_images_of(folder)) for folder in folders]
+    camera_ids = np.repeat(np.arange(len(files)), [len(some) for some in files])
+    flat = [file for some in files for file in some]
+    names = [
+        f"{folders[number].name}/{file.stem}"
+        for number, file in zip(camera_ids, flat, strict=True)
+    ]
+    clock = name_times.clock(names)
+    notes: tuple[str, ...] = ()
+    numbers = np.array(clock.times)
+    if clock.cameras is None or not _same_groups(clock.cameras, camera_ids):
+        numbers = np.concatenate([name_times.order(_stems(some)) for some in files])
+        notes = (
+            "the names of the images tell no times that cameras share: the n-th image "
+            "of each camera is taken at one time",
+        )
+    stored = frames.read_frames(flat, shrink_by, orientation="stored")
+    return _Recorded(
+        images=stored.images,
+        valid=stored.valid(),
+        camera_ids=camera_ids.astype(np.int32),
+        numbers=numbers,
+        names=tuple(name.replace("/", "_") for name in names),
+        rate=None,
+        notes=(*notes, *stored.notes, *_lengths(folders, camera_ids)),
+    )
+
+
+def _stems(files):
+    return [file.stem for file in files]
+
+
+def _same_groups(one, other):
+    pairs = set(zip(one.tolist(), other.tolist(), strict=True))
+    return len(pairs) == len(set(one.tolist())) == len(set(other.tolist()))
+
+
+def _read_videos(path, files, shrink_by):
+    """Decode all videos; equal times are equal numbers of frame intervals."""
+    count = sum(video.stated_frames(file) for file in files)
+    width, height = (side // shrink_by for side in _size_of(files[0]))
+    total = count * width * height * 3
+    if total > frames.MAX_BYTES:
+        raise CaptureError(
+            f"{path}: {count} frames of {width}x{height} in {len(files)} videos "
+            f"need {total / 2**30:.0f} GiB, more than {frames.MAX_BYTES / 2**30:.0f}; "
+            "read them smaller with factor= or max_side="
+        )
+    images: Any = np.empty((count + SPARE, height, width, 3), np.uint8)
+    seconds: list[float] = []
+    camera_ids: list[int] = []
+    notes: tuple[str, ...] = ()
+    with events.stage("decoding videos", len(files)) as stage:
+        for number, file in enumerate(files):
+            first = len(seconds)
+            for moment, frame in video.read_video(file, damaged="skip"):
+                if len(seconds) == len(images):  # the file stated fewer
+                    images = np.concatenate([images, np.empty_like(images)])
+                images[len(seconds)] = _shrunk(file, frame, shrink_by, (width, height))
+                seconds.append(moment)
+                camera_ids.append(number)
+            notes += tuple(
+                f"{file.name}: {note}"
+                for note in video.notes_of(file, len(seconds) - first, seconds[-1])
+            )
+            stage.advance()
+    cameras = np.array(camera_ids, np.int32)
+    numbers, interval = _intervals(np.array(seconds), cameras)
+    names = [
+        f"{files[row].stem}_{number:05d}"
+        for row, number in zip(camera_ids, numbers.tolist(), strict=True)
+    ]
+    return _Recorded(
+        images=images[: len(seconds)],
+        valid=None,
+        camera_ids=cameras,
+        numbers=numbers,
+        names=tuple(names),
+        rate=1 / interval if interval > 0 else None,
+        notes=(*notes, *_lengths(files, cameras)),
+    )
+
+
+def _shrunk(file, frame, shrink_by, size):
+    small = shrink(frame, shrink_by)
+    if small.shape[1::-1] != size:
+        raise CaptureError(
+            f"{file}: frames of {frame.shape[1]}x{frame.shape[0]} pixels, unlike the "
+            "first camera; all cameras of a rig share one size"
+        )
+    return small
+
+
+def _intervals(seconds, camera_ids):
+    """Number frames by the interval of the fastest camera, from each one's first."""
+    own = [seconds[camera_ids == number] for number in np.unique(camera_ids)]
+    gaps = [np.median(np.diff(one)) for one in own if len(one) > 1]
+    interval = float(min(gaps, default=0.0))
+    if not interval > 0:
+        return np.concatenate([np.arange(len(one)) for one in own]), 0.0
+    numbers = [np.round((one - one[0]) / interval).astype(int) for one in own]
+    # Two frames closer than half an interval, as of phones: all by their order.
+    if any(len(np.unique(each)) < len(each) for each in numbers):
+        numbers = [np.arange(len(one)) for one in own]
+    return np.concatenate(numbers), interval
+
+
+def _lengths(cameras, camera_ids):
+    """A note where cameras have different numbers of frames."""
+    counts = np.bincount(camera_ids, minlength=len(cameras))
+    if counts.min() == counts.max():
+        return ()
+    least, most = int(counts.argmin()), int(counts.argmax())
+    return (
+        f"cameras have different numbers of frames: {cameras[least].name} has "
+        f"{counts.min()}, {cameras[most].name} has {counts.max()}",
+    )
+
+
+def _split(recorded, names, heldout, path):
+    """Rows to learn from, rows to score on, and a note."""
+    if isinstance(heldout, int):
+        train, scored = frames.hold_out_in_time(
+            recorded.numbers, recorded.camera_ids, heldout, str(path)
+        )
+        return train, scored, f"every {heldout}th frame is held out"
+    chosen = names[0] if heldout is None else heldout
+    if chosen not in names:
+        raise CaptureError(
+            f"{path}: no camera {chosen!r} to hold out; there are {', '.join(names)}, "
+            "or a number n holds out every n-th frame"
+        )
+    held = recorded.camera_ids == names.index(chosen)
+    note = f"camera {chosen} is held out, {len(names) - 1} are learned from"
+    return np.flatnonzero(~held), np.flatnonzero(held), note
