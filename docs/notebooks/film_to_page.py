@@ -11,13 +11,13 @@
 # ---
 
 # %% [markdown]
-# # From a film to a page that plays it
+# # From a video to a page that plays the scene
 #
-# A film has no cameras, and something in it moves. This goes the whole way: sharp
-# frames, cameras by COLMAP in two passes (the second without what moves), a look at
-# what was found, Gaussians that move, held-out scores, and `player.html`, in which the
-# scene can be seen from anywhere. `nerfies reconstruct clip.mp4` does all of it in one
-# command; here the steps are apart, so that each can be looked at. (Extras `sfm`,
+# A video has no camera poses, and something in it moves. This notebook goes the whole
+# way: sharp frames, poses by COLMAP in two passes (the second with moving objects
+# masked), a look at the results of preprocessing, dynamic Gaussians, held-out metrics,
+# and `player.html`, which shows the scene from any viewpoint. `nerfies reconstruct
+# clip.mp4` does all of it in one command. Here the steps are separate. (Extras `sfm`,
 # `video` and `report`.)
 
 # %%
@@ -43,11 +43,10 @@ MAX_SIDE = None  # of the pictures to learn from, pixels; None takes the capture
 OUT = pathlib.Path(tempfile.mkdtemp(prefix="film-to-page-"))
 
 # %% [markdown]
-# ## A film
+# ## A video
 #
-# Without one of yours the built-in scene is filmed, by its first camera alone, into an
-# mp4. Nothing of what is known of it is used below but, at the end, to say how good the
-# cameras are.
+# This renders the built-in scene from its first camera to an mp4. Replace it by a video
+# of your own. The ground truth is only used to measure the error of the poses.
 
 # %%
 clip, filmed = CLIP, None
@@ -68,19 +67,19 @@ print(clip)
 # %% [markdown]
 # ## Cameras
 #
-# `prepare` keeps the sharpest frame of each stretch of the film, asks COLMAP for the
-# cameras, looks with these for what moves, and asks again without it. What it says on
-# the way is worth reading: how many pictures found their place, and by how many pixels
-# the points at rest are off.
+# `prepare` keeps the sharpest frame of each interval of the video, runs COLMAP, detects
+# moving objects with the first poses, and runs COLMAP again with these masked. Its
+# messages report the number of registered images and the reprojection error of static
+# points.
 
 # %%
 how = Preparation(frames=FRAMES, max_side=320, passes=PASSES)
 capture = preparation.prepare(clip, OUT / "capture", how, tell=print)
 
 # %% [markdown]
-# COLMAP's world has no unit and no up, so cameras are compared after the similarity
-# that fits best (Umeyama 1991). What is left is how far the path is off, over its
-# length.
+# COLMAP's world has no unit and no up direction, so poses are compared after the best
+# similarity transform (Umeyama 1991). The result is the error of the camera path as a
+# share of its length.
 
 
 # %%
@@ -108,8 +107,8 @@ if filmed is not None:
 # %% [markdown]
 # ## Train
 #
-# A run folder, as the command makes it: settings, checkpoints, scores, pictures, a film
-# from a moving camera, the page. Every eighth frame is held out and never learned from.
+# The result is a run folder, as from the command: settings, checkpoints, metrics,
+# images, a video from a moving camera, the page. Every eighth frame is held out.
 
 # %%
 source = CaptureSource(OUT / "capture", max_side=MAX_SIDE)
@@ -120,8 +119,8 @@ print(*sorted(path.name for path in outcome.folder.iterdir()), sep="\n")
 # %% [markdown]
 # ## Look at it
 #
-# Held-out frames, above as filmed and below as drawn. Scores want company: beside them
-# the run prints the PSNR of the mean of two neighboring frames.
+# Held-out frames, with the original above and the render below. The run also prints the
+# PSNR of two baselines, such as the mean of the two neighboring frames.
 
 # %%
 run = outcome.run
@@ -139,8 +138,7 @@ for axis in axes.flat:
 plt.show()
 
 # %% [markdown]
-# The page holds everything, the Gaussians and their motion; it can be mailed, and needs
-# no server.
+# The page contains the Gaussians and their motion, and needs no server.
 
 # %%
 page = outcome.folder / "player.html"

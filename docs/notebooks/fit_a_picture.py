@@ -11,13 +11,12 @@
 # ---
 
 # %% [markdown]
-# # Fit Gaussians to a picture
+# # Fit Gaussians to an image
 #
-# A scene of Gaussians is a handful of arrays, and drawing them is one differentiable
-# function of those arrays. So the smallest thing one can do with them is to take a
-# picture, begin with Gaussians scattered over a plane in front of a camera, and descend
-# the error of what is drawn. That is the inner loop of every `splats-*` preset, without
-# cameras that move, without time and without growth.
+# A scene of Gaussians is a handful of arrays, and rendering is a differentiable
+# function of these arrays. The smallest example takes an image, scatters Gaussians over
+# a plane in front of a camera, and minimizes the error of the render. This is the inner
+# loop of every `splats-*` preset, without moving cameras, time and densification.
 
 # %%
 import jax
@@ -36,7 +35,7 @@ WIDTH = 160  # pixels
 PICTURE = None  # a file of yours; None takes a frame of the built-in scene
 
 # %% [markdown]
-# ## The picture
+# ## The image
 #
 # Colors lie in [0, 1]. `height, width, 3`, as everywhere in this library.
 
@@ -51,12 +50,12 @@ truth = jnp.asarray(np.asarray(picture.resize((WIDTH, height))) / 255, jnp.float
 size = (WIDTH, height)
 
 # %% [markdown]
-# ## The camera, and Gaussians before it
+# ## The camera and the Gaussians
 #
 # A pinhole at the origin looks along z. With a focal length of `WIDTH` pixels the plane
-# at a depth of one scene unit fills the picture from -0.5 to 0.5. The parameters are
-# unconstrained: scales are exponentials and opacities logistic functions of what is
-# trained, so no step can leave what is allowed.
+# at a depth of one scene unit fills the image from -0.5 to 0.5. The parameters are
+# unconstrained: scales are exponentials and opacities logistic functions of them, so
+# every step is valid.
 
 # %%
 camera = nj.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), float(WIDTH), size)
@@ -102,12 +101,12 @@ start = scattered(jax.random.key(0), GAUSSIANS)
 # %% [markdown]
 # ## Is the gradient right?
 #
-# Before anything is descended: the slope of the loss along a random direction, by
-# `jax.grad`, against the difference quotient. As it is trained, a Gaussian is cut off
-# where its alpha falls below 1/255, and a pixel is done when next to nothing shines
-# through: the loss has tiny steps there that no gradient can see, and the quotient
-# comes out 3 to 8 percent higher. Without the two cuts both agree as far as float32
-# carries the quotient, to 1e-4 here and 1e-3 with fewer Gaussians.
+# First compare the directional derivative of the loss by `jax.grad` with a difference
+# quotient. In training, a Gaussian is cut off where its alpha falls below 1/255, and a
+# pixel is saturated when almost nothing shines through. The loss has tiny steps there
+# that the gradient does not include, and the quotient is 3 to 8 percent higher. Without
+# these two thresholds they agree to the precision of the quotient in float32, 1e-4 here
+# and 1e-3 with fewer Gaussians.
 
 # %%
 leaves, tree = jax.tree.flatten(start)
@@ -115,8 +114,8 @@ keys = jax.random.split(jax.random.key(1), len(leaves))
 direction = tree.unflatten(
     [jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
 )
-# In scene units, where the rest are logarithms; not in depth, for what is drawn jumps
-# where one Gaussian passes before another.
+# In scene units, where the others are logarithms. Not in depth, because the render is
+# discontinuous where one Gaussian passes in front of another.
 direction["mean"] = direction["mean"] * jnp.array([0.01, 0.01, 0.0])
 
 
@@ -134,7 +133,7 @@ print(f"slope {slope:.6f}, difference quotient {quotient:.6f}")
 assert abs(slope - quotient) < 5e-3 * abs(quotient)
 
 # %% [markdown]
-# ## Descend
+# ## Optimize
 #
 # Adam with a rate for each kind of parameter. The loop is a `lax.scan`, so all steps
 # are one program.
@@ -171,9 +170,8 @@ fitted, values = train(start)
 # %% [markdown]
 # ## Look at it
 #
-# The truth, what was begun with, what was fitted and where it is still wrong (five
-# times brighter). A flat picture of the mean color is the least one can do; what was
-# learned has to beat it by far.
+# The ground truth, the initial state, the fit, and its error (five times brighter). A
+# constant image of the mean color is the baseline to beat.
 
 # %%
 panels = {
@@ -199,6 +197,6 @@ assert values[-1] < values[0]
 # ## Further
 #
 # - More Gaussians, or more steps: what is the error bounded by?
-# - `depth=True` composites depth as well; a loss on it is one more line.
+# - `depth=True` also composites depth. A loss on it is one more line.
 # - `nj.fit` with `gj.build(gj.PRESETS["splats-static-small"], ...)` does the same from
-# many cameras, and grows Gaussians where the picture asks for them.
+# many cameras, and adds Gaussians where the image needs them.
