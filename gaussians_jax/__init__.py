@@ -1,9 +1,9 @@
-"""Moving scenes as 3D Gaussians, splatted in pure JAX.
+"""Dynamic scenes as 3D Gaussians, in pure JAX.
 
-Reads floors 1-5 of `nerfies_jax` (`geometry`, `nets`, `capture`, `training`, and
-`measure`, `evaluation`, `evidence`) and nothing above them.
+It imports layers 1 to 5 of `nerfies_jax` (`geometry`, `nets`, `capture`, `training`,
+and `measure`, `evaluation`, `evidence`) and nothing above them.
 
-The names of `__init__.pyi` are the face of the package; each is loaded when it is used.
+The public names are listed in `__init__.pyi`, and each is imported when it is used.
 """
 
 import lazy_loader

@@ -1,1 +1,1 @@
-"""What a moving scene of Gaussians may call for, one file each."""
+"""Optional components of a scene of Gaussians, one file each."""

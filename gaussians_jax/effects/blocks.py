@@ -17,7 +17,7 @@ def in_blocks(
     active: Bool[Array, " gaussians"] | None,
     block: int,
 ) -> PyTree:
-    """`evaluate(*rows)` with the memory that `block` rows need.
+    """Evaluate `evaluate(*rows)` with the memory that `block` Gaussians need.
 
     `evaluate` takes and returns pytrees whose leaves have the Gaussians first. A block
     in which no row is active is not evaluated, so compacted rows do not pay for the

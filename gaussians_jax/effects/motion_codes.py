@@ -22,7 +22,7 @@ from nerfies_jax.training.effects import PenaltyContext, Term, from_step
 
 @runtime_checkable
 class Codes(Protocol):
-    """What is read here of the settings of a motion."""
+    """Settings of a motion that time codes depend on."""
 
     @property
     def embedding(self) -> int:
@@ -42,11 +42,13 @@ class Codes(Protocol):
 
     @property
     def waves(self) -> float | None:
-        """How fast first codes change over space and time; None: each by itself."""
+        """Frequencies of the initial codes over space and time; None for independent
+        ones.
+        """
 
     @property
     def coarser(self) -> int | None:
-        """Of so many rows one stays for the coarse network; None: there is none."""
+        """Ratio of fine to coarse time codes; None without a coarse network."""
 
     @property
     def grow_until(self) -> int:
@@ -54,11 +56,11 @@ class Codes(Protocol):
 
     @property
     def smoothness(self) -> float:
-        """Weight of `second_differences`; 0 leaves it out."""
+        """Weight of `second_differences`, 0 without it."""
 
     @property
     def opacity(self) -> float:
-        """Weight of `mean_opacity`; 0 leaves it out."""
+        """Weight of `mean_opacity`, 0 without it."""
 
     @property
     def warm_up(self) -> int:
@@ -121,15 +123,31 @@ def init_times(
 
 
 def coarse_rows(spec: Codes, count: int) -> int:
-    """What the coarse network reads of a table of `count`, and the fine one at first.
+    """Compute the number of codes that the coarse network reads, and the fine one at
+    first.
 
-    Two at least, or there is no motion; all of a smaller table.
+    Args:
+      spec: Settings.
+      count: Size of the table.
+
+    Returns:
+      At least two, or all of a smaller table.
     """
     return min(count, max(2, -(-count // (spec.coarser or 1))))
 
 
 def fine_rows(spec: Codes, count: int, step: int) -> int:
-    """How many rows the fine network reads after so many steps; host side."""
+    """Compute the number of codes that the fine network reads after some steps, on the
+    host.
+
+    Args:
+      spec: Settings.
+      count: Size of the table.
+      step: Number of steps.
+
+    Returns:
+      Number of codes.
+    """
     least = coarse_rows(spec, count)
     if step >= spec.grow_until:
         return count
@@ -165,14 +183,28 @@ def read(
 
 
 def second_differences(times: Float[Array, "moments code"]) -> Float[Array, ""]:
-    """Mean square of how codes bend from row to row; 0 of fewer than three."""
+    """Compute the mean square of second differences between consecutive codes.
+
+    Args:
+      times: Table of codes.
+
+    Returns:
+      The mean, 0 for fewer than three codes.
+    """
     if times.shape[0] < 3:
         return jnp.zeros((), times.dtype)
     return jnp.mean(jnp.square(jnp.diff(times, 2, axis=0)))
 
 
 def mean_opacity(params: Params) -> Float[Array, ""]:
-    """Of the active Gaussians; 0 without any."""
+    """Compute the mean opacity of the active Gaussians, 0 without any.
+
+    Args:
+      params: Trained parameters.
+
+    Returns:
+      The mean.
+    """
     rows = params.rows["splats"]
     active = splats.active_mask(rows)
     opacity = jnp.where(active, splats.activate(rows).opacity, 0)
@@ -180,7 +212,14 @@ def mean_opacity(params: Params) -> Float[Array, ""]:
 
 
 def has_penalty(spec: Codes) -> bool:
-    """Whether `penalty` has a term."""
+    """Test if `penalty` has a term.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      True if it has one.
+    """
     return spec.smoothness > 0 or spec.opacity > 0
 
 

@@ -1,4 +1,4 @@
-"""Few nodes that carry many Gaussians: who is near, how much it counts, where to.
+"""Linear blend skinning of many Gaussians by few nodes: neighbors, weights, motion.
 
 SC-GS (Huang et al. 2024, arXiv:2312.14937): a Gaussian follows its nearest nodes under
 weights that fall with the distance in each node's own radius, by linear blend skinning,
@@ -32,14 +32,14 @@ class Moves(NamedTuple):
 
 
 class Displaced(NamedTuple):
-    """What nodes do to the Gaussians they carry; zero is nothing."""
+    """Displacement and rotation of Gaussians by their nodes."""
 
     offset: Float[Array, "gaussians 3"]  # scene units
     turn: Float[Array, "gaussians 4"]  # quaternion, less the identity
 
 
 class Links(NamedTuple):
-    """Which nodes are asked to move as one body, and how much each pair counts."""
+    """Pairs of nodes that should move rigidly, and their weights."""
 
     index: Int[Array, "nodes links"]
     weight: Float[Array, "nodes links"]  # sums to one over the links of a node
@@ -50,10 +50,18 @@ def nearest(
     nodes: Float[Array, "nodes coordinates"],
     count: int,
 ) -> Int[Array, "points near"]:
-    """The nodes nearest to each point, nearest first; all of them where they are few.
+    """Find the nodes nearest to each point, nearest first.
 
-    One core, 10,000 points and three of 64, 128 and 512 nodes: 7, 13 and 44 ms, so this
-    is done when rows change and not in every step.
+    On one core, 10,000 points and three of 64, 128 and 512 nodes take 7, 13 and 44 ms,
+    so this runs when the number of Gaussians changes and not in every step.
+
+    Args:
+      points: The points.
+      nodes: The nodes.
+      count: Number of nodes per point, or all if there are fewer.
+
+    Returns:
+      Indices of the nodes.
     """
     count = min(count, len(nodes))
 
@@ -66,13 +74,20 @@ def nearest(
 def weights(
     distance_sq: Float[Array, "*points near"], log_radius: Float[Array, "*points near"]
 ) -> Float[Array, "*points near"]:
-    """exp(-d² / 2r²) of each near node, over their sum.
+    """Compute normalized weights exp(-d² / 2r²) of the nearest nodes.
 
-    In SC-GS's code a learned share of each node multiplies it, and 1e-7 is added. The
+    In SC-GS's code a learned factor of each node multiplies it, and 1e-7 is added. The
     plain quotient is 0/0 in float32 from 13 radii on. This one depends on differences
-    alone and goes over to the node that is nearest in its own radii; some 1e6 times as
-    far away as nodes are apart, float32 takes them for equally far. A radius outside
-    `splats.LOG_SCALE_RANGE` (as a logarithm) counts as its bound.
+    only and converges to the node that is nearest in its own radii. About 1e6 times as
+    far away as the spacing of the nodes, float32 makes them equally far. A radius
+    outside `splats.LOG_SCALE_RANGE` (as a logarithm) is clamped.
+
+    Args:
+      distance_sq: Squared distances.
+      log_radius: Logarithms of the radii.
+
+    Returns:
+      Weights that sum to one.
     """
     held = jnp.clip(log_radius, *splats.LOG_SCALE_RANGE)
     return jax.nn.softmax(-distance_sq * jnp.exp(-2 * held) / 2, axis=-1)
@@ -85,14 +100,24 @@ def displaced(
     near: Int[Array, "gaussians near"],
     mean: Float[Array, "gaussians 3"],
 ) -> Displaced:
-    """How the nodes near them displace and turn Gaussians.
+    """Displace and rotate Gaussians by their nearest nodes.
 
-    Means go to the weighted mean of where each node would carry them, rotations are
-    followed by the weighted mean of the nodes' quaternions, each with the sign that is
-    on the side of the one that counts most: opposite quaternions are one turn, and
-    their plain mean is none. What no near node moves stays where it is, exactly. That a
-    node's turn sweeps what is off it is SC-GS's code with `local_frame`; without, nodes
-    shift only.
+    Means move to the weighted mean of where each node moves them. The rotation is the
+    weighted mean of the nodes' quaternions, each with the sign nearer to the one with
+    the largest weight, because opposite quaternions are the same rotation. A Gaussian
+    none of whose nodes moves stays exactly in place. Rotations of a node also move
+    distant Gaussians, as in SC-GS's code with `local_frame`. Otherwise nodes only
+    translate.
+
+    Args:
+      position: Positions of the nodes.
+      log_radius: Logarithms of their radii.
+      moves: Motion of the nodes.
+      near: Nearest nodes of each Gaussian.
+      mean: Canonical means.
+
+    Returns:
+      Displacements and rotations.
     """
     # One gather of a node's whole row: 1.4 ms for 10,000 Gaussians with three nodes
     # each, forward and backward. As products with a matrix that is 0 or 1, which
@@ -112,7 +137,15 @@ def displaced(
 
 
 def apply(gaussians: Gaussians, by: Displaced) -> Gaussians:
-    """Gaussians that were displaced and turned; rotations come out normalized."""
+    """Apply displacements and rotations to Gaussians.
+
+    Args:
+      gaussians: Canonical Gaussians.
+      by: Displacements and rotations.
+
+    Returns:
+      Gaussians with normalized rotations.
+    """
 
     def turned(extra, own):
         return quaternions.normalize(own + quaternions.multiply(extra, own))
@@ -174,12 +207,20 @@ def links(
 def arap_error(
     before: Float[Array, "nodes 3"], after: Float[Array, "nodes 3"], linked: Links
 ) -> Float[Array, ""]:
-    """How far nodes and what they are linked to are from moving as rigid bodies.
+    """Measure the deviation of linked nodes from rigid motion.
 
-    The mean over the nodes of sum_k w_k |(p_i - p_k) - R_i (q_i - q_k)|², the
-    as-rigid-as-possible term of SC-GS (there a sum), in the square of the unit of the
-    places; R_i is the turn that makes it least. At a least value the slope is that with
-    R_i held, so nothing goes through the decomposition.
+    It is the mean over the nodes of sum_k w_k |(p_i - p_k) - R_i (q_i - q_k)|², the
+    as-rigid-as-possible term of SC-GS (there a sum), with the rotation R_i that
+    minimizes it. At a minimum the gradient is that with constant R_i, so no gradient
+    passes through the decomposition.
+
+    Args:
+      before: Positions of the nodes.
+      after: Their positions at another time.
+      linked: Linked pairs.
+
+    Returns:
+      The error in squared units of the positions.
     """
     edges, turned = (
         places[:, None] - places[linked.index] for places in (before, after)
@@ -195,10 +236,16 @@ def arap_error(
 def farthest_points(
     points: Float[np.ndarray, "points coordinates"], count: int
 ) -> Int[np.ndarray, " chosen"]:
-    """Farthest-point sampling: each next point is the one farthest from those chosen.
+    """Sample points by farthest-point sampling, on the host.
 
-    Starts from the point farthest from the middle; at most as many as there are points
-    that differ. Host side: 20 ms for 128 of 9000 points.
+    It starts from the point farthest from the center. 128 of 9000 points take 20 ms.
+
+    Args:
+      points: The points.
+      count: Number of samples, limited to the number of distinct points.
+
+    Returns:
+      Indices of the samples.
     """
     points = np.asarray(points, np.float64)
     if not len(points) or count < 1:
