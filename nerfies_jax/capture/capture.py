@@ -15,6 +15,9 @@ from nerfies_jax.capture.given import Given
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
+# Scene units: positions and depths around 1 are what everything is computed for.
+MAX_LENGTH = 1e6
+MAX_SCALE = 1e12  # of scene units over world units, or one over that
 MAX_ID = 2**20  # a table of codes longer than this is a broken id, not a capture
 
 
@@ -243,6 +246,25 @@ def _check_numbers(capture, where):
         raise CaptureError(
             f"{where}: {count} scene points are not finite; remove them from the cloud"
         )
+    _check_range(capture, where)
+
+
+def _check_range(capture, where):
+    """Refuse lengths that float32 cannot compute with."""
+    depths = capture.depths
+    deepest = 0.0 if depths is None or not depths.size else float(depths.max())
+    for what, value, least, most in (
+        ("near", capture.near, 1 / MAX_LENGTH, MAX_LENGTH),
+        ("far", capture.far, 1 / MAX_LENGTH, MAX_LENGTH),
+        ("the largest depth", deepest, 0.0, MAX_LENGTH),
+        ("scale", capture.scale, 1 / MAX_SCALE, MAX_SCALE),
+    ):
+        if not least <= value <= most:
+            raise CaptureError(
+                f"{where}: {what} is {value:.3g}; expected {least:g} to {most:g} "
+                "(scene units); check the unit of the files, and write 0 where a depth "
+                "is unknown"
+            )
 
 
 def _check_rows(capture, where, frames):

@@ -21,6 +21,11 @@ from nerfies_jax.geometry.precision import exact_product, refuse_half
 MAX_SLOPE = 1e4  # lateral offset over depth: 0.006 degrees short of sideways
 MIN_DEPTH = 1e-12  # scene units
 MAX_ASIDE = 20  # images, of the principal point from the center
+# Bounds of `validate`: fields of view from 179.4 degrees to 0.06, and coefficients,
+# which reach some hundreds in calibrations of wide lenses.
+FOCAL_RANGE = (0.005, 1000.0)  # of the longer side of the image
+MAX_ASPECT, MAX_SKEW, MAX_DISTORTION = 10.0, 1.0, 1e4
+MAX_POSITION = 1e6  # scene units; float32 has steps of 0.06 there
 Real = int | float | np.number
 
 
@@ -428,6 +433,7 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
             )
     if min(size) < 1:
         raise ValueError(f"{name}: picture size {size} must be at least 1x1 pixels")
+    _check_range(camera, size, name)
     # Tiles of a large image have it far outside, of another resolution or unit farther.
     center = np.asarray(camera.principal_point_px, np.float64)
     aside = (np.abs(center / size - 0.5) > MAX_ASIDE).any(axis=-1)
@@ -437,6 +443,32 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
             f"more than {MAX_ASIDE} images outside {size[0]}x{size[1]}"
             f"{_row(aside, 0)}; resize the camera with its image"
         )
+
+
+def _check_range(camera, size, name):
+    """Refuse numbers that no camera has and float32 cannot compute with."""
+    focal = np.asarray(camera.focal_px, np.float64)
+    side = max(size)
+    lens = np.concatenate([camera.radial, camera.tangential], axis=-1)
+    for what, value, least, most in (
+        ("focal_px over the longer side of the image", focal / side, *FOCAL_RANGE),
+        ("pixel_aspect", camera.pixel_aspect, 1 / MAX_ASPECT, MAX_ASPECT),
+        ("|skew_px| over focal_px", np.abs(camera.skew_px) / focal, 0.0, MAX_SKEW),
+        ("the largest of |position|", _largest(camera.position), 0.0, MAX_POSITION),
+        ("the largest distortion coefficient", _largest(lens), 0.0, MAX_DISTORTION),
+    ):
+        value = np.asarray(value, np.float64)
+        bad = (value < least) | (value > most)
+        if bad.any():
+            raise ValueError(
+                f"{name}: {what} is {value[bad][0]:.3g}{_row(bad, 0)}; expected "
+                f"{least:g} to {most:g}, so estimate the camera again or leave the "
+                "frame out"
+            )
+
+
+def _largest(vectors):
+    return np.abs(np.asarray(vectors, np.float64)).max(axis=-1)
 
 
 def _in_camera(camera: Camera, point: Float[Array, "3"]):

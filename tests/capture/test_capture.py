@@ -8,7 +8,7 @@ import pytest
 from nerfies_jax.capture import capture as capturing
 from nerfies_jax.capture import frames as frames_of_files
 from nerfies_jax.capture import name_times
-from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.geometry import camera
 from tests import scenes
 
@@ -43,6 +43,20 @@ def make(frames=4, size=(6, 4), **changes):
         points=PointCloud(eye.astype(np.float32), np.zeros((frames, 3), np.uint8)),
     )
     return Capture(**(values | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"far": 1e38}, "far is 1e\\+38"),
+        ({"near": 1e-30}, "near is 1e-30"),
+        ({"scale": 1e-40}, "scale is 1e-40"),
+        ({"depths": np.full((4, 4, 6), 3e38, np.float32)}, "largest depth is 3e\\+38"),
+    ],
+)
+def test_lengths_that_float32_cannot_compute_with_are_refused(changes, what):
+    with pytest.raises(CaptureError, match=what):
+        make(**changes)
 
 
 @pytest.mark.parametrize(

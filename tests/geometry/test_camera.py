@@ -217,6 +217,12 @@ def one_with(**changes):
         ),
         (lambda: validated(focal_px=0), r"focal_px must be positive, got 0 \(row 1\)"),
         (lambda: validated(pixel_aspect=-1), r"pixel_aspect must be positive, got -1"),
+        (lambda: validated(focal_px=1e30), r"focal_px over .* 1.5.e\+27 \(row 1\)"),
+        (lambda: validated(focal_px=1e-30), r"focal_px over .*; expected 0.005"),
+        (lambda: validated(pixel_aspect=1e6), r"pixel_aspect is 1e\+06 \(row 1\)"),
+        (lambda: validated(skew_px=-1e9), r"skew_px\| over focal_px is"),
+        (lambda: validated(position=1e30), r"position\| is 1e\+30 \(row 1\)"),
+        (lambda: validated(radial=1e20), r"distortion coefficient is 1e\+20"),
         (lambda: validated(principal_point_px=5000), r"outside 640x480 \(row 1\)"),
         (
             lambda: cameras.validate(one_with(radial=np.zeros(2)), SIZE),
