@@ -223,7 +223,7 @@ def one_with(**changes):
         (lambda: validated(skew_px=-1e9), r"skew_px\| over focal_px is"),
         (lambda: validated(position=1e30), r"position\| is 1e\+30 \(row 1\)"),
         (lambda: validated(radial=1e20), r"distortion coefficient is 1e\+20"),
-        (lambda: validated(principal_point_px=5000), r"outside 640x480 \(row 1\)"),
+        (lambda: validated(principal_point_px=50000), r"outside 640x480 \(row 1\)"),
         (
             lambda: cameras.validate(one_with(radial=np.zeros(2)), SIZE),
             r"radial has shape \(2,\)",
