@@ -31,7 +31,7 @@ def lines(numbers: Mapping[str, float]) -> list[str]:
         where = ""
         if "motion.moving_gain" in numbers:
             where = f", {_signed(numbers['motion.moving_gain'])} in dynamic regions"
-        text.append(f"motion:   gains {_signed(numbers['motion.gain'])}{where}")
+        text.append(f"motion:    gains {_signed(numbers['motion.gain'])}{where}")
     return text
 
 
@@ -62,5 +62,5 @@ def warnings(numbers: Mapping[str, float]) -> list[str]:
 
 
 def _signed(decibels):
-    """With two digits, and no sign of minus before nothing."""
+    """Format with two decimals, without a minus sign before zero."""
     return f"{round(decibels, 2) + 0.0:+.2f} dB"

@@ -460,7 +460,7 @@ def _next(folder, run, trained, base=None):
     """Suggested next commands, with absolute paths relative to a `base`."""
     own = run.config.effects
     line = commands.render(folder, own, base)
-    looked = report.Command("Render it from other cameras, at other times:", line)
+    looked = report.Command("Render it from other viewpoints and times:", line)
     if trained.result.stopped_by == "non-finite":
         return [looked]  # resumed, it would stop at the same step
     if trained.result.steps < run.spec.steps:
@@ -478,19 +478,19 @@ def _log(folder, page, metrics, baselines, following):
         f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
         f"over {value['heldout.frames']} frames{_parts(value)}; "
         f"{value['train.seconds']:.0f} s of "
-        f"training and {value['train.compile_seconds']:.0f} s of compiling; "
-        f"{value['render.ms_per_frame']:.0f} ms a frame"
+        f"training, {value['train.compile_seconds']:.0f} s of compilation; "
+        f"{value['render.ms_per_frame']:.0f} ms per frame"
     )
     if "tracks.epe" in value:
         console.say(
-            f"points:   {value['tracks.epe']:.4f} scene units from where they are, "
-            f"{value['tracks.static_epe']:.4f} if they stood still"
+            f"tracks:    end-point error {value['tracks.epe']:.4f} scene units, "
+            f"{value['tracks.static_epe']:.4f} for a static prediction"
         )
     for line in baselines:
         console.say(line)
     if page is not None:
         console.say(f"report:     {page}")
-    for kind, name in (("comparison:", "comparison.png"), ("film:", "scene.mp4")):
+    for kind, name in (("comparison:", "comparison.png"), ("video:", "scene.mp4")):
         if (folder / name).exists():
             console.say(f"{kind:11} {folder / name}")
     for command in following:

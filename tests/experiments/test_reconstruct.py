@@ -116,7 +116,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
         assert words in printed
     assert "There is no player" not in page
     assert "plan: 2 steps for 250 s of training" in printed
-    assert "motion:   gains +0.00 dB" in printed
+    assert "motion:    gains +0.00 dB" in printed
     told = runs.read_events(out)
     names = event_checks.ended_stages(told)
     order = ["reading images", "initializing the scene", "training"]
