@@ -1,15 +1,15 @@
-"""Named radiance fields: the papers' numbers, and variants for a CPU.
+"""Named radiance fields with the papers' settings, and variants for a CPU.
 
-Samples, networks, rates and weights are those of the paper or code cited at each;
-numbers without a word are defaults of their specs, which cite their own source. Where a
-preset leaves its paper, that is said beside it. All of them leave the papers in this:
+Samples, networks, rates and weights are those of the paper or code cited at each.
+Numbers without a comment are defaults of their specs, which cite their own source.
+Deviations from the paper are stated at each preset. All of them deviate in this:
 
-- Densities pass a softplus for a ReLU, fine samples are stratified draws where the
-  papers' are independent, and encodings have the identity beside the bands and no
-  factor of pi.
-- `nerf` and what descends from it train without the crop of the first 500 steps, in
-  Euclidean space alone (no normalized device coordinates), without noise on densities.
-- None of the full sizes was ever trained to its end: they want a GPU.
+- Densities use a softplus instead of a ReLU, fine samples are stratified draws where
+  those of the papers are independent, and encodings have the identity next to the bands
+  and no factor of pi. - `nerf` and presets derived from it train without the crop of
+  the first 500 steps, in
+  Euclidean space only (no normalized device coordinates), without noise on densities. -
+  None of the full sizes was ever trained to its end, since they need a GPU.
 """
 
 import dataclasses
@@ -306,7 +306,7 @@ SMALL_TINEUVOX = dataclasses.replace(
 
 
 def _on_grid(preset: RadianceScene) -> RadianceScene:
-    """A small preset with its template on a grid; what moves starts from tracks."""
+    """A small preset with its template on a grid, whose motion starts from tracks."""
     names = ("rays", "micro_batches", "template", "coarse", "template_rate")
     grid = {name: getattr(SMALL_NERF_GRID, name) for name in names}
     # A grid shows what does not move within seconds, and a warp that has found nothing
@@ -316,7 +316,7 @@ def _on_grid(preset: RadianceScene) -> RadianceScene:
     return dataclasses.replace(preset, start=start, **grid)
 
 
-# What changes with time, on planes of space and time as in HexPlane: it is asked three
+# The dynamic medium, on planes of space and time as in HexPlane: it is evaluated three
 # times a sample. Built-in `default`, 90 seconds of one core (steps, held-out PSNR,
 # where it moves, and what motion is worth there):
 #   waves, 4 of 96 wide, 1024 rays           54    18.8  15.1
@@ -348,7 +348,7 @@ STILL_NERF_GRID = dataclasses.replace(
     SMALL_NERF_GRID,
     steps=8000,
     rays=512,
-    # Of rays that meet nothing, few. Blender lego, eight held-out frames, seconds of
+    # Few rays that meet nothing. Blender lego, eight held-out frames, seconds of
     # one busy core, without that and with: 24.68 dB in 66 s and 25.26 in 73 after 1200
     # steps, 25.38 in 137 and 25.91 in 136 after 2400 (1024 rays, samples all along).
     sampling=SamplingSpec(24, 24, occupancy=OccupancySpec()),
@@ -391,7 +391,18 @@ PRESETS = {
 
 
 def with_steps(spec: RadianceScene, steps: int) -> RadianceScene:
-    """The same field over another number of steps, its schedules in proportion."""
+    """Change the number of steps of a radiance field.
+
+    Args:
+      spec: The scene.
+      steps: Number of steps.
+
+    Returns:
+      The scene with its schedules stretched in proportion.
+
+    Raises:
+      ValueError: If `steps` is below 1.
+    """
     if steps < 1:
         raise ValueError(f"steps={steps}: train for at least one step")
     in_proportion = step_counts.stretched(spec, steps / spec.steps)

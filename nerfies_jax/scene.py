@@ -58,7 +58,15 @@ OPTIMIZER = optax.scale_by_adam()
 
 
 def metadata_of(capture: Capture, spec: RadianceScene) -> SceneMetadata:
-    """What the field must know of a capture; host side."""
+    """Compute the scene metadata of a capture, on the host.
+
+    Args:
+      capture: The capture.
+      spec: The scene.
+
+    Returns:
+      The metadata.
+    """
     return scene_metadata.metadata_of(capture, spec.extent)
 
 
@@ -136,9 +144,15 @@ def _check_guides(spec, effects):
 
 
 def drawing(radiance: Field, seen: Callable[..., tuple[View, Codes]]) -> dict[str, Any]:
-    """How a model draws a field: its `render` and `surveyed`.
+    """Return the `render` and `surveyed` functions of a field's model.
 
-    `seen(params, what is to be drawn)` is a view and the codes of its frame.
+    Args:
+      radiance: The field.
+      seen: Function `seen(params, given)` that returns a view and the codes of its
+        frame for the object to be rendered.
+
+    Returns:
+      The fields of `Model` by name.
     """
 
     def render(params, given, size, step):
@@ -192,7 +206,18 @@ def _stepper(spec, radiance, devices):
 def micro_batch(
     radiance: Field, state: TrainState, frames: Frames, key: Key[Array, ""]
 ) -> tuple[Batch, Cells | None]:
-    """Rays to learn from at once, and what guides their samples (`OccupancySpec`)."""
+    """Draw the rays of a micro-batch.
+
+    Args:
+      radiance: The field.
+      state: Training state.
+      frames: Training frames.
+      key: PRNG key.
+
+    Returns:
+      The rays, and the occupied cells that guide their samples (`OccupancySpec`) or
+      None.
+    """
     spec = radiance.spec
     count, plan = spec.rays // spec.micro_batches, spec.sampling.occupancy
     if plan is None:
@@ -261,7 +286,16 @@ def learning_rates(
 
 
 def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
-    """Rays through pixels drawn from all frames alike, and what was filmed there."""
+    """Draw rays through random pixels of all frames, uniformly.
+
+    Args:
+      frames: Training frames.
+      count: Number of rays.
+      key: PRNG key.
+
+    Returns:
+      The rays and their observed colors.
+    """
     row_key, column_key, line_key = jax.random.split(key, 3)
     number, height, width = frames.images.shape[:3]
     row = jax.random.randint(row_key, (count,), 0, number)
@@ -290,10 +324,22 @@ def loss_terms(
     key: Key[Array, ""],
     guide: Cells | None = None,
 ) -> dict[str, Term]:
-    """Every term of the loss of one batch, by name; a `guide` as in `render_ray`.
+    """Compute every term of the loss of one batch.
 
-    "coarse" and "fine" are mean squared errors of color; "color" is NeRF-W's negative
-    log-likelihood where a transient medium says how uncertain it is.
+    "coarse" and "fine" are mean squared errors of color. "color" is NeRF-W's negative
+    log-likelihood, if a transient medium provides the uncertainty.
+
+    Args:
+      radiance: The field.
+      params: Its parameters.
+      frames: Training frames.
+      batch: Rays.
+      step: Number of completed steps.
+      key: PRNG key.
+      guide: Occupied cells, as in `render_ray`, or None.
+
+    Returns:
+      Terms by name.
     """
     ray_key, penalty_key = jax.random.split(key)
     metadata = radiance.metadata
@@ -384,6 +430,13 @@ def _width_of(one: TemplateSpec) -> int:
 
 
 def count_parameters(state: TrainState) -> dict[str, int]:
-    """`parameters`: the numbers of all networks and codes."""
+    """Count the parameters of all networks and codes.
+
+    Args:
+      state: Training state.
+
+    Returns:
+      The number, under "parameters".
+    """
     leaves = jax.tree.leaves(state.params)
     return {"parameters": sum(math.prod(leaf.shape) for leaf in leaves)}

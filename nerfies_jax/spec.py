@@ -1,4 +1,4 @@
-"""Which radiance field, and how it is trained: settings only."""
+"""Settings of a radiance field and of its training."""
 
 import dataclasses
 import math
@@ -41,12 +41,13 @@ WARPS = {WarpSpec: warp.effect, TimeWarpSpec: time_warp.effect}
 
 @dataclasses.dataclass(frozen=True)
 class SamplingSpec:
-    """Where along a ray the field is asked; the defaults are Mildenhall et al. 2020.
+    """Settings of the samples along a ray. The defaults are those of NeRF.
 
-    `fine` samples are drawn where the coarse level found weight; 0 leaves one level.
-    The fine level sees both, or those alone where `union` is false: then half as many
-    are asked of the larger network, and few of them of empty space. `block` rays are
-    rendered at a time when a whole frame is: memory does not grow with the picture.
+    `fine` samples are drawn by the weights of the coarse level, and 0 leaves one level.
+    The fine level evaluates both, or only the new ones if `union` is false. Then half
+    as many samples are evaluated by the larger network, and few of them in empty space.
+    `block` rays are rendered at a time in a whole frame, so memory does not grow with
+    the image.
     """
 
     coarse: int = 64
@@ -199,7 +200,14 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
 
 
 def guided(one: WarpSpec | AmbientSpec | None) -> WarpSpec | AmbientSpec | None:
-    """The same warp or slice, reading the mask of what moves as well."""
+    """Add the mask of moving points to the guides of a warp or ambient surface.
+
+    Args:
+      one: Settings, or None.
+
+    Returns:
+      The changed settings.
+    """
     if one is None or moving_mask.NAME in one.guides:
         return one
     return dataclasses.replace(one, guides=(*one.guides, moving_mask.NAME))

@@ -1,9 +1,9 @@
-"""Ambient slicing: the template has more dimensions than space, and frames slice it.
+"""Ambient slicing surfaces: the template has extra dimensions, and frames slice it.
 
-HyperNeRF (Park et al. 2021, arXiv:2106.13228, section 4): a topology that changes, a
-mouth that opens, is no warp of one template in space, but may be a slice of one in
-space and a few ambient dimensions. A *bent* surface lets each observed point have its
-own ambient coordinates (equation 6); the axis-aligned *plane* has one for the frame.
+HyperNeRF (Park et al. 2021, arXiv:2106.13228, section 4): a topological change, such as
+a mouth that opens, is no warp of one template in space, but may be a slice of one in
+space and a few ambient dimensions. A *bent* surface gives each observed point its own
+ambient coordinates (equation 6). The axis-aligned *plane* has one for the frame.
 """
 
 import dataclasses
@@ -79,7 +79,15 @@ class AmbientSpec:
 
 
 def network(spec: AmbientSpec) -> MLPSpec:
-    """What reads [encoded point, code] and answers a bent slice's ambient point."""
+    """Return the settings of the network from [encoded point, code] to ambient
+    coordinates.
+
+    Args:
+      spec: Settings of a bent surface.
+
+    Returns:
+      Settings of an MLP with the head "ambient".
+    """
     return MLPSpec(
         inputs=spec.position.width(3) + spec.code_width + len(spec.guides),
         depth=spec.depth,
@@ -107,7 +115,16 @@ def effect(spec: AmbientSpec) -> Effect:
 
 
 def init(spec: AmbientSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
-    """A bent slice that is almost the plane through zero, for all codes."""
+    """Initialize a bent surface near the plane through zero, for all codes.
+
+    Args:
+      spec: Settings.
+      key: PRNG key.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters.
+    """
     params = mlp.init(network(spec), key, dtype)
     # mlp.SMALL is the half-width of a uniform draw: √3 of its standard deviation.
     shrink = math.sqrt(3) * HEAD_DEVIATION / mlp.SMALL
@@ -120,7 +137,17 @@ def init(spec: AmbientSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
 def features(
     spec: AmbientSpec, params: MLP | None, point: Vector, condition: FrameCondition
 ) -> Float[Array, " features"]:
-    """What the template reads: the encoded ambient point, as far as it is open."""
+    """Compute the features for the template: the encoded ambient coordinates.
+
+    Args:
+      spec: Settings.
+      params: Parameters, None for a plane.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      Features [features], weighted by the coarse-to-fine window.
+    """
     ambient = ambient_point(spec, params, point, condition)
     opened = window(spec, condition.step, ambient)
     return encoding.encode(spec.encoding, ambient, opened)
@@ -129,10 +156,18 @@ def features(
 def ambient_point(
     spec: AmbientSpec, params: MLP | None, point: Vector, condition: FrameCondition
 ) -> Float[Array, " dims"]:
-    """Where in the ambient dimensions the slice of this moment is at an observed point.
+    """Compute the ambient coordinates of an observed point, without encoding.
 
-    Not encoded: for pictures of the slice, and for renders along a path in it. A plane
-    has no parameters.
+    They are for images of the slice, and for renders along a path in it.
+
+    Args:
+      spec: Settings.
+      params: Parameters, None for a plane.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      Ambient coordinates, [dims].
     """
     if spec.kind == "plane":
         return condition.codes[PLANE_TABLE]
@@ -145,7 +180,16 @@ def ambient_point(
 def window(
     spec: AmbientSpec, step: Int[Array, ""], like: Float[Array, "..."]
 ) -> Float[Array, " bands"]:
-    """How far the bands of the ambient encoding are open after `step` steps."""
+    """Compute the coarse-to-fine window of the ambient encoding.
+
+    Args:
+      spec: Settings.
+      step: Number of completed steps.
+      like: Array of the type of the result.
+
+    Returns:
+      Weights in [0, 1], [bands].
+    """
     return schedules.band_window(
         spec.encoding.bands,
         spec.anneal_steps,

@@ -1,11 +1,11 @@
-"""A learned code for each exposure, which color reads and density does not.
+"""Learned appearance code for each exposure, which color reads and density does not.
 
 NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "latent appearance modeling")
-gives each photograph a code (GLO, Bojanowski et al. 2018) that says how light, exposure
-and white balance were; Nerfies (Park et al. 2021, arXiv:2011.12948, section 3.1) takes
-it over. Geometry is the same under all codes, because only the color branch gets them.
+gives each photograph a code (GLO, Bojanowski et al. 2018) for light, exposure and white
+balance. Nerfies (Park et al. 2021, arXiv:2011.12948, section 3.1) uses it too. Geometry
+is the same under all codes, because only the color branch gets them.
 
-In the official Nerfies code the codes are dead: its color branch asks for another
+In the official Nerfies code the codes have no effect: its color branch asks for another
 switch, and under the published presets their gradient is exactly zero.
 """
 

@@ -1,7 +1,7 @@
-"""The background stays put: points known to be static must not be moved by the warp.
+"""Background regularization: static points must not be moved by the warp.
 
-Park et al. 2021 (Nerfies), arXiv:2011.12948, "background regularization": without it
-the warp and the template may drift together, which no image tells.
+Park et al. 2021 (Nerfies), arXiv:2011.12948. Without it the warp and the template may
+drift together, which images do not show.
 """
 
 import dataclasses
@@ -55,10 +55,17 @@ def effect(spec: BackgroundSpec) -> Effect:
 
 
 def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:
-    """Mean over static points of ρ(|displacement|²).
+    """Compute the mean over static points of ρ(|displacement|²).
 
-    With no more points than `spec.points` all are taken, each once; of more, as many
-    are drawn with replacement.
+    All points are used if there are at most `spec.points`. Otherwise as many are drawn
+    with replacement. Each point is evaluated in a random frame, with noise.
+
+    Args:
+      spec: Settings.
+      context: Context of the step.
+
+    Returns:
+      A scalar.
     """
     # The official code draws frames and jitter with one key.
     choice_key, frame_key, noise_key = jax.random.split(context.key, 3)
@@ -79,7 +86,17 @@ def mean_drift(
     point: Float[Array, "points 3"],
     rows: Int[Array, " points"],
 ) -> Scalar:
-    """The same at given points, in units of the field, each in a given frame."""
+    """Compute the mean of ρ(|displacement|²) over points.
+
+    Args:
+      spec: Settings.
+      context: Context of the step.
+      point: Points in units of the field, [points, 3].
+      rows: Training frame of each point, [points].
+
+    Returns:
+      A scalar.
+    """
     conditions = jax.vmap(context.condition_of)(rows)
     moved = jax.vmap(context.displace)(point, conditions)
     # ρ takes the square: the length has no slope where nothing moves

@@ -1,10 +1,9 @@
-"""What the effects of a radiance field see of a ray, and what they say of it.
+"""Inputs and outputs of the effects of a radiance field on a ray.
 
-The seams themselves are those of `nerfies_jax.training.effects`.
-
-Everything here is in field coordinates: `nerfies_jax.scene` shifts and scales rays so
-that the filmed volume fills a box around the origin. Functions of a point are written
-for one point and vmapped by the scene.
+The hooks of effects are those of `nerfies_jax.training.effects`. Everything here is in
+field coordinates: `nerfies_jax.scene` shifts and scales rays so that the captured
+volume fills a box around the origin. Functions of a point take one point, and the scene
+vmaps them.
 """
 
 from collections.abc import Callable
@@ -19,7 +18,7 @@ Scalar = Float[Array, ""]
 
 
 class Sample(NamedTuple):
-    """One sample of one ray, as a second medium sees it."""
+    """One sample of one ray, as the input of a second medium."""
 
     point: Vector  # where it was observed; no warp applied
     direction: Vector  # of the ray, unit length
@@ -27,7 +26,7 @@ class Sample(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """What else is on the ray, at one sample."""
+    """A second medium at one sample of a ray."""
 
     density: Scalar  # per unit of the field
     color: Vector  # in [0, 1]
@@ -39,7 +38,7 @@ class Medium(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """One sample of one ray, as color sees it; slopes reach none of the parameters."""
+    """One sample of one ray, as the input of color. Gradients reach no parameters."""
 
     point: Vector  # where it was observed
     features: Float[Array, " width"]  # last hidden layer of the level's trunk there
@@ -50,14 +49,14 @@ class Surface(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What an effect found at a surface."""
+    """Output of an effect at a surface."""
 
     features: Float[Array, " features"]  # that color reads
     found: dict[str, Array] = {}  # noqa: RUF012  what the penalty needs again
 
 
 class RayOutput(NamedTuple):
-    """One ray (or a batch) as one level of sampling renders it."""
+    """Output of one level of sampling for one ray or a batch."""
 
     distances: Float[Array, "*rays samples"]
     point: Float[Array, "*rays samples 3"]  # where it was observed
@@ -73,17 +72,17 @@ class RayOutput(NamedTuple):
     spacing: Float[Array, "*rays samples"]  # what length each sample stands for
     # Known to be behind the samples; None: the last one stands for all behind it.
     background: Float[Array, "*rays 3"] | None
-    # What surfaces found, by effect, leaves with leading axes rays and samples.
+    # Outputs at surfaces by effect, with leaves [rays, samples, ...].
     looks: dict[str, dict[str, Array]] = {}  # noqa: RUF012
 
     @property
     def weight(self) -> Float[Array, "*rays samples"]:
-        """Of all media together: how much of the ray ends at each sample."""
+        """Rendering weight of each sample, for all media together."""
         return sum(self.media_weight.values(), self.static_weight)
 
 
 class Batch(NamedTuple):
-    """The rays of one step and what was filmed there; leading axis rays."""
+    """Rays of one step and their observed colors, with rays along the leading axis."""
 
     row: Int[Array, " rays"]  # of the frames learned from
     pixel: Float[Array, "rays 2"]
@@ -95,7 +94,7 @@ class Batch(NamedTuple):
 
 
 class Box(NamedTuple):
-    """`field = (scene - center) * scale`."""
+    """Transform to field coordinates, `field = (scene - center) * scale`."""
 
     center: Vector  # scene units
     scale: Scalar
@@ -104,7 +103,18 @@ class Box(NamedTuple):
 def guides_of(
     names: tuple[str, ...], condition: FrameCondition
 ) -> list[Float[Array, "1"]]:
-    """What effects said of a point, by name; ValueError for what none said."""
+    """Return the per-point codes of some names.
+
+    Args:
+      names: Names of the codes.
+      condition: Conditioning of a point.
+
+    Returns:
+      The codes, [1] each.
+
+    Raises:
+      ValueError: If no effect provides a code of that name.
+    """
     missing = [name for name in names if name not in condition.codes]
     if missing:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Elastic regularization: surfaces may move and turn, but stretching costs.
+"""Elastic regularization: rigid motion of surfaces is free, stretching has a cost.
 
 Park et al. 2021 (Nerfies), arXiv:2011.12948, "elastic regularization": Σ log²σ over the
 singular values of the warp's Jacobian, made robust, summed along each ray with the
@@ -72,7 +72,14 @@ class ElasticSpec:
 
 
 def schedule(spec: ElasticSpec) -> schedules.Schedule | float:
-    """The weight as a function of the completed steps, or a constant."""
+    """Return the weight as a schedule, or as a constant.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      A function of the step, or a number.
+    """
     if spec.decay_steps is None:
         return spec.weight
     return schedules.cosine(
@@ -94,9 +101,16 @@ def effect(spec: ElasticSpec) -> Effect:
 
 
 def energy_of_step(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
-    """`spec.every` times `energy` at the steps that this divides, zeros at the others.
+    """Compute `spec.every` times `energy` every `spec.every` steps, and zero otherwise.
 
-    So their mean over steps, and that of their gradients, is what `energy` has.
+    The mean over steps, and that of gradients, is then that of `energy`.
+
+    Args:
+      spec: Settings.
+      context: Context of the step.
+
+    Returns:
+      The energy and the share of folds, scalars.
     """
     if spec.every == 1:
         return energy(spec, context)
@@ -115,11 +129,18 @@ def energy_of_step(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, 
 def displacement_cost(spec: ElasticSpec, displacement: Matrix) -> Scalar:
     """Compute the cost of one Jacobian of a displacement field, not of a warp.
 
-    ρ(E) + `fold_cost` max(0, -det J), with J = 1 + `displacement` and E its log energy.
-    Two things are needed where J folds. E must be signed: unsigned, a mirror image is
-    at rest. And ρ must not have the last word: it saturates, and at diag(1, 1, -1) has
-    a slope of 1e-6, so nothing would unfold; the determinant pulls with slope one.
-    Without folds the second is zero and E is Nerfies'.
+    It is ρ(E) + `fold_cost` max(0, -det J), with J = 1 + `displacement` and E its log
+    energy. Two things are needed where J folds. E must be signed, since unsigned a
+    mirror image has no energy. And ρ alone is not enough: it saturates, and at diag(1,
+    1, -1) has a gradient of 1e-6, so nothing would unfold. The determinant has a
+    gradient of one. Without folds the second term is zero and E is that of Nerfies.
+
+    Args:
+      spec: Settings.
+      displacement: Jacobian of the displacement, [3, 3].
+
+    Returns:
+      The cost, a scalar.
     """
     folds = spec.fold_cost > 0
     form = matrix3.signed_log_energy if folds else matrix3.log_energy
@@ -135,18 +156,33 @@ def displacement_cost(spec: ElasticSpec, displacement: Matrix) -> Scalar:
 
 @checked
 def displacement_determinant(displacement: Matrix) -> Scalar:
-    """det(1 + D), as a triple product."""
+    """Compute det(1 + D) as a triple product.
+
+    Args:
+      displacement: Jacobian D of the displacement, [3, 3].
+
+    Returns:
+      The determinant.
+    """
     # Broadcast products: `jnp.linalg.det` is LU, whose slope at rank one is NaN.
     x, y, z = displacement + jnp.eye(3, dtype=displacement.dtype)
     return dot(x, cross(y, z))
 
 
 def energy(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
-    """Mean over rays of Σ_s w_s cost_s on the coarse level, and the share of folds.
+    """Compute the mean over rays of Σ w cost on the coarse level, and the share of
+    folds.
 
-    The weights are those of the static medium, which is what the warp deforms, and get
-    no gradient: space is to be stiffened, not emptied. The share is of weight as well:
-    how much of what is seen lies in folds.
+    The weights are those of the static medium, which the warp deforms, and have no
+    gradient: space should become stiff, not empty. The share is also by weight: the
+    visible part that lies in folds.
+
+    Args:
+      spec: Settings.
+      context: Context of the step.
+
+    Returns:
+      The energy and the share of folds, scalars.
     """
     level = context.levels[0]
     point, weight = draw(spec.points, level, context.key)
@@ -165,12 +201,20 @@ def energy(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
 def draw(
     points: int | None, level: RayOutput, key: Key[Array, ""]
 ) -> tuple[Float[Array, "rays points 3"], Float[Array, "rays points"]]:
-    """Points of each ray and weights under which their sum is that over all samples.
+    """Sample points of each ray, with weights under which their sum is unbiased.
 
-    The sum is unbiased: a sample is drawn in proportion to its weight, and all that
-    are drawn share the ray's total. Deviation of the gradient of 24 rays of 16 samples
-    through surfaces, as a share of its length: 0.67 for one draw, 0.21 for four, 1.6
-    for four samples taken evenly (docs/results/elastic_points.md).
+    A sample is drawn with a probability proportional to its weight, and all draws share
+    the total of the ray. The deviation of the gradient of 24 rays of 16 samples through
+    surfaces, relative to its norm, is 0.67 for one draw, 0.21 for four, and 1.6 for
+    four evenly spaced samples (docs/results/elastic_points.md).
+
+    Args:
+      points: Number of draws per ray. None for all samples.
+      level: Output of the level.
+      key: PRNG key.
+
+    Returns:
+      Points [rays, points, 3] and weights [rays, points].
     """
     weight = jax.lax.stop_gradient(level.static_weight)
     if points is None or points >= weight.shape[-1]:
@@ -183,10 +227,19 @@ def draw(
 def systematic(
     weight: Float[Array, " samples"], start: Scalar, draws: int
 ) -> tuple[Int[Array, " draws"], Float[Array, " draws"]]:
-    """Samples drawn in proportion to `weight`, and the weight each then stands for.
+    """Draw samples with a probability proportional to their weights (systematic
+    sampling).
 
-    One uniform number in [0, 1), `start`, places `draws` equidistant marks on the
-    cumulated weight. A sample without weight is not drawn, except from an empty ray.
+    A sample without weight is not drawn, except on an empty ray.
+
+    Args:
+      weight: Non-negative weights, [samples].
+      start: Uniform number in [0, 1), the offset of equidistant marks on the cumulative
+        weight.
+      draws: Number of draws.
+
+    Returns:
+      Indices of samples and the weight that each represents, [draws].
     """
     cumulated = jnp.cumsum(weight)
     total = cumulated[-1]

@@ -1,4 +1,4 @@
-"""The moments that a capture is learned from: how far apart, which lies beside one."""
+"""Spacing and neighbors of the training timestamps."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +6,17 @@ from jaxtyping import Array, Bool, Float
 
 
 def interval(moments: int) -> float:
-    """Time from one of so many moments to the next; a single one has no neighbors."""
+    """Return the time between two of evenly spaced timestamps in [0, 1].
+
+    Args:
+      moments: Number of timestamps.
+
+    Returns:
+      The interval, 2 for a single timestamp, which has no neighbors.
+
+    Raises:
+      ValueError: If there are none.
+    """
     if moments < 1:
         raise ValueError(f"a capture has at least one moment, got moments={moments}")
     return 1 / (moments - 1) if moments > 1 else 2.0
@@ -15,10 +25,16 @@ def interval(moments: int) -> float:
 def beside(
     times: tuple[float, ...], time: Float[Array, " rays"], sign: int
 ) -> tuple[Float[Array, " rays"], Bool[Array, " rays"]]:
-    """The learned moment after (1) or before (-1) the one nearest to a time.
+    """Find the training timestamp after or before the one nearest to a time.
 
-    The second is whether there is one; where there is none, the first is an interval
-    away.
+    Args:
+      times: Training timestamps in ascending order.
+      time: Times, [rays].
+      sign: 1 for the next timestamp, -1 for the previous one.
+
+    Returns:
+      Timestamps [rays], one interval away if there is none, and booleans [rays] that
+      are True if there is one.
     """
     known = np.asarray(times)
     between = jnp.asarray((known[1:] + known[:-1]) / 2, time.dtype)

@@ -1,10 +1,11 @@
-"""A mask of what moves, learned for every point, which guides warp and slice.
+"""A learned mask of moving points, which guides the warp and the ambient surface.
 
-Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, its mask that guides the deformation
-field. The text with its equations was not at hand; its code (JokerYan/NeRF-DS) is
-followed. Where colors change as a mirror moves, they cannot say what corresponds. A
-network says of each observed point and moment how surely it moves; the warp and the
-ambient slice read that beside their code; and masks of the pictures teach it.
+Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, mask guided deformation field. The
+text with its equations was not at hand, so its code (JokerYan/NeRF-DS) is followed.
+Where colors change with the motion of a specular surface, they do not show
+correspondence. A network predicts for each observed point and time how certainly it
+moves. The warp and the ambient surface read that next to their code, and masks of the
+images supervise it.
 """
 
 import dataclasses
@@ -64,7 +65,14 @@ class MovingMaskSpec:
 
 
 def network(spec: MovingMaskSpec) -> MLPSpec:
-    """What reads [encoded point, code] and answers the logit of moving."""
+    """Return the settings of the network from [encoded point, code] to a logit.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      Settings of an MLP with the head "logit".
+    """
     return MLPSpec(
         inputs=spec.position.width(3) + spec.code_width,
         depth=spec.depth,
@@ -87,14 +95,33 @@ def effect(spec: MovingMaskSpec) -> Effect:
 
 
 def init(spec: MovingMaskSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
-    """Nothing is known of any point."""
+    """Initialize the network, with undecided masks.
+
+    Args:
+      spec: Settings.
+      key: PRNG key.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters.
+    """
     return mlp.init(network(spec), key, dtype)
 
 
 def share(
     spec: MovingMaskSpec, params: MLP, point: Vector, condition: FrameCondition
 ) -> Scalar:
-    """How surely an observed point moves, in (0, 1)."""
+    """Predict how certainly an observed point moves.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      A scalar in (0, 1).
+    """
     encoded = encoding.encode(spec.position, point, None)
     inputs = jnp.concatenate([encoded, condition.codes[spec.table]])
     logit = mlp.apply(network(spec), params, inputs)["logit"][0]
@@ -108,7 +135,16 @@ def share(
 def penalty(
     spec: MovingMaskSpec, params: MLP, context: PenaltyContext
 ) -> dict[str, Term]:
-    """How far the points that are seen are from the masks, summed over the levels."""
+    """Compute the error of the rendered masks, summed over the levels.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      context: Context of the step.
+
+    Returns:
+      The term "error", or none if the frames have no masks.
+    """
     if context.frames.moving is None:
         return {}
     batch = context.batch
@@ -128,9 +164,18 @@ def difference(
     moves: Bool[Array, " rays"],
     valid: Bool[Array, " rays"],
 ) -> Scalar:
-    """Mean over filmed rays of Σ w |share - mask|, by the weights they are drawn with.
+    """Compute the mean over valid rays of Σ w |share - mask|, as in the published code.
 
-    As the paper's code has it; the weights get no slope.
+    The rendering weights get no gradient.
+
+    Args:
+      shares: Predictions at the samples, [rays, samples].
+      level: Output of the level.
+      moves: Observed masks, [rays].
+      valid: True for observed pixels, [rays].
+
+    Returns:
+      A scalar.
     """
     weight = jax.lax.stop_gradient(level.weight)
     off = jnp.abs(shares - moves[:, None].astype(shares.dtype))

@@ -1,10 +1,11 @@
-"""A medium that changes with time, and where each of its points goes (NSFF).
+"""A time-dependent medium with scene flow (NSFF).
 
 Li et al. 2021, arXiv:2011.13084: no canonical scene and no warp, but a second field of
-point and time, blended with the static one, which predicts its own flow to the moments
-before and after. The field of the next moment, read where the flow leads, must look
-like this one. Weights and sizes are those of the public code; chains over two moments
-(its last stage) and extra rays on what moves (its first) are left out.
+point and time, blended with the static one, which predicts its own flow to the next and
+previous timestamps. The field of the next timestamp, evaluated where the flow leads,
+must look like the current one. Weights and sizes are those of the public code. Chains
+over two timestamps (its last stage) and extra rays on moving regions (its first) are
+left out.
 """
 
 import dataclasses
@@ -34,9 +35,9 @@ SIGNS = (1, -1)
 
 @dataclasses.dataclass(frozen=True)
 class FlowWeights:
-    """What each term counts for; a term of weight zero is not computed.
+    """Weights of the loss terms. A term of weight zero is not computed.
 
-    The last two need depth and optical flow of the capture, and fade: tenfold every
+    The last two need depth and optical flow of the capture, and decay tenfold every
     `SceneFlowSpec.decay_steps`.
     """
 
@@ -109,7 +110,7 @@ class SceneFlow(NamedTuple):
 
 
 class Dynamic(NamedTuple):
-    """What the medium is at one point and time."""
+    """The medium at one point and time."""
 
     density: Scalar  # per unit of the field
     color: Vector
@@ -119,7 +120,7 @@ class Dynamic(NamedTuple):
 
 
 class Neighbor(NamedTuple):
-    """Samples of the rays, followed to the next or the previous moment."""
+    """Samples of the rays, followed to the next or the previous timestamp."""
 
     point: Float[Array, "rays samples 3"]  # where the flow leads
     flow: Float[Array, "rays samples 3"]  # that led there, over one interval
@@ -153,7 +154,17 @@ def effect(spec: SceneFlowSpec, times: tuple[float, ...], features: int) -> Effe
 def init(
     spec: SceneFlowSpec, key: Key[Array, ""], features: int, dtype=jnp.float32
 ) -> SceneFlow:
-    """Flow next to nothing, disocclusion and blending undecided."""
+    """Initialize the parameters: small flow, undecided disocclusion and blending.
+
+    Args:
+      spec: Settings.
+      key: PRNG key.
+      features: Width of the static template's trunk.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters.
+    """
     network_key, flow_key, disocclusion_key, blend_key = jax.random.split(key, 4)
     one = spec.network
     inputs = one.encoded_width + spec.time.width(1)
@@ -181,7 +192,18 @@ def dynamic(
     direction: Vector,
     time: Scalar,
 ) -> Dynamic:
-    """The medium at one point and time, seen along one direction."""
+    """Evaluate the medium at one point and time.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      point: Observed point in units of the field, [3].
+      direction: Unit viewing direction, [3].
+      time: Time in [0, 1].
+
+    Returns:
+      Density, color, flow and disocclusion logits.
+    """
     one = spec.network
     features = [
         template.encode(one, params.network, point, None, time),
@@ -205,7 +227,20 @@ def dynamic(
 def medium(
     spec: SceneFlowSpec, params: SceneFlow, sample: Sample, condition: FrameCondition
 ) -> Medium:
-    """The medium at one sample, and its share of the opacity there."""
+    """Evaluate the medium at one sample, with its share of the opacity.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      sample: The sample.
+      condition: Conditioning of the frame.
+
+    Returns:
+      The medium.
+
+    Raises:
+      ValueError: If the template's trunk has another width.
+    """
     width = params.blend.weight.shape[0]
     if sample.features.shape != (width,):
         raise ValueError(
@@ -229,10 +264,20 @@ def neighbor(
     context: PenaltyContext,
     side: int,
 ) -> Neighbor:
-    """The samples of the last level at the moment after (FORWARD) or before them.
+    """Follow the samples of the last level to the next or previous timestamp.
 
-    Where it is more or less than an interval away, beside frames that are held out,
-    points go on as evenly: only what was filmed says what must be seen then.
+    If that is more or less than one interval away, because frames are held out, points
+    continue at constant velocity, since only observed frames can be compared.
+
+    Args:
+      spec: Settings.
+      times: Training timestamps in ascending order.
+      params: Parameters.
+      context: Context of the step.
+      side: FORWARD or BACKWARD.
+
+    Returns:
+      The samples at the other timestamp.
     """
     level = context.levels[-1]
     extras = level.media[NAME].extras
@@ -269,7 +314,17 @@ def penalty(
     params: SceneFlow,
     context: PenaltyContext,
 ) -> dict[str, Term]:
-    """All losses beside that of the blended picture, as logged."""
+    """Compute all loss terms except that of the blended image.
+
+    Args:
+      spec: Settings.
+      times: Training timestamps in ascending order.
+      params: Parameters.
+      context: Context of the step.
+
+    Returns:
+      Terms by name.
+    """
     batch, level = context.batch, context.levels[-1]
     own = level.media[NAME]
     weight = flow_losses.dynamic_weights(level.spacing, own.density)
@@ -330,17 +385,33 @@ def _alone(level, weight, color):
 def picture_mask(
     spec: SceneFlowSpec, level: RayOutput, step: Int[Array, ""]
 ) -> Float[Array, " rays"]:
-    """How much the medium alone must look like the picture, in [0, 1] and fixed.
+    """Compute the weight of rays in the loss of the medium alone, without gradient.
 
-    All of it up to `decay_steps`, so that it finds geometry to move; then as much as it
-    is seen in the blend.
+    It is one up to `decay_steps`, so that the medium finds geometry to move, and then
+    the opacity of the medium in the blend.
+
+    Args:
+      spec: Settings.
+      level: Output of the last level.
+      step: Number of completed steps.
+
+    Returns:
+      Weights in [0, 1], [rays].
     """
     share = jax.lax.stop_gradient(jnp.sum(level.media_weight[NAME], axis=-1))
     return jnp.where(step < spec.decay_steps, 1, jnp.clip(share, 0, 1))
 
 
 def depth_term(context: PenaltyContext, weight: Float[Array, "rays samples"]) -> Scalar:
-    """How far the medium's own depth is from the capture's, both normalized."""
+    """Compare the medium's own depth with that of the capture, both normalized.
+
+    Args:
+      context: Context of the step.
+      weight: Rendering weights of the medium alone, [rays, samples].
+
+    Returns:
+      The error, a scalar.
+    """
     batch, level = context.batch, context.levels[-1]
     known = _pixels(context.frames.depths, batch.row, batch.pixel)
     distance = flow_losses.settle(weight, level.distances[..., None])[..., 0]
@@ -356,10 +427,19 @@ def flow_term(
     weight: Float[Array, "rays samples"],
     sides: list[Neighbor],
 ) -> Scalar:
-    """Pixels between where the flow leads, as the neighbor sees it, and the capture's.
+    """Compare the projected scene flow with the optical flow of the capture.
 
-    The neighboring frame may be more or less than a `gap` away, where frames are held
-    out; the flow is then stretched as if points moved evenly.
+    The neighboring frame may be more or less than one interval away, if frames are held
+    out. The flow is then scaled for motion at constant velocity.
+
+    Args:
+      context: Context of the step.
+      gap: Interval between timestamps.
+      weight: Rendering weights of the medium alone, [rays, samples].
+      sides: Samples at the next and previous timestamps.
+
+    Returns:
+      The error in pixels, a scalar.
     """
     batch, frames, level = context.batch, context.frames, context.levels[-1]
     flow = frames.flow
@@ -393,6 +473,6 @@ def flow_term(
 def _pixels(
     pictures: Array, row: Int[Array, " rays"], pixel: Float[Array, "rays 2"]
 ) -> Array:
-    """What each ray's own pixel holds."""
+    """Value of an image at the pixel of each ray."""
     column, line = jnp.floor(pixel).astype(jnp.int32).T
     return pictures[row, line, column]

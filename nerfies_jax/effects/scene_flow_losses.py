@@ -1,7 +1,7 @@
-"""The terms of neural scene flow fields, each a function of arrays alone.
+"""Loss terms of neural scene flow fields, as functions of arrays alone.
 
-Li et al. 2021, arXiv:2011.13084, as settled by the public code. Rays without a
-neighboring moment are counted out by `present`; a mean over nothing is zero.
+Li et al. 2021, arXiv:2011.13084, with details from the public code. Rays without a
+neighboring timestamp are excluded by `present`. A mean over nothing is zero.
 """
 
 import math
@@ -23,9 +23,17 @@ FAINTEST = 1e-30
 
 
 def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
-    """A tenth every `decay_steps`: how much the capture's depth and flow still count.
+    """Compute the decay of the weight of depth and flow, a factor of ten every so many
+    steps.
 
-    They are guesses of other networks in NSFF, good for a start.
+    In NSFF these are predictions of other networks, used only for initialization.
+
+    Args:
+      decay_steps: Number of steps for a factor of ten.
+      step: Number of completed steps.
+
+    Returns:
+      A factor in (0, 1].
     """
     passed = (step // decay_steps).astype(jnp.result_type(float))
     return jnp.exp(-math.log(10) * passed)
@@ -34,9 +42,14 @@ def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
 def weighted_mean(
     values: Float[Array, "*axes channels"], weight: Float[Array, "*axes"]
 ) -> Scalar:
-    """Mean over channels and over the other axes by `weight`.
+    """Compute the mean over channels, and over the other axes by weight.
 
-    0, without a slope, where no weight reaches `FAINTEST`.
+    Args:
+      values: Values, [..., channels].
+      weight: Non-negative weights, [...].
+
+    Returns:
+      The mean, and 0 without gradient if no weight exceeds `FAINTEST`.
     """
     # Selected, not `total + eps`, which fades all weights that are small together. And
     # of weights near one: a quotient's slope has the divisor's square, which is 0
@@ -51,7 +64,15 @@ def weighted_mean(
 def mean_where(
     values: Float[Array, "rays channels"], present: Bool[Array, " rays"]
 ) -> Scalar:
-    """Mean over the rays that are `present`."""
+    """Compute the mean over rays that are present.
+
+    Args:
+      values: Values, [rays, channels].
+      present: True for rays to use, [rays].
+
+    Returns:
+      The mean, a scalar.
+    """
     return weighted_mean(values, present.astype(values.dtype))
 
 
@@ -62,11 +83,22 @@ def warped(
     visible: Float[Array, "rays samples"],
     mask: Float[Array, " rays"],
 ) -> Scalar:
-    """Squared error of a neighbor's colors brought here, where it shows the same.
+    """Compute the squared error of a neighbor's colors, warped to this timestamp.
 
-    Rays count by their composited `visible`, 1 - disocclusion. The weights of
-    compositing are held fixed there: density is to explain color, not to make rays
-    count less.
+    Rays are weighted by their composited `visible`, 1 - disocclusion. The rendering
+    weights get no gradient there: density should explain color, not reduce the weight
+    of rays.
+
+    Args:
+      color: Rendered colors of the neighbor along the warped rays, [rays, 3].
+      target: Observed colors, [rays, 3].
+      weight: Rendering weights, [rays, samples].
+      visible: Probability that the sample is visible at both timestamps, [rays,
+        samples].
+      mask: Weights of rays, [rays].
+
+    Returns:
+      The error, a scalar.
     """
     seen = jnp.sum(jax.lax.stop_gradient(weight) * visible, axis=-1)
     return weighted_mean(jnp.square(color - target), mask * seen)
@@ -78,7 +110,18 @@ def cycle(
     visible: Float[Array, "rays samples"],
     present: Bool[Array, " rays"],
 ) -> Scalar:
-    """Mean of |f + b|: there and back again, per axis."""
+    """Compute the mean of |f + b| per axis, the cycle consistency of flow.
+
+    Args:
+      flow: Flow f, [rays, samples, 3].
+      back: Flow b back from where f leads, [rays, samples, 3].
+      visible: Probability that the sample is visible at both timestamps, [rays,
+        samples].
+      present: True for rays with a neighbor, [rays].
+
+    Returns:
+      A scalar.
+    """
     return weighted_mean(jnp.abs(flow + back), jnp.where(present[:, None], visible, 0))
 
 
@@ -87,10 +130,18 @@ def magnitude(
     weight: Float[Array, "rays samples"],
     present: Bool[Array, " rays"],
 ) -> Scalar:
-    """Mean of |Σ w f| per axis: what is seen should stand still if it can.
+    """Compute the mean of |Σ w f| per axis, which prefers a static scene.
 
-    The public code sums over x, y and z where the samples are meant. `weight` is held
-    fixed: what moves shall not become transparent for it.
+    The public code sums over x, y and z where the samples are meant. The rendering
+    weights get no gradient, so that moving regions do not become transparent.
+
+    Args:
+      flow: Flow f, [rays, samples, 3].
+      weight: Rendering weights w, [rays, samples].
+      present: True for rays with a neighbor, [rays].
+
+    Returns:
+      A scalar.
     """
     fixed = jax.lax.stop_gradient(weight)[..., None]
     return mean_where(jnp.abs(jnp.sum(fixed * flow, axis=-2)), present)
@@ -99,9 +150,18 @@ def magnitude(
 def smoothness(
     flow: Float[Array, "rays samples 3"], present: Bool[Array, " rays"]
 ) -> Scalar:
-    """Mean |f(next sample on the ray) - f|, per axis.
+    """Compute the mean difference of the flow of neighboring samples on a ray, per
+    axis.
 
-    Over whole rays: the code leaves out the last 5 %, where its coordinates blow up.
+    It covers whole rays. The public code leaves out the last 5 %, where its coordinates
+    diverge.
+
+    Args:
+      flow: Flow, [rays, samples, 3].
+      present: True for rays with a neighbor, [rays].
+
+    Returns:
+      A scalar.
     """
     change = jnp.mean(jnp.abs(jnp.diff(flow, axis=-2)), axis=-1)
     return mean_where(change, present)
@@ -112,15 +172,29 @@ def kinetic(
     backward: Float[Array, "rays samples 3"],
     present: Bool[Array, " rays"],
 ) -> Scalar:
-    """Half the mean squared acceleration, forward + backward flow, per axis.
+    """Compute half the mean squared acceleration, forward plus backward flow, per axis.
 
-    Of rays with both neighbors.
+    Args:
+      forward: Flow to the next timestamp, [rays, samples, 3].
+      backward: Flow to the previous timestamp, [rays, samples, 3].
+      present: True for rays with both neighbors, [rays].
+
+    Returns:
+      A scalar.
     """
     return 0.5 * mean_where(jnp.mean(jnp.square(forward + backward), axis=-1), present)
 
 
 def entropy(share_logit: Float[Array, "rays samples"]) -> Scalar:
-    """Mean of -v log v of the blending weight: static or not, rather than half."""
+    """Compute the mean of -v log v of the blending weight, which prefers 0 or 1 to a
+    half.
+
+    Args:
+      share_logit: Logits of v, [rays, samples].
+
+    Returns:
+      A scalar.
+    """
     # log_sigmoid: log(v + 1e-8) has no slope left where v is small.
     share = jax.nn.sigmoid(share_logit)
     return -jnp.mean(share * jax.nn.log_sigmoid(share_logit))
@@ -129,14 +203,31 @@ def entropy(share_logit: Float[Array, "rays samples"]) -> Scalar:
 def dynamic_weights(
     spacing: Float[Array, "rays samples"], density: Float[Array, "rays samples"]
 ) -> Float[Array, "rays samples"]:
-    """Of the medium alone, unblended, at samples that stand for so much of a ray."""
+    """Compute the rendering weights of the medium alone, without blending.
+
+    Args:
+      spacing: Lengths of the samples' intervals, [rays, samples].
+      density: Densities of the medium, [rays, samples].
+
+    Returns:
+      Weights, [rays, samples].
+    """
     return jax.vmap(compositing.weights)(density * spacing)
 
 
 def settle(
     weight: Float[Array, "rays samples"], values: Float[Array, "rays samples axes"]
 ) -> Float[Array, "rays axes"]:
-    """Expected value along a ray; light that no sample stops ends at the last one."""
+    """Compute the expected value along a ray. Light that passes all samples ends at the
+    last.
+
+    Args:
+      weight: Rendering weights, [rays, samples].
+      values: Values of the samples, [rays, samples, axes].
+
+    Returns:
+      Expected values, [rays, axes].
+    """
     passed = 1 - jnp.sum(weight, axis=-1, keepdims=True)
     return jnp.sum(weight[..., None] * values, axis=-2) + passed * values[..., -1, :]
 
@@ -146,10 +237,21 @@ def normalized_depth(
     target: Float[Array, " rays"],
     known: Bool[Array, " rays"],
 ) -> Scalar:
-    """Squared difference of depths, each less its median and over its mean deviation.
+    """Compute the squared difference of depths after normalization by median and
+    deviation.
 
-    Blind to scale and offset, as the depth of a single picture is (Ranftl et al. 2020,
-    arXiv:1907.01341, equation 5). Zero with fewer than two known depths.
+    It is invariant to scale and offset, like the depth of a single image.
+
+    Args:
+      predicted: Rendered depths, [rays].
+      target: Depths of the capture, [rays].
+      known: True where the depth is known, [rays].
+
+    Returns:
+      The error, zero with fewer than two known depths.
+
+    References:
+      Ranftl et al. 2020, arXiv:1907.01341, equation 5.
     """
     enough = jnp.sum(known) > 1
     known = known & enough

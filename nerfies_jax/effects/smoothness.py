@@ -1,9 +1,9 @@
-"""Smooth grids and planes: features of neighbors may not differ for nothing.
+"""Smooth grids and planes: total variation of neighboring features.
 
-The total variation that Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, put on their
+It is the regularizer that Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, use on their
 voxel grid for real captures. Their text was not at hand. Their code (hustvl/TiNeuVox)
-descends a Huber cost of every difference; here it is the mean of their squares, as in
-K-Planes (arXiv:2301.10241, equation 3). Of a hashed grid some vertices are drawn in
+minimizes a Huber cost of every difference. Here it is the mean of their squares, as in
+K-Planes (arXiv:2301.10241, equation 3). In a hashed grid some vertices are drawn in
 every step.
 """
 
@@ -28,7 +28,7 @@ VARIED = 1024  # vertices of each level of a hashed grid that are drawn in a ste
 
 @dataclasses.dataclass(frozen=True)
 class SmoothnessSpec:
-    """What a mean squared difference of one counts for, up to the step `until`."""
+    """Weight of the mean squared difference, up to the step `until`."""
 
     weight: float = 1e-2
     until: int | None = steps(10_000)  # None: to the end
@@ -73,10 +73,18 @@ def has_tables(spec: TemplateSpec) -> bool:
 
 
 def variation(spec: TemplateSpec, params: Template, key: Key[Array, ""]) -> Scalar:
-    """Mean squared difference of neighbors in the tables, features squared.
+    """Compute the mean squared difference of neighboring features in the tables.
 
-    The mean over the levels of a hashed grid, at `VARIED` vertices of each, and over
-    all planes.
+    For a hashed grid it is the mean over the levels, at `VARIED` vertices of each. For
+    planes it is the mean over all planes of space.
+
+    Args:
+      spec: Settings of the template.
+      params: Its parameters.
+      key: PRNG key.
+
+    Returns:
+      A scalar.
     """
     position, tables = spec.position, params.tables
     if isinstance(position, VoxelGridSpec):

@@ -1,11 +1,11 @@
-"""Color that knows where its surface is, and how it lies, at the moment.
+"""Surface-aware color: color reads the observed position and normal of its surface.
 
-Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, its surface-aware NeRF. The text with
-its equations was not at hand; its code (JokerYan/NeRF-DS) is followed. A mirror that
-moves shows other things, so color reads the observed point and the normal there,
-beside the view direction. A head of the template says the normal in the template; the
-warp turns it to where it is observed. It learns from the slope of the density, and may
-not face away from the camera.
+Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, surface-aware NeRF. The text with its
+equations was not at hand, so its code (JokerYan/NeRF-DS) is followed. A moving specular
+surface shows changing reflections, so color reads the observed point and the normal
+there, next to the view direction. A head of the template predicts the normal in the
+template, and the warp rotates it to where it is observed. It is supervised by the
+gradient of the density, and must not face away from the camera.
 """
 
 import dataclasses
@@ -30,19 +30,19 @@ NAME = "surface"
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceSpec:
-    """What color reads, and what a normal that is wrong counts for.
+    """Encodings that color reads, and weights of the losses of normals.
 
-    Bands of both encodings are shut for `closed_steps` and open one by one over the
-    next `anneal_steps`, as those of the point in the paper's code; those of the normal
-    open there from step 10,000 to 12,000. Both weights are the code's.
+    Bands of both encodings are closed for `closed_steps` and open one by one over the
+    next `anneal_steps`, as those of the point in the paper's code. Those of the normal
+    open there from step 10,000 to 12,000. Both weights are those of the code.
 
-    Both count as there: by the weights of the samples, as a mean over samples. What
-    differs: the normal that may not face away is the one observed, of unit length, and
-    not the head's answer in the template; a normal is turned by the transpose of the
-    warp's Jacobian, which is exact for every warp and the paper's rotation for a rigid
-    one; it learns from the slope of the template's density, which gets none from it,
-    nor does the trunk; and squares of differences stand for their lengths, which have
-    no slope at zero.
+    Both losses are weighted by the samples' weights, as a mean over samples, as in the
+    code. The differences are: the normal that must not face away is the observed one,
+    of unit length, and not the output of the head in the template. A normal is rotated
+    by the transpose of the warp's Jacobian, which is exact for every warp and the
+    paper's rotation for a rigid one. It is supervised by the gradient of the template's
+    density, which gets no gradient from it, nor does the trunk. Squares of differences
+    replace their norms, which have no gradient at zero.
     """
 
     position: EncodingSpec = EncodingSpec(4)
@@ -80,7 +80,16 @@ def effect(spec: SurfaceSpec, widths: dict[str, int]) -> Effect:
 def init(
     widths: dict[str, int], key: Key[Array, ""], dtype=jnp.float32
 ) -> dict[str, Layer]:
-    """A head for each level."""
+    """Initialize a head for each level.
+
+    Args:
+      widths: Width of the trunk of each level.
+      key: PRNG key.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      A layer by level.
+    """
     keys = jax.random.split(key, len(widths))
     return {
         name: mlp.init_layer(one, width, 3, "glorot", dtype)
@@ -95,11 +104,20 @@ def look(
     surface: Surface,
     condition: FrameCondition,
 ) -> Look:
-    """What color reads of one sample, and its normals.
+    """Compute the features of one sample that color reads, and its normals.
 
-    "head" is what the head says, of any length, in the template; "observed" is its
-    direction turned to the observation; "slope" is where density falls fastest in the
-    template. Both are unit vectors, or zero where there is no direction.
+    Args:
+      spec: Settings.
+      params: Heads by level.
+      level: Name of the level.
+      surface: The sample.
+      condition: Conditioning of the frame.
+
+    Returns:
+      The features. `found` holds "head", the output of the head, of any length, in the
+      template, "observed", its direction rotated to the observation, and "slope", the
+      direction in which density decreases fastest in the template. The latter two are
+      unit vectors, or zero if there is no direction.
     """
     # Normals may not bend the density to theirs: within 60 steps of a small run their
     # slopes through the trunk emptied the scene.
@@ -121,7 +139,17 @@ def window(
     step: Int[Array, ""],
     like: Float[Array, "..."],
 ) -> Float[Array, " bands"] | None:
-    """How far the bands of an encoding are open after `step` steps."""
+    """Compute the coarse-to-fine window of an encoding.
+
+    Args:
+      spec: Settings.
+      one: The encoding.
+      step: Number of completed steps.
+      like: Array of the type of the result.
+
+    Returns:
+      Weights in [0, 1] [bands], or None without bands.
+    """
     if one.bands == 0:
         return None
     return schedules.band_window(
@@ -130,10 +158,16 @@ def window(
 
 
 def unit(vector: Vector) -> Vector:
-    """The vector at length one; zero, with zero slope, where it has no direction.
+    """Normalize a vector. Zero stays zero, with zero gradient.
 
-    Divided by its largest entry first: the square of 1e-20, and of 1e20, is outside of
-    float32.
+    It is divided by its largest entry first, since the square of 1e-20, and of 1e20, is
+    outside of the range of float32.
+
+    Args:
+      vector: A vector, [3].
+
+    Returns:
+      The unit vector, [3].
     """
     largest = jnp.max(jnp.abs(vector))
     there = largest > 0
@@ -145,7 +179,16 @@ def unit(vector: Vector) -> Vector:
 
 
 def penalty(spec: SurfaceSpec, _, context: PenaltyContext) -> dict[str, Term]:
-    """What the normals of all levels cost, summed over the levels."""
+    """Compute the losses of the normals, summed over the levels.
+
+    Args:
+      spec: Settings.
+      _: Parameters, which are not used.
+      context: Context of the step.
+
+    Returns:
+      The terms "slope" and "back_facing".
+    """
     costs = [
         costs_of(level, context.batch.direction, context.batch.valid)
         for level in context.levels
@@ -162,10 +205,18 @@ def costs_of(
     direction: Float[Array, "rays 3"],
     valid: Bool[Array, " rays"],
 ) -> tuple[Scalar, Scalar]:
-    """Means over samples of w |head - slope|² and of w max(0, n·d)².
+    """Compute the means over samples of w |head - slope|² and of w max(0, n·d)².
 
-    Weights are those that the samples are drawn with and get no slope; so are slopes of
-    the density. Samples where the density has no slope do not count in the first.
+    The rendering weights get no gradient, nor do the gradients of the density. Samples
+    without a gradient of the density do not count in the first.
+
+    Args:
+      level: Output of the level.
+      direction: Unit directions of the rays, [rays, 3].
+      valid: True for observed pixels, [rays].
+
+    Returns:
+      The two losses, scalars.
     """
     found = level.looks[NAME]
     weight = jnp.where(valid[:, None], jax.lax.stop_gradient(level.weight), 0)

@@ -1,9 +1,9 @@
-"""T-NeRF: the template reads the time itself, and nothing is warped.
+"""T-NeRF: the template reads the time, and nothing is warped.
 
-The baseline of D-NeRF (Pumarola et al. 2020, arXiv:2011.13961: a network of position,
-direction and time) and of DyCheck (Gao et al. 2022, arXiv:2210.13445), where the time
-is a code of the frame. On DyCheck's captures of one moving camera it has a higher PSNR
-than Nerfies; what it lacks is correspondence between times.
+It is the baseline of D-NeRF (Pumarola et al. 2020, arXiv:2011.13961: a network of
+position, direction and time) and of DyCheck (Gao et al. 2022, arXiv:2210.13445), where
+the time is a code of the frame. On DyCheck's captures by one moving camera it has a
+higher PSNR than Nerfies. It provides no correspondence between times.
 """
 
 import dataclasses
@@ -61,7 +61,15 @@ def effect(spec: TimeSpec) -> Effect:
 
 
 def features(spec: TimeSpec, condition: FrameCondition) -> Float[Array, " features"]:
-    """The encoded time, or the code of the frame."""
+    """Return the encoded time, or the code of the frame.
+
+    Args:
+      spec: Settings.
+      condition: Conditioning of the frame.
+
+    Returns:
+      Features, [features].
+    """
     if spec.condition == "code":
         return condition.codes[spec.table]
     return encoding.encode(spec.encoding, condition.time[None], None)

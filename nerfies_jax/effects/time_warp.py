@@ -1,11 +1,11 @@
-"""TiNeuVox's motion: a small network shifts points by an embedding of the time.
+"""Motion of TiNeuVox: a small network shifts points by an embedding of the time.
 
 Fang et al. 2022, arXiv:2205.15285, "coordinate deformation" and "radiance network". The
-text with its equations was not at hand; its code (hustvl/TiNeuVox) is followed: a
-network embeds the encoded time; another, small one reads the embedding and the encoded
-point and answers the shift to the template. The radiance network reads the embedding
-and the encoded point as it was observed, too, and so makes up for what so small a
-deformation gets wrong. The time 0 is a time like any other.
+text with its equations was not at hand, so its code (hustvl/TiNeuVox) is followed. One
+network embeds the encoded time. A second, small one reads the embedding and the encoded
+point and returns the shift to the template. The radiance network reads the embedding
+and the encoded observed point as well, and so corrects errors of such a small
+deformation. Time 0 is not special.
 """
 
 import dataclasses
@@ -56,13 +56,27 @@ class TimeWarp(NamedTuple):
 
 
 def time_network(spec: TimeWarpSpec) -> MLPSpec:
-    """What embeds the encoded time."""
+    """Return the settings of the network that embeds the encoded time.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      Settings of an MLP with the head "embedding".
+    """
     heads = (("embedding", HeadSpec(spec.embedding)),)
     return MLPSpec(spec.time.width(1), 1, spec.width, heads)
 
 
 def shift_network(spec: TimeWarpSpec) -> MLPSpec:
-    """What reads [encoded point, embedding] and answers the shift."""
+    """Return the settings of the network from [encoded point, embedding] to the shift.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      Settings of an MLP with the head "linear".
+    """
     inputs = spec.position.width(3) + spec.embedding
     heads = (("linear", HeadSpec(3, "small")),)
     return MLPSpec(inputs, spec.depth, spec.width, heads)
@@ -80,7 +94,17 @@ def effect(spec: TimeWarpSpec) -> Effect:
 
 
 def init(spec: TimeWarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> TimeWarp:
-    """Nearly the identity: no point of a box of side two moves by more than 1e-4."""
+    """Initialize near the identity: in a box of side two no point moves by more than
+    1e-4.
+
+    Args:
+      spec: Settings.
+      key: PRNG key.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters.
+    """
     time_key, shift_key = jax.random.split(key)
     network = shift_network(spec)
     shift = mlp.init(network, shift_key, dtype)
@@ -94,7 +118,16 @@ def init(spec: TimeWarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> TimeWarp
 def embed(
     spec: TimeWarpSpec, params: TimeWarp, time: Scalar
 ) -> Float[Array, " embedding"]:
-    """What both networks read of a time in [0, 1]."""
+    """Embed a time.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      time: Time in [0, 1].
+
+    Returns:
+      The embedding, [embedding].
+    """
     encoded = encoding.encode(spec.time, time[None], None)
     return mlp.apply(time_network(spec), params.time, encoded)["embedding"]
 
@@ -102,7 +135,17 @@ def embed(
 def displace(
     spec: TimeWarpSpec, params: TimeWarp, point: Vector, condition: FrameCondition
 ) -> Vector:
-    """Template point minus observed point, in units of the field."""
+    """Compute the displacement from an observed point to the template.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      Template point minus observed point in units of the field, [3].
+    """
     network = shift_network(spec)
     # Under vmap over the samples of a ray the time's product is made once.
     known = embed(spec, params, condition.time)
@@ -114,6 +157,16 @@ def displace(
 def features(
     spec: TimeWarpSpec, params: TimeWarp, point: Vector, condition: FrameCondition
 ) -> Float[Array, " features"]:
-    """What the radiance network reads beside the grid: observed point and time."""
+    """Compute the features that the radiance network reads next to the grid.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      The encoded observed point and the embedding of the time, [features].
+    """
     encoded = encoding.encode(spec.position, point, None)
     return jnp.concatenate([encoded, embed(spec, params, condition.time)])

@@ -1,10 +1,10 @@
-"""What passes through single exposures, and how far their colors can be trusted.
+"""Transient objects of single exposures, and the uncertainty of their colors.
 
-NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "transient objects"): beside the
+NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "transient objects"): next to the
 static field each photograph has a medium of its own, with density, color and an
-uncertainty `beta`. People and cars settle there. Pictures show it, held-out ones with
-codes between those of their neighbors in time, unless it is left out
-(`variants.without_effects`), as the paper does and `held_out_codes.score`.
+uncertainty `beta`, which represents people and cars. Renders show it, held-out ones
+with codes between those of their neighbors in time, unless it is left out
+(`variants.without_effects`), as in the paper and in `held_out_codes.score`.
 """
 
 import dataclasses
@@ -73,7 +73,16 @@ class TransientSpec:
 
 
 def network(spec: TransientSpec, features: int) -> MLPSpec:
-    """What reads [template features, code] and answers the medium before activation."""
+    """Return the settings of the network from [template features, code] to the medium.
+
+    Args:
+      spec: Settings.
+      features: Width of the template's trunk.
+
+    Returns:
+      Settings of an MLP with the heads "density", "color" and "beta", before
+      activation.
+    """
     heads = (("density", 1), ("color", 3), ("beta", 1))
     return MLPSpec(
         inputs=features + spec.code_width,
@@ -99,16 +108,36 @@ def effect(spec: TransientSpec, features: int) -> Effect:
 def init(
     spec: TransientSpec, key: Key[Array, ""], features: int, dtype=jnp.float32
 ) -> MLP:
-    """Glorot weights: the medium starts about as dense as the static field."""
+    """Initialize with Glorot weights: the medium starts about as dense as the static
+    field.
+
+    Args:
+      spec: Settings.
+      key: PRNG key.
+      features: Width of the template's trunk.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters.
+    """
     return mlp.init(network(spec, features), key, dtype)
 
 
 def medium(
     spec: TransientSpec, params: MLP, sample: Sample, condition: FrameCondition
 ) -> Medium:
-    """Density, color and uncertainty of the medium at one sample.
+    """Evaluate density, color and uncertainty of the medium at one sample.
 
-    The trunk is shared and learns from both media, as in the paper: nothing is stopped.
+    The trunk is shared and gets gradients from both media, as in the paper.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      sample: The sample.
+      condition: Conditioning of the frame.
+
+    Returns:
+      The medium.
     """
     inputs = jnp.concatenate([sample.features, condition.codes[TABLE]])
     raw = mlp.apply(network(spec, sample.features.shape[-1]), params, inputs)
@@ -124,11 +153,19 @@ def uncertainty(
     weights: Float[Array, "*rays samples"],
     beta: Float[Array, "*rays samples"],
 ) -> Float[Array, "*rays"]:
-    """Standard deviation of a ray's color: beta_min + Σ w β over its samples.
+    """Compute the standard deviation of a ray's color, beta_min + Σ w β over its
+    samples.
 
-    `weights` are the transient medium's. The paper has β_min inside the sum, so that a
-    ray which meets no transient has a β of zero and an infinite loss. Like the public
-    reimplementation this adds it outside.
+    The paper has β_min inside the sum, so that a ray without a transient has a β of
+    zero and an infinite loss. Like the public reimplementation this adds it outside.
+
+    Args:
+      beta_min: Least standard deviation.
+      weights: Rendering weights of the transient medium, [..., samples].
+      beta: Uncertainty of the samples, [..., samples].
+
+    Returns:
+      Standard deviations, [...].
     """
     return beta_min + jnp.sum(weights * beta, axis=-1)
 
@@ -140,19 +177,33 @@ def photometric(
     valid: Bool[Array, "*rays"] | None,
     beta_power: float = 0.0,
 ) -> Float[Array, ""]:
-    """Mean over the valid rays of (|color - truth|² / 2β² + log β) [β]^beta_power.
+    """Compute the mean over rays of (|color - truth|² / 2β² + log β) [β]^beta_power.
 
-    At a power of zero the first two terms of equation 13, where the second reads
-    log β² / 2. At a given residual it is least at β = |color - truth|, and never less
-    than log beta_min: it is negative for good fits. The public reimplementation adds 3
-    so that curves stay above zero, which changes no gradient, and takes the mean over
-    the channels, which makes the first term a third.
+    At a power of zero these are the first two terms of equation 13, where the second
+    reads log β² / 2. At a given residual the loss is least at β = |color - truth|, and
+    never less than log beta_min. It is negative for good fits. The public
+    reimplementation adds 3 so that curves stay above zero, which changes no gradient,
+    and takes the mean over the channels, which makes the first term a third.
 
-    [β] is β that teaches nothing, its power in [0, 2]. At zero colors learn at 1/β² of
-    their residuals: what a short run has not learned yet is called uncertain, and what
-    is uncertain is not learned, so that a floor's checks stay gone. At one they learn
-    at 1/β, at two alike, and β still goes to |color - truth| (Seitzer et al. 2022,
-    arXiv:2203.09168, the β-NLL, whose β is half of this power).
+    [β] is β without a gradient. With a power of zero, colors learn at 1/β² of their
+    residuals: regions that a short run has not learned yet are called uncertain, and
+    uncertain regions are not learned, so that the pattern of a floor never appears.
+    With one they learn at 1/β, with two uniformly, and β still converges to |color -
+    truth|.
+
+    Args:
+      color: Rendered colors, [..., 3].
+      truth: Observed colors, [..., 3].
+      beta: Standard deviations, positive, [...].
+      valid: True for observed pixels, [...]. None for all.
+      beta_power: Power in [0, 2].
+
+    Returns:
+      The loss, a scalar.
+
+    References:
+      Martin-Brualla et al. 2021, equation 13. Seitzer et al. 2022, arXiv:2203.09168
+      (β-NLL, whose β is half of this power).
     """
     if valid is not None:
         # Selected before anything is squared or divided: unfilmed pixels may hold NaN.
@@ -168,10 +219,17 @@ def photometric(
 
 
 def penalty(spec: TransientSpec, context: PenaltyContext) -> dict[str, Term]:
-    """The mean transient density of the finest samples of the valid rays.
+    """Compute the mean transient density of the finest samples of the valid rays.
 
-    The last term of equation 13. In units of the field: where the box is scaled by s,
-    the same picture has densities 1/s times as large.
+    It is the last term of equation 13, in units of the field. If the box is scaled by
+    s, the same image has densities 1/s times as large.
+
+    Args:
+      spec: Settings.
+      context: Context of the step.
+
+    Returns:
+      The term "density".
     """
     density = context.levels[-1].media[NAME].density
     value = losses.masked_mean(density, context.batch.valid)

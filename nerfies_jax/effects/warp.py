@@ -1,9 +1,9 @@
-"""A warp: where in the template the point was that is observed here and now.
+"""Warp from an observed point to its position in the template.
 
-Nerfies (Park et al. 2021, arXiv:2011.12948) moves each point along its own screw;
-D-NeRF (Pumarola et al. 2020, arXiv:2011.13961) shifts it. Both map the observation to
-the template, and both are written here as the displacement of one point, of which
-`matrix3.displacement_log_energy` makes an exact elastic energy.
+Nerfies (Park et al. 2021, arXiv:2011.12948) moves each point by a rigid transform of
+its own, and D-NeRF (Pumarola et al. 2020, arXiv:2011.13961) translates it. Both map the
+observation to the template, and both are written here as the displacement of one point,
+from which `matrix3.displacement_log_energy` computes an exact elastic energy.
 """
 
 import dataclasses
@@ -72,7 +72,15 @@ class WarpSpec:
 
 
 def network(spec: WarpSpec) -> MLPSpec:
-    """What reads [encoded point, condition] and answers the screw or the shift."""
+    """Return the settings of the network from [encoded point, condition] to twist or
+    shift.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      Settings of an MLP with the head "linear" and, for SE(3), "angular".
+    """
     condition = spec.code_width if spec.condition == "code" else spec.time.width(1)
     names = ("angular", "linear") if spec.kind == "se3" else ("linear",)
     return MLPSpec(
@@ -97,10 +105,19 @@ def effect(spec: WarpSpec) -> Effect:
 
 
 def init(spec: WarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
-    """Nearly the identity: no point of a box of side two moves by more than 2e-4.
+    """Initialize near the identity: in a box of side two no point moves by more than
+    2e-4.
 
-    Weights that read an annealed band start at zero. Until it opens they get no
-    gradient, and drawn at random they would then bend a trained warp.
+    Weights that read an annealed band start at zero. They get no gradient until it
+    opens, and random ones would then deform a trained warp.
+
+    Args:
+      spec: Settings.
+      key: PRNG key.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters.
     """
     params = mlp.init(network(spec), key, dtype)
     # mlp.SMALL bounds what each feature adds; their sum has random signs.
@@ -128,7 +145,17 @@ def _closed(spec, layer, above):
 def displace(
     spec: WarpSpec, params: MLP, point: Vector, condition: FrameCondition
 ) -> Vector:
-    """Template point minus observed point, in units of the field."""
+    """Compute the displacement from an observed point to the template.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      Template point minus observed point in units of the field, [3].
+    """
     encoded = encoding.encode(spec.position, point, window(spec, condition.step, point))
     guides = guides_of(spec.guides, condition)
     if spec.condition == "code":
@@ -142,7 +169,16 @@ def displace(
 def window(
     spec: WarpSpec, step: Int[Array, ""], like: Float[Array, "..."]
 ) -> Float[Array, " bands"] | None:
-    """How far the bands of the point's encoding are open after `step` steps."""
+    """Compute the coarse-to-fine window of the point's encoding.
+
+    Args:
+      spec: Settings.
+      step: Number of completed steps.
+      like: Array of the type of the result.
+
+    Returns:
+      Weights in [0, 1] [bands], or None if all bands are open.
+    """
     if spec.anneal_steps is None or spec.position.bands == 0:
         return None
     bands = spec.position.bands

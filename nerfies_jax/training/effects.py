@@ -230,10 +230,16 @@ class Effect(NamedTuple):
 
 
 def stream(name: str) -> int:
-    """What to fold into a key for an effect or a table of this name.
+    """Return a number to fold into a key, for an effect or a table of some name.
 
-    Counted instead, what comes behind an effect would be drawn anew when it is left
-    out, and an ablation would compare two starts as well.
+    With consecutive numbers instead, everything after an effect would be drawn anew
+    when it is left out, and an ablation would compare two initializations as well.
+
+    Args:
+      name: The name.
+
+    Returns:
+      A hash of the name.
     """
     return zlib.crc32(name.encode())
 
@@ -303,11 +309,26 @@ def from_step(
 
 
 def weighted_sum(terms: Mapping[str, Term], first: Scalar | int = 0) -> Scalar:
-    """The loss: `first` and what each term adds to it, in their order."""
+    """Compute the loss, the sum of terms with their weights.
+
+    Args:
+      terms: Terms by name.
+      first: Value to start from.
+
+    Returns:
+      The sum, in the order of the terms.
+    """
     weighted = (t.weight * t.value for t in terms.values() if t.weight is not None)
     return sum(weighted, first)
 
 
 def values(terms: Mapping[str, Term]) -> dict[str, Scalar]:
-    """What is logged of the terms: their values, without weights."""
+    """Return the logged values of terms, without their weights.
+
+    Args:
+      terms: Terms by name.
+
+    Returns:
+      Values by name.
+    """
     return {name: term.value for name, term in terms.items()}
