@@ -12,12 +12,8 @@ from nerfies_jax.training.model import in_default_precision
 from tests import scenes
 from tests.hard_cases import tiny_fields
 
-SPLATS = {
-    "splats-deformable": scenes.TINY_DEFORMABLE,
-    "sonata": scenes.TINY_SONATA,
-    "moba": scenes.TINY_MOBA,
-}
-FIELDS = ("nerf-w", "nerfies", "hypernerf", "nsff")
+SPLATS = {"sonata": scenes.TINY_SONATA, "moba": scenes.TINY_MOBA}
+FIELDS = ("nerf-w", "hypernerf", "nsff")
 
 
 def one_step(name):

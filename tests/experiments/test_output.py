@@ -26,8 +26,9 @@ pytestmark = [
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 RECONSTRUCT = ("--preset", "splats-static-small", "--steps", "12")
 RECONSTRUCT += ("--set", "densification=none", "sh_degree=0", "init.extra_random=0")
-# What befalls the output, and the exit code: a reader that leaves is no failure.
-BROKEN = {"2>&1 | head -1": 0, "2>&-": 0, ">/dev/full": 1, "2>/dev/full": 1}
+# Two ends of an output that are no failure; a full one, which is, is that of a resumed
+# run below.
+BROKEN = {"2>&1 | head -1": 0, "2>&-": 0}
 
 
 def command(name, *words, output=""):
@@ -157,9 +158,7 @@ def test_a_preparation_completes_whatever_reads_it(tmp_path):
     assert len(list((tmp_path / "out" / "camera").glob("*.json"))) == 8
 
 
-@pytest.mark.parametrize(
-    ("output", "code"), [("| true", 1), (">/dev/full", 1), ("2>&-", 0)]
-)
+@pytest.mark.parametrize(("output", "code"), [("| true", 1), ("2>&-", 0)])
 def test_a_document_that_is_lost_is_a_failure(output, code, undisturbed, tmp_path):
     whole, _ = undisturbed
     out = tmp_path / "ply"

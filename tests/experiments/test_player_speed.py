@@ -13,6 +13,7 @@ def browser():
     yield from launched()
 
 
+@pytest.mark.slow
 def test_frames_are_timed_and_their_fragments_counted(browser, tmp_path):
     path = tmp_path / "player.html"
     write_blobs(path)

@@ -174,6 +174,16 @@ HARD = {
 }
 
 
+@jitted
+def error_and_slopes(here, there, both):
+    def total(here, there):
+        drawn = motion_flow.drawn_flow(here, there, both, SIZE, GSPLAT)
+        things = motion_flow.camera_flow(both, drawn.depth)
+        return motion_flow.error(drawn.flow, things, drawn.share > 0.01)
+
+    return jax.value_and_grad(total, (0, 1))(here, there)
+
+
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", HARD)
 def test_flow_and_slopes_are_finite_of(name, dtype):
@@ -181,17 +191,12 @@ def test_flow_and_slopes_are_finite_of(name, dtype):
     here, there = scattered(dtype)
     there = HARD[name](jax.tree.map(np.asarray, there))
     there = jax.tree.map(lambda x: np.asarray(x, dtype), there)
-
-    def total(here, there):
-        drawn = motion_flow.drawn_flow(here, there, both, SIZE, GSPLAT)
-        things = motion_flow.camera_flow(both, drawn.depth)
-        return motion_flow.error(drawn.flow, things, drawn.share > 0.01)
-
-    value, slopes = jitted(jax.value_and_grad(total, (0, 1)))(here, there)
+    value, slopes = error_and_slopes(here, there, both)
     assert np.isfinite(value)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
 
 
+@pytest.mark.full
 def test_gradients_go_through_both_ends_and_no_weight(float64):
     """Of the way alone: means, turns and sizes in the next camera's picture."""
     here, there = scattered("float64")

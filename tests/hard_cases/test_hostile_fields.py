@@ -27,16 +27,25 @@ def marked(name, *others):
 
 
 FIELDS = [marked(name) for name in tiny_fields.PAPERS]
+# Starts of the other fields: those that reach what they have and NeRF-W has not.
+FEW_STARTS = ("as filmed", "one instant", "nothing filmed", "cameras inside")
+FEW_STARTS += ("opaque by far", "shattered warp", "all a hundredfold")
+
+
+def is_tried(name, start):
+    """Whether a field is trained from that start."""
+    spec, needs = tiny_fields.tiny(name), STARTS[start].needs
+    if needs:
+        return any(getattr(spec, effect) for effect in needs)
+    return name in QUICK or start in FEW_STARTS
+
+
 RUNS = [
     marked(name, start)
     for name in tiny_fields.PAPERS
-    for start, one in STARTS.items()
-    if not one.needs
-    or any(getattr(tiny_fields.tiny(name), effect) for effect in one.needs)
+    for start in STARTS
+    if is_tried(name, start)
 ]
-# Starts of the other systems: those that reach what they have.
-FEW_STARTS = ("as filmed", "one instant", "nothing filmed", "cameras inside")
-FEW_STARTS += ("opaque by far", "shattered warp", "all a hundredfold")
 RUNS += [marked(name, start) for name in tiny_fields.SYSTEMS for start in FEW_STARTS]
 
 
@@ -79,7 +88,7 @@ def test_a_field_stays_finite_from(name, start, tmp_path):
 OVERFLOWING = Start(params=field_starts.times(1e12))
 
 
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("name", [marked(name) for name in QUICK])
 def test_a_field_that_overflows_stops_where_it_started_and_says_so(name, tmp_path):
     ended, _ = trained(name, OVERFLOWING, tmp_path)
     assert ended.result.stopped_by == "non-finite"

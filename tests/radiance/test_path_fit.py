@@ -149,6 +149,7 @@ def test_what_tracks_have_found_learns_slowly_at_first(start, first):
             np.testing.assert_allclose(own / rates["template"], share, rtol=1e-5)
 
 
+@pytest.mark.full
 def test_a_motion_of_one_s_own_may_have_no_parameters():
     field = field_of("nerfies-small")
     own = Effect("own", displace=lambda params, point, condition: 0 * point)
@@ -234,7 +235,8 @@ def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
         assert np.linalg.norm(wall, axis=-1).mean() < 0.1 * size
 
 
-@pytest.mark.parametrize("still", [0, pytest.param(200, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("still", [0, 200])
 def test_points_seen_once_leave_everything_where_it_is(still):
     """Each has one place: there is no motion to find, with or without a wall."""
     known = np.zeros((40, FRAMES), bool)

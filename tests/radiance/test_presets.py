@@ -93,8 +93,14 @@ def test_the_networks_read_their_input_again_where_the_papers_do(name, inputs, l
         assert [one.weight.shape for one in hidden] == [(n, 256) for n in rows]
 
 
-@pytest.mark.slow  # but "nerf": tests/radiance/test_scene.py trains one
-@pytest.mark.parametrize("name", [f"{name}-small" for name in PAPERS[1:]])
+# Without what others train: "nerf" is in tests/radiance/test_scene.py, Nerfies in
+# HyperNeRF, and NeRF-W and NeRF-DS in tests/hard_cases.
+TRAINED = ("d-nerf-small", "t-nerf-small", "hypernerf-small", "nsff-small")
+TRAINED += ("tineuvox-small",)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRAINED)
 def test_a_small_preset_learns_more_than_one_color(name):
     capture = scenes.tiny_capture()
     spec = dataclasses.replace(presets.with_steps(PRESETS[name], 200), rays=32)
