@@ -1,11 +1,11 @@
-"""Radiance fields of moving scenes, and the ground both representations share.
+"""Radiance fields of dynamic scenes, and the modules that both representations share.
 
-Floors 1-5 (`geometry`, `nets`, `capture`, `training`, and `measure`, `evaluation`,
-`evidence`) hold what every reconstruction needs: cameras, small networks, captures, the
-training loop, metrics, a renderer. `gaussians_jax` reads those floors and nothing above
-them. A room reads only rooms on lower floors.
+`geometry`, `nets`, `capture`, `training`, `measure`, `evaluation` and `evidence` hold
+what every reconstruction needs: cameras, small networks, captures, the training loop,
+metrics, a renderer and preprocessing. `gaussians_jax` imports these modules only. A
+module imports from lower layers only (docs/architecture.md).
 
-The names of `__init__.pyi` are the face of the package; each is loaded when it is used.
+The names in `__init__.pyi` are the public API. Each is imported when it is used.
 """
 
 import lazy_loader

@@ -6,10 +6,10 @@ Deviations from the paper are stated at each preset. All of them deviate in this
 
 - Densities use a softplus instead of a ReLU, fine samples are stratified draws where
   those of the papers are independent, and encodings have the identity next to the bands
-  and no factor of pi. - `nerf` and presets derived from it train without the crop of
-  the first 500 steps, in
-  Euclidean space only (no normalized device coordinates), without noise on densities. -
-  None of the full sizes was ever trained to its end, since they need a GPU.
+  and no factor of pi.
+- `nerf` and presets derived from it train without the crop of the first 500 steps, in
+  Euclidean space only (no normalized device coordinates), without noise on densities.
+- None of the full sizes was ever trained to its end, since they need a GPU.
 """
 
 import dataclasses

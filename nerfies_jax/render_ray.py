@@ -60,7 +60,7 @@ def displacement(bound: Bound, point: Vector, condition: FrameCondition) -> Vect
 
 
 def _marked(bound, point, condition):
-    """The condition with the codes of an observed point beside those of the frame."""
+    """Add the codes of an observed point to those of the frame."""
     marks = {}
     for effect in bound.effects:
         if effect.mark is not None:

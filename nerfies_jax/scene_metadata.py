@@ -83,7 +83,7 @@ def _span(capture):
 
 
 def _box(capture, near, far):
-    """Center and longest half-side of what is filmed."""
+    """Center and longest half side of the captured volume."""
     if capture.points is not None and len(capture.points.position) >= MIN_POINTS:
         positions = capture.points.position
         low, high = np.quantile(positions, (OUTLIERS, 1 - OUTLIERS), axis=0)
@@ -105,7 +105,7 @@ def _box(capture, near, far):
 
 
 def _frustum_points(capture, near, far, depths=8):
-    """Corners and centers of the pictures at some depths, in scene units.
+    """Corners and centers of the images at some depths, in scene units.
 
     Without skew and distortion: they say roughly where the scene is.
     """

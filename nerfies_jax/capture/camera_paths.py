@@ -102,7 +102,7 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
 
 
 def _across(up, train_cameras, target, least):
-    """`up`, or that of the middle picture where the view goes nearly along it."""
+    """Return `up`, or that of the middle image if the view is nearly parallel to it."""
     forward = target - np.median(train_cameras.position.astype(np.float64), axis=0)
     if np.linalg.norm(np.cross(forward, up)) >= least * np.linalg.norm(forward):
         return up
@@ -278,19 +278,19 @@ def _window(train_cameras, target, up):
 
 
 def _sway(train_cameras, target, up, phase):
-    """An ellipse through the 70 % span of the filmed positions, facing the target."""
+    """Ellipse through the 70 % span of the captured positions, facing the target."""
     middle, right, upward = _window(train_cameras, target, up)
     return middle + np.sin(phase)[:, None] * right + np.cos(phase)[:, None] * upward
 
 
 def _lemniscate(train_cameras, target, up, phase):
-    """Gerono's, through the same span: twice through the middle of what was filmed."""
+    """Gerono's lemniscate through the same span, twice through its middle."""
     middle, right, upward = _window(train_cameras, target, up)
     return middle + np.sin(phase)[:, None] * right + np.sin(2 * phase)[:, None] * upward
 
 
 def _orbit(train_cameras, target, up, phase):
-    """A full circle about the up axis, at the filmed distance and height."""
+    """Full circle about the up axis, at the captured distance and height."""
     offset = np.median(train_cameras.position.astype(np.float64), axis=0) - target
     height = (offset @ up) * up
     flat = offset - height

@@ -124,9 +124,9 @@ def read(
 
 
 def _with_physical_cameras(model):
-    """The model with camera ids that say which device, and a note where it does not.
+    """Return the model with ids of physical cameras, and a note if they are unknown.
 
-    COLMAP's default gives every picture a lens of its own, which tells none apart.
+    COLMAP's default gives every image a camera of its own, which identifies no device.
     """
     if len(np.unique(model.camera_ids)) < len(model.camera_ids):
         return model, ()
@@ -138,7 +138,9 @@ def _with_physical_cameras(model):
 
 
 def _with_pictures(path, model, factor, max_side, missing):
-    """The model of the pictures found, their files, their shrinking, and what lacks."""
+    """Return the model of the existing images, their files and reduction, and a
+    note.
+    """
     available, paths = _find_pictures(path, model)
     full = (model.lenses[0].width, model.lenses[0].height)
     source, shrink_by = frames.choose_source(
@@ -228,7 +230,7 @@ def read_model(folder: pathlib.Path) -> Model:
 
 
 def _best_model(path):
-    """The folder of the model with most pictures, and notes.
+    """Return the folder of the model with most images, and notes.
 
     COLMAP numbers models in the order in which it found them.
     """
@@ -258,7 +260,7 @@ def _best_model(path):
 
 
 def _find_pictures(path, model):
-    """For each reduction stored, its folder and the file of each picture or None."""
+    """Find the folder of each stored reduction, and the file of each image or None."""
     first = model.lenses[0]
     available, paths = {}, {}
     for place in PICTURES:
@@ -289,7 +291,9 @@ def _find_pictures(path, model):
 
 
 def _find(folder, name, path):
-    """The picture, also under another ending: reductions are often saved as PNG."""
+    """Find an image, also with another suffix, since reductions are often saved as
+    PNG.
+    """
     inside(folder, name, path)
     stem = pathlib.PurePosixPath(name).with_suffix("").as_posix()
     return frames.find_picture(folder, name) or frames.find_picture(folder, stem)
@@ -320,7 +324,7 @@ def _masks(path, names, size, shrink_by):
 
 
 def _scaled(lens, stored, size, path):
-    """The lens for pictures of `size`, made from stored ones by whole blocks."""
+    """Return the lens for images of `size`, made from stored ones by whole blocks."""
     if lens.is_spherical():
         raise CaptureError(
             f"{path}: camera {lens.camera_id} is {lens.model_name}, a whole sphere; "

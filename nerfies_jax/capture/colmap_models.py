@@ -16,10 +16,13 @@ BYTES_PER_SECOND = 1e6  # text is read at 4 MB of them on a slow machine
 
 
 def tables(folder: pathlib.Path) -> decoder.Answer:
-    """Read what `colmap_tables.read` returns of a sparse model, binary or text.
+    """Read a sparse model, binary or text, in the decoder process.
 
     Args:
       folder: Folder of the model.
+
+    Returns:
+      The result of `colmap_tables.read`.
 
     Raises:
       CaptureError: If the model cannot be read.

@@ -31,7 +31,7 @@ _KINDS = "biuf"  # of NumPy types that an answer may have
 
 
 class DecoderError(FileError):
-    """What the child said is wrong with a file, or how the child ended.
+    """Defect of a file as the child reported it, or the way in which the child ended.
 
     Attributes:
       has_advice: Whether the message says what to do, and lacks only the path.
@@ -41,7 +41,7 @@ class DecoderError(FileError):
 
 
 class Answer(NamedTuple):
-    """What the child read."""
+    """Result of one operation of the child."""
 
     about: dict[str, Any]
     arrays: dict[str, np.ndarray]
@@ -64,13 +64,16 @@ class Decoder:
         """Run an operation of `decoder_child` that has one answer.
 
         Args:
-          operation: Its name.
+          operation: Name of the operation.
           cpu_seconds: Processor time that the file may take, besides `CPU_SECONDS`.
           memory_bytes: Memory that it may take, besides `MEMORY_BYTES`.
-          **arguments: Of the operation, as JSON.
+          **arguments: Arguments of the operation, as JSON values.
+
+        Returns:
+          The answer.
 
         Raises:
-          DecoderError: The file is damaged, or took too much.
+          DecoderError: If the file is damaged, or takes too much.
         """
         # To its end: a stream that is given up takes the child with it.
         answers = [*self.stream(operation, cpu_seconds, memory_bytes, **arguments)]
@@ -87,7 +90,17 @@ class Decoder:
     ) -> Iterator[Answer]:
         """Run an operation with any number of answers, as they come.
 
-        Args, Raises: As for `request`. The limit of time is for one answer.
+        Args:
+          operation: As for `request`.
+          cpu_seconds: As for `request`.
+          memory_bytes: As for `request`.
+          **arguments: As for `request`.
+
+        Yields:
+          The answers. The limit of time is for one answer.
+
+        Raises:
+          DecoderError: As for `request`.
         """
         with self._lock:
             job = {
@@ -117,7 +130,7 @@ class Decoder:
                     self.close()
 
     def _running(self):
-        """The child; a new one if it ended."""
+        """Return the child, and start a new one if it has ended."""
         if self._child is None or self._child.poll() is not None:
             self.close()
             root = pathlib.Path(__file__).resolve().parents[2]
@@ -165,7 +178,7 @@ class _Told(Exception):
 
 
 def _next_answer(child, seconds):
-    """The next answer of the child; None behind the last one of a request."""
+    """Return the next answer of the child, None after the last one of a request."""
     timer = threading.Timer(seconds, child.kill)
     timer.daemon = True
     timer.start()
@@ -207,7 +220,11 @@ _sessions_lock = threading.Lock()
 
 @contextlib.contextmanager
 def session() -> Iterator[Decoder]:
-    """Keep one child for all requests of the block, and of blocks inside it."""
+    """Keep one child for all requests of the block, and of blocks inside it.
+
+    Yields:
+      The decoder.
+    """
     global _shared, _spare, _sessions
     with _sessions_lock:
         _shared = _shared or Decoder()
@@ -228,9 +245,12 @@ def session() -> Iterator[Decoder]:
 
 @contextlib.contextmanager
 def streaming() -> Iterator[Decoder]:
-    """Use a child for one stream, while others serve what is read in between.
+    """Use a child for one stream, while others serve requests in between.
 
     Inside a `session` it is kept for the next stream.
+
+    Yields:
+      The decoder.
     """
     global _spare
     with _sessions_lock:

@@ -250,7 +250,7 @@ def from_pictures(
 
 
 def _readable(folder):
-    """The upright sizes of pictures that can be opened here, and a note of others."""
+    """Return the upright sizes of readable images, and a note of the others."""
     files = pictures_in(folder)
     photographs = [file.name for file in files if file.suffix.lower() in HEIC]
     notes = ()
@@ -359,7 +359,7 @@ def _upright(file):
 
 
 def _focal(files: Sequence[pathlib.Path]) -> float | None:
-    """The median focal length that the files tell, in longest sides of the picture."""
+    """Median focal length that the files state, in longest sides of the image."""
     focals = []
     for file in files:
         with _opened(file) as picture:

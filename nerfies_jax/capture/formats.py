@@ -72,7 +72,14 @@ def _is_llff(path):
 
 
 def videos_in(path: pathlib.Path) -> list[pathlib.Path]:
-    """List the videos of a folder by their suffix, sorted letter by letter."""
+    """List the videos of a folder by their suffix.
+
+    Args:
+      path: The folder.
+
+    Returns:
+      Paths, sorted character by character.
+    """
     files = path.glob("*") if path.is_dir() else ()
     return sorted(
         file

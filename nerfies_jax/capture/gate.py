@@ -55,7 +55,14 @@ def findings(capture: Capture) -> list[Finding]:
 
 
 def table(capture: Capture) -> list[str]:
-    """Format the findings as lines: what was checked, its value, and any problem."""
+    """Format the findings about a capture: each check, its value, and any problem.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Lines of text.
+    """
     found = findings(capture)
     wide = max(len(one.subject) for one in found)
     lines = []

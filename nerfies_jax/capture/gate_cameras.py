@@ -20,7 +20,14 @@ ON_STEPS = 0.99  # of the coordinates: they were float32 once
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check intrinsics and the precision of positions."""
+    """Check intrinsics and the precision of positions.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The findings.
+    """
     return [
         _field_of_view(capture),
         _aspect(capture),
@@ -119,7 +126,7 @@ def _principal_point(capture):
 
 
 def _lens(capture):
-    """Whether a lens model folds back, or moves corners too far to be a lens."""
+    """Check that lens models do not fold back or move corners too far."""
     cameras = capture.cameras
     if not np.any(cameras.radial):
         return Finding("lens distortion", "none")
@@ -159,7 +166,7 @@ def _lens(capture):
 
 
 def _precision(capture):
-    """Whether float32 resolves positions in scene units to a part of a pixel."""
+    """Check that float32 resolves positions in scene units to a fraction of a pixel."""
     places = [capture.cameras.position]
     if capture.points is not None:
         places.append(capture.points.position)
@@ -178,7 +185,7 @@ def _precision(capture):
 
 
 def _rounded(capture):
-    """Whether positions in the files are multiples of what float32 can hold there."""
+    """Check if positions in the files were rounded to float32."""
     world = np.float64(capture.cameras.position) / capture.scale + np.array(
         capture.center
     )

@@ -22,7 +22,14 @@ SAMPLES = 1_000_000  # of the pixels; more change no median
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check the units of depths, and name folders that nothing in the capture names."""
+    """Check the units of depths, and find folders that nothing in the capture names.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The findings.
+    """
     return [*_depths(capture), *_unread(capture)]
 
 

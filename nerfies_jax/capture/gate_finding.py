@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 
 class Finding(NamedTuple):
-    """What a check measured, and what is wrong with it."""
+    """Value that a check measured, and the problem that it shows, if any."""
 
     subject: str  # what was checked, a few words
     value: str  # what was measured

@@ -18,7 +18,14 @@ _MASKS = (
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check shares of observed and moving pixels, and times."""
+    """Check shares of observed and moving pixels, and times.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The findings.
+    """
     return [*_observed(capture), *_moving(capture), *_times(capture)]
 
 

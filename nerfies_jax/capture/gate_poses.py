@@ -42,7 +42,14 @@ class Projected(NamedTuple):
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Compare the poses and intrinsics of a capture with its points."""
+    """Compare the poses and intrinsics of a capture with its points.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The findings, none if there are too few points.
+    """
     if capture.points is None or len(capture.points.position) < LEAST_POINTS:
         return []
     count = len(capture.ids)
@@ -79,7 +86,7 @@ def findings(capture: Capture) -> list[Finding]:
 
 
 def _explained(capture, cameras, pose, points, share):
-    """What explains that next to no point is seen, and whether nothing else can."""
+    """Explain why hardly any point is visible, and tell if nothing else can."""
     others = _others(capture, cameras, pose)
     if share < NONE:  # a tile or a survey shows some, and other units many
         others |= _other_units(cameras, pose)
@@ -180,7 +187,9 @@ def _other_units(cameras, pose):
 
 
 def _extent(capture, shown):
-    """Shares of width and height that nearly all points cover; empty if too few do."""
+    """Shares of width and height that nearly all points cover, or () for too few
+    points.
+    """
     extents = []
     for pixel, inside in zip(shown.pixel, shown.inside, strict=True):
         if inside.sum() >= LEAST_POINTS:
@@ -190,7 +199,7 @@ def _extent(capture, shown):
 
 
 def _spread(capture, shown):
-    """Whether all points lie in a small part of the images, as in a wrong unit."""
+    """Check if all points lie in a small part of the images, as in a wrong unit."""
     extent = _extent(capture, shown)
     if not len(extent):
         return []
@@ -208,7 +217,7 @@ def _spread(capture, shown):
 
 
 def _parallax(pose, shown):
-    """Whether cameras move so little that their unit must be another one."""
+    """Check if cameras move so little that their unit must be another one."""
     moved = float(np.linalg.norm(np.ptp(pose.position, axis=0)))
     depths = shown.depth[shown.inside]
     if moved == 0 or not depths.size:
@@ -225,7 +234,7 @@ def _parallax(pose, shown):
 
 
 def _near_and_far(capture, shown):
-    """Whether the points that are seen lie between near and far."""
+    """Check that the visible points lie between near and far."""
     depths = shown.depth[shown.inside] * capture.scale
     if not depths.size:
         return []
@@ -296,10 +305,13 @@ def _project(cameras, pose, points, size):
 
 
 def fold_radius(radial: np.ndarray) -> np.ndarray:
-    """Undistorted radius at which each lens folds back, inf where it never does.
+    """Compute the undistorted radius at which each lens folds back.
 
     Args:
-      radial: k1, k2, k3 of each lens, [lenses, 3].
+      radial: Coefficients k1, k2, k3 of each lens, [lenses, 3].
+
+    Returns:
+      Radii in the image plane [lenses], inf for lenses that never fold.
     """
     radii = {}
     for k1, k2, k3 in np.unique(radial, axis=0).tolist():

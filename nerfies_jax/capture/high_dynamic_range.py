@@ -91,7 +91,7 @@ def _scene_of_hlg():
 
 @functools.cache
 def _roll_off():
-    """Nits shown over nits filmed, by the EETF of ITU-R BT.2390-11, section 5.4.1."""
+    """Displayed over recorded nits, by the EETF of ITU-R BT.2390-11, section 5.4.1."""
     peak = _pq_of_nits(BRIGHTEST_NITS)
     filmed = _pq_of_nits(np.linspace(0, BRIGHTEST_NITS, CODES)) / peak
     top = _pq_of_nits(WHITE_NITS) / peak

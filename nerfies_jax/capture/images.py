@@ -139,11 +139,14 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
 
 
 def decode(path: AnyPath, header: Header | None = None) -> np.ndarray:
-    """Decode an image with Pillow, as `read_pixels` needs it.
+    """Decode an image with Pillow, for `read_pixels`.
 
     Args:
       path: The file, which may not be an EXR.
-      header: What `read_header` returned of it.
+      header: Its header, from `read_header`, if already read.
+
+    Returns:
+      The pixels as decoded.
 
     Raises:
       CaptureError: If it cannot be decoded.

@@ -185,7 +185,7 @@ def read_poses(path: pathlib.Path) -> Poses:
 
 
 def _folders(path, poses):
-    """Reduction -> folder with as many pictures as there are poses."""
+    """Folders by reduction, with as many images as there are poses."""
     available = {}
     for folder in sorted(path.glob("images*")):
         files = frames.pictures_in(folder) if folder.is_dir() else []

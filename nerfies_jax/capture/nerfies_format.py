@@ -233,7 +233,9 @@ def _write_pictures(capture, folder, factor):
 
 
 def _check_picture_size(file, full_size, source):
-    """Stored pictures may be trimmed to whole blocks, by less than one pixel here."""
+    """Check image sizes. Stored images may be trimmed to whole blocks, by under a
+    pixel.
+    """
     width, height = pictures.read_header(file).size
     if (
         abs(width - full_size[0] / source) >= 1

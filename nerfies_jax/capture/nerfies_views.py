@@ -25,7 +25,7 @@ Triple = tuple[float, float, float]
 
 
 class CameraFile(msgspec.Struct):
-    """`camera/<id>.json`, in pixels of the full-size picture."""
+    """`camera/<id>.json`, in pixels of the full-size image."""
 
     orientation: tuple[Triple, Triple, Triple]  # camera from world
     position: Triple

@@ -194,14 +194,14 @@ def _straight(radial, tangential, bent):
 
 @jax.jit
 def _bent(radial, tangential, slopes):
-    """Distorted slopes, and whether the lens has them once."""
+    """Distorted image-plane positions, and booleans where the lens is one-to-one."""
     each = (None, None, 0)
     bent = jax.vmap(distortion.distort, each)(radial, tangential, slopes)
     return bent, jax.vmap(distortion.one_to_one, each)(radial, tangential, slopes)
 
 
 def _source_pixels(camera, size):
-    """Where each pinhole pixel lies in the filmed picture, and whether it does.
+    """Locate each undistorted pixel in the distorted image, with booleans of success.
 
     Where the lens model folds back there is no pixel at all.
     """
@@ -211,7 +211,7 @@ def _source_pixels(camera, size):
 
 
 def _slopes(camera, size):
-    """Image-plane slopes [pixels, 2] of the pixel centers, the lens left aside."""
+    """Image-plane positions [pixels, 2] of the pixel centers, without distortion."""
     focal, skew = float(camera.focal_px), float(camera.skew_px)
     offset = np.asarray(rays.pixel_centers(size)) - np.asarray(
         camera.principal_point_px
@@ -222,7 +222,7 @@ def _slopes(camera, size):
 
 
 def _pixels(camera, slopes, size):
-    """Pixel positions [height, width, 2] of image-plane slopes [pixels, 2]."""
+    """Pixel positions [height, width, 2] of image-plane positions [pixels, 2]."""
     focal, skew = float(camera.focal_px), float(camera.skew_px)
     slopes = slopes.reshape(size[1], size[0], 2)
     across = focal * slopes[..., 0] + skew * slopes[..., 1]

@@ -138,7 +138,7 @@ def _images_of(folder):
 
 
 def _read_folders(path, folders, shrink_by):
-    """Read the images of all cameras; equal times are those of equal names."""
+    """Read the images of all cameras. Equal times are those of equal names."""
     files = [frames.pictures_in(_images_of(folder)) for folder in folders]
     camera_ids = np.repeat(np.arange(len(files)), [len(some) for some in files])
     flat = [file for some in files for file in some]
@@ -177,7 +177,7 @@ def _same_groups(one, other):
 
 
 def _read_videos(path, files, shrink_by):
-    """Decode all videos; equal times are equal numbers of frame intervals."""
+    """Decode all videos. Equal times are equal numbers of frame intervals."""
     count = sum(video.stated_frames(file) for file in files)
     width, height = (side // shrink_by for side in _size_of(files[0]))
     total = count * width * height * 3

@@ -22,13 +22,21 @@ Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 def frames(
     path: str, stride: int, most: int, rows: list[int] | None, gray: bool, damaged: str
 ) -> Iterator[Reply]:
-    """Decode frames; arguments as for `video.read_video`.
+    """Decode frames, for `video.read_video`.
+
+    Args:
+      path: The video.
+      stride: As for `video.read_video`.
+      most: As for `video.read_video`.
+      rows: As for `video.read_video`.
+      gray: As for `video.read_video`.
+      damaged: As for `video.read_video`.
 
     Yields:
-      Nothing for a frame that is passed over. Else seconds, and the pixels.
+      Nothing for a frame that is passed over, else seconds and the pixels.
 
     Raises:
-      FileError: The way out of a video that cannot be used, without the path.
+      FileError: If the video cannot be used, with the remedy but without the path.
     """
     av = extras.library("av", "video")
     last = math.inf if rows is None else max(rows, default=-1)
@@ -64,7 +72,14 @@ def frames(
 
 
 def transfer(path: str) -> Iterator[Reply]:
-    """Find the transfer function of an HDR video; None of other videos."""
+    """Find the transfer function of an HDR video.
+
+    Args:
+      path: The video.
+
+    Yields:
+      The transfer function, None for other videos.
+    """
     av = extras.library("av", "video")
     with _words_of(av), av.open(path) as container:
         frame = next(container.decode(_main_stream(container)), None)
@@ -73,7 +88,14 @@ def transfer(path: str) -> Iterator[Reply]:
 
 
 def length(path: str) -> Iterator[Reply]:
-    """Read how many frames a video states to have, or its length and rate tell."""
+    """Find the number of frames that a video states, or that its length and rate imply.
+
+    Args:
+      path: The video.
+
+    Yields:
+      The number of frames.
+    """
     av = extras.library("av", "video")
     with _words_of(av), av.open(path) as container:
         stream = _main_stream(container)
@@ -83,7 +105,16 @@ def length(path: str) -> Iterator[Reply]:
 
 
 def notes(path: str, count: int, last: float) -> Iterator[Reply]:
-    """Say what is unusual about a video; arguments as for `video.notes_of`."""
+    """Describe anything unusual about a video, for `video.notes_of`.
+
+    Args:
+      path: The video.
+      count: Number of frames that could be read.
+      last: Time of the last one in seconds.
+
+    Yields:
+      Notes.
+    """
     av = extras.library("av", "video")
     with _words_of(av), av.open(path) as container:
         yield {"notes": _notes(container, count, last)}, {}
@@ -211,7 +242,7 @@ def _pixels(frame):
 
 
 def _upright(pixels, frame):
-    """The picture turned and mirrored as the matrix of the film says, if it has one."""
+    """Rotate and mirror an image by the display matrix of the video, if it has one."""
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return pixels

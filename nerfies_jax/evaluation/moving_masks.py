@@ -71,7 +71,7 @@ def _films(capture):
 
 
 def _bent(moving, filmed):
-    """Masks of the pinholes' pictures in the pixels of the filmed ones."""
+    """Distort masks of pinhole images to the pixels of the captured images."""
     if not pinholes.has_lens(filmed.cameras):
         return moving
     maps = pinholes.Maps(pinholes.pinhole_places, filmed.size)

@@ -85,7 +85,9 @@ def misses(views: Views, seen: Sight, body: Body) -> np.ndarray:
 
 
 def _projected(views, seen, body):
-    """[entries, 2] px off, and the slope [entries, 2, 3] by the place in the world."""
+    """Errors [entries, 2] in px, and their gradients [entries, 2, 3] by the
+    position.
+    """
     turned = np.einsum("oij,oj->oi", body.rotation[seen.frame], body.point[seen.track])
     away = turned + (body.shift - views.position)[seen.frame]
     local = np.einsum("oij,oj->oi", views.rotation[seen.frame], away)

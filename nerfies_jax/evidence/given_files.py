@@ -184,7 +184,7 @@ def _masks(folder, capture):
 
 
 def _fitted(array, capture, path, what):
-    """The nearest pixels of an array of the pictures' shape, whatever its size."""
+    """Nearest pixels of an array of the images' aspect, whatever its size."""
     width, height = capture.size
     tall, wide = array.shape[:2]
     # To within a pixel of the smaller of the two.

@@ -90,7 +90,7 @@ def _farthest_in_cells(place, inverse):
 
 
 def _plane(offset, value, weight):
-    """Planes over `offset` [n, k, 2]: their value at offset zero [n], slopes [n, 2]."""
+    """Planes over `offset` [n, k, 2]: value at offset zero [n], and gradient [n, 2]."""
     weight = weight / weight.sum(1, keepdims=True)
     middle = np.einsum("nk,nkc->nc", weight, offset)
     mean = np.einsum("nk,nk->n", weight, value)

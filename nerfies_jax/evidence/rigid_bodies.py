@@ -88,7 +88,7 @@ def _work(own, paths):
 
 
 def _some_frames(views, tracks, paths, every):
-    """All three as of a film of every so many frames."""
+    """Views, tracks and paths of every `every`-th frame."""
     if every == 1:
         return views, tracks, paths
     kept = slice(None, None, every)

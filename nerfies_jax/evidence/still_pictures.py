@@ -56,7 +56,7 @@ def log_odds(views: Views, still: PointCloud) -> np.ndarray:
 
 
 def _leveled(views):
-    """Blurred pictures of one mean and spread for each channel, and that spread."""
+    """Blurred images with one mean and spread for each channel, and that spread."""
     image = views.image.astype(np.float32)
     mean, spread = image.mean((1, 2)), np.maximum(image.std((1, 2)), 1e-3)
     typical = np.median(spread, axis=0)

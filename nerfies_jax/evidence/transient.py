@@ -158,7 +158,7 @@ def _way(flow, seen, part):
 
 
 def _leveled(gray):
-    """The picture less its local mean, over its contrast: exposure taken out."""
+    """Image minus its local mean, over its contrast, without exposure."""
     detail = gray - cv2.GaussianBlur(gray, (0, 0), LOCAL_PX)
     spread = np.sqrt(np.mean(detail**2))
     return detail / (5 * spread) if spread > 0 else detail

@@ -92,9 +92,9 @@ def project(
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
     """Project world points to pixels.
 
-    A point beside the camera gets a pixel far outside the image, one behind it on the
-    axis the principal point. Pixel and derivatives are finite there but meaningless.
-    See `projectable` for points outside the range of the lens model.
+    A point at the side of the camera gets a pixel far outside the image, and one behind
+    it on the axis gets the principal point. Pixel and derivatives are finite there but
+    meaningless. See `projectable` for points outside the range of the lens model.
 
     Args:
       camera: Cameras, [...].

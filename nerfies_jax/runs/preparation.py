@@ -153,7 +153,7 @@ def _taken(kind, source, scratch, how) -> Taken:
 
 
 def _solve(scratch, taken, how, tell) -> Solved:
-    """The cameras of the pictures in `scratch/images`, in one pass or two."""
+    """Estimate the cameras of the images in `scratch/images`, in one pass or two."""
     spec = MappingSpec(
         camera_model=how.camera_model, matcher=how.matcher, threads=how.threads
     )

@@ -152,7 +152,7 @@ def make(
 
 
 def _staged(folder):
-    """Where to write: beside earlier products, which stay until all new ones are there.
+    """Yield a folder to write to, next to earlier products until all new ones exist.
 
     A run without any keeps what it could write, whatever fails.
     """

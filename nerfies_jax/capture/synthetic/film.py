@@ -178,7 +178,7 @@ def _sub_pixels(count, dtype):
 
 
 def _tiles(size, dtype):
-    """Pixel centers [tiles, TILE², 2] that cover a picture, and a margin beyond it."""
+    """Pixel centers [tiles, TILE², 2] that cover an image, and a margin beyond it."""
     down, across = (-(-length // TILE) for length in size[::-1])
     centers = rays.pixel_centers((across * TILE, down * TILE), dtype)
     tiles = centers.reshape(down, TILE, across, TILE, 2).swapaxes(1, 2)
