@@ -67,7 +67,7 @@ def read(
     """
     path = pathlib.Path(path)
     root = path if path.is_dir() else path.parent
-    split = read_split(path, heldout)
+    split = read_split(path, heldout, missing)
     entries = [*split.train, *split.heldout]
     where = str(split.file)
     files = [_picture(root, entry, split.file) for entry in entries]

@@ -95,7 +95,7 @@ def read(
     every = frames.HELD_OUT if heldout is None else heldout
     group = np.zeros(len(ids)) if clock.cameras is None else clock.cameras
     train, scored = frames.hold_out_in_time(times, group, every, str(path))
-    notes += (f"every {every}th frame is held out",)
+    notes += (frames.held_out_note(scored, every),)
     return Capture(
         name=path.resolve().name,
         source="colmap",

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable
 from typing import NamedTuple
 
-from nerfies_jax.capture import gate
+from nerfies_jax.capture import gate, times_file
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath
 
@@ -213,6 +213,7 @@ def load(
     max_side: int | None = None,
     heldout: int | str | None = None,
     missing: str = "refuse",
+    times: AnyPath | None = None,
     **options,
 ) -> Capture:
     """Read a capture of any format.
@@ -224,7 +225,9 @@ def load(
         given.
       heldout: None for the files' own split (every 8th frame if they have none), n for
         every n-th frame, or the name of a split.
-      missing: "refuse" or "skip" frames without an image.
+      missing: "refuse" or "skip" frames without an image, a camera file or a pose.
+      times: File of frame times (`times_file.with_times`) that replace those of the
+        capture.
       **options: Further arguments of the reader, such as `background` of Blender's.
 
     Returns:
@@ -235,13 +238,14 @@ def load(
     """
     path = pathlib.Path(path)
     reader = importlib.import_module(recognize(path).module)
-    return gate.checked(
-        reader.read(
-            path,
-            factor=factor,
-            max_side=max_side,
-            heldout=heldout,
-            missing=missing,
-            **options,
-        )
+    capture = reader.read(
+        path,
+        factor=factor,
+        max_side=max_side,
+        heldout=heldout,
+        missing=missing,
+        **options,
     )
+    if times is not None:
+        capture = times_file.with_times(capture, times)
+    return gate.checked(capture)

@@ -5,7 +5,7 @@ import pathlib
 import re
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -381,6 +381,15 @@ def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.n
     rows = np.arange(count)
     scored = rows % every == every // 2
     return rows[~scored], rows[scored]
+
+
+def held_out_note(scored: np.ndarray | list[Any], every: int) -> str:
+    """Say what `hold_out_every` held out."""
+    if not len(scored):
+        return "no frame is held out: there are too few"
+    if len(scored) == 1:
+        return "one frame is held out"
+    return f"every {every}th frame is held out"
 
 
 def dense(values: ArrayLike) -> np.ndarray:

@@ -19,6 +19,9 @@ class GivenFiles:
     """Depths or inverse depths of any scale: npz, npy, folder of EXR, PNG or npy."""
     flow: pathlib.Path | str | None = None
     """Optical flow: npz of forward and backward, or a folder with .flo of each."""
+    times: pathlib.Path | str | None = None
+    """Frame times in seconds or on any clock: text with a name and a time in each line,
+    or JSON."""
 
     def __post_init__(self):
         for name, path in vars(self).items():

@@ -105,7 +105,7 @@ def read(
         center=placement.center,
         up=frames.up_direction(cameras),
         path=path,
-        notes=(*notes, f"every {every}th frame is held out"),
+        notes=(*notes, frames.held_out_note(scored, every)),
     )
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from nerfies_jax.capture import frames, name_times
+from nerfies_jax.capture import frames, name_times, unread_keys
 from nerfies_jax.capture.capture import (
     MAX_ID,
     Capture,
@@ -152,8 +152,34 @@ def read_cameras(
         camera_ids=frames.dense([m.camera_id for m in moments]),
         scene=scene,
         extra=extra,
-        notes=(*notes, *lost, *more),
+        notes=(*notes, *lost, *more, *_unread(path, ids)),
     )
+
+
+def _unread(path, ids):
+    """Name the keys that are not read, since they may change the scene."""
+    files = {
+        path / "scene.json": {*SceneFile.__struct_fields__},
+        path / "dataset.json": {
+            *DatasetFile.__struct_fields__,
+            *("count", "num_exemplars"),
+        },
+        path / "extra.json": {
+            *ExtraFile.__struct_fields__,
+            *("bbox", "lookat", "lookats"),
+        },
+        path / "camera" / f"{ids[0]}.json": {*CameraFile.__struct_fields__},
+    }
+    notes = [
+        note
+        for file, known in files.items()
+        if file.is_file()
+        for note in unread_keys.notes(file, known)
+    ]
+    file = path / "metadata.json"
+    if file.is_file():
+        notes += unread_keys.notes(file, None, {None: {*Moment.__struct_fields__}})
+    return tuple(notes)
 
 
 def _splits(path, heldout):
@@ -185,7 +211,7 @@ def _splits(path, heldout):
         pool = sorted(pool, key=frames.natural)
         kept, scored = frames.hold_out_every(len(pool), step, str(path))
         if heldout is None:
-            notes += (f"no validation ids: every {step}th frame is held out",)
+            notes += (f"no validation ids: {frames.held_out_note(scored, step)}",)
         return [pool[row] for row in kept], [pool[row] for row in scored], notes
     left_out = len(every) - len({*train, *val})
     if train and left_out:

@@ -264,7 +264,7 @@ def _split(recorded, names, heldout, path):
         train, scored = frames.hold_out_in_time(
             recorded.numbers, recorded.camera_ids, heldout, str(path)
         )
-        return train, scored, f"every {heldout}th frame is held out"
+        return train, scored, frames.held_out_note(scored, heldout)
     chosen = names[0] if heldout is None else heldout
     if chosen not in names:
         raise CaptureError(

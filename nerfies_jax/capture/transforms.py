@@ -2,12 +2,11 @@
 
 import collections
 import pathlib
-from typing import Any
 
 import msgspec
 import numpy as np
 
-from nerfies_jax.capture import frames, name_times, text_files
+from nerfies_jax.capture import frames, name_times, text_files, unread_keys
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import read_json
 from nerfies_jax.capture.nearest import known_names
@@ -47,7 +46,7 @@ class Frame(Lens, kw_only=True):
     """One image."""
 
     file_path: str
-    transform_matrix: list[list[float]]
+    transform_matrix: list[list[float]] | None = None  # None if no pose was found
     time: float | None = None
     mask_path: str | None = None  # black: do not learn from
     depth_file_path: str | None = None  # nerfstudio's; not read, which a note says
@@ -89,12 +88,15 @@ class Split(msgspec.Struct):
     notes: tuple[str, ...] = ()
 
 
-def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
+def read_split(
+    path: pathlib.Path, heldout: int | str | None, missing: str = "refuse"
+) -> Split:
     """Read the frames of a folder or file.
 
     Args:
       path: The folder or file.
       heldout: As in `blender_format.read`.
+      missing: "refuse" or "skip" frames without a `transform_matrix`.
 
     Returns:
       The split.
@@ -105,10 +107,38 @@ def read_split(path: pathlib.Path, heldout: int | str | None) -> Split:
     file = path if path.is_file() else path / "transforms_train.json"
     if path.is_dir() and not file.is_file() and (path / "transforms.json").is_file():
         file = path / "transforms.json"
-    transforms = read_json(file, Transforms)
-    notes = _fill_times(file, transforms.frames)
-    split = _split(file, transforms, heldout)
+    transforms, notes = _with_poses(file, missing)
+    notes += _fill_times(file, transforms.frames)
+    split = _split(file, transforms, heldout, missing)
     return msgspec.structs.replace(split, notes=(*split.notes, *notes, *_unread(file)))
+
+
+def _with_poses(file, missing):
+    """Read a file; frames without a pose are refused, or left out with a note."""
+    transforms = read_json(file, Transforms)
+    frames.check_missing(missing, str(file))
+    posed = [each for each in transforms.frames if each.transform_matrix is not None]
+    lost = [
+        each.file_path for each in transforms.frames if each.transform_matrix is None
+    ]
+    if not lost:
+        return transforms, ()
+    listed = ", ".join(lost[:5]) + (", ..." if len(lost) > 5 else "")
+    if missing == "refuse" or not posed:
+        raise CaptureError(
+            f"{file}: {len(lost)} of {len(transforms.frames)} frames have no "
+            f"transform_matrix ({listed}); add their poses, or leave those frames out "
+            'with missing="skip"'
+        )
+    gone = {text_files.forward_slashes(name) for name in lost}
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        names = getattr(transforms, key)
+        if names is not None:
+            kept = [n for n in names if text_files.forward_slashes(n) not in gone]
+            setattr(transforms, key, kept)
+    transforms.frames = posed
+    note = f"{len(lost)} frames left out, they have no transform_matrix: {listed}"
+    return transforms, (note,)
 
 
 def _fill_times(file, entries):
@@ -183,15 +213,12 @@ def stems(entries: list[Frame]) -> list[str]:
 
 def _unread(file):
     """Name the keys that no reader here knows, since they may change the scene."""
-    table = read_json(file, dict[str, Any])
-    keys = set(table) - set(Transforms.__struct_fields__)
-    for entry in table["frames"]:
-        keys |= set(entry) - set(Frame.__struct_fields__)
-    keys = sorted(keys - HARMLESS)
-    return (f"keys that are not read: {', '.join(keys)}",) if keys else ()
+    known = HARMLESS.union(Transforms.__struct_fields__)
+    of_frames = HARMLESS.union(Frame.__struct_fields__)
+    return unread_keys.notes(file, known, {"frames": of_frames})
 
 
-def _split(file, transforms, heldout):
+def _split(file, transforms, heldout, missing):
     if not transforms.frames:
         raise CaptureError(f"{file}: no frames; list them under frames")
     if isinstance(heldout, str) and heldout not in ("val", "test"):
@@ -205,12 +232,16 @@ def _split(file, transforms, heldout):
     named = isinstance(heldout, str) or (heldout is None and lists)
     if transforms.train_filenames is not None and named:
         return _listed(file, transforms, wanted)
+    empty: tuple[str, ...] = ()
     if not isinstance(heldout, int) and file.name == "transforms_train.json":
         for name in wanted:
             other = file.with_name(f"transforms_{name}.json")
             if other.is_file():
-                second = read_json(other, Transforms)
-                more = _fill_times(other, second.frames)
+                second, lost = _with_poses(other, missing)
+                if not second.frames:
+                    empty += (f"{other.name} has no frames",)
+                    continue
+                more = lost + _fill_times(other, second.frames)
                 more += _fill_file(file, transforms.frames, second.frames)
                 more += _fill_file(other, second.frames, transforms.frames)
                 scored = _own_lens(second)
@@ -219,7 +250,7 @@ def _split(file, transforms, heldout):
                     transforms,
                     transforms.frames,
                     scored,
-                    (f"the {name} split is held out", *more),
+                    (f"the {name} split is held out", *empty, *more),
                 )
     if isinstance(heldout, str):
         raise CaptureError(
@@ -245,7 +276,7 @@ def _split(file, transforms, heldout):
         transforms,
         [ordered[row] for row in kept],
         [ordered[row] for row in scored],
-        (f"no other split: every {every}th frame is held out",),
+        (f"no other split: {frames.held_out_note(scored, every)}", *empty),
     )
 
 

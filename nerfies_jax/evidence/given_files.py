@@ -39,7 +39,7 @@ PICTURES, DEPTHS = (".png",), (".exr", ".png", ".npy")
 
 @decoder.session()
 def attached(capture: Capture, files: GivenFiles) -> Capture:
-    """Read external files and attach them to a capture.
+    """Read external files, except for times, and attach them to a capture.
 
     Args:
       capture: The capture.
@@ -51,7 +51,7 @@ def attached(capture: Capture, files: GivenFiles) -> Capture:
     Raises:
       CaptureError: If a file does not fit.
     """
-    if files == GivenFiles():
+    if files == GivenFiles(times=files.times):  # those are read with the capture
         return capture
     if capture.cameras.radial.any() or capture.cameras.tangential.any():
         raise CaptureError(

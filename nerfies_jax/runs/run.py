@@ -288,6 +288,7 @@ def _filmed(source, seed):
         max_side=source.max_side,
         heldout=heldout,
         missing=source.missing,
+        times=source.files.times,
     )
 
 
@@ -296,6 +297,11 @@ def _built_in(source, seed):
         raise ValueError(
             f"scene={source.scene}: no such built-in scene; "
             + known_names(source.scene, synthetic.PRESETS)
+        )
+    if source.files.times is not None:
+        raise ValueError(
+            f"times={source.files.times}: a built-in scene has its own times; they are "
+            "for captures"
         )
     for name in ("factor", "max_side", "heldout"):
         if getattr(source, name) is not None:

@@ -76,7 +76,7 @@ def test_what_is_recognized(tmp_path, files, expected):
 
 
 def test_every_reader_takes_the_common_options():
-    common = set(inspect.signature(formats.load).parameters) - {"options"}
+    common = set(inspect.signature(formats.load).parameters) - {"options", "times"}
     for reader in (nerfies_format, blender_format, colmap, llff_format):
         assert common <= set(inspect.signature(reader.read).parameters)
 

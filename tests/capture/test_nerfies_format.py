@@ -537,3 +537,26 @@ def test_metadata_without_times_takes_those_of_the_names(tmp_path):
     dump(file, table)
     with pytest.raises(CaptureError, match=r"5 of 6 frames have no warp_id \(000, "):
         nerfies_views.read_cameras(tmp_path)
+
+
+def test_keys_that_are_not_read_are_named(tmp_path):
+    make(tmp_path)
+    assert not any("not read" in note for note in nerfies_format.read(tmp_path).notes)
+    for name, keys in (
+        ("scene.json", {"rotation": 1}),
+        ("extra.json", {"bbox": [], "mirror": True}),
+        ("camera/000.json", {"shutter": 0.1}),
+    ):
+        file = tmp_path / name
+        dump(file, (json.loads(file.read_text()) if file.exists() else {}) | keys)
+    moments = json.loads((tmp_path / "metadata.json").read_text())
+    moments["003"]["exposure"] = 2.0
+    dump(tmp_path / "metadata.json", moments)
+    notes = nerfies_format.read(tmp_path).notes
+    for file, key in (
+        ("scene.json", "rotation"),
+        ("extra.json", "mirror"),
+        ("000.json", "shutter"),
+        ("metadata.json", "exposure"),
+    ):
+        assert f"keys of {file} that are not read: {key}" in notes

@@ -100,4 +100,4 @@ def test_the_distortion_of_another_model_is_not_taken_over(tmp_path):
 def test_keys_that_are_not_read_are_named(tmp_path):
     make(tmp_path, {"": 6}, top={"fl_x": 20.0, "aabb_scale": 4}, rolling_shutter=[0, 1])
     notes = blender_format.read(tmp_path).notes
-    assert "keys that are not read: rolling_shutter" in notes
+    assert "keys of transforms.json that are not read: rolling_shutter" in notes

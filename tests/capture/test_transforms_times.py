@@ -70,3 +70,37 @@ def test_times_come_from_names_where_no_frame_has_one(tmp_path):
         f"images_{name}": float(row % 2) for row, name in enumerate(names)
     }
     assert len(set(capture.camera_ids[capture.times == 0].tolist())) == 2
+
+
+@pytest.mark.parametrize("lists", [False, True])
+def test_frames_without_a_pose_are_refused_or_left_out(lists, tmp_path):
+    make(tmp_path, {"": 9})
+
+    def forget(row, entry):
+        if row in (2, 7):
+            entry["transform_matrix"] = None
+
+    rewrite(tmp_path, forget)
+    table = json.loads((tmp_path / "transforms.json").read_text())
+    del table["frames"][2]["transform_matrix"]
+    if lists:
+        names = [entry["file_path"] for entry in table["frames"]]
+        table |= {"train_filenames": names[:7], "test_filenames": names[7:]}
+    dump(tmp_path / "transforms.json", table)
+    with pytest.raises(CaptureError, match=r"2 of 9 frames have no transform_matrix"):
+        blender_format.read(tmp_path)
+    capture = blender_format.read(tmp_path, missing="skip")
+    assert sorted(times_by_number(capture)) == [0, 1, 3, 4, 5, 6, 8]
+    assert len(capture.heldout) == 1
+    assert "2 frames left out, they have no transform_matrix" in "".join(capture.notes)
+
+
+def test_notes_say_what_is_held_out(tmp_path):
+    make(tmp_path / "empty", {"train": 9, "test": 0})
+    capture = blender_format.read(tmp_path / "empty")
+    assert len(capture.heldout) == 1
+    assert "transforms_test.json has no frames" in capture.notes
+    assert "no other split: every 8th frame is held out" not in capture.notes
+    make(tmp_path / "two", {"": 2})
+    (note, *_) = blender_format.read(tmp_path / "two").notes
+    assert note == "no other split: no frame is held out: there are too few"

@@ -365,3 +365,31 @@ def test_pixels_are_made_square(tmp_path):
     assert next(video.read_video(path))[1].shape == (48, 64, 3)
     assert next(video.read_video(path, gray=True))[1].shape == (48, 64)
     assert "pixels of shape 2, made square" in video.notes_of(path, 3, 0.2)
+
+
+def coded(path, size, **params):
+    """Three frames of raw H.264, which begins anew wherever it is cut."""
+    with av.open(str(path), "w", format="h264") as container:
+        options = {"x264-params": ":".join(f"{k}={v}" for k, v in params.items())}
+        stream = container.add_stream("h264", rate=10, options=options)
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        for frame in film(3, size[::-1]):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
+        container.mux(stream.encode())
+    return path.read_bytes()
+
+
+def test_a_size_that_changes_within_a_video_is_refused(tmp_path):
+    parts = [coded(tmp_path / "a.h264", size) for size in ((64, 48), (32, 32))]
+    path = tmp_path / "both.h264"
+    path.write_bytes(b"".join(parts))
+    with pytest.raises(CaptureError, match=r"changes from 64x48 to 32x32 .* frame 3"):
+        list(video.read_video(path))
+
+
+@pytest.mark.parametrize("interlaced", [0, 1])
+def test_interlaced_video_is_said(interlaced, tmp_path):
+    path = tmp_path / "a.h264"
+    coded(path, (64, 48), interlaced=interlaced)
+    notes = " ".join(video.notes_of(path, 3, 0.2))
+    assert ("interlaced: lines of two times" in notes) == bool(interlaced)

@@ -33,7 +33,7 @@ TABLE = [
     ("evidence", "OUT", "OUT"),
     ("evidence", "OUT --scene fast", "OUT and --scene fast: name a folder or"),
     ("evidence", "--scene tiny --masks OUT", "no such folder of masks"),
-    ("reconstruct", "--scene tiny --tracks OUT", "OUT: not a readable npz"),
+    ("reconstruct", "--scene tiny --tracks OUT", "OUT: No such file or directory"),
     ("render", "OUT --max-side 0", "--max-side 0: draw at least one pixel"),
     ("export", "nowhere ply", "no run here"),
     ("export", "nowhere ply --frames 1", "a sequence has at least two"),

@@ -151,3 +151,16 @@ def test_files_of_other_tools_may_be_moved(begun):
     there.mkdir()
     with pytest.raises(runs.Refused, match="other_masks"):  # taken, and empty
         runs.resume(folder, expected=wanted)
+
+
+def test_times_of_a_file_are_of_captures_and_of_no_built_in_scene(tmp_path):
+    nerfies_format.write(CAPTURE, tmp_path / "a")
+    file = tmp_path / "times.txt"
+    rows = zip(CAPTURE.ids, CAPTURE.times.tolist(), strict=True)
+    file.write_text("".join(f"{name} {7 * time**2}\n" for name, time in rows))
+    source = CaptureSource(capture=tmp_path / "a", files=GivenFiles(times=file))
+    read = runs.stored_capture(source)
+    np.testing.assert_allclose(read.times, CAPTURE.times**2, atol=1e-6)
+    assert read.given is None
+    with pytest.raises(ValueError, match="a built-in scene has its own times"):
+        runs.stored_capture(CaptureSource(files=GivenFiles(times=file)))

@@ -1,0 +1,178 @@
+"""Frame times from a file of the user, for captures whose own times are wrong."""
+
+import collections
+import dataclasses
+import pathlib
+import re
+from collections.abc import Callable
+
+import numpy as np
+
+from nerfies_jax.capture import frames, safe_files, text_files
+from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.json_files import AnyPath, read_json
+
+MAX_BYTES = 64 * 2**20
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")  # float() takes 0_1
+_LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
+
+
+def with_times(capture: Capture, path: AnyPath) -> Capture:
+    """Replace the times of a capture by those of a file.
+
+    Frames of equal time are of several cameras, if the capture knows only one and their
+    names without the last number tell them apart.
+
+    Args:
+      capture: The capture.
+      path: JSON, an object of frame names and times or a list of times; or text with
+        one frame in each line, name and time separated by a comma, semicolon or space,
+        or the time alone. Times are numbers on any clock, such as seconds. Without
+        names there is one for each frame, in the natural order of their names. A line
+        without a number at its end before all others is a heading.
+
+    Returns:
+      The capture, with times from 0 to 1 and `warp_ids` by them.
+
+    Raises:
+      CaptureError: The file cannot be read, or a frame has no time in it.
+    """
+    path = pathlib.Path(path)
+    named, listed = _read(path)
+    names = sorted(capture.ids, key=frames.natural)
+    notes: tuple[str, ...] = ()
+    if listed is not None:
+        if len(listed) != len(names):
+            raise CaptureError(
+                f"{path}: {len(listed)} times for {len(names)} frames; give one for "
+                "each, in the order of their names, or write the names too"
+            )
+        table = dict(zip(names, listed, strict=True))
+        values = [table[name] for name in capture.ids]
+    else:
+        values, notes = _by_name(capture, named, path)
+    clock = np.array(values, np.float64)
+    if not np.isfinite(clock).all():
+        row = int(np.argmin(np.isfinite(clock)))
+        raise CaptureError(
+            f"{path}: frame {capture.ids[row]!r} has time {clock[row]:g}; every time "
+            "must be a finite number"
+        )
+    camera_ids, more = _cameras(capture, clock)
+    first, last = clock.min(), clock.max()
+    note = f"times from {path.name}: {first:.6g} to {last:.6g} are 0 to 1"
+    changed = not np.array_equal(camera_ids, capture.camera_ids)
+    return dataclasses.replace(
+        capture,
+        times=frames.spread(clock),
+        warp_ids=frames.dense(clock),
+        camera_ids=camera_ids,
+        flow=None if changed else capture.flow,  # it is between frames of one camera
+        notes=(*capture.notes, note, *notes, *more),
+    )
+
+
+def _read(path):
+    """Times by name, or a list of times."""
+    if path.suffix.lower() == ".json":
+        content = read_json(path, dict[str, float] | list[float])
+        return (content, None) if isinstance(content, dict) else (None, content)
+    try:
+        text = text_files.utf8(safe_files.read_bytes(path, MAX_BYTES)).decode()
+    except UnicodeDecodeError as error:
+        raise CaptureError(
+            f"{path}: not text ({error.reason}); save it as UTF-8"
+        ) from None
+    lines = [line.strip() for line in text.splitlines()]
+    rows = [
+        re.split(r"[,;\t]\s*|\s+(?=\S+$)", line)
+        for line in lines
+        if line and not line.startswith("#")
+    ]
+    if rows and _number(rows[0][-1]) is None and _number(rows[0][0]) is None:
+        rows = rows[1:]  # a heading
+    if not rows:
+        raise CaptureError(f"{path}: no times in it; write a name and a time per line")
+    widths = collections.Counter(map(len, rows))
+    width = widths.most_common(1)[0][0]
+    time_first = any(_number(row[-1]) is None for row in rows) and all(
+        _number(row[0]) is not None for row in rows
+    )
+    for row in rows:
+        value = _number(row[0] if time_first else row[-1])
+        if len(row) != width or width > 2 or value is None:
+            raise CaptureError(
+                f"{path}: {' '.join(row)!r} is not a frame's name and time; write both "
+                "in each line, or the time alone in all"
+            )
+    if width == 1:
+        return None, [float(row[0]) for row in rows]
+    pairs = [tuple(reversed(row)) if time_first else tuple(row) for row in rows]
+    named: dict[str, float] = {}
+    for name, number in pairs:
+        if named.setdefault(name, float(number)) != float(number):
+            raise CaptureError(f"{path}: frame {name!r} has two times; keep one")
+    return named, None
+
+
+def _number(word):
+    return float(word) if _NUMBER.fullmatch(word) else None
+
+
+def _by_name(capture, named, path):
+    """The time of each frame, and a note of entries that are of none."""
+    table = {_plain(name): number for name, number in named.items()}
+    if len(table) < len(named):
+        raise CaptureError(f"{path}: several names of one frame; keep one of each")
+    find = _finder(table)
+    keys = [find(name) for name in capture.ids]
+    lost = [name for name, key in zip(capture.ids, keys, strict=True) if key is None]
+    if lost:
+        listed = ", ".join(lost[:5]) + (", ..." if len(lost) > 5 else "")
+        raise CaptureError(
+            f"{path}: no time for {len(lost)} of {len(keys)} frames ({listed}); add "
+            "them under these names, or under those of their images"
+        )
+    unused = len(table) - len({*keys})
+    notes = (f"{unused} entries of {path.name} are of no frame",) if unused else ()
+    return [table[key] for key in keys], notes
+
+
+def _plain(name):
+    """A path of an image as the id of its frame: folders joined, without its ending."""
+    stem = pathlib.PurePosixPath(text_files.forward_slashes(name))
+    if stem.suffix.lower() in (*frames.SUFFIXES, ".exr"):
+        stem = stem.with_suffix("")
+    return "_".join(part for part in stem.parts if part not in (".", "/"))
+
+
+def _finder(table) -> Callable[[str], str | None]:
+    """Find the entry of a frame, whose id or name may have folders in front."""
+    ends = collections.defaultdict(list)
+    for key in table:
+        parts = key.split("_")
+        for first in range(1, len(parts)):
+            ends["_".join(parts[first:])].append(key)
+
+    def find(name):
+        if name in table:
+            return name
+        parts = name.split("_")
+        shorter = ["_".join(parts[first:]) for first in range(1, len(parts))]
+        found = [*ends.get(name, ()), *(each for each in shorter if each in table)][:2]
+        return found[0] if len(found) == 1 or (found and found[0] in shorter) else None
+
+    return find
+
+
+def _cameras(capture, clock):
+    """Physical cameras, of frames that share times and tell cameras in their names."""
+    pairs = {*zip(clock.tolist(), capture.camera_ids.tolist(), strict=True)}
+    if len(pairs) == len(clock) or capture.camera_ids.any():
+        return capture.camera_ids, ()
+    groups = [_LAST_NUMBER.sub("#", name) for name in capture.ids]
+    if len({*zip(clock.tolist(), groups, strict=True)}) < len(clock):
+        return capture.camera_ids, ()
+    count = len({*groups})
+    note = f"frames share times: taken as {count} cameras, told apart by their names"
+    return frames.dense(groups), (note,)
