@@ -1,7 +1,7 @@
 """Where textbook formulas lose their digits, what ours keep, and what that costs.
 
     python -m experiments.hard_cases
-    python -m experiments.hard_cases --rooms rotations splats --repeats 30
+    python -m experiments.hard_cases --topics rotations splats --repeats 30
     python -m experiments.hard_cases --document docs/numerics.md   # renew its table
 
 Every case sweeps a function to its singular point. The table shows the worst errors of
@@ -42,8 +42,8 @@ from nerfies_jax import console
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform, run_folder
 
-# The cases of each room and, in tests/experiments/hard_cases, the file of their tests.
-ROOMS = {
+# The cases of each topic and, in tests/experiments/hard_cases, the file of their tests.
+TOPICS = {
     "rotations": (rotations.CASES + quaternions.CASES, "test_rotations.py"),
     "elastic": (elastic.CASES, "test_elastic_cases.py"),
     "geometry": (geometry.CASES, "test_geometry_cases.py"),
@@ -61,12 +61,12 @@ JITTER = 1e-3  # of the timed inputs, so that rows differ
 class HardCases:
     """Measure errors and costs of formulas at their hard points."""
 
-    rooms: tuple[str, ...] = tuple(ROOMS)
-    """Which rooms' cases."""
+    topics: tuple[str, ...] = tuple(TOPICS)
+    """Topics whose cases to measure."""
     cases: tuple[str, ...] = ()
-    """Names of cases, or parts of names (default: all of the rooms)."""
+    """Names of cases, or parts of names (default: all of the topics)."""
     numbers: int = 300_000
-    """In the inputs of a timed call: fewer inputs where one holds more numbers."""
+    """Numbers in the inputs of a timed call."""
     repeats: int = 15
     """Timed calls of each form, in turn. The table has the medians."""
     out: pathlib.Path | None = None
@@ -77,9 +77,9 @@ class HardCases:
     """Where to compute."""
 
     def __post_init__(self):
-        if not self.rooms or not set(self.rooms) <= set(ROOMS):
+        if not self.topics or not set(self.topics) <= set(TOPICS):
             raise ValueError(
-                f"--rooms {' '.join(self.rooms)}: choose from {', '.join(ROOMS)}"
+                f"--topics {' '.join(self.topics)}: choose from {', '.join(TOPICS)}"
             )
         if self.numbers < 1 or self.repeats < 1:
             raise ValueError(
@@ -95,7 +95,7 @@ class Outcome(NamedTuple):
 
 
 class CaseResult(NamedTuple):
-    """All that was measured of one case."""
+    """Measurements of one case."""
 
     case: Case
     test: str  # file and test that hold it
@@ -110,7 +110,7 @@ class CaseResult(NamedTuple):
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        chosen = choose(args.rooms, args.cases)
+        chosen = choose(args.topics, args.cases)
         folder = run_folder.new_run_folder(args.out, "hard_cases")
         if args.document is not None:
             report.parts(args.document)  # before the work
@@ -128,18 +128,18 @@ def main(args):
     return cli.stored(folder / "hard_cases.json")
 
 
-def choose(rooms, names) -> list[tuple[Case, str]]:
-    """Cases of the rooms whose name has one of `names` in it, with their tests."""
+def choose(topics, names) -> list[tuple[Case, str]]:
+    """Select cases of topics whose name contains one of `names`, with their tests."""
     chosen = []
-    for room in rooms:
-        cases, test = ROOMS[room]
+    for topic in topics:
+        cases, test = TOPICS[topic]
         chosen += [
             (case, f"hard_cases/{test}::test_held")
             for case in cases
             if not names or any(name in case.name for name in names)
         ]
     if not chosen:
-        known = [case.name for room in rooms for case in ROOMS[room][0]]
+        known = [case.name for topic in topics for case in TOPICS[topic][0]]
         raise ValueError(
             f"--cases {' '.join(names)}: no such case; there are {', '.join(known)}"
         )

@@ -10,16 +10,16 @@ import pytest
 from experiments.hard_cases import __main__ as hard_cases
 from experiments.hard_cases import case as hard_case
 from experiments.hard_cases import report
-from experiments.hard_cases.__main__ import ROOMS
+from experiments.hard_cases.__main__ import TOPICS
 
 DOCUMENT = pathlib.Path(__file__).parents[2] / "docs/numerics.md"
 PAGE = f"before\n{report.BEGIN}\nold\n{report.END}\nbehind\n"
 
 
 def test_names_tell_all_cases_apart():
-    names = [case.name for cases, _ in ROOMS.values() for case in cases]
+    names = [case.name for cases, _ in TOPICS.values() for case in cases]
     assert len(set(names)) == len(names)
-    for cases, _ in ROOMS.values():
+    for cases, _ in TOPICS.values():
         for case in cases:
             assert len(case.at) == len(case.inputs)
             assert {"float32", "float64"} <= set(case.bounds)
@@ -29,7 +29,7 @@ def test_the_page_has_a_row_of_every_case_and_no_other():
     table = DOCUMENT.read_text().split(report.BEGIN)[1].split(report.END)[0]
     lines = [line for line in table.splitlines() if line.startswith("| ")]
     rows = [re.split(r" (?<!\\)\| ", line[2:])[:3] for line in lines[1:]]
-    cases = [case for cases, _ in ROOMS.values() for case in cases]
+    cases = [case for cases, _ in TOPICS.values() for case in cases]
     told = [(one.name, one.breaks, f"{one.formula}; {one.switch}") for one in cases]
     assert rows == [[cell.replace("|", r"\|") for cell in row] for row in told]
 
@@ -38,7 +38,7 @@ def test_the_page_has_a_row_of_every_case_and_no_other():
 def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys):
     page, out = tmp_path / "page.md", tmp_path / "out"
     page.write_text(PAGE)
-    words = ["--rooms", "encodings", "--cases", "window", "--numbers", "10"]
+    words = ["--topics", "encodings", "--cases", "window", "--numbers", "10"]
     words += ["--repeats", "1", "--out", str(out), "--document", str(page)]
     hard_cases.main(words)
     printed = capsys.readouterr().out
@@ -56,7 +56,7 @@ def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys)
 
 
 def test_errors_are_of_the_largest_entry_and_never_forgiving():
-    case = ROOMS["encodings"][0][0]._replace(floors=(0.0, 0.0, 0.0))
+    case = TOPICS["encodings"][0][0]._replace(floors=(0.0, 0.0, 0.0))
     exact = np.array([[1.0, -4.0], [0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
     got = np.array([[1.0, -3.0], [0.0, 0.0], [0.0, 1e-9], [1.0, np.nan]])
     errors = hard_case.errors(case, got, exact, 0)
@@ -66,7 +66,7 @@ def test_errors_are_of_the_largest_entry_and_never_forgiving():
 
 
 def test_the_truth_of_a_derivative_is_that_of_the_closed_form():
-    case = ROOMS["encodings"][0][0]._replace(exact=lambda x: [x[0] ** 3 * x[1]])
+    case = TOPICS["encodings"][0][0]._replace(exact=lambda x: [x[0] ** 3 * x[1]])
     row = np.array([[2.0, 5.0]])
     np.testing.assert_allclose(hard_case.truth(case, row, 1), [[[60.0, 8.0]]])
     np.testing.assert_allclose(

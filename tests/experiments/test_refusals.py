@@ -45,7 +45,7 @@ TABLE = [
     ("export", "nowhere colmap --path sway", "--path is not for colmap, but for path"),
     ("player_speed", "nothing.html", "nothing.html: no such file"),
     ("player_speed", "nothing.html --time 2", "--time is from 0 to 1"),
-    ("hard_cases", "--rooms kitchen", "choose from rotations"),
+    ("hard_cases", "--topics kitchen", "choose from rotations"),
     ("hard_cases", "--cases nothing", "no such case; there are screw"),
     ("hard_cases", "--numbers 0", "at least 1"),
     ("hard_cases", "--document nowhere.md", "no such file, or not both"),
