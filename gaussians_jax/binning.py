@@ -47,7 +47,7 @@ class TileRects(NamedTuple):
     left: Int[Array, " gaussians"]
     top: Int[Array, " gaussians"]
     columns: Int[Array, " gaussians"]
-    count: Int[Array, " gaussians"]  # columns times rows; zero where nothing is drawn
+    count: Int[Array, " gaussians"]  # columns times rows, zero if not rendered
 
 
 class Cursor(NamedTuple):

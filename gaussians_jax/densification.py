@@ -33,7 +33,7 @@ class DefaultStrategySpec:
     """When and where Gaussians are added and removed."""
 
     refine_every: int = 100  # steps
-    refine_start_iter: int = steps(600)  # the first event; the paper waits for 500
+    refine_start_iter: int = steps(600)  # the first event (500 in the paper)
     refine_stop_iter: int = steps(15_000)
     grow_grad2d: float = 2e-4  # of the mean on the screen, in NDC units per view
     grow_scale3d: float = 0.01  # largest scale, of the scene extent
@@ -137,7 +137,7 @@ def observe(
     width, height = size
     per_ndc = jnp.asarray([width / 2, height / 2], mean2d_gradient_px.dtype)
     grad = mean2d_gradient_px * per_ndc
-    # Summed squares underflow in float32 below 1e-19; hypot does not.
+    # Summed squares underflow in float32 below 1e-19, hypot does not.
     norm = jnp.where(visible, jnp.hypot(grad[:, 0], grad[:, 1]), 0)
     radius_px = jnp.where(visible, radius_px, 0)
     rows = stats.active.shape[0]
@@ -149,7 +149,7 @@ def observe(
         if significance is not None:
             weight = weight * significance.reshape(rows, -1)
         total = jnp.sum(weight, axis=1)
-        # None that is seen, or counts: no slope.
+        # Without visible children there is no gradient.
         norm = jnp.sum(weight * norm, axis=1) / jnp.where(total > 0, total, 1)
         visible = jnp.any(visible, axis=1)
         radius_px = jnp.max(radius_px, axis=1)

@@ -236,7 +236,7 @@ def _ply_bytes(rows):
     rest = rows.sh_rest.shape[1]
     blocks = {
         ("x", "y", "z"): rows.mean,
-        ("nx", "ny", "nz"): np.zeros_like(rows.mean),  # unused; the viewers expect them
+        ("nx", "ny", "nz"): np.zeros_like(rows.mean),  # unused, but viewers expect them
         ("f_dc_0", "f_dc_1", "f_dc_2"): rows.sh_dc[:, 0],
         tuple(f"f_rest_{i}" for i in range(3 * rest)): rows.sh_rest.transpose(
             0, 2, 1
@@ -266,10 +266,10 @@ def _read_splat(path):
             "not a .splat file"
         )
     table = np.frombuffer(data, _SPLAT_ROW)
-    with np.errstate(invalid="ignore"):  # a signaling NaN; caught as broken later
+    with np.errstate(invalid="ignore"):  # a signaling NaN, refused later
         scale = table["scale"].astype(np.float64)
     bounds = np.exp(splats.LOG_SCALE_RANGE)
-    # A flat Gaussian, of scale 0, is drawn at the smallest scale; NaN stays NaN.
+    # A flat Gaussian of scale 0 gets the smallest scale. NaN stays NaN.
     log_scale = np.where(scale >= 0, np.log(np.clip(scale, *bounds)), np.nan)
     rows = Splats(
         mean=table["mean"].astype(np.float32),

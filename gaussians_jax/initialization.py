@@ -30,7 +30,7 @@ class InitSpec:
     """
 
     points: int = 100_000  # at most so many of the capture's own points
-    random: int = 10_000  # drawn in the views instead of them
+    random: int = 10_000  # sampled in the views instead
     min_points: int = 100
     extra_random: int | None = 0
     opacity: float = 0.1
@@ -226,7 +226,7 @@ def filmed_depths(capture):
     at 0.4), and a Gaussian there covers the whole image: 20 times slower steps.
     """
     depth = point_depths(capture)
-    # Points beyond the far plane are drawn, but what is filmed lies before it.
+    # Points beyond the far plane are rendered, but surfaces are in front of it.
     depth = depth[depth < capture.far]
     if not depth.size:
         return capture.near, capture.far

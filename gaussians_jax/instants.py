@@ -96,7 +96,7 @@ def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:
     opacity = jnp.clip(deformed.opacity, jnp.finfo(eps.dtype).tiny, 1 - eps)
     logit = jnp.log(opacity) - jnp.log1p(-opacity)
     smallest = math.exp(splats.LOG_SCALE_RANGE[0])
-    # A linear rule takes scales through zero, and what is drawn is their square.
+    # A linear rule makes scales negative, and rendering squares them.
     log_scale = jnp.log(jnp.maximum(jnp.abs(deformed.scale), smallest))
     kept = (deformed.opacity == trained.opacity) | ~splats.active_mask(rows)
     return rows._replace(

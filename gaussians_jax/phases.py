@@ -96,7 +96,7 @@ def update_mask(spec: AlternationSpec | None, step: Int[Array, ""] | int) -> Upd
     if spec is None:
         return UpdateMask(jnp.asarray(True), jnp.asarray(True))
     outside = (step < spec.start) | (step >= spec.stop)
-    # Before `start` the remainder is not negative either; `outside` decides there.
+    # Before `start` the remainder is not negative either, and `outside` decides.
     place = (step - spec.start) % (spec.nets + spec.rows)
     return UpdateMask(outside | (place >= spec.nets), outside | (place < spec.nets))
 

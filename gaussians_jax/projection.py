@@ -40,11 +40,11 @@ class Footprints(NamedTuple):
     placeholders in the other fields, and zero gradient.
     """
 
-    mean_px: Float[Array, "gaussians 2"]  # x right, y down; pixel centers at +0.5
+    mean_px: Float[Array, "gaussians 2"]  # x right, y down, pixel centers at +0.5
     whitening: Float[Array, "gaussians 3"]  # p 1/px, k px/px, r 1/px
     opacity: Float[Array, " gaussians"]  # compensated where antialiased
     depth: Float[Array, " gaussians"]  # z, scene units
-    extent_px: Float[Array, "gaussians 2"]  # half box of alpha >= cut; no gradient
+    extent_px: Float[Array, "gaussians 2"]  # half box of alpha >= cut, no gradient
 
     @property
     def visible(self) -> Bool[Array, " gaussians"]:
@@ -217,7 +217,7 @@ def _whiten(first, second, spec):
     whitening = jnp.stack([half * inverse, shear, half * lax.rsqrt(blurred)])
     ratio = sharp / blurred
     small = ratio < MIN_COMPENSATION_SQ
-    # sqrt has no slope at 0, so the branch not taken gets a 1.
+    # sqrt has no gradient at 0, so the unused branch gets a 1.
     compensation = jnp.where(
         small, MIN_COMPENSATION_SQ**0.5, jnp.sqrt(jnp.where(small, 1, ratio))
     )

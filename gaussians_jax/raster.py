@@ -189,7 +189,7 @@ def _cotangent(layout, residuals, cotangent):
 
 
 def _shown(state):
-    # Of the transmittance alone, whose sign says "done"; channels may be negative.
+    # Of the transmittance only, whose sign marks saturation. Channels may be negative.
     return jnp.concatenate([jnp.abs(state[:, :1]), state[:, 1:]], axis=1)
 
 

@@ -24,12 +24,12 @@ class RasterSpec:
     antialiased: bool = False  # opacity times sqrt(det before / after dilation)
     near: float = 0.01  # z-depth, scene units
     far: float = 1e10
-    tangent_margin: float = 0.3  # clamp of x/z, y/z in the Jacobian; half images
+    tangent_margin: float = 0.3  # clamp of x/z, y/z in the Jacobian, in half images
     tile: int = 8  # pixels along an edge
-    capacity: int | None = None  # (tile, Gaussian) pairs sorted at a time; None: chosen
+    capacity: int | None = None  # (tile, Gaussian) pairs per chunk; None: automatic
     batch: int | None = None  # tiles blended in lockstep; None: by backend
     chunk: int | None = None  # Gaussians blended in one step; None: by backend
-    kept_chunks: int = 4  # of sorted pairs, for the backward pass; 4 bytes a pair
+    kept_chunks: int = 4  # sorted pairs to keep for the backward pass, 4 bytes each
 
     def __post_init__(self):
         if not 0 < self.alpha_threshold < self.alpha_max < 1:

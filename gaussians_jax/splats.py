@@ -21,9 +21,11 @@ from nerfies_jax.geometry.camera import Camera
 
 PyTree = Any
 
-INACTIVE_LOGIT = -1000.0  # sigmoid and its slope underflow to 0 below -745 in float64
+INACTIVE_LOGIT = (
+    -1000.0
+)  # sigmoid and its gradient underflow to 0 below -745 in float64
 # exp(15)^2 = 1e13 and exp(-20)^2 = 4e-18 keep products of scales far from overflow and
-# from the flush to zero; raw values beyond are drawn at the bound and get no gradient.
+# from the flush to zero; raw values beyond are clamped and get no gradient.
 # An unbounded exp is inf at 89 in float32.
 LOG_SCALE_RANGE = (-20.0, 15.0)
 SH_DC = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant harmonic
@@ -46,7 +48,7 @@ class Gaussians(NamedTuple):
     """Activated Gaussians in world coordinates, ready to render."""
 
     mean: Float[Array, "gaussians 3"]
-    quaternion: Float[Array, "gaussians 4"]  # wxyz; normalized where it is used
+    quaternion: Float[Array, "gaussians 4"]  # wxyz, normalized where it is used
     scale: Float[Array, "gaussians 3"]  # standard deviations, positive
     opacity: Float[Array, " gaussians"]  # in [0, 1]
 

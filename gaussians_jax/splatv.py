@@ -28,11 +28,11 @@ from nerfies_jax.measure.image_quality import psnr, quantize
 from nerfies_jax.training.model import TrainState
 
 MAGIC = 0x674B
-TEXELS_ACROSS = 4096  # of the viewer's texture; a Gaussian is four of them in a row
-ALWAYS = 1e4  # width of the bell of what does not fade, in films: 1 - 3e-9 at its ends
-FARTHEST_CENTER = 10.0  # of a bell, in films; farther off it is no bell any more
+TEXELS_ACROSS = 4096  # of the viewer's texture, four for each Gaussian
+ALWAYS = 1e4  # width of a constant opacity, in units of the video: 1 - 3e-9 at its ends
+FARTHEST_CENTER = 10.0  # largest center of a fading opacity, in units of the video
 FAINTEST = 1e-3  # weight in the fit of motion of what cannot be seen at all
-FAINTEST_SEEN = 0.05  # opacity; what is fainter is not measured
+FAINTEST_SEEN = 0.05  # opacity; fainter Gaussians are not measured
 MEASURED = 12  # views
 MOST = 6e4  # of a number in the file, whose half floats end at 65504
 NEAREST = 0.2  # scene units: what is nearer the viewer does not draw
@@ -73,9 +73,9 @@ class Curves(NamedTuple):
 class Fit(NamedTuple):
     """Error of the curves with respect to the trained motion."""
 
-    rms: float  # of the means at all instants, of what can be seen; scene units
-    most: float  # of 99 of 100 Gaussians at their worst instant
-    psnr: float  # dB, pictures of the curves against the run's own
+    rms: float  # of the visible means at all times, scene units
+    most: float  # of 99 of 100 Gaussians at their worst time
+    psnr: float  # dB, renders of the curves against the run's own
     views: int
 
 

@@ -17,7 +17,7 @@ from gaussians_jax import splats
 from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import quaternion
 
-FADES = 1 / 512  # change of opacity that no picture of 8 bits shows
+FADES = 1 / 512  # change of opacity that is invisible in 8-bit images
 # The deformation of any choice of rows: (parameters of those rows, time) -> Gaussians.
 DeformRows = Callable[[Params, Float[Array, ""]], Gaussians]
 
@@ -32,7 +32,7 @@ class RowIndex(NamedTuple):
 class StaticDynamicSplit(NamedTuple):
     """A trained scene with moving and static Gaussians separated."""
 
-    static: Gaussians  # all rows, as they are at the middle instant
+    static: Gaussians  # all Gaussians at the middle time
     index: RowIndex
     dynamic: Params  # the parameters of the rows that move, and all networks
 

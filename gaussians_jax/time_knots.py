@@ -29,7 +29,7 @@ class Track(NamedTuple):
 
     mean: Float[Array, "knots moving 3"]  # scene units
     log_scale: Float[Array, "knots moving 3"]
-    # Unit length; of q and -q the one nearer to the knot before.
+    # Unit length, with the sign nearer to the previous knot.
     quaternion: Float[Array, "knots moving 4"]
 
 
@@ -123,7 +123,7 @@ def at(
         mean=mean,
         quaternion=jax.vmap(quaternion.normalize)(turn),
         scale=jnp.exp(log_scale),
-        # Not interpolated; merged from here only to be overwritten.
+        # Not interpolated: merged only to be overwritten.
         opacity=jnp.zeros_like(mean[:, 0]),
     )
     merged = static_rows.merge(knots.static, moved, knots.index)
@@ -223,7 +223,7 @@ def spline_weights(knots: int, time: Float[Array, ""]) -> Float[Array, " knots"]
 @jax.jit
 def _track(gaussians):
     """Convert Gaussians to table entries."""
-    # A scale that the motion took through zero is drawn by its size.
+    # A scale that the motion made negative counts by its absolute value.
     scale = jnp.clip(jnp.abs(gaussians.scale), *np.exp(splats.LOG_SCALE_RANGE).tolist())
     return Track(
         gaussians.mean,

@@ -35,10 +35,10 @@ class TrackStart(NamedTuple):
 
     position: np.ndarray  # [moving, 3] canonical, scene units
     color: np.ndarray  # [moving, 3] in [0, 1]
-    rows: Any  # of the motion, a row for each; None where it keeps none
+    rows: Any  # per-Gaussian parameters of the motion; None without any
     nets: Any  # of the motion
-    time: np.ndarray  # [moving] of the picture that each was lifted from, in films
-    followed: np.ndarray  # [moving] for how long tracks near it were, in films
+    time: np.ndarray  # [moving] time of the frame that each was unprojected from
+    followed: np.ndarray  # [moving] duration of nearby tracks, in units of the video
     resting: Resting | None = None  # what the networks were fitted to hold still
 
 

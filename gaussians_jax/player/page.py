@@ -34,10 +34,10 @@ from nerfies_jax.evaluation.representation import Player
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training.model import Model, TrainState
 
-# A larger page takes a browser seconds to open; a scene that needs more gets fewer
-# instants, as far as motion is still to be told from them.
+# A larger page takes a browser seconds to open. A scene that needs more gets fewer
+# times, as long as they still resolve the motion.
 MOST_BYTES, FEWEST_INSTANTS = 48 * 2**20, 8
-# What the page's own project() reads; the sizes that only cost time stay here.
+# Settings that the page's own project() reads.
 RASTER = (
     *("alpha_threshold", "alpha_max", "eps2d", "antialiased", "near", "far"),
     "tangent_margin",
@@ -158,7 +158,7 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
         "skew": first.skew_px,
         "center": first.principal_point_px,
         "size": capture.size,
-        # On the viewing axis, so that turning about it begins with the first picture.
+        # On the viewing axis, so that orbiting starts from the first image.
         "target": target,
     }
     return {

@@ -18,7 +18,7 @@ from nerfies_jax.geometry.camera import Camera
 
 LEAST_INSTANTS, MOST_INSTANTS = 24, 48
 MOST_VIEWS = 48  # training views that say what was seen, and in which color
-MOST_SIDE_PX = 320  # of them: larger pictures take long and say the same
+MOST_SIDE_PX = 320  # of their images: larger ones take longer with the same result
 # Pixels' worth of picture, in the view that shows most of it: what shows less is left
 # out. Built-in scene, `splats-tracked-small`, 300 steps: this
 # leaves out 436 of 10,000, and held-out frames are 56.6 dB from the model's own; 0.3
