@@ -298,7 +298,7 @@ SMALL_TINEUVOX = dataclasses.replace(
     ),
     smoothness=SmoothnessSpec(weight=1.0, until=1500),
     # Tables alone learn fast, as published (8e-2 beside 6e-4). With networks as fast a
-    # dark film, of a hand before books, became an opaque black wall before the cameras
+    # dark video, of a hand before books, became an opaque black wall before the cameras
     # within ten steps, and stayed one.
     template_rate=1.0,
     table_rate=6.0,

@@ -18,7 +18,7 @@ class SceneMetadata:
 
     near: float  # z-depth, scene units
     far: float
-    center: tuple[float, float, float]  # of the filmed volume, scene units
+    center: tuple[float, float, float]  # of the captured volume, scene units
     scale: float  # field = (scene - center) * scale
     background: tuple[float, float, float] | None  # color behind everything, if known
     times: tuple[float, ...]  # distinct times that are learned from, rising

@@ -45,7 +45,7 @@ class Surface(NamedTuple):
     # A normal in the template as one in the observation: by the transpose of the
     # Jacobian of all warps, so of another length.
     turned: Callable[[Vector], Vector]
-    outward: Callable[[], Vector]  # against the slope of the template's density
+    outward: Callable[[], Vector]  # against the gradient of the template's density
 
 
 class Look(NamedTuple):

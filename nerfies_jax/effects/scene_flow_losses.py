@@ -15,7 +15,7 @@ from nerfies_jax.radiance import compositing
 
 Scalar = Float[Array, ""]
 # Mean deviation of the depths of a batch, as a share of their median, below which they
-# count as flat: bounds the normalized depth by a thousand and its slope.
+# count as flat: bounds the normalized depth by a thousand and its gradient.
 FLATTEST = 1e-3
 # Weights below count as none: the slope of a mean in a weight is up to the values over
 # the largest weight, and float32 holds 3e38.
@@ -52,8 +52,8 @@ def weighted_mean(
       The mean, and 0 without gradient if no weight exceeds `FAINTEST`.
     """
     # Selected, not `total + eps`, which fades all weights that are small together. And
-    # of weights near one: a quotient's slope has the divisor's square, which is 0
-    # in float32 where all weights are below 1e-19, and the slope then 0 · inf.
+    # of weights near one: a quotient's gradient has the divisor's square, which is 0
+    # in float32 where all weights are below 1e-19, and the gradient then 0 · inf.
     none = jnp.max(weight) <= FAINTEST
     scaled, _ = near_one(jnp.where(none, 1, weight))
     share = jnp.where(none, 0, scaled)
@@ -195,7 +195,7 @@ def entropy(share_logit: Float[Array, "rays samples"]) -> Scalar:
     Returns:
       A scalar.
     """
-    # log_sigmoid: log(v + 1e-8) has no slope left where v is small.
+    # log_sigmoid: log(v + 1e-8) has no gradient left where v is small.
     share = jax.nn.sigmoid(share_logit)
     return -jnp.mean(share * jax.nn.log_sigmoid(share_logit))
 

@@ -22,7 +22,7 @@ from nerfies_jax.training import fit, losses
 from nerfies_jax.training.fit import Fit
 from nerfies_jax.training.model import Model, TrainState, View, in_default_precision
 
-LEVELS = 255.0  # of an 8-bit picture, the unit of the error
+LEVELS = 255.0  # of an 8-bit image, the unit of the error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +38,7 @@ class CameraFitSpec:
 
     max_steps: int = 100  # of L-BFGS
     tolerance: float = 0.01  # squared gray levels per pixel
-    # Larger pictures are halved, thirded, ...: a field would take minutes for each.
+    # Larger images are halved, thirded, ...: a field would take minutes for each.
     most_pixels: int = 5000
 
     def __post_init__(self):

@@ -22,7 +22,7 @@ from nerfies_jax.measure.metric_table import metric
 from nerfies_jax.measure.perceptual import LpipsParams, Network
 from nerfies_jax.training.model import in_default_precision
 
-# Five scales halve a picture four times, and the window of 11 must fit into the last.
+# Five scales halve an image four times, and the window of 11 must fit into the last.
 MS_SSIM_SIDE = 160  # pixels that the shorter side must exceed
 
 

@@ -19,7 +19,7 @@ from nerfies_jax.capture import images
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evaluation import figures
 
-PANEL_WIDTH = 240  # pixels at least: smaller pictures are enlarged so labels fit
+PANEL_WIDTH = 240  # pixels at least: smaller images are enlarged so labels fit
 GAP = 6  # pixels between panels
 TEXT_HEIGHT = 20
 INK, PAPER, FADED = (32, 33, 36), (255, 255, 255), (110, 113, 120)
@@ -28,7 +28,7 @@ UNKNOWN = (128, 128, 128)  # gray is in none of the color maps
 # (CC0): a run is looked at without matplotlib.
 ERROR_MAP, DEPTH_MAP = 0, 1
 # The share of depths beyond each end of the shown range; one stray splat in front of
-# the camera would otherwise turn the whole picture into one color.
+# the camera would otherwise turn the whole image into one color.
 STRAY_SHARE = 0.01
 
 

@@ -22,7 +22,7 @@ class Scored(NamedTuple):
     color: np.ndarray  # [frames, height, width, 3] float32, clipped to [0, 1]
     alpha: np.ndarray  # [frames, height, width]
     depth: np.ndarray  # [frames, height, width] z-depth, scene units
-    psnr: np.ndarray  # dB, of the 8-bit picture
+    psnr: np.ndarray  # dB, of the 8-bit image
     ssim: np.ndarray  # scikit-image's Gaussian form
 
 
@@ -30,7 +30,7 @@ class Halves(NamedTuple):
     """Metrics of right halves of frames with codes fitted to their left halves."""
 
     rows: np.ndarray  # of the capture
-    psnr: np.ndarray  # dB, of the 8-bit picture
+    psnr: np.ndarray  # dB, of the 8-bit image
     ssim: np.ndarray
 
 

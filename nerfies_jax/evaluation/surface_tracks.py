@@ -16,7 +16,7 @@ from nerfies_jax.training.model import TrainState
 
 LEAST_ALPHA = 0.5  # below it a pixel shows no surface
 # A point counts as seen up to this share of its depth behind what is drawn there: a
-# drawn depth is a mean over what is soft. In a film of a bookshelf, 250 steps trained,
+# drawn depth is a mean over what is soft. In a video of a bookshelf, 250 steps trained,
 # the depth drawn of a point differs from one frame to the next by 1 % below to 14 %
 # above its own, from the lower quartile to the upper.
 DEPTH_SLACK = 0.1
@@ -26,10 +26,10 @@ class SurfaceTracks(NamedTuple):
     """Points over training frames in the order of time, in NumPy."""
 
     positions: np.ndarray  # [points, frames, 3] scene units; the start where lost
-    # [points, frames] bool: followed, in the picture, and not behind what is drawn
+    # [points, frames] bool: followed, in the image, and not behind what is drawn
     visible: np.ndarray
     times: np.ndarray  # [frames] in [0, 1]
-    pixels: np.ndarray  # [points, frames, 2] in that frame's picture, right and down
+    pixels: np.ndarray  # [points, frames, 2] in that frame's image, right and down
     rows: np.ndarray  # [frames] of the capture
 
 

@@ -18,7 +18,7 @@ from nerfies_jax import events
 from nerfies_jax.evidence import wide_steps
 from nerfies_jax.evidence.view_set import Views
 
-# Small pictures are enlarged first: 0.06 px of median error for 0.10 at 176x132, where
+# Small images are enlarged first: 0.06 px of median error for 0.10 at 176x132, where
 # the built-in scenes' flow is known.
 ENLARGED_BELOW_PX, ENLARGED = 320, 2
 # Forward and back must meet: within half a pixel and a fiftieth of the way.
@@ -279,7 +279,7 @@ def _jumps(flow, frame):
 
 def _covers_patch(area):
     side = 2 * round(LOST_SHARE * area.shape[1] / 2) + 1
-    # Nothing lies outside: strips at the border leave the picture.
+    # Nothing lies outside: strips at the border leave the image.
     outside = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
     return cv2.erode(np.uint8(area), np.ones((side, side)), **outside).any()
 

@@ -34,7 +34,7 @@ def with_flow(capture: Capture) -> Capture:
         if len(mine) < 2:
             continue
         views = view_set.in_time_order(capture, mine)
-        # Pictures of one moment are no film: there is nothing to search twice for.
+        # Images of one moment are no video: there is nothing to search twice for.
         film = np.ptp(views.time) > 0
         span = view_set.depth_span(capture, views) if film else None
         pictures = dense_flow.leveled(views)

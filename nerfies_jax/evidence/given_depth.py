@@ -11,7 +11,7 @@ import numpy as np
 from nerfies_jax.evidence.rest_points import RestPoints
 from nerfies_jax.evidence.tracks import Tracks, pixel_of
 
-FEWEST = 12  # points at rest in a picture
+FEWEST = 12  # points at rest in an image
 ROUNDS = 8  # of reweighting
 USABLE = 0.1  # median relative miss; a depth worse than that says little
 SAME = 0.002  # of the relative miss: so much better an inverse depth must fit

@@ -25,13 +25,13 @@ from nerfies_jax.capture.given import Given, GivenFiles
 
 MOST_NUMBERS = 2_000_000_000  # of one file
 # Names of tracks and of where they are seen, which axis counts the frames where the
-# shape leaves it open, and where the first pixel has its center: TAPIR, whose pictures
+# shape leaves it open, and where the first pixel has its center: TAPIR, whose images
 # begin at 0, and CoTracker, which samples with corners aligned.
 TRACK_NAMES = (
     ("tracks", "visibles", 1, 0.5),
     ("pred_tracks", "pred_visibility", 0, 0.0),
 )
-LEAST_INSIDE = 0.5  # of what is seen must lie in the pictures
+LEAST_INSIDE = 0.5  # of what is seen must lie in the images
 SEEN = 0.5  # of a visibility between 0 and 1
 FLO_MAGIC = 202021.25  # of Middlebury's .flo
 PICTURES, DEPTHS = (".png",), (".exr", ".png", ".npy")

@@ -13,8 +13,8 @@ from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.evidence import view_set
 from nerfies_jax.evidence.view_set import Views
 
-FRAMES = 12  # that are looked from, evenly over the film
-# Pixels of pictures made small; more of larger ones.
+FRAMES = 12  # that are looked from, evenly over the video
+# Pixels of images made small; more of larger ones.
 EVERY_PX = 2
 # A pixel nearer than that to a known point shows it. `still_points` has one for every
 # second pixel of each of twelve frames, fewer where little texture tells depth.

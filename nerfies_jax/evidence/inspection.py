@@ -31,7 +31,7 @@ class Inspection:
 
     findings: tuple[Finding, ...]
     sheet: np.ndarray  # [height, width, 3] uint8
-    factor: int  # pictures were looked at this many times smaller
+    factor: int  # images were looked at this many times smaller
     seconds: float
     views: Views
     evidence: Evidence

@@ -25,7 +25,7 @@ CALM_PX = 0.75
 # Pixels that could not be tracked may still differ from the static scene: "no" needs a
 # small mask. Static videos have up to 0.8 % (`static` at 112x84 and 40 frames).
 MASKED_FOR_NO = 0.01
-# And nearly all of the textured pixels carried on, in films of some length.
+# And nearly all of the textured pixels carried on, in videos of some length.
 CARRIED_FOR_NO, MIN_FOR_NO = 0.8, 9
 
 

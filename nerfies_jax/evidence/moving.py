@@ -12,8 +12,8 @@ from nerfies_jax.evidence.view_set import Views
 
 # Half a pixel off a point at rest counts as half certain.
 HALF_CERTAIN_PX, STEEPNESS = 0.5, 3.0
-# Cameras of real films are off by a pixel themselves: at least so many times what the
-# stillest quarter of the tracks is off. Without it 21 % of a film of a hand before
+# Cameras of real videos are off by a pixel themselves: at least so many times what the
+# stillest quarter of the tracks is off. Without it 21 % of a video of a hand before
 # books counts as moving, with it 7 %: the hand.
 STILLEST, OVER_NOISE = 0.25, 3.0
 # Tracks near each other in shared frames move alike.

@@ -19,11 +19,11 @@ from nerfies_jax.evidence.view_set import Views
 from nerfies_jax.geometry.rays import across_ray
 
 # On squared acceleration, in units per frame squared, beside squared distances to rays:
-# the least, and the most of a film of many frames in which little happens from one to
+# the least, and the most of a video of many frames in which little happens from one to
 # the next. From 1 to 30 errors are the same in built-in scenes of 60 frames (0.6 %); at
 # five times the frames 10 gives 4 %, 1,000 and more give 0.6 % again.
 LEAST_PENALTY, MOST_PENALTY = 10.0, 1e5
-TRIED = 300  # tracks, by which a film's penalty is chosen
+TRIED = 300  # tracks, by which a video's penalty is chosen
 # The depth around is right but for this factor. With `TRACK_PX` it weighs 1e-5 of a ray
 # at a focal length of 200 px: enough for things that drive past, and built-in scenes
 # keep their errors.
@@ -43,7 +43,7 @@ class Paths(NamedTuple):
     )  # [tracks, frames, 3] scene units; NaN before and after a track
     known: np.ndarray  # [tracks, frames] bool: seen there, and in front of the camera
     depth: np.ndarray  # [tracks, frames] z-depth; NaN before and after a track
-    # [tracks]: deviation of a common factor of the depths that the film alone leaves;
+    # [tracks]: deviation of a common factor of the depths that the video alone leaves;
     # above about 0.3 the depths are those of what stands around.
     depth_deviation: np.ndarray
 

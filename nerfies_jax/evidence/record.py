@@ -49,12 +49,12 @@ from nerfies_jax.evidence.watch import (
     Watch,
 )
 
-# A path has as many frames at least, and a film as many; fewer say nothing of motion.
+# A path has as many frames at least, and a video as many; fewer say nothing of motion.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
 MOVES = 0.5  # score from which a track counts as moving
 MOST_PATHS = 1500
 MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between them
-# Where less of the pictures can be carried to the next frame, tracks are chance: a
+# Where less of the images can be carried to the next frame, tracks are chance: a
 # camera that jumps.
 LEAST_CARRIED = 0.4
 # Shares of the budget after which there is none left for a part.
@@ -101,7 +101,7 @@ def _gathered(capture, use_depths, watch):
     pictures = dense_flow.leveled(views)
     flow = taken.flow(given, views)
     if flow is None:
-        # Pictures of one moment are no film: there is nothing to search twice for.
+        # Images of one moment are no video: there is nothing to search twice for.
         film = np.ptp(views.time) > 0
         span = view_set.depth_span(capture, views) if film else None
         flow = _flow(views, pictures, span, watch)

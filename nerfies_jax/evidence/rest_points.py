@@ -109,7 +109,7 @@ def miss(rest: RestPoints) -> np.ndarray:
     Returns:
       Errors in pixels, [tracks].
     """
-    # NumPy's nanquantile takes each row by itself: 2 s of a film of 60 frames.
+    # NumPy's nanquantile takes each row by itself: 2 s of a video of 60 frames.
     order = np.sort(rest.residual, axis=1)  # NaN come last
     place = QUANTILE * (np.isfinite(rest.residual).sum(1) - 1)
     low = np.maximum(np.floor(place).astype(int), 0)

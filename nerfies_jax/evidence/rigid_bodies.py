@@ -20,7 +20,7 @@ from nerfies_jax.evidence.view_set import Views
 GROUPS = 12
 FEWEST = 20  # tracks of a body
 MOST = 300  # tracks that are adjusted; the others are placed afterwards
-# Frames in which a thing is adjusted: of longer films every second, every third, ...;
+# Frames in which a thing is adjusted: of longer videos every second, every third, ...;
 # its work grows with the cube of them.
 MOST_FRAMES = 80
 LEAST_SHARE = 0.5  # of a group's tracks that a body must explain

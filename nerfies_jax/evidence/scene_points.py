@@ -19,12 +19,12 @@ from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.evidence.still_points import CENTERS, REACH
 from nerfies_jax.evidence.view_set import MIN_POINTS, Views
 
-CELLS = (8, 6)  # across and down: a picture is covered where a cell holds a point
+CELLS = (8, 6)  # across and down: an image is covered where a cell holds a point
 COVERED = 0.5  # of the cells that show anything
 # A point that a following frame's flow misses by so much is not where it should be.
-# Pixels of pictures made small; more of larger ones.
+# Pixels of images made small; more of larger ones.
 AGREES_PX, AGREES_DEVIATIONS = 3.0, 4.0
-LEAST_FOLLOWED = 4  # frames that a point is followed to; fewer in shorter films
+LEAST_FOLLOWED = 4  # frames that a point is followed to; fewer in shorter videos
 LEAST_MOVING = 0.005  # of a frame's pixels: still scenes have up to 0.4 % marked
 DEPTH_KNOWN, DEPTH_AGREES = 0.05, 0.2  # shares of a depth: its deviation, its bound
 STILL_SHARE = 0.8  # of the points that can be checked

@@ -20,7 +20,7 @@ BLUR_PX = 0.7
 CELL = 2  # pixels of a side that share a depth
 NEARER = 0.9  # of the depth of a cell: a neighbor so near hides what shows through
 HIDDEN = 0.93  # of the depth: in the other frame something nearer stands there
-# Difference that speaks neither way, as a share of the film's spread of colors, and of
+# Difference that speaks neither way, as a share of the video's spread of colors, and of
 # its slope: places are not exact.
 EVEN, EVEN_SLOPE = 0.5, 0.25
 STEEPNESS, MOST = 2.0, 3.0  # of the logarithm of odds

@@ -12,7 +12,7 @@ from nerfies_jax.evidence.watch import PARTS
 
 # Above it a path's depth is that of what stands around it; half of it is a good depth.
 UNCERTAIN = 0.3
-# Deviation of the depth of points at rest, as a share: the film has no parallax.
+# Deviation of the depth of points at rest, as a share: the video has no parallax.
 NO_PARALLAX = 0.3
 EXPLAINED = 0.01  # of the typical distance: a rigid group's paths are its motion
 

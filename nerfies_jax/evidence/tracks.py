@@ -10,8 +10,8 @@ from nerfies_jax.evidence.dense_flow import NeighborFlow
 from nerfies_jax.evidence.view_set import Views
 
 # Starts: every so many pixels in every third frame, about 10,000 tracks of 60 frames of
-# 176x132; larger pictures get as many.
-GRID_STEPS, EVERY_FRAMES = 29, 3  # across the picture's width
+# 176x132; larger images get as many.
+GRID_STEPS, EVERY_FRAMES = 29, 3  # across the image's width
 MOST_PLACES = 30_000_000  # tracks times frames, about 30 bytes each
 SHORTEST = 8  # frames: fewer say little of how a point moves
 # Flow's errors add up along a track. Each point is looked up again in the frame where

@@ -20,8 +20,8 @@ from nerfies_jax.evidence.record import Evidence
 from nerfies_jax.evidence.view_set import Views
 
 LOST_PX, LOST_SHARE = 1.0, 0.1  # forward and back must meet, of the way
-LOST_COLOR = 0.1  # half the contrast of a picture whose deviation is a fifth
-OPENED_SHARE = 3 / 176  # of the picture's width: no strips
+LOST_COLOR = 0.1  # half the contrast of an image whose deviation is a fifth
+OPENED_SHARE = 3 / 176  # of the image's width: no strips
 PATCH = 5  # pixels to each side
 REACH_SHARES = (0.05, 0.15)  # of the width: how far what was lost is looked for
 AROUND = 3  # pairs before and after: what jumps stands out among them
@@ -33,7 +33,7 @@ GONE_SHARE = 0.03
 MIN_TIMES = 2  # it came and it went
 # Pairs of frames that carry less show other things to begin with, as photographs do and
 # the last and first of cameras that take turns: they say nothing, and where more than
-# so many are like that, neither does the film.
+# so many are like that, neither does the video.
 LEAST_CARRIED, MOST_APART = 0.4, 0.1
 LOCAL_PX = 12  # deviation of the local mean
 
@@ -194,7 +194,7 @@ def _lost(views, index, picture, target, there, back):
     gap = np.linalg.norm(there.flow + led_back, axis=-1)
     open_end = gap > LOST_PX + LOST_SHARE * np.linalg.norm(there.flow, axis=-1)
     changed = cv2.GaussianBlur(np.abs(picture - color), (0, 0), 1.5) > LOST_COLOR
-    # Beyond the edge of the other picture under the common shift, and the patch's own.
+    # Beyond the edge of the other image under the common shift, and the patch's own.
     # Near objects move more than the rest, and leave the image where the rest stays.
     rim = PATCH + there.reach
     common = grid + there.shift
@@ -215,5 +215,5 @@ def _found(picture, target, line, column, shift, reach):
     low = [max(0, at - span) for at in middle]
     window = target[low[0] : middle[0] + span + 1, low[1] : middle[1] + span + 1]
     if min(window.shape) < 2 * PATCH + 1:
-        return True  # out of the picture: nothing to be said
+        return True  # out of the image: nothing to be said
     return bool(skimage.feature.match_template(window, patch).max() > ALIKE)

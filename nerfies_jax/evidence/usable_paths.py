@@ -13,7 +13,7 @@ from nerfies_jax.training.track_start import TrackStartSpec
 
 LEAST_SEEN = 6  # frames in which a path is known
 LEAST_PATHS = 12
-LEAST_MOVING = 0.005  # of the pixels: films of still scenes have up to 0.4 % marked
+LEAST_MOVING = 0.005  # of the pixels: videos of still scenes have up to 0.4 % marked
 MARKED = 0.01  # of the pixels: from here on something moves, followed or not
 
 

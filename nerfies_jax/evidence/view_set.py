@@ -9,9 +9,9 @@ import scipy.ndimage as nd
 
 from nerfies_jax.capture.capture import Capture
 
-LONGEST_SIDE_PX = 256  # of pictures in which what need not be sharp is looked for
+LONGEST_SIDE_PX = 256  # of images in which what need not be sharp is looked for
 PLAIN_SHARE = 0.9  # of the border's pixels: then what lies behind has one color
-PLAIN_LEVELS = 3  # gray levels of 255: JPEG and rounding, not a picture
+PLAIN_LEVELS = 3  # gray levels of 255: JPEG and rounding, not an image
 MIN_POINTS = 300  # that say where the scene is
 MOST_POINTS = 4000  # that are looked at
 OUTSIDE = 0.02  # share of points on either side taken for outliers
@@ -337,7 +337,7 @@ def _textured(gray):
     )
     half = (xx + yy) / 2
     least = half - np.sqrt(np.maximum(half**2 - (xx * yy - xy**2), 0))
-    # Immerkaer 1996: the Laplacian of a picture that has no curvature is noise alone.
+    # Immerkaer 1996: the Laplacian of an image that has no curvature is noise alone.
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
     # Its lower quarter (0.3186 deviations): where there is least detail.
     noise = np.quantile(np.abs(nd.convolve(gray, mask)), 0.25) / (6 * 0.3186)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from nerfies_jax import events
 
-# Films of 100 frames of 480x270 take 20 s on one core, and up to a minute and a half
+# Videos of 100 frames of 480x270 take 20 s on one core, and up to a minute and a half
 # where most steps are wide.
 ENOUGH_WORK = 600.0
 

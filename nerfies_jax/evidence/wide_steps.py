@@ -20,7 +20,7 @@ from nerfies_jax.evidence.view_set import Views
 WIDE_SHARE = 0.03
 MOST_TURN_RAD = 0.8  # between viewing axes: then hardly anything looks alike
 # From one plane to the next, of the width, and how many at most. Twice as far apart and
-# three at most, that film keeps 5 % marked; with six it has 0.8 %. Groups of features
+# three at most, that video keeps 5 % marked; with six it has 0.8 %. Groups of features
 # that a similarity takes to the next frame (SIFT, RANSAC) are no better to begin from:
 # of every sixth frame of `fast` 79 % of the moving points are lost with and without.
 STEP_SHARE, MOST_PLANES = 0.03, 6
@@ -101,7 +101,7 @@ def plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray:
     pixel, ahead = view_set.project(views, other, point.reshape(-1, 3))
     moved = pixel.reshape(height, width, 2) - np.stack([x, y], -1)
     behind = (ahead <= 0).reshape(height, width)
-    # A guess out of the picture is as good as any.
+    # A guess out of the image is as good as any.
     return np.where(behind[..., None], 0, np.clip(moved, -width, width)).astype(
         np.float32
     )

@@ -85,7 +85,7 @@ def depth_errors(
     error = depth - truth
     right = (depth < DELTA * truth) & (truth < DELTA * depth)
     error_sq = _mean(error**2, known)
-    nonzero = error_sq > 0  # the root has no slope at 0
+    nonzero = error_sq > 0  # the root has no gradient at 0
     root = jnp.sqrt(jnp.where(nonzero, error_sq, 1.0))
     return DepthErrors(
         abs_rel=_mean(jnp.abs(error) / truth, known),
@@ -226,7 +226,7 @@ def _distance(a, b, where):
     )
     finite = jnp.all(jnp.isfinite(difference), axis=-1)
     squares = jnp.sum(jnp.where(finite[..., None], difference, 0.0) ** 2, axis=-1)
-    apart = squares > 0  # the root has no slope at 0
+    apart = squares > 0  # the root has no gradient at 0
     distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, squares, 1.0)), 0.0)
     return jnp.where(finite, distance, jnp.inf)
 

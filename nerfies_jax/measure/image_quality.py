@@ -103,7 +103,7 @@ def masked_psnr(
     _refuse_stacks(image)
     mask = mask[..., None]
     image, truth = widened(image), widened(truth)
-    # Both pictures are emptied before the difference: NaN * 0 is NaN, and so is the
+    # Both images are emptied before the difference: NaN * 0 is NaN, and so is the
     # gradient of a `where` whose other branch is NaN.
     error = jnp.where(mask, image, 0.0) - jnp.where(mask, truth, 0.0)
     count = jnp.sum(mask).astype(image.dtype) * image.shape[-1]
@@ -180,7 +180,7 @@ def ms_ssim(
         luminance, contrast = _terms(image, truth, _window_mean)
         last = scale == scales - 1
         term = jnp.mean(luminance * contrast if last else contrast, axis=(0, 1))
-        # A negative correlation has no real power, and the slope of x^0.04 at 0 is
+        # A negative correlation has no real power, and the gradient of x^0.04 at 0 is
         # infinite: such a scale scores 0 and passes no gradient.
         similar = term > 0
         score = score * jnp.where(similar, jnp.where(similar, term, 1.0) ** weight, 0.0)

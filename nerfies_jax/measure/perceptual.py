@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from nerfies_jax.geometry.precision import exact_einsum, widened
 from nerfies_jax.measure import weight_files
 
-# The reference's ImageNet statistics, moved to pictures in [-1, 1].
+# The reference's ImageNet statistics, moved to images in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 # The reference adds 1e-10 to the length of a feature vector; a pixel where every
@@ -259,7 +259,7 @@ def _stage_distances(params, network, image, truth, scaling):
 
 def _unit(x):
     length_sq = jnp.sum(x**2, axis=-1, keepdims=True)
-    # sqrt has no slope at 0, where every channel of a pixel is dead.
+    # sqrt has no gradient at 0, where every channel of a pixel is dead.
     alive = length_sq > 0
     length = jnp.where(alive, jnp.sqrt(jnp.where(alive, length_sq, 1.0)), 0.0)
     return x / (length + LENGTH_OFFSET)

@@ -32,6 +32,6 @@ def cubic(distance: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     # In |x|³ the sign would have no second derivative at 0; x²|x| has it.
     near = jnp.where(inside, distance, 0)
     middle = 2 / 3 - near**2 + near**2 * jnp.abs(near) / 2
-    # Beyond 2 nothing, whose slope must be finite where the distance is not.
+    # Beyond 2 nothing, whose gradient must be finite where the distance is not.
     left = jnp.maximum(2 - size, 0)
     return jnp.where(inside, middle, left**3 / 6)

@@ -74,13 +74,13 @@ def bits(values: Numbers, mean: Numbers, log_scale: Numbers, step: Numbers) -> N
       Balle et al. 2018, arXiv:1802.01436, equation 11, which prints the probability.
     """
     scale = jnp.exp(jnp.clip(log_scale, *LOG_RANGE))
-    # By the size of the distance, whose slope at zero is zero as the answer's is.
+    # By the size of the distance, whose gradient at zero is zero as the answer's is.
     away = (values - mean) / scale
     away, wide = away * jnp.sign(away), step / scale
     # Between two ends that all but meet float32 sees nothing: there the law is a curve.
     flat = wide < FLAT
     held = jnp.where(flat, 1.0, wide)
-    # Farther away the square of the distance has no digits left for a slope.
+    # Farther away the square of the distance has no digits left for a gradient.
     beyond = jnp.maximum(away - held / 2 - FARTHEST, 0)
     away = away - beyond
     near = jax.scipy.special.log_ndtr(held / 2 - away)

@@ -217,7 +217,7 @@ def _slope_between_vertices(cells, stride, primals, tangents):
     #   their slope by tables       514       499
     #   by places                  1610       386
     #   by both                    2124       651
-    # An operation of its own over all points, its slopes by tables scattered corner
+    # An operation of its own over all points, its gradients by tables scattered corner
     # after corner, takes 195 for 480 of these by itself; whole steps and frames of
     # `d-nerf-grid-small` then take a tenth more.
     moved = [not isinstance(tangent, SymbolicZero) for tangent in tangents]
@@ -354,7 +354,7 @@ def total_variation(
     grid = table.reshape(vertices, vertices, vertices, -1)
     # XLA:CPU adds floats to one sum one after the other, and squares them at that pace:
     # the squares of 97^3 rows of four take 35 ms, brought to one shape and summed by a
-    # product 3 (27 and 14 with the slope).
+    # product 3 (27 and 14 with the gradient).
     squares = sum(_squared_differences(grid, axis) for axis in range(3))
     lines = squares.reshape(vertices**2, -1)
     total = jnp.sum(exact_product(lines, jnp.ones(lines.shape[1], lines.dtype)))

@@ -471,7 +471,7 @@ def hold(
     distance = jnp.where(outside, jnp.abs(offset) - half, 0)
     # Its slope is (1 + 3 e) (1 + 2 e + 3 e^2)^(-3/2), which nothing cancels in; that of
     # e / sqrt(1 + e^2), a difference of equals, is noise in float32 from e = 3000. Far
-    # out in 1 / e: the square of e would overflow, and the slope be 0 from 1e15 on.
+    # out in 1 / e: the square of e would overflow, and the gradient be 0 from 1e15 on.
     far = distance > margin
     excess = jnp.where(far, 0, distance) / margin
     inverse = margin / jnp.where(far, distance, margin)
@@ -499,7 +499,7 @@ def _sum_over_inputs(spec, index, layer, kernels, inputs):
     """A layer without its bias."""
     dtype = inputs.dtype
     # One standard deviation beyond the end the outermost Gaussian is steepest. The
-    # last B-spline has its center one interval beyond: all slopes are there still.
+    # last B-spline has its center one interval beyond: all gradients are there still.
     margin = width(spec, index)
     if spec.basis == "rbf":
         margin /= math.sqrt(2)

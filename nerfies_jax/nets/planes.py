@@ -341,7 +341,7 @@ def l1_time_planes(
       K-Planes, arXiv:2301.10241, equation 5 (L1).
     """
     off = plane - 1
-    # Not `abs`, whose slope at zero is one: planes start at one, and all that rests
+    # Not `abs`, whose gradient at zero is one: planes start at one, and all that rests
     # would be pushed one way.
     return jnp.mean(off * jnp.sign(off))
 

@@ -19,7 +19,7 @@ from nerfies_jax.geometry.precision import at_least_float32
 # density of a trained field is opaque over it, and its square is finite in float32.
 AT_INFINITY = 1e10
 # Opacity below which a ray counts as going on to its far end: a quarter of a level of
-# an 8-bit picture. Bounds the slope of the expected distance by 1e3 of the ray's span.
+# an 8-bit image. Bounds the gradient of the expected distance by 1e3 of the ray's span.
 EMPTY_BELOW = 1e-3
 # Opacity up to which `thinned` takes log1p, and above it a sum of logarithms. Not 1/2:
 # from 0.3 to 0.42 XLA's log1p of float64 is off by up to 120 eps on the CPU, and by

@@ -15,9 +15,9 @@ STILL_SECONDS = 30.0  # for what scored frames show at other moments
 STILL_PIXELS = 10_000_000  # of these frames together, 24 bytes each
 LEAST_STILL, LEAST_MOMENTS, MOST_MOMENTS = 2, 4, 16
 FILM_SECONDS = 45.0  # of rendering
-FILM_LENGTH = 4.0  # seconds that the film plays
+FILM_LENGTH = 4.0  # seconds that the video plays
 MOST_FILMED, LEAST_FILMED = 96, 24
-LEAST_SIDE = 32  # pixels: a film is not made smaller than this
+LEAST_SIDE = 32  # pixels: a video is not made smaller than this
 
 
 class Evaluations(NamedTuple):

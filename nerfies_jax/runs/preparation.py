@@ -43,7 +43,7 @@ from nerfies_jax.training import specs
 # Masks are of a pinhole and features lie beside edges: this share of the longer side
 # is masked around what moves as well.
 RIM = 0.01
-# Cameras of the second pass are kept where they place so many of the first's pictures.
+# Cameras of the second pass are kept where they place so many of the first's images.
 AS_MANY = 0.9
 
 Tell = Callable[[str], None]
@@ -137,7 +137,7 @@ def _named(scratch, source, out):
         yield
     except CaptureError as error:
         hidden = re.escape(str(scratch.resolve()))
-        # Its pictures by name, whatever else as the whole.
+        # Its images by name, whatever else as the whole.
         inside = f"{hidden}{re.escape(os.sep)}(images|[^:]*)"
         named = out if "cannot be written" in str(error) else source
         said = re.sub(inside, lambda _: str(named), str(error))
@@ -163,7 +163,7 @@ def _solve(scratch, taken, how, tell) -> Solved:
     if how.masks is not None:
         poses = run_sfm(pictures, scratch / "only", given, spec)
         return Solved(poses, True, tuple(poses.lines()))
-    # Coarse first: what moves has most of the fine features of some pictures.
+    # Coarse first: what moves has most of the fine features of some images.
     coarse = spec if how.passes == 1 else dataclasses.replace(spec, first_octave=0)
     try:
         first = run_sfm(pictures, scratch / "first", None, coarse)

@@ -13,7 +13,7 @@ from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.capture.npz_files import read_arrays
 
 KEPT = "capture.npz"
-BLOCKS = 8  # a picture is kept as the means of so many blocks a side
+BLOCKS = 8  # an image is kept as the means of so many blocks a side
 LEVELS = 3.0  # of 255, between the means of a block
 TOLERANCE = 1e-3  # of cameras, times and bounds: relative, and in their own units
 

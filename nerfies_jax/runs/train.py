@@ -40,7 +40,7 @@ class Trained(NamedTuple):
 
     result: FitResult
     renderer: Renderer
-    draw: Draw  # the same, of the frames as they were filmed
+    draw: Draw  # the same, of the frames as they were captured
     watched: np.ndarray  # rows of the held-out frames that its curve is of
 
 

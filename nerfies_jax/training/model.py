@@ -133,7 +133,7 @@ class Model(NamedTuple):
     # Subset of "depths", "points", "flow" and "moving" that it reads if available.
     required_data: frozenset[str] = frozenset()
     stages: Stages | None = None  # where rendering has parts worth keeping
-    surveyed: Surveyed | None = None  # where a survey makes pictures quicker
+    surveyed: Surveyed | None = None  # where a survey makes images quicker
     # Faster form of `init` with the same structure, which a checkpoint is read into.
     example: Callable[[Any, Any], TrainState] | None = None
     devices: int = 1  # on which `step` works, by `data_parallel`
