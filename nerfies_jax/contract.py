@@ -76,7 +76,7 @@ def checked(
     Args:
       function: The function. Its arrays are annotated with jaxtyping types; arguments
         with other annotations pass unchecked. NamedTuples are checked field by field.
-      broadcast: Whether the function is written for one item and shall map over leading
+      broadcast: True if the function is written for one item and shall map over leading
         axes. Each array argument may then have any number of them, and those of all
         arguments broadcast. Without any the function is called as it is.
       images: Names of arguments that are images. uint8 and uint16 images are divided by

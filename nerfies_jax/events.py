@@ -90,7 +90,7 @@ def stage(name: str, total: int | None = None, done: int = 0) -> Iterator[Stage]
     and one every ten seconds after that.
 
     Args:
-      name: What is done, as `structure from motion`.
+      name: Name for the user, such as `structure from motion`.
       total: Number of items, or None for a stage without a count.
       done: Number of items that were finished before.
 

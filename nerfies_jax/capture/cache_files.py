@@ -39,7 +39,7 @@ def read(
     Args:
       path: The file or folder.
       load: Reads it. Whatever it raises means that the file is of no use.
-      aside: Whether to rename a file of no use to NAME.damaged, because it holds more
+      aside: True to rename a file of no use to NAME.damaged, because it holds more
         than what is made again now.
 
     Returns:

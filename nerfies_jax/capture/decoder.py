@@ -34,7 +34,7 @@ class DecoderError(FileError):
     """Defect of a file as the child reported it, or the way in which the child ended.
 
     Attributes:
-      has_advice: Whether the message says what to do, and lacks only the path.
+      has_advice: True if the message names the remedy, and lacks only the path.
     """
 
     has_advice = False

@@ -16,14 +16,14 @@ def read(path: str, header_only: bool) -> tuple[dict[str, Any], dict[str, np.nda
 
     Args:
       path: The file.
-      header_only: Whether to leave out the pixels.
+      header_only: True to leave out the pixels.
 
     Returns:
       Origin of the data window, size of the display window, and how many numbers there
       are; and the channels [height, width].
 
     Raises:
-      FileError: What cannot be used, and the way out, without the path.
+      FileError: If the file cannot be used, with the remedy but without the path.
     """
     origin, (width, height), display_size, count = _windows(path)
     about = {

@@ -306,8 +306,8 @@ def read_masks(
     Args:
         paths: One for each frame, at least one of them; None where there is no file.
         size: Width and height of the shrunk images.
-        shrink_by: How many pixels of the masks a pixel of the result has, by side.
-        black: What black pixels are, for notes and errors: "not observed", "moving".
+        shrink_by: Integer reduction of the masks.
+        black: Meaning of black pixels, for messages: "not observed" or "moving".
 
     Returns:
         The share of white in each block, float32 [frames, height, width], 1 where there

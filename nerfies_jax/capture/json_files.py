@@ -307,7 +307,7 @@ def replaced_folder(
 
     Args:
       path: The folder. It may be absent or empty.
-      overwrite: Whether a folder with files may be replaced.
+      overwrite: True if a folder with files may be replaced.
       replaceable: Files of the earlier folder that may be deleted, by their paths
         relative to it. Any other is refused before the block begins. By default those
         that have a like in the new folder, up to the numbers in their names, which is

@@ -128,7 +128,7 @@ def cameras_of(poses: Poses, placed: Placement, size: tuple[int, int]) -> Camera
 
     Args:
       poses: The cameras, in world units and full-size pixels.
-      placed: How the world becomes the scene.
+      placed: Placement of the world in the scene.
       size: Width and height of the images.
 
     Returns:

@@ -61,7 +61,7 @@ def read_mask(
 
     Args:
         path: An image of any kind that `images` reads.
-        encoding: How the set says white; by default, that of this file alone.
+        encoding: Encoding of the set. By default, that of this file alone.
         orientation: "refuse" a mask that EXIF turns, or turn it "upright".
 
     Returns:

@@ -232,7 +232,7 @@ def write_nerfstudio(
       path: The file.
       planned: The cameras.
       rate: Frames per second.
-      overwrite: Whether to replace an existing file.
+      overwrite: True to replace an existing file.
       keyframes: Those that the path passes through, to edit it later.
     """
     refuse_existing(path, overwrite)

@@ -40,7 +40,7 @@ def linear_call(
         calls share a compiled program.
       transpose: Takes a cotangent of the result in place of `argument`, and returns the
         cotangent of `argument`.
-      settings: What both functions need besides arrays.
+      settings: Static argument of both functions.
       residuals: Arrays in which the functions need not be linear.
       argument: Array in which they are.
 

@@ -142,8 +142,8 @@ def positional_encoding(
       num_frequencies: Number of frequency bands, 1, 2, 4, ... in that order, 0 to 24.
       window: Weight of each band, [..., num_frequencies], as `coarse_to_fine_window`
         makes them. None leaves all bands on. The coordinates are not weighed.
-      include_input: Whether the coordinates themselves come first.
-      times_pi: Whether frequencies are multiplied by pi, as in the paper of NeRF. The
+      include_input: True to put the coordinates themselves first.
+      times_pi: True to multiply frequencies by pi, as in the paper of NeRF. The
         code of NeRF and Nerfies leaves it out.
 
     Returns:
