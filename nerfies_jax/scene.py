@@ -241,11 +241,21 @@ def descend(
 def learning_rates(
     spec: RadianceScene, effects: tuple[Effect, ...], params: PyTree, step: Array
 ) -> dict[str, PyTree]:
-    """Of each part of the parameters: the effect's own, or that of the schedule.
+    """Compute the learning rate of each part of the parameters.
 
-    A warp that starts from tracks, and the codes that it reads, begin with a share, as
-    does a scene flow with a trunk of its own where there is no warp to fit. A medium on
-    tables learns at the rate of the template.
+    It is the effect's own, or that of the schedule. A warp that is initialized from
+    tracks, and the codes that it reads, begin with a share of it, as does a scene flow
+    with a trunk of its own if there is no warp to fit. A medium on tables has the rate
+    of the template.
+
+    Args:
+      spec: The scene.
+      effects: Its effects.
+      params: Its parameters.
+      step: Number of completed steps.
+
+    Returns:
+      Rates, a prefix of the parameters.
     """
     own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
     common = schedules.log_linear(
@@ -398,7 +408,15 @@ def _color_terms(
 
 
 def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
-    """Roughly the memory of the first state and step; host side, nothing allocated."""
+    """Estimate the memory of the first state and step, without allocating anything.
+
+    Args:
+      spec: The scene.
+      capture: The capture.
+
+    Returns:
+      Number of bytes.
+    """
     plan = spec.sampling
     last = plan.coarse if plan.fine == 0 else plan.union * plan.coarse + plan.fine
     samples = last if plan.fine == 0 else plan.coarse + last

@@ -79,7 +79,7 @@ class SamplingSpec:
 
 @dataclasses.dataclass(frozen=True)
 class RadianceScene:
-    """Which field and how it is trained; `None` for an effect: it is not there."""
+    """Settings of a radiance field and of its training. An effect of None is absent."""
 
     steps: int
     template: TemplateSpec = TemplateSpec()

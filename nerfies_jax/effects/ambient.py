@@ -30,16 +30,16 @@ HEAD_DEVIATION = 1e-5
 
 @dataclasses.dataclass(frozen=True)
 class AmbientSpec:
-    """Form of the slice; the defaults are HyperNeRF's (its section 5 and code).
+    """Settings of the slicing surface. The defaults are those of HyperNeRF.
 
-    `bent`: a network of the point, encoded by `position` with all bands open, and of
-    the frame's code in `table`, which the warp shares. `plane`: the ambient point is a
-    code of `dims` numbers of the frame itself, from its own table "ambient". (Under the
-    same name the published presets take the code of the warp, eight numbers.)
+    `kind="bent"` is a network of the point, encoded by `position` with all bands open,
+    and of the frame's code in `table`, which the warp shares. `kind="plane"` has a code
+    of `dims` numbers for each frame, from its own table "ambient". (Under the same name
+    the published presets take the code of the warp, eight numbers.)
 
-    The template reads the ambient point encoded by `encoding`, whose bands are shut for
-    `closed_steps` and open over the next `anneal_steps`. Without identity the template
-    has no ambient dimensions until then. `guides` are as those of the warp.
+    The template reads the ambient coordinates encoded by `encoding`, whose bands are
+    closed for `closed_steps` and open over the next `anneal_steps`. Without identity
+    the template has no ambient dimensions until then. `guides` are those of the warp.
     """
 
     kind: str = "bent"

@@ -16,7 +16,10 @@ from nerfies_jax.training.effects import APPEARANCE, Effect, Table
 
 @dataclasses.dataclass(frozen=True)
 class AppearanceSpec:
-    """Width of the code: 8 in Nerfies, 48 in NeRF-W; `table` names where it lives."""
+    """Settings of the appearance codes, of width 8 in Nerfies and 48 in NeRF-W.
+
+    `table` is the name of their table.
+    """
 
     width: int = 8
     table: str = "appearance"

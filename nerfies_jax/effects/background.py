@@ -17,14 +17,15 @@ from nerfies_jax.training.effects import Effect, PenaltyContext, Term
 
 @dataclasses.dataclass(frozen=True)
 class BackgroundSpec:
-    """How many points a step looks at, how they are jittered, and what moving costs.
+    """Settings of the background regularization: number and noise of points, and its
+    cost.
 
-    Each of a step's micro-batches draws so many.
+    Each of a step's micro-batches draws as many `points`.
 
     `noise` (standard deviation) and `width` are in units of the field, whose box is the
-    filmed volume: the official code's scenes are scaled to fill one of diagonal one.
-    `width` is the displacement at which ρ leaves the parabola. The official scaling is
-    the default: its weight of one is 1e-3 of what the paper's ρ (`losses`) would say.
+    captured volume. The official code's scenes are scaled to fill one of diagonal one.
+    `width` is the displacement at which ρ leaves the parabola. The official `scaling`
+    is the default. Its `weight` of one is 1e-3 of that of the paper's ρ (`losses`).
 
     A scene of a capture without static points is refused when it is built.
     """

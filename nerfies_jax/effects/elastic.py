@@ -25,24 +25,24 @@ Matrix = Float[Array, "3 3"]
 
 @dataclasses.dataclass(frozen=True)
 class ElasticSpec:
-    """Strength, form and sampling of the penalty, on the coarse samples.
+    """Settings of the elastic regularization: strength, form and sampling.
 
-    `weight` holds for `hold_steps` and then falls along a cosine to `last_weight` over
-    `decay_steps` (None: it stays). The first official preset has 1e-3 throughout, the
-    others 1e-2 for 50_000 steps and 100_000 down to 1e-8.
+    It is evaluated on the coarse samples. `weight` is constant for `hold_steps` and
+    then falls along a cosine to `last_weight` over `decay_steps` (None: it stays). The
+    first official preset has 1e-3 throughout, the others 1e-2 for 50_000 steps and
+    100_000 down to 1e-8.
 
     `points` samples of each ray are drawn by their weights before anything is
-    differentiated (None: all of them, as the official code). `robust_width` is the
-    logarithmic strain at which ρ leaves the parabola (None: E itself); `scaling` is
+    differentiated (None: all of them, as in the official code). `robust_width` is the
+    logarithmic strain at which ρ leaves the parabola (None: E itself). `scaling` is
     that of `losses.geman_mcclure`.
 
-    One step of `every` asks for the penalty, which counts as many times as much in it
-    (lazy regularization, Karras et al. 2020, arXiv:1912.04958, section 3.1); what is
-    logged of it is right as a mean over so many steps.
+    One step of `every` evaluates the penalty, with its weight multiplied by as much
+    (lazy regularization, Karras et al. 2020, arXiv:1912.04958, section 3.1). Its logged
+    value is correct as a mean over so many steps.
 
-    `fold_cost` is what mirroring a unit volume costs beside ρ; 0 makes mirror images
-    free, as the official code does. See
-    `displacement_cost`.
+    `fold_cost` is the cost of mirroring a unit volume, in addition to ρ. With 0 mirror
+    images are free, as in the official code. See `displacement_cost`.
     """
 
     weight: float = 1e-3

@@ -34,13 +34,14 @@ NAME = "mask"
 
 @dataclasses.dataclass(frozen=True)
 class MovingMaskSpec:
-    """Size of the network and weight of its loss; the defaults are the paper's code's.
+    """Settings of the mask network and its loss. The defaults are those of the code.
 
-    `position` and `skips` are those of the warp there, for its network of masks could
-    not be read. Its read-out is a ReLU, which can be zero for all points and then never
-    learns; here it is a sigmoid, which starts undecided. Bands are open, where there
-    they open with the warp's. `code_width` is that of the codes in `table`: those of
-    the warp, or its own, as there, under a name that no other effect has.
+    `position` and `skips` are those of the warp there, since its network of masks could
+    not be read. Its output is a ReLU, which can be zero for all points and then never
+    learns. Here it is a sigmoid, which starts undecided. Bands are open, where there
+    they open with the warp's. `code_width` is that of the codes in `table`. These are
+    the codes of the warp, or separate ones, as in the code, under a name that no other
+    effect has.
     """
 
     position: EncodingSpec = EncodingSpec(4)

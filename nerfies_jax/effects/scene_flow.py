@@ -62,14 +62,15 @@ class FlowWeights:
 
 @dataclasses.dataclass(frozen=True)
 class SceneFlowSpec:
-    """Size and losses of the medium; the defaults are the public code's.
+    """Settings of the medium and its losses. The defaults are those of the public code.
 
-    `flow_bound` is how far a point can go along each axis between two moments, in units
-    of the field. After `decay_steps` the medium need no longer explain the whole
-    picture by itself, only what the blending gives it. `flow_trunk` gives the flow a
-    trunk of its own, of the same size, where the public code reads it from the
-    medium's: what tracks have found then survives the medium's first steps. A network
-    on planes of `moments` (HexPlane) reads features of a point at a time, for waves.
+    `flow_bound` is the largest motion of a point along each axis between two
+    timestamps, in units of the field. After `decay_steps` the medium need no longer
+    explain the whole image by itself, only its share of the blend. `flow_trunk` gives
+    the flow a trunk of its own, of the same size, where the public code reads it from
+    the medium's. Flow initialized from tracks then survives the first steps of the
+    medium. A network on planes of `moments` (HexPlane) reads features of a point at a
+    time instead of a positional encoding.
     """
 
     network: TemplateSpec = TemplateSpec()

@@ -19,10 +19,10 @@ CONDITIONS = ("time", "code")
 
 @dataclasses.dataclass(frozen=True)
 class TimeSpec:
-    """What the template reads beside the point.
+    """Settings of the time features that the template reads.
 
-    `condition="time"` is the time in [0, 1] under `encoding`; "code" is the code of the
-    frame from the table `table`, which warps may share.
+    `condition="time"` is the time in [0, 1] under `encoding`, and "code" is the code of
+    the frame from the table `table`, which warps may share.
     """
 
     encoding: EncodingSpec = EncodingSpec(4)

@@ -26,11 +26,11 @@ from nerfies_jax.training.effects import Effect, FrameCondition
 
 @dataclasses.dataclass(frozen=True)
 class TimeWarpSpec:
-    """Sizes; the defaults are those of the paper's larger model, by its code.
+    """Sizes of the networks. The defaults are those of the code's larger model.
 
-    `embedding` is the width of what is made of the time, through one hidden layer of
-    `width`; the shift has `depth` of them. It starts near zero, where the code's starts
-    as any layer.
+    `embedding` is the width of the time embedding, computed with one hidden layer of
+    `width`. The shift has `depth` of them. It starts near zero, where that of the code
+    starts like any layer.
     """
 
     position: EncodingSpec = EncodingSpec(10)

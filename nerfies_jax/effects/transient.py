@@ -33,13 +33,15 @@ NAME = TABLE = "transient"
 
 @dataclasses.dataclass(frozen=True)
 class TransientSpec:
-    """The medium and its costs; defaults of the paper and of its reimplementation.
+    """Settings of the medium and its costs. Defaults of the paper and its
+    reimplementation.
 
     `beta_min` is the least standard deviation of a ray's color, in units of color. It
-    bounds the loss from below; without it a pixel that is met exactly would be worth
-    anything. `density_weight` is the paper's lambda_u: what keeps the static scene out
-    of the transient medium. `beta_power` is that of `photometric`: zero is the paper's
-    loss, one lets a short run learn what it called uncertain.
+    bounds the loss from below. Without it a pixel that is matched exactly would have an
+    unbounded likelihood. `density_weight` is the paper's lambda_u, which keeps the
+    static scene out of the transient medium. `beta_power` is that of `photometric`.
+    Zero is the paper's loss, and one lets a short run learn regions that it called
+    uncertain.
     """
 
     code_width: int = 16

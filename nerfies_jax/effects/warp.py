@@ -28,14 +28,14 @@ CONDITIONS = ("code", "time")
 
 @dataclasses.dataclass(frozen=True)
 class WarpSpec:
-    """Form and size of the warp; the defaults are Nerfies' (Park et al. 2021).
+    """Form and size of the warp. The defaults are those of Nerfies (Park et al. 2021).
 
-    `condition="code"` reads a code of the frame, from the table `table`; "time" reads
+    `condition="code"` reads a code of the frame, from the table `table`. "time" reads
     the encoded time, and then time 0 is the template itself (D-NeRF). `anneal_steps`
-    opens the bands of `position` one by one over so many steps (coarse to fine); None
-    has them open from the start. Without identity in `position`, step 0 of an annealed
-    warp moves all points of a frame alike. `guides` names codes of a point, one number
-    each, that it reads as well: a field with a mask of what moves adds it.
+    opens the bands of `position` one by one over so many steps (coarse to fine), and
+    None has them open from the start. Without identity in `position`, step 0 of an
+    annealed warp moves all points of a frame alike. `guides` names per-point codes, one
+    number each, that it reads as well. A field with a mask of moving points adds it.
     """
 
     kind: str = "se3"
