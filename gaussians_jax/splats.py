@@ -21,9 +21,7 @@ from nerfies_jax.geometry.camera import Camera
 
 PyTree = Any
 
-INACTIVE_LOGIT = (
-    -1000.0
-)  # sigmoid and its gradient underflow to 0 below -745 in float64
+INACTIVE_LOGIT = -1000.0  # sigmoid and its gradient are 0 below -745 in float64
 # exp(15)^2 = 1e13 and exp(-20)^2 = 4e-18 keep products of scales far from overflow and
 # from the flush to zero; raw values beyond are clamped and get no gradient.
 # An unbounded exp is inf at 89 in float32.
