@@ -7,6 +7,8 @@ values. `checked` is called after every reader.
 
 import dataclasses
 
+import numpy as np
+
 from nerfies_jax.capture import gate_cameras, gate_depths, gate_frames, gate_poses
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.gate_finding import Finding
@@ -46,12 +48,14 @@ def findings(capture: Capture) -> list[Finding]:
     Returns:
       One finding for each check that applies. Those with a `problem` need attention.
     """
-    return [
-        *gate_poses.findings(capture),
-        *gate_cameras.findings(capture),
-        *gate_depths.findings(capture),
-        *gate_frames.findings(capture),
-    ]
+    # Absurd numbers overflow here, and are then found to be wrong.
+    with np.errstate(all="ignore"):
+        return [
+            *gate_poses.findings(capture),
+            *gate_cameras.findings(capture),
+            *gate_depths.findings(capture),
+            *gate_frames.findings(capture),
+        ]
 
 
 def table(capture: Capture) -> list[str]:
@@ -98,9 +102,21 @@ def check_observed(capture: Capture) -> None:
                 )
     given = None if capture.given is None else capture.given.moving
     for moving in (capture.moving, given):
-        if moving is not None and moving[capture.train].all():
+        if moving is None:
+            continue
+        static = ~moving[capture.train]
+        if not static.any():
             raise CaptureError(
                 f"{where}: every pixel of the {capture.train.size} frames to learn "
                 "from is marked as moving, which leaves no static scene; the masks may "
                 "be inverted"
+            )
+        observed = (
+            moving.shape == capture.images.shape[:3] and capture.valid is not None
+        )
+        if observed and not (static & capture.valid[capture.train]).any():
+            raise CaptureError(
+                f"{where}: no observed pixel of the {capture.train.size} training "
+                "frames is static; the masks of observed or of moving pixels may be "
+                "inverted"
             )

@@ -9,7 +9,6 @@ from nerfies_jax.capture.gate_poses import fold_radius
 
 # Degrees across the image that a pinhole may have, and those that are usual.
 POSSIBLE, USUAL = (0.01, 165.0), (0.5, 140.0)
-MOST_ASPECT = 10.0
 ALIKE, OFF_CENTER = 0.03, 0.25
 ZOOM = 2.0
 # Float32 steps in pixels: what is worth a note, and what makes a capture useless.
@@ -93,8 +92,7 @@ def _aspect(capture):
         f"focal length {odd.min():.3g} to {odd.max():.3g}; check that both are of "
         "images of one size"
     )
-    extreme = odd.max() > MOST_ASPECT or odd.min() < 1 / MOST_ASPECT
-    return Finding("pixel aspect", value, problem, bool(extreme))
+    return Finding("pixel aspect", value, problem)
 
 
 def _principal_point(capture):
