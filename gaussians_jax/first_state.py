@@ -16,7 +16,8 @@ from gaussians_jax.growth import AuxState, states_of
 from gaussians_jax.spec import SplatScene, carried_count, refuse_what_cannot_train
 from gaussians_jax.splats import Params
 from nerfies_jax import data_parallel
-from nerfies_jax.capture.capture import Capture, PointCloud, training_bytes
+from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.frame_memory import frame_bytes
 from nerfies_jax.evidence import hidden_points, record, usable_paths, view_set
 from nerfies_jax.training.effects import Effect, stream
 from nerfies_jax.training.model import TrainState, in_default_precision
@@ -26,7 +27,10 @@ HIDDEN_LOGIT = 2.0
 
 
 def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
-    """Roughly the memory of the first state and step; host side, nothing allocated."""
+    """Estimate the memory of the frames, the first state and a step, in bytes.
+
+    Nothing is allocated. The capture's own memory is counted, too.
+    """
     tracked = spec.start.motion == "tracks"
     init = initialization.of_start(spec.init, tracked)
     count = initialization.initial_count(init, capture)
@@ -38,7 +42,7 @@ def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     # A chunk holds keys, rows and blending inputs of every pair.
     numbers += 16 * (spec.raster.capacity or 0)
     devices = data_parallel.device_count(spec.batch_size)
-    return 4 * numbers + devices * training_bytes(capture)
+    return 4 * numbers + frame_bytes(capture, devices)
 
 
 def first_state(

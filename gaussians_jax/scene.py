@@ -337,7 +337,7 @@ def observe(
     """What the losses compare: a frame that was drawn with the one that was filmed."""
     return Observation(
         rendering,
-        frames.images[row].astype(frames.times.dtype) / 255,
+        frames.images[frames.image_row(row)].astype(frames.times.dtype) / 255,
         None if frames.valid is None else frames.valid[row],
         None if frames.depths is None else frames.depths[row],
         frames,

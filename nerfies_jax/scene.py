@@ -18,7 +18,8 @@ from nerfies_jax import (
     render_ray,
     scene_metadata,
 )
-from nerfies_jax.capture.capture import Capture, training_bytes
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.frame_memory import frame_bytes
 from nerfies_jax.effects import moving_mask, scene_flow, transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
 from nerfies_jax.evidence import usable_paths
@@ -307,14 +308,14 @@ def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
       The rays and their observed colors.
     """
     row_key, column_key, line_key = jax.random.split(key, 3)
-    number, height, width = frames.images.shape[:3]
+    number, (height, width) = len(frames.times), frames.images.shape[1:3]
     row = jax.random.randint(row_key, (count,), 0, number)
     column = jax.random.randint(column_key, (count,), 0, width)
     line = jax.random.randint(line_key, (count,), 0, height)
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     pixel = jnp.stack([column, line], axis=1).astype(camera.position.dtype) + 0.5
     ray = jax.vmap(rays.pixel_ray)(camera, pixel)
-    color = frames.images[row, line, column].astype(pixel.dtype) / 255
+    color = frames.images[frames.image_row(row), line, column].astype(pixel.dtype) / 255
     valid = ray.valid
     if frames.valid is not None:
         valid = valid & frames.valid[row, line, column]
@@ -408,7 +409,9 @@ def _color_terms(
 
 
 def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
-    """Estimate the memory of the first state and step, without allocating anything.
+    """Estimate the memory of the frames, the first state and a step.
+
+    Nothing is allocated. The capture's own memory is counted, too.
 
     Args:
       spec: The scene.
@@ -435,7 +438,7 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     rays_at_once = spec.rays // spec.micro_batches
     activations = 3 * rays_at_once * widths
     devices = data_parallel.device_count(spec.micro_batches)
-    return 4 * activations + devices * training_bytes(capture)
+    return 4 * activations + frame_bytes(capture, devices)
 
 
 def _width_of(one: TemplateSpec) -> int:

@@ -24,21 +24,24 @@ def black_borders(images: np.ndarray) -> np.ndarray | None:
     Returns:
       Booleans [frames, height, width], or None if there are no such regions.
     """
-    brightest = images.max(-1)
-    dark = brightest <= BLACK
-    borders = np.zeros(dark.shape, bool)
-    for row in np.flatnonzero(_rim(dark).any(-1)):
-        labels = skimage.measure.label(dark[row], connectivity=1)
+    borders = None
+    for row, image in enumerate(images):  # one at a time, to spare memory
+        brightest = image.max(-1)
+        dark = brightest <= BLACK
+        if not _rim(dark).any():
+            continue
+        labels = skimage.measure.label(dark, connectivity=1)
+        border = np.zeros(dark.shape, bool)
         for label in np.unique(_rim(labels)[_rim(labels) > 0]):
             region = labels == label
-            empty = brightest[row][region].mean() <= EMPTY
+            empty = brightest[region].mean() <= EMPTY
             if empty and SMALLEST <= region.mean() <= LARGEST:
-                borders[row] |= region
-        if borders[row].any():
-            borders[row] = skimage.morphology.dilation(
-                borders[row], np.ones((5, 5), bool)
-            )
-    return borders if borders.any() else None
+                border |= region
+        if border.any():
+            if borders is None:
+                borders = np.zeros(images.shape[:3], bool)
+            borders[row] = skimage.morphology.dilation(border, np.ones((5, 5), bool))
+    return borders
 
 
 def without_black_borders(

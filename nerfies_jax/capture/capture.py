@@ -93,18 +93,6 @@ def point_depths(capture: Capture) -> np.ndarray:
     return depth[depth > capture.near]
 
 
-def training_bytes(capture: Capture) -> int:
-    """Return the memory that the training images take on each device.
-
-    Args:
-      capture: The capture.
-
-    Returns:
-      Number of bytes.
-    """
-    return capture.images[:1].nbytes * len(capture.train)
-
-
 def validate(capture: Capture):
     """Check a capture.
 
@@ -405,6 +393,8 @@ def shrink(image: np.ndarray, factor: int) -> np.ndarray:
     Returns:
       uint8 image, [height // factor, width // factor, 3].
     """
+    if factor == 1:
+        return image
     parts = blocks(np.moveaxis(image, -1, 0), factor)
     total = parts.sum((-3, -1), dtype=np.uint32)
     area = factor * factor

@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerfies_jax import events
-from nerfies_jax.capture import decoder, masks, npz_files, safe_files, text_files
+from nerfies_jax.capture import (
+    decoder,
+    frame_memory,
+    masks,
+    npz_files,
+    safe_files,
+    text_files,
+)
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import CaptureError, PointCloud, blocks, shrink
 from nerfies_jax.geometry import camera
@@ -252,8 +259,9 @@ def read_frames(
             f"{len(paths) * width * height * 3 / 2**30:.0f} GiB, more than "
             f"{MAX_BYTES / 2**30:.0f}; read them smaller with factor= or max_side="
         )
-    colors = np.empty((len(paths), height, width, 3), np.uint8)
-    alphas = np.full((len(paths), height, width), 255, np.uint8)
+    colors = frame_memory.aligned_empty((len(paths), height, width, 3), np.uint8)
+    # Zeros cost no memory until they are written, and most captures have no alpha.
+    transparencies = np.zeros((len(paths), height, width), np.uint8)
 
     def decode(row):
         alpha = known = None
@@ -265,7 +273,7 @@ def read_frames(
             color = pictures.over(color, alpha, background)
         colors[row] = shrink(color, shrink_by)
         if alpha is not None:
-            alphas[row] = shrink(alpha[..., None], shrink_by)[..., 0]
+            transparencies[row] = 255 - shrink(alpha[..., None], shrink_by)[..., 0]
         if known is not None:
             known = blocks(known, shrink_by).all((-3, -1))
         return alpha is not None, known
@@ -282,10 +290,12 @@ def read_frames(
             if known is not None:
                 unknown[row] = known
             reading.advance()
-    alpha = alphas if any_alpha else None
+    alpha = None
+    if any_alpha:
+        alpha = np.subtract(255, transparencies, out=transparencies)
     if not unknown:
         return Frames(colors, alpha, None, ())
-    observed = np.ones(alphas.shape, bool)
+    observed = np.ones(colors.shape[:3], bool)
     for row, known in unknown.items():
         observed[row] = known
     note = (

@@ -2,9 +2,11 @@
 
 from collections.abc import Set
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from nerfies_jax.capture import frame_memory
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.flow import training_flow
 from nerfies_jax.geometry import camera as cameras
@@ -39,8 +41,14 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
         extras["flow"] = training_flow(capture)
     if "moving" in required_data and capture.moving is not None:
         extras["moving"] = capture.moving[rows]
+    if frame_memory.is_shared(capture):
+        # Unlike `jnp.asarray`, this takes the array as it is.
+        images = jax.device_put(capture.images)
+        extras["image_rows"] = rows.astype(np.int32)
+    else:
+        images = capture.images[rows]
     frames = Frames(
-        images=capture.images[rows],
+        images=images,
         cameras=cameras.take(capture.cameras, rows),
         times=capture.times[rows],
         appearance=capture.appearance_ids[rows],

@@ -104,7 +104,9 @@ class Representation(NamedTuple):
     growth: Callable[[Spec, TrainState], float]
     metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[..., Model]  # (spec, metadata, effects=()) -> model
-    estimate_memory_bytes: Callable[[Spec, Capture], int]  # of the first state and step
+    estimate_memory_bytes: Callable[
+        [Spec, Capture], int
+    ]  # frames, first state and step
     memory_hint: str  # which settings make the first state smaller
     # (spec, metadata, model, state, frames, effects=()) -> the parts of a step
     step_parts: Callable[..., StepParts]

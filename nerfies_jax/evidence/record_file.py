@@ -61,7 +61,11 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
     checksum = hashlib.blake2b(digest_size=12)
     budget = capture.preprocessing
     checksum.update(f"evidence {VERSION} {use_depths} {budget}".encode())
-    parts = [capture.images[capture.train], capture.times, capture.train]
+    images = capture.images
+    checksum.update(f"{images.dtype}{(len(capture.train), *images.shape[1:])}".encode())
+    for row in capture.train:  # a copy of all of them could be most of the memory
+        checksum.update(np.ascontiguousarray(images[row]).data)
+    parts = [capture.times, capture.train]
     parts += [np.asarray([capture.near, capture.far]), *capture.cameras]
     if capture.points is not None:
         parts.append(capture.points.position)

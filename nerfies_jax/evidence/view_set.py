@@ -82,7 +82,7 @@ def without_cameras(images: np.ndarray) -> Views:
       The frames.
     """
     frames, height, width = images.shape[:3]
-    gray = np.ascontiguousarray(images.mean(-1) / 255, np.float32)
+    gray = _gray(images)
     unknown = np.full((frames, 3, 3), np.nan)
     return Views(
         row=np.arange(frames),
@@ -98,9 +98,17 @@ def without_cameras(images: np.ndarray) -> Views:
     )
 
 
+def _gray(images):
+    """Mean of the channels in [0, 1], float32; one image at a time, to spare memory."""
+    gray = np.empty(images.shape[:3], np.float32)
+    for row, image in enumerate(images):
+        gray[row] = image.mean(-1) / 255
+    return gray
+
+
 def _views(capture, rows):
     image = capture.images[rows]
-    gray = np.ascontiguousarray(image.mean(-1) / 255, np.float32)
+    gray = _gray(image)
     valid = ~plain(capture, rows)
     if capture.valid is not None:
         # Pixels sampled at the rim of a black corner are half black.

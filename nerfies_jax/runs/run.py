@@ -12,7 +12,7 @@ import psutil
 
 from nerfies_jax import capture as captures
 from nerfies_jax import events
-from nerfies_jax.capture import gate, pinholes, synthetic
+from nerfies_jax.capture import frame_memory, gate, pinholes, synthetic
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.errors import FileError
@@ -437,6 +437,7 @@ def first_state(run: Run) -> TrainState:
       ValueError: If it would not fit in memory.
     """
     needed = run.representation.estimate_memory_bytes(run.spec, run.capture)
+    needed -= frame_memory.capture_bytes(run.capture)  # it is there already
     free = free_memory()
     if needed > free:
         raise ValueError(

@@ -28,6 +28,12 @@ class Frames(NamedTuple):
     points: Any = None  # [points, 3] float32 static scene points, scene units
     flow: FrameFlow | None = None  # rows count the frames that are learned from
     moving: Any = None  # [frames, height, width] bool: moves by itself
+    # Rows of `images` if it has all frames of the capture; None if it has these.
+    image_rows: Any = None
+
+    def image_row(self, row: Any) -> Any:
+        """Return the row of `images` that a training frame has."""
+        return row if self.image_rows is None else self.image_rows[row]
 
 
 class View(NamedTuple):
