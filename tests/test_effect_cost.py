@@ -2,10 +2,10 @@
 
 A preset from which everything was removed is the static scene of `tests.bare_scenes`,
 which knows of no effect: the compiled steps have the same flops, bytes and memory and
-give the same bits. A preset from which one effect was removed (and what cannot be
-without it) is the scene that was put together by hand from the others, while every
-function of the module of the one that is missing refuses to be called: both lower to
-the same text, and a compiler that gets the same text makes the same program.
+give the same bits. A preset from which effects were removed (and what cannot be
+without them) is the scene that was put together by hand from the others, while every
+function of the modules of the missing ones refuses to be called: both lower to the same
+text, and a compiler that gets the same text makes the same program.
 """
 
 import dataclasses
@@ -171,32 +171,45 @@ def check_removed(run, start, owner, make):
         same_bits(run.state, upwards.state)
 
 
-def removals(presets, quick):
-    """Each part once, from the first of the papers' presets that has it.
+# Others need these, or do nothing without them: each is removed by itself.
+BASES = ("appearance", "warp", "scene_flow", "motion")
 
-    Small presets are those papers' in kind.
+
+def removals(presets, quick):
+    """Each part once, with the others of the first paper's preset that has it.
+
+    Each removal traces two programs, and what is left of one of several effects shows
+    as well as what is left of one alone. Small presets are those papers' in kind.
     """
     of = {}
     for name, spec in presets.items():
         for part in parts_of(spec) if not name.endswith("-small") else ():
             of.setdefault(part, name)
+    groups = {}
+    for part, name in of.items():
+        groups.setdefault((name, part if part in BASES else ""), []).append(part)
     return [
-        pytest.param(name, part, marks=() if part == quick else pytest.mark.slow)
-        for part, name in of.items()
+        pytest.param(
+            name,
+            parts,
+            marks=() if parts == [quick] else pytest.mark.slow,
+            id=f"{name}-{'-'.join(parts)}",
+        )
+        for (name, _), parts in groups.items()
     ]
 
 
 @pytest.mark.parametrize(
-    ("preset", "part"), removals(field_presets.PRESETS, "appearance")
+    ("preset", "parts"), removals(field_presets.PRESETS, "appearance")
 )
-def test_a_field_without_an_effect_is_one_that_never_had_it(preset, part):
-    run = started_field(without(bare_scenes.tiny_field(preset), part))
+def test_a_field_without_effects_is_one_that_never_had_them(preset, parts):
+    run = started_field(without(bare_scenes.tiny_field(preset), *parts))
     check_removed(run, started_field, field_spec, hand_made_effects.of_field)
 
 
-@pytest.mark.parametrize(("preset", "part"), removals(splat_presets.PRESETS, None))
-def test_splats_without_an_effect_are_some_that_never_had_it(preset, part):
-    run = started_splats(without(bare_scenes.tiny_splats(preset), part))
+@pytest.mark.parametrize(("preset", "parts"), removals(splat_presets.PRESETS, None))
+def test_splats_without_effects_are_some_that_never_had_them(preset, parts):
+    run = started_splats(without(bare_scenes.tiny_splats(preset), *parts))
     check_removed(run, started_splats, splat_scene, hand_made_effects.of_splats)
 
 

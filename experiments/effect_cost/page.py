@@ -19,12 +19,12 @@ operations:
   that a scene should have, effect by effect, and finds those and no others.
 - `tests/test_effect_cost.py` compares every preset that lost all its effects with a
   static scene written without the machinery: equal flops, bytes and memory of the
-  compiled step, and bitwise equal states after it. Every preset that lost one effect
-  lowers to the same text, from the same first state, as one that was put together by
-  hand from the others, while every function of the missing effect's module refuses to
-  be called. Parts of motions that are `None`, and their penalties of weight zero,
-  are held likewise: their functions refuse to be called, and the first state is that
-  of the whole without their arrays.
+  compiled step, and bitwise equal states after it. Every effect is removed from a
+  preset, which then lowers to the same text, from the same first state, as one that was
+  put together by hand from the others, while every function of the missing effects'
+  modules refuses to be called. Parts of motions that are `None`, and their penalties
+  of weight zero, are held likewise: their functions refuse to be called, and the first
+  state is that of the whole without their arrays.
 
 So `python -m experiments.reconstruct --preset nerfies-small --set background=none` is
 Nerfies without background points, and not Nerfies with a term of weight zero.

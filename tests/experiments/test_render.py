@@ -207,7 +207,7 @@ def test_renders_of_other_settings_have_other_names(tmp_path):
 @pytest.mark.slow
 def test_a_killed_render_leaves_the_earlier_one_and_no_litter(tmp_path):
     run = saved(tmp_path, "splats-deformable-small", SPLATS, lambda params, _: params)
-    words = ("--path", "sway", "--max-side", 24)
+    words = ("--path", "sway", "--frames", 30, "--max-side", 24)
     assert main(run, *words) == 0
     before = contents(run / "renders")
     command = [sys.executable, "-m", "experiments", "render", run, *words]
