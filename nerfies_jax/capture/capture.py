@@ -71,6 +71,11 @@ class Capture:
         validate(self)
 
     @property
+    def centre(self) -> tuple[float, float, float]:
+        """The center under its earlier name, which scripts of users still have."""
+        return self.center
+
+    @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.images.shape[2], self.images.shape[1]

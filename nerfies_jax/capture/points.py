@@ -12,6 +12,7 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.rays import across_ray
 
 MAX_POINTS = 50_000_000
+SAME_PLACE = 1e-9  # share of the coordinates within which cameras are at one place
 INLIERS = 0.95  # share of points nearest to their median that the scene must hold
 # Depths beyond these quantiles are outliers; the margins move the planes outwards.
 QUANTILES, FAR_MARGIN = (0.001, 0.999), 1.2
@@ -83,7 +84,8 @@ def place_by_cameras(cameras: Camera) -> Placement:
     else:
         distance = 10 * spread
         center = positions.mean(0) + axes.mean(0) * distance
-    if not distance > 0:  # every camera at one place: any size is as good
+    # Every camera at one place, up to rounding: any size is as good.
+    if not distance > SAME_PLACE * np.abs(positions).max():
         distance, center = 1.0, positions.mean(0) + axes.mean(0)
     return Placement(tuple(center.tolist()), float(1 / distance), 0.05, 4.0)
 
