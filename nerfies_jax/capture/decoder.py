@@ -12,7 +12,7 @@ import pathlib
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,7 +87,7 @@ class Decoder:
         cpu_seconds: float = 0.0,
         memory_bytes: int = 0,
         **arguments: Any,
-    ) -> Iterator[Answer]:
+    ) -> Generator[Answer, None, None]:
         """Run an operation with any number of answers, as they come.
 
         Args:
@@ -164,8 +164,9 @@ class Decoder:
             return
         child.kill()
         for pipe in (child.stdin, child.stdout):
-            with contextlib.suppress(OSError):
-                pipe.close()
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
         child.wait()
 
 

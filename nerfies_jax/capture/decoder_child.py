@@ -10,6 +10,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable, Iterable
 
 from nerfies_jax import children
 from nerfies_jax.capture.errors import FileError
@@ -62,7 +63,7 @@ def _video(operation, **arguments):
     yield from getattr(video_decoding, operation)(**arguments)
 
 
-OPERATIONS = {
+OPERATIONS: dict[str, tuple[Callable[..., Iterable], str]] = {
     "colmap": (_colmap, "nerfies_jax.capture.colmap_tables"),
     "exr": (_exr, "nerfies_jax.capture.exr_decoding"),
     "video": (functools.partial(_video, "frames"), _VIDEO),

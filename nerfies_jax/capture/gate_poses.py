@@ -54,13 +54,13 @@ def findings(capture: Capture) -> list[Finding]:
         return []
     count = len(capture.ids)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).astype(int))
-    cameras = Camera(*(np.float64(leaf[rows]) for leaf in capture.cameras))
+    cameras = Camera._make(np.asarray(leaf, float)[rows] for leaf in capture.cameras)
     places = capture.points.position
     some = np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)
     points = np.float64(places[some]) / capture.scale + np.array(capture.center)
     pose = Pose(
-        cameras.camera_from_world,
-        cameras.position / capture.scale + np.array(capture.center),
+        np.asarray(cameras.camera_from_world),
+        np.asarray(cameras.position) / capture.scale + np.array(capture.center),
     )
     shown = _project(cameras, pose, points, capture.size)
     share, front = shown.inside.mean(), (shown.depth > 0).mean()
@@ -316,7 +316,8 @@ def fold_radius(radial: np.ndarray) -> np.ndarray:
     radii = {}
     for k1, k2, k3 in np.unique(radial, axis=0).tolist():
         # d/dr (r + k1 r^3 + k2 r^5 + k3 r^7), a polynomial in r^2
-        roots = np.roots(np.trim_zeros([7 * k3, 5 * k2, 3 * k1, 1.0], "f"))
+        slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])
+        roots = np.roots(np.trim_zeros(slope, "f"))
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
         radii[k1, k2, k3] = float(np.sqrt(real.min())) if real.size else np.inf
     return np.array([radii[tuple(each)] for each in radial.tolist()])

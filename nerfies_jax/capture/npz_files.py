@@ -43,7 +43,7 @@ class Archive:
         members = archive.infolist()
         if len(members) > MAX_MEMBERS:
             raise ValueError(f"{len(members)} arrays; at most {MAX_MEMBERS} are read")
-        self._members = {}
+        self._members: dict[str, zipfile.ZipInfo] = {}
         for member in members:
             name = member.filename.removesuffix(".npy")
             # Others unpack without a bound, and NumPy writes none of them.
@@ -82,6 +82,7 @@ class Archive:
         """
         member = self._members[name]
         with self._archive.open(member) as stream:
+            assert isinstance(stream, io.BufferedIOBase)  # as ZipExtFile is
             return read_array(stream, member.file_size)
 
 
@@ -179,7 +180,7 @@ def read_array(stream: io.BufferedIOBase, size: int) -> np.ndarray:
             f"{size - header_bytes} bytes hold"
         )
     array = np.empty(count, dtype)
-    left = memoryview(array.view(np.uint8)) if array.nbytes else memoryview(b"")
+    left = array.view(np.uint8).data if array.nbytes else memoryview(b"")
     while left:
         part = stream.readinto(left[:_CHUNK])
         if not part:

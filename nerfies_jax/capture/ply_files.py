@@ -57,8 +57,8 @@ def read(path: pathlib.Path) -> plyfile.PlyData:
         raise ValueError(f"{size} bytes of text; save it as a binary PLY")
     try:
         if encoding != "utf-8":  # only text can be encoded otherwise
-            text = text_files.utf8(safe_files.read_bytes(path, MAX_TEXT))
-            text = text.decode("ascii", "ignore").replace("\r\n", "\n")
+            raw = text_files.utf8(safe_files.read_bytes(path, MAX_TEXT))
+            text = raw.decode("ascii", "ignore").replace("\r\n", "\n")
             return plyfile.PlyData.read(io.StringIO(text))
         if is_text:
             with path.open(encoding="ascii", errors="ignore") as stream:
