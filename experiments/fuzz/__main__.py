@@ -64,7 +64,9 @@ def main(args):
         args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / STORED
     stored = cli.stored(path) or {"seed": args.seed, "targets": {}}
-    stored["machine"] = clock.machine() | {"revision": revision()}
+    stored["machine"] = clock.machine()
+    # A campaign that goes on may have begun with earlier readers.
+    stored["revisions"] = [*dict.fromkeys([*stored.get("revisions", []), revision()])]
     names = [args.only] if args.only else [*TARGETS]
     begun, rounds = time.monotonic(), 1
     while (left := args.mutations - _done(stored)) > 0:
@@ -82,7 +84,7 @@ def main(args):
             write_json(path, stored)
         if left <= 0:
             break
-        rounds = min(4 * rounds, 64)
+        rounds = min(4 * rounds, 32)
     failures = sum(sum(one["failures"].values()) for one in stored["targets"].values())
     console.say(f"{_done(stored)} mutations, {failures} failures; kept in {path}")
     return cli.Ended(stored, 1 if failures else 0)

@@ -28,9 +28,14 @@ def page(stored: dict) -> str:
     )
     parts = [
         f"Of {total:,} damaged files {wrong:,} were neither read nor refused with the "
-        f"file's path (revision {stored['machine'].get('revision', 'unknown')}).",
+        f"file's path ({_revisions(stored)}).",
         markdown.table(heads, rows),
     ]
     if failures:
         parts += ["What went wrong:", markdown.bullets(failures)]
     return "\n\n".join(parts)
+
+
+def _revisions(stored):
+    names = [str(name)[:12] for name in stored["revisions"]]
+    return ("revision " if len(names) == 1 else "revisions ") + ", ".join(names)

@@ -13,6 +13,14 @@ from nerfies_jax.capture.colmap_library import MIN_TRACK, library
 MAX_ERROR_PX = 2.0  # largest mean reprojection error of a point that is kept
 # pycolmap reads these if there are no binary files of that name.
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt")
+# Least bytes of a row of a binary file, behind the number of its rows.
+_ROW_BYTES = {
+    "cameras.bin": 24,
+    "images.bin": 73,
+    "points3D.bin": 51,
+    "rigs.bin": 8,
+    "frames.bin": 8,
+}
 
 
 def read(folder: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -72,12 +80,49 @@ def _plain(camera):
 
 
 def _reconstruction(folder):
+    _check_counts(folder)
     with contextlib.ExitStack() as stack:
         source = _as_utf8(folder, stack)
         model = library().Reconstruction(str(source))
         if not (folder / "images.bin").is_file():
             _restore_names(model, source / "images.txt")
         return model
+
+
+def _check_counts(folder):
+    """Raise ValueError if a binary file claims more than it holds.
+
+    pycolmap believes it, and allocates until it may not.
+    """
+    for name, row in _ROW_BYTES.items():
+        path = folder / name
+        if not path.is_file():
+            continue
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            count = int.from_bytes(file.read(8), "little")
+        if 8 + count * row > size:
+            raise ValueError(f"{name} claims {count} rows in {size} bytes")
+    for name, fixed, named, each in (
+        ("images.bin", 64, True, 24),
+        ("points3D.bin", 43, False, 8),
+    ):
+        if (folder / name).is_file():
+            _check_lists((folder / name).read_bytes(), name, fixed, named, each)
+
+
+def _check_lists(data, name, fixed, named, each):
+    """Walk over rows of `fixed` bytes, maybe a name, and a list with its length."""
+    at, size = 8, len(data)
+    for row in range(int.from_bytes(data[:8], "little")):
+        at += fixed
+        if named:
+            end = data.find(b"\0", at)
+            at = size if end < 0 else end + 1
+        length = int.from_bytes(data[at : at + 8], "little")
+        at += 8 + length * each
+        if at > size:
+            raise ValueError(f"{name} ends in its row {row}")
 
 
 def _as_utf8(folder, stack):
