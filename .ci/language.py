@@ -32,7 +32,8 @@ SPELLING = re.compile(
     r"|general|linear|local|final|character|util|memor|vector)is(e|ing|ation)"
     r"|^analys(ed?|ing)$|(model|label|travel|level|signal|cancel|channel)l(ed|ing)$"
 )
-ALLOWED = {"minimise"}  # optimistix.minimise
+# optimistix.minimise, and the former name of Capture.center
+ALLOWED = {"minimise", "centre"}
 
 
 def docstrings(path):

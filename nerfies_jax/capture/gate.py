@@ -111,10 +111,10 @@ def check_observed(capture: Capture) -> None:
                 "from is marked as moving, which leaves no static scene; the masks may "
                 "be inverted"
             )
-        observed = (
-            moving.shape == capture.images.shape[:3] and capture.valid is not None
-        )
-        if observed and not (static & capture.valid[capture.train]).any():
+        valid = capture.valid
+        if valid is None or moving.shape != capture.images.shape[:3]:
+            continue
+        if not (static & valid[capture.train]).any():
             raise CaptureError(
                 f"{where}: no observed pixel of the {capture.train.size} training "
                 "frames is static; the masks of observed or of moving pixels may be "

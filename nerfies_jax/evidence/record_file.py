@@ -66,7 +66,8 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
     for row in capture.train:  # a copy of all of them could be most of the memory
         checksum.update(np.ascontiguousarray(images[row]).data)
     parts = [capture.times, capture.train]
-    parts += [np.asarray([capture.near, capture.far]), *capture.cameras]
+    parts += [np.asarray([capture.near, capture.far])]
+    parts += map(np.asarray, capture.cameras)
     if capture.points is not None:
         parts.append(capture.points.position)
     depths = capture.depths if use_depths else None
