@@ -49,7 +49,7 @@ _ARGUMENT = re.compile(
 _RESUME = re.compile(r"runs\.resume(?:\('([^']*)'\))?")
 Preset = Annotated[str | None, options.Known(PRESETS), tyro.conf.arg(metavar="NAME")]
 Overrides = Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE ...")]
-Effects = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE:NAME ...")]
+Code = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE:NAME ...")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,8 +149,8 @@ def check_presets(names: Iterable[str]) -> None:
             )
 
 
-def find_effects(names: Iterable[str]) -> None:
-    """Let modules of the current folder be found, if `--effect` names any of them.
+def find_code(names: Iterable[str]) -> None:
+    """Let modules of the current folder be found, if options name any of them.
 
     The folder comes last on the path: a stranger's run folder may hold a `jax.py`.
     """
@@ -387,8 +387,8 @@ def as_options(text: str, error: Exception) -> str:
     for each in (error, error.__cause__):
         if isinstance(each, OverrideError):
             return f"--set {text}"
-        if isinstance(each, trust.UntrustedEffects):
-            return f"{text}, with --effect {shlex.join(each.names)}"
+        if isinstance(each, trust.UntrustedCode):
+            return f"{text}, with --trust {shlex.join(each.names)}"
         if isinstance(each, CaptureNotFound):
             words = ("--out", str(each.folder), "--resume")
             command = f"python -m experiments.reconstruct CAPTURE {shlex.join(words)}"

@@ -48,9 +48,9 @@ class Compare:
     """Held-out frames in the image. 0 renders none."""
     out: pathlib.Path | None = None
     """Folder for compare.json, curves.png and pictures.png (default: runs/compare)."""
-    effect: cli.Effects = ()
-    """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
-    so they are loaded only if they are named here again."""
+    trust: cli.Code = ()
+    """Code from other packages that the run was trained with, as MODULE:NAME. It is
+    loaded only if it is named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to render."""
 
@@ -78,7 +78,7 @@ class Compared(NamedTuple):
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        compared = read(args.runs, args.effect if args.frames else None)
+        compared = read(args.runs, args.trust if args.frames else None)
         folder = run_folder.new_run_folder(args.out, "compare")
         goals = args.psnr or default_goals(compared)
     console.say(table(compared, goals))
@@ -89,9 +89,9 @@ def main(args):
         kinds = [representations.of_run(each.folder) for each in compared]
         threads = {kind.threads for kind in kinds if kind is not None}
         with cli.user_errors():
-            cli.find_effects(args.effect)
+            cli.find_code(args.trust)
             platform.start_jax(args.device, "all" if "all" in threads else "one")
-            draw(folder / "pictures.png", compared, args.frames, args.effect)
+            draw(folder / "pictures.png", compared, args.frames, args.trust)
     console.say(f"saved in {folder}")
     return cli.stored(folder / "compare.json")
 
@@ -101,7 +101,8 @@ def read(folders, trusted=None) -> list[Compared]:
 
     Args:
       folders: Run folders.
-      trusted: Own effects that may be loaded, if the runs are to be rendered.
+      trusted: Names MODULE:NAME of code from other packages that may be loaded, if the
+        runs are to be rendered.
 
     Returns:
       The runs.
@@ -116,12 +117,14 @@ def read(folders, trusted=None) -> list[Compared]:
         curve = curves.read(folder)
         try:
             metrics, remark = _progress(folder, name)
-            config = json.loads((folder / run_folder.CONFIG).read_text())["config"]
+            stored = json.loads((folder / run_folder.CONFIG).read_text())
+            config = stored["config"]
             source = config["source"]
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{folder}: not a run ({error!r})") from error
         if trusted is not None:
-            trust.check_effects(folder, config.get("effects", ()), trusted)
+            kind = representations.named(stored["representation"])
+            trust.check(folder, stored, kind.spec_type, trusted)
         compared.append(Compared(name, folder, metrics, curve, remark))
         same = {key: source.get(key) for key in SAME}
         if source.get("capture") is None:  # a built-in scene is made from the seed
@@ -279,14 +282,14 @@ def save(folder: pathlib.Path, compared, goals) -> None:
         pictures.curve(histories, folder / "curves.png")
 
 
-def draw(path: pathlib.Path, compared, count: int, effects=()) -> None:
+def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
     """Held-out frames: the truth and every run's picture, below them the errors."""
     from nerfies_jax import evaluation, runs
     from nerfies_jax.evaluation import pictures
 
     scored = []
     for each in compared:
-        run = runs.saved_run(each.folder, effects=effects)
+        run = runs.saved_run(each.folder, trusted=trusted)
         state = runs.restore(each.folder, run).state
         run = runs.with_found_cameras(run, state)
         rows = evaluation.spread(run.filmed.heldout, count)

@@ -69,9 +69,9 @@ class Export:
     """File or folder to write (default: in RUN/exports)."""
     overwrite: bool = False
     """Replace what is there."""
-    effect: cli.Effects = ()
-    """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
-    so they are loaded only if they are named here again."""
+    trust: cli.Code = ()
+    """Code from other packages that the run was trained with, as MODULE:NAME. It is
+    loaded only if it is named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 
@@ -127,14 +127,14 @@ class Export:
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        cli.find_effects(args.effect)
+        cli.find_code(args.trust)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import runs
         from nerfies_jax.capture.json_files import refuse_existing, sweep
 
         sweep(args.place.resolve().parent)
         refuse_existing(args.place, args.overwrite)
-        run = runs.saved_run(args.run, effects=args.effect)
+        run = runs.saved_run(args.run, trusted=args.trust)
         if run.model.found is not None:
             # What is written is in the cameras that training found.
             run = runs.with_found_cameras(run, runs.restore(args.run, run).state)
@@ -182,9 +182,7 @@ def _splatv(args: Export, run: Any) -> str:
     model = run.model
     if spec.exposure is not None:  # of which the file has none
         neutral = ("exposure",)
-        model = run.representation.variant(
-            spec, run.metadata, neutral, False, effects=run.effects
-        )
+        model = run.representation.variant(spec, run.metadata, neutral, False)
     draw = evaluation.Renderer(model, capture.size)
     fit = splatv.measured(curves, learned, draw, state, raster, capture)
     said = (
@@ -266,7 +264,7 @@ def _tracks(args: Export, run: Any) -> str:
 
 
 def _mover(run: Any):
-    return run.representation.mover(run.spec, run.metadata, effects=run.effects)
+    return run.representation.mover(run.spec, run.metadata)
 
 
 def _exr(args: Export, run: Any) -> str:

@@ -17,6 +17,7 @@ from experiments import cli
 from nerfies_jax import console, stopping
 from nerfies_jax.runs import commands, platform, representations, run_folder
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
+from nerfies_jax.training import extensions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Reconstruct:
     """
 
     GROUPS: ClassVar = {
-        "model": ("preset", "effects", "set", "effect"),
+        "model": ("preset", "effects", "set", "trust"),
         "training": ("steps", "seconds", "seed", "evaluate_every", "checkpoint_every"),
         "following": ("view", "log"),
     }
@@ -61,13 +62,11 @@ class Reconstruct:
     seed: int | None = None
     """Seed of all random numbers (default: 0)."""
     set: cli.Overrides = ()
-    """Fields of the preset, densification.cap_max=20000 motion.width=128 warp=none,
+    """Fields of the preset, strategy.cap_max=20000 motion.width=128 warp=none,
     say; experiments.settings lists those there are."""
-    effect: cli.Effects = ()
-    """Effects of your own in addition to those of the preset, as MODULE:NAME: an
-    Effect, or a function that makes one from the scene's metadata
-    (docs/own_effect.md). They run code, so --resume loads them only if they are named
-    again."""
+    trust: cli.Code = ()
+    """With --resume, code from other packages that the run was started with, as
+    MODULE:NAME. It is loaded only if it is named here again."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
     checkpoint_every: float = 60.0
@@ -100,8 +99,7 @@ def main(args):
     stopped_by = outcome.result.stopped_by
     code = 1 if outcome.errors else 0
     if stopped_by in stopping.NAMES:
-        effects = outcome.run.config.effects
-        again = commands.resume(outcome.folder, effects)
+        again = commands.resume(outcome.folder, outcome.run.code)
         console.say(f"continue with: {again}")
         code = code or 128 + signal.Signals[stopped_by]
     return cli.Ended(_result(outcome), code)
@@ -120,7 +118,8 @@ def _result(outcome):
 
 def _outcome(args):
     with cli.user_errors():
-        cli.find_effects(args.effect)
+        named = extensions.names_in_assignments(args.set)
+        cli.find_code((*args.trust, *named))
         if args.resume:
             args = _with_folder(args)
             _check_resumed(args)
@@ -139,7 +138,7 @@ def _outcome(args):
                 args.out,
                 expected=_expected(args),
                 overrides=(*steps, *args.set),
-                effects=args.effect,
+                trusted=args.trust,
                 watched=watched,
                 **common,
             )
@@ -148,7 +147,6 @@ def _outcome(args):
         source=cli.plain(args.source),
         steps=args.steps,
         overrides=args.set,
-        effects=args.effect,
         seed=args.seed or 0,
     )
     with cli.user_errors((runs.Refused,)):
@@ -210,7 +208,7 @@ def _cores(args):
 
 def _expected(args):
     """Collect the options that must agree with the run that is continued."""
-    options = {"preset": args.preset, "seed": args.seed, "effects": args.effect or None}
+    options = {"preset": args.preset, "seed": args.seed}
     options = {name: value for name, value in options.items() if value is not None}
     return {**cli.given(args.source), **options}
 

@@ -82,9 +82,9 @@ class Render:
     """Formats to write: png images, one mp4, exr with linear color, alpha and depth."""
     max_side: int | None = None
     """Longest side of the images, in pixels (default: as trained)."""
-    effect: cli.Effects = ()
-    """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
-    so they are loaded only if they are named here again."""
+    trust: cli.Code = ()
+    """Code from other packages that the run was trained with, as MODULE:NAME. It is
+    loaded only if it is named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 
@@ -124,7 +124,7 @@ class Render:
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        cli.find_effects(args.effect)
+        cli.find_code(args.trust)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import evaluation, runs
         from nerfies_jax.capture import json_files, video
@@ -135,7 +135,7 @@ def main(args):
         render_folder.refuse_early(out, args)
         if "mp4" in args.formats:
             video.library()  # missing, it is said before anything is rendered
-        run = runs.saved_run(args.run, effects=args.effect)
+        run = runs.saved_run(args.run, trusted=args.trust)
         move = _mover(args, run)
         restored = runs.restore(args.run, run)
         state = restored.state
@@ -180,16 +180,14 @@ def _model(args, run):
     blended = args.appearance is not None
     if not args.without and not blended:
         return run.model
-    return run.representation.variant(
-        run.spec, run.metadata, args.without, blended, effects=run.effects
-    )
+    return run.representation.variant(run.spec, run.metadata, args.without, blended)
 
 
 def _mover(args, run):
     """Return the function that moves points between images, if flow is shown."""
     if args.show != "flow":
         return None
-    move = run.representation.mover(run.spec, run.metadata, effects=run.effects)
+    move = run.representation.mover(run.spec, run.metadata)
     if move is None:
         raise ValueError(
             "--show flow: nothing in this run moves points; it needs a warp or motion"

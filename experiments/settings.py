@@ -4,7 +4,7 @@
     python -m experiments.settings nerfies-small --json
 
 A line is what `--set` takes, and what it has now. Where a field holds one of several
-kinds of settings, or none, the kinds are named: `--set densification=MCMCStrategySpec`.
+kinds of settings, or none, the kinds are named: `--set strategy=MCMCStrategySpec`.
 """
 
 import dataclasses

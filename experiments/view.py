@@ -32,9 +32,9 @@ class View:
     max_side: int | None = None
     """Longest side of the finest images rendered here, in pixels (default: as
     trained)."""
-    effect: cli.Effects = ()
-    """Effects of your own that the run was trained with, as MODULE:NAME. They run code,
-    so they are loaded only if they are named here again."""
+    trust: cli.Code = ()
+    """Code from other packages that the run was trained with, as MODULE:NAME. It is
+    loaded only if it is named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 
@@ -47,13 +47,13 @@ class View:
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        cli.find_effects(args.effect)
+        cli.find_code(args.trust)
         platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
         from nerfies_jax import runs
         from nerfies_jax.runs import curves, viewer
 
         viewer.check_installed()
-        run = runs.saved_run(args.run, effects=args.effect)
+        run = runs.saved_run(args.run, trusted=args.trust)
         restored = runs.restore(args.run, run)
         size = cli.sized(run.capture.size, args.max_side)
         page = viewer.Viewer(run, size, args.port, args.run)

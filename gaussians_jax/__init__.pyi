@@ -1,9 +1,14 @@
-from .effects.se3_bases import SE3BasesSpec as SE3BasesSpec
+from . import losses as losses
+from . import motion as motion
+from . import strategy as strategy
 from .files import load as load
 from .files import save as save
+from .metadata import SceneMetadata as SceneMetadata
 from .presets import PRESETS as PRESETS
 from .presets import with_steps as with_steps
 from .projection import project as project
+from .protocols import Appearance as Appearance
+from .protocols import CameraOptimizer as CameraOptimizer
 from .raster import rasterize as rasterize
 from .raster_spec import RasterSpec as RasterSpec
 from .rasterization_api import RasterizationInfo as RasterizationInfo
@@ -11,7 +16,7 @@ from .rasterization_api import rasterization as rasterization
 from .rendering import render as render
 from .scene import build as build
 from .scene import metadata_of as metadata_of
-from .spec import SplatScene as SplatScene
+from .spec import Scene as Scene
 from .splats import Gaussians as Gaussians
 from .splats import Params as Params
 from .splats import Splats as Splats

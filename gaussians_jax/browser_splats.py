@@ -9,13 +9,10 @@ from gaussians_jax.effects import deformation
 from nerfies_jax.evaluation.representation import SplatCloud, Splatting
 from nerfies_jax.geometry import quaternion as quaternions
 from nerfies_jax.geometry.precision import exact_product
-from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import TrainState
 
 
-def splatting(
-    spec, metadata, without: tuple[str, ...], effects: tuple[Effect, ...] = ()
-) -> Splatting:
+def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
     """Build the function that evaluates the Gaussians of a scene for a rasterizer.
 
     Deformation, spherical harmonics, exposure and covariances are one program, compiled
@@ -25,7 +22,6 @@ def splatting(
       spec: Specification of the scene.
       metadata: Its metadata.
       without: Names of effects to leave out, of `variants.parts`.
-      effects: The user's own effects.
 
     Returns:
       A function of a trained state, a time in [0, 1], an appearance id and the position
@@ -34,8 +30,8 @@ def splatting(
     Raises:
       ValueError: If the scene cannot be rendered without one of the effects.
     """
-    spec, effects = variants.reduced(spec, metadata, without, effects)
-    every = scene.all_effects(spec, metadata, effects)
+    spec = variants.reduced(spec, metadata, without)
+    every = scene.all_effects(spec, metadata)
     background = jnp.asarray(metadata.background)
 
     @jax.jit

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import optimizer as row_optimizer
 from gaussians_jax import splats
+from gaussians_jax.protocols import Population, StepInfo, StrategyEvent
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.training.step_counts import steps
@@ -59,6 +60,50 @@ class DefaultStrategySpec:
                 raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
         if not self.shrink > 1:
             raise ValueError(f"children are smaller: shrink > 1, got {self.shrink}")
+
+    def init(self, gaussians: Splats) -> "RowStats":
+        """Return statistics of no view yet."""
+        return empty_stats(gaussians)
+
+    def update(self, state: "RowStats", info: StepInfo) -> "RowStats":
+        """Return the statistics after one more view."""
+        return observe(
+            state,
+            info.mean2d_gradient,
+            info.visible,
+            info.radius_px,
+            info.size,
+            info.significance,
+        )
+
+    def events(self, steps: int) -> tuple[StrategyEvent, ...]:
+        """Return when Gaussians grow and are pruned, and when opacities are reset."""
+        last = min(self.refine_stop_iter, steps)
+        grow = tuple(range(self.refine_start_iter, last, self.refine_every))
+        resets = tuple(range(self.reset_every, last, self.reset_every))
+        return (
+            StrategyEvent("densify", grow, self._densify),
+            StrategyEvent("reset opacity", resets, self._reset, changes_rows=False),
+        )
+
+    def _densify(self, population: Population) -> Population:
+        changed = densify(
+            population.optimizer,
+            population.params,
+            population.moments,
+            population.state,
+            population.key,
+            self,
+            step=population.step,
+            extent=population.extent,
+        )
+        return population._replace(params=changed.params, moments=changed.moments)
+
+    def _reset(self, population: Population) -> Population:
+        params, moments = reset_opacity(
+            population.optimizer, population.params, population.moments, self
+        )
+        return population._replace(params=params, moments=moments)
 
 
 class RowStats(NamedTuple):

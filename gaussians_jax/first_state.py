@@ -9,17 +9,23 @@ import numpy as np
 import optax
 from jaxtyping import Array, Key
 
-from gaussians_jax import densification, initialization, rendering, splats, track_start
-from gaussians_jax.densification import DefaultStrategySpec
+from gaussians_jax import (
+    initialization,
+    protocols,
+    rendering,
+    splats,
+    track_start,
+)
 from gaussians_jax.effects import deformation
 from gaussians_jax.growth import AuxState, states_of
+from gaussians_jax.protocols import Strategy
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.spec import SplatScene, carried_count, refuse_what_cannot_train
 from gaussians_jax.splats import Params
 from nerfies_jax import data_parallel
 from nerfies_jax.capture.capture import Capture, PointCloud
 from nerfies_jax.capture.frame_memory import frame_bytes
 from nerfies_jax.evidence import hidden_points, record, usable_paths, view_set
-from nerfies_jax.training.effects import Effect, stream
 from nerfies_jax.training.model import TrainState, in_default_precision
 
 # Nothing else will ever make opaque what no camera sees: 88 %.
@@ -47,7 +53,8 @@ def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
 
 def first_state(
     spec: SplatScene,
-    effects: tuple[Effect, ...],
+    strategy: Strategy | None,
+    effects: tuple[SplatRecord, ...],
     optimizer: optax.GradientTransformation,
     capture: Capture,
     key: Key[Array, ""],
@@ -62,7 +69,7 @@ def first_state(
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
     tracked, hidden, capture = _from_tracks(spec, effects, capture, start_key)
-    most = None if spec.densification is None else spec.densification.cap_max
+    most = None if strategy is None else strategy.cap_max
     init = initialization.of_start(spec.init, tracked is not None, most)
     position, color = initialization.initial_points(init, capture, seed)
     if hidden is not None and most is not None:
@@ -87,23 +94,12 @@ def first_state(
     rows = initialization.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
     params = Params({"splats": rows}, {})
-    for effect in effects:
-        effect_key = jax.random.fold_in(start_key, stream(effect.name))
-        rows_key, nets_key = jax.random.split(effect_key)
-        if effect.init_rows is not None:
-            params.rows[effect.name] = effect.init_rows(rows_key, rows)
-        if effect.init is not None:
-            params.nets[effect.name] = effect.init(nets_key)
-        if effect.place is not None:
-            placed = effect.place(params.nets[effect.name], rows)
-            params.nets[effect.name] = placed
+    params = protocols.initialized(effects, start_key, params)
     if tracked is not None:
         params = track_start.put_in(params, effects, tracked)
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
-    stats = ()
-    if isinstance(spec.densification, DefaultStrategySpec):
-        stats = densification.empty_stats(params.rows["splats"])
+    stats = () if strategy is None else strategy.init(params.rows["splats"])
     aux_state = AuxState(stats, states_of(effects, params))
     return TrainState(
         params, optimizer.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
@@ -135,7 +131,7 @@ def _thinned(points, most):
     return PointCloud(points.position[kept], points.color[kept])
 
 
-def count_rows(effects: tuple[Effect, ...], state: TrainState) -> dict[str, int]:
+def count_rows(effects: tuple[SplatRecord, ...], state: TrainState) -> dict[str, int]:
     """Active Gaussians, and `parameters`: the numbers of rows and the networks.
 
     Where rows carry what is drawn, `gaussians` are those that are drawn and `rows`

@@ -3,15 +3,14 @@
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Key
 
-from gaussians_jax import densification, mcmc
-from gaussians_jax.mcmc import MCMCStrategySpec
-from gaussians_jax.spec import SceneMetadata, SplatScene
+from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.protocols import Population
+from gaussians_jax.records import SplatRecord
+from gaussians_jax.spec import SplatScene, strategy_of
 from gaussians_jax.splats import Params
-from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Event, TrainState
 
 PyTree = Any
@@ -23,11 +22,11 @@ EVENT, NOISE = 2**32 - 2, 2**32 - 3
 class AuxState(NamedTuple):
     """What a scene keeps beside its parameters: of the rows, and what effects keep."""
 
-    stats: PyTree  # densification.RowStats, or () where no strategy keeps them
+    stats: PyTree  # of the strategy; () without one
     effects: dict[str, PyTree]  # by the name of the effect
 
 
-def states_of(effects: tuple[Effect, ...], params: Params) -> dict[str, PyTree]:
+def states_of(effects: tuple[SplatRecord, ...], params: Params) -> dict[str, PyTree]:
     """What each effect keeps from this change of the rows to the next; host side."""
     return {
         effect.name: effect.state(params)
@@ -44,18 +43,53 @@ def stream_key(state: TrainState, stream: int) -> Key[Array, ""]:
 def events(
     spec: SplatScene,
     metadata: SceneMetadata,
-    effects: tuple[Effect, ...],
+    effects: tuple[SplatRecord, ...],
     optimizer: optax.GradientTransformation,
 ) -> tuple[Event, ...]:
-    """When rows are born, die and are reset, and effects revise what they learn."""
-    revisions = tuple(_revision(effect, spec.steps) for effect in effects
-                      if effect.revise is not None)  # fmt: skip
-    plan = spec.densification
-    if plan is None:
-        return revisions
-    if isinstance(plan, MCMCStrategySpec):
-        return _mcmc_events(plan, spec.steps, effects, optimizer) + revisions
-    return _default_events(plan, spec, metadata, effects, optimizer) + revisions
+    """Return when rows are born, die and are reset, and when parameters are projected.
+
+    Args:
+      spec: Settings of the scene.
+      metadata: Sizes of the capture.
+      effects: Parts of the scene.
+      optimizer: The optimizer, which knows its state.
+
+    Returns:
+      The events of the strategy, and those of the effects behind them.
+    """
+    strategy = strategy_of(spec, metadata)
+    own = () if strategy is None else strategy.events(spec.steps)
+    return (
+        *(_event(one, strategy, metadata, effects, optimizer) for one in own),
+        *(_revision(one, spec.steps) for one in effects if one.revise_at),
+    )
+
+
+def _event(event, strategy, metadata, effects, optimizer):
+    def apply(state, frames):
+        del frames
+        stats, states = state.aux_state
+        population = Population(
+            state.params,
+            state.optimizer,
+            stats,
+            stream_key(state, EVENT),
+            int(state.step),
+            metadata.extent,
+            optimizer,
+        )
+        changed = event.apply(population)
+        stats = changed.state
+        if event.changes_rows:
+            stats = strategy.init(changed.params.rows["splats"])
+            states = states_of(effects, changed.params)
+        return state._replace(
+            params=changed.params,
+            optimizer=changed.moments,
+            aux_state=AuxState(stats, states),
+        )
+
+    return Event(event.name, event.steps, apply)
 
 
 def _revision(effect, steps):
@@ -67,61 +101,3 @@ def _revision(effect, steps):
 
     when = tuple(step for step in effect.revise_at if step < steps)
     return Event(f"revise {effect.name}", when, revise)
-
-
-def _default_events(plan, spec, metadata, effects, optimizer):
-    last = min(plan.refine_stop_iter, spec.steps)
-
-    def densify(state, frames):
-        del frames
-        stats, states = state.aux_state
-        step = int(state.step)
-        for effect in effects:
-            if effect.grow_score is not None:
-                factor = effect.grow_score(states[effect.name], step)
-                stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
-        changed = densification.densify(
-            optimizer,
-            state.params,
-            state.optimizer,
-            stats,
-            stream_key(state, EVENT),
-            plan,
-            step=step,
-            extent=metadata.extent,
-        )
-        aux_state = AuxState(changed.stats, states_of(effects, changed.params))
-        return state._replace(
-            params=changed.params, optimizer=changed.moments, aux_state=aux_state
-        )
-
-    def reset(state, frames):
-        del frames
-        params, moments = densification.reset_opacity(
-            optimizer, state.params, state.optimizer, plan
-        )
-        return state._replace(params=params, optimizer=moments)
-
-    grow = tuple(range(plan.refine_start_iter, last, plan.refine_every))
-    return (
-        Event("densify", grow, densify),
-        Event(
-            "reset opacity",
-            tuple(range(plan.reset_every, last, plan.reset_every)),
-            reset,
-        ),
-    )
-
-
-def _mcmc_events(plan, steps, effects, optimizer):
-    def refine(state, frames):
-        del frames
-        params, moments, _ = mcmc.refine(
-            optimizer, state.params, state.optimizer, stream_key(state, EVENT), plan
-        )
-        aux_state = AuxState((), states_of(effects, params))
-        return state._replace(params=params, optimizer=moments, aux_state=aux_state)
-
-    last = min(plan.refine_stop_iter, steps)
-    when = tuple(range(plan.refine_start_iter, last, plan.refine_every))
-    return (Event("relocate and add", when, refine),)

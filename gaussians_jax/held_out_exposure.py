@@ -13,7 +13,6 @@ from gaussians_jax import scene
 from gaussians_jax.effects import exposure
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Rendering, TrainState, View
 
 
@@ -23,7 +22,6 @@ def score(
     state: TrainState,
     capture: Capture,
     rows: np.ndarray,
-    effects: tuple[Effect, ...] = (),
 ) -> evaluation.Halves | None:
     """Scores of the right halves of frames, their exposure fitted to the left ones.
 
@@ -32,7 +30,7 @@ def score(
     if spec.exposure is None:
         return None
     neutral = dataclasses.replace(spec, exposure=None)
-    model = scene.build(neutral, metadata, effects)
+    model = scene.build(neutral, metadata)
     renderer = evaluation.Renderer(model, capture.size)
 
     def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> np.ndarray:

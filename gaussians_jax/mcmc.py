@@ -19,9 +19,11 @@ from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import densification, splats
 from gaussians_jax import optimizer as row_optimizer
+from gaussians_jax.protocols import Population, StepInfo, StrategyEvent
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.geometry.precision import exact_einsum, exact_product
+from nerfies_jax.training.effects import PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
@@ -51,6 +53,8 @@ class MCMCStrategySpec:
     opacity_reg: float = 0.01
     scale_reg: float = 0.01  # per scene unit
 
+    name = "mcmc"
+
     def __post_init__(self):
         if not 0 < self.min_opacity < 1:
             raise ValueError(
@@ -72,6 +76,43 @@ class MCMCStrategySpec:
                 raise ValueError(
                     f"{name}={value} must be finite and not negative; 0 leaves it out"
                 )
+
+    def init(self, gaussians: Splats) -> tuple[()]:
+        """Return no state: nothing is observed."""
+        return ()
+
+    def update(self, state: tuple[()], info: StepInfo) -> tuple[()]:
+        """Return no state."""
+        return state
+
+    def events(self, steps: int) -> tuple[StrategyEvent, ...]:
+        """Return when Gaussians are relocated and added."""
+        last = min(self.refine_stop_iter, steps)
+        when = tuple(range(self.refine_start_iter, last, self.refine_every))
+        return (StrategyEvent("relocate and add", when, self._refine),)
+
+    def _refine(self, population: Population) -> Population:
+        params, moments, _ = refine(
+            population.optimizer,
+            population.params,
+            population.moments,
+            population.key,
+            self,
+        )
+        return population._replace(params=params, moments=moments)
+
+    def loss(self, params: Params, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the penalty on opacities and scales."""
+        return {"penalty": Term(penalty(params.rows["splats"], self), 1.0)}
+
+    def perturb(
+        self,
+        key: Key[Array, ""],
+        params: Params,
+        learning_rate: Float[Array, ""] | float,
+    ) -> Params:
+        """Return the parameters with noise on the means."""
+        return inject_noise(key, params, learning_rate, self)
 
 
 def compute_relocation(

@@ -19,6 +19,7 @@ import json
 import os
 import pathlib
 import zipfile
+from collections.abc import Collection
 from typing import Any
 
 import jax
@@ -31,7 +32,7 @@ from gaussians_jax.splats import Params
 from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.json_files import replaced_file
-from nerfies_jax.training import specs
+from nerfies_jax.training import extensions, specs
 
 FORMAT = "gaussians_jax model"
 VERSION = 2
@@ -68,13 +69,22 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
     return path.stat().st_size
 
 
-def load(path: str | os.PathLike) -> tuple[Params, dict[str, Any]]:
-    """Parameters and description, as they were saved; host side.
+def load(
+    path: str | os.PathLike, trusted: Collection[str] = ()
+) -> tuple[Params, dict[str, Any]]:
+    """Read parameters and description, as they were saved; host side.
 
-    Sequences in the description come back as tuples.
+    Args:
+      path: The file.
+      trusted: Names MODULE:NAME of classes from other packages that may be imported,
+        which runs their code.
+
+    Returns:
+      The parameters and the description, whose sequences come back as tuples.
 
     Raises:
-      FileError: The file is damaged, or not that of a model.
+      FileError: If it is damaged or no model file, or names a class that is not
+        trusted.
     """
     path = pathlib.Path(path)
     if not path.is_file():
@@ -82,8 +92,11 @@ def load(path: str | os.PathLike) -> tuple[Params, dict[str, Any]]:
     try:
         with npz_files.archive(path) as archive:
             about = _about(archive)
-            params = _put_together(about["params"], archive)
-        description = specs.from_json(about["description"], SplatScene, SceneMetadata)
+            others = _others(about, trusted)
+            params = _put_together(about["params"], archive, others)
+        description = specs.from_json(
+            about["description"], SplatScene, SceneMetadata, *others.values()
+        )
         _check(params)
     except FileError:  # it names the path already
         raise
@@ -171,18 +184,36 @@ def _taken_apart(tree, name, arrays):
     return {"array": name}
 
 
-def _put_together(structure, archive):
+def _others(about, trusted):
+    """Classes of other packages that the file names, by name."""
+    names = (
+        *extensions.names_in(about["params"], "record"),
+        *extensions.names_in(about["description"], specs.TYPE),
+    )
+    for name in names:
+        if name not in trusted:
+            raise ValueError(
+                f"it names {name!r} of another package, which runs code when it is "
+                f"loaded; load it with trusted=({name!r},) if you trust it"
+            )
+    return {name: extensions.load_class(name) for name in names}
+
+
+def _put_together(structure, archive, others):
     if structure is None:
         return None
     if "array" in structure:
         return jnp.asarray(archive.read(structure["array"]))
     if "dict" in structure:
         items = structure["dict"].items()
-        return {key: _put_together(item, archive) for key, item in items}
+        return {key: _put_together(item, archive, others) for key, item in items}
     if "tuple" in structure:
-        return tuple(_put_together(item, archive) for item in structure["tuple"])
-    record = specs.record_named(structure["record"])
+        items = structure["tuple"]
+        return tuple(_put_together(item, archive, others) for item in items)
+    name = structure["record"]
+    record = others[name] if name in others else specs.record_named(name)
     fields = {
-        key: _put_together(item, archive) for key, item in structure["fields"].items()
+        key: _put_together(item, archive, others)
+        for key, item in structure["fields"].items()
     }
     return specs.build_record(record, fields)

@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.splats import Params, Splats
 from nerfies_jax.evidence import rigid_groups
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.updates import descended
 
 PyTree = Any
@@ -80,7 +81,7 @@ class Depth(NamedTuple):
 
 
 class Guess(NamedTuple):
-    """What a fit starts from: `Effect.fit_to_paths` of a motion that knows better."""
+    """Initialization of a fit, as `Motion.fit` of a motion returns it."""
 
     points: Points
     rates: Points  # a prefix of `points`, in units of `StartSpec.fit_rate`
@@ -176,7 +177,7 @@ def combination(
     return np.linalg.solve(normal, right) + constant[:, None] * middle
 
 
-def guess(effect: Effect, paths: Paths, key: Key[Array, ""]) -> Guess:
+def guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
     """The effect's own guess; of one that has none, points in the middle of the film.
 
     What is known to be at rest is held there where networks move all alike: else they
@@ -185,14 +186,19 @@ def guess(effect: Effect, paths: Paths, key: Key[Array, ""]) -> Guess:
     if effect.fit_to_paths is not None:
         return effect.fit_to_paths(paths, key)
     canonical = jnp.asarray(places_at_one_moment(paths), jnp.float32)
-    still = resting(paths) if effect.init is not None else None
-    rows_key, nets_key = jax.random.split(key)
-    rows = still_rows = nets = row_rate = None
-    if effect.init_rows is not None:
-        rows, still_rows = _first_rows(effect, canonical, still, rows_key)
-        row_rate = 1.0
-    if effect.init is not None:
-        nets = effect.init(nets_key)
+    own = _initialized(effect, canonical, key)
+    still, still_rows = None, None
+    if own.shared is not None:
+        still = resting(paths)
+    if still is not None:
+        # All from one draw, those at rest behind.
+        both = jnp.concatenate([canonical, still])
+        own, count = _initialized(effect, both, key), len(canonical)
+        still_rows = jax.tree.map(lambda leaf: leaf[count:], own.per_gaussian)
+        rows = jax.tree.map(lambda leaf: leaf[:count], own.per_gaussian)
+        own = own._replace(per_gaussian=rows)
+    rows, nets = own
+    row_rate = None if rows is None else 1.0
     points = Points(canonical, rows, nets)
     rates = Points(paths.unit, row_rate, None if nets is None else 0.4)
     if still is None:
@@ -204,16 +210,10 @@ def guess(effect: Effect, paths: Paths, key: Key[Array, ""]) -> Guess:
     )
 
 
-def _first_rows(effect, canonical, still, key):
-    """Rows of the points, and of those at rest; all from one draw."""
-    every = canonical if still is None else jnp.concatenate([canonical, still])
-    blank = scene_of(effect, Points(every, None, None))
-    rows = effect.init_rows(key, blank.rows["splats"])
-    count = len(canonical)
-    return (
-        jax.tree.map(lambda leaf: leaf[:count], rows),
-        jax.tree.map(lambda leaf: leaf[count:], rows),
-    )
+def _initialized(effect, places, key):
+    """The first parameters of a motion whose Gaussians are at these places."""
+    blank = scene_of(effect, Points(places, None, None))
+    return effect.init(key, blank.rows["splats"])
 
 
 def _unrest_of(effect, unit):
@@ -232,7 +232,7 @@ def _unrest_of(effect, unit):
     return penalty
 
 
-def scene_of(effect: Effect, points: Points) -> Params:
+def scene_of(effect: SplatRecord, points: Points) -> Params:
     """The points as Gaussians of a scene that has this effect alone."""
     count, kind = len(points.canonical), points.canonical.dtype
     rows = Splats(
@@ -249,7 +249,7 @@ def scene_of(effect: Effect, points: Points) -> Params:
 
 
 def places(
-    effect: Effect, points: Points, time: Float[Array, ""]
+    effect: SplatRecord, points: Points, time: Float[Array, ""]
 ) -> Float[Array, "points 3"]:
     """Where the motion carries the points at a time."""
     return _deformer(effect, points)(time).mean
@@ -264,7 +264,7 @@ def _deformer(effect, points):
 
 
 def fit(
-    effect: Effect,
+    effect: SplatRecord,
     paths: Paths,
     key: Key[Array, ""],
     *,

@@ -2,7 +2,7 @@
 
 MoBa-GS, sections 3.6 and 3.5 (equation 8). All are functions of a traced step, so that
 a chunk of any length is one program. The phase before them, a warm-up without motion,
-belongs to each motion: `Effect.warm_up`.
+belongs to each motion: `SplatRecord.warm_up`.
 """
 
 import dataclasses

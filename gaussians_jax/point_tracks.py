@@ -8,7 +8,6 @@ from gaussians_jax import scene
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTracks
-from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import in_default_precision
 
 NEIGHBORS = 8  # Gaussians that carry a point
@@ -21,7 +20,6 @@ def follow(
     state,
     capture: Capture,
     known: GroundTruth,
-    effects: tuple[Effect, ...] = (),
 ) -> PointTracks | None:
     """Points of the start at all other moments, carried by the Gaussians around them.
 
@@ -35,10 +33,10 @@ def follow(
     Jacobian, so no strain. `known.start_points` [tracks, 3] and the result are in scene
     units, `state` is that of `scene.build`. None without motion or without points.
     """
-    every = scene.all_effects(spec, metadata, effects)
+    every = scene.all_effects(spec, metadata)
     if all(effect.deform is None for effect in every) or not len(known.path):
         return None
-    stages = scene.build(spec, metadata, effects).stages
+    stages = scene.build(spec, metadata).stages
     prepared = jax.jit(stages.prepare)(state.params)
     deform = jax.jit(lambda params, ready, time: stages.deform(params, ready, time))
     times = in_default_precision(capture.times[known.moments])
@@ -63,15 +61,15 @@ def follow(
     )
 
 
-def mover(spec, metadata, effects=()) -> Move | None:
+def mover(spec, metadata) -> Move | None:
     """What takes points of one view's instant to another's, as `follow` does.
 
     None where nothing moves the Gaussians.
     """
-    every = scene.all_effects(spec, metadata, effects)
+    every = scene.all_effects(spec, metadata)
     if all(effect.deform is None for effect in every):
         return None
-    stages = scene.build(spec, metadata, effects).stages
+    stages = scene.build(spec, metadata).stages
 
     @jax.jit
     def deform(params, time):

@@ -62,7 +62,7 @@ STATIC = SplatScene(steps=30_000)
 MCMC = SplatScene(
     steps=30_000,
     init=InitSpec(opacity=0.5, scale=0.1),
-    densification=MCMCStrategySpec(),
+    strategy=MCMCStrategySpec(),
 )
 
 # Yang et al. 2023, arXiv:2309.13101, for real captures: the network, the warm-up and
@@ -109,7 +109,7 @@ SONATA = SplatScene(
     batch_size=2,
     dssim_weight=0.0,
     optimizer="radam",
-    densification=DefaultStrategySpec(refine_stop_iter=60_000, reset_every=6_000_000),
+    strategy=DefaultStrategySpec(refine_stop_iter=60_000, reset_every=6_000_000),
     motion=KanMotionSpec(
         waves=2.0,
         spread=0.5,
@@ -132,7 +132,7 @@ E_D3DGS = SplatScene(
     steps=60_000,
     batch_size=2,
     dssim_weight=0.0,
-    densification=DefaultStrategySpec(refine_stop_iter=60_000, reset_every=6_000_000),
+    strategy=DefaultStrategySpec(refine_stop_iter=60_000, reset_every=6_000_000),
     motion=EmbeddingMotionSpec(),
     neighbors=NeighborSpec(),
 )
@@ -145,7 +145,7 @@ E_D3DGS = SplatScene(
 MOBA = SplatScene(
     steps=20_000,
     init=InitSpec(source="random", random=100_000),
-    densification=DefaultStrategySpec(refine_stop_iter=10_000),
+    strategy=DefaultStrategySpec(refine_stop_iter=10_000),
     motion=BasisMotionSpec(),
     alternation=AlternationSpec(10_000, 15_000),
     annealing=AnnealingSpec(15_000),
@@ -183,7 +183,7 @@ FOUR_D = SplatScene(
     steps=17_000,
     batch_size=2,
     dssim_weight=0.0,
-    densification=DefaultStrategySpec(
+    strategy=DefaultStrategySpec(
         refine_stop_iter=13_000, reset_every=1_000_000, cap_max=360_000
     ),
     motion=PlaneMotionSpec(),
@@ -197,7 +197,7 @@ SC_GS = SplatScene(
     steps=80_000,
     init=InitSpec(points=50_000, extra_random=None),
     learning_rates=LearningRateSpec(log_scale=1e-3),
-    densification=DefaultStrategySpec(refine_stop_iter=50_000),
+    strategy=DefaultStrategySpec(refine_stop_iter=50_000),
     motion=NodeMotionSpec(),
     start=StartSpec(motion="tracks", moving_points=20_000),
 )
@@ -223,7 +223,7 @@ D_MISO = SplatScene(
     steps=80_000,
     batch_size=4,
     init=InitSpec(points=4000),
-    densification=DefaultStrategySpec(refine_stop_iter=5000, cap_max=10_000),
+    strategy=DefaultStrategySpec(refine_stop_iter=5000, cap_max=10_000),
     motion=MotionSpec(warm_up=2000, smoothing=None),
     carried=CarriedSpec(),
 )
@@ -242,7 +242,7 @@ ADC_GS = SplatScene(
     init=InitSpec(points=2000, random=2000),
     sh_degree=0,
     learning_rates=LearningRateSpec(mean=4e-3, log_scale=7e-3, quaternion=2e-3),
-    densification=DefaultStrategySpec(
+    strategy=DefaultStrategySpec(
         refine_start_iter=9100,
         refine_stop_iter=50_000,
         grow_grad2d=2e-3,

@@ -36,7 +36,6 @@ from nerfies_jax.evaluation.representation import (
 from nerfies_jax.evidence import record, rigid_groups, usable_paths
 from nerfies_jax.evidence.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
 from nerfies_jax.training import specs
-from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, TrainState
 from nerfies_jax.training.track_start import FROM_REST
 
@@ -75,10 +74,10 @@ def growth(spec: Any, state: TrainState) -> float:
     1.5 times from 4500 to 8379 under a cap of 10,000 (`splats-static-small`, 600
     steps), 1.1 times from 7000 to the cap (`splats-tracked-small`, 250 steps).
     """
-    if spec.densification is None:
+    if spec.strategy is None:
         return 1.0
     first = int(splats.active_mask(state.params.rows["splats"]).sum())
-    return min(max(spec.densification.cap_max / first, 1.0) ** 0.5, 2.0)
+    return min(max(spec.strategy.cap_max / first, 1.0) ** 0.5, 2.0)
 
 
 def save(
@@ -86,14 +85,13 @@ def save(
     spec: Any,
     metadata: Any,
     state: TrainState,
-    effects: tuple[Effect, ...] = (),
 ) -> Saved:
     """`model.npz`, all of the scene, and `gaussians.ply` for viewers."""
     if not bool(splats.active_mask(state.params.rows["splats"]).any()):
         return Saved(notes=(f"No Gaussian is left, so there is no {MODEL}.",))
     about = {"spec": spec, "metadata": metadata, "step": int(state.step)}
     size = model_file.save(folder / MODEL, state.params, about)
-    every = scene.all_effects(spec, metadata, effects)
+    every = scene.all_effects(spec, metadata)
     drawn = deformation.drawn_rows(every, state.params)
     files.save(folder / "gaussians.ply", drawn)
     if all(effect.deform is None for effect in every):
@@ -223,14 +221,14 @@ def capacity(
     """
     share = max((size[0] * size[1] / SMALL_PIXELS) ** 0.5, 1.0)
     counts = {
-        "densification.cap_max": share * spec.densification.cap_max,
+        "strategy.cap_max": share * spec.strategy.cap_max,
         "init.points": share * spec.init.points,
     }
     if spec.start.motion == "tracks":
         moving = share * spec.start.moving_points
         more = min(max(LONG / followed, 1.0) ** 0.5, MOST_TIMES) * moving
         counts["start.moving_points"] = more
-        counts["densification.cap_max"] += more - moving
+        counts["strategy.cap_max"] += more - moving
     if share <= 1 and counts.get("start.moving_points", 0) <= spec.start.moving_points:
         return ()
     return tuple(f"{k}={float(f'{n:.2g}'):.0f}" for k, n in counts.items())

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, Int, Key
 from gaussians_jax import (
     growth,
     initialization,
-    mcmc,
     phases,
     rendering,
     splats,
@@ -20,13 +19,14 @@ from gaussians_jax import (
 from gaussians_jax.effects import deformation
 from gaussians_jax.first_state import count_rows, first_state
 from gaussians_jax.initialization import StartSpec
-from gaussians_jax.mcmc import MCMCStrategySpec
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.spec import (
-    OPTIMIZERS,
     SceneMetadata,
     SplatScene,
     effects_of,
+    optimizer_of,
     raster_of,
+    strategy_of,
 )
 from gaussians_jax.splats import Params, Splats
 from gaussians_jax.update import Drawn
@@ -35,12 +35,9 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.scene_metadata import exposures
 from nerfies_jax.training import loop, losses
 from nerfies_jax.training.effects import (
-    FIELD_SEAMS,
-    Effect,
     FrameCondition,
     Observation,
     PenaltyContext,
-    Term,
     joined,
     penalty_terms,
     values,
@@ -54,6 +51,7 @@ from nerfies_jax.training.model import (
     TrainState,
     View,
 )
+from nerfies_jax.training.protocols import as_terms, name_of
 
 PyTree = Any
 
@@ -81,27 +79,24 @@ def metadata_of(capture: Capture) -> SceneMetadata:
 
 
 def all_effects(
-    spec: SplatScene, metadata: SceneMetadata, more: tuple[Effect, ...] = ()
-) -> tuple[Effect, ...]:
+    spec: SplatScene, metadata: SceneMetadata, more: tuple[SplatRecord, ...] = ()
+) -> tuple[SplatRecord, ...]:
     """The effects of a spec and then `more`, each with the learning rates it needs."""
     own = effects_of(spec, metadata)
-    every = joined(own, more, refused=FIELD_SEAMS, reserved=("splats",))
+    every = joined(own, more, reserved=("splats",))
     for effect in every:
-        for seam, rate in (
-            ("init", "learning_rate"),
-            ("init_rows", "row_learning_rate"),
-        ):
-            if getattr(effect, seam) and not getattr(effect, rate):
-                raise ValueError(
-                    f"the effect {effect.name!r} has {seam} and no {rate}, so what it "
-                    f"starts would not train; give it a {rate}, a function of the step"
-                )
+        if effect.init and not effect.learning_rate:
+            raise ValueError(
+                f"the effect {effect.name!r} has init and no learning_rate, so its "
+                "parameters would not train; give it a learning_rate, a function of "
+                "the step"
+            )
     deformation.check_derived(every)
     return every
 
 
 def build(
-    spec: SplatScene, metadata: SceneMetadata, effects: tuple[Effect, ...] = ()
+    spec: SplatScene, metadata: SceneMetadata, effects: tuple[SplatRecord, ...] = ()
 ) -> Model:
     """Everything the loop, the renderer and the report need of this scene.
 
@@ -110,7 +105,7 @@ def build(
     more = tuple(effect.name for effect in effects)
     effects = all_effects(spec, metadata, effects)
     # Counts updates per row; for the networks, whose rows are never born, it is plain.
-    optimizer = OPTIMIZERS[spec.optimizer]()
+    optimizer = optimizer_of(spec)
     stages = _stages(spec, metadata, effects)
     devices = data_parallel.device_count(spec.batch_size)
 
@@ -119,7 +114,8 @@ def build(
         return stages.draw(params, deformed, view, size, step)
 
     def init(capture, key, spec=spec):
-        return first_state(spec, effects, optimizer, capture, key)
+        strategy = strategy_of(spec, metadata)
+        return first_state(spec, strategy, effects, optimizer, capture, key)
 
     def example(capture, key):
         at_rest = dataclasses.replace(spec, start=StartSpec(motion="none"))
@@ -218,6 +214,7 @@ def _posed(effects, params, frames):
 
 def _stepper(spec, metadata, effects, optimizer, devices):
     """One update from a batch of frames: (state, frames) -> (state, metrics), pure."""
+    strategy = strategy_of(spec, metadata)
 
     def one_view(index, state, frames):
         seen = _condition(spec, state, frames, index)
@@ -240,9 +237,8 @@ def _stepper(spec, metadata, effects, optimizer, devices):
         metrics, grads = means
         trained = update.descend(spec, metadata, effects, optimizer, state, grads)
         aux_state = state.aux_state
-        for index, (_, _, drawn) in enumerate(each):
-            _, condition = _condition(spec, state, frames, index)
-            aux_state = update.gather(spec, effects, aux_state, drawn, condition, size)
+        for _, _, drawn in each:
+            aux_state = update.observed(strategy, aux_state, drawn, size)
         state = TrainState(*trained, aux_state, state.step + 1, state.key)
         return state, metrics
 
@@ -295,7 +291,7 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
     return {"loss": value, **metrics}, grads, Drawn(mean2d_grad, *drawn)
 
 
-def draws_depth(effects: tuple[Effect, ...], frames: Frames) -> bool:
+def draws_depth(effects: tuple[SplatRecord, ...], frames: Frames) -> bool:
     """Whether a step draws depths: a channel that nothing reads costs 4 % of it."""
     read = any("depths" in effect.required_data for effect in effects)
     return read and frames.depths is not None
@@ -303,7 +299,7 @@ def draws_depth(effects: tuple[Effect, ...], frames: Frames) -> bool:
 
 def loss_of(
     spec: SplatScene,
-    effects: tuple[Effect, ...],
+    effects: tuple[SplatRecord, ...],
     params: Params,
     observation: Observation,
     condition: FrameCondition,
@@ -324,9 +320,10 @@ def loss_of(
         at_time=deformation.deformer(effects, condition),
     )
     terms = penalty_terms(effects, params.nets, context, states)
-    if isinstance(spec.densification, MCMCStrategySpec):
-        cost = mcmc.penalty(params.rows["splats"], spec.densification)
-        terms["mcmc/penalty"] = Term(cost, 1.0)
+    strategy = spec.strategy
+    if hasattr(strategy, "loss"):
+        for name, term in as_terms(strategy.loss(params, context)).items():
+            terms[f"{name_of(strategy)}/{name}"] = term
     metrics = {"mse": losses.mse(color, truth, valid)} | values(terms)
     return weighted_sum(terms, photometric), metrics
 

@@ -42,7 +42,7 @@ SMALL_STATIC = SplatScene(
     init=InitSpec(points=4000, random=5000, extra_random=2000),
     sh_degree=1,
     sh_every=1000,
-    densification=DefaultStrategySpec(
+    strategy=DefaultStrategySpec(
         refine_every=200,
         refine_start_iter=300,
         refine_stop_iter=2000,
@@ -68,7 +68,7 @@ SMALL_STATIC = SplatScene(
 #   and events every 100 steps (7692 Gaussians)   21.93 / 0.795
 SMALL_MCMC = dataclasses.replace(
     SMALL_STATIC,
-    densification=MCMCStrategySpec(
+    strategy=MCMCStrategySpec(
         refine_every=50, refine_start_iter=300, refine_stop_iter=2500, cap_max=10_000
     ),
 )
@@ -80,8 +80,8 @@ SMALL_FROM_TRACKS = dataclasses.replace(
     batch_size=2,
     init=InitSpec(points=4000, random=5000, extra_random=None),
     sh_every=700,
-    densification=dataclasses.replace(
-        SMALL_STATIC.densification,
+    strategy=dataclasses.replace(
+        SMALL_STATIC.strategy,
         refine_every=130,
         refine_start_iter=200,
         refine_stop_iter=1300,
@@ -162,7 +162,7 @@ SMALL_D_MISO = dataclasses.replace(
     SMALL_FROM_TRACKS,
     init=InitSpec(points=1500, random=1500, extra_random=None),
     start=StartSpec(motion="tracks", moving_points=800),
-    densification=dataclasses.replace(SMALL_FROM_TRACKS.densification, cap_max=2500),
+    strategy=dataclasses.replace(SMALL_FROM_TRACKS.strategy, cap_max=2500),
     motion=SMALL_DEFORMABLE.motion,
     carried=CarriedSpec(
         count=4,
@@ -180,7 +180,7 @@ SMALL_ADC_GS = dataclasses.replace(
     init=InitSpec(points=500, random=600, extra_random=None),
     start=StartSpec(motion="tracks", moving_points=350),
     sh_degree=0,
-    densification=dataclasses.replace(SMALL_FROM_TRACKS.densification, cap_max=1000),
+    strategy=dataclasses.replace(SMALL_FROM_TRACKS.strategy, cap_max=1000),
     motion=AnchorMotionSpec(
         time_code=16,
         width=64,
@@ -224,9 +224,7 @@ SMALL_SONATA = dataclasses.replace(
 # time, 21.90 with these.
 SMALL_MOBA = dataclasses.replace(
     SMALL_STATIC,
-    densification=dataclasses.replace(
-        SMALL_STATIC.densification, refine_stop_iter=1500
-    ),
+    strategy=dataclasses.replace(SMALL_STATIC.strategy, refine_stop_iter=1500),
     motion=dataclasses.replace(
         SMALL_BASIS_MOTION,
         time=EncodingSpec(6),

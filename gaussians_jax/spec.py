@@ -1,31 +1,16 @@
 """Which scene of Gaussians: its settings, and the effects that they ask for."""
 
 import dataclasses
-import math
 
-from gaussians_jax import phases
+from gaussians_jax import phases, protocols
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import (
-    acceleration,
-    anchor_motion,
     carried,
-    depth,
     embedding_motion,
-    exposure,
     kan_motion,
     mlp_motion,
-    motion_basis,
     motion_flow,
-    motion_growth,
     neighbors,
-    node_motion,
-    plane_motion,
-    polynomial_motion,
-    pose_refinement,
-    se3_bases,
-    spectral,
-    spline_motion,
-    temporal_opacity,
     time_basis,
 )
 from gaussians_jax.effects.acceleration import AccelerationSpec
@@ -38,7 +23,7 @@ from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from gaussians_jax.effects.motion_flow import FlowSpec
-from gaussians_jax.effects.motion_growth import MotionGrowthSpec
+from gaussians_jax.effects.motion_growth import MotionGrowthSpec, MotionGuided
 from gaussians_jax.effects.neighbors import NeighborSpec
 from gaussians_jax.effects.node_motion import NodeMotionSpec
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
@@ -52,10 +37,14 @@ from gaussians_jax.effects.time_basis import TimeBasisSpec
 from gaussians_jax.initialization import InitSpec, StartSpec
 from gaussians_jax.learning_rates import LearningRateSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
+from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.optimizer import scale_by_row_adam, scale_by_row_radam
 from gaussians_jax.phases import AlternationSpec, AnnealingSpec
+from gaussians_jax.protocols import Appearance, CameraOptimizer, Motion, Strategy
 from gaussians_jax.raster_spec import RasterSpec
-from nerfies_jax.training.effects import Effect
+from gaussians_jax.records import SplatRecord
+from nerfies_jax.training.extensions import Settings, check
+from nerfies_jax.training.protocols import Optimizer, Regularizer
 from nerfies_jax.training.step_counts import steps
 
 OPTIMIZERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
@@ -93,6 +82,12 @@ OF_MOTION = (
     "flow",
 )
 
+PROTOCOLS = {
+    "motion": Motion,
+    "strategy": Strategy,
+    "exposure": Appearance,
+    "poses": CameraOptimizer,
+}
 WITHOUT_NETWORKS = PolynomialMotionSpec, SplineMotionSpec  # all in their rows
 
 
@@ -108,11 +103,13 @@ class SplatScene:
     dssim_weight: float = 0.2
     learning_rates: LearningRateSpec = LearningRateSpec()
     raster: RasterSpec = RasterSpec()
-    densification: DefaultStrategySpec | MCMCStrategySpec | None = DefaultStrategySpec()
-    optimizer: str = "adam"
+    strategy: DefaultStrategySpec | MCMCStrategySpec | Strategy | Settings | None = (
+        DefaultStrategySpec()
+    )
+    optimizer: str | Optimizer = "adam"
     alternation: AlternationSpec | None = None
     annealing: AnnealingSpec | None = None
-    motion: AnyMotion | None = None
+    motion: AnyMotion | Motion | Settings | None = None
     temporal_opacity: TemporalOpacitySpec | None = None
     carried: CarriedSpec | None = None  # what is drawn of each row; None: the row
     start: StartSpec = StartSpec()
@@ -121,11 +118,18 @@ class SplatScene:
     motion_growth: MotionGrowthSpec | None = None
     spectral: SpectralSpec | None = None
     depth: DepthSpec | None = None
-    exposure: ExposureSpec | None = None
+    exposure: ExposureSpec | Appearance | Settings | None = None
     flow: FlowSpec | None = None
-    poses: PoseRefinementSpec | None = None
+    poses: PoseRefinementSpec | CameraOptimizer | Settings | None = None
+    # Beside those with a field of their own.
+    regularizers: tuple[Regularizer | Settings, ...] = ()
 
     def __post_init__(self):
+        for name, protocol in PROTOCOLS.items():
+            if getattr(self, name) is not None:
+                check(name, getattr(self, name), protocol)
+        for one in self.regularizers:
+            check("regularizers", one, Regularizer)
         if self.steps < 1:
             raise ValueError(f"steps={self.steps}: train for at least one step")
         if self.batch_size < 1:
@@ -139,32 +143,14 @@ class SplatScene:
             )
         if not 0 <= self.dssim_weight <= 1:
             raise ValueError(f"dssim_weight={self.dssim_weight} must lie in [0, 1]")
-        if self.optimizer not in OPTIMIZERS:
+        if isinstance(self.optimizer, str) and self.optimizer not in OPTIMIZERS:
             raise ValueError(
                 f"unknown optimizer {self.optimizer!r}; choose from "
                 f"{sorted(OPTIMIZERS)}"
             )
 
 
-@dataclasses.dataclass(frozen=True)
-class SceneMetadata:
-    """What a scene must know of its capture before anything is compiled."""
-
-    extent: float  # scene units: how far the cameras spread
-    background: tuple[float, float, float]
-    frames: int  # to learn from
-    # As in `nerfies_jax.scene_metadata`: the rows between which an exposure lies.
-    exposures: tuple[tuple[int, int, float], ...] = ((0, 0, 0.0),)
-    # Low and high corner of what was filmed, scene units; None: nobody asks for it.
-    box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    near: float = math.inf  # z-depth, scene units: what is farther must be drawn
-    depth: float = 1.0  # z-depth halfway in what is filmed, scene units
-    times: int | None = None  # distinct ones of the frames; None: each has its own
-
-    @property
-    def moments(self) -> int:
-        """How many times are learned from: fewer than frames of several cameras."""
-        return self.frames if self.times is None else self.times
+Scene = SplatScene  # the public name
 
 
 def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
@@ -175,6 +161,12 @@ def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
     """
     near = min(spec.raster.near, metadata.near)
     return dataclasses.replace(spec.raster, near=near)
+
+
+def optimizer_of(spec: SplatScene) -> Optimizer:
+    """Return the optimizer of a scene, whose updates are scaled by learning rates."""
+    own = spec.optimizer
+    return OPTIMIZERS[own]() if isinstance(own, str) else own
 
 
 def carried_count(spec: SplatScene) -> int | None:
@@ -213,8 +205,8 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "motion to fit to tracks; leave one of them out"
         )
     _refuse_beside_carried(spec)
-    still = 0 if spec.start.motion == "tracks" or motion is None else motion.warm_up
-    if still and getattr(motion, "fading", None) is not None:
+    still = 0 if spec.start.motion == "tracks" else getattr(motion, "warm_up", 0)
+    if still and _fading(motion) is not None:
         raise ValueError(
             f"motion.warm_up={still} with motion.fading: what is drawn fades from the "
             "first step, and what is trained only then; leave one of them out "
@@ -231,7 +223,7 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
 def _refuse_beside_carried(spec):
     """Raise ValueError for what rows that carry Gaussians cannot have."""
     carry = carried_count(spec) is not None
-    if carry and isinstance(spec.densification, MCMCStrategySpec):
+    if carry and isinstance(spec.strategy, MCMCStrategySpec):
         raise ValueError(
             "MCMCStrategySpec shares the opacity of a Gaussian among its copies, and "
             "rows that carry several have none of their own; choose "
@@ -244,7 +236,7 @@ def _refuse_beside_carried(spec):
         )
     fading = {
         "temporal_opacity": spec.temporal_opacity,
-        "motion.fading": getattr(spec.motion, "fading", None),
+        "motion.fading": _fading(spec.motion),
     }
     faded = [name for name, one in fading.items() if one is not None]
     if carry and faded:
@@ -258,7 +250,7 @@ def _refuse_beside_carried(spec):
 def _refuse_growth(spec, still):
     """Raise ValueError where motion would steer no growth."""
     growth = spec.motion_growth
-    if growth is not None and not isinstance(spec.densification, DefaultStrategySpec):
+    if growth is not None and not isinstance(spec.strategy, DefaultStrategySpec):
         raise ValueError(
             "motion_growth steers the gradient threshold of DefaultStrategySpec, which "
             "this scene has not; leave it out as well (motion_growth=none)"
@@ -273,9 +265,9 @@ def _refuse_growth(spec, still):
 
 def _refuse_late(spec, still):
     """Raise ValueError for what would begin after the last step."""
-    starts = {"motion.warm_up": still}
+    starts, motion = {"motion.warm_up": still}, spec.motion
     parts = {
-        "motion.rate": getattr(spec.motion, "rate", None),
+        "motion.rate": motion.rate if isinstance(motion, AnchorMotionSpec) else None,
         "neighbors": spec.neighbors,
         "acceleration": spec.acceleration,
         "flow": None if spec.start.motion == "tracks" else spec.flow,
@@ -290,6 +282,11 @@ def _refuse_late(spec, still):
             )
 
 
+def _fading(motion):
+    """How the opacities of a motion come and go; None where they stay."""
+    return motion.fading if isinstance(motion, PolynomialMotionSpec) else None
+
+
 def _embedded(motion):
     """What of a motion its neighbors keep alike; ValueError where it has no such."""
     if type(motion) not in EMBEDDED:
@@ -301,84 +298,72 @@ def _embedded(motion):
     return EMBEDDED[type(motion)]
 
 
-# Of a motion's spec, the steps of training, and the capture.
-MOTIONS = {
-    MotionSpec: lambda spec, steps, seen: mlp_motion.effect(spec, steps, seen.moments),
-    KanMotionSpec: lambda spec, steps, seen: kan_motion.effect(
-        spec, steps, seen.moments
-    ),
-    BasisMotionSpec: lambda spec, steps, seen: motion_basis.effect(
-        spec, steps, seen.moments
-    ),
-    SE3BasesSpec: lambda spec, steps, seen: se3_bases.effect(spec, steps, seen.extent),
-    TimeBasisSpec: lambda spec, steps, seen: time_basis.effect(
-        spec, steps, seen.extent
-    ),
-    PolynomialMotionSpec: lambda spec, steps, seen: polynomial_motion.effect(
-        spec, steps, seen.extent
-    ),
-    SplineMotionSpec: lambda spec, steps, seen: spline_motion.effect(
-        spec, steps, seen.extent
-    ),
-    PlaneMotionSpec: lambda spec, steps, seen: plane_motion.effect(
-        spec, steps, seen.extent, seen.box
-    ),
-    EmbeddingMotionSpec: lambda spec, steps, seen: embedding_motion.effect(
-        spec, steps, seen.moments
-    ),
-    NodeMotionSpec: lambda spec, steps, seen: node_motion.effect(
-        spec, steps, seen.extent
-    ),
-    AnchorMotionSpec: lambda spec, steps, seen: anchor_motion.effect(
-        spec, steps, seen.moments
-    ),
-}
-
-
-def motion_of(spec: SplatScene, metadata: SceneMetadata) -> Effect | None:
+def motion_of(spec: SplatScene, metadata: SceneMetadata) -> SplatRecord | None:
     """The motion that the spec asks for; one that starts from tracks moves at once."""
     motion = spec.motion
     if motion is None:
         return None
     if spec.start.motion == "tracks":
-        motion = dataclasses.replace(motion, warm_up=0)
-    return MOTIONS[type(motion)](motion, spec.steps, metadata)
+        motion = protocols.moving_at_once(motion)
+    return protocols.compile_motion(protocols.bound(motion, spec.steps, metadata))
 
 
-def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
-    """The effects that the spec asks for, in the order in which they act."""
+def strategy_of(spec: SplatScene, metadata: SceneMetadata) -> Strategy | None:
+    """Return the strategy of a scene, guided by its motion where the spec says so."""
+    own = spec.strategy
+    if own is None:
+        return None
+    strategy = protocols.bound(own, spec.steps, metadata)
+    if spec.motion_growth is None:
+        return strategy
+    return MotionGuided(strategy, spec.motion_growth, metadata.extent)
+
+
+def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[SplatRecord, ...]:
+    """Return the parts of a scene, compiled, in the order in which they act.
+
+    Args:
+      spec: Settings of the scene.
+      metadata: Sizes of the capture.
+
+    Returns:
+      The motion first, if there is one.
+    """
+
+    def bound(part):
+        return protocols.bound(part, spec.steps, metadata)
+
     motion = motion_of(spec, metadata)
     effects = [] if motion is None else [motion]
     if spec.temporal_opacity is not None:
-        effects.append(temporal_opacity.effect(spec.temporal_opacity))
+        effects.append(protocols.compile_motion(bound(spec.temporal_opacity)))
     if spec.carried is not None:
         # What is carried turns by itself from when on the rows move.
         still = 0 if motion is None else motion.warm_up
         effects.append(carried.effect(spec.carried, spec.steps, still))
-    if spec.acceleration is not None:
-        effects.append(
-            acceleration.effect(spec.acceleration, metadata.extent, metadata.moments)
-        )
+    early, late = _regularizers(spec, metadata, motion)
+    effects += [protocols.compile_regularizer(one) for one in early]
+    if spec.exposure is not None:
+        effects.append(protocols.compile_appearance(bound(spec.exposure)))
+    effects += [protocols.compile_regularizer(one) for one in late]
+    if spec.poses is not None:
+        effects.append(protocols.compile_camera_optimizer(bound(spec.poses)))
+    return tuple(effects)
+
+
+def _regularizers(spec, metadata, motion):
+    """The regularizers before and behind the exposure, which sums of terms keep to."""
+    early, late = [spec.acceleration], [*spec.regularizers]
     # A trained scene is drawn without its motion as well.
     if spec.neighbors is not None and motion is not None:
         of = _embedded(spec.motion)
-        effects.append(neighbors.effect(spec.neighbors, metadata.extent, of))
-    if spec.motion_growth is not None:
-        effects.append(motion_growth.effect(spec.motion_growth, metadata.extent))
-    if spec.spectral is not None:
-        effects.append(spectral.effect(spec.spectral, spec.steps))
-    if spec.depth is not None:
-        effects.append(depth.effect(spec.depth))
-    if spec.exposure is not None:
-        effects.append(exposure.effect(spec.exposure, spec.steps, metadata.exposures))
+        early.append(neighbors.Bound(spec.neighbors, metadata.extent, of))
+    early += [spec.spectral, spec.depth]
     if spec.flow is not None:
         at_once = spec.start.motion == "tracks"  # as the motion
         one = dataclasses.replace(spec.flow, start=0) if at_once else spec.flow
-        effects.append(motion_flow.effect(one, raster_of(spec, metadata)))
-    if spec.poses is not None:
-        effects.append(
-            pose_refinement.effect(
-                spec.poses, spec.steps, metadata.frames, metadata.depth
-            )
-        )
-    return tuple(effects)
+        late.insert(0, motion_flow.Bound(one, raster_of(spec, metadata)))
+    return tuple(
+        [protocols.bound(one, spec.steps, metadata) for one in some if one is not None]
+        for some in (early, late)
+    )

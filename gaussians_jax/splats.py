@@ -128,6 +128,20 @@ def active_mask(splats: Splats) -> Bool[Array, " gaussians"]:
     return ~(splats.opacity_logit <= INACTIVE_LOGIT / 2)
 
 
+def in_use(gaussians: Gaussians) -> Bool[Array, " gaussians"]:
+    """Select the Gaussians that can be seen.
+
+    The opacity of an inactive row is exactly zero.
+
+    Args:
+      gaussians: Gaussians of a scene, at any time.
+
+    Returns:
+      True where the opacity is not zero.
+    """
+    return ~(gaussians.opacity <= 0)
+
+
 def rows_to_write(splats: Splats, path: pathlib.Path) -> np.ndarray:
     """Select the Gaussians that a file holds, on the host.
 

@@ -5,12 +5,11 @@ import jax.numpy as jnp
 
 from gaussians_jax import projection, rendering, scene, splats, update
 from gaussians_jax.effects import deformation
-from gaussians_jax.spec import OPTIMIZERS, raster_of
+from gaussians_jax.spec import optimizer_of, raster_of, strategy_of
 from gaussians_jax.update import Drawn
 from nerfies_jax.measure.part_time import StepParts, part
 from nerfies_jax.training import losses, rate
 from nerfies_jax.training.effects import (
-    Effect,
     FrameCondition,
     PenaltyContext,
     penalty_terms,
@@ -25,7 +24,6 @@ def parts(
     model: Model,
     state: TrainState,
     frames: Frames,
-    effects: tuple[Effect, ...] = (),
 ) -> StepParts:
     """Begin to compile the parts of one step, forward and backward.
 
@@ -33,7 +31,7 @@ def parts(
     the first frame and one device, and counted for as many views as a device draws in a
     step. "rest" is what they leave of the whole step.
     """
-    effects = scene.all_effects(spec, metadata, effects)
+    effects = scene.all_effects(spec, metadata)
     condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
 
     @jax.jit
@@ -44,7 +42,7 @@ def parts(
     now = drawn(state.params)
     a_view = _drawing(spec, metadata, effects, now, frames)
     a_view |= _own_of_effects(effects, state, frames, condition)
-    once = _update(spec, metadata, effects, state, now, frames, condition)
+    once = _update(spec, metadata, effects, state, now, frames)
     views = spec.batch_size // model.devices
 
     def with_rest(timed):
@@ -106,19 +104,20 @@ def _own_of_effects(effects, state, frames, condition):
     return parts
 
 
-def _update(spec, metadata, effects, state, now, frames, condition):
+def _update(spec, metadata, effects, state, now, frames):
     """What follows the gradient, with parameters for gradients of their shape."""
-    optimizer = OPTIMIZERS[spec.optimizer]()
+    optimizer = optimizer_of(spec)
 
     def descend(state, grads):
         return update.descend(spec, metadata, effects, optimizer, state, grads)
 
+    strategy = strategy_of(spec, metadata)
+
     def gather(aux_state, *drawn):
-        drawn = Drawn(*drawn)
-        return update.gather(spec, effects, aux_state, drawn, condition, _size(frames))
+        return update.observed(strategy, aux_state, Drawn(*drawn), _size(frames))
 
     parts = {"optimizer": part(descend, state, state.params)}
-    if update.has_statistics(spec, effects):
+    if jax.tree.leaves(state.aux_state.stats):
         footprints = jax.eval_shape(
             lambda *seen: projection.project(
                 *seen, _size(frames), raster_of(spec, metadata)

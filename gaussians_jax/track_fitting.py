@@ -10,11 +10,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from gaussians_jax import path_fit
+from gaussians_jax import path_fit, protocols
+from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.path_fit import Paths, Points
-from gaussians_jax.spec import MOTIONS, SceneMetadata
+from gaussians_jax.protocols import Motion
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.splats import Params
-from nerfies_jax.training.effects import Effect
+from nerfies_jax.training.extensions import check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +34,7 @@ class TrackFit:
     params: Params
     error_before: float
     error_after: float
-    _effect: Effect
+    _effect: SplatRecord
     _points: Points
     _span: tuple[float, float]
 
@@ -99,9 +101,7 @@ def fit_tracks(
       Wang et al. 2024 (Shape of Motion, arXiv:2407.13764), Section 3.3, for the
       initialization of SE(3) bases from tracks.
     """
-    if type(motion) not in MOTIONS:
-        names = ", ".join(sorted(kind.__name__ for kind in MOTIONS))
-        raise ValueError(f"motion must be one of {names}, got {motion!r}")
+    check("motion", motion, Motion)
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
     if not 0 < learning_rate < np.inf:
@@ -139,8 +139,8 @@ def fit_tracks(
     unit = max(unit, float(np.finfo(np.float32).tiny) ** 0.5)
     box = tuple(map(tuple, (places.min(0) - unit, places.max(0) + unit)))
     metadata = SceneMetadata(unit, (0.0, 0.0, 0.0), count, box=box)
-    moving = dataclasses.replace(motion, warm_up=0)
-    effect = MOTIONS[type(motion)](moving, steps, metadata)
+    moving = protocols.bound(protocols.moving_at_once(motion), steps, metadata)
+    effect = protocols.compile_motion(moving)
     share = (times - times[0]) / (times[-1] - times[0])
     fitted = path_fit.fit(
         effect,

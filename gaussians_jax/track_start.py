@@ -16,12 +16,12 @@ from scipy.spatial import cKDTree
 from gaussians_jax import path_fit
 from gaussians_jax.initialization import StartSpec
 from gaussians_jax.path_fit import Depth, Paths, Points, PyTree, Resting
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.splats import Params
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evidence import record, usable_paths, view_set
 from nerfies_jax.evidence.moving import picture_scale
 from nerfies_jax.evidence.record import Evidence
-from nerfies_jax.training.effects import Effect
 
 DEPTH_TRACKS, DEPTH_REACH_PX = 6, 8.0  # whose depth a moving pixel takes
 CARRIERS = 3  # points of the fit that carry a seed, and lend a Gaussian its rows
@@ -44,7 +44,7 @@ class TrackStart(NamedTuple):
 
 def start(
     spec: StartSpec,
-    effect: Effect,
+    effect: SplatRecord,
     evidence: Evidence,
     capture: Capture,
     key: jax.Array,
@@ -192,7 +192,9 @@ def rows_at_rest(resting: Resting, places: Float[Array, "places 3"]) -> PyTree:
     return jax.tree.map(lambda leaf: jnp.asarray(_mixed(leaf, near, share)), own)
 
 
-def put_in(params: Params, effects: tuple[Effect, ...], tracked: TrackStart) -> Params:
+def put_in(
+    params: Params, effects: tuple[SplatRecord, ...], tracked: TrackStart
+) -> Params:
     """Insert the fitted motion, which is the first effect, into the parameters.
 
     The tracked Gaussians are the last ones, and all others are static.

@@ -7,15 +7,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from gaussians_jax import densification, growth, learning_rates, mcmc, phases
-from gaussians_jax.densification import DefaultStrategySpec
+from gaussians_jax import growth, learning_rates, phases
 from gaussians_jax.growth import AuxState
-from gaussians_jax.mcmc import MCMCStrategySpec
 from gaussians_jax.phases import Trained
 from gaussians_jax.projection import Footprints
+from gaussians_jax.protocols import MotionParams, StepInfo, Strategy
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.spec import SceneMetadata, SplatScene
 from gaussians_jax.splats import Gaussians, Params
-from nerfies_jax.training.effects import Effect, FrameCondition
 from nerfies_jax.training.model import TrainState
 from nerfies_jax.training.updates import apply_updates
 
@@ -34,19 +33,19 @@ class Drawn(NamedTuple):
 def descend(
     spec: SplatScene,
     metadata: SceneMetadata,
-    effects: tuple[Effect, ...],
+    effects: tuple[SplatRecord, ...],
     optimizer: optax.GradientTransformation,
     state: TrainState,
     grads: Params,
 ) -> Trained:
     """Parameters and moments after one update along `grads`."""
     updates, opt_state = optimizer.update(grads, state.optimizer, state.params)
-    by_part = _learning_rates(spec, metadata, effects, state.step)
+    by_part = _learning_rates(spec, metadata, effects, state.params, state.step)
     trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
-    if isinstance(spec.densification, MCMCStrategySpec):
-        noise_key = growth.stream_key(state, growth.NOISE)
+    if hasattr(spec.strategy, "perturb"):
+        key = growth.stream_key(state, growth.NOISE)
         rate = by_part.rows["splats"].mean
-        params = mcmc.inject_noise(noise_key, trained.params, rate, spec.densification)
+        params = spec.strategy.perturb(key, trained.params, rate)
         trained = trained._replace(params=params)
     if spec.alternation is not None:
         mask = phases.update_mask(spec.alternation, state.step)
@@ -55,46 +54,36 @@ def descend(
     return trained
 
 
-def has_statistics(spec: SplatScene, effects: tuple[Effect, ...]) -> bool:
-    """Whether a step gathers any."""
-    own = any(effect.update_state is not None for effect in effects)
-    return own or isinstance(spec.densification, DefaultStrategySpec)
-
-
-def gather(
-    spec: SplatScene,
-    effects: tuple[Effect, ...],
+def observed(
+    strategy: Strategy | None,
     aux_state: AuxState,
     drawn: Drawn,
-    condition: FrameCondition,
     size: tuple[int, int],
 ) -> AuxState:
-    """Statistics for the density control and of the effects, with one more frame.
+    """Return the state of the strategy after one more frame.
 
-    `size` is that of the frame, (width, height) in pixels.
+    Args:
+      strategy: Control of the number of Gaussians; None: there is none.
+      aux_state: State of the scene.
+      drawn: Observation of the Gaussians in the frame.
+      size: (width, height) of the frame in pixels.
     """
-    stats, states = aux_state
-    if isinstance(spec.densification, DefaultStrategySpec):
-        footprints = drawn.footprints
-        radius_px = jnp.max(footprints.extent_px, axis=1)
-        stats = densification.observe(
-            stats,
-            drawn.mean2d_grad,
-            footprints.seen(size),
-            radius_px,
-            size,
-            drawn.significance,
-        )
-    for effect in effects:
-        if effect.update_state is not None:
-            own = effect.update_state(
-                states[effect.name], drawn.canonical, drawn.moved, condition
-            )
-            states = states | {effect.name: own}
-    return AuxState(stats, states)
+    if strategy is None:
+        return aux_state
+    footprints = drawn.footprints
+    info = StepInfo(
+        drawn.mean2d_grad,
+        footprints.seen(size),
+        jnp.max(footprints.extent_px, axis=1),
+        size,
+        drawn.canonical,
+        drawn.moved,
+        drawn.significance,
+    )
+    return aux_state._replace(stats=strategy.update(aux_state.stats, info))
 
 
-def _learning_rates(spec, metadata, effects, step):
+def _learning_rates(spec, metadata, effects, params, step):
     """A prefix of `Params` with the learning rate of everything below each leaf.
 
     Times the root of the views in a step: their mean is that much less noisy.
@@ -106,9 +95,14 @@ def _learning_rates(spec, metadata, effects, step):
     }
     nets = {}
     for effect in effects:
-        if effect.init_rows is not None:
-            rows[effect.name] = effect.row_learning_rate(step)
-        if effect.init is not None:
-            nets[effect.name] = effect.learning_rate(step)
+        if effect.init is None:
+            continue
+        own = effect.learning_rate(step)
+        # A single number is the rate of all its parameters.
+        each = own if isinstance(own, MotionParams) else MotionParams(own, own)
+        if effect.name in params.rows:
+            rows[effect.name] = each.per_gaussian
+        if effect.name in params.nets:
+            nets[effect.name] = each.shared
     rates, root = Params(rows, nets), spec.batch_size**0.5
     return rates if root == 1 else jax.tree.map(lambda rate: root * rate, rates)

@@ -10,52 +10,41 @@ import numpy as np
 from gaussians_jax import scene, splats, static_rows, time_knots
 from gaussians_jax.effects.anchors import AnchorMotionSpec
 from nerfies_jax.evaluation.representation import Parts, check_there
-from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, Stages, TrainState
 
 REMOVABLE = ("motion", "carried", "exposure")  # what shows in a picture
 INSTANTS = 33  # at which rows are looked for that move
 
 
-def parts(spec, metadata, effects: tuple[Effect, ...] = ()) -> Parts:
-    """Motion and exposure can be left out, and such of the user's own."""
+def parts(spec, metadata) -> Parts:
+    """Return the parts of a scene that can be left out: those that show in an image."""
     del metadata
-    seams = ("deform", "expose")
-    own = [e.name for e in effects if any(getattr(e, seam) for seam in seams)]
-    there = [name for name in REMOVABLE if getattr(spec, name) is not None]
-    return Parts((*there, *own), appearance=spec.exposure is not None)
+    there = tuple(name for name in REMOVABLE if getattr(spec, name) is not None)
+    return Parts(there, appearance=spec.exposure is not None)
 
 
-def without_effects(
-    spec,
-    metadata,
-    without: tuple[str, ...],
-    blended: bool,
-    effects: tuple[Effect, ...] = (),
-) -> Model:
+def without_effects(spec, metadata, without: tuple[str, ...], blended: bool) -> Model:
     """The model with some effects left out."""
     if blended:
         raise ValueError(
             "--appearance: splats have no appearance codes; reconstruct with a preset "
             "that has them, as nerf-w or nerfies"
         )
-    spec, kept = reduced(spec, metadata, without, effects)
-    return scene.build(spec, metadata, kept)
+    return scene.build(reduced(spec, metadata, without), metadata)
 
 
-def reduced(spec, metadata, without: tuple[str, ...], effects: tuple[Effect, ...]):
-    """Remove effects from a specification and from the user's own.
+def reduced(spec, metadata, without: tuple[str, ...]):
+    """Remove parts from the settings of a scene.
 
     Raises:
       ValueError: If the scene cannot be rendered without one of them.
     """
-    check_there(without, parts(spec, metadata, effects).removable)
+    check_there(without, parts(spec, metadata).removable)
     left = {name: None for name in REMOVABLE if name in without}
     if "motion" in left and isinstance(spec.motion, AnchorMotionSpec):
         # Of the same features as the motion is what anchors carry at rest.
         left["motion"] = dataclasses.replace(spec.motion, moves=False)
-    kept = tuple(effect for effect in effects if effect.name not in without)
-    return dataclasses.replace(spec, **left), kept
+    return dataclasses.replace(spec, **left)
 
 
 class Faster(NamedTuple):

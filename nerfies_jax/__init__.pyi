@@ -1,4 +1,5 @@
 from .contract import checked as checked
+from .effects import protocols as protocols
 from .effects.elastic_loss import elastic_loss as elastic_loss
 from .evaluation import Renderer as Renderer
 from .evaluation import frames_of as frames_of
@@ -38,7 +39,6 @@ from .scene import RadianceScene as RadianceScene
 from .scene import build as build
 from .scene import metadata_of as metadata_of
 from .training import losses as losses
-from .training.effects import Effect as Effect
 from .training.effects import FrameCondition as FrameCondition
 from .training.effects import Term as Term
 from .training.loop import fit as fit

@@ -1,5 +1,6 @@
 """A radiance field as pure functions: rendering, warping and latent codes."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float, Int, Key
 from nerfies_jax import frustum_grid, skipping
 from nerfies_jax import spec as specs
 from nerfies_jax.effects.effect import RayOutput
+from nerfies_jax.effects.records import FieldRecord
 from nerfies_jax.field_ray import Ray, field_ray_through
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
@@ -21,8 +23,6 @@ from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene
 from nerfies_jax.training.effects import (
     MOMENT,
-    SPLAT_SEAMS,
-    Effect,
     FrameCondition,
     Table,
     joined,
@@ -42,7 +42,7 @@ class Field(NamedTuple):
 
     spec: RadianceScene
     metadata: SceneMetadata
-    effects: tuple[Effect, ...]
+    effects: tuple[FieldRecord, ...]
     init: Callable[[Key[Array, ""]], PyTree]
     codes_at: Callable[[PyTree, View], Codes]  # of a view, by table
     # (params, ray, condition, key, guide) -> its levels, coarse to fine. Without a key
@@ -64,7 +64,7 @@ def field(
     spec: RadianceScene,
     metadata: SceneMetadata,
     without: tuple[str, ...] = (),
-    effects: tuple[Effect, ...] = (),
+    effects: tuple[FieldRecord, ...] = (),
 ) -> Field:
     """Make the field of a spec and further effects, with some left out.
 
@@ -81,7 +81,7 @@ def field(
       The field.
     """
     own = specs.effects_of(spec, metadata)
-    every = joined(own, effects, refused=SPLAT_SEAMS, reserved=("template", "codes"))
+    every = joined(own, effects, reserved=("template", "codes"))
     tables = specs.tables_of(every)
     active = _active(every, without)
     bind = functools.partial(Bound, spec, metadata, active)
@@ -102,7 +102,7 @@ def field(
         return draw(bind(params), camera, FrameCondition(time, codes, step), size)
 
     moves = is_moved(active)
-    still = tuple(effect._replace(displace=None) for effect in active)
+    still = tuple(dataclasses.replace(effect, displace=None) for effect in active)
 
     def surveyed_once():
         # Warps that a grid is read for say where the template is asked, at all times.
@@ -175,7 +175,7 @@ def draw(
     return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), flat)
 
 
-def feeds_networks(effect: Effect) -> bool:
+def feeds_networks(effect: FieldRecord) -> bool:
     """Return whether the template or a warp reads the output of an effect.
 
     Args:
@@ -210,10 +210,14 @@ def _init(spec, metadata, effects, key):
     nets = {}
     keys = jax.random.split(key, 3)
     for number, (name, one) in enumerate(specs.templates_of(spec).items()):
+        own = jax.random.fold_in(keys[0], number)
+        if not isinstance(one, template.TemplateSpec):
+            nets[name] = one.init(own, lifted, condition)
+            continue
         extras = 0 if one.direction is None else one.direction.width(3)
         nets[name] = template.init(
             one,
-            jax.random.fold_in(keys[0], number),
+            own,
             one.encoded_width + lifted,
             condition + extras,
         )

@@ -40,7 +40,7 @@ def resolves(bound: Bound) -> bool:
 
     Fields with `lift` or `mark` hooks are excluded, since evaluating those at every
     sample takes as long. Effects state their shortest wavelength
-    (`Effect.shortest_wave`), otherwise it is unknown.
+    (`FieldRecord.shortest_wave`), otherwise it is unknown.
 
     Args:
       bound: The field with its parameters.

@@ -12,7 +12,7 @@ import numpy as np
 from nerfies_jax import evaluation, field_ray, scene, skipping
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.training import fit, losses
-from nerfies_jax.training.effects import APPEARANCE, Effect, FrameCondition
+from nerfies_jax.training.effects import APPEARANCE, FrameCondition
 from nerfies_jax.training.model import (
     Rendering,
     TrainState,
@@ -35,7 +35,6 @@ def score(
     state: TrainState,
     capture: Capture,
     rows: np.ndarray,
-    effects: tuple[Effect, ...] = (),
 ) -> evaluation.Halves | None:
     """Evaluate the right halves of frames, with codes fitted to the left halves.
 
@@ -48,15 +47,14 @@ def score(
       state: Trained state.
       capture: The capture.
       rows: Indices of the frames.
-      effects: Effects in addition to those of the spec.
 
     Returns:
       The metrics. None if the field has no codes that only training frames have.
     """
-    whole = scene.field(spec, metadata, effects=effects)
+    whole = scene.field(spec, metadata)
     names = {effect.name for effect in whole.effects}
     passing = tuple(sorted({"transient"} & names))
-    field = scene.field(spec, metadata, passing, effects)
+    field = scene.field(spec, metadata, passing)
     tables = _tables(field)
     if not tables:
         return None

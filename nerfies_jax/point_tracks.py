@@ -11,7 +11,7 @@ from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTracks
 from nerfies_jax.render_ray import Bound, mean_flow
 from nerfies_jax.training import tracks
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import in_default_precision
 
 LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
@@ -23,7 +23,6 @@ def follow(
     state,
     capture: Capture,
     known: GroundTruth,
-    effects: tuple[Effect, ...] = (),
 ) -> PointTracks | None:
     """Track points from the start to all other times, through the template of a field.
 
@@ -37,12 +36,11 @@ def follow(
       state: Trained state, of `scene.build`.
       capture: The capture.
       known: Ground truth, whose start points are tracked.
-      effects: Effects in addition to those of the spec.
 
     Returns:
       The tracks in scene units. None without such motion or without points.
     """
-    field = scene.field(spec, metadata, effects=effects)
+    field = scene.field(spec, metadata)
     if not len(known.path):
         return None
     if all(effect.displace is None for effect in field.effects):
@@ -167,18 +165,17 @@ def _flow_mover(field) -> Move | None:
     return move
 
 
-def mover(spec, metadata, effects=()) -> Move | None:
+def mover(spec, metadata) -> Move | None:
     """Return the motion of points from the time of one view to that of another.
 
     Args:
       spec: The scene.
       metadata: Scene metadata.
-      effects: Effects in addition to those of the spec.
 
     Returns:
       The motion, or None if nothing in the scene moves points.
     """
-    field = scene.field(spec, metadata, effects=effects)
+    field = scene.field(spec, metadata)
     if all(effect.displace is None for effect in field.effects):
         return _flow_mover(field)
     center = np.asarray(metadata.center, np.float32)

@@ -10,13 +10,16 @@ from jaxtyping import Array, Float, Key
 
 from nerfies_jax.effects import scene_flow, transient
 from nerfies_jax.effects.effect import Medium, RayOutput, Sample, Surface
+from nerfies_jax.effects.protocols import TemplateInputs
+from nerfies_jax.effects.records import FieldRecord
 from nerfies_jax.field_ray import Ray, fine_distances, first_distances
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import encoding
 from nerfies_jax.radiance import compositing, occupancy, sampling, template
+from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import RadianceScene, template_of
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 
 PyTree = Any
 Vector = Float[Array, "3"]
@@ -30,10 +33,10 @@ class Bound:
 
     spec: RadianceScene
     metadata: SceneMetadata
-    effects: tuple[Effect, ...]
+    effects: tuple[FieldRecord, ...]
     params: PyTree
 
-    def own(self, effect: Effect) -> PyTree:
+    def own(self, effect: FieldRecord) -> PyTree:
         """Return the parameters of one effect.
 
         Args:
@@ -116,7 +119,7 @@ class _Samples(NamedTuple):
     lifted: tuple[Float[Array, "samples features"], ...]
 
 
-def is_moved(effects: tuple[Effect, ...]) -> bool:
+def is_moved(effects: tuple[FieldRecord, ...]) -> bool:
     """Return whether the template is evaluated at displaced or ambient coordinates.
 
     Args:
@@ -236,11 +239,12 @@ def color_offset(
       condition: Conditioning of the frame.
 
     Returns:
-      The contribution, as of `template.color_offset`.
+      The contribution, as of `template.color_offset`. With a template of another
+      package, the direction and the features of the ray.
     """
     one, net = template_of(bound.spec, name), bound.params["template"][name]
     inputs = []
-    if one.direction is not None:
+    if isinstance(one, TemplateSpec) and one.direction is not None:
         inputs.append(encoding.encode(one.direction, direction, None))
     inputs += [
         effect.condition(bound.own(effect), condition)
@@ -248,6 +252,8 @@ def color_offset(
         if effect.condition is not None
     ]
     read = jnp.concatenate([*inputs, jnp.zeros(0, direction.dtype)])
+    if not isinstance(one, TemplateSpec):
+        return jnp.concatenate([direction, read])
     return template.color_offset(one, net, read)
 
 
@@ -274,6 +280,11 @@ def radiance_at(
     """
     warped, lifted = place
     one, net = template_of(bound.spec, name), bound.params["template"][name]
+    if not isinstance(one, TemplateSpec):
+        features = jnp.concatenate([*lifted, jnp.zeros(0, warped.dtype)])
+        given = warped, offset[:3], features, offset[3:], condition.step
+        density, color = one.apply(net, TemplateInputs(*given))
+        return template.Radiance(density, color, jnp.zeros(0, warped.dtype))
     encoded = template.encode(one, net, warped, condition.step)
     features = jnp.concatenate([encoded, *lifted])
     raw, hidden = template.raw_density(one, net, features)
@@ -388,8 +399,8 @@ def _composite(bound, ray, samples, radiance, media):
 
 
 def says_beta(
-    effects: tuple[Effect, ...], media: Mapping[str, Medium]
-) -> Effect | None:
+    effects: tuple[FieldRecord, ...], media: Mapping[str, Medium]
+) -> FieldRecord | None:
     """Find the effect whose medium provides the uncertainty of a ray's color.
 
     Args:

@@ -1,5 +1,6 @@
 """A radiance field put together: a spec becomes a `Model` the loop can train."""
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -22,18 +23,20 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.frame_memory import frame_bytes
 from nerfies_jax.effects import moving_mask, scene_flow, transient
 from nerfies_jax.effects.effect import Batch, Box, RayOutput
+from nerfies_jax.effects.protocols import NetworkTemplate, Template
+from nerfies_jax.effects.records import FieldRecord
 from nerfies_jax.evidence import usable_paths
 from nerfies_jax.field import Codes, Field, field
 from nerfies_jax.geometry import rays
 from nerfies_jax.nets import codes
+from nerfies_jax.nets.adapters import Network
 from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.radiance.occupancy import Cells
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
-from nerfies_jax.spec import RadianceScene
+from nerfies_jax.spec import RadianceScene, optimizer_of
 from nerfies_jax.training import loop, losses, schedules
 from nerfies_jax.training.effects import (
-    Effect,
     FrameCondition,
     PenaltyContext,
     Term,
@@ -55,8 +58,6 @@ __all__ = ["Field", "RadianceScene", "SceneMetadata", "build", "field", "metadat
 
 PyTree = Any
 
-OPTIMIZER = optax.scale_by_adam()
-
 
 def metadata_of(capture: Capture, spec: RadianceScene) -> SceneMetadata:
     """Compute the scene metadata of a capture, on the host.
@@ -72,15 +73,35 @@ def metadata_of(capture: Capture, spec: RadianceScene) -> SceneMetadata:
 
 
 def build(
-    spec: RadianceScene, metadata: SceneMetadata, effects: tuple[Effect, ...] = ()
+    spec: RadianceScene,
+    metadata: SceneMetadata,
+    effects: tuple[FieldRecord, ...] = (),
+    *,
+    template: Template | Network | None = None,
 ) -> Model:
-    """Everything the loop, the renderer and the report need of this scene.
+    """Build the model of a radiance field.
 
-    `effects` act behind those of the spec. Raises ValueError where an effect needs what
-    the capture does not have, or reads a guide that no effect marks.
+    Args:
+      spec: The scene.
+      metadata: Scene metadata, as of `metadata_of`.
+      effects: Internal records of further effects, behind those of the spec.
+      template: Template in the place of the spec's: an object of the protocol
+        `Template`, or a network of `nets.adapters` that reads [point, features] and
+        [direction, condition] of a sample and returns its density and color.
+
+    Returns:
+      What the training loop and the renderer need.
+
+    Raises:
+      ValueError: If a part needs data that the capture does not have, or a guide that
+        no part provides.
     """
+    if isinstance(template, Network):
+        template = NetworkTemplate(template)
+    if template is not None:
+        spec = dataclasses.replace(spec, template=template, coarse=None)
     radiance = field(spec, metadata, effects=effects)
-    _check_guides(spec, effects)
+    _check_guides(spec, radiance.effects)
     codes_at = radiance.codes_at
     if spec.background is not None and "points" not in metadata.available_data:
         raise ValueError(
@@ -106,11 +127,13 @@ def build(
     def example(_, key):
         return first_state(radiance.init(key), key)
 
+    optimizer = optimizer_of(spec)
+
     def first_state(params, key):
         params = in_default_precision(params)
         cells = occupied_rays.first(radiance)
         return TrainState(
-            params, OPTIMIZER.init(params), cells, jnp.zeros((), jnp.int32), key
+            params, optimizer.init(params), cells, jnp.zeros((), jnp.int32), key
         )
 
     read = frozenset().union(*(effect.required_data for effect in radiance.effects))
@@ -130,17 +153,15 @@ def build(
 
 def _check_guides(spec, effects):
     """Refuse what would end as a missing code where a warp or a slice is traced."""
-    # What an effect of one's own marks it says only when it is traced.
-    if any(effect.mark is not None for effect in effects):
-        return
-    there = () if spec.mask is None else (moving_mask.NAME,)
+    there = tuple(effect.name for effect in effects if effect.mark is not None)
     for part in ("warp", "ambient"):
         for guide in getattr(getattr(spec, part), "guides", ()):
             if guide not in there:
                 raise ValueError(
-                    f"{part}.guides names {guide!r}, and of a point the effects say "
-                    f"{' and '.join(there) or 'nothing'}; leave it out, set mask for "
-                    f"{moving_mask.NAME!r}, or pass an effect with a mark"
+                    f"{part}.guides names {guide!r}, and there is "
+                    f"{' and '.join(there) or 'none'}; leave it out, set mask for "
+                    f"{moving_mask.NAME!r}, or add a conditioning of that name whose "
+                    'target is "warp"'
                 )
 
 
@@ -229,18 +250,23 @@ def micro_batch(
 
 
 def descend(
-    spec: RadianceScene, effects: tuple[Effect, ...], state: TrainState, grads: PyTree
+    spec: RadianceScene,
+    effects: tuple[FieldRecord, ...],
+    state: TrainState,
+    grads: PyTree,
 ) -> tuple[PyTree, optax.OptState]:
     """The parameters and moments after one update along `grads`."""
     # optax counts in int32 and multiplies float32 by it.
     with jax.numpy_dtype_promotion("standard"):
-        updates, moments = OPTIMIZER.update(grads, state.optimizer)
+        updates, moments = optimizer_of(spec).update(
+            grads, state.optimizer, state.params
+        )
     rates = learning_rates(spec, effects, state.params, state.step)
     return apply_updates(state.params, updates, rates), moments
 
 
 def learning_rates(
-    spec: RadianceScene, effects: tuple[Effect, ...], params: PyTree, step: Array
+    spec: RadianceScene, effects: tuple[FieldRecord, ...], params: PyTree, step: Array
 ) -> dict[str, PyTree]:
     """Compute the learning rate of each part of the parameters.
 
@@ -389,7 +415,7 @@ def loss_terms(
 
 
 def _color_terms(
-    effects: tuple[Effect, ...], levels: tuple[RayOutput, ...], batch: Batch
+    effects: tuple[FieldRecord, ...], levels: tuple[RayOutput, ...], batch: Batch
 ) -> dict[str, Term]:
     last = levels[-1]
     mse = losses.mse(last.color, batch.color, batch.valid)
@@ -424,10 +450,11 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     last = plan.coarse if plan.fine == 0 else plan.union * plan.coarse + plan.fine
     samples = last if plan.fine == 0 else plan.coarse + last
     widths = samples * _width_of(spec.template)
+    # Of parts from other packages nothing is known.
     for net in (spec.warp, spec.ambient, spec.mask):
-        widths += 0 if net is None else samples * net.depth * net.width
-    if spec.transient is not None:
-        widths += last * spec.transient.depth * spec.transient.width
+        widths += samples * getattr(net, "depth", 0) * getattr(net, "width", 0)
+    net = spec.transient
+    widths += last * getattr(net, "depth", 0) * getattr(net, "width", 0)
     if spec.scene_flow is not None:
         medium = spec.scene_flow.network
         trunk = spec.scene_flow.flow_trunk * medium.depth * medium.width
@@ -443,6 +470,8 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
 
 def _width_of(one: TemplateSpec) -> int:
     """Floats that are kept of a sample: of its layers, and those read from planes."""
+    if not isinstance(one, TemplateSpec):
+        return 0  # unknown
     width, position = one.depth * one.width + one.color_width, one.position
     if not isinstance(position, PlanesSpec):
         return width  # of grids hardly any more: 0.77 to 1.02 of the estimate

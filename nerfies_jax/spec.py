@@ -3,25 +3,21 @@
 import dataclasses
 import math
 
+import optax
+
 from nerfies_jax.effects import (
-    ambient,
-    appearance,
-    background,
-    elastic,
     moving_mask,
-    scene_flow,
+    records,
     smoothness,
     surface,
-    time_condition,
-    time_warp,
-    transient,
-    warp,
 )
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.effects.background import BackgroundSpec
 from nerfies_jax.effects.elastic import ElasticSpec
 from nerfies_jax.effects.moving_mask import MovingMaskSpec
+from nerfies_jax.effects.protocols import Conditioning, Medium, Template, Warp
+from nerfies_jax.effects.records import FieldRecord
 from nerfies_jax.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.effects.smoothness import SmoothnessSpec
 from nerfies_jax.effects.surface import SurfaceSpec
@@ -33,10 +29,13 @@ from nerfies_jax.radiance.occupancy import OccupancySpec
 from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, Table
+from nerfies_jax.training.effects import Table
+from nerfies_jax.training.extensions import Settings, check
+from nerfies_jax.training.protocols import Optimizer, Regularizer
 from nerfies_jax.training.track_start import FieldStartSpec
 
-WARPS = {WarpSpec: warp.effect, TimeWarpSpec: time_warp.effect}
+OPTIMIZERS = {"adam": optax.scale_by_adam}
+PROTOCOLS = {"transient": Medium, "warp": Warp}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,8 +81,10 @@ class RadianceScene:
     """Settings of a radiance field and of its training. An effect of None is absent."""
 
     steps: int
-    template: TemplateSpec = TemplateSpec()
-    coarse: TemplateSpec | None = None  # of the coarse level; None is like the fine one
+    template: TemplateSpec | Template = TemplateSpec()
+    coarse: TemplateSpec | Template | None = (
+        None  # of the coarse level; None is like the fine one
+    )
     sampling: SamplingSpec = SamplingSpec()
     rays: int = 1024  # in a step
     # In so many equal parts, on as many devices or one after the other: less memory.
@@ -97,11 +98,12 @@ class RadianceScene:
     learning_rate_end: float = 5e-5
     template_rate: float = 1.0  # times that: of the template, for tables learn faster
     table_rate: float = 1.0  # times that again: of the tables alone
+    optimizer: str | Optimizer = "adam"
     density_noise: float = 0.0  # standard deviation, while training
     appearance: AppearanceSpec | None = None
-    transient: TransientSpec | None = None
+    transient: TransientSpec | Medium | Settings | None = None
     time: TimeSpec | None = None
-    warp: WarpSpec | TimeWarpSpec | None = None
+    warp: WarpSpec | TimeWarpSpec | Warp | Settings | None = None
     ambient: AmbientSpec | None = None
     elastic: ElasticSpec | None = None
     background: BackgroundSpec | None = None
@@ -109,9 +111,19 @@ class RadianceScene:
     smoothness: SmoothnessSpec | None = None
     mask: MovingMaskSpec | None = None
     surface: SurfaceSpec | None = None
+    # Beside those with a field of their own.
+    conditioning: tuple[Conditioning | Settings, ...] = ()
+    regularizers: tuple[Regularizer | Settings, ...] = ()
     start: FieldStartSpec = FieldStartSpec()
 
     def __post_init__(self):
+        for name, protocol in PROTOCOLS.items():
+            if getattr(self, name) is not None:
+                check(name, getattr(self, name), protocol)
+        for one in self.conditioning:
+            check("conditioning", one, Conditioning)
+        for one in self.regularizers:
+            check("regularizers", one, Regularizer)
         if self.steps < 1 or self.rays < 1:
             raise ValueError(
                 f"train for at least one step of one ray, got steps={self.steps}, "
@@ -123,6 +135,11 @@ class RadianceScene:
                 f"{self.micro_batches} equal parts; choose a multiple, or "
                 "micro_batches=1"
             )
+        if isinstance(self.optimizer, str) and self.optimizer not in OPTIMIZERS:
+            raise ValueError(
+                f"unknown optimizer {self.optimizer!r}; choose from "
+                f"{sorted(OPTIMIZERS)}, or pass a gradient transformation of optax"
+            )
         if not 0 <= self.density_noise < math.inf:
             raise ValueError(
                 f"density_noise={self.density_noise} must be finite and not negative"
@@ -132,7 +149,13 @@ class RadianceScene:
                 raise ValueError(
                     f"{name}={getattr(self, name)} must be positive and finite"
                 )
-        if any(one.reads_time for one in (self.template, self.coarse or self.template)):
+        templates = (self.template, self.coarse or self.template)
+        others = [one for one in templates if not isinstance(one, TemplateSpec)]
+        for one in others:
+            check("template", one, Template)
+        if others:
+            _refuse_beside_other_template(self)
+        if any(getattr(one, "reads_time", False) for one in templates):
             raise ValueError(
                 "a template is read at a point, at whatever time, and its planes have "
                 "none: set position.moments=none (scene_flow.network may have them)"
@@ -161,19 +184,49 @@ class RadianceScene:
             )
 
 
-def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ...]:
+def _refuse_beside_other_template(spec):
+    """Raise ValueError for what only the built-in template can serve."""
+    alone = {
+        "density_noise": spec.density_noise == 0,
+        "table_rate": spec.table_rate == 1,
+        "transient": spec.transient is None,
+        "scene_flow": spec.scene_flow is None,
+        "surface": spec.surface is None,
+        "smoothness": spec.smoothness is None,
+    }
+    for name, fine in alone.items():
+        if not fine:
+            raise ValueError(
+                f"{name}={getattr(spec, name)!r} needs the layers of the built-in "
+                "template (TemplateSpec), and this scene has another; leave it out"
+            )
+
+
+def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecord, ...]:
     """The effects that the spec asks for, in the order in which they act."""
 
-    def flow(one):
-        return scene_flow.effect(one, metadata.times, spec.template.width)
+    def bound(part):
+        return part.bind(spec.steps, metadata) if hasattr(part, "bind") else part
 
-    def smooth(one):
-        return smoothness.effect(one, templates_of(spec))
+    def conditioning(part):
+        return records.compile_conditioning(bound(part))
+
+    def medium(part):
+        return records.compile_medium(bound(part), spec.template.width)
+
+    def warp(part):
+        return records.compile_warp(bound(part))
+
+    def regularizer(part):
+        return records.compile_regularizer(bound(part))
 
     def surfaces(one):
         widths = {name: net.width for name, net in templates_of(spec).items()}
         return surface.effect(one, widths)
 
+    smooth = spec.smoothness
+    if smooth is not None:
+        smooth = smoothness.Bound(smooth, templates_of(spec))
     bent, slice_ = spec.warp, spec.ambient
     if isinstance(bent, WarpSpec) and spec.start.motion == "tracks":
         # Fitted with all bands open, and closing them would undo it.
@@ -181,22 +234,27 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[Effect, ..
     if spec.mask is not None:
         bent, slice_ = guided(bent), guided(slice_)
     built = (
-        (spec.appearance, appearance.effect),
-        (
-            spec.transient,
-            lambda one: transient.effect(one, spec.template.width),
-        ),
-        (spec.time, time_condition.effect),
-        (bent, WARPS.get(type(bent))),
-        (slice_, ambient.effect),
-        (spec.elastic, elastic.effect),
-        (spec.background, background.effect),
-        (spec.scene_flow, flow),
-        (spec.smoothness, smooth),
-        (spec.mask, moving_mask.effect),
+        (spec.appearance, conditioning),
+        (spec.transient, medium),
+        (spec.time, conditioning),
+        (bent, warp),
+        (slice_, conditioning),
+        (spec.elastic, regularizer),
+        (spec.background, regularizer),
+        (spec.scene_flow, medium),
+        (smooth, regularizer),
+        (spec.mask, conditioning),
         (spec.surface, surfaces),
+        *((one, conditioning) for one in spec.conditioning),
+        *((one, regularizer) for one in spec.regularizers),
     )
     return tuple(make(one) for one, make in built if one is not None)
+
+
+def optimizer_of(spec: RadianceScene) -> Optimizer:
+    """Return the optimizer of a field, whose updates are scaled by learning rates."""
+    own = spec.optimizer
+    return OPTIMIZERS[own]() if isinstance(own, str) else own
 
 
 def guided(one: WarpSpec | AmbientSpec | None) -> WarpSpec | AmbientSpec | None:
@@ -213,7 +271,7 @@ def guided(one: WarpSpec | AmbientSpec | None) -> WarpSpec | AmbientSpec | None:
     return dataclasses.replace(one, guides=(*one.guides, moving_mask.NAME))
 
 
-def tables_of(effects: tuple[Effect, ...]) -> tuple[Table, ...]:
+def tables_of(effects: tuple[FieldRecord, ...]) -> tuple[Table, ...]:
     """The latent tables of all effects, each once."""
     tables = {}
     for effect in effects:
@@ -226,13 +284,13 @@ def tables_of(effects: tuple[Effect, ...]) -> tuple[Table, ...]:
     return tuple(tables.values())
 
 
-def templates_of(spec: RadianceScene) -> dict[str, TemplateSpec]:
+def templates_of(spec: RadianceScene) -> dict[str, TemplateSpec | Template]:
     """The networks of all levels that have one, by name."""
     single = spec.sampling.fine == 0 or spec.sampling.shared
     names = ("fine",) if single else ("coarse", "fine")
     return {name: template_of(spec, name) for name in names}
 
 
-def template_of(spec: RadianceScene, level: str) -> TemplateSpec:
+def template_of(spec: RadianceScene, level: str) -> TemplateSpec | Template:
     """The network of one level, "coarse" or "fine"."""
     return spec.coarse if level == "coarse" and spec.coarse else spec.template

@@ -5,7 +5,7 @@ import jax
 from nerfies_jax import scene
 from nerfies_jax.measure.part_time import StepParts, part
 from nerfies_jax.training import loop, rate
-from nerfies_jax.training.effects import Effect, weighted_sum
+from nerfies_jax.training.effects import weighted_sum
 from nerfies_jax.training.model import Frames, Model, TrainState
 
 
@@ -15,7 +15,6 @@ def parts(
     model: Model,
     state: TrainState,
     frames: Frames,
-    effects: tuple[Effect, ...] = (),
 ) -> StepParts:
     """Begin to compile the parts of one training step of a radiance field.
 
@@ -29,12 +28,11 @@ def parts(
       model: Its model.
       state: Training state.
       frames: Training frames.
-      effects: Effects in addition to those of the spec.
 
     Returns:
       The parts.
     """
-    field = scene.field(spec, metadata, effects=effects)
+    field = scene.field(spec, metadata)
     batch_key, loss_key = jax.random.split(loop.step_key(state))
 
     def draw(state, frames, key):

@@ -9,7 +9,7 @@ from nerfies_jax import scene
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import Parts, check_there
 from nerfies_jax.field import feeds_networks
-from nerfies_jax.training.effects import APPEARANCE, Effect
+from nerfies_jax.training.effects import APPEARANCE
 from nerfies_jax.training.model import Model, View
 
 
@@ -21,18 +21,17 @@ class Between(NamedTuple):
     share: Float[Array, ""]  # in [0, 1]
 
 
-def parts(spec, metadata, effects: tuple[Effect, ...] = ()) -> Parts:
+def parts(spec, metadata) -> Parts:
     """Return the effects that can be left out: those that displace points, and media.
 
     Args:
       spec: The scene.
       metadata: Scene metadata.
-      effects: Effects in addition to those of the spec.
 
     Returns:
       The removable effects, and whether the field has appearance codes.
     """
-    whole = scene.field(spec, metadata, effects=effects)
+    whole = scene.field(spec, metadata)
     # Effects that feed the networks are part of them. A penalty renders nothing.
     removable = tuple(
         effect.name
@@ -53,7 +52,6 @@ def without_effects(
     metadata,
     without: tuple[str, ...],
     blended: bool,
-    effects: tuple[Effect, ...] = (),
 ) -> Model:
     """Return the model with some effects left out, or with blended appearances.
 
@@ -62,7 +60,6 @@ def without_effects(
       metadata: Scene metadata.
       without: Names of the effects to leave out.
       blended: True for a model that renders a `Between` in place of a view.
-      effects: Effects in addition to those of the spec.
 
     Returns:
       The model.
@@ -71,8 +68,8 @@ def without_effects(
       ValueError: If an effect is not removable, or there are no appearance codes to
         blend.
     """
-    check_there(without, parts(spec, metadata, effects).removable)
-    field = scene.field(spec, metadata, without, effects)
+    check_there(without, parts(spec, metadata).removable)
+    field = scene.field(spec, metadata, without)
     if blended and not _has_appearance(field):
         raise ValueError(
             "this field has no appearance codes to blend; reconstruct with a preset "
@@ -90,7 +87,7 @@ def without_effects(
         codes = {name: (1 - share) * start[name] + share * end[name] for name in start}
         return view, codes
 
-    model = scene.build(spec, metadata, effects)
+    model = scene.build(spec, metadata)
     return model._replace(**scene.drawing(field, blend if blended else plain))
 
 

@@ -52,7 +52,7 @@ LEANS_ON = {
     "alternation": ("motion",),
     "acceleration": ("motion",),
     "neighbors": ("motion",),
-    "motion_growth": ("motion", "densification"),
+    "motion_growth": ("motion", "strategy"),
     "flow": ("motion",),
 }
 
@@ -178,7 +178,7 @@ def tiny_splats(name):
         init=InitSpec(random=100, min_points=1000),
         start=StartSpec(motion="none"),
         sh_degree=1,
-        densification=shrunk(spec.densification, cap_max=256),
+        strategy=shrunk(spec.strategy, cap_max=256),
         motion=motion,
         acceleration=shrunk(spec.acceleration, samples=16),
         neighbors=shrunk(spec.neighbors, count=3),
@@ -294,7 +294,7 @@ def splat_step(spec, metadata, shuffled_row):
             return value, (losses.mse(image, truth, valid), seen)
 
         still, wanted = None, (0,)
-        if spec.densification is not None:
+        if spec.strategy is not None:
             still = jnp.zeros_like(state.params.rows["splats"].mean[:, :2])
             wanted = (0, 1)
         (value, (mse, seen)), grads = jax.value_and_grad(
@@ -307,7 +307,7 @@ def splat_step(spec, metadata, shuffled_row):
         rates = Params({"splats": rates}, {})
         params = apply_updates(state.params, updates, rates)
         aux_state = state.aux_state
-        if spec.densification is not None:
+        if spec.strategy is not None:
             radius_px = jnp.max(seen.extent_px, axis=1)
             stats = densification.observe(
                 aux_state.stats, grads[1], seen.seen(size), radius_px, size

@@ -5,6 +5,7 @@ import dataclasses
 
 import pytest
 
+from gaussians_jax import protocols
 from gaussians_jax.effects import (
     acceleration,
     anchor_motion,
@@ -35,6 +36,7 @@ from nerfies_jax.effects import (
     background,
     elastic,
     moving_mask,
+    records,
     scene_flow,
     smoothness,
     surface,
@@ -84,6 +86,8 @@ MOTION_MODULES = {
     node_motion.NodeMotionSpec: node_motion,
     anchors.AnchorMotionSpec: anchor_motion,
 }
+# Of the protocols that the parts of a scene fill.
+METHODS = ("bind", "init", "precompute", "apply", "loss", "update", "events", "state")
 BY_FRAMES = {  # the others ask for the scene's extent
     mlp_motion.MotionSpec,
     kan_motion.KanMotionSpec,
@@ -98,29 +102,40 @@ def of_field(spec, metadata):
     width = spec.template.width
     effects = []
     guides = () if spec.mask is None else ("mask",)
+
+    def conditioning(one):
+        effects.append(records.compile_conditioning(one))
+
+    def medium(one):
+        effects.append(records.compile_medium(one, width))
+
+    def regularizer(one):
+        effects.append(records.compile_regularizer(one))
+
     if spec.appearance is not None:
-        effects.append(appearance.effect(spec.appearance))
+        conditioning(spec.appearance)
     if spec.transient is not None:
-        effects.append(transient.effect(spec.transient, width))
+        medium(spec.transient)
     if spec.time is not None:
-        effects.append(time_condition.effect(spec.time))
-    if isinstance(spec.warp, TimeWarpSpec):
-        effects.append(time_warp.effect(spec.warp))
-    elif spec.warp is not None:
-        effects.append(warp.effect(dataclasses.replace(spec.warp, guides=guides)))
+        conditioning(spec.time)
+    if spec.warp is not None:
+        one = spec.warp
+        if not isinstance(one, TimeWarpSpec):
+            one = dataclasses.replace(one, guides=guides)
+        effects.append(records.compile_warp(one))
     if spec.ambient is not None:
         bent = dataclasses.replace(spec.ambient, guides=guides)
-        effects.append(ambient.effect(bent))
+        conditioning(bent.bind(spec.steps, metadata))
     if spec.elastic is not None:
-        effects.append(elastic.effect(spec.elastic))
+        regularizer(spec.elastic)
     if spec.background is not None:
-        effects.append(background.effect(spec.background))
+        regularizer(spec.background)
     if spec.scene_flow is not None:
-        effects.append(scene_flow.effect(spec.scene_flow, metadata.times, width))
+        medium(scene_flow.Bound(spec.scene_flow, metadata.times))
     if spec.smoothness is not None:
-        effects.append(smoothness.effect(spec.smoothness, templates_of(spec)))
+        regularizer(smoothness.Bound(spec.smoothness, templates_of(spec)))
     if spec.mask is not None:
-        effects.append(moving_mask.effect(spec.mask))
+        conditioning(spec.mask)
     if spec.surface is not None:
         widths = {name: one.width for name, one in templates_of(spec).items()}
         effects.append(surface.effect(spec.surface, widths))
@@ -132,34 +147,39 @@ def of_splats(spec, metadata):
     effects, extent, frames = [], metadata.extent, metadata.frames
     motion = spec.motion
     if motion is not None:
-        seen = (frames,) if type(motion) in BY_FRAMES else (extent,)
-        if isinstance(motion, plane_motion.PlaneMotionSpec):
-            seen = (extent, metadata.box)
         module = MOTION_MODULES[type(motion)]
-        effects.append(module.effect(motion, spec.steps, *seen))
+        seen = (frames,) if type(motion) in BY_FRAMES else (extent,)
+        if module is plane_motion:
+            seen = (extent, metadata.box)
+        own = module.Bound(motion, spec.steps, *seen)
+        effects.append(protocols.compile_motion(own))
     if spec.temporal_opacity is not None:
-        effects.append(temporal_opacity.effect(spec.temporal_opacity))
+        own = temporal_opacity.Bound(spec.temporal_opacity)
+        effects.append(protocols.compile_motion(own))
     if spec.carried is not None:
         still = 0 if motion is None else motion.warm_up
         effects.append(carried.effect(spec.carried, spec.steps, still))
     if spec.acceleration is not None:
-        effects.append(acceleration.effect(spec.acceleration, extent, frames))
+        own = acceleration.Bound(spec.acceleration, extent, frames)
+        effects.append(protocols.compile_regularizer(own))
     if spec.neighbors is not None:
-        effects.append(neighbors.effect(spec.neighbors, extent, effects[0].name))
-    if spec.motion_growth is not None:
-        effects.append(motion_growth.effect(spec.motion_growth, extent))
+        own = neighbors.Bound(spec.neighbors, extent, effects[0].name)
+        effects.append(protocols.compile_regularizer(own))
     if spec.spectral is not None:
-        effects.append(spectral.effect(spec.spectral, spec.steps))
+        own = spec.spectral.bind(spec.steps, metadata)
+        effects.append(protocols.compile_regularizer(own))
     if spec.depth is not None:
-        effects.append(depth.effect(spec.depth))
+        effects.append(protocols.compile_regularizer(spec.depth))
     if spec.exposure is not None:
-        places = metadata.exposures
-        effects.append(exposure.effect(spec.exposure, spec.steps, places))
+        own = exposure.Bound(spec.exposure, spec.steps, metadata.exposures)
+        effects.append(protocols.compile_appearance(own))
     if spec.flow is not None:
-        effects.append(motion_flow.effect(spec.flow, spec.raster))
+        own = motion_flow.Bound(spec.flow, spec.raster)
+        effects.append(protocols.compile_regularizer(own))
     if spec.poses is not None:
         seen = frames, metadata.depth
-        effects.append(pose_refinement.effect(spec.poses, spec.steps, *seen))
+        own = pose_refinement.Bound(spec.poses, spec.steps, *seen)
+        effects.append(protocols.compile_camera_optimizer(own))
     return tuple(effects)
 
 
@@ -191,9 +211,26 @@ def poisoned(modules):
     with pytest.MonkeyPatch.context() as patch:
         for module in modules:
             functions = functions_of(module)
-            assert "effect" in functions
             refuse(patch, module, functions)
+            methods = [
+                (kind, name)
+                for kind in classes_of(module)
+                for name in METHODS
+                if name in vars(kind)
+            ]
+            assert functions or methods
+            for kind, name in methods:
+                refuse(patch, kind, [name])
         yield
+
+
+def classes_of(module):
+    """The classes that a module has of its own."""
+    return [
+        value
+        for value in vars(module).values()
+        if isinstance(value, type) and value.__module__ == module.__name__
+    ]
 
 
 def functions_of(module):

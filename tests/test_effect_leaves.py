@@ -211,8 +211,6 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
             nets["spectral"] = spectral.init(spec.spectral)
         if spec.neighbors is not None:
             states.add("neighbors")
-        if spec.motion_growth is not None:
-            states.add("motion_growth")
         assert set(state.params.rows) == rows
         assert shapes(state.params.nets) == shapes(nets)
         assert set(state.aux_state.effects) == states

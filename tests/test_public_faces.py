@@ -215,9 +215,9 @@ CASES = {
 # Names without a case, and why.
 OTHERS = {
     "types": "nj.Camera nj.Rays nj.RaySamples nj.Rendered nj.KANSpec nj.RadianceScene "
-    "nj.Effect nj.FrameCondition nj.Term nj.Renderer gj.RasterSpec "
-    "gj.RasterizationInfo gj.SE3BasesSpec gj.TrackFit gj.SplatScene gj.Gaussians "
-    "gj.Params gj.Splats "
+    "nj.FrameCondition nj.Term nj.Renderer gj.RasterSpec "
+    "gj.RasterizationInfo gj.TrackFit gj.Scene gj.SceneMetadata gj.Gaussians "
+    "gj.Params gj.Splats gj.Appearance gj.CameraOptimizer "
     "nj.kan.KANSpec nj.kan.KAN nj.kan.KANLayer nj.kan.Kernels",
     "settings": "nj.PRESETS nj.with_steps gj.PRESETS gj.with_steps nj.checked "
     "nj.losses.check_geman_mcclure nj.kan.spacing nj.kan.centers nj.kan.width "
@@ -228,7 +228,7 @@ OTHERS = {
     "nj.adapters.equinox",
     "files": "gj.load gj.save",
     "host, refused in their own tests": "nj.look_at gj.from_points nj.pixel_rays "
-    "gj.fit_tracks",
+    "gj.fit_tracks gj.strategy.select",
     "parts of kan.apply": "nj.kan.first_layer_part nj.kan.after_first_layer",
     "as the image metrics": "nj.losses.middle_level",
 }

@@ -20,12 +20,12 @@ def test_an_override_reaches_a_nested_field_with_its_type():
     spec = specs.override(
         presets.SMALL_DEFORMABLE,
         (
-            "densification.cap_max=123",
+            "strategy.cap_max=123",
             "motion.learning_rate=1e-3",
             "raster.antialiased=true",
         ),
     )
-    assert spec.densification.cap_max == 123
+    assert spec.strategy.cap_max == 123
     assert spec.motion.learning_rate == 1e-3
     assert spec.raster.antialiased is True
     assert spec.init == presets.SMALL_DEFORMABLE.init
@@ -38,9 +38,9 @@ def test_an_effect_is_taken_out_with_none():
 def test_one_of_several_kinds_is_chosen_by_the_name_of_its_class():
     spec = specs.override(
         presets.SMALL_DEFORMABLE,
-        ("densification=MCMCStrategySpec", "densification.cap_max=123"),
+        ("strategy=MCMCStrategySpec", "strategy.cap_max=123"),
     )
-    assert spec.densification == MCMCStrategySpec(cap_max=123)
+    assert spec.strategy == MCMCStrategySpec(cap_max=123)
 
 
 def test_a_tuple_is_read_by_its_items():
@@ -51,10 +51,10 @@ def test_a_tuple_is_read_by_its_items():
 @pytest.mark.parametrize(
     ("assignment", "words"),
     [
-        ("densification.cap_mxa=3", r"no field 'cap_mxa'; did you mean cap_max\?"),
-        ("cap_max=3", r"SplatScene has no .*; did you mean densification.cap_max\?"),
-        ("densification.cap_max=many", "cannot be read as"),
-        ("densification=MCMC", "one of DefaultStrategySpec, MCMCStrategySpec"),
+        ("strategy.cap_mxa=3", r"no field 'cap_mxa'; did you mean cap_max\?"),
+        ("cap_max=3", r"SplatScene has no .*; did you mean strategy.cap_max\?"),
+        ("strategy.cap_max=many", "cannot be read as"),
+        ("strategy=MCMC", "one of DefaultStrategySpec, MCMCStrategySpec"),
         ("alternation.nets=3", "no defaults for start and stop"),
         ("steps", "expected path.to.field=value"),
         ("steps.more=1", "has no fields"),
@@ -79,10 +79,10 @@ def test_every_field_that_is_listed_can_be_set_to_what_it_is(name):
 
 def test_a_field_is_listed_with_its_words_and_default():
     listed = {f.path: f for f in spec_fields.fields_of(presets.SMALL_STATIC)}
-    every = listed["densification.refine_every"]
+    every = listed["strategy.refine_every"]
     assert (every.default, every.kind, every.about) == ("100", "int", "steps")
     assert every.holder is DefaultStrategySpec
-    assert listed["densification"].kind.endswith("MCMCStrategySpec or none")
+    assert listed["strategy"].kind.endswith("MCMCStrategySpec or MODULE:NAME or none")
     start = spec_fields.fields_of(fields.SMALL_NERFIES)
     (jitter,) = (f.about for f in start if f.path == "elastic.points")
     assert jitter.startswith("`points` samples of each ray are drawn by their weights")

@@ -1,5 +1,7 @@
 """The face of both packages as a program uses it; mypy reads it, nothing runs it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,8 @@ import nerfies_jax as nj
 def splats(folder: str) -> float:
     capture = nj.load_capture(folder, max_side=256, heldout=8)
     spec = gj.with_steps(gj.PRESETS["splats-deformable-small"], 500)
-    model = gj.build(spec, gj.metadata_of(capture), effects=(own(),))
+    spec = dataclasses.replace(spec, motion=Still(), regularizers=(Own(),))
+    model = gj.build(spec, gj.metadata_of(capture))
     state = model.init(capture, jax.random.key(0))
     frames = nj.frames_of(capture, model.required_data)
     result = nj.fit(model, state, frames, steps=spec.steps, seconds=60)
@@ -30,11 +33,29 @@ def field(scene: str) -> int:
     return len(model.counts(model.init(capture, jax.random.key(0))))
 
 
-def own() -> nj.Effect:
-    return nj.Effect(
-        "own",
-        penalty=lambda params, context: {"one": nj.Term(jax.numpy.ones(()), None)},
-    )
+@dataclasses.dataclass(frozen=True)
+class Own:
+    def loss(
+        self, params: object, context: gj.losses.PenaltyContext
+    ) -> dict[str, nj.Term]:
+        return {"one": nj.Term(jnp.ones(()), None)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Still:
+    learning_rate: float = 1e-3
+
+    def init(self, key: jax.Array, gaussians: gj.Splats) -> gj.motion.MotionParams:
+        return gj.motion.MotionParams(jnp.zeros_like(gaussians.mean))
+
+    def apply(
+        self,
+        params: gj.motion.MotionParams,
+        cache: object,
+        gaussians: gj.Gaussians,
+        frame: nj.FrameCondition,
+    ) -> gj.Gaussians:
+        return gaussians._replace(mean=gaussians.mean + params.per_gaussian)
 
 
 def drawn(gaussians: gj.Gaussians, colors: jax.Array) -> jax.Array:

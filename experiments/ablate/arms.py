@@ -227,7 +227,7 @@ SONATA = Suite(
 
 # From tracks the cap of the small preset is reached before motion may guide growth,
 # and its threshold guides nothing (`MotionGrowthSpec`).
-ROOM = ("densification.cap_max=14000", "motion.warm_up=0")
+ROOM = ("strategy.cap_max=14000", "motion.warm_up=0")
 GUIDED = (*ROOM, "motion_growth.start=1", "motion_growth.motion=0.04")
 
 MOBA = Suite(

@@ -51,7 +51,7 @@ class Ablate:
     tracks: int = 200
     """Points to follow, at most."""
     set: cli.Overrides = ()
-    """Fields changed in every arm, as densification.cap_max=5000 template.depth=4."""
+    """Fields changed in every arm, as strategy.cap_max=5000 template.depth=4."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Where to compute."""
 

@@ -49,9 +49,9 @@ def score(
 def _check_capture(config, folder):
     """Refuse the numbers of another capture whose folder has the same name."""
     from nerfies_jax.runs.reconstruction import Refused
-    from nerfies_jax.runs.run import read_settings
+    from nerfies_jax.runs.run import read_config
 
-    there = read_settings(folder).config.source.capture
+    there = read_config(folder).source.capture
     wanted = config.source.capture
     if there == wanted or (there and wanted and run_folder.is_of(there, wanted)):
         return

@@ -197,9 +197,9 @@ def _spec(name, args):
         spec = dataclasses.replace(spec, rays=args.rays)
     if args.rows is not None and hasattr(spec, "init"):
         init = dataclasses.replace(spec.init, source="random", random=args.rows)
-        most = max(spec.densification.cap_max or args.rows, args.rows)
-        densification = dataclasses.replace(spec.densification, cap_max=most)
-        spec = dataclasses.replace(spec, init=init, densification=densification)
+        most = max(spec.strategy.cap_max or args.rows, args.rows)
+        densification = dataclasses.replace(spec.strategy, cap_max=most)
+        spec = dataclasses.replace(spec, init=init, strategy=densification)
     return spec
 
 

@@ -17,7 +17,7 @@ ROUGH = (
     "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 )
 COMMON = ("--evaluate-every", "2", "--checkpoint-every", "0", "--set")
-SPLATS = ("densification=none", "sh_degree=0", "init.extra_random=0")
+SPLATS = ("strategy=none", "sh_degree=0", "init.extra_random=0")
 MOTION = ("motion.width=8", "motion.depth=2", "motion.skips=")
 FIELD = (
     *("rays=32", "sampling.coarse=4", "sampling.fine=4", "background=none"),

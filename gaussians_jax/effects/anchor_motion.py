@@ -23,12 +23,11 @@ slope; how much anchors are seen over time beside each other counts for nothing 
 """
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import path_fit, splats
 from gaussians_jax.effects import carried, kan_motion
@@ -50,12 +49,12 @@ from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.carried import Carried
 from gaussians_jax.effects.kan_motion import Offsets
 from gaussians_jax.path_fit import Guess, Paths, Points
+from gaussians_jax.protocols import MotionParams
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.nets import codes, mlp
 from nerfies_jax.nets.mlp import MLP, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import (
-    Effect,
     FrameCondition,
     PenaltyContext,
     Term,
@@ -161,10 +160,10 @@ def fit_to_paths(
 
 
 def features_of(
-    spec: AnchorMotionSpec, scene: Params, condition: FrameCondition | None
+    spec: AnchorMotionSpec, params: MotionParams, condition: FrameCondition | None
 ) -> Features:
     """Features as they are read: with noise in training, kept afterwards."""
-    own, net = scene.rows[NAME], scene.nets[NAME]
+    own, net = params
     if spec.rate is None:
         return own
     if condition is None or condition.step is None:
@@ -179,29 +178,16 @@ def features_of(
     )
 
 
-def _moved(spec, scene, gaussians, condition, _):
-    """The seam `deform`: anchors moved coarsely."""
-    net = scene.nets[NAME]
-    code = codes.at_time(net.times, condition.time)
-    by = in_blocks(
-        lambda reads: offsets(net.coarse, coarse_spec(spec), reads, code),
-        (features_of(spec, scene, condition).reference,),
-        splats.active_mask(scene.rows["splats"]),
-        spec.block,
-    )
-    return kan_motion.apply(gaussians, by)
-
-
 def _derive_rows(spec, scene, condition):
-    """The seam `derive_rows`: what anchors carry at rest, and what it was made of."""
-    features = features_of(spec, scene, condition)
+    own = MotionParams(scene.rows[NAME], scene.nets[NAME])
+    features = features_of(spec, own, condition)
     rows = scene.rows["splats"]
     own = made(scene.nets[NAME], spec, features, rows.sh_rest.shape[1])
     return carried.at_rest(rows, own), (own, features)
 
 
 def _derive(spec, scene, derived, rows, condition):
-    """The seam `derive`: what anchors carry, moved finely once the warm-up is over."""
+    """Return what anchors carry, moved finely once the warm-up is over."""
     net = scene.nets[NAME]
     if not spec.moves:
         return posed(net, spec, derived, rows, None)
@@ -227,7 +213,8 @@ def penalty(
     numbers = spec.reference + spec.count * residual_width(spec)
 
     def evaluate(scene):
-        features = features_of(spec, scene, context.condition)
+        own = MotionParams(scene.rows[NAME], scene.nets[NAME])
+        features = features_of(spec, own, context.condition)
         first, others = bits(features, scene.nets[NAME].law, spec)
         total = jnp.sum(first, axis=1) + jnp.sum(others, axis=(1, 2))
         count = jnp.maximum(jnp.sum(active), 1) * numbers
@@ -242,34 +229,90 @@ def penalty(
     return {"bits": Term(value, spec.rate.weight)}
 
 
-def effect(spec: AnchorMotionSpec, run_steps: int, frames: int) -> Effect:
-    """The seams that this motion fills, for a run of so many steps over `frames`."""
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of an `AnchorMotionSpec` in a run of `steps` over `frames`."""
 
-    def falling(of, name):
-        first, last = getattr(of, name), getattr(of, f"{name}_end")
-        return schedules.log_linear(first, last, run_steps)
+    spec: AnchorMotionSpec
+    steps: int
+    frames: int
 
-    make, move = falling(spec, "make_rate"), falling(spec, "learning_rate")
-    law = None if spec.rate is None else falling(spec.rate, "learning_rate")
+    name = NAME
+    significance = staticmethod(significance)
 
-    def rates(step):
-        moving = move(step) if spec.moves else None
-        of_law = None if law is None else law(step)
-        return Anchors(moving, make(step), moving, moving, of_law)
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
 
-    return Effect(
-        name=NAME,
-        init_rows=lambda key, rows: init_features(
-            key, spec, len(rows.mean), rows.mean.dtype
-        ),
-        init=functools.partial(init, spec=spec, frames=frames),
-        row_learning_rate=falling(spec, "feature_rate"),
-        learning_rate=rates,
-        warm_up=spec.warm_up,
-        deform=functools.partial(_moved, spec) if spec.moves else None,
-        derive_rows=functools.partial(_derive_rows, spec),
-        derive=functools.partial(_derive, spec),
-        significance=significance,
-        penalty=None if spec.rate is None else functools.partial(penalty, spec),
-        fit_to_paths=functools.partial(fit_to_paths, spec, frames),
-    )
+    @property
+    def moves(self) -> bool:
+        """Whether anchors move at all."""
+        return self.spec.moves
+
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of features, networks and law."""
+        spec = self.spec
+
+        def falling(of, name):
+            first, last = getattr(of, name), getattr(of, f"{name}_end")
+            return schedules.log_linear(first, last, self.steps)(step)
+
+        moving = falling(spec, "learning_rate") if spec.moves else None
+        law = None if spec.rate is None else falling(spec.rate, "learning_rate")
+        make = falling(spec, "make_rate")
+        shared = Anchors(moving, make, moving, moving, law)
+        return MotionParams(falling(spec, "feature_rate"), shared)
+
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize features and networks."""
+        rows_key, shared_key = jax.random.split(key)
+        mean = gaussians.mean
+        return MotionParams(
+            init_features(rows_key, self.spec, len(mean), mean.dtype),
+            init(shared_key, self.spec, self.frames),
+        )
+
+    def apply(
+        self,
+        params: MotionParams,
+        cache: None,
+        gaussians: Gaussians,
+        frame: FrameCondition,
+    ) -> Gaussians:
+        """Move the anchors coarsely."""
+        spec, net = self.spec, params.shared
+        code = codes.at_time(net.times, frame.time)
+        by = in_blocks(
+            lambda reads: offsets(net.coarse, coarse_spec(spec), reads, code),
+            (features_of(spec, params, frame).reference,),
+            splats.in_use(gaussians),
+            spec.block,
+        )
+        return kan_motion.apply(gaussians, by)
+
+    def derive_rows(
+        self, scene: Params, condition: FrameCondition | None
+    ) -> tuple[Splats, tuple[Carried, Features]]:
+        """Return what anchors carry at rest, and what it was made of."""
+        return _derive_rows(self.spec, scene, condition)
+
+    def derive(
+        self,
+        scene: Params,
+        derived: tuple[Splats, tuple[Carried, Features]],
+        rows: Gaussians,
+        condition: FrameCondition,
+    ) -> Gaussians:
+        """Return what anchors carry where they are now."""
+        return _derive(self.spec, scene, derived, rows, condition)
+
+    def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the bits of the features."""
+        if self.spec.rate is None:
+            return {}
+        return penalty(self.spec, params.shared, context)
+
+    def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
+        """Return anchors at the points of the paths, to fit from."""
+        return fit_to_paths(self.spec, self.frames, paths, key)

@@ -10,7 +10,7 @@ equations were not at hand, is said in `anchor_motion`.
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Key
 from gaussians_jax.effects import motion_codes
 from gaussians_jax.effects.carried import Carried
 from gaussians_jax.effects.kan_motion import KanMotionSpec, Offsets
+from gaussians_jax.metadata import SceneMetadata
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import entropy, mlp
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
@@ -96,6 +97,12 @@ class AnchorMotionSpec:
             schedules.check_falling(getattr(self, name), getattr(self, f"{name}_end"))
         for network in (make_spec, coarse_spec, fine_spec):
             network(self)  # checks its sizes
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> Any:
+        """Return the motion for a run of `run_steps` of this capture."""
+        from gaussians_jax.effects import anchor_motion  # it reads this module
+
+        return anchor_motion.Bound(self, run_steps, metadata.moments)
 
 
 class Features(NamedTuple):

@@ -25,6 +25,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from gaussians_jax import splats
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.splats import Gaussians, Params, Splats
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.geometry.precision import exact_einsum
@@ -32,7 +34,7 @@ from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 
 NAME = "carried"
 
@@ -211,7 +213,7 @@ def follow(
     return posed(own, turn, still, rows)
 
 
-def effect(spec: CarriedSpec, steps: int, warm_up: int) -> Effect:
+def effect(spec: CarriedSpec, steps: int, warm_up: int) -> SplatRecord:
     """The seams that this fills, for a run of `steps`; nothing turns before `warm_up`.
 
     Opacities and looks are those at rest: a motion of the rows that changes opacities
@@ -219,8 +221,7 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> Effect:
     """
 
     def rates(step):
-        del step
-        return Carried(
+        own = Carried(
             spec.offset_rate,
             spec.log_scale_rate,
             spec.quaternion_rate,
@@ -228,6 +229,10 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> Effect:
             spec.sh_dc_rate,
             spec.sh_rest_rate,
         )
+        if spec.turns is None:
+            return MotionParams(own)
+        first, last = spec.turns.learning_rate, spec.turns.learning_rate_end
+        return MotionParams(own, schedules.log_linear(first, last, steps)(step))
 
     def derive_rows(
         params: Params, condition: FrameCondition | None
@@ -260,20 +265,19 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> Effect:
         turn = None if spec.turns is None else turn_of(params, condition)
         return posed(params.rows[NAME], turn, derived[0], rows)
 
-    own = Effect(
+    def init(key, gaussians):
+        rows_key, shared_key = jax.random.split(key)
+        own = init_rows(rows_key, spec, gaussians)
+        if spec.turns is None:
+            return MotionParams(own)
+        return MotionParams(own, mlp.init(network_spec(spec.turns), shared_key))
+
+    return SplatRecord(
         name=NAME,
-        init_rows=lambda key, rows: init_rows(key, spec, rows),
-        row_learning_rate=rates,
+        init=init,
+        learning_rate=rates,
         derive_rows=derive_rows,
         derive=derive,
-    )
-    if spec.turns is None:
-        return own
-    return own._replace(
-        init=lambda key: mlp.init(network_spec(spec.turns), key),
-        learning_rate=schedules.log_linear(
-            spec.turns.learning_rate, spec.turns.learning_rate_end, steps
-        ),
     )
 
 

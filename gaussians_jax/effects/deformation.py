@@ -12,11 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gaussians_jax import splats
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.splats import Gaussians, Params, Splats
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 
 PyTree = Any
-Effects = tuple[Effect, ...]
+Effects = tuple[SplatRecord, ...]
 
 
 def prepare(effects: Effects, params: Params) -> dict[str, PyTree]:
@@ -60,7 +61,7 @@ def deform_rows(
     return gaussians
 
 
-def derives(effects: Effects) -> Effect | None:
+def derives(effects: Effects) -> SplatRecord | None:
     """The effect by which rows carry what is drawn; None where they are drawn."""
     return next((effect for effect in effects if effect.derive is not None), None)
 

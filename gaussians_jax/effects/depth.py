@@ -7,6 +7,7 @@ arXiv:1907.01341, section 5, and Li et al. 2021 ("NSFF"), arXiv:2011.13084.
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nerfies_jax.contract import checked
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import losses
-from nerfies_jax.training.effects import Effect, Observation, PenaltyContext, Term
+from nerfies_jax.training.effects import Observation, PenaltyContext, Term
 
 NAME = "depth"
 KINDS = ("correlation", "affine", "metric")
@@ -47,6 +48,9 @@ class DepthSpec:
     weight: float = 0.1
     opaque: float = 0.5  # least opacity of a pixel whose depth is compared
 
+    name = NAME
+    required_data = frozenset({"depths"})
+
     def __post_init__(self):
         if self.kind not in KINDS or self.space not in SPACES:
             raise ValueError(
@@ -58,6 +62,10 @@ class DepthSpec:
                 "weight is finite and not negative, and 0 < opaque < 1; got "
                 f"weight={self.weight} and opaque={self.opaque}"
             )
+
+    def loss(self, params: Any, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the difference of rendered and known depth in one frame."""
+        return terms(self, context.observation)
 
 
 @checked
@@ -192,12 +200,3 @@ def terms(spec: DepthSpec, observation: Observation) -> dict[str, Term]:
     error = FORMS[spec.kind](drawn, truth, known)
     share = jnp.mean(known.astype(error.dtype))
     return {"error": Term(error, spec.weight), "known": Term(share, None)}
-
-
-def effect(spec: DepthSpec) -> Effect:
-    """The seams of the depth loss; it reads the capture's depths."""
-
-    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
-        return terms(spec, context.observation)
-
-    return Effect(name=NAME, penalty=penalty, required_data=frozenset({"depths"}))

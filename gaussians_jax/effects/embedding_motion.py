@@ -9,23 +9,23 @@ for HyperNeRF's films; that the fine network reads ever more rows is from the co
 """
 
 import dataclasses
-import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects import kan_motion, motion_codes
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.kan_motion import KanMotionSpec, Offsets
-from gaussians_jax.splats import Gaussians, Params
+from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.nets import mlp
 from nerfies_jax.nets.mlp import MLP, HeadSpec, Layer, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import (
-    Effect,
     FrameCondition,
     PenaltyContext,
     Term,
@@ -83,6 +83,10 @@ class EmbeddingMotionSpec:
             warm_up=self.warm_up,
             embedding_rate=self.embedding_rate,
         )
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.moments)
 
 
 class Decoder(NamedTuple):
@@ -181,42 +185,67 @@ def deform(
     return Offsets(**in_blocks(evaluate, (prepared,), active, spec.block))
 
 
-def effect(spec: EmbeddingMotionSpec, steps: int, frames: int) -> Effect:
-    """The seams that this motion fills, for a run of `steps` over `frames`."""
-    count = motion_codes.moments(spec, frames)
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `EmbeddingMotionSpec` in a run of `steps`."""
 
-    def prepared(params: Params) -> Float[Array, "gaussians features"]:
-        active = splats.active_mask(params.rows["splats"])
-        return prepare(params.nets[NAME], spec, params.rows[NAME], active)
+    spec: EmbeddingMotionSpec
+    steps: int
+    frames: int
 
-    def moved(
-        params: Params,
+    name = NAME
+
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
+
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of embeddings, and of networks and time codes."""
+        first, last = self.spec.learning_rate, self.spec.learning_rate_end
+        rate = schedules.log_linear(first, last, self.steps)
+        return MotionParams(jnp.full((), self.spec.embedding_rate), rate(step))
+
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize the embeddings, the time codes and the networks."""
+        rows_key, shared_key = jax.random.split(key)
+        return MotionParams(
+            motion_codes.init_embedding(rows_key, self.spec, gaussians.mean),
+            init(shared_key, self.spec, self.frames),
+        )
+
+    def precompute(
+        self, params: MotionParams, gaussians: Splats
+    ) -> Float[Array, "gaussians features"]:
+        """Evaluate what does not depend on the time."""
+        active = splats.active_mask(gaussians)
+        return prepare(params.shared, self.spec, params.per_gaussian, active)
+
+    def apply(
+        self,
+        params: MotionParams,
+        cache: Float[Array, "gaussians features"],
         gaussians: Gaussians,
-        condition: FrameCondition,
-        ready: Float[Array, "gaussians features"],
+        frame: FrameCondition,
     ) -> Gaussians:
-        active = splats.active_mask(params.rows["splats"])
-        offsets = deform(params.nets[NAME], spec, condition.time, ready, active)
+        """Move the Gaussians to their state at a time."""
+        active = splats.in_use(gaussians)
+        offsets = deform(params.shared, self.spec, frame.time, cache, active)
         return kan_motion.apply(gaussians, offsets)
 
-    def penalty(own: EmbeddingMotion, context: PenaltyContext) -> dict[str, Term]:
-        return motion_codes.penalty(spec, own.times, context)
+    def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the penalties on codes that bend, and on opacity."""
+        return motion_codes.penalty(self.spec, params.shared.times, context)
 
-    return Effect(
-        name=NAME,
-        init_rows=lambda key, rows: motion_codes.init_embedding(key, spec, rows.mean),
-        init=functools.partial(init, spec=spec, frames=frames),
-        row_learning_rate=lambda step: jnp.full((), spec.embedding_rate),
-        learning_rate=schedules.log_linear(
-            spec.learning_rate, spec.learning_rate_end, steps
-        ),
-        warm_up=spec.warm_up,
-        prepare=prepared,
-        deform=moved,
-        penalty=penalty if motion_codes.has_penalty(spec) else None,
-        revise=functools.partial(motion_codes.revised, spec),
-        revise_at=motion_codes.growth_steps(spec, count),
-    )
+    @property
+    def project_steps(self) -> tuple[int, ...]:
+        """Steps after which the fine network reads more rows of the table."""
+        count = motion_codes.moments(self.spec, self.frames)
+        return motion_codes.growth_steps(self.spec, count)
+
+    def project(self, shared: EmbeddingMotion, step: int) -> EmbeddingMotion:
+        """Return the shared parameters with the rows that are read from a step."""
+        return motion_codes.revised(self.spec, shared, step)
 
 
 # 30 codes for the built-in scene: the coarse network reads six, the fine one six to 30.

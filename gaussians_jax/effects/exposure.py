@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from gaussians_jax.metadata import SceneMetadata
 from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nets import codes
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect
 
 NAME = "exposure"
 # For each appearance id the rows it lies between, and where, as in
@@ -38,6 +38,10 @@ class ExposureSpec:
 
     def __post_init__(self):
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the appearance model for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.exposures)
 
 
 def init(key: Key[Array, ""], exposures: int) -> Float[Array, "exposures 3 4"]:
@@ -72,21 +76,34 @@ def changed(
     return picture + mixed + change[:, 3]
 
 
-def effect(spec: ExposureSpec, steps: int, places: Places) -> Effect:
-    """The effect on a scene of Gaussians that is trained for so many steps."""
-    count = 1 + max(max(left, right) for left, right, _ in places)
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Appearance` of an `ExposureSpec` in a run of `steps`."""
 
-    def expose(table, picture, appearance):
-        return changed(picture, of_id(table, places, appearance))
+    spec: ExposureSpec
+    steps: int
+    places: Places
 
-    return Effect(
-        NAME,
-        init=lambda key: init(key, count),
-        learning_rate=schedules.log_linear(
-            spec.learning_rate, spec.learning_rate_end, steps
-        ),
-        expose=expose,
-    )
+    name = NAME
+
+    def learning_rate(self, step: Int[Array, ""]) -> Float[Array, ""]:
+        """Evaluate the learning rate of the table."""
+        first, last = self.spec.learning_rate, self.spec.learning_rate_end
+        return schedules.log_linear(first, last, self.steps)(step)
+
+    def init(self, key: Key[Array, ""]) -> Float[Array, "exposures 3 4"]:
+        """Initialize exposures that change nothing."""
+        count = 1 + max(max(left, right) for left, right, _ in self.places)
+        return init(key, count)
+
+    def apply(
+        self,
+        params: Float[Array, "exposures 3 4"],
+        image: Float[Array, "*pixels 3"],
+        appearance: Int[Array, ""],
+    ) -> Float[Array, "*pixels 3"]:
+        """Return the image as observed under an appearance id."""
+        return changed(image, of_id(params, self.places, appearance))
 
 
 def fitted(

@@ -17,17 +17,19 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects import motion_codes
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.splats import Gaussians, Params
+from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.nets import codes, kan, mlp
 from nerfies_jax.nets.kan import KAN, KANSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "kan_motion"
@@ -118,6 +120,10 @@ class KanMotionSpec:
         if not self.embedding_rate > 0:
             raise ValueError(f"embedding_rate={self.embedding_rate} must be positive")
         field_spec(self)  # checks what the network is made of
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.moments)
 
 
 class KanMotion(NamedTuple):
@@ -330,49 +336,66 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
     return gaussians
 
 
-def effect(spec: KanMotionSpec, steps: int, frames: int) -> Effect:
-    """The seams that this motion fills, for a run of `steps` over `frames`."""
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `KanMotionSpec` in a run of `steps`."""
 
-    def init_rows(key, rows):
-        return motion_codes.init_embedding(key, spec, rows.mean)
+    spec: KanMotionSpec
+    steps: int
+    frames: int
 
-    def init_networks(key):
-        return init(key, spec, frames)
+    name = NAME
 
-    def embedding_rate(step):
-        return jnp.full((), spec.embedding_rate)
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
 
-    def prepared(params: Params) -> Float[Array, "gaussians features"]:
-        active = splats.active_mask(params.rows["splats"])
-        return prepare(params.nets[NAME], spec, params.rows[NAME], active)
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of embeddings, and of networks and time codes."""
+        first, last = self.spec.learning_rate, self.spec.learning_rate_end
+        rate = schedules.log_linear(first, last, self.steps)
+        return MotionParams(jnp.full((), self.spec.embedding_rate), rate(step))
 
-    def moved(
-        params: Params,
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize the embeddings, the time codes and the networks."""
+        rows_key, shared_key = jax.random.split(key)
+        return MotionParams(
+            motion_codes.init_embedding(rows_key, self.spec, gaussians.mean),
+            init(shared_key, self.spec, self.frames),
+        )
+
+    def precompute(
+        self, params: MotionParams, gaussians: Splats
+    ) -> Float[Array, "gaussians features"]:
+        """Evaluate what does not depend on the time."""
+        active = splats.active_mask(gaussians)
+        return prepare(params.shared, self.spec, params.per_gaussian, active)
+
+    def apply(
+        self,
+        params: MotionParams,
+        cache: Float[Array, "gaussians features"],
         gaussians: Gaussians,
-        condition: FrameCondition,
-        ready: Float[Array, "gaussians features"],
+        frame: FrameCondition,
     ) -> Gaussians:
-        active = splats.active_mask(params.rows["splats"])
-        offsets = deform(params.nets[NAME], spec, condition.time, ready, active)
+        """Move the Gaussians to their state at a time."""
+        active = splats.in_use(gaussians)
+        offsets = deform(params.shared, self.spec, frame.time, cache, active)
         return apply(gaussians, offsets)
 
-    def penalty(own: KanMotion, context: PenaltyContext) -> dict[str, Term]:
-        return motion_codes.penalty(spec, own.times, context)
+    def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the penalties on codes that bend, and on opacity."""
+        return motion_codes.penalty(self.spec, params.shared.times, context)
 
-    count = motion_codes.moments(spec, frames)
-    grows = spec.coarser is not None
-    return Effect(
-        name=NAME,
-        init_rows=init_rows,
-        init=init_networks,
-        row_learning_rate=embedding_rate,
-        learning_rate=schedules.log_linear(
-            spec.learning_rate, spec.learning_rate_end, steps
-        ),
-        warm_up=spec.warm_up,
-        prepare=prepared,
-        deform=moved,
-        penalty=penalty if motion_codes.has_penalty(spec) else None,
-        revise=functools.partial(motion_codes.revised, spec) if grows else None,
-        revise_at=motion_codes.growth_steps(spec, count) if grows else (),
-    )
+    @property
+    def project_steps(self) -> tuple[int, ...]:
+        """Steps after which the fine network reads more rows of the table."""
+        if self.spec.coarser is None:
+            return ()
+        count = motion_codes.moments(self.spec, self.frames)
+        return motion_codes.growth_steps(self.spec, count)
+
+    def project(self, shared: KanMotion, step: int) -> KanMotion:
+        """Return the shared parameters with the rows that are read from a step."""
+        return motion_codes.revised(self.spec, shared, step)

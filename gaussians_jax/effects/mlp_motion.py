@@ -15,13 +15,15 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
-from gaussians_jax.splats import Gaussians, Params
+from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.step_counts import steps
 
 NAME = "mlp_motion"
@@ -82,6 +84,10 @@ class MotionSpec:
                 f"block >= 1 and warm_up >= 0, got {self.block} and {self.warm_up}"
             )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.moments)
 
 
 # One core, forward and backward, at 5k and 10k Gaussians: 14 and 28 ms, about what
@@ -227,30 +233,44 @@ def smooth_time(
     return time + noise * deviation.astype(time.dtype)
 
 
-def effect(spec: MotionSpec, steps: int, frames: int) -> Effect:
-    """The seams that this motion fills, for a run of `steps` over `frames`."""
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `MotionSpec` in a run of `steps`."""
 
-    def init_networks(key):
-        return init(key, spec)
+    spec: MotionSpec
+    steps: int
+    frames: int
 
-    def moved(
-        params: Params, gaussians: Gaussians, condition: FrameCondition, _
+    name = NAME
+
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
+
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rate of the networks."""
+        first, last = self.spec.learning_rate, self.spec.learning_rate_end
+        rate = schedules.log_linear(first, last, self.steps)
+        return MotionParams(shared=rate(step))
+
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize the networks."""
+        _, shared_key = jax.random.split(key)
+        return MotionParams(shared=init(shared_key, self.spec))
+
+    def apply(
+        self,
+        params: MotionParams,
+        cache: None,
+        gaussians: Gaussians,
+        frame: FrameCondition,
     ) -> Gaussians:
-        time = condition.time
-        if spec.smoothing is not None and condition.step is not None:
-            key = jax.random.fold_in(condition.key, _STREAM)
-            time = smooth_time(key, spec.smoothing, time, condition.step, frames)
-        active = splats.active_mask(params.rows["splats"])
-        motion = params.nets[NAME]
-        offsets = deform(motion, spec, gaussians.mean, time, active)
-        return apply(gaussians, offsets, spec.scale_rule)
-
-    return Effect(
-        name=NAME,
-        init=init_networks,
-        learning_rate=schedules.log_linear(
-            spec.learning_rate, spec.learning_rate_end, steps
-        ),
-        warm_up=spec.warm_up,
-        deform=moved,
-    )
+        """Move the Gaussians to a time, which is noisy early in training."""
+        time, smoothing = frame.time, self.spec.smoothing
+        if smoothing is not None and frame.step is not None:
+            key = jax.random.fold_in(frame.key, _STREAM)
+            time = smooth_time(key, smoothing, time, frame.step, self.frames)
+        active = splats.in_use(gaussians)
+        offsets = deform(params.shared, self.spec, gaussians.mean, time, active)
+        return apply(gaussians, offsets, self.spec.scale_rule)

@@ -13,19 +13,21 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
-from gaussians_jax.splats import Gaussians, Params
+from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.step_counts import steps
 
 NAME = "motion_basis"
@@ -92,6 +94,10 @@ class BasisMotionSpec:
         weights_spec(self)
         if self.count is not None:
             basis_spec(self)
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.moments)
 
 
 class BasisMotion(NamedTuple):
@@ -330,38 +336,49 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
     )
 
 
-def effect(spec: BasisMotionSpec, steps: int, frames: int) -> Effect:
-    """The seams that this motion fills, for a run of `steps` over `frames`."""
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `BasisMotionSpec` in a run of `steps`."""
 
-    def init_networks(key):
-        return init(key, spec)
+    spec: BasisMotionSpec
+    steps: int
+    frames: int
 
-    def prepared(params: Params) -> Prepared:
-        rows = params.rows["splats"]
-        return prepare(params.nets[NAME], spec, rows.mean, splats.active_mask(rows))
+    name = NAME
 
-    def moved(
-        params: Params, gaussians: Gaussians, condition: FrameCondition, ready: Prepared
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
+
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rate of the networks."""
+        first, last = self.spec.learning_rate, self.spec.learning_rate_end
+        rate = schedules.log_linear(first, last, self.steps)
+        return MotionParams(shared=rate(step))
+
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize the networks."""
+        _, shared_key = jax.random.split(key)
+        return MotionParams(shared=init(shared_key, self.spec))
+
+    def precompute(self, params: MotionParams, gaussians: Splats) -> Prepared:
+        """Evaluate what does not depend on the time."""
+        active = splats.active_mask(gaussians)
+        return prepare(params.shared, self.spec, gaussians.mean, active)
+
+    def apply(
+        self,
+        params: MotionParams,
+        cache: Prepared,
+        gaussians: Gaussians,
+        frame: FrameCondition,
     ) -> Gaussians:
-        time = condition.time
-        if spec.smoothing is not None and condition.step is not None:
-            key = jax.random.fold_in(condition.key, _STREAM)
-            time = mlp_motion.smooth_time(
-                key, spec.smoothing, time, condition.step, frames
-            )
-        rows = params.rows["splats"]
-        offsets = deform(
-            params.nets[NAME], spec, rows.mean, time, ready, splats.active_mask(rows)
-        )
+        """Move the Gaussians to a time, which is noisy early in training."""
+        time, smoothing = frame.time, self.spec.smoothing
+        if smoothing is not None and frame.step is not None:
+            key = jax.random.fold_in(frame.key, _STREAM)
+            time = mlp_motion.smooth_time(key, smoothing, time, frame.step, self.frames)
+        active, mean = splats.in_use(gaussians), gaussians.mean
+        offsets = deform(params.shared, self.spec, mean, time, cache, active)
         return apply(gaussians, offsets)
-
-    return Effect(
-        name=NAME,
-        init=init_networks,
-        learning_rate=schedules.log_linear(
-            spec.learning_rate, spec.learning_rate_end, steps
-        ),
-        warm_up=spec.warm_up,
-        prepare=prepared,
-        deform=moved,
-    )

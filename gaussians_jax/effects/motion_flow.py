@@ -15,7 +15,6 @@ pixels of the first.
 """
 
 import dataclasses
-import functools
 import math
 from typing import Any, NamedTuple
 
@@ -27,13 +26,13 @@ from jaxtyping import Array, Bool, Float
 from gaussians_jax import projection, raster
 from gaussians_jax.projection import Footprints
 from gaussians_jax.raster_spec import RasterSpec
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.splats import Gaussians, Params
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.precision import exact_einsum, exact_product
 from nerfies_jax.training import losses
-from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.effects import PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "flow"
@@ -83,37 +82,39 @@ class Drawn(NamedTuple):
     depth: Float[Array, "height width"]  # expected z-depth, scene units; 0 of nothing
 
 
-def effect(spec: FlowSpec, picture: RasterSpec) -> Effect:
-    """The seams of `spec`; a capture without flow has no term."""
-    reads = {"flow", "moving"} if spec.moving_only else {"flow"}
-    return Effect(
-        NAME,
-        penalty=functools.partial(penalty, spec, picture),
-        required_data=frozenset(reads),
-    )
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Regularizer` of a `FlowSpec`; a capture without flow has no term."""
 
+    spec: FlowSpec
+    picture: RasterSpec
 
-def penalty(
-    spec: FlowSpec, picture: RasterSpec, _: Any, context: PenaltyContext
-) -> dict[str, Term]:
-    """How far the Gaussians' flow is from that of things, and the share compared."""
-    frames = context.observation.frames
-    if frames is None or frames.flow is None:
-        return {}
+    name = NAME
 
-    def evaluate(params):
-        return compared(spec, picture, params, context)
+    @property
+    def required_data(self) -> frozenset[str]:
+        """Data of the capture that it reads."""
+        return frozenset({"flow", "moving"} if self.spec.moving_only else {"flow"})
 
-    def nothing(params):
-        zero = jnp.zeros((), params.rows["splats"].mean.dtype)
-        return zero, zero
+    def loss(self, params: Params, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the difference of the Gaussians' flow and that of the capture."""
+        frames, spec = context.observation.frames, self.spec
+        if frames is None or frames.flow is None:
+            return {}
 
-    if spec.start == 0:
-        error, known = evaluate(context.params)
-    else:
-        early = context.step < spec.start
-        error, known = lax.cond(early, nothing, evaluate, context.params)
-    return {"error": Term(error, spec.weight), "known": Term(known, None)}
+        def evaluate(params):
+            return compared(spec, self.picture, params, context)
+
+        def nothing(params):
+            zero = jnp.zeros((), params.rows["splats"].mean.dtype)
+            return zero, zero
+
+        if spec.start == 0:
+            error, known = evaluate(params)
+        else:
+            early = context.step < spec.start
+            error, known = lax.cond(early, nothing, evaluate, params)
+        return {"error": Term(error, spec.weight), "known": Term(known, None)}
 
 
 def compared(

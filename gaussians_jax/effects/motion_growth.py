@@ -8,21 +8,23 @@ asks what stands still for a steeper gradient instead.
 """
 
 import dataclasses
+import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from gaussians_jax.splats import Gaussians, Params
-from nerfies_jax.training.effects import Effect, FrameCondition
+from gaussians_jax.densification import DefaultStrategySpec
+from gaussians_jax.protocols import StepInfo, StrategyEvent
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.training.step_counts import steps
 
-NAME = "motion_growth"
+PyTree = Any
 FORMS = ("soft", "hard")
 # At most so many rows give the median of all. Measured at 10k rows, one core: 0.2 ms
-# for all of `update_state`, against 5.6 ms with every row, nearly all of it sorting.
+# for all of `travelled`, against 5.6 ms with every row, nearly all of it sorting.
 MEDIAN_ROWS = 512
 
 
@@ -69,17 +71,15 @@ class Travel(NamedTuple):
     high: Float[Array, "gaussians 3"]
 
 
-def init_state(params: Params) -> Travel:
-    """Nothing seen yet."""
-    mean = params.rows["splats"].mean
+def no_travel(gaussians: Splats | Gaussians) -> Travel:
+    """Return a state in which nothing was seen yet."""
+    mean = gaussians.mean
     # Not infinity: a state is finite throughout, or the loop stops.
     most = jnp.finfo(mean.dtype).max
     return Travel(jnp.full_like(mean, most), jnp.full_like(mean, -most))
 
 
-def update_state(
-    state: Travel, canonical: Gaussians, moved: Gaussians, condition: FrameCondition
-) -> Travel:
+def travelled(state: Travel, canonical: Gaussians, moved: Gaussians) -> Travel:
     """One more instant.
 
     A displacement counts relative to the median displacement of the active rows at that
@@ -87,7 +87,6 @@ def update_state(
     motion of a Gaussian. Where most of a scene moves as one, it is therefore the rest
     that counts as moving. Displacements that are not finite are passed over.
     """
-    del condition
     displacement = moved.mean - canonical.mean
     known = jnp.all(jnp.isfinite(displacement), axis=1)
     # The logistic function of an inactive row's mark is exactly zero.
@@ -160,17 +159,53 @@ def grow_score(
     return growth_factor(spec, motion(state), spec.motion * extent).astype(dtype)
 
 
-def effect(spec: MotionGrowthSpec, extent: float) -> Effect:
-    """The seams this effect fills in a scene of the given extent, in scene units."""
-    if not 0 < extent < math.inf:
-        raise ValueError(
-            f"extent={extent} of the scene must be positive and finite; see "
-            "`splats.scene_extent`"
+class Guided(NamedTuple):
+    """State of a `MotionGuided` strategy."""
+
+    stats: PyTree  # of the strategy that is guided
+    travel: Travel
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionGuided:
+    """The default strategy, its threshold of growth dependent on the motion."""
+
+    base: DefaultStrategySpec
+    spec: MotionGrowthSpec
+    extent: float  # of the scene, scene units
+
+    def __post_init__(self):
+        if not 0 < self.extent < math.inf:
+            raise ValueError(
+                f"extent={self.extent} of the scene must be positive and finite; see "
+                "`splats.scene_extent`"
+            )
+
+    @property
+    def cap_max(self) -> int:
+        """Largest number of Gaussians."""
+        return self.base.cap_max
+
+    def init(self, gaussians: Splats) -> Guided:
+        """Return the state of no view yet."""
+        return Guided(self.base.init(gaussians), no_travel(gaussians))
+
+    def update(self, state: Guided, info: StepInfo) -> Guided:
+        """Return the state after one more view."""
+        travel = travelled(state.travel, info.canonical, info.moved)
+        return Guided(self.base.update(state.stats, info), travel)
+
+    def events(self, steps: int) -> tuple[StrategyEvent, ...]:
+        """Return the events of the guided strategy."""
+        return tuple(
+            event._replace(apply=functools.partial(self._applied, event))
+            for event in self.base.events(steps)
         )
 
-    def score(state, step):
-        return grow_score(spec, extent, state, step)
-
-    return Effect(
-        name=NAME, state=init_state, update_state=update_state, grow_score=score
-    )
+    def _applied(self, event, population):
+        stats, travel = population.state
+        if event.changes_rows:
+            factor = grow_score(self.spec, self.extent, travel, population.step)
+            stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
+        changed = event.apply(population._replace(state=stats))
+        return changed._replace(state=Guided(changed.state, travel))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from gaussians_jax import splats
 from gaussians_jax.splats import Params
-from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.effects import PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "neighbors"
@@ -152,25 +152,34 @@ def inconsistency(
     return total / jnp.maximum(active_count * each, 1).astype(embedding.dtype)
 
 
-def effect(spec: NeighborSpec, extent: float, of: str) -> Effect:
-    """The seams of the penalty on `params.rows[of]`, [gaussians, width]."""
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Regularizer` of a `NeighborSpec` on `params.rows[of]`."""
 
-    def state(params: Params) -> Neighbors:
-        if of not in params.rows:
+    spec: NeighborSpec
+    extent: float  # of the scene, scene units
+    of: str
+
+    name = NAME
+
+    def state(self, params: Params) -> Neighbors:
+        """Find the neighbors; host side."""
+        if self.of not in params.rows:
             raise ValueError(
-                f"there are no rows {of!r} whose neighbors could be alike, only "
+                f"there are no rows {self.of!r} whose neighbors could be alike, only "
                 f"{sorted(params.rows)}; leave the neighbors out of this scene"
             )
-        return find(spec, params, extent)
+        return find(self.spec, params, self.extent)
 
-    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
-        active = splats.active_mask(context.params.rows["splats"])
-        graph = context.state
+    def loss(self, params: Params, context: PenaltyContext) -> dict[str, Term]:
+        """Compute how unlike the embeddings of neighbors are."""
+        active = splats.active_mask(params.rows["splats"])
+        graph, spec = context.state, self.spec
 
         def evaluate(embedding):
             return inconsistency(embedding, graph, active)
 
-        value = _from_step(spec.start, context.step, evaluate, context.params.rows[of])
+        value = _from_step(spec.start, context.step, evaluate, params.rows[self.of])
         linked = jnp.mean((graph.weight > LINKED).astype(value.dtype), axis=1)
         active_count = jnp.maximum(jnp.sum(active), 1).astype(value.dtype)
         # Inactive rows have no weight and so are not counted.
@@ -178,8 +187,6 @@ def effect(spec: NeighborSpec, extent: float, of: str) -> Effect:
             "inconsistency": Term(value, spec.weight),
             "linked": Term(jnp.sum(linked) / active_count, None),
         }
-
-    return Effect(name=NAME, state=state, penalty=penalty)
 
 
 def _from_step(start, step, evaluate, embedding):

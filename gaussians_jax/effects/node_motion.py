@@ -32,6 +32,7 @@ and its noise on the times of real captures are not there.
 """
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple
 
@@ -44,15 +45,16 @@ from gaussians_jax import path_fit, splats
 from gaussians_jax.effects import skinning
 from gaussians_jax.effects.blocks import in_blocks
 from gaussians_jax.effects.skinning import Links, Moves
+from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.path_fit import Guess, Paths, Points
-from gaussians_jax.splats import Gaussians, Params, Splats
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import (
-    Effect,
     FrameCondition,
     PenaltyContext,
     Term,
@@ -135,6 +137,10 @@ class NodeMotionSpec:
                 )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
         network_spec(self)  # checks its sizes
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.extent)
 
 
 class Nodes(NamedTuple):
@@ -313,63 +319,75 @@ def fit_to_paths(
     return Guess(start, rates, penalty if len(resting) else None)
 
 
-def effect(spec: NodeMotionSpec, run_steps: int, extent: float) -> Effect:
-    """The seams that this motion fills, for a run of so many steps.
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `NodeMotionSpec` in a run of `steps`."""
 
-    `extent`, in scene units, is the measure of shifts, as it is that of the means.
-    """
-    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
+    spec: NodeMotionSpec
+    steps: int
+    extent: float  # of the scene, the unit of shifts, scene units
 
-    priced = spec.mask is not None and spec.mask.sparsity > 0
+    name = NAME
 
-    def rates(step):
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
+
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of the nodes and their network."""
+        spec = self.spec
+        rate = schedules.log_linear(
+            spec.learning_rate, spec.learning_rate_end, self.steps
+        )
         now = rate(step)
         share = now / spec.learning_rate
         mask = None if spec.mask is None else spec.mask.rate * share
-        place, radius = extent * spec.place_rate * share, spec.radius_rate * share
-        return Nodes(place, radius, now, mask)
+        place, radius = self.extent * spec.place_rate * share, spec.radius_rate * share
+        return MotionParams(shared=Nodes(place, radius, now, mask))
 
-    def place(nodes, rows: Splats):
-        means = np.asarray(rows.mean)
-        return placed(nodes, means[skinning.farthest_points(means, spec.nodes)])
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize the network, with nodes spread over the Gaussians; host side."""
+        _, shared_key = jax.random.split(key)
+        means = np.asarray(gaussians.mean)
+        places = means[skinning.farthest_points(means, self.spec.nodes)]
+        return MotionParams(shared=placed(init(shared_key, self.spec), places))
 
-    def prepared(params: Params) -> Found:
-        means = params.rows["splats"].mean
-        return find(params.nets[NAME], spec, extent, means, linked=False)
+    def precompute(self, params: MotionParams, gaussians: Splats) -> Found:
+        """Find the nodes near each Gaussian."""
+        mean = gaussians.mean
+        return find(params.shared, self.spec, self.extent, mean, linked=False)
 
-    @jax.jit
-    def found(params: Params) -> Found:
-        means = params.rows["splats"].mean
-        return find(params.nets[NAME], spec, extent, means)
+    @functools.partial(jax.jit, static_argnums=0)
+    def refresh(self, params: MotionParams, gaussians: Splats) -> Found:
+        """Find nodes near Gaussians and each other, when Gaussians come and go."""
+        return find(params.shared, self.spec, self.extent, gaussians.mean)
 
-    def moved(
-        params: Params, gaussians: Gaussians, condition: FrameCondition, ready: Found
+    def apply(
+        self,
+        params: MotionParams,
+        cache: Found,
+        gaussians: Gaussians,
+        frame: FrameCondition,
     ) -> Gaussians:
-        nodes = params.nets[NAME]
-        now = moves(nodes, spec, extent, condition.time)
-        return skinning.apply(gaussians, displaced(nodes, now, ready, gaussians.mean))
+        """Move the Gaussians to their state at a time."""
+        now = moves(params.shared, self.spec, self.extent, frame.time)
+        offsets = displaced(params.shared, now, cache, gaussians.mean)
+        return skinning.apply(gaussians, offsets)
 
-    def penalty(nodes: Nodes, context: PenaltyContext) -> dict[str, Term]:
-        terms, time = {}, context.condition.time
+    def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
+        """Compute how little nodes move as rigid bodies, and how many move at all."""
+        nodes, spec, time = params.shared, self.spec, context.condition.time
+        terms = {}
         if spec.rigidity is not None:
             times = time, jax.random.uniform(context.key, (), time.dtype)
-            value = arap_loss(nodes, spec, extent, context.state.links, times)
+            value = arap_loss(nodes, spec, self.extent, context.state.links, times)
             terms["unrigidity"] = Term(value, spec.rigidity)
-        if priced:
+        if spec.mask is not None and spec.mask.sparsity > 0:
             used = jnp.mean(jax.nn.sigmoid(nodes.mask))
             terms["moving"] = Term(used, spec.mask.sparsity)
         return from_step(spec.warm_up, context.step, terms)
 
-    return Effect(
-        name=NAME,
-        init=lambda key: init(key, spec),
-        place=place,
-        learning_rate=rates,
-        penalty=None if spec.rigidity is None and not priced else penalty,
-        warm_up=spec.warm_up,
-        prepare=prepared,
-        deform=moved,
-        fit_to_paths=lambda paths, key: fit_to_paths(spec, extent, paths, key),
-        state=found,
-        ready_by_state=True,
-    )
+    def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
+        """Return nodes spread over moving and static points, to fit from."""
+        return fit_to_paths(self.spec, self.extent, paths, key)

@@ -21,15 +21,22 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.effects.motion_basis import Offsets, apply
-from gaussians_jax.splats import Gaussians, Params
+from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.nets import mlp, planes
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.nets.planes import Level, PlanesSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition, Term, from_step
+from nerfies_jax.training.effects import (
+    FrameCondition,
+    PenaltyContext,
+    Term,
+    from_step,
+)
 from nerfies_jax.training.step_counts import steps
 
 NAME = "plane_motion"
@@ -73,6 +80,10 @@ class PlaneMotionSpec:
         schedules.check_falling(self.plane_rate, self.plane_rate_end)
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
         network_spec(self)  # checks its sizes
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.extent, metadata.box)
 
 
 class Motion(NamedTuple):
@@ -165,44 +176,64 @@ def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Te
     }
 
 
-def effect(
-    spec: PlaneMotionSpec,
-    run_steps: int,
-    extent: float,
-    box: tuple[Corner, Corner] | None,
-) -> Effect:
-    """The seams that this motion fills, for a run of so many steps.
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `PlaneMotionSpec` in a run of `steps`.
 
-    `box` are the low and the high corner of what was filmed, in scene units, in which
-    the planes lie.
+    `box` is the low and the high corner of the volume of the planes, scene units.
     """
-    if box is None or not all(a < b for a, b in zip(*box, strict=True)):
-        raise ValueError(
-            f"the planes of a motion lie in a box of the scene, got box={box}; give "
-            "SceneMetadata its low and its high corner, as scene.metadata_of does"
-        )
-    plane_rate = schedules.log_linear(spec.plane_rate, spec.plane_rate_end, run_steps)
-    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
 
-    def prepared(params: Params) -> Features:
-        place = places(box, params.rows["splats"].mean)
-        return prepare(params.nets[NAME], spec, place)
+    spec: PlaneMotionSpec
+    steps: int
+    extent: float  # of the scene, the unit of shifts, scene units
+    box: tuple[Corner, Corner] | None
 
-    def moved(
-        params: Params, gaussians: Gaussians, condition: FrameCondition, ready: Features
+    name = NAME
+
+    def __post_init__(self):
+        if self.box is None or not all(
+            low < high for low, high in zip(*self.box, strict=True)
+        ):
+            raise ValueError(
+                f"the planes of a motion lie in a box of the scene, got box={self.box};"
+                " give SceneMetadata its low and its high corner, as scene.metadata_of "
+                "does"
+            )
+
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
+
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of the planes and of the network."""
+        spec, run = self.spec, self.steps
+        planes = schedules.log_linear(spec.plane_rate, spec.plane_rate_end, run)
+        network = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run)
+        return MotionParams(shared=Motion(planes(step), network(step)))
+
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize the planes and the network."""
+        _, shared_key = jax.random.split(key)
+        return MotionParams(shared=init(shared_key, self.spec))
+
+    def precompute(self, params: MotionParams, gaussians: Splats) -> Features:
+        """Read the planes of space."""
+        return prepare(params.shared, self.spec, places(self.box, gaussians.mean))
+
+    def apply(
+        self,
+        params: MotionParams,
+        cache: Features,
+        gaussians: Gaussians,
+        frame: FrameCondition,
     ) -> Gaussians:
-        place = places(box, params.rows["splats"].mean)
-        off = offsets(params.nets[NAME], spec, place, condition.time, ready)
-        return apply(gaussians, off._replace(mean=extent * off.mean))
+        """Move the Gaussians to their state at a time."""
+        place = places(self.box, gaussians.mean)
+        off = offsets(params.shared, self.spec, place, frame.time, cache)
+        return apply(gaussians, off._replace(mean=self.extent * off.mean))
 
-    return Effect(
-        name=NAME,
-        init=lambda key: init(key, spec),
-        learning_rate=lambda step: Motion(plane_rate(step), rate(step)),
-        penalty=lambda params, context: from_step(
-            spec.warm_up, context.step, smoothness(spec, params.planes)
-        ),
-        warm_up=spec.warm_up,
-        prepare=prepared,
-        deform=moved,
-    )
+    def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the smoothness of the planes, once the motion has begun."""
+        terms = smoothness(self.spec, params.shared.planes)
+        return from_step(self.spec.warm_up, context.step, terms)

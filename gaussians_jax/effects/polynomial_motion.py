@@ -20,15 +20,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import path_fit, splats
 from gaussians_jax.effects import temporal_opacity
 from gaussians_jax.effects.temporal_opacity import Fading
+from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.path_fit import Guess, Paths
-from gaussians_jax.splats import Gaussians, Params, Splats
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.fit import check_positive
 from nerfies_jax.training.step_counts import steps
 
@@ -72,6 +74,10 @@ class PolynomialMotionSpec:
             raise ValueError(f"warm_up={self.warm_up} must not be negative")
         check_positive(turn_rate=self.turn_rate)
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.extent)
 
 
 class Polynomials(NamedTuple):
@@ -130,31 +136,48 @@ def fit_to_paths(spec: PolynomialMotionSpec, paths: Paths) -> Guess:
     return Guess(points, path_fit.Points(paths.unit, rates, None))
 
 
-def effect(spec: PolynomialMotionSpec, run_steps: int, extent: float) -> Effect:
-    """The seams that this motion fills, for a run of so many steps.
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `PolynomialMotionSpec` in a run of `steps`."""
 
-    `extent`, in scene units, is the measure of shifts, as it is that of the means.
-    """
-    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
+    spec: PolynomialMotionSpec
+    steps: int
+    extent: float  # of the scene, the unit of shifts, scene units
 
-    def init_rows(key, rows: Splats):
-        return init(key, spec, len(rows.mean), rows.mean.dtype)
+    name = NAME
 
-    def row_rates(step):
-        fading = None
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
+
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of the coefficients."""
+        spec, fading = self.spec, None
         if spec.fading is not None:
             fading = Fading(spec.fading.time_rate, spec.fading.width_rate)
-        return Polynomials(extent * rate(step), spec.turn_rate, fading)
+        rate = schedules.log_linear(
+            spec.learning_rate, spec.learning_rate_end, self.steps
+        )
+        rows = Polynomials(self.extent * rate(step), spec.turn_rate, fading)
+        return MotionParams(rows)
 
-    def moved(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
-        del ready
-        return deform(params.rows[NAME], gaussians, condition.time)
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize coefficients with which nothing moves."""
+        rows_key, _ = jax.random.split(key)
+        mean = gaussians.mean
+        return MotionParams(init(rows_key, self.spec, len(mean), mean.dtype))
 
-    return Effect(
-        name=NAME,
-        init_rows=init_rows,
-        row_learning_rate=row_rates,
-        warm_up=spec.warm_up,
-        deform=moved,
-        fit_to_paths=lambda paths, key: fit_to_paths(spec, paths),
-    )
+    def apply(
+        self,
+        params: MotionParams,
+        cache: None,
+        gaussians: Gaussians,
+        frame: FrameCondition,
+    ) -> Gaussians:
+        """Move the Gaussians to their state at a time."""
+        return deform(params.per_gaussian, gaussians, frame.time)
+
+    def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
+        """Return a closed-form fit of each path by itself, from which a fit starts."""
+        return fit_to_paths(self.spec, paths)

@@ -18,12 +18,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Key
 
+from gaussians_jax.metadata import SceneMetadata
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry.camera import Camera, move
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import in_default_precision
 
 NAME = "poses"
@@ -45,6 +45,10 @@ class PoseRefinementSpec:
 
     def __post_init__(self):
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the camera optimizer for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.frames, metadata.depth)
 
 
 def refined(screws: Screws, cameras: Camera, depth: float) -> Camera:
@@ -89,14 +93,30 @@ def found(screws: Screws, capture: Capture, depth: float) -> Capture:
     return dataclasses.replace(capture, cameras=cameras)
 
 
-def effect(spec: PoseRefinementSpec, steps: int, frames: int, depth: float) -> Effect:
-    """The effect on a scene that learns from so many frames for so many steps."""
-    return Effect(
-        NAME,
-        init=lambda key: jnp.zeros((frames, 6), jnp.float32),
-        learning_rate=schedules.log_linear(
-            spec.learning_rate, spec.learning_rate_end, steps
-        ),
-        pose=lambda screws, cameras: refined(screws, cameras, depth),
-        found=lambda screws, capture: found(screws, capture, depth),
-    )
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `CameraOptimizer` of a `PoseRefinementSpec` in a run of `steps`."""
+
+    spec: PoseRefinementSpec
+    steps: int
+    frames: int  # that the scene is trained on
+    depth: float  # z-depth halfway into the scene, scene units
+
+    name = NAME
+
+    def learning_rate(self, step: Int[Array, ""]) -> Float[Array, ""]:
+        """Evaluate the learning rate of the screws."""
+        first, last = self.spec.learning_rate, self.spec.learning_rate_end
+        return schedules.log_linear(first, last, self.steps)(step)
+
+    def init(self, key: Key[Array, ""]) -> Screws:
+        """Initialize screws that leave every camera as it is."""
+        return jnp.zeros((self.frames, 6), jnp.float32)
+
+    def apply(self, params: Screws, cameras: Camera) -> Camera:
+        """Return the refined cameras of the training frames."""
+        return refined(params, cameras, self.depth)
+
+    def apply_to_capture(self, params: Screws, capture: Capture) -> Capture:
+        """Return the capture with the refined cameras of all frames; host side."""
+        return found(params, capture, self.depth)

@@ -20,18 +20,20 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import splats, time_knots
+from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.path_fit import Guess, Paths, Points
-from gaussians_jax.splats import Gaussians, Params, Splats
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.evidence import rigid_groups
 from nerfies_jax.geometry import lie
 from nerfies_jax.geometry.fusion import components, stacked
 from nerfies_jax.geometry.jacobi import dot
 from nerfies_jax.geometry.precision import exact_einsum, exact_product
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.step_counts import steps
 
 NAME = "se3_bases"
@@ -81,6 +83,10 @@ class SE3BasesSpec:
         if self.warm_up < 0:
             raise ValueError(f"warm_up={self.warm_up} must not be negative")
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.extent)
 
 
 class Poses(NamedTuple):
@@ -209,39 +215,49 @@ def _at_knots(track, times, spec):
     return table
 
 
-def effect(spec: SE3BasesSpec, steps: int, extent: float) -> Effect:
-    """The seams that this motion fills, for a run of `steps`.
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `SE3BasesSpec` in a run of `steps`."""
 
-    `extent`, in scene units, is the measure of shifts, as it is that of the means.
-    """
-    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, steps)
+    spec: SE3BasesSpec
+    steps: int
+    extent: float  # of the scene, the unit of shifts, scene units
 
-    def init_rows(key, rows: Splats):
-        del key
-        return init_logits(spec, len(rows.mean), rows.mean.dtype)
+    name = NAME
 
-    def row_rate(step):
-        return jnp.full((), spec.logit_rate)
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
 
-    def rates(step):
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of logits and bases."""
         # A center and a shift say the same twice over; centers stay.
-        now = rate(step)
-        coarse = Poses(now, extent * now)
-        fine = jax.tree.map(lambda own: spec.fine_rate * own, coarse)
-        return Bases(fine, coarse, jnp.zeros_like(now))
+        first, last = self.spec.learning_rate, self.spec.learning_rate_end
+        now = schedules.log_linear(first, last, self.steps)(step)
+        coarse = Poses(now, self.extent * now)
+        fine = jax.tree.map(lambda own: self.spec.fine_rate * own, coarse)
+        bases = Bases(fine, coarse, jnp.zeros_like(now))
+        return MotionParams(jnp.full((), self.spec.logit_rate), bases)
 
-    def moved(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
-        del ready
-        motion = at_time(params.nets[NAME], condition.time)
-        return deform(motion, params.rows[NAME], gaussians)
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize the bases, and logits with which nothing moves."""
+        _, shared_key = jax.random.split(key)
+        mean = gaussians.mean
+        logits = init_logits(self.spec, len(mean), mean.dtype)
+        return MotionParams(logits, init(shared_key, self.spec))
 
-    return Effect(
-        name=NAME,
-        init=lambda key: init(key, spec),
-        init_rows=init_rows,
-        row_learning_rate=row_rate,
-        learning_rate=rates,
-        warm_up=spec.warm_up,
-        deform=moved,
-        fit_to_paths=lambda paths, key: fit_to_paths(spec, paths),
-    )
+    def apply(
+        self,
+        params: MotionParams,
+        cache: None,
+        gaussians: Gaussians,
+        frame: FrameCondition,
+    ) -> Gaussians:
+        """Move the Gaussians to their state at a time."""
+        motion = at_time(params.shared, frame.time)
+        return deform(motion, params.per_gaussian, gaussians)
+
+    def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
+        """Return a closed-form fit of groups of points, from which a fit starts."""
+        return fit_to_paths(self.spec, paths)

@@ -12,12 +12,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
+from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.splats import Params
 from nerfies_jax.contract import checked
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.effects import PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "spectral"
@@ -112,6 +114,11 @@ class SpectralSpec:
         _positive("gates'", learning_rate=self.learning_rate)
         if self.after < 0:
             raise ValueError(f"after={self.after} counts steps; it is not negative")
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the regularizer of a run of `run_steps`."""
+        kind = LearnedBound if self.gate in LEARNED else Bound
+        return kind(self, run_steps)
 
 
 class Bands(NamedTuple):
@@ -320,25 +327,45 @@ def terms(
     return weighed
 
 
-def effect(spec: SpectralSpec, steps: int) -> Effect:
-    """The seams that these losses fill, for a run of `steps`."""
-    if spec.after >= steps:
-        raise ValueError(
-            f"after={spec.after} leaves none of the run's {steps} steps to the "
-            "spectral losses; start them earlier or leave them out"
-        )
-    learned = spec.gate in LEARNED
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Regularizer` of a `SpectralSpec` whose gate learns nothing."""
 
-    def penalty(gates: Gates | None, context: PenaltyContext) -> dict[str, Term]:
+    spec: SpectralSpec
+    steps: int
+
+    name = NAME
+
+    def __post_init__(self):
+        if self.spec.after >= self.steps:
+            raise ValueError(
+                f"after={self.spec.after} leaves none of the run's {self.steps} steps "
+                "to the spectral losses; start them earlier or leave them out"
+            )
+
+    def loss(self, params: Params, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the spectral losses of one frame."""
         seen = context.observation
-        weight = weights(spec, gates, context.step, steps)
-        return terms(spec, weight, seen.rendering.color, seen.truth, seen.valid)
+        gates = self._gates(params)
+        weight = weights(self.spec, gates, context.step, self.steps)
+        return terms(self.spec, weight, seen.rendering.color, seen.truth, seen.valid)
 
-    return Effect(
-        name=NAME,
-        init=(lambda key: init(spec)) if learned else None,
-        learning_rate=(lambda step: jnp.asarray(spec.learning_rate))
-        if learned
-        else None,
-        penalty=penalty,
-    )
+    def _gates(self, params):
+        del params
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnedBound(Bound):
+    """The `Regularizer` of a `SpectralSpec` whose gate is learned."""
+
+    @property
+    def learning_rate(self) -> float:
+        """Learning rate of the gate."""
+        return self.spec.learning_rate
+
+    def init(self, key: Key[Array, ""]) -> Gates:
+        """Initialize the gate."""
+        return init(self.spec)
+
+    def _gates(self, params):
+        return params.nets[NAME]

@@ -14,14 +14,16 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import path_fit, splats, time_knots
+from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.path_fit import Guess, Paths, Points
-from gaussians_jax.splats import Gaussians, Params, Splats
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.geometry.precision import exact_einsum
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.step_counts import steps
 
 NAME = "spline_motion"
@@ -45,6 +47,10 @@ class SplineMotionSpec:
         if self.warm_up < 0:
             raise ValueError(f"warm_up={self.warm_up} must not be negative")
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.extent)
 
 
 class Splines(NamedTuple):
@@ -85,26 +91,42 @@ def fit_to_paths(spec: SplineMotionSpec, paths: Paths) -> Guess:
     return Guess(points, Points(paths.unit, Splines(paths.unit, 0.0), None))
 
 
-def effect(spec: SplineMotionSpec, run_steps: int, extent: float) -> Effect:
-    """The seams that this motion fills, for a run of so many steps.
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `SplineMotionSpec` in a run of `steps`."""
 
-    `extent`, in scene units, is the measure of shifts, as it is that of the means.
-    """
-    rate = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run_steps)
+    spec: SplineMotionSpec
+    steps: int
+    extent: float  # of the scene, the unit of shifts, scene units
 
-    def init_rows(key, rows: Splats):
-        del key
-        return init(spec, len(rows.mean), rows.mean.dtype)
+    name = NAME
 
-    def moved(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
-        del ready
-        return deform(params.rows[NAME], gaussians, condition.time)
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
 
-    return Effect(
-        name=NAME,
-        init_rows=init_rows,
-        row_learning_rate=lambda step: Splines(extent * rate(step), rate(step)),
-        warm_up=spec.warm_up,
-        deform=moved,
-        fit_to_paths=lambda paths, key: fit_to_paths(spec, paths),
-    )
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of the control points."""
+        first, last = self.spec.learning_rate, self.spec.learning_rate_end
+        rate = schedules.log_linear(first, last, self.steps)
+        return MotionParams(Splines(self.extent * rate(step), rate(step)))
+
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize control points with which nothing moves."""
+        mean = gaussians.mean
+        return MotionParams(init(self.spec, len(mean), mean.dtype))
+
+    def apply(
+        self,
+        params: MotionParams,
+        cache: None,
+        gaussians: Gaussians,
+        frame: FrameCondition,
+    ) -> Gaussians:
+        """Move the Gaussians to their state at a time."""
+        return deform(params.per_gaussian, gaussians, frame.time)
+
+    def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
+        """Return a closed-form fit of each path by itself, from which a fit starts."""
+        return fit_to_paths(self.spec, paths)

@@ -14,10 +14,12 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax.splats import Gaussians, Params, Splats
-from nerfies_jax.training.effects import Effect, FrameCondition
+from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.fit import check_positive
 
 NAME = "temporal_opacity"
@@ -41,6 +43,10 @@ class TemporalOpacitySpec:
 
     def __post_init__(self):
         check_positive(**dataclasses.asdict(self))
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the part of a scene with these settings."""
+        return Bound(self)
 
 
 class Fading(NamedTuple):
@@ -88,23 +94,39 @@ def around(
     return Fading(time, np.log(np.maximum(spec.width * followed, least)))
 
 
-def effect(spec: TemporalOpacitySpec) -> Effect:
-    """The seams that it fills; behind every motion, for motions may set opacities."""
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `TemporalOpacitySpec`: it moves nothing, and fades."""
 
-    def init_rows(key: Key[Array, ""], rows: Splats):
-        del key
-        return always(len(rows.mean), rows.mean.dtype)
+    spec: TemporalOpacitySpec
 
-    def deform(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
-        del ready
-        return faded(params.rows[NAME], gaussians, condition.time)
+    name = NAME
 
-    return Effect(
-        name=NAME,
-        init_rows=init_rows,
-        row_learning_rate=lambda step: Fading(
-            jnp.full((), spec.time_rate), jnp.full((), spec.width_rate)
-        ),
-        deform=deform,
-        lifted_rows=lambda time, followed: around(spec, time, followed),
-    )
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of times and widths."""
+        del step
+        rates = jnp.full((), self.spec.time_rate), jnp.full((), self.spec.width_rate)
+        return MotionParams(Fading(*rates))
+
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize Gaussians that are visible at all times."""
+        mean = gaussians.mean
+        return MotionParams(always(len(mean), mean.dtype))
+
+    def apply(
+        self,
+        params: MotionParams,
+        cache: None,
+        gaussians: Gaussians,
+        frame: FrameCondition,
+    ) -> Gaussians:
+        """Fade the Gaussians at a time."""
+        return faded(params.per_gaussian, gaussians, frame.time)
+
+    def lifted_rows(
+        self,
+        time: Float[np.ndarray, " gaussians"],
+        followed: Float[np.ndarray, " gaussians"],
+    ) -> Fading:
+        """Return the times and widths of Gaussians lifted from moving pixels."""
+        return around(self.spec, time, followed)

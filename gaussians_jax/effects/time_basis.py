@@ -16,18 +16,20 @@ import dataclasses
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
-from gaussians_jax.splats import Gaussians, Params, Splats
+from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.protocols import MotionParams
+from gaussians_jax.splats import Gaussians, Splats
 from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import (
-    Effect,
     FrameCondition,
     PenaltyContext,
     Term,
@@ -77,6 +79,10 @@ class TimeBasisSpec:
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
         schedules.check_falling(self.coefficient_rate, self.coefficient_rate_end)
         network_spec(self)  # checks its sizes
+
+    def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
+        """Return the motion for a run of `run_steps` of this capture."""
+        return Bound(self, run_steps, metadata.extent)
 
 
 class Trajectories(NamedTuple):
@@ -154,38 +160,53 @@ def sparsity(
     return jnp.sum(share)
 
 
-def effect(spec: TimeBasisSpec, run_steps: int, extent: float) -> Effect:
-    """The seams that this motion fills, for a run of so many steps.
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Motion` of a `TimeBasisSpec` in a run of `steps`."""
 
-    `extent`, in scene units, is the measure of shifts, as it is that of the means.
-    """
+    spec: TimeBasisSpec
+    steps: int
+    extent: float  # of the scene, the unit of shifts, scene units
 
-    def init_rows(key, rows: Splats):
-        del key
-        return init_coefficients(spec, len(rows.mean), rows.mean.dtype)
+    name = NAME
 
-    def moved(params: Params, gaussians: Gaussians, condition: FrameCondition, ready):
-        del ready
-        trajectories = at_time(params.nets[NAME], spec, extent, condition.time)
-        return deform(trajectories, params.rows[NAME], gaussians)
+    @property
+    def warm_up(self) -> int:
+        """Number of steps without motion."""
+        return self.spec.warm_up
 
-    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
-        rows = context.params.rows
-        value = sparsity(rows[NAME], splats.active_mask(rows["splats"]))
-        terms = {"sparsity": Term(value, spec.sparsity)}
-        return from_step(spec.warm_up, context.step, terms)
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of coefficients and network."""
+        spec, run = self.spec, self.steps
+        coefficients = schedules.log_linear(
+            spec.coefficient_rate, spec.coefficient_rate_end, run
+        )
+        network = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run)
+        return MotionParams(coefficients(step), network(step))
 
-    return Effect(
-        name=NAME,
-        init=lambda key: init(key, spec),
-        init_rows=init_rows,
-        row_learning_rate=schedules.log_linear(
-            spec.coefficient_rate, spec.coefficient_rate_end, run_steps
-        ),
-        learning_rate=schedules.log_linear(
-            spec.learning_rate, spec.learning_rate_end, run_steps
-        ),
-        penalty=None if spec.sparsity is None else penalty,
-        warm_up=spec.warm_up,
-        deform=moved,
-    )
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize the network, and coefficients with which nothing moves."""
+        _, shared_key = jax.random.split(key)
+        mean = gaussians.mean
+        coefficients = init_coefficients(self.spec, len(mean), mean.dtype)
+        return MotionParams(coefficients, init(shared_key, self.spec))
+
+    def apply(
+        self,
+        params: MotionParams,
+        cache: None,
+        gaussians: Gaussians,
+        frame: FrameCondition,
+    ) -> Gaussians:
+        """Move the Gaussians to their state at a time."""
+        trajectories = at_time(params.shared, self.spec, self.extent, frame.time)
+        return deform(trajectories, params.per_gaussian, gaussians)
+
+    def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
+        """Compute how many trajectories a Gaussian uses, once the motion has begun."""
+        if self.spec.sparsity is None:
+            return {}
+        active = splats.active_mask(context.params.rows["splats"])
+        value = sparsity(params.per_gaussian, active)
+        terms = {"sparsity": Term(value, self.spec.sparsity)}
+        return from_step(self.spec.warm_up, context.step, terms)

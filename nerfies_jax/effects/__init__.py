@@ -1,1 +1,6 @@
-"""What a scene may call for beyond a static radiance field, one file each."""
+"""Parts of a radiance field beyond a static scene, one file each."""
+
+import lazy_loader
+
+# Modules that `nerfies_jax` shows; each is loaded when it is used.
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, ["protocols"])

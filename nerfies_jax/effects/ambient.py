@@ -7,8 +7,8 @@ ambient coordinates (equation 6). The axis-aligned *plane* has one for the frame
 """
 
 import dataclasses
-import functools
 import math
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
@@ -18,7 +18,7 @@ from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
+from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
 from nerfies_jax.training.step_counts import steps
 
 KINDS = ("bent", "plane")
@@ -77,6 +77,10 @@ class AmbientSpec:
             )
         network(self)  # refuses wrong depths, widths and skips
 
+    def bind(self, run_steps: int, metadata: Any) -> "Bound":
+        """Return the conditioning of a scene with these settings."""
+        return BentBound(self) if self.kind == "bent" else Bound(self)
+
 
 def network(spec: AmbientSpec) -> MLPSpec:
     """Return the settings of the network from [encoded point, code] to ambient
@@ -97,21 +101,47 @@ def network(spec: AmbientSpec) -> MLPSpec:
     )
 
 
-def effect(spec: AmbientSpec) -> Effect:
-    """The seams of `spec`; of the observed point, before any warp."""
-    bent = spec.kind == "bent"
-    table = (
-        Table(spec.table, MOMENT, spec.code_width)
-        if bent
-        else Table(PLANE_TABLE, MOMENT, spec.dims)
-    )
-    return Effect(
-        "ambient",
-        tables=(table,),
-        init=(lambda key: init(spec, key)) if bent else None,
-        lift=functools.partial(features, spec),
-        lift_width=spec.encoding.width(spec.dims),
-    )
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Conditioning` of an `AmbientSpec`; of the observed point, before any warp.
+
+    This is a slice that is a plane: it has no network.
+    """
+
+    spec: AmbientSpec
+
+    name = "ambient"
+    target = "trunk"
+
+    @property
+    def features(self) -> int:
+        """Number of features that the trunk reads in addition."""
+        return self.spec.encoding.width(self.spec.dims)
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Table of the codes that it reads."""
+        return (Table(PLANE_TABLE, MOMENT, self.spec.dims),)
+
+    def apply(
+        self, params: MLP | None, point: Vector, frame: FrameCondition
+    ) -> Float[Array, " features"]:
+        """Compute the encoded ambient coordinates of a point."""
+        return features(self.spec, params, point, frame)
+
+
+@dataclasses.dataclass(frozen=True)
+class BentBound(Bound):
+    """The `Conditioning` of an `AmbientSpec` whose slice is bent by a network."""
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Table of the codes that it reads."""
+        return (Table(self.spec.table, MOMENT, self.spec.code_width),)
+
+    def init(self, key: Key[Array, ""]) -> MLP:
+        """Initialize the network."""
+        return init(self.spec, key)
 
 
 def init(spec: AmbientSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:

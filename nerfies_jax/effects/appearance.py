@@ -11,7 +11,9 @@ switch, and under the published presets their gradient is exactly zero.
 
 import dataclasses
 
-from nerfies_jax.training.effects import APPEARANCE, Effect, Table
+from jaxtyping import Array, Float
+
+from nerfies_jax.training.effects import APPEARANCE, FrameCondition, Table, Vector
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +26,9 @@ class AppearanceSpec:
     width: int = 8
     table: str = "appearance"
 
+    name = "appearance"
+    target = "color"
+
     def __post_init__(self):
         if self.width < 1:
             raise ValueError(
@@ -31,12 +36,18 @@ class AppearanceSpec:
                 "codes, set the effect to none"
             )
 
+    @property
+    def features(self) -> int:
+        """Number of features that the color branch reads in addition."""
+        return self.width
 
-def effect(spec: AppearanceSpec) -> Effect:
-    """The seams of `spec`: the code joins what the color branch reads."""
-    return Effect(
-        "appearance",
-        tables=(Table(spec.table, APPEARANCE, spec.width),),
-        condition=lambda _, condition: condition.codes[spec.table],
-        condition_width=spec.width,
-    )
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Table of the codes."""
+        return (Table(self.table, APPEARANCE, self.width),)
+
+    def apply(
+        self, params: None, point: Vector | None, frame: FrameCondition
+    ) -> Float[Array, " features"]:
+        """Return the code of the frame's exposure."""
+        return frame.codes[self.table]

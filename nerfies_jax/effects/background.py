@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from nerfies_jax.effects.effect import Scalar
 from nerfies_jax.training import losses
-from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.effects import PenaltyContext, PyTree, Term
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +36,9 @@ class BackgroundSpec:
     scaling: str = "official"
     weight: float = 1.0
 
+    name = "background"
+    required_data = frozenset({"points"})
+
     def __post_init__(self):
         if self.points < 1:
             raise ValueError(f"points={self.points} of a step must be at least 1")
@@ -45,14 +48,9 @@ class BackgroundSpec:
                 raise ValueError(f"{name}={value} must be finite and not negative")
         losses.check_geman_mcclure(self.width, self.scaling)
 
-
-def effect(spec: BackgroundSpec) -> Effect:
-    """The seams of `spec`; each random static point is seen in a random frame."""
-
-    def penalty(_, context):
-        return {"background": Term(drift(spec, context), spec.weight)}
-
-    return Effect("background", penalty=penalty, required_data=frozenset({"points"}))
+    def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
+        """Compute how far random static points are moved in random frames."""
+        return {"background": Term(drift(self, context), self.weight)}
 
 
 def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:

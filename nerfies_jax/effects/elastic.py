@@ -17,7 +17,7 @@ from nerfies_jax.effects.effect import RayOutput, Scalar
 from nerfies_jax.geometry import matrix3
 from nerfies_jax.geometry.jacobi import cross, dot
 from nerfies_jax.training import losses, schedules
-from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.effects import PenaltyContext, PyTree, Term
 from nerfies_jax.training.step_counts import steps
 
 Matrix = Float[Array, "3 3"]
@@ -55,6 +55,8 @@ class ElasticSpec:
     scaling: str = "paper"
     fold_cost: float = 1.0
 
+    name = "elastic"
+
     def __post_init__(self):
         if self.points is not None and self.points < 1:
             raise ValueError(
@@ -69,6 +71,14 @@ class ElasticSpec:
         schedule(self)  # refuses impossible steps
         if self.robust_width is not None:  # refuses wrong widths and scalings
             losses.check_geman_mcclure(self.robust_width, self.scaling)
+
+    def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the elastic energy of the warp at the coarse samples of a step."""
+        value, folded = energy_of_step(self, context)
+        weight = schedule(self)
+        if callable(weight):
+            weight = weight(context.step)
+        return {"elastic": Term(value, weight), "folded": Term(folded, None)}
 
 
 def schedule(spec: ElasticSpec) -> schedules.Schedule | float:
@@ -85,19 +95,6 @@ def schedule(spec: ElasticSpec) -> schedules.Schedule | float:
     return schedules.cosine(
         spec.weight, spec.last_weight, spec.decay_steps, after=spec.hold_steps
     )
-
-
-def effect(spec: ElasticSpec) -> Effect:
-    """The seams of `spec`."""
-
-    def penalty(_, context):
-        value, folded = energy_of_step(spec, context)
-        weight = schedule(spec)
-        if callable(weight):
-            weight = weight(context.step)
-        return {"elastic": Term(value, weight), "folded": Term(folded, None)}
-
-    return Effect("elastic", penalty=penalty)
 
 
 def energy_of_step(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:

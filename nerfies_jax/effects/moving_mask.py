@@ -22,7 +22,6 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training.effects import (
     MOMENT,
-    Effect,
     FrameCondition,
     PenaltyContext,
     Table,
@@ -52,6 +51,11 @@ class MovingMaskSpec:
     code_width: int = 8
     weight: float = 0.1
 
+    name = NAME
+    target = "warp"
+    features = 1
+    required_data = frozenset({"moving"})
+
     def __post_init__(self):
         if self.code_width < 1:
             raise ValueError(
@@ -63,6 +67,25 @@ class MovingMaskSpec:
                 f"weight={self.weight} of the mask must be finite and not negative"
             )
         network(self)  # refuses wrong depths, widths and skips
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Table of the codes that it reads."""
+        return (Table(self.table, MOMENT, self.code_width),)
+
+    def init(self, key: Key[Array, ""]) -> MLP:
+        """Initialize the network."""
+        return init(self, key)
+
+    def apply(
+        self, params: MLP, point: Vector, frame: FrameCondition
+    ) -> Float[Array, "1"]:
+        """Compute how surely an observed point moves."""
+        return share(self, params, point, frame)[None]
+
+    def loss(self, params: MLP, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the difference from the masks of a capture, if it has any."""
+        return penalty(self, params, context)
 
 
 def network(spec: MovingMaskSpec) -> MLPSpec:
@@ -80,18 +103,6 @@ def network(spec: MovingMaskSpec) -> MLPSpec:
         width=spec.width,
         heads=(("logit", HeadSpec(1, "small")),),
         skips=spec.skips,
-    )
-
-
-def effect(spec: MovingMaskSpec) -> Effect:
-    """The seams of `spec`; without masks in a capture it learns from colors alone."""
-    return Effect(
-        NAME,
-        tables=(Table(spec.table, MOMENT, spec.code_width),),
-        init=lambda key: init(spec, key),
-        mark=lambda *given: {NAME: share(spec, *given)[None]},
-        penalty=functools.partial(penalty, spec),
-        required_data=frozenset({"moving"}),
     )
 
 

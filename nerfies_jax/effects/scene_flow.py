@@ -9,9 +9,8 @@ left out.
 """
 
 import dataclasses
-import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,7 @@ from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance import compositing, template
 from nerfies_jax.radiance.template import Template, TemplateSpec
-from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "scene_flow"
@@ -99,6 +98,10 @@ class SceneFlowSpec:
                 'after the last are asked for as well; set "clamp"'
             )
 
+    def bind(self, run_steps: int, metadata: Any) -> "Bound":
+        """Return the medium of a field of this capture."""
+        return Bound(self, metadata.times)
+
 
 class SceneFlow(NamedTuple):
     """Parameters."""
@@ -133,23 +136,41 @@ class Neighbor(NamedTuple):
     present: Bool[Array, " rays"]  # whether the capture has that moment
 
 
-def effect(spec: SceneFlowSpec, times: tuple[float, ...], features: int) -> Effect:
-    """The seams of `spec` for a capture that is learned from at these rising times.
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Medium` of a `SceneFlowSpec` for a capture with these rising times.
 
-    They need not be even: frames are held out. `features` is the width of the static
-    template's trunk.
+    They need not be even: frames are held out.
     """
-    learned_moments.interval(len(times))  # refuses none
-    required_data = {"depths": spec.weights.depth, "flow": spec.weights.flow}
-    return Effect(
-        NAME,
-        init=lambda key: init(spec, key, features),
-        medium=functools.partial(medium, spec),
-        penalty=functools.partial(penalty, spec, times),
-        required_data=frozenset(
-            name for name, weight in required_data.items() if weight > 0
-        ),
-    )
+
+    spec: SceneFlowSpec
+    times: tuple[float, ...]
+
+    name = NAME
+
+    def __post_init__(self):
+        learned_moments.interval(len(self.times))  # refuses none
+
+    @property
+    def required_data(self) -> frozenset[str]:
+        """Data of the capture that its losses read."""
+        weights = self.spec.weights
+        read = {"depths": weights.depth, "flow": weights.flow}
+        return frozenset(name for name, weight in read.items() if weight > 0)
+
+    def init(self, key: Key[Array, ""], features: int) -> "SceneFlow":
+        """Initialize the networks, for a trunk with so many features."""
+        return init(self.spec, key, features)
+
+    def apply(
+        self, params: "SceneFlow", sample: Sample, frame: FrameCondition
+    ) -> Medium:
+        """Compute the medium at one sample."""
+        return medium(self.spec, params, sample, frame)
+
+    def loss(self, params: "SceneFlow", context: PenaltyContext) -> dict[str, Term]:
+        """Compute the losses of the flow."""
+        return penalty(self.spec, self.times, params, context)
 
 
 def init(

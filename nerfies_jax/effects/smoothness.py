@@ -20,7 +20,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.radiance.template import Template, TemplateSpec
-from nerfies_jax.training.effects import Effect, PenaltyContext, Term
+from nerfies_jax.training.effects import PenaltyContext, PyTree, Term
 from nerfies_jax.training.step_counts import steps
 
 VARIED = 1024  # vertices of each level of a hashed grid that are drawn in a step
@@ -45,31 +45,39 @@ class SmoothnessSpec:
             )
 
 
-def effect(spec: SmoothnessSpec, templates: dict[str, TemplateSpec]) -> Effect:
-    """The seams of `spec` for the templates of a field, by level."""
-    tabled = {name: one for name, one in templates.items() if has_tables(one)}
-    if not tabled:
-        raise ValueError(
-            "smoothness is of grids and planes, and no template has one; set "
-            "smoothness=none, or choose a preset on a grid"
-        )
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """The `Regularizer` of a `SmoothnessSpec` on the templates of a field, by level."""
 
-    def penalty(_, context: PenaltyContext) -> dict[str, Term]:
-        nets, found = context.params["template"], []
+    spec: SmoothnessSpec
+    templates: dict[str, TemplateSpec]
+
+    name = "smoothness"
+
+    def __post_init__(self):
+        if not any(map(has_tables, self.templates.values())):
+            raise ValueError(
+                "smoothness is of grids and planes, and no template has one; set "
+                "smoothness=none, or choose a preset on a grid"
+            )
+
+    def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the variation of the tables."""
+        tabled = {k: one for k, one in self.templates.items() if has_tables(one)}
+        found = []
         for number, (name, one) in enumerate(tabled.items()):
             key = jax.random.fold_in(context.key, number)
-            found.append(variation(one, nets[name], key))
-        weight = spec.weight
-        if spec.until is not None:
-            weight = jnp.where(context.step < spec.until, weight, 0)
+            found.append(variation(one, params["template"][name], key))
+        weight = self.spec.weight
+        if self.spec.until is not None:
+            weight = jnp.where(context.step < self.spec.until, weight, 0)
         return {"variation": Term(sum(found), weight)}
-
-    return Effect("smoothness", penalty=penalty)
 
 
 def has_tables(spec: TemplateSpec) -> bool:
     """Whether the template reads a point from tables."""
-    return not isinstance(spec.position, EncodingSpec)
+    own = isinstance(spec, TemplateSpec)  # of others nothing is known
+    return own and not isinstance(spec.position, EncodingSpec)
 
 
 def variation(spec: TemplateSpec, params: Template, key: Key[Array, ""]) -> Scalar:

@@ -17,12 +17,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.effects.effect import Look, RayOutput, Scalar, Surface, Vector
+from nerfies_jax.effects.records import FieldRecord
 from nerfies_jax.geometry.precision import exact_einsum
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import Layer
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import Effect, FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "surface"
@@ -66,9 +67,9 @@ class SurfaceSpec:
                 )
 
 
-def effect(spec: SurfaceSpec, widths: dict[str, int]) -> Effect:
+def effect(spec: SurfaceSpec, widths: dict[str, int]) -> FieldRecord:
     """The seams of `spec` on levels whose trunks are so wide."""
-    return Effect(
+    return FieldRecord(
         NAME,
         init=lambda key: init(widths, key),
         surface=functools.partial(look, spec),

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from nerfies_jax.nets import encoding
 from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
+from nerfies_jax.training.effects import MOMENT, FrameCondition, Table, Vector
 
 CONDITIONS = ("time", "code")
 
@@ -30,6 +30,9 @@ class TimeSpec:
     table: str = "motion"
     code_width: int = 8
 
+    name = "time"
+    target = "trunk"
+
     def __post_init__(self):
         if self.condition not in CONDITIONS:
             raise ValueError(
@@ -43,21 +46,23 @@ class TimeSpec:
             )
 
     @property
-    def width(self) -> int:
-        """How many features it adds."""
+    def features(self) -> int:
+        """Number of features that the trunk reads in addition."""
         by_code = self.condition == "code"
         return self.code_width if by_code else self.encoding.width(1)
 
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Tables of the codes that it reads."""
+        if self.condition != "code":
+            return ()
+        return (Table(self.table, MOMENT, self.code_width),)
 
-def effect(spec: TimeSpec) -> Effect:
-    """The seams of `spec`; the same features at all points of a moment."""
-    by_code = spec.condition == "code"
-    return Effect(
-        "time",
-        tables=(Table(spec.table, MOMENT, spec.code_width),) if by_code else (),
-        lift=lambda _, point, condition: features(spec, condition),
-        lift_width=spec.width,
-    )
+    def apply(
+        self, params: None, point: Vector | None, frame: FrameCondition
+    ) -> Float[Array, " features"]:
+        """Compute the features of a frame, the same at all points."""
+        return features(self, frame)
 
 
 def features(spec: TimeSpec, condition: FrameCondition) -> Float[Array, " features"]:

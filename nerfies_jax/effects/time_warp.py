@@ -9,7 +9,6 @@ deformation. Time 0 is not special.
 """
 
 import dataclasses
-import functools
 import math
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ from nerfies_jax.effects.effect import Scalar, Vector
 from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +45,25 @@ class TimeWarpSpec:
                 "alike"
             )
         shift_network(self)  # refuses wrong depths and widths
+
+    @property
+    def features(self) -> int:
+        """Number of features that the trunk reads in addition."""
+        return self.position.width(3) + self.embedding
+
+    def init(self, key: Key[Array, ""]) -> "TimeWarp":
+        """Initialize the networks."""
+        return init(self, key)
+
+    def apply(self, params: "TimeWarp", point: Vector, frame: FrameCondition) -> Vector:
+        """Compute the displacement of a point."""
+        return displace(self, params, point, frame)
+
+    def lift(
+        self, params: "TimeWarp", point: Vector, frame: FrameCondition
+    ) -> Float[Array, " features"]:
+        """Compute what the trunk reads in addition."""
+        return features(self, params, point, frame)
 
 
 class TimeWarp(NamedTuple):
@@ -80,17 +98,6 @@ def shift_network(spec: TimeWarpSpec) -> MLPSpec:
     inputs = spec.position.width(3) + spec.embedding
     heads = (("linear", HeadSpec(3, "small")),)
     return MLPSpec(inputs, spec.depth, spec.width, heads)
-
-
-def effect(spec: TimeWarpSpec) -> Effect:
-    """The seams of `spec`."""
-    return Effect(
-        "warp",
-        init=lambda key: init(spec, key),
-        displace=functools.partial(displace, spec),
-        lift=functools.partial(features, spec),
-        lift_width=spec.position.width(3) + spec.embedding,
-    )
 
 
 def init(spec: TimeWarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> TimeWarp:

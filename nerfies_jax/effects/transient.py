@@ -8,7 +8,6 @@ with codes between those of their neighbors in time, unless it is left out
 """
 
 import dataclasses
-import functools
 import math
 
 import jax
@@ -21,7 +20,6 @@ from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import losses
 from nerfies_jax.training.effects import (
     APPEARANCE,
-    Effect,
     FrameCondition,
     PenaltyContext,
     Table,
@@ -51,6 +49,8 @@ class TransientSpec:
     density_weight: float = 0.01
     beta_power: float = 0.0
 
+    name = NAME
+
     def __post_init__(self):
         if self.code_width < 1:
             raise ValueError(
@@ -73,6 +73,23 @@ class TransientSpec:
             )
         network(self, 1)  # refuses wrong depths and widths
 
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Table of the codes that it reads."""
+        return (Table(TABLE, APPEARANCE, self.code_width),)
+
+    def init(self, key: Key[Array, ""], features: int) -> MLP:
+        """Initialize the network, for a trunk with so many features."""
+        return init(self, key, features)
+
+    def apply(self, params: MLP, sample: Sample, frame: FrameCondition) -> Medium:
+        """Compute the medium at one sample."""
+        return medium(self, params, sample, frame)
+
+    def loss(self, params: MLP | None, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the penalty on its density."""
+        return penalty(self, context)
+
 
 def network(spec: TransientSpec, features: int) -> MLPSpec:
     """Return the settings of the network from [template features, code] to the medium.
@@ -91,19 +108,6 @@ def network(spec: TransientSpec, features: int) -> MLPSpec:
         depth=spec.depth,
         width=spec.width,
         heads=tuple((name, HeadSpec(width)) for name, width in heads),
-    )
-
-
-def effect(spec: TransientSpec, features: int) -> Effect:
-    """The seams of `spec` on a template whose trunk is `features` wide."""
-    return Effect(
-        NAME,
-        tables=(Table(TABLE, APPEARANCE, spec.code_width),),
-        init=lambda key: init(spec, key, features),
-        medium=functools.partial(medium, spec),
-        penalty=lambda _, context: penalty(spec, context),
-        beta_min=spec.beta_min,
-        beta_power=spec.beta_power,
     )
 
 

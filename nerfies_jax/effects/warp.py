@@ -7,7 +7,6 @@ from which `matrix3.displacement_log_energy` computes an exact elastic energy.
 """
 
 import dataclasses
-import functools
 import math
 
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ from nerfies_jax.nets import dense, encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import MOMENT, Effect, FrameCondition, Table
+from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
 from nerfies_jax.training.step_counts import steps
 
 KINDS = ("se3", "translation")
@@ -70,6 +69,26 @@ class WarpSpec:
             )
         network(self)  # refuses wrong depths, widths and skips
 
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Tables of the codes that the warp reads."""
+        if self.condition != "code":
+            return ()
+        return (Table(self.table, MOMENT, self.code_width),)
+
+    @property
+    def shortest_wave(self) -> float | None:
+        """Shortest wavelength of the displacement, units of the field."""
+        return self.position.shortest_wave
+
+    def init(self, key: Key[Array, ""]) -> MLP:
+        """Initialize the network."""
+        return init(self, key)
+
+    def apply(self, params: MLP, point: Vector, frame: FrameCondition) -> Vector:
+        """Compute the displacement of a point."""
+        return displace(self, params, point, frame)
+
 
 def network(spec: WarpSpec) -> MLPSpec:
     """Return the settings of the network from [encoded point, condition] to twist or
@@ -89,18 +108,6 @@ def network(spec: WarpSpec) -> MLPSpec:
         width=spec.width,
         heads=tuple((name, HeadSpec(3, "small")) for name in names),
         skips=spec.skips,
-    )
-
-
-def effect(spec: WarpSpec) -> Effect:
-    """The seams of `spec`."""
-    by_code = spec.condition == "code"
-    return Effect(
-        "warp",
-        tables=(Table(spec.table, MOMENT, spec.code_width),) if by_code else (),
-        init=lambda key: init(spec, key),
-        displace=functools.partial(displace, spec),
-        shortest_wave=spec.position.shortest_wave,
     )
 
 

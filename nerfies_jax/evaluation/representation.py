@@ -83,11 +83,7 @@ Splatting = Callable[[TrainState, float, int, np.ndarray], SplatCloud]
 
 
 class Representation(NamedTuple):
-    """Constructors and functions of a representation's scenes.
-
-    Functions that take a spec and its metadata take `effects` as well, which are
-    user-defined.
-    """
+    """Constructors and functions of a representation's scenes."""
 
     name: str
     # Cores that XLA:CPU should see: "one" if its own threading slows the loops down.
@@ -103,22 +99,22 @@ class Representation(NamedTuple):
     # Mean time of a step over a run, relative to one with the first state.
     growth: Callable[[Spec, TrainState], float]
     metadata_of: Callable[[Capture, Spec], Any]
-    build: Callable[..., Model]  # (spec, metadata, effects=()) -> model
+    build: Callable[..., Model]  # (spec, metadata) -> model
     estimate_memory_bytes: Callable[
         [Spec, Capture], int
     ]  # frames, first state and step
     memory_hint: str  # which settings make the first state smaller
-    # (spec, metadata, model, state, frames, effects=()) -> the parts of a step
+    # (spec, metadata, model, state, frames) -> the parts of a step
     step_parts: Callable[..., StepParts]
-    # (spec, metadata, names left out, whether appearances are blended, effects=()) ->
-    # model; it draws a `nerfies_jax.variants.Between` instead of a view where they are.
+    # (spec, metadata, names left out, whether appearances are blended) -> model; it
+    # draws a `nerfies_jax.variants.Between` instead of a view where they are.
     variant: Callable[..., Model]
-    parts: Callable[..., Parts]  # (spec, metadata, effects=())
-    # (spec, metadata, state, capture, rows, effects=()), codes fitted to half a frame;
+    parts: Callable[..., Parts]  # (spec, metadata)
+    # (spec, metadata, state, capture, rows), codes fitted to half a frame;
     # None where the scene has no codes of its own for each frame.
     score_halves: Callable[..., Halves | None]
     fitted_rays: int  # rendered to fit the codes of one frame
-    # (folder, spec, metadata, state, effects=()) -> what it wrote beside the checkpoint
+    # (folder, spec, metadata, state) -> what it wrote beside the checkpoint
     save: Callable[..., Saved]
     # (path, title, spec, model, state, capture, poster) -> a page that shows the scene
     # from anywhere at any time; None where nothing plays it in a browser.
@@ -131,7 +127,7 @@ class Representation(NamedTuple):
     # Preset of a capture if the user names none.
     default_preset: Callable[[Capture], Choice] | None
     prices: dict[str, Pair]  # by effect, as in `nerfies_jax.evidence.findings`
-    # (spec, metadata, names left out, effects=()) -> the Gaussians of a trained scene
+    # (spec, metadata, names left out) -> the Gaussians of a trained scene
     # for a rasterizer elsewhere; None where a scene has none.
     splatting: Callable[..., Splatting] | None = None
 

@@ -15,20 +15,20 @@ _RECONSTRUCT = ("python", "-m", "experiments.reconstruct")
 
 def resume(
     folder: pathlib.Path,
-    effects: tuple[str, ...] = (),
+    code: tuple[str, ...] = (),
     base: pathlib.Path | None = None,
 ) -> str:
     """Return the command that continues a run.
 
     Args:
       folder: Folder of the run, which holds its settings.
-      effects: Effects of the user's own, as MODULE:NAME, which must be repeated.
+      code: Names MODULE:NAME of code from other packages, which must be repeated.
       base: Folder that paths are relative to, or None.
 
     Returns:
       The command line.
     """
-    words = [*_RECONSTRUCT, "--out", str(folder), "--resume", *_trusting(effects)]
+    words = [*_RECONSTRUCT, "--out", str(folder), "--resume", *_trusting(code)]
     return _line(words, base)
 
 
@@ -49,31 +49,31 @@ def reconstruct(config: RunConfig, base: pathlib.Path | None = None) -> str:
         words += ["--seed", str(config.seed)]
     if config.overrides:
         words += ["--set", *config.overrides]
-    return _line([*words, *_trusting(config.effects)], base)
+    return _line(words, base)
 
 
 def render(
     folder: pathlib.Path,
-    effects: tuple[str, ...] = (),
+    code: tuple[str, ...] = (),
     base: pathlib.Path | None = None,
 ) -> str:
     """Return the command that renders a run from a camera that moves in a circle.
 
     Args:
       folder: Folder of the run.
-      effects: Effects of the user's own, as MODULE:NAME, which must be repeated.
+      code: Names MODULE:NAME of code from other packages, which must be repeated.
       base: Folder that paths are relative to, or None.
 
     Returns:
       The command line.
     """
     words = ["python", "-m", "experiments.render", str(folder), "--path", "orbit"]
-    return _line([*words, *_trusting(effects)], base)
+    return _line([*words, *_trusting(code)], base)
 
 
-def _trusting(effects):
-    """The option that names the user's own effects: no folder is trusted with them."""
-    return ["--effect", *effects] if effects else []
+def _trusting(code):
+    """Return the option that names code of other packages: no folder may do so."""
+    return ["--trust", *code] if code else []
 
 
 def _line(words, base):

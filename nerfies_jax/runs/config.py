@@ -92,7 +92,6 @@ class RunConfig:
     source: CaptureSource = CaptureSource()
     steps: int | None = None  # the preset's own; schedules stretch with them
     overrides: tuple[str, ...] = ()  # of the preset's fields, as PATH=VALUE
-    effects: tuple[str, ...] = ()  # of the user's own, as MODULE:NAME
     seed: int = 0
 
 

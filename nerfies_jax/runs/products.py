@@ -115,7 +115,7 @@ def make(
             attempt(None, save_depth, place / "depth", run.capture, scored)
             save, model = run.representation.save, (run.spec, run.metadata, state)
             with events.stage("saving the model"):
-                saved = attempt(Saved(), save, place, *model, effects=run.effects)
+                saved = attempt(Saved(), save, place, *model)
             fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
             numbers, remarks = quality.measure(
                 run, state, trained.draw, scored, extra, ms_per_frame / 1e3
@@ -299,7 +299,6 @@ def score_halves(
         state,
         run.capture,
         scored.rows[few],
-        effects=run.effects,
     )
     if halves is None:
         return [], ()
@@ -458,7 +457,7 @@ def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
 
 def _next(folder, run, trained, base=None):
     """Suggested next commands, with absolute paths relative to a `base`."""
-    own = run.config.effects
+    own = run.code
     line = commands.render(folder, own, base)
     looked = report.Command("Render it from other viewpoints and times:", line)
     if trained.result.stopped_by == "non-finite":

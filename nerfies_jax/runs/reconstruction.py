@@ -30,7 +30,7 @@ from nerfies_jax.runs.run import (
     Run,
     first_state,
     new_run,
-    read_settings,
+    read_config,
     restore,
     save_config,
     saved_run,
@@ -135,7 +135,7 @@ def resume(
     *,
     expected: Mapping[str, Any] = {},
     overrides: tuple[str, ...] = (),
-    effects: Collection[str] = (),
+    trusted: Collection[str] = (),
     seconds: float | int | None = None,
     evaluate_every: float | int = 20.0,
     checkpoint_every: float | int = 60.0,
@@ -153,8 +153,8 @@ def resume(
         and of its source by name. A capture that was moved since is named at its new
         place.
       overrides: Fields of its spec that it must have been started with, as PATH=VALUE.
-      effects: User-defined effects, as MODULE:NAME, that may be loaded if the run was
-        started with them. The folder alone cannot cause code to run.
+      trusted: Names MODULE:NAME of code from other packages that may be loaded if the
+        run was started with it. The folder alone cannot cause code to run.
       seconds: Seconds of training of this call.
       evaluate_every: Seconds of training between two evaluations.
       checkpoint_every: Seconds of training between two checkpoints.
@@ -178,7 +178,7 @@ def resume(
             moved = _check_expected(folder, expected)
             held.enter_context(run_folder.owned(folder))
             extra = quality.prepared(more)
-            run = saved_run(folder, overrides, moved, effects)
+            run = saved_run(folder, overrides, moved, trusted)
             _describe(run)
             quality.check(extra, run.capture.size)
             state, record, after = _restored(folder, run)
@@ -270,7 +270,7 @@ def _check_expected(folder, expected):
 
     Returns what of its source has been moved since, by name.
     """
-    config = read_settings(folder).config
+    config = read_config(folder)
     stored = {**vars(config), **vars(config.source)}
     there, source = stored["capture"], expected.get("capture")
     if there is not None and source is not None and run_folder.is_of(there, source):
@@ -313,7 +313,7 @@ def _restored(folder, run):
 
 def _opened(held, folder, run, state, after):
     """Where the run saves, with its state saved there: nothing done is ever lost."""
-    line = commands.resume(folder, run.config.effects)
+    line = commands.resume(folder, run.code)
     stopping.advise(f"continue with: {line}")
     checkpoints = held.enter_context(train.open_checkpoints(folder, run, after))
     if after is None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # a record is loaded when it is asked for, not with this modu
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs.platform import Threads
 from nerfies_jax.runs.run_folder import CONFIG
-from nerfies_jax.training import specs
+from nerfies_jax.training import extensions, specs
 
 GROUP = "nerfies_jax.representations"
 USUAL = "splats-tracked-small"  # where none is named, and tracks tell a motion
@@ -110,20 +110,27 @@ def of_run(folder: pathlib.Path) -> "Representation | None":
         return None
 
 
-def stored_spec(representation: "Representation", stored: Any) -> Any:
-    """Convert a spec from a run folder.
+def stored_spec(
+    representation: "Representation", stored: Any, *, load: bool = False
+) -> Any:
+    """Read a spec as a run folder holds it.
 
     Args:
-      representation: The representation.
+      representation: The representation of the run.
       stored: JSON values.
+      load: Whether classes of other packages that are named in it are imported, which
+        runs their code.
 
     Returns:
-      A spec of that representation.
+      The spec.
 
     Raises:
-      ValueError, TypeError: If the values are not a spec.
+      ValueError, TypeError: If it is no spec of that representation.
     """
-    return specs.from_json(stored, representation.spec_type)
+    known = representation.spec_type
+    names = extensions.names_in(stored, specs.TYPE) if load else ()
+    others = [name for name in names if name not in specs.allowed_names(known)]
+    return specs.from_json(stored, known, *map(extensions.load_class, others))
 
 
 class Cores(NamedTuple):

@@ -1,5 +1,6 @@
 """A run: its capture, scene and model, and the settings in its folder."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -23,11 +24,10 @@ from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.evidence import frame_flow, frame_masks, given_files
-from nerfies_jax.runs import own_effects, representations, same_capture, trust
+from nerfies_jax.runs import representations, same_capture, trust
 from nerfies_jax.runs.config import CaptureNotFound, CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG, LEFT_OUT
 from nerfies_jax.training import checkpoint, specs
-from nerfies_jax.training.effects import Effect
 from nerfies_jax.training.model import Model, TrainState
 from nerfies_jax.training.provenance import provenance
 
@@ -50,7 +50,12 @@ class Run(NamedTuple):
     spec: Any  # of the representation's `spec_type`
     metadata: Any  # what the scene must know of the capture
     model: Model
-    effects: tuple[Effect, ...] = ()  # of the user's own, beside those of the spec
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """Names of the code from other packages that the run needs."""
+        stored = {"config": vars(self.config), "spec": specs.as_json(self.spec)}
+        return trust.outside_names(stored, type(self.spec))
 
 
 def new_run(config: RunConfig, stored: Capture | None = None) -> Run:
@@ -136,9 +141,8 @@ def with_steps(run: Run, steps: int) -> Run:
 @events.stage("building the model")
 def _built(config, representation, spec, capture, filmed):
     metadata = representation.metadata_of(capture, spec)
-    effects = own_effects.load(config.effects, metadata)
-    model = representation.build(spec, metadata, effects=effects)
-    return Run(config, capture, filmed, representation, spec, metadata, model, effects)
+    model = representation.build(spec, metadata)
+    return Run(config, capture, filmed, representation, spec, metadata, model)
 
 
 def with_found_cameras(run: Run, state: TrainState) -> Run:
@@ -337,7 +341,7 @@ def saved_run(
     folder: pathlib.Path,
     overrides: tuple[str, ...] = (),
     moved: Mapping[str, Any] = {},
-    effects: Collection[str] = (),
+    trusted: Collection[str] = (),
 ) -> Run:
     """Open the run in a folder, with the settings and the capture it was made with.
 
@@ -348,22 +352,21 @@ def saved_run(
         which may have changed since.
       overrides: Settings that the run must have, as PATH=VALUE.
       moved: The parts of its source that have another path today, which is kept.
-      effects: The effects from outside of this package that the caller trusts, as
-        MODULE:NAME. They are loaded if the run was trained with them.
+      trusted: Names MODULE:NAME of code from other packages that the caller trusts. It
+        is loaded if the run needs it.
 
     Returns:
       The run.
 
     Raises:
-      UntrustedEffects: The run uses effects that are not in `effects`. It is a
-        ValueError, and nothing has been imported.
+      UntrustedCode: The run needs code that is not in `trusted`. It is a ValueError,
+        and nothing has been imported.
       CaptureNotFound: The capture is not where it was. It is a ValueError.
       ValueError: `overrides` would change settings, or the capture is not the one that
         the run was started with.
     """
     folder = pathlib.Path(folder)
-    config, kind, spec = read_settings(folder)
-    trust.check_effects(folder, config.effects, effects)
+    config, kind, spec = read_settings(folder, trusted)
     wanted = specs.override(spec, overrides)
     changed = specs.differences(specs.as_json(spec), specs.as_json(wanted))
     if changed:
@@ -382,18 +385,55 @@ def saved_run(
     return run
 
 
-def read_settings(folder: pathlib.Path) -> Settings:
-    """Read the settings of a run.
+def read_settings(folder: pathlib.Path, trusted: Collection[str] = ()) -> Settings:
+    """Read the settings of the run in a folder.
 
     Args:
       folder: The run folder.
+      trusted: Names MODULE:NAME of code from other packages that may be loaded.
 
     Returns:
       The settings.
 
     Raises:
-      ValueError: If they cannot be read.
+      UntrustedCode: If the run needs code that is not among `trusted`. It is a
+        ValueError, and nothing has been imported.
+      FileError: If the settings cannot be read.
     """
+    stored = _stored(folder)
+    with _readable(folder):
+        kind = representations.named(stored["representation"])
+        config = specs.from_json(stored["config"], RunConfig)
+    trust.check(folder, stored, kind.spec_type, trusted)
+    with _readable(folder):
+        spec = representations.stored_spec(kind, stored["spec"], load=True)
+        for value, wanted in ((config, RunConfig), (spec, kind.spec_type)):
+            if not isinstance(value, wanted):
+                raise ValueError(f"a {type(value).__name__} for a {wanted.__name__}")
+    return Settings(config, kind, spec)
+
+
+def read_config(folder: pathlib.Path) -> RunConfig:
+    """Read the request that a run in a folder was started with, and no code.
+
+    Args:
+      folder: The run folder.
+
+    Returns:
+      The request.
+
+    Raises:
+      ValueError: If it cannot be read.
+    """
+    stored = _stored(folder)
+    with _readable(folder):
+        config = specs.from_json(stored["config"], RunConfig)
+        if not isinstance(config, RunConfig):
+            raise ValueError(f"a {type(config).__name__} for a RunConfig")
+    return config
+
+
+def _stored(folder):
     path = folder / CONFIG
     if not path.is_file():
         raise ValueError(
@@ -401,14 +441,15 @@ def read_settings(folder: pathlib.Path) -> Settings:
             "experiments.reconstruct printed; a run that was killed before it had one "
             "must be started again"
         )
+    with _readable(folder):
+        return read_json(path, dict[str, Any])
+
+
+@contextlib.contextmanager
+def _readable(folder):
+    """Say of which file it is that what is read in the block is no settings."""
     try:
-        stored = read_json(path, dict[str, Any])
-        kind = representations.named(stored["representation"])
-        config = specs.from_json(stored["config"], RunConfig)
-        spec = representations.stored_spec(kind, stored["spec"])
-        for value, wanted in ((config, RunConfig), (spec, kind.spec_type)):
-            if not isinstance(value, wanted):
-                raise ValueError(f"a {type(value).__name__} for a {wanted.__name__}")
+        yield
     except FileError:  # it names the path already
         raise
     except (
@@ -419,8 +460,9 @@ def read_settings(folder: pathlib.Path) -> Settings:
         RecursionError,
     ) as error:
         reason = " ".join(str(error).split())
-        raise FileError(f"{path}: not the settings of a run ({reason})") from error
-    return Settings(config, kind, spec)
+        raise FileError(
+            f"{folder / CONFIG}: not the settings of a run ({reason})"
+        ) from error
 
 
 @events.stage("initializing the scene")

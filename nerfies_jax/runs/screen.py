@@ -35,8 +35,8 @@ class Screen:
         pixels = TRACED_PIXELS if traced else RASTERIZED_PIXELS
         self.pyramid = interactive.pyramid(full, pixels)
         settings = run.spec, run.metadata
-        self.parts = run.representation.parts(*settings, effects=run.effects)
-        self._move = run.representation.mover(*settings, effects=run.effects)
+        self.parts = run.representation.parts(*settings)
+        self._move = run.representation.mover(*settings)
         self._models: dict[tuple[str, ...], Model] = {}
         self._renderers: dict[tuple[str, ...], Renderer] = {}
         self._splatting: dict[tuple[str, ...], Splatting] = {}
@@ -82,7 +82,7 @@ class Screen:
         if look.without not in self._splatting:
             run = self.run
             self._splatting[look.without] = run.representation.splatting(
-                run.spec, run.metadata, look.without, effects=run.effects
+                run.spec, run.metadata, look.without
             )
         splatting = self._splatting[look.without]
         return splatting(state, look.time, look.appearance, np.asarray(eye.position))
@@ -158,7 +158,7 @@ class Screen:
             run, model = self.run, self.run.model
             if without:
                 model = run.representation.variant(
-                    run.spec, run.metadata, without, False, effects=run.effects
+                    run.spec, run.metadata, without, False
                 )
             self._models[without] = model
         return self._models[without]

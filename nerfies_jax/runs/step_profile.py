@@ -44,7 +44,7 @@ def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     try:
         parts = run.representation.step_parts(
-            run.spec, run.metadata, run.model, state, frames, effects=run.effects
+            run.spec, run.metadata, run.model, state, frames
         )
     except Exception as error:
         profile = refused(error)

@@ -76,8 +76,12 @@ def _kind_text(kind):
         return f"{_kind_text(typing.get_args(kind)[0])},..."
     if kind is type(None):
         return "none"
+    if getattr(kind, "_is_protocol", False):
+        return "MODULE:NAME"
     parts = typing.get_args(kind)
-    return " or ".join(map(_kind_text, parts)) if parts else kind.__name__
+    if not parts:
+        return kind.__name__
+    return " or ".join(dict.fromkeys(map(_kind_text, parts)))
 
 
 def field_words(kind: type) -> dict[str, str]:

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from nerfies_jax.capture.nearest import known_names
-from nerfies_jax.training import spec_fields
+from nerfies_jax.training import extensions, spec_fields
 
 TYPE = "type"  # a spec's, in JSON; no field can have this name
 NUMBER = "number"  # around an infinity or NaN, which JSON does not have
@@ -94,7 +94,19 @@ def from_json(stored: Any, *kinds: type) -> Any:
       ValueError: A type is not among the allowed ones, or a field is unknown, missing
         or out of its bounds. Nothing is imported to find that out.
     """
-    return _revived(stored, {type_name(kind): kind for kind in _allowed(kinds)})
+    return _revived(stored, allowed_names(*kinds))
+
+
+def allowed_names(*kinds: type) -> dict[str, type]:
+    """Return the settings and records that a value of some types can hold, by name.
+
+    Args:
+      *kinds: Types of settings.
+
+    Returns:
+      These types, and those that their annotated fields can hold.
+    """
+    return {type_name(kind): kind for kind in _allowed(kinds)}
 
 
 def _revived(stored, allowed):
@@ -168,9 +180,12 @@ def type_name(kind: type) -> str:
       kind: The type.
 
     Returns:
-      Module and qualified name, joined by a dot.
+      Module and qualified name, joined by a dot, or by a colon if the type is from
+      another package.
     """
-    return f"{kind.__module__}.{kind.__qualname__}"
+    ours = kind.__module__.partition(".")[0] in (*PACKAGES, "experiments")
+    separator = "." if ours else extensions.SEPARATOR
+    return f"{kind.__module__}{separator}{kind.__qualname__}"
 
 
 def record_named(name: Any) -> type:
@@ -313,13 +328,22 @@ def _read(kind, text, path):
     named = {choice.__name__: choice for choice in choices}
     if text in named:
         return _defaults(named[text], path)
+    origin = typing.get_origin(kind)
+    several = typing.get_args(options[0]) if origin is tuple else ()
+    protocols = _protocols(several or options)
+    if protocols and several:
+        names = [part for part in text.split(",") if part]
+        return tuple(_loaded(name, protocols, path) for name in names)
+    if protocols and extensions.SEPARATOR in text:
+        return _loaded(text, protocols, path)
     if type(None) in options:
         if text.lower() == "none":
             return None
         kind = next(option for option in options if option is not type(None))
+    if origin is not tuple:
+        kind = next((each for each in options if each in {int, float, str}), kind)
     if kind is bool and text.lower() in {"true", "false"}:
         return text.lower() == "true"
-    origin = typing.get_origin(kind)
     try:
         if kind in {int, float, str}:
             return kind(text)
@@ -331,8 +355,23 @@ def _read(kind, text, path):
     except ValueError:
         pass
     if named:
-        kind = f"one of {', '.join(named)}"
+        kind = f"one of {', '.join([*named, *['MODULE:NAME'] * bool(protocols)])}"
     raise OverrideError(f"{path}={text}: cannot be read as {kind}")
+
+
+def _protocols(options):
+    """The protocols among the types that a field can hold."""
+    return [kind for kind in options if getattr(kind, "_is_protocol", False)]
+
+
+def _loaded(name, protocols, path):
+    """The part of this name, which fills the first of the protocols or can be bound."""
+    try:
+        part = extensions.load(name)
+        extensions.check(path, part, protocols[0])
+    except ValueError as error:
+        raise OverrideError(f"{path}={name}: {error}") from error
+    return part
 
 
 def _defaults(spec_class, path):

@@ -56,7 +56,7 @@ def slices(params, point, when):
     """The ambient point, and what the template reads of it at each of `STEPS`."""
 
     def lift(step):
-        return ambient.effect(BENT).lift(params, point, when._replace(step=step))
+        return BENT.bind(1, None).apply(params, point, when._replace(step=step))
 
     return ambient.ambient_point(BENT, params, point, when), jax.vmap(lift)(
         jnp.asarray(STEPS)
@@ -71,7 +71,7 @@ def test_a_bent_slice_is_the_loop_over_its_layers(dtype, rng):
     tolerance = {"float32": 3e-6, "float64": 1e-13}[dtype]
     assert ambient_point.dtype == lifted.dtype == dtype
     np.testing.assert_allclose(ambient_point, exact, atol=tolerance)
-    assert lifted.shape == (len(STEPS), ambient.effect(BENT).lift_width)
+    assert lifted.shape == (len(STEPS), BENT.bind(1, None).features)
     opened = [window_by_hand(BENT, int(step)) for step in STEPS]
     features = [networks.waves(BENT.encoding, exact, shares) for shares in opened]
     np.testing.assert_allclose(lifted, features, atol=tolerance)
@@ -80,16 +80,18 @@ def test_a_bent_slice_is_the_loop_over_its_layers(dtype, rng):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("spec", [BENT, PLANE], ids=["bent", "plane"])
 def test_while_shut_the_template_reads_zeros_and_nothing_learns(spec, dtype, rng):
-    effect = ambient.effect(spec)
+    effect = spec.bind(1, None)
     params = bent_params(dtype) if spec.kind == "bent" else None
     point = jnp.asarray(rng.uniform(-1, 1, 3), dtype)
-    pull = jnp.asarray(rng.normal(size=effect.lift_width), dtype)
+    pull = jnp.asarray(rng.normal(size=effect.features), dtype)
     still = condition(dtype)
 
     @jax.jit
     def read(params, codes, step):
         def total(params, codes):
-            lifted = effect.lift(params, point, FrameCondition(still.time, codes, step))
+            lifted = effect.apply(
+                params, point, FrameCondition(still.time, codes, step)
+            )
             return pull @ lifted, lifted
 
         return jax.grad(total, argnums=(0, 1), has_aux=True)(params, codes)
@@ -109,15 +111,15 @@ def test_while_shut_the_template_reads_zeros_and_nothing_learns(spec, dtype, rng
 
 
 def test_a_plane_has_one_ambient_point_for_all_points(dtype, rng):
-    effect = ambient.effect(PLANE)
-    assert effect.init is None
+    effect = PLANE.bind(1, None)
+    assert not hasattr(effect, "init")
     assert effect.tables == (Table("ambient", MOMENT, 3),)
     when = condition(dtype)
 
     @jax.jit
     @jax.vmap
     def seen(point):
-        return ambient.ambient_point(PLANE, None, point, when), effect.lift(
+        return ambient.ambient_point(PLANE, None, point, when), effect.apply(
             None, point, when
         )
 
@@ -130,7 +132,7 @@ def test_a_plane_has_one_ambient_point_for_all_points(dtype, rng):
 
 def test_a_bent_slice_shares_the_code_of_the_warp_and_starts_flat(rng):
     spec = AmbientSpec()
-    effect = ambient.effect(spec)
+    effect = spec.bind(1, None)
     assert effect.tables == (Table("motion", MOMENT, 8),)
     points = rng.uniform(-1, 1, (200, 3)).astype(np.float32)
     codes = {"motion": jnp.asarray(np.full(8, 0.05, np.float32))}
@@ -151,12 +153,12 @@ def test_a_bent_slice_shares_the_code_of_the_warp_and_starts_flat(rng):
 
 def test_a_slice_has_its_slopes_in_point_code_and_weights(float64, rng):
     params, when = bent_params("float64"), condition("float64", 7000)
-    effect = ambient.effect(BENT)
-    pull = rng.normal(size=effect.lift_width)
+    effect = BENT.bind(1, None)
+    pull = rng.normal(size=effect.features)
 
     def read(params, point, code):
         seen = when._replace(codes={"motion": code})
-        return pull @ effect.lift(params, point, seen)
+        return pull @ effect.apply(params, point, seen)
 
     point = rng.uniform(-1, 1, 3)
     error = gradients.directional_error(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from nerfies_jax import evaluation, presets, scene
-from nerfies_jax.effects import appearance
 from nerfies_jax.effects.appearance import AppearanceSpec
 from nerfies_jax.field_ray import Ray
 from nerfies_jax.nets.encoding import EncodingSpec
@@ -73,12 +72,12 @@ def params_of(dtype):
 
 @pytest.mark.parametrize("table", ["appearance", "exposure"])
 def test_the_condition_is_the_code_itself(table, rng):
-    effect = appearance.effect(AppearanceSpec(width=3, table=table))
-    assert effect.tables == (Table(table, APPEARANCE, 3),)
-    assert effect.condition_width == 3
-    code = rng.normal(size=3).astype(np.float32)
+    spec = AppearanceSpec(width=3, table=table)
+    assert spec.tables == (Table(table, APPEARANCE, 3),)
+    assert spec.features == 3
+    code = jnp.asarray(rng.normal(size=3), jnp.float32)
     codes = {"exposure": code, "appearance": -code} | {table: code}
-    read = effect.condition(None, condition(code)._replace(codes=codes))
+    read = spec.apply(None, None, condition(code)._replace(codes=codes))
     assert read is code
 
 

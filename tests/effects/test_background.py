@@ -63,12 +63,11 @@ def test_points_are_seen_in_the_field_in_all_frames(scaling, rng):
         x = overheard(heard, x, condition.time)
         return 0.1 * x + condition.time
 
-    effect = background.effect(spec)
-    assert effect.required_data == {"points"}
+    assert spec.required_data == {"points"}
 
     @jax.jit
     def penalty(key):
-        return effect.penalty(None, context(displace, points, 7, "float32", key))
+        return spec.loss(None, context(displace, points, 7, "float32", key))
 
     value = float(penalty(jax.random.key(0))["background"].value)
     ((x, times),) = heard

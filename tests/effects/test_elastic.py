@@ -336,11 +336,8 @@ def test_terms_and_schedule(setting):
     here = context(
         field(setting.params), setting.point, setting.weight, setting.conditions
     )
-    seams = elastic.effect(spec)
-    assert seams.name == "elastic"
-    assert seams.init is None
-    assert seams.tables == ()
-    at_step = jax.jit(lambda step: seams.penalty(None, here._replace(step=step)))
+    assert spec.name == "elastic"
+    at_step = jax.jit(lambda step: spec.loss(None, here._replace(step=step)))
     for step, weight in ((0, 1e-2), (50, 1e-2), (100, 5.000005e-3), (999, 1e-8)):
         terms = at_step(jnp.int32(step))
         assert set(terms) == {"elastic", "folded"}
@@ -356,7 +353,7 @@ def test_a_lazy_penalty_counts_for_the_steps_that_skip_it(setting):
         here = context(
             field(params), setting.point, setting.weight, setting.conditions, step=step
         )
-        terms = elastic.effect(ElasticSpec(every=every)).penalty(None, here)
+        terms = ElasticSpec(every=every).loss(None, here)
         return terms["elastic"].value, terms["folded"].value
 
     slopes = jax.value_and_grad(total, has_aux=True)

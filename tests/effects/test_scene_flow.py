@@ -76,10 +76,10 @@ def test_terms_without_a_weight_or_data_are_not_there():
     given = scenario("float32")
     spec = dataclasses.replace(TINY, weights=FlowWeights(**dict.fromkeys(NAMES, 0.0)))
     assert terms_of(spec, *given, 0) == {}
-    assert scene_flow.effect(spec, TIMES, FEATURES).required_data == frozenset()
+    assert scene_flow.Bound(spec, TIMES).required_data == frozenset()
     only_flow = dataclasses.replace(spec, weights=FlowWeights(depth=0.0))
-    assert scene_flow.effect(only_flow, TIMES, FEATURES).required_data == {"flow"}
-    assert scene_flow.effect(TINY, TIMES, FEATURES).required_data == {"flow", "depths"}
+    assert scene_flow.Bound(only_flow, TIMES).required_data == {"flow"}
+    assert scene_flow.Bound(TINY, TIMES).required_data == {"flow", "depths"}
     params, frames, batch, arrays = given
     bare = frames._replace(depths=None, flow=None)
     terms = jax.eval_shape(

@@ -33,7 +33,7 @@ def roughness(effect, found, step, seed=0):
     nets = {name: Template(None, None, one) for name, one in found.items()}
     key, step = jax.random.key(seed), jnp.int32(step)
     context = PenaltyContext(None, step, key, {"template": nets})
-    return effect.penalty(None, context)["variation"]
+    return effect.loss(context.params, context)["variation"]
 
 
 def of(grid, axes):
@@ -42,7 +42,7 @@ def of(grid, axes):
 
 
 def test_smoothness_is_the_mean_square_between_neighbors(dtype, rng):
-    effect = smoothness.effect(SmoothnessSpec(2.0, until=5), TEMPLATES)
+    effect = smoothness.Bound(SmoothnessSpec(2.0, until=5), TEMPLATES)
     found = tables(dtype, rng)
     term = roughness(effect, found, 4)
     assert term.value.dtype == dtype
@@ -54,7 +54,7 @@ def test_smoothness_is_the_mean_square_between_neighbors(dtype, rng):
 
 
 def test_of_hashed_grids_it_is_guessed(rng):
-    effect = smoothness.effect(SmoothnessSpec(), HASHED)
+    effect = smoothness.Bound(SmoothnessSpec(), HASHED)
     rows = tuple(jnp.asarray(rng.normal(size=(n, 2)), "float32") for n in (27, 125))
     each = [of(np.reshape(rows[0], (3, 3, 3, 2)), 3)]
     each += [of(np.reshape(rows[1], (5, 5, 5, 2)), 3)]
@@ -65,7 +65,7 @@ def test_of_hashed_grids_it_is_guessed(rng):
 
 @pytest.mark.hard_cases
 def test_what_is_even_has_neither_roughness_nor_slope(dtype, rng):
-    effect = smoothness.effect(SmoothnessSpec(), TEMPLATES)
+    effect = smoothness.Bound(SmoothnessSpec(), TEMPLATES)
     level = jax.tree.map(lambda x: 0 * x + 7, tables(dtype, rng))
     value, slopes = jax.value_and_grad(lambda t: roughness(effect, t, 0).value)(level)
     assert value == 0
@@ -74,4 +74,4 @@ def test_what_is_even_has_neither_roughness_nor_slope(dtype, rng):
 
 def test_smoothness_needs_tables():
     with pytest.raises(ValueError, match="no template has one; set smoothness=none"):
-        smoothness.effect(SmoothnessSpec(), {"fine": TemplateSpec()})
+        smoothness.Bound(SmoothnessSpec(), {"fine": TemplateSpec()})

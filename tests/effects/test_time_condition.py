@@ -24,19 +24,19 @@ def condition(dtype, time, code=()):
     "encoding", [EncodingSpec(10, times_pi=True), EncodingSpec(3, identity=False)]
 )
 def test_the_template_reads_the_encoded_time(encoding, dtype):
-    effect = time_condition.effect(TimeSpec(encoding))
-    assert effect.init is None
-    assert effect.tables == ()
+    spec = TimeSpec(encoding)
+    assert not hasattr(spec, "init")
+    assert spec.tables == ()
     times = np.asarray([0.0, 0.37, 1.0, -0.5], dtype)
 
     @jax.jit
     @jax.vmap
     def lift(time):
-        return effect.lift(None, jnp.zeros(3, dtype), condition(dtype, time))
+        return spec.apply(None, jnp.zeros(3, dtype), condition(dtype, time))
 
     lifted = lift(times)
     assert lifted.dtype == dtype
-    assert lifted.shape == (4, effect.lift_width)
+    assert lifted.shape == (4, spec.features)
     exact = [networks.waves(encoding, time) for time in times]
     # float32: sines of arguments up to 512π, rounded once more by the reduction
     tolerance = {"float32": 3e-7, "float64": 1e-12}[dtype]
@@ -44,17 +44,16 @@ def test_the_template_reads_the_encoded_time(encoding, dtype):
 
 
 def test_by_code_it_is_the_frame_s_code(dtype, rng):
-    effect = time_condition.effect(BY_CODE)
-    code = rng.normal(size=5).astype(dtype)
-    assert effect.tables == (Table("motion", MOMENT, 5),)
-    assert effect.lift_width == 5
-    lifted = effect.lift(None, code[:3], condition(dtype, 0.2, code))
+    code = jnp.asarray(rng.normal(size=5), dtype)
+    assert BY_CODE.tables == (Table("motion", MOMENT, 5),)
+    assert BY_CODE.features == 5
+    lifted = BY_CODE.apply(None, None, condition(dtype, 0.2, code))
     assert lifted.dtype == dtype
     np.testing.assert_array_equal(lifted, code)
 
 
 def test_time_has_a_slope(float64, rng):
-    pull = jnp.asarray(rng.normal(size=TimeSpec().width))
+    pull = jnp.asarray(rng.normal(size=TimeSpec().features))
 
     def read(times):
         features = jax.vmap(

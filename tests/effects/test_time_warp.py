@@ -32,18 +32,17 @@ def by_hand(params, point, time):
 @pytest.mark.parametrize("time", [0.0, 0.37, 1.0])
 def test_shift_and_features_are_those_of_the_layers(time, dtype, rng):
     params = drawn.params(lambda key: time_warp.init(SPEC, key), dtype, 0.3)
-    effect = time_warp.effect(SPEC)
     points = rng.uniform(-1, 1, (4, 3)).astype(dtype)
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(None, 0))
     def both(params, point):
         when = at(time, dtype)
-        return effect.displace(params, point, when), effect.lift(params, point, when)
+        return SPEC.apply(params, point, when), SPEC.lift(params, point, when)
 
     shifts, lifted = both(params, points)
     assert shifts.dtype == lifted.dtype == dtype
-    assert lifted.shape == (4, effect.lift_width)
+    assert lifted.shape == (4, SPEC.features)
     bound = {"float32": 2e-5, "float64": 1e-13}[dtype]
     for point, shift, features in zip(points, shifts, lifted, strict=True):
         expected = by_hand(params, np.asarray(point, np.float64), time)

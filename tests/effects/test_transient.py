@@ -217,11 +217,9 @@ def context(dtype, density, valid):
 
 
 def test_the_penalty_is_the_mean_density_of_the_fine_samples(dtype):
-    effect = transient.effect(SPEC, FEATURES)
-
     @jax.jit
     def penalty(density):
-        return effect.penalty(None, context(dtype, density, [True, True, False]))
+        return SPEC.loss(None, context(dtype, density, [True, True, False]))
 
     density = np.array([[0.0, 1.0, 2.0], [5.0, 4.0, 0.0], [1e6, 1.0, 1.0]], dtype)
     terms = penalty(density)

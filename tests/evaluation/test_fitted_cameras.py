@@ -189,7 +189,7 @@ def test_an_empty_scene_finds_no_camera(capture):
 KINDS = {
     "gaussians": (
         splat_scene,
-        dataclasses.replace(scenes.TINY_SPLATS, densification=None),
+        dataclasses.replace(scenes.TINY_SPLATS, strategy=None),
     ),
     "radiance": (scene, FIELD),
 }

@@ -85,7 +85,7 @@ def test_larger_pictures_get_more_gaussians(preset, changes):
     assert representation.capacity(spec, (176, 132)) == ()
     assert representation.capacity(spec, (88, 66)) == ()
     larger = specs.override(spec, representation.capacity(spec, (352, 264)))
-    assert larger.densification.cap_max == 2 * spec.densification.cap_max
+    assert larger.strategy.cap_max == 2 * spec.strategy.cap_max
     assert larger.init.points == 2 * spec.init.points
     moving = larger.start.moving_points / spec.start.moving_points
     assert moving == (2 if spec.start.motion == "tracks" else 1)
@@ -98,4 +98,4 @@ def test_what_is_followed_for_a_short_time_gets_more_gaussians(followed, times):
     assert short.init.points == spec.init.points
     assert short.start.moving_points == times * spec.start.moving_points
     more = short.start.moving_points - spec.start.moving_points
-    assert short.densification.cap_max == spec.densification.cap_max + more
+    assert short.strategy.cap_max == spec.strategy.cap_max + more

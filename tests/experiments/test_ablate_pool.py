@@ -144,7 +144,7 @@ def test_a_process_takes_the_settings_of_its_arm_from_their_file(tmp_path, monke
         seeds=3,
         jobs=4,
         budget=5.0,
-        set=("densification.cap_max=99", "sh_degree=0"),
+        set=("strategy.cap_max=99", "sh_degree=0"),
     )
     (tmp_path / "logs").mkdir()
     words = pool.command(types.SimpleNamespace(args=args, out=tmp_path), "full", 2)

@@ -43,7 +43,7 @@ def reconstruct_at(tmp_path, preset, *settings):
 def test_splats_that_blow_up_say_where_and_are_reported(tmp_path, capsys):
     # One update of an opacity by 3e38 stays in float32, the second does not.
     rate = "learning_rates.opacity_logit=3e38"
-    quick = ("densification=none", "sh_degree=0")
+    quick = ("strategy=none", "sh_degree=0")
     folder, step = reconstruct_at(tmp_path, "splats-static-small", rate, *quick)
     printed = capsys.readouterr()
     last = printed.err.splitlines()[-1]

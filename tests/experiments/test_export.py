@@ -20,7 +20,7 @@ from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
 
 CENTER = (1.0, -2.0, 3.0)  # of the world, which is twice as large as the scene
-SPLATS = ("sh_degree=1", "densification=none", "init.extra_random=0")
+SPLATS = ("sh_degree=1", "strategy=none", "init.extra_random=0")
 SPLATS += ("motion.width=8", "motion.depth=2", "motion.skips=")
 FIELD = ("elastic=none", "background=none", "rays=32", "template.skips=")
 FIELD += ("template.depth=1", "template.width=8", "template.color_width=8")

@@ -47,6 +47,9 @@ FLOORS = {
     "nerfies_jax.runs": 9,
     "nerfies_jax": 10,  # the face of the package
     "gaussians_jax.effects": 7,
+    "gaussians_jax.losses": 8,
+    "gaussians_jax.motion": 8,
+    "gaussians_jax.strategy": 8,
     "gaussians_jax.spec": 8,
     "gaussians_jax.first_state": 8,
     "gaussians_jax.growth": 8,

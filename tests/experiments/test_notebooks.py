@@ -12,7 +12,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 # Constants of each, small; `.ci/run` runs fit_a_picture as it is. COLMAP finds the
 # cameras of no fewer and smaller pictures; what is learned from them may be smaller.
 SMALL = {
-    "own_effect": {"STEPS": 8, "SIZE": (48, 36), "FRAMES": 8},
+    "own_motion": {"STEPS": 8, "SIZE": (48, 36), "FRAMES": 8},
     "film_to_page": {
         "FRAMES": 14,
         "STEPS": 20,

@@ -25,7 +25,7 @@ pytestmark = [
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 RECONSTRUCT = ("--preset", "splats-static-small", "--steps", "12")
-RECONSTRUCT += ("--set", "densification=none", "sh_degree=0", "init.extra_random=0")
+RECONSTRUCT += ("--set", "strategy=none", "sh_degree=0", "init.extra_random=0")
 # Two ends of an output that are no failure; a full one, which is, is that of a resumed
 # run below.
 BROKEN = {"2>&1 | head -1": 0, "2>&-": 0}

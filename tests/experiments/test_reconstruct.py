@@ -24,10 +24,10 @@ from nerfies_jax.training import rate
 from tests import event_checks, scenes
 
 QUICK = (
-    "densification.refine_every=4",
-    "densification.refine_start_iter=4",
-    "densification.refine_stop_iter=10",
-    "densification.cap_max=300",
+    "strategy.refine_every=4",
+    "strategy.refine_start_iter=4",
+    "strategy.refine_stop_iter=10",
+    "strategy.cap_max=300",
     "motion.width=8",
     "motion.depth=2",
     "motion.skips=",
@@ -87,7 +87,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(reconstruction, "first_state", counted)
     words = (tmp_path / "filmed", "--preset", "splats-static-small", "--seconds", 250)
-    quick = ("densification=none", "sh_degree=0", "init.extra_random=0")
+    quick = ("strategy=none", "sh_degree=0", "init.extra_random=0")
     assert ended(*words, "--out", out, "--json", "--set", *quick) == 0
     assert len(states) == 1
     assert {path.name for path in out.iterdir()} >= {*PRODUCTS}

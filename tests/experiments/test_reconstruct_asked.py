@@ -154,7 +154,7 @@ def test_a_run_is_found_by_what_was_filmed(tmp_path, monkeypatch, capsys):
     ],
 )
 def test_a_command_that_is_printed_keeps_all_options(source):
-    overrides = ("sh_degree=1", "densification=none")
+    overrides = ("sh_degree=1", "strategy=none")
     config = RunConfig("splats-static", source, 60, overrides, seed=3)
     words = shlex.split(commands.reconstruct(config))
     assert words[:3] == ["python", "-m", "experiments.reconstruct"]

@@ -27,7 +27,7 @@ STEPS = 60
 QUICK = (
     *("--preset", "splats-static-small", "--steps", str(STEPS)),
     *("--evaluate-every", "1", "--checkpoint-every", "0"),
-    *("--set", "densification=none", "sh_degree=0", "init.extra_random=0"),
+    *("--set", "strategy=none", "sh_degree=0", "init.extra_random=0"),
 )
 
 

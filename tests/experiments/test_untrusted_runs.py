@@ -22,11 +22,12 @@ from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.training.loop import History
 from tests import scenes
 
-SMALL = ("sh_degree=0", "densification=none", "init.extra_random=0")
+SMALL = ("sh_degree=0", "strategy=none", "init.extra_random=0")
 # It leaves a mark when it is imported, when its class is made, and when it is called.
 HOLIDAY = """
-import pathlib
-from nerfies_jax.training.effects import Effect
+import dataclasses, pathlib
+import jax.numpy as jnp
+from gaussians_jax.protocols import MotionParams
 
 def mark(name):
     (pathlib.Path(__file__).parent / f"ran-{name}").touch()
@@ -37,10 +38,21 @@ class Loud:
     def __init__(self, *arguments, **fields):
         mark("class")
 
-def run(metadata):
-    mark("call")
-    return Effect("holiday")
+@dataclasses.dataclass(frozen=True)
+class Drift:
+    learning_rate: float = 1e-3
+
+    def __post_init__(self):
+        mark("motion")
+
+    def init(self, key, gaussians):
+        return MotionParams(jnp.zeros_like(gaussians.mean))
+
+    def apply(self, params, cache, gaussians, frame):
+        way = frame.time * params.per_gaussian
+        return gaussians._replace(mean=gaussians.mean + way)
 """
+DRIFT = {"type": "holiday:Drift", "learning_rate": 0.5}
 OPENING = {
     "render": ("render", "RUN"),
     "export": ("export", "RUN", "transforms"),
@@ -111,16 +123,20 @@ def ran(folder):
 
 
 HOSTILE = {
-    "a module beside it": (
-        lambda s: s["config"].update(effects=["holiday:run"]),
-        r"holiday:run\), which run code .* with --effect holiday:run",
+    "a motion beside it": (
+        lambda s: s["spec"].update(motion={"type": "holiday:Drift"}),
+        r"holiday:Drift\), which run code .* with --trust holiday:Drift",
+    ),
+    "a class of another package in the spec": (
+        lambda s: s["spec"]["init"].update(type="holiday:Loud"),
+        r"holiday:Loud\), which run code .* with --trust holiday:Loud",
     ),
     "functions of Python": (
-        lambda s: s["config"].update(effects=["os:abort", "subprocess:Popen x"]),
-        "with --effect os:abort 'subprocess:Popen x'",
+        lambda s: s["config"].update(overrides=["a=os:abort", "b=subprocess:Popen x"]),
+        "with --trust os:abort 'subprocess:Popen x'",
     ),
-    "no list of effects": (
-        lambda s: s["config"].update(effects="os:abort"),
+    "no list of overrides": (
+        lambda s: s["config"].update(overrides="os:abort"),
         "'os:abort'",
     ),
     "a class as config": (
@@ -159,35 +175,36 @@ def test_no_command_runs_what_a_folder_names(
     assert not list(stranger.rglob("pictures.png"))
 
 
-def test_an_effect_that_is_named_again_is_loaded(stranger, finished, capsys):
-    edit(stranger / "config.json", HOSTILE["a module beside it"][0])
-    trusting = (*OPENING["export"], "--effect", "holiday:other", "holiday:run")
-    assert main(trusting, stranger, finished) == 0, capsys.readouterr().err
-    assert ran(stranger) == ["ran-call", "ran-import"]
+def test_code_that_is_named_again_is_loaded(stranger, finished, capsys):
+    edit(stranger / "config.json", lambda s: s["spec"].update(motion=DRIFT))
+    trusting = (*OPENING["export"], "--trust", "holiday:other", "holiday:Drift")
+    main(trusting, stranger, finished)  # its checkpoint has no motion
+    assert ran(stranger) == ["ran-import", "ran-motion"]
     assert sys.path[-1] == str(stranger)  # last: it may hold a jax.py as well
 
 
 def test_a_run_opened_in_python_trusts_what_its_caller_names(stranger, monkeypatch):
-    edit(stranger / "config.json", HOSTILE["a module beside it"][0])
-    with pytest.raises(trust.UntrustedEffects) as refused:
+    edit(stranger / "config.json", lambda s: s["spec"].update(motion=DRIFT))
+    with pytest.raises(trust.UntrustedCode) as refused:
         runs.saved_run(stranger)
-    assert refused.value.names == ("holiday:run",)
+    assert refused.value.names == ("holiday:Drift",)
     assert "--" not in str(refused.value)
-    with pytest.raises(runs.Refused, match="holiday:run"):
+    with pytest.raises(runs.Refused, match="holiday:Drift"):
         runs.resume(stranger)
     assert ran(stranger) == []
     monkeypatch.syspath_prepend(stranger)
-    opened = runs.saved_run(stranger, effects=["holiday:run"])
-    assert [effect.name for effect in opened.effects] == ["holiday"]
+    opened = runs.saved_run(stranger, trusted=["holiday:Drift"])
+    assert opened.spec.motion.learning_rate == 0.5
+    assert opened.code == ("holiday:Drift",)
 
 
 def test_only_a_module_that_is_not_found_elsewhere_is_looked_for_here(stranger):
     for name in ("numpy", "json", "absent_everywhere"):
         (stranger / f"{name}.py").write_text("")
     for name in ("json:x", "numpy.linalg:norm", "plain", ":x", "nowhere_at_all:x"):
-        cli.find_effects([name])
+        cli.find_code([name])
         assert str(stranger) not in sys.path
-    cli.find_effects(["absent_everywhere:x"])
+    cli.find_code(["absent_everywhere:x"])
     assert sys.path[-1] == str(stranger)
 
 

@@ -141,12 +141,12 @@ def test_rows_are_drawn_evenly_from_the_active(places):
 
 @functools.cache
 def compiled_penalty(spec, at_time, extent):
-    effect = acceleration.effect(spec, extent, 11)
+    regularizer = acceleration.Bound(spec, extent, 11)
 
     def penalty(params, time, step, seed):
         condition = FrameCondition(time, step=step, key=jax.random.key(seed))
         context = PenaltyContext(condition, step, None, params, at_time=at_time)
-        return effect.penalty(None, context)
+        return regularizer.loss(params, context)
 
     return jitted(penalty)
 

@@ -20,6 +20,7 @@ from nerfies_jax.nets import entropy
 from nerfies_jax.training import loop
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import scenes
+from tests.gaussians import bound
 from tests.gaussians.shared import jitted, put, rotations, rows_of, some_gaussians
 from tests.gradients import directional_error
 
@@ -39,15 +40,14 @@ EXACT = {"float32": 1e-5, "float64": 1e-12}
 
 @functools.cache
 def effect():
-    return anchor_motion.effect(SPEC, 100, FRAMES)
+    return bound.record(SPEC, frames=FRAMES)
 
 
 def params_of(dtype, size=0.5):
     rows = rows_of(some_gaussians(ROWS, dtype), opacity_logit=0.3)
     rng = np.random.default_rng(0)
     shapes = jax.eval_shape(
-        lambda key: (effect().init_rows(key, rows), effect().init(key)),
-        jax.random.key(0),
+        lambda key: tuple(effect().init(key, rows)), jax.random.key(0)
     )
     own, net = put(
         jax.tree.map(lambda leaf: size * rng.normal(size=leaf.shape), shapes), dtype

@@ -15,11 +15,12 @@ from gaussians_jax.effects.carried import Carried, CarriedSpec, TurnSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.initialization import InitSpec
 from gaussians_jax.mcmc import MCMCStrategySpec
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.splats import Params
 from nerfies_jax import evaluation
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.training import loop
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from tests import scenes
 from tests.gaussians.shared import jitted, put, rotations, rows_of, some_gaussians
 from tests.gradients import directional_error
@@ -41,7 +42,8 @@ def rows_and_own(dtype, count=EACH):
 
 def params_of(dtype):
     rows, own = rows_and_own(dtype)
-    net = jax.eval_shape(lambda: carried.effect(SPEC, 100, 0).init(jax.random.key(0)))
+    init = carried.effect(SPEC, 100, 0).init
+    net = jax.eval_shape(lambda: init(jax.random.key(0), rows).shared)
     rng = np.random.default_rng(2)
     net = put(jax.tree.map(lambda leaf: rng.normal(size=leaf.shape), net), dtype)
     return Params({"splats": rows, NAME: own}, {NAME: net})
@@ -367,15 +369,15 @@ def test_scenes_that_cannot_carry_are_refused():
     plan = MCMCStrategySpec(cap_max=100)
     capture = scenes.tiny_capture()
     metadata = scene.metadata_of(capture)
-    model = scene.build(dataclasses.replace(TINY, densification=plan), metadata)
+    model = scene.build(dataclasses.replace(TINY, strategy=plan), metadata)
     with pytest.raises(ValueError, match="carried=none"):
         model.init(capture, jax.random.key(0))
 
     def nothing(*_):
         raise AssertionError
 
-    second = Effect("second", derive=nothing, derive_rows=nothing)
+    second = SplatRecord("second", derive=nothing, derive_rows=nothing)
     with pytest.raises(ValueError, match="carried and second each say"):
         scene.build(TINY, metadata, (second,))
     with pytest.raises(ValueError, match="'half' fills one of derive and derive_rows"):
-        deformation.check_derived((Effect("half", derive=nothing),))
+        deformation.check_derived((SplatRecord("half", derive=nothing),))

@@ -215,13 +215,13 @@ def test_what_is_unknown_or_see_through_teaches_nothing(kind, space, dtype):
 
 
 def test_the_effect_reads_the_depths():
-    effect, shot = depth.effect(DepthSpec("metric")), some_shot()
-    assert effect.required_data == {"depths"}
+    regularizer, shot = DepthSpec("metric"), some_shot()
+    assert regularizer.required_data == {"depths"}
 
     @jitted
     def loss(shot):
         context = PenaltyContext(None, None, None, None, observation=shot)
-        return weighted_sum(effect.penalty(None, context))
+        return weighted_sum(regularizer.loss(None, context))
 
     error = np.abs(shot.rendering.depth - shot.depth).mean() / shot.depth.mean()
     np.testing.assert_allclose(loss(shot), 0.1 * error, rtol=1e-6)

@@ -13,9 +13,11 @@ import pytest
 from gaussians_jax import splats as rows
 from gaussians_jax.effects import kan_motion, motion_codes
 from gaussians_jax.effects.kan_motion import KanMotion, KanMotionSpec, Offsets
+from gaussians_jax.protocols import MotionParams
 from gaussians_jax.splats import Params
 from nerfies_jax.nets import kan, mlp
 from nerfies_jax.training.effects import PenaltyContext
+from tests.gaussians import bound
 from tests.gaussians.motions import FRAMES, MOTIONS, deformed, read_by, strong
 from tests.gaussians.motions import KAN as SMALL
 from tests.gaussians.shared import (
@@ -81,27 +83,30 @@ def test_a_coarse_and_a_fine_network_add_what_they_read_of_one_table(float64):
 
 def test_two_networks_have_an_event_and_prices_and_one_has_neither():
     spec = dataclasses.replace(TWO, smoothness=0.5, opacity=0.25)
-    effect = kan_motion.effect(spec, 1000, FRAMES)
+    motion = bound.motion(spec, 1000, frames=FRAMES)
     own = strong("kan", spec, "float32")
-    assert effect.revise(own, 0).rows == 3
-    assert effect.revise(own, 60).rows == 4
-    assert effect.revise_at == (50, 100)
+    assert motion.project(own, 0).rows == 3
+    assert motion.project(own, 60).rows == 4
+    assert motion.project_steps == (50, 100)
     scene = Params({"splats": rows_of(some_gaussians(3, np.float32), np.zeros(3))}, {})
     context = PenaltyContext(None, None, None, scene)
-    terms = effect.penalty(own, context)
+    params = MotionParams(None, own)
+    terms = motion.loss(params, context)
     np.testing.assert_allclose(terms["opacity"].value, 0.5, rtol=1e-6)
     bend = np.diff(own.times, 2, axis=0)
     np.testing.assert_allclose(terms["smoothness"].value, np.mean(bend**2), rtol=1e-5)
     assert (terms["smoothness"].weight, terms["opacity"].weight) == (0.5, 0.25)
     for name in terms:
         less = dataclasses.replace(spec, **{name: 0.0})
-        rest = kan_motion.effect(less, 1000, FRAMES).penalty(own, context)
+        rest = bound.motion(less, 1000, frames=FRAMES).loss(params, context)
         assert rest.keys() == terms.keys() - {name}
-    plain = kan_motion.effect(SMALL, 1000, FRAMES)
-    assert (plain.penalty, plain.revise, plain.revise_at) == (None, None, ())
-    assert len(jax.tree.leaves(plain.init(jax.random.key(0)))) < len(
-        jax.tree.leaves(effect.init(jax.random.key(0)))
+    plain = bound.motion(SMALL, 1000, frames=FRAMES)
+    assert (plain.loss(params, context), plain.project_steps) == ({}, ())
+    one, two = (
+        jax.tree.leaves(kan_motion.init(jax.random.key(0), each, FRAMES))
+        for each in (SMALL, spec)
     )
+    assert len(one) < len(two)
 
 
 @pytest.mark.parametrize("off", ["position", "scale", "rotation"])
@@ -245,15 +250,15 @@ def test_equal_and_wild_embeddings_have_finite_slopes(dtype):
 
 
 def test_the_effect_tells_its_rows_networks_and_rates():
-    filled = kan_motion.effect(SMALL, steps=100, frames=FRAMES)
+    filled = bound.motion(SMALL, frames=FRAMES)
     first = rows.from_points(np.zeros((12, 3)), np.zeros((12, 3)))
-    drawn = jax.eval_shape(filled.init_rows, jax.random.key(0), first)
+    drawn, nets = jitted(filled.init)(jax.random.key(0), first)
     assert drawn.shape == (12, 6)
-    nets = jitted(filled.init)(jax.random.key(0))
     assert isinstance(nets, KanMotion)
     assert not any_nonzero(nets.field.heads)  # no motion yet
     assert nets.times.any()
     assert nets.times.shape == (math.ceil(FRAMES / 2), 4)
-    np.testing.assert_allclose(filled.row_learning_rate(np.int32(50)), 2.5e-3)
+    rates = filled.learning_rate(jnp.int32(50))
+    np.testing.assert_allclose(rates.per_gaussian, 2.5e-3)
     one = jax.eval_shape(lambda key: kan_motion.init(key, SMALL, 1), jax.random.key(0))
     assert one.times.shape == (1, 4)

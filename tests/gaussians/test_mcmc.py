@@ -37,7 +37,7 @@ QUIET = rich.console.Console(quiet=True)
 # 200 points, and five events of 5 % up to the cap.
 SCENE = dataclasses.replace(
     scenes.TINY_DEFORMABLE,
-    densification=MCMCStrategySpec(refine_every=4, refine_start_iter=4, cap_max=230),
+    strategy=MCMCStrategySpec(refine_every=4, refine_start_iter=4, cap_max=230),
 )
 
 
@@ -291,8 +291,8 @@ def test_a_step_shakes_the_means_and_nothing_else():
     spec = dataclasses.replace(SCENE, alternation=AlternationSpec(1, 3, nets=1))
 
     def stepped(spec, **changed):
-        plan = dataclasses.replace(SCENE.densification, **changed)
-        model, state, frames = built(dataclasses.replace(spec, densification=plan))
+        plan = dataclasses.replace(SCENE.strategy, **changed)
+        model, state, frames = built(dataclasses.replace(spec, strategy=plan))
         # Opacities of 0.0067, near the threshold: at 0.1 there is next to no noise.
         splats = state.params.rows["splats"]
         logit = np.where(rows.active_mask(splats), -5.0, splats.opacity_logit)

@@ -291,9 +291,9 @@ def test_a_penalty_compares_frames_with_the_next_and_begins_at_its_start():
     model = scene.build(SCENE, scene.metadata_of(capture))
     assert {"flow", "moving"} <= model.required_data
     frames = frames_of(capture, model.required_data)
-    effect = motion_flow.effect(SCENE.flow, GSPLAT)
+    regularizer = motion_flow.Bound(SCENE.flow, GSPLAT)
     unmasked = dataclasses.replace(SCENE.flow, moving_only=False)
-    assert motion_flow.effect(unmasked, GSPLAT).required_data == {"flow"}
+    assert motion_flow.Bound(unmasked, GSPLAT).required_data == {"flow"}
     state = model.init(capture, jax.random.key(0))
 
     def still(params, time):
@@ -304,7 +304,7 @@ def test_a_penalty_compares_frames_with_the_next_and_begins_at_its_start():
         context = PenaltyContext(
             None, step, None, state.params, observation=observation, at_time=still
         )
-        return effect.penalty(None, context)
+        return regularizer.loss(state.params, context)
 
     everywhere = frames._replace(moving=None)
     early, late = (jax.jit(terms)(jnp.int32(step), everywhere, 1) for step in (2, 3))

@@ -5,16 +5,20 @@ import itertools
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import densification, optimizer
+from gaussians_jax import densification, optimizer, splats
 from gaussians_jax.densification import DefaultStrategySpec
 from gaussians_jax.effects import motion_growth
-from gaussians_jax.effects.motion_growth import MotionGrowthSpec, Travel
+from gaussians_jax.effects.motion_growth import (
+    Guided,
+    MotionGrowthSpec,
+    MotionGuided,
+    Travel,
+)
+from gaussians_jax.protocols import Population
 from gaussians_jax.splats import Gaussians, Params, Splats
-from nerfies_jax.training.effects import FrameCondition
 from tests.gaussians.shared import full, jitted, put
 
 EXTENT = 2.0
@@ -45,11 +49,9 @@ def watch(canonical, displacements):
 
     def body(state, displacement):
         moved = canonical._replace(mean=canonical.mean + displacement)
-        condition = FrameCondition(jnp.asarray(0.5, displacement.dtype))
-        return motion_growth.update_state(state, canonical, moved, condition), None
+        return motion_growth.travelled(state, canonical, moved), None
 
-    params = Params({"splats": canonical}, {})  # its means are all that is read
-    first = motion_growth.init_state(params)
+    first = motion_growth.no_travel(canonical)  # its means are all that is read
     return jax.lax.scan(body, first, displacements)[0]
 
 
@@ -88,7 +90,7 @@ def test_motion_is_the_box_about_the_median_row(count, rng, dtype):
 def test_one_instant_and_none_are_no_motion(dtype):
     paths = np.ones((1, 4, 3), dtype) * np.arange(4, dtype=dtype)[:, None]
     assert not seen_motion(paths).any()
-    nothing = motion_growth.init_state(rows_of(4, dtype))
+    nothing = motion_growth.no_travel(rows_of(4, dtype).rows["splats"])
     assert not motion_growth.motion(nothing).any()
     assert nothing.low.dtype.name == nothing.high.dtype.name == dtype
     nobody = put(jax.tree.map(lambda x: np.asarray(x)[:0], nothing))
@@ -137,8 +139,7 @@ def factor_of(spec, motion):
     high = np.zeros((len(motion), 3), np.float32)
     high[:, 1] = 2 * motion  # half the diagonal of the box
     state = put(Travel(np.zeros_like(high), high))
-    effect = motion_growth.effect(spec, EXTENT)
-    return effect.grow_score(state, 500)
+    return motion_growth.grow_score(spec, EXTENT, state, 500)
 
 
 def test_the_soft_factor_is_its_formula():
@@ -177,24 +178,26 @@ def test_the_soft_form_becomes_the_hard_one_as_beta_grows():
 
 
 def grown(spec, params, gradient, motion, step=600):
-    """The event of a scene with this effect: labels of the rows that were cloned."""
+    """Labels of the rows that are cloned by the event of a strategy so guided."""
     rows = params.rows["splats"]
-    stats = densification.empty_stats(rows)
+    strategy, stats = STRATEGY, densification.empty_stats(rows)
     score = np.zeros_like(stats.grad2d)
     score[: len(gradient)] = gradient
+    stats = stats._replace(grad2d=put(score), views=put(np.ones_like(stats.views)))
     if spec is not None:
+        strategy = MotionGuided(STRATEGY, spec, EXTENT)
         high = np.zeros_like(rows.mean)
         high[: len(motion), 0] = 2 * motion
-        seen = put(Travel(np.zeros_like(high), high))
-        score = score * motion_growth.effect(spec, EXTENT).grow_score(seen, step)
-    stats = stats._replace(grad2d=put(score), views=put(np.ones_like(stats.views)))
-    state, key = jax.jit(TX.init)(params), jax.random.key(0)
-    changed = densification.densify(
-        TX, params, state, stats, key, STRATEGY, step=step, extent=EXTENT
-    )
-    assert changed.report.split == changed.report.pruned == 0
-    labels = np.asarray(changed.params.rows["label"])[: changed.report.active, 0]
-    return changed, sorted(labels[-changed.report.cloned or len(labels) :].astype(int))
+        stats = Guided(stats, put(Travel(np.zeros_like(high), high)))
+    moments, key = jax.jit(TX.init)(params), jax.random.key(0)
+    grow, _ = strategy.events(steps=1000)
+    population = Population(params, moments, stats, key, step, EXTENT, TX)
+    changed = grow.apply(population).params.rows
+    active = np.asarray(splats.active_mask(changed["splats"]))
+    count = len(rows.mean)
+    labels = np.asarray(changed["label"])[active, 0].astype(int)
+    np.testing.assert_array_equal(labels[:count], np.arange(count))  # none is gone
+    return sorted(labels[count:])
 
 
 STEEP, FLAT = 1.5 * STRATEGY.grow_grad2d, 0.5 * STRATEGY.grow_grad2d
@@ -218,6 +221,4 @@ TABLE = tuple(itertools.product((STEEP, FLAT), (2 * TAU, 0.5 * TAU, 0.0)))
 def test_truth_table_of_the_conjunction(spec, step, cloned, dtype):
     gradient, motion = (np.array(column) for column in zip(*TABLE, strict=True))
     params = rows_of(len(TABLE), dtype)
-    changed, labels = grown(spec, params, gradient, motion, step)
-    assert labels == cloned
-    assert changed.stats.grad2d.dtype.name == dtype
+    assert grown(spec, params, gradient, motion, step) == cloned

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from gaussians_jax import splats
-from gaussians_jax.effects import deformation, kan_motion, mlp_motion, motion_basis
+from gaussians_jax.effects import deformation, kan_motion
 from gaussians_jax.effects.kan_motion import KanMotionSpec
 from gaussians_jax.effects.mlp_motion import MotionSpec
 from gaussians_jax.effects.motion_basis import BasisMotionSpec
 from nerfies_jax.training.effects import FrameCondition
 from tests import gradients
+from tests.gaussians import bound
 from tests.gaussians.motions import (
     FRAMES,
     MOTIONS,
@@ -116,7 +117,7 @@ def test_no_active_row_and_no_row_at_all(name, dtype):
 def scene_and_effect(name):
     motion, params = MOTIONS[name], scene_of(name)
     spec = dataclasses.replace(motion.spec, warm_up=10)
-    return params, (motion.module.effect(spec, steps=100, frames=2),)
+    return params, (bound.record(spec, frames=2),)
 
 
 @pytest.mark.parametrize("name", ["kan", *full("mlp", "basis")])
@@ -194,15 +195,15 @@ def test_moving_gaussians(name, float64):
 
 
 @pytest.mark.parametrize(
-    ("make", "first", "last"),
+    ("spec", "first", "last"),
     [
-        (functools.partial(mlp_motion.effect, MotionSpec()), 8e-4, 1.6e-6),
-        (functools.partial(kan_motion.effect, KanMotionSpec()), 1.6e-4, 1.6e-5),
-        (functools.partial(motion_basis.effect, BasisMotionSpec()), 8e-4, 1.6e-6),
+        (MotionSpec(), 8e-4, 1.6e-6),
+        (KanMotionSpec(), 1.6e-4, 1.6e-5),
+        (BasisMotionSpec(), 8e-4, 1.6e-6),
     ],
 )
-def test_the_rate_falls_in_equal_ratios(make, first, last):
-    rate = jitted(make(steps=1000, frames=FRAMES).learning_rate)
-    rates = [rate(np.int32(step)) for step in (0, 500, 1000, 4000)]
+def test_the_rate_falls_in_equal_ratios(spec, first, last):
+    rate = jitted(bound.motion(spec, 1000, frames=FRAMES).learning_rate)
+    rates = [rate(np.int32(step)).shared for step in (0, 500, 1000, 4000)]
     expected = [first, math.sqrt(first * last), last, last]
     np.testing.assert_allclose(rates, expected, rtol=1e-5)

@@ -193,12 +193,13 @@ def test_weights_that_vanish_bring_neither_loss_nor_slope(dtype):
 
 def test_the_effect_weighs_and_waits_for_its_start():
     params = scene(some_places())
-    effect = neighbors.effect(NeighborSpec(weight=0.5, start=10), extent=1.0, of="code")
-    graph = effect.state(params)
+    spec = NeighborSpec(weight=0.5, start=10)
+    regularizer = neighbors.Bound(spec, extent=1.0, of="code")
+    graph = regularizer.state(params)
 
     def penalty(params, graph, step):
         context = PenaltyContext(None, step, None, params, state=graph)
-        terms = effect.penalty(None, context)
+        terms = regularizer.loss(params, context)
         return weighted_sum(terms), terms["linked"].value
 
     program = jax.jit(penalty).lower(params, graph, np.int32(9)).compile()
@@ -210,6 +211,6 @@ def test_the_effect_weighs_and_waits_for_its_start():
     linked = np.mean(np.asarray(graph.weight) > 1e-3)
     np.testing.assert_allclose(linked_term, linked, rtol=1e-6)
     assert linked > 0.5
-    absent = neighbors.effect(NeighborSpec(), extent=1.0, of="kan_motion")
+    absent = neighbors.Bound(NeighborSpec(), extent=1.0, of="kan_motion")
     with pytest.raises(ValueError, match=r"no rows .kan_motion.*code"):
         absent.state(params)

@@ -10,14 +10,16 @@ import pytest
 import scipy.special
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import path_fit, spec, splats
+from gaussians_jax import path_fit, protocols, splats
 from gaussians_jax.effects import deformation, node_motion, skinning
 from gaussians_jax.effects.node_motion import MaskSpec, NodeMotionSpec
 from gaussians_jax.effects.skinning import Links, Moves
 from gaussians_jax.path_fit import Paths
+from gaussians_jax.protocols import MotionParams
 from gaussians_jax.splats import Params
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
+from tests.gaussians import bound
 from tests.gaussians.shared import put, rows_of, some_gaussians
 from tests.gradients import directional_error
 
@@ -39,13 +41,17 @@ by_name = pytest.mark.parametrize("name", OF)
 
 
 @functools.cache
+def motion_of(name="nodes"):
+    return bound.motion(OF[name], extent=EXTENT)
+
+
+@functools.cache
 def effect(name="nodes"):
-    scene = spec.SplatScene(steps=100, motion=OF[name])
-    return spec.motion_of(scene, spec.SceneMetadata(EXTENT, (0.0, 0.0, 0.0), 9))
+    return protocols.compile_motion(motion_of(name))
 
 
 def params_of(gaussians, dtype, size=0.5, name="nodes"):
-    shapes = jax.eval_shape(lambda: effect(name).init(jax.random.key(0)))
+    shapes = jax.eval_shape(lambda: node_motion.init(jax.random.key(0), OF[name]))
     rng = np.random.default_rng(0)
     nets = jax.tree.map(lambda leaf: size * rng.normal(size=leaf.shape), shapes)
     return Params({"splats": rows_of(gaussians)}, {NAME: put(nets, dtype)})
@@ -129,14 +135,15 @@ def test_slopes_are_those_of_differences(name, float64):
         scene = Params({"splats": rows}, {NAME: nodes})
         there = moved(scene, gaussians._replace(mean=mean), time, name)
         drawn = jnp.sum(weights * jnp.concatenate([there.mean, there.quaternion], -1))
-        terms = effect(name).penalty(nodes, context)
+        terms = motion_of(name).loss(MotionParams(shared=nodes), context)
         assert set(terms) == {{"nodes": "unrigidity", "masked": "moving"}[name]}
         return drawn + sum(term.value for term in terms.values())
 
     args = params.nets[NAME], gaussians.mean, put(0.47, "float64")
     assert directional_error(value, *args, step=1e-6) < 1e-6
     # A mask would be closed for good before it shows.
-    early = effect(name).penalty(params.nets[NAME], context._replace(step=begun - 1))
+    own = MotionParams(shared=params.nets[NAME])
+    early = motion_of(name).loss(own, context._replace(step=begun - 1))
     assert {float(term.weight) for term in early.values()} == {0.0}
 
 
@@ -318,9 +325,8 @@ def test_nodes_are_spread_out_and_as_wide_as_their_neighbors_are_far():
     assert len(chosen) == 4  # that differ
     assert sorted(np.abs(chosen).max(axis=1)) == [0, 1, 2, 5]
     np.testing.assert_array_equal(chosen[0], [0, 0, 5])
-    placed = effect().place(
-        effect().init(jax.random.key(0)), rows_of(some_gaussians(ROWS, "float32"))
-    )
+    rows = rows_of(some_gaussians(ROWS, "float32"))
+    placed = effect().init(jax.random.key(0), rows).shared
     apart = np.linalg.norm(placed.position[:, None] - placed.position, axis=2)
     near = np.sort(apart, axis=1)[:, 1:4]
     radius = np.sqrt(np.mean(near**2, axis=1))
@@ -336,7 +342,7 @@ def test_nodes_at_rest_stay_at_rest_when_others_are_fitted_to_paths():
     still = rng.uniform(-1, 1, (200, 3)) + np.array([0, 0, 2.0])
     paths = Paths(time, position, np.ones((30, 12), bool), 1.0, still)
     small = dataclasses.replace(MOTION, nodes=16, depth=2, width=32)
-    motion = node_motion.effect(small, 100, EXTENT)
+    motion = bound.record(small, extent=EXTENT)
     fitted = path_fit.fit(motion, paths, jax.random.key(0), steps=400)
     assert fitted.last < 0.02
     nodes = fitted.points.nets
@@ -360,7 +366,7 @@ def test_nothing_is_computed_for_what_only_resting_nodes_carry():
         position=put(np.asarray(nodes.position) + away[:, None], "float32"),
         mask=put(shut, "float32"),
     )
-    two = node_motion.effect(dataclasses.replace(MASKED, near=2), 100, EXTENT)
+    two = bound.record(dataclasses.replace(MASKED, near=2), extent=EXTENT)
     params = Params({"splats": rows_of(gaussians)}, {NAME: nodes})
 
     @jax.jit
@@ -389,7 +395,8 @@ def mask_terms(nodes, time):
     context = PenaltyContext(FrameCondition(time), begun, None, None)
 
     def loss(nodes):
-        return effect("masked").penalty(nodes, context)["moving"].value
+        own = MotionParams(shared=nodes)
+        return motion_of("masked").loss(own, context)["moving"].value
 
     def motion(nodes):
         now = node_motion.moves(nodes, MASKED, EXTENT, time)
@@ -443,10 +450,14 @@ def test_no_motion_of_nothing(changes, words):
 
 def test_without_rigidity_and_mask_nothing_is_found_for_them_and_nothing_costs():
     plain = dataclasses.replace(MOTION, rigidity=None)
-    motion = node_motion.effect(plain, 100, EXTENT)
-    assert motion.penalty is None
-    state = motion.state(params_of(some_gaussians(ROWS, "float32"), "float32"))
+    motion = bound.motion(plain, extent=EXTENT)
+    context = PenaltyContext(FrameCondition(None), jnp.int32(9), None, None)
+    params = params_of(some_gaussians(ROWS, "float32"), "float32")
+    own = MotionParams(shared=params.nets[NAME])
+    assert motion.loss(own, context) == {}
+    state = motion.refresh(own, params.rows["splats"])
     assert state.links is None
     assert state.moving is None
     free = dataclasses.replace(MASKED, mask=MaskSpec(sparsity=0.0))
-    assert node_motion.effect(free, 100, EXTENT).penalty is None
+    own = MotionParams(shared=None)
+    assert bound.motion(free, extent=EXTENT).loss(own, context) == {}

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import initialization, spec
+from gaussians_jax import initialization
 from gaussians_jax.effects import plane_motion
 from gaussians_jax.effects.plane_motion import PlaneMotionSpec
+from gaussians_jax.protocols import MotionParams
 from gaussians_jax.splats import Params
 from nerfies_jax.nets.planes import PlanesSpec
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import scenes
+from tests.gaussians import bound
 from tests.gaussians.shared import put, rows_of, some_gaussians
 from tests.gradients import directional_error
 from tests.nets.test_planes import expected
@@ -29,18 +31,17 @@ MOTION = PlaneMotionSpec(
 
 @functools.cache
 def effect():
-    scene = spec.SplatScene(steps=100, motion=MOTION)
-    return spec.motion_of(
-        scene, spec.SceneMetadata(EXTENT, (0.0, 0.0, 0.0), 9, box=BOX)
-    )
+    return bound.record(MOTION, extent=EXTENT, box=BOX)
 
 
 def penalty(motion, step):
-    return effect().penalty(motion, PenaltyContext(None, jnp.int32(step), None, None))
+    context = PenaltyContext(None, jnp.int32(step), None, None)
+    own = MotionParams(shared=motion)
+    return bound.motion(MOTION, extent=EXTENT, box=BOX).loss(own, context)
 
 
 def params_of(gaussians, dtype, size=0.5):
-    shapes = jax.eval_shape(lambda: effect().init(jax.random.key(0)))
+    shapes = jax.eval_shape(lambda: plane_motion.init(jax.random.key(0), MOTION))
     rng = np.random.default_rng(0)
     nets = jax.tree.map(lambda leaf: size * rng.normal(size=leaf.shape), shapes)
     return Params({"splats": rows_of(gaussians)}, {NAME: put(nets, dtype)})
@@ -153,4 +154,4 @@ def test_no_motion_of_nothing(changes, words):
 @pytest.mark.parametrize("box", [None, (BOX[1], BOX[0])])
 def test_planes_without_a_box_are_refused(box):
     with pytest.raises(ValueError, match="its low and its high corner"):
-        plane_motion.effect(MOTION, 100, EXTENT, box)
+        bound.motion(MOTION, extent=EXTENT, box=box)

@@ -14,10 +14,10 @@ import pytest
 from gaussians_jax import projection, rendering, representation, scene, splats
 from gaussians_jax.player import packing, sampled
 from gaussians_jax.player import page as player_page
+from gaussians_jax.records import SplatRecord
 from gaussians_jax.splats import Gaussians
 from nerfies_jax import evaluation
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.training.effects import Effect
 from tests import scenes
 from tests.gaussians.browser import by_node, image_of, launched, needs_node, program_of
 from tests.gaussians.shared import jitted, put
@@ -45,7 +45,7 @@ def moving_scene():
     """A scene whose Gaussians are long, colored, moving, or behind everyone."""
     capture = scenes.tiny_capture()
     model = scene.build(
-        SPEC, scene.metadata_of(capture), (Effect("swing", deform=swing),)
+        SPEC, scene.metadata_of(capture), (SplatRecord("swing", deform=swing),)
     )
     state = model.init(capture, jax.random.key(0))
     rows = state.params.rows["splats"]

@@ -116,7 +116,7 @@ def test_a_step_moves_the_cameras_of_its_own_frames_and_no_other():
 def test_cameras_that_are_off_are_found():
     """A scene that is known, cameras that are off: at most a fifth of that is left."""
     metadata = scene.metadata_of(EVEN)
-    plain = dataclasses.replace(SPEC, densification=None)
+    plain = dataclasses.replace(SPEC, strategy=None)
     whole = scene.build(dataclasses.replace(plain, poses=None), metadata)
     state = whole.init(EVEN, jax.random.key(0))
     trained = loop.fit(whole, state, evaluation.frames_of(EVEN), steps=150).state

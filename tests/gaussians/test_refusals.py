@@ -223,14 +223,19 @@ def late(**changes):
 BROKEN = np.where(np.arange(18).reshape(6, 3) == 13, np.nan, 1.0)
 FROM_POINTS = InitSpec(source="points")
 CALLS = [
-    (lambda: acceleration.effect(AccelerationSpec(), 1.0, 1), "at least two frames"),
+    (lambda: acceleration.Bound(AccelerationSpec(), 1.0, 1), "at least two frames"),
     (lambda: harmonics.degree_of(5), "1, 4, 9 or 16 coefficients, got 5"),
     (lambda: initialization.uses_capture_points(FROM_POINTS, capture_with(None)),
      'it has none; choose source="random"'),
     (lambda: initialization.initial_count(FROM_POINTS, capture_with(0)),
      'it has none; choose source="random"'),
     (lambda: kan_motion.init(jax.random.key(0), KanMotionSpec(), 0), "frames=0"),
-    (lambda: motion_growth.effect(MotionGrowthSpec(), 0.0), "extent=0.0"),
+    (
+        lambda: motion_growth.MotionGuided(
+            DefaultStrategySpec(), MotionGrowthSpec(), 0.0
+        ),
+        "extent=0.0",
+    ),
     (lambda: moba(motion=None), "without a motion"),
     (lambda: moba(motion=scenes.TINY_MOTION, neighbors=NeighborSpec()),
      "neighbors=none"),
@@ -241,8 +246,8 @@ CALLS = [
     (lambda: moba(motion=PolynomialMotionSpec(), alternation=None,
                   carried=CarriedSpec()),
      "motion.fading=none"),
-    (lambda: moba(densification=None), "motion_growth=none"),
-    (lambda: moba(densification=MCMCStrategySpec()), "threshold of Default"),
+    (lambda: moba(strategy=None), "motion_growth=none"),
+    (lambda: moba(strategy=MCMCStrategySpec()), "threshold of Default"),
     (lambda: moba(flow=FlowSpec(), carried=CarriedSpec()), "flow=none"),
     (lambda: moba(motion=AnchorMotionSpec(moves=False), start=StartSpec("tracks")),
      "motion.moves=false"),
@@ -266,7 +271,7 @@ CALLS = [
      "motion.warm_up=5 with motion.fading"),
     (lambda: raster.rasterize(*footprints((5, 0))), "at least one pixel"),
     (lambda: through_a_lens(), "without lens distortion, got radial"),
-    (lambda: spectral.effect(SpectralSpec(after=10), 10), "after=10"),
+    (lambda: spectral.Bound(SpectralSpec(after=10), 10), "after=10"),
     (lambda: splats.pad_rows(some_rows(), 6),
      "7 rows cannot be padded to a capacity of 6"),
     (lambda: splats.capacity_for(3101, most=3100),

@@ -103,9 +103,7 @@ def test_events_grow_the_scene_and_keep_its_picture_learnable():
     assert grow.steps == (10, 20)
     spec = dataclasses.replace(
         scenes.TINY_SPLATS,
-        densification=dataclasses.replace(
-            scenes.TINY_SPLATS.densification, grow_grad2d=1e-9
-        ),
+        strategy=dataclasses.replace(scenes.TINY_SPLATS.strategy, grow_grad2d=1e-9),
     )
     eager = scene.build(spec, scene.metadata_of(scenes.tiny_capture()))
     after = eager.events[0].apply(state, frames)
@@ -192,7 +190,7 @@ def test_what_was_filmed_is_drawn_however_small_its_units_are(unit):
 
 # Fields of the parts that count steps.
 COUNTED = {
-    "densification": ("refine_start_iter", "refine_stop_iter"),
+    "strategy": ("refine_start_iter", "refine_stop_iter"),
     "motion": ("warm_up",),
     "alternation": ("start", "stop"),
     "annealing": ("after",),
@@ -216,8 +214,8 @@ def test_presets_build_and_stretch_with_their_steps(name):
         whole, short = getattr(spec, part), getattr(half, part)
         for name in fields if whole is not None else ():
             assert getattr(short, name) == 10 * round(getattr(whole, name) / 20)
-    if isinstance(spec.densification, DefaultStrategySpec):
-        whole, short = (each.densification.reset_every for each in (spec, half))
+    if isinstance(spec.strategy, DefaultStrategySpec):
+        whole, short = (each.strategy.reset_every for each in (spec, half))
         assert short == 10 * round(whole / 20)
     assert half.sh_every == 10 * round(spec.sh_every / 20)
     assert scene.build(half, metadata).spec == (half, metadata)

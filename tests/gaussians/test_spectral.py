@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gaussians_jax import protocols
 from gaussians_jax.effects import spectral
 from gaussians_jax.effects.spectral import FourierSpec, Gates, SpectralSpec, WaveletSpec
+from gaussians_jax.splats import Params
 from nerfies_jax.training.effects import (
     Observation,
     PenaltyContext,
@@ -18,6 +20,7 @@ from nerfies_jax.training.effects import (
 )
 from nerfies_jax.training.model import Rendering
 from tests import gradients
+from tests.gaussians import bound
 from tests.gaussians.shared import any_nonzero, full, jitted, put
 
 EVERY_SIZE = pytest.mark.parametrize("size", [(1, 1), (7, 5), *full(((12, 10),))])
@@ -280,16 +283,17 @@ def shot_of(rng, size=(6, 6)):
 @pytest.mark.parametrize("gate", spectral.GATES)
 def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     spec = SpectralSpec(gate=gate, after=3)
-    effect, shot = spectral.effect(spec, 10), shot_of(rng)
+    regularizer, shot = bound.motion(spec, 10), shot_of(rng)
     learned = gate in spectral.LEARNED
+    effect = protocols.compile_regularizer(regularizer)
     assert (effect.init is not None) == (effect.learning_rate is not None) == learned
-    gates = put(effect.init(jax.random.key(0)), "float32") if learned else None
+    gates = put(spectral.init(spec), "float32") if learned else None
 
     @jitted
     @functools.partial(jax.value_and_grad, has_aux=True)
     def both(gates, step):
         context = PenaltyContext(None, step, None, None, observation=shot)
-        terms = effect.penalty(gates, context)
+        terms = regularizer.loss(Params({}, {spectral.NAME: gates}), context)
         return weighted_sum(terms), values(terms)
 
     (early, _), grad = both(gates, np.int32(2))
@@ -300,4 +304,4 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     assert later == pytest.approx(by_hand, rel=1e-6)
     np.testing.assert_allclose(metrics["wavelet_weight"], 0.05, rtol=1e-6)
     if learned:
-        np.testing.assert_allclose(effect.learning_rate(put(5)), 1e-2)
+        np.testing.assert_allclose(effect.learning_rate(put(5)).shared, 1e-2)

@@ -14,17 +14,19 @@ from gaussians_jax.effects.temporal_opacity import Fading, TemporalOpacitySpec
 from gaussians_jax.splats import Params
 from gaussians_jax.track_start import TrackStart
 from nerfies_jax.training.effects import FrameCondition
+from tests.gaussians import bound
 from tests.gaussians.shared import put, rows_of, some_gaussians
 from tests.gradients import directional_error
 
 NAME = temporal_opacity.NAME
-EFFECT = temporal_opacity.effect(TemporalOpacitySpec(width=0.5))
+EFFECT = bound.record(TemporalOpacitySpec(width=0.5))
 TIME, LOG_WIDTH = [0.1, 0.5, 0.9, 0.4], [-2.0, 0.0, -1.0, 3.0]
 
 
 @jax.jit
 def shown(fading, gaussians, time):
-    return EFFECT.deform(Params({NAME: fading}, {}), gaussians, FrameCondition(time), 0)
+    frame = FrameCondition(time)
+    return EFFECT.deform(Params({NAME: fading}, {}), gaussians, frame, None)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.4, 1.0])
@@ -54,7 +56,7 @@ def test_slopes_are_those_of_differences(float64):
 @pytest.mark.parametrize("time", [0.0, 0.5, 1.0])
 def test_what_is_not_lifted_is_seen_all_the_time(time, dtype):
     gaussians = some_gaussians(4, dtype)
-    fading = EFFECT.init_rows(jax.random.key(0), rows_of(gaussians))
+    fading = EFFECT.init(jax.random.key(0), rows_of(gaussians)).per_gaussian
     there = shown(fading, gaussians, put(time, dtype))
     np.testing.assert_allclose(there.opacity, gaussians.opacity, rtol=4e-5)
     slope = jax.grad(lambda f: jnp.sum(shown(f, gaussians, put(time, dtype)).opacity))
@@ -63,9 +65,8 @@ def test_what_is_not_lifted_is_seen_all_the_time(time, dtype):
 
 def test_the_lifted_ones_start_around_their_pictures():
     rows = rows_of(some_gaussians(5, "float32"))
-    params = Params(
-        {"splats": rows, NAME: EFFECT.init_rows(jax.random.key(0), rows)}, {}
-    )
+    first = EFFECT.init(jax.random.key(0), rows).per_gaussian
+    params = Params({"splats": rows, NAME: first}, {})
     times, followed = np.float32([0.25, 0.75]), np.float32([0.4, 0.0])
     tracked = TrackStart(rows.mean[:2], rows.mean[:2], None, None, times, followed)
     motion = spec.motion_of(

@@ -61,10 +61,9 @@ def drawn(name, dtype, size=0.5):
     """Rows and networks that move things, and the Gaussians."""
     effect, rng = effect_of(name), np.random.default_rng(0)
     key, gaussians = jax.random.key(0), some_gaussians(ROWS, dtype)
-    shapes = jax.eval_shape(lambda: effect.init_rows(key, rows_of(gaussians)))
-    nets = {} if effect.init is None else jax.eval_shape(lambda: effect.init(key))
+    shapes = jax.eval_shape(lambda: tuple(effect.init(key, rows_of(gaussians))))
     draw = lambda leaf: size * rng.normal(size=leaf.shape)  # noqa: E731
-    return put(jax.tree.map(draw, (shapes, nets)), dtype), gaussians
+    return put(jax.tree.map(draw, shapes), dtype), gaussians
 
 
 def expected(name, rows, nets, time):
@@ -141,10 +140,7 @@ def test_what_starts_does_not_move_at_all_and_has_slopes(name, time, dtype):
     effect, gaussians = effect_of(name), some_gaussians(ROWS, dtype)
     rows, nets = jax.tree.map(
         lambda leaf: leaf.astype(dtype),
-        (
-            effect.init_rows(jax.random.key(0), rows_of(gaussians)),
-            {} if effect.init is None else effect.init(jax.random.key(0)),
-        ),
+        tuple(effect.init(jax.random.key(0), rows_of(gaussians))),
     )
     run, time = moving(name), put(time, dtype)
     np.testing.assert_array_equal(run(rows, nets, gaussians, time).mean, gaussians.mean)

@@ -111,12 +111,13 @@ def test_networks_that_are_fitted_leave_the_wall_where_it_is(name, monkeypatch):
         fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=400)
         assert fitted.last < 0.03
         rest = Points(jnp.asarray(wall[200:], jnp.float32), None, fitted.points.nets)
-        if still is not None and effect.init_rows is not None:
+        if still is not None and fitted.points.rows is not None:
             own = track_start.rows_at_rest(fitted.points.resting, rest.canonical)
             rest = rest._replace(rows=own)
-        elif effect.init_rows is not None:
+        elif fitted.points.rows is not None:
             blank = path_fit.scene_of(effect, rest).rows["splats"]
-            rest = rest._replace(rows=effect.init_rows(jax.random.key(9), blank))
+            own = effect.init(jax.random.key(9), blank).per_gaussian
+            rest = rest._replace(rows=own)
         now = places_of(effect, rest, time[3])
         moved.append(np.median(np.linalg.norm(now - rest.canonical, axis=-1)))
     assert moved[1] < 0.02
@@ -146,9 +147,8 @@ def test_wrong_paths_bend_nothing():
 def test_slopes_of_carried_points_are_those_of_differences(float64):
     effect = effect_of(MOTIONS["bases"])
     rng = np.random.default_rng(3)
-    nets = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, jnp.float64), effect.init(jax.random.key(0))
-    )
+    first = se3_bases.init(jax.random.key(0), MOTIONS["bases"])
+    nets = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), first)
     points = Points(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)), nets)
 
     def value(points):
@@ -241,8 +241,8 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     spec_ = small_scene(start=start)
     # There is room for two of them under the cap.
     known = min(len(evidence.still.position), spec_.init.points)
-    cap = dataclasses.replace(spec_.densification, cap_max=known + 150 + 2)
-    spec_ = dataclasses.replace(spec_, densification=cap)
+    cap = dataclasses.replace(spec_.strategy, cap_max=known + 150 + 2)
+    spec_ = dataclasses.replace(spec_, strategy=cap)
     model = scene.build(spec_, scene.metadata_of(capture))
     state = model.init(capture, jax.random.key(0))
     rows = state.params.rows

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import densification, growth, representation, scene, splats
+from gaussians_jax import growth, representation, scene, splats
 from gaussians_jax.growth import AuxState
 from gaussians_jax.initialization import InitSpec
-from gaussians_jax.spec import effects_of
+from gaussians_jax.protocols import Strategy
+from gaussians_jax.spec import effects_of, strategy_of
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.training.model import Frames, Model, TrainState, View
 from tests import bare_scenes, scenes
@@ -64,7 +65,7 @@ def hostile_spec(name):
     """
     spec = TINY[name] if name in TINY else bare_scenes.tiny_splats(name)
     plan = bare_scenes.shrunk(
-        spec.densification,
+        spec.strategy,
         refine_every=50,
         refine_start_iter=50,
         refine_stop_iter=STEPS,
@@ -74,7 +75,7 @@ def hostile_spec(name):
         # Of an extent of 0.04 scene units: the paper's 0.1 prunes all of this scene.
         prune_scale3d=50.0,
     )
-    return dataclasses.replace(spec, steps=STEPS, densification=plan)
+    return dataclasses.replace(spec, steps=STEPS, strategy=plan)
 
 
 class Ready(NamedTuple):
@@ -84,6 +85,7 @@ class Ready(NamedTuple):
     start: TrainState
     frames: Frames
     effects: tuple
+    strategy: Strategy | None
     render: object  # (params, view, step) -> Rendering
 
 
@@ -102,6 +104,7 @@ def ready(name) -> Ready:
         model.init(capture, jax.random.key(3)),
         hostile.frames_of(capture, model.required_data),
         effects_of(spec, metadata),
+        strategy_of(spec, metadata),
         render,
     )
 
@@ -111,7 +114,7 @@ def started_with(prepared: Ready, rows):
     params, rows = prepared.start.params, jax.device_put(rows)
     params = params._replace(rows=params.rows | {"splats": rows})
     aux_state = AuxState(
-        densification.empty_stats(rows), growth.states_of(prepared.effects, params)
+        prepared.strategy.init(rows), growth.states_of(prepared.effects, params)
     )
     return prepared.start._replace(params=params, aux_state=aux_state)
 

@@ -9,6 +9,7 @@ import pytest
 
 from nerfies_jax import frustum_grid, scene
 from nerfies_jax.effects.ambient import AmbientSpec
+from nerfies_jax.effects.records import FieldRecord
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.field_ray import Ray, field_ray_through
 from nerfies_jax.geometry import camera as cameras
@@ -16,7 +17,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.render_ray import Bound
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from tests import gradients
 
 SIZE = (50, 31)
@@ -31,7 +32,7 @@ def bound_of(*effects, metadata=METADATA):
 
 def read(displace, dtype, size=SIZE, metadata=METADATA):
     """(points, their displacements as read on the grid) in a picture of that size."""
-    bound = bound_of(Effect("own", displace=displace), metadata=metadata)
+    bound = bound_of(FieldRecord("own", displace=displace), metadata=metadata)
 
     @jax.jit
     def every(camera, position, share):
@@ -122,8 +123,8 @@ WARP = WarpSpec(position=EncodingSpec(3), depth=1, width=8, skips=())
         ({"warp": WARP}, None, True),
         ({"warp": dataclasses.replace(WARP, position=EncodingSpec(9))}, None, False),
         ({"warp": WARP, "ambient": AmbientSpec()}, None, False),
-        ({"warp": WARP}, Effect("own", displace=linear), False),
-        ({"warp": WARP}, Effect("own", displace=linear, shortest_wave=1.0), True),
+        ({"warp": WARP}, FieldRecord("own", displace=linear), False),
+        ({"warp": WARP}, FieldRecord("own", displace=linear, shortest_wave=1.0), True),
     ],
     ids=["at rest", "warped", "of fine waves", "lifted", "unknown", "known"],
 )

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from nerfies_jax import path_fit, presets, scene
 from nerfies_jax.effects import scene_flow
 from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.effects.records import FieldRecord
 from nerfies_jax.path_fit import FilmPaths
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
 from nerfies_jax.training.track_start import FieldStartSpec
 
@@ -152,7 +153,7 @@ def test_what_tracks_have_found_learns_slowly_at_first(start, first):
 @pytest.mark.full
 def test_a_motion_of_one_s_own_may_have_no_parameters():
     field = field_of("nerfies-small")
-    own = Effect("own", displace=lambda params, point, condition: 0 * point)
+    own = FieldRecord("own", displace=lambda params, point, condition: 0 * point)
     field = field._replace(effects=(*field.effects, own))
     params = field.init(jax.random.key(0))
     assert "own" not in params

@@ -1,6 +1,7 @@
 """Points followed by the warp or the flow of a field, against closed forms."""
 
 import dataclasses
+import functools
 import types
 
 import jax
@@ -12,8 +13,8 @@ import scipy.spatial
 from nerfies_jax import point_tracks, presets, scene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.effects.effect import Medium
+from nerfies_jax.effects.records import FieldRecord
 from nerfies_jax.evaluation import protocol
-from nerfies_jax.training.effects import Effect
 from tests import scenes
 
 
@@ -41,7 +42,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
         return jnp.where(abs(moment.time - times[lost_at]) < 1e-3, jnp.nan, moved)
 
     stub = types.SimpleNamespace(
-        effects=(Effect("warp", displace=displace),),
+        effects=(FieldRecord("warp", displace=displace),),
         codes_at=lambda params, view: {},
         displace=displace,
     )
@@ -69,7 +70,9 @@ def test_points_are_followed_through_a_warp_in_closed_form(
 
 
 @pytest.mark.parametrize(("moving", "every"), [(0.75, 1), (1.0, 2)])
-def test_points_are_followed_along_a_flow_in_closed_form(filmed, moving, every):
+def test_points_are_followed_along_a_flow_in_closed_form(
+    filmed, moving, every, monkeypatch
+):
     """A turn about an axis, by so much in each interval, of a share of what is there.
 
     With `every` second moment known, the flow is followed over two intervals at once.
@@ -98,14 +101,14 @@ def test_points_are_followed_along_a_flow_in_closed_form(filmed, moving, every):
             extras={"flow_forward": forward, "flow_backward": backward},
         )
 
-    effect = Effect("scene_flow", medium=medium)
-    field = scene.field(spec, metadata, effects=(effect,))
+    effect = FieldRecord("scene_flow", medium=medium)
+    whole = functools.partial(scene.field, effects=(effect,))
+    monkeypatch.setattr(scene, "field", whole)
+    field = scene.field(spec, metadata)
     shapes = jax.eval_shape(field.init, jax.random.key(0))
     params = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
     state = types.SimpleNamespace(params=params, step=jnp.int32(0))
-    followed = point_tracks.follow(
-        spec, metadata, state, capture, known, effects=(effect,)
-    )
+    followed = point_tracks.follow(spec, metadata, state, capture, known)
     center = np.asarray(metadata.center)
     for column, row in enumerate(chosen):
         hops = int(row) - int(chosen[known.start])

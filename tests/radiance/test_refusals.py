@@ -22,7 +22,6 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.scene_metadata import SceneMetadata
 from nerfies_jax.spec import SamplingSpec
-from nerfies_jax.training.effects import Effect
 from tests import scenes
 
 METADATA = SceneMetadata(
@@ -96,9 +95,12 @@ def sample_pdf(edges, weights, count):
             "learning_rate_end",
         ),
         (lambda: scene.build(ON_POINTS, METADATA), "background=none"),
-        (lambda: scene.build(WET, METADATA), "warp.guides names 'wet'.*say nothing"),
+        (lambda: scene.build(WET, METADATA), "warp.guides names 'wet'.*there is none"),
         (lambda: scene.build(UNMASKED, METADATA), "ambient.guides names 'mask'.*mask"),
-        (lambda: scene.build(MASKED, METADATA), "warp.guides names 'wet'.*say mask"),
+        (
+            lambda: scene.build(MASKED, METADATA),
+            "warp.guides names 'wet'.*there is mask",
+        ),
         (lambda: scene.field(TWO_WIDTHS, METADATA), "code_width"),
         (
             lambda: scene.field(BENT, METADATA, ("elastic",)),
@@ -113,19 +115,25 @@ def test_wrong_settings_are_refused(call, words):
         call()
 
 
-def test_a_guide_comes_from_an_effect_of_ones_own_that_marks():
-    rain = Effect("rain", mark=lambda own, point, condition: {"wet": point[:1]})
-    assert scene.build(WET, METADATA, (rain,)).spec[2:] == ("rain",)
-    with pytest.raises(ValueError, match="pass an effect with a mark"):
-        scene.build(WET, METADATA, (rain._replace(mark=None),))
+@dataclasses.dataclass(frozen=True)
+class Rain:
+    """A conditioning that warps read."""
+
+    name: str = "wet"
+    features: int = 1
+    target: str = "warp"
+
+    def apply(self, params, point, frame):
+        return point[:1]
 
 
-def test_a_guide_that_no_mark_says_is_named_where_it_is_read():
-    """What an effect of one's own marks is known only when it is traced."""
-    dry = Effect("dry", mark=lambda own, point, condition: {"dry": point[:1]})
+def test_a_guide_comes_from_a_conditioning_of_another_package():
+    spec = dataclasses.replace(WET, conditioning=(Rain(),))
     capture = scenes.tiny_capture()
-    model = scene.build(WET, scene.metadata_of(capture, WET), (dry,))
+    model = scene.build(spec, scene.metadata_of(capture, spec))
     frames = evaluation.frames_of(capture, model.required_data)
     state = jax.eval_shape(lambda key: model.init(capture, key), jax.random.key(0))
-    with pytest.raises(ValueError, match=r"guides name 'wet'.*there are .*dry"):
-        jax.eval_shape(model.step, state, frames)
+    jax.eval_shape(model.step, state, frames)
+    dry = dataclasses.replace(spec, conditioning=(Rain("dry"),))
+    with pytest.raises(ValueError, match=r"'wet', and there is dry; .* target is"):
+        scene.build(dry, METADATA)

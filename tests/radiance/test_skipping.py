@@ -11,6 +11,7 @@ import pytest
 from nerfies_jax import evaluation, scene, skipping, variants
 from nerfies_jax.effects.ambient import AmbientSpec
 from nerfies_jax.effects.appearance import AppearanceSpec
+from nerfies_jax.effects.records import FieldRecord
 from nerfies_jax.effects.transient import TransientSpec
 from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.field_ray import field_ray_through
@@ -23,7 +24,7 @@ from nerfies_jax.radiance.template import TemplateSpec
 from nerfies_jax.render_ray import Bound
 from nerfies_jax.scene import RadianceScene
 from nerfies_jax.spec import SamplingSpec
-from nerfies_jax.training.effects import Effect, FrameCondition
+from nerfies_jax.training.effects import FrameCondition
 from tests import scenes
 
 SIZE = (23, 17)
@@ -148,7 +149,7 @@ def test_space_is_surveyed_of_a_warp_that_colors_what_it_moves():
     def look(_, condition):
         return jnp.ones(2)
 
-    own = Effect(
+    own = FieldRecord(
         "own", condition=look, condition_width=2, displace=displace, shortest_wave=9.0
     )
     metadata = scene.metadata_of(scenes.tiny_capture(), ONE_LEVEL)

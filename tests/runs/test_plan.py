@@ -34,9 +34,9 @@ def test_schedules_stretch_with_steps_however_these_are_given():
 @pytest.mark.parametrize("growing", [True, False])
 def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
-    overrides = ("sh_degree=1", "densification.cap_max=400", "init.extra_random=0")
+    overrides = ("sh_degree=1", "strategy.cap_max=400", "init.extra_random=0")
     if not growing:
-        overrides = ("densification=none",)
+        overrides = ("strategy=none",)
     config = RunConfig(
         "splats-static-small", CaptureSource(tmp_path / "filmed"), None, overrides
     )
@@ -65,7 +65,7 @@ def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     )
     assert ("1.4 times that" in line) == growing
     if growing:
-        stop = planned.spec.densification.refine_stop_iter
+        stop = planned.spec.strategy.refine_stop_iter
         assert stop == 10 * round(200 * planned.spec.steps / 3000)
 
 
@@ -76,10 +76,10 @@ def test_growth_is_expected_within_bounds():
     state = model.init(capture, jax.random.key(0))
     at_first = model.counts(state)["gaussians"]
     for cap, growth in ((at_first // 2, 1), (2 * at_first, 2**0.5), (10**6, 2)):
-        density = dataclasses.replace(spec.densification, cap_max=cap)
+        density = dataclasses.replace(spec.strategy, cap_max=cap)
         growth_of_scene = kind.growth(
-            dataclasses.replace(spec, densification=density), state
+            dataclasses.replace(spec, strategy=density), state
         )
         assert growth_of_scene == pytest.approx(growth)
-    assert kind.growth(dataclasses.replace(spec, densification=None), state) == 1
+    assert kind.growth(dataclasses.replace(spec, strategy=None), state) == 1
     assert representations.named("radiance").growth(None, state) == 1

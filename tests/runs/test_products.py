@@ -141,7 +141,7 @@ def test_the_curve_and_the_headline_agree_visibly(tmp_path, monkeypatch):
 
 def test_twice_as_long_is_twice_as_long_whoever_set_the_steps():
     config = RunConfig("splats-static-small", overrides=("steps=40", "sh_degree=0"))
-    run = types.SimpleNamespace(config=config, spec=scene_spec(config))
+    run = types.SimpleNamespace(config=config, spec=scene_spec(config), code=())
     result = types.SimpleNamespace(stopped_by="steps", steps=40)
     *_, longer = products._next(
         pathlib.Path("run"), run, types.SimpleNamespace(result=result)

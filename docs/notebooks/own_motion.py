@@ -11,14 +11,12 @@
 # ---
 
 # %% [markdown]
-# # An effect of one's own, with its gradients checked
+# # A motion of your own, with its gradients checked
 #
-# Everything beyond a static scene is an *effect*: a name and some pure functions, each
-# in a seam of its own ([own_effect.md](../own_effect.md) lists the seams). Here is one
-# that the library does not have: every Gaussian swings to and fro along a line of its
-# own, all of them with one period that is learned as well. It is written, its gradients
-# are checked, it is trained on a scene that does move, and it is held against the same
-# scene without it.
+# The parts of a scene are small protocols ([extending.md](../extending.md)). Here is a
+# motion that the library does not have: every Gaussian swings along a line of its own,
+# all of them with one period that is learned as well. Its gradients are checked, it is
+# trained on a scene that moves, and it is compared with the same scene without motion.
 
 # %%
 import dataclasses
@@ -37,36 +35,33 @@ SIZE = (96, 72)  # pixels
 FRAMES = 24
 
 # %% [markdown]
-# ## The effect
+# ## The motion
 #
-# `init_rows` are parameters with a row for each Gaussian (they are cloned, split and
-# removed with it), `init` those without. `deform` says where Gaussians are at a time
-# from 0 to 1, and `penalty` what swinging costs. The swing starts at exactly zero: an
-# effect that is added to a scene must not change it before it has learned something.
+# `per_gaussian` parameters have a row for each Gaussian and are cloned, split and
+# removed with it, `shared` ones do not. `apply` moves the Gaussians to a time from 0
+# to 1, and `loss` penalizes swinging. The swing starts at exactly zero: a motion that
+# is added to a scene should not change it before it has learned something.
 
 
 # %%
-def swing(weight):
-    def offset(reach, cycles, time):
-        return jnp.sin(2 * jnp.pi * cycles * time) * reach
+@dataclasses.dataclass(frozen=True)
+class Swing:
+    """Sinusoidal motion of each Gaussian along a line."""
 
-    def deform(scene, gaussians, condition, prepared):
-        way = offset(scene.rows["swing"], scene.nets["swing"], condition.time)
-        return gaussians._replace(mean=gaussians.mean + way)
+    weight: float = 1e-3
+    learning_rate: float = 1e-3
 
-    def penalty(params, context):
-        reach = context.params.rows["swing"]
-        return {"reach_sq": nj.Term(jnp.mean(reach**2), weight)}
+    def init(self, key, gaussians):
+        reach = jnp.zeros_like(gaussians.mean)
+        return gj.motion.MotionParams(reach, jnp.asarray(0.5))  # half a cycle
 
-    return nj.Effect(
-        "swing",
-        init=lambda key: jnp.asarray(0.5),  # half a cycle over the film
-        learning_rate=lambda step: jnp.asarray(1e-3),
-        init_rows=lambda key, rows: jnp.zeros_like(rows.mean),
-        row_learning_rate=lambda step: jnp.asarray(1e-3),
-        deform=deform,
-        penalty=penalty,
-    )
+    def apply(self, params, cache, gaussians, frame):
+        phase = 2 * jnp.pi * params.shared * frame.time
+        shift = jnp.sin(phase) * params.per_gaussian
+        return gaussians._replace(mean=gaussians.mean + shift)
+
+    def loss(self, params, context):
+        return {"reach_sq": nj.Term(jnp.mean(params.per_gaussian**2), self.weight)}
 
 
 # %% [markdown]
@@ -80,10 +75,10 @@ capture, _ = synthetic.make(film)
 frames = nj.frames_of(capture)
 spec = gj.with_steps(gj.PRESETS["splats-static-small"], STEPS)
 metadata = gj.metadata_of(capture)
-effect = swing(weight=1e-3)
+motion = Swing()
 models = {
     "without": gj.build(spec, metadata),
-    "with swing": gj.build(spec, metadata, effects=(effect,)),
+    "with swing": gj.build(dataclasses.replace(spec, motion=motion), metadata),
 }
 
 # %% [markdown]
@@ -117,9 +112,8 @@ def moved(parameters, time, weights):
         scale=jnp.ones((rows, 3), reach.dtype),
         opacity=jnp.ones(rows, reach.dtype),
     )
-    scene = gj.Params({"swing": reach}, {"swing": cycles})
-    condition = nj.FrameCondition(time=time)
-    placed = effect.deform(scene, gaussians, condition, None)
+    own = gj.motion.MotionParams(reach, cycles)
+    placed = motion.apply(own, None, gaussians, nj.FrameCondition(time=time))
     return jnp.sum(weights * placed.mean)
 
 
@@ -146,7 +140,7 @@ for dtype, step, allowed in (("float64", 1e-5, 1e-8), ("float32", 1e-2, 1e-2)):
 # %% [markdown]
 # ## Train with it and without
 #
-# Same seed, same steps. The effect begins at zero, so both start from the same picture.
+# Same seed, same steps. The motion begins at zero, so both start from the same image.
 
 # %%
 states = {}
@@ -186,6 +180,6 @@ assert 0 < reach.max() < np.inf
 # %% [markdown]
 # ## Further
 #
-# - Put `swing` into a module of yours, and `nerfies reconstruct CAPTURE --effect
-# MODULE:swing` trains a whole run with it.
-# - `MotionSpec`, `SE3BasesSpec` and the other motions are effects of the same form.
+# - Put `Swing` into a module of yours, and `nerfies reconstruct CAPTURE --set
+# motion=MODULE:Swing` trains a whole run with it.
+# - `gj.motion.MLP`, `gj.motion.SE3Bases` and the other motions fill the same protocol.
