@@ -327,8 +327,9 @@ def _points(path, images, cameras, views, moving):
     position = ((world - np.array(scene.center)) * scene.scale).astype(np.float32)[
         finite
     ]
-    colors = path / "points_color.npy"  # ours
-    if colors.exists():
+    # Ours, in the spelling of this version or of earlier ones.
+    colors = next(iter(sorted(path.glob("points_colo*r.npy"))), None)
+    if colors is not None:
         color = frames.load_array(colors, 3 * MAX_POINTS)
         if color.shape != world.shape or color.dtype != np.uint8:
             raise CaptureError(

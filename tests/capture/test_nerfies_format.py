@@ -465,6 +465,15 @@ def test_what_is_written_is_read_back(tmp_path):
     np.testing.assert_allclose(second.up, first.up, atol=1e-7)
 
 
+def test_colors_of_points_are_read_by_their_earlier_name(tmp_path):
+    first = full_capture(tmp_path)
+    nerfies_format.write(first, tmp_path / "copy")
+    earlier = "points_color.npy".replace("color", "colo" + "ur")
+    (tmp_path / "copy/points_color.npy").rename(tmp_path / "copy" / earlier)
+    second = nerfies_format.read(tmp_path / "copy")
+    np.testing.assert_array_equal(second.points.color, first.points.color)
+
+
 def test_reductions_can_be_written_too(tmp_path):
     first = full_capture(tmp_path)
     first.valid[:, :4] = True  # whole blocks
