@@ -1,4 +1,4 @@
-"""A scene before its first step: parameters, moments and statistics; host side."""
+"""Initial state of a scene: parameters, moments and statistics, on the host."""
 
 import dataclasses
 import math
@@ -33,7 +33,7 @@ HIDDEN_LOGIT = 2.0
 
 
 def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
-    """Estimate the memory of the frames, the first state and a step, in bytes.
+    """Estimate the memory of the initial state and a step, without allocating it.
 
     Nothing is allocated. The capture's own memory is counted, too.
     """
@@ -59,7 +59,7 @@ def first_state(
     capture: Capture,
     key: Key[Array, ""],
 ) -> TrainState:
-    """Parameters, moments and statistics before the first step; host side.
+    """Initialize parameters, moments and statistics, on the host.
 
     Rows are padded to a capacity that `splats.capacity_for` says. `key` also becomes
     the run's own, by a split.

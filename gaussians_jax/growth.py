@@ -1,4 +1,4 @@
-"""What happens between two chunks of a scene's training: its rows grow and die."""
+"""Events between the chunks of training, which add and remove Gaussians."""
 
 from typing import Any, NamedTuple
 
@@ -20,14 +20,14 @@ EVENT, NOISE = 2**32 - 2, 2**32 - 3
 
 
 class AuxState(NamedTuple):
-    """What a scene keeps beside its parameters: of the rows, and what effects keep."""
+    """State of a scene besides its parameters: statistics, and state of effects."""
 
     stats: PyTree  # of the strategy; () without one
     effects: dict[str, PyTree]  # by the name of the effect
 
 
 def states_of(effects: tuple[SplatRecord, ...], params: Params) -> dict[str, PyTree]:
-    """What each effect keeps from this change of the rows to the next; host side."""
+    """Initialize the state of each effect, on the host."""
     return {
         effect.name: effect.state(params)
         for effect in effects

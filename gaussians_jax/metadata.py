@@ -1,4 +1,4 @@
-"""What a scene of Gaussians knows of its capture before anything is compiled."""
+"""Metadata of a capture that a scene of Gaussians is compiled with."""
 
 import dataclasses
 import math

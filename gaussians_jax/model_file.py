@@ -1,4 +1,4 @@
-"""A trained scene in one file: active Gaussians, networks, and what they mean.
+"""A trained scene in one file: active Gaussians, networks and settings.
 
 The file is a NumPy archive (.npz): one float32 array for each leaf of the parameters,
 and one text, JSON, with the format's version, the structure that the leaves form and a
@@ -40,10 +40,20 @@ ABOUT = "about.json"  # the archive's member with the text
 
 
 def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -> int:
-    """Write the active rows and the networks in float32; returns the file's bytes.
+    """Write the active Gaussians and the networks in float32.
 
-    `description` holds plain values and frozen settings. The file appears whole or not
-    at all. A value that is not finite is refused.
+    The file appears whole or not at all.
+
+    Args:
+      path: File to write.
+      params: Trained parameters.
+      description: Plain values and frozen settings.
+
+    Returns:
+      Bytes of the file.
+
+    Raises:
+      ValueError: If a parameter is not finite.
     """
     path = pathlib.Path(path)
     rows = params.rows["splats"]
@@ -72,7 +82,7 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
 def load(
     path: str | os.PathLike, trusted: Collection[str] = ()
 ) -> tuple[Params, dict[str, Any]]:
-    """Read parameters and description, as they were saved; host side.
+    """Read parameters and description, as they were saved.
 
     Args:
       path: The file.
@@ -136,7 +146,7 @@ def _about(archive):
 
 
 def _check(params):
-    """What every reader of parameters counts on."""
+    """Check what every reader of parameters relies on."""
     if not isinstance(params, Params) or "splats" not in params.rows:
         raise ValueError("no Gaussians in it: params.rows['splats'] is missing")
     count = len(params.rows["splats"].mean)
@@ -154,7 +164,9 @@ def _check(params):
 
 
 def _taken_apart(tree, name, arrays):
-    """The structure as JSON; its leaves go into `arrays`, named by their place."""
+    """Return the structure as JSON, and put its leaves into `arrays`, named by their
+    path.
+    """
     if tree is None:
         return None
     if isinstance(tree, dict):

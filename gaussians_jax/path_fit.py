@@ -1,9 +1,9 @@
-"""A motion fitted to known paths of points, before anything is drawn.
+"""Fit of a motion to known 3D paths of points, before training on images.
 
-Descent on pictures does not find motion of more than a few pixels; paths that come from
-tracks hand it over (`nerfies_jax.evidence`). Every effect that deforms Gaussians can be
-fitted: its networks, its rows and the canonical places of the points are descended
-together on the distance between where it carries the points and where they were seen.
+Gradient descent on images does not find motion of more than a few pixels. Paths from
+tracks do (`nerfies_jax.evidence`). Every motion can be fitted: its networks, its
+per-Gaussian parameters and the canonical positions of the points are optimized together
+on the distance between the moved points and their paths.
 """
 
 from collections.abc import Callable
@@ -54,7 +54,9 @@ class Resting(NamedTuple):
 
 
 class Points(NamedTuple):
-    """What is fitted: points with what the motion keeps for each, and its networks."""
+    """Points to fit, with their per-Gaussian parameters, and the networks of the
+    motion.
+    """
 
     canonical: Float[Array, "points 3"]  # scene units
     rows: PyTree  # of the effect, a row for each point; None where it keeps none
@@ -63,7 +65,7 @@ class Points(NamedTuple):
 
 
 class Paths(NamedTuple):
-    """Where points were seen over a film; host side."""
+    """Paths of points over a video, on the host."""
 
     times: Float[np.ndarray, " frames"]  # in [0, 1]
     position: Float[np.ndarray, "points frames 3"]  # scene units
@@ -74,7 +76,7 @@ class Paths(NamedTuple):
 
 
 class Depth(NamedTuple):
-    """How well the depth of points is known beside where they are in the pictures."""
+    """Uncertainty of the points' depth relative to that of their image position."""
 
     ray: Float[np.ndarray, "points frames 3"]  # of length one, from the camera
     deviation: Float[np.ndarray, " points"]  # as a share of it
@@ -106,7 +108,8 @@ def mean_places(paths: Paths) -> Float[np.ndarray, "points 3"]:
 
 
 def places_at_one_moment(paths: Paths) -> Float[np.ndarray, "points 3"]:
-    """Where each point is in the middle of the film, as a part of a rigid body.
+    """Compute the position of each point in the middle of the video, as part of a rigid
+    body.
 
     Means over a path lie together where a body turns; these are as far apart as the
     points are. Host side.
@@ -118,7 +121,7 @@ def places_at_one_moment(paths: Paths) -> Float[np.ndarray, "points 3"]:
 
 
 def along(deviation: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points"]:
-    """What a distance along a ray counts where points are bound, one across counting 1.
+    """Weight distances along the ray, relative to 1 for those across, of rigid points.
 
     By the deviation of a point's depth. Where the film tells depth, a thing's own size
     and turn tell it better than each track of it by itself; where it does not, nothing
@@ -128,7 +131,7 @@ def along(deviation: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points
 
 
 def resting(paths: Paths) -> Float[Array, "still 3"] | None:
-    """Some of the points at rest, scene units; None where none is known. Host side."""
+    """Sample static points in scene units; None if none are known."""
     if paths.still is None or not len(paths.still):
         return None
     chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
@@ -140,7 +143,7 @@ def rest_loss(
     unit: float,
     times: Float[Array, " times"],
 ) -> Float[Array, ""]:
-    """What it costs in a fit that points at rest move, mean over the times.
+    """Penalize the motion of static points, as a mean over the times.
 
     `moved(time)` gives what is zero where they do not turn [points, any], the vector of
     a quaternion or of a rotation, and shifts [points, 3]; the latter count in units.
@@ -158,7 +161,7 @@ def rest_loss(
 def combination(
     basis: Float[np.ndarray, "frames count"], paths: Paths
 ) -> Float[np.ndarray, "points count 3"]:
-    """Coefficients of functions of time that follow each path; host side.
+    """Fit coefficients of functions of time to each path, on the host.
 
     Weighted least squares of each path by itself, in closed form: the squared distances
     where it is known, `BEND` and `DRIFT` times the squared differences everywhere. The
@@ -178,7 +181,7 @@ def combination(
 
 
 def guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
-    """The effect's own guess; of one that has none, points in the middle of the film.
+    """Return the motion's own guess, or points in the middle of the video.
 
     What is known to be at rest is held there where networks move all alike: else they
     would move that as well, and the scene bend to follow.
@@ -256,7 +259,9 @@ def places(
 
 
 def _deformer(effect, points):
-    """(time) -> the points as Gaussians, moved and turned; they begin unturned."""
+    """Return a function from time to the points as moved Gaussians, initially
+    unrotated.
+    """
     params = scene_of(effect, points)
     ready = None if effect.prepare is None else effect.prepare(params)
     still = splats.activate(params.rows["splats"])
@@ -271,7 +276,7 @@ def fit(
     rate: float = 5e-3,
     steps: int = 3000,
 ) -> PathFit:
-    """Descend on the distance to the paths, where they are known, from a guess.
+    """Optimize the distance to the known parts of paths, from a guess.
 
     The distance is softened near zero and not squared, so that single wrong paths bend
     nothing; a rigid guess counts less of it along the rays (`along`). The guess's

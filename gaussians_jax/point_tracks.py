@@ -21,7 +21,8 @@ def follow(
     capture: Capture,
     known: GroundTruth,
 ) -> PointTracks | None:
-    """Points of the start at all other moments, carried by the Gaussians around them.
+    """Predict ground-truth points at all other times, moved by the Gaussians around
+    them.
 
     A point moves as the `NEIGHBORS` nearest Gaussians that can be seen do on average,
     where they are at the start; `neighbor_weights` says how much each counts. This
@@ -62,7 +63,7 @@ def follow(
 
 
 def mover(spec, metadata) -> Move | None:
-    """What takes points of one view's instant to another's, as `follow` does.
+    """Return a function that moves points from one view's time to another's (`follow`).
 
     None where nothing moves the Gaussians.
     """
@@ -87,7 +88,7 @@ def mover(spec, metadata) -> Move | None:
 def carried(
     points: np.ndarray, means: np.ndarray, opacity: np.ndarray, start: int
 ) -> np.ndarray:
-    """Where Gaussians carry points [points, 3] to: [points, moments, 3].
+    """Move points [points, 3] with Gaussians: [points, times, 3].
 
     `means` [moments, gaussians, 3] are theirs; the points are given at moment `start`.
     Rows that are not active have no opacity, and so carry nothing.

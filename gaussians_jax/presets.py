@@ -1,4 +1,4 @@
-"""Named scenes: a paper's numbers; those for a CPU are in `small_presets`.
+"""Presets with the numbers of the papers; those for a CPU are in `small_presets`.
 
 Where a preset leaves its paper, that is said beside it. None of the full sizes was ever
 trained to its end: they want a GPU.
@@ -290,7 +290,18 @@ PRESETS = {
 
 
 def with_steps(spec: SplatScene, steps: int) -> SplatScene:
-    """The same scene over another number of steps, its schedules in proportion."""
+    """Change the number of training steps, and stretch all schedules in proportion.
+
+    Args:
+      spec: Settings.
+      steps: Number of steps.
+
+    Returns:
+      The changed settings.
+
+    Raises:
+      ValueError: If `steps` is less than one.
+    """
     if steps < 1:
         raise ValueError(f"steps={steps}: train for at least one step")
     in_proportion = step_counts.stretched(spec, steps / spec.steps)

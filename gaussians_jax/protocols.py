@@ -32,7 +32,7 @@ PyTree = Any
 
 
 class MotionParams(NamedTuple):
-    """Parameters of a motion, or of another part of a scene; None where it has none.
+    """Parameters of a motion or of another component, None where it has none.
 
     Attributes:
       per_gaussian: Arrays with one row per Gaussian. Rows are cloned, split and pruned
@@ -63,7 +63,7 @@ class Motion(Protocol):
     learning_rate: LearningRate
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
-        """Initialize the parameters; host side.
+        """Initialize the parameters, on the host.
 
         Args:
           key: PRNG key of this motion.
@@ -81,7 +81,7 @@ class Motion(Protocol):
         gaussians: Gaussians,
         frame: FrameCondition,
     ) -> Gaussians:
-        """Move the Gaussians to their state at one time; pure.
+        """Move the Gaussians to their state at one time.
 
         Args:
           params: Parameters of this motion.
@@ -112,7 +112,7 @@ class Appearance(Protocol):
         image: Float[Array, "*pixels 3"],
         appearance: Int[Array, ""],
     ) -> Float[Array, "*pixels 3"]:
-        """Return the image, sRGB, as observed under an appearance id; pure."""
+        """Return the sRGB image as observed under an appearance id."""
         ...
 
 
@@ -131,7 +131,7 @@ class CameraOptimizer(Protocol):
         ...
 
     def apply(self, params: PyTree, cameras: Camera) -> Camera:
-        """Return the refined cameras of the training frames, in their order; pure."""
+        """Return the refined cameras of the training frames, in their order."""
         ...
 
 
@@ -216,7 +216,7 @@ class Strategy(Protocol):
         ...
 
     def update(self, state: PyTree, info: StepInfo) -> PyTree:
-        """Return the state after one more view; traced."""
+        """Return the state after one more view, traced."""
         ...
 
     def events(self, steps: int) -> tuple[StrategyEvent, ...]:
@@ -317,7 +317,7 @@ def _hooks(part):
 def initialized(
     parts: tuple[SplatRecord, ...], key: Key[Array, ""], scene: Params
 ) -> Params:
-    """Return a scene with the initial parameters of its parts; host side.
+    """Return a scene with the initial parameters of its parts, on the host.
 
     Each part has a key of its own by its name, whatever other parts there are.
     """

@@ -12,7 +12,7 @@ from nerfies_jax.training.effects import FrameCondition, PyTree, Record
 
 @dataclasses.dataclass(frozen=True)
 class SplatRecord(Record):
-    """Hooks of a part of a scene of Gaussians; None where a part has none.
+    """Hooks of a part of a scene of Gaussians, None where a part has none.
 
     `params` are the part's shared parameters, None without any; `scene` is the
     `splats.Params` of all, for deforming takes rows.

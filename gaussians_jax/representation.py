@@ -68,7 +68,7 @@ MOTION_PARTS = ("motion", "neighbors", *OF_MOTION)
 
 
 def growth(spec: Any, state: TrainState) -> float:
-    """How much longer than one of the first steps those of a whole run take.
+    """Predict how much longer the steps of a whole run take than its first steps.
 
     The root of how many times the Gaussians may become, two at most. Built-in scene:
     1.5 times from 4500 to 8379 under a cap of 10,000 (`splats-static-small`, 600
@@ -124,7 +124,7 @@ def player(
     capture: Capture,
     poster: np.ndarray,
 ) -> Player:
-    """`player.html`; the poster is uint8 [height, width, 3]."""
+    """Write `player.html`, with a poster uint8 [height, width, 3]."""
     degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
     raster = raster_of(spec, model.spec[1])
     return page.write(path, title, model, raster, degree, state, capture, poster)

@@ -62,7 +62,14 @@ ORDER = 2**32 - 1  # stream of the run's key, as those in `growth`
 
 
 def metadata_of(capture: Capture) -> SceneMetadata:
-    """The metadata of a capture; host side."""
+    """Compute the metadata of a capture, on the host.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Bounds, scale and numbers of frames and cameras.
+    """
     positions = np.asarray(capture.cameras.position)[capture.train]
     halfway = 2 / (1 / capture.near + 1 / capture.far)
     span = initialization.filmed_depths(capture)
@@ -98,9 +105,18 @@ def all_effects(
 def build(
     spec: SplatScene, metadata: SceneMetadata, effects: tuple[SplatRecord, ...] = ()
 ) -> Model:
-    """Everything the loop, the renderer and the report need of this scene.
+    """Compile settings to the functions that training, rendering and the report use.
 
-    `effects` act behind those of the spec.
+    Args:
+      spec: Settings.
+      metadata: Metadata of the capture.
+      effects: Records of further parts, which act after those of the settings.
+
+    Returns:
+      The model.
+
+    Raises:
+      ValueError: If settings contradict each other or the capture.
     """
     more = tuple(effect.name for effect in effects)
     effects = all_effects(spec, metadata, effects)
@@ -194,7 +210,7 @@ def _draw(
 
 
 def _exposed(effects, params, drawn, view):
-    """What was drawn, as it was filmed in the light of the view."""
+    """Apply the exposure model of the view to a render."""
     for effect in effects:
         if effect.expose is not None:
             own = params.nets.get(effect.name)
@@ -204,7 +220,7 @@ def _exposed(effects, params, drawn, view):
 
 
 def _posed(effects, params, frames):
-    """What is learned from, its cameras as training has them."""
+    """Return the training frames with their refined cameras."""
     for effect in effects:
         if effect.pose is not None:
             own = params.nets.get(effect.name)
@@ -292,7 +308,15 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
 
 
 def draws_depth(effects: tuple[SplatRecord, ...], frames: Frames) -> bool:
-    """Whether a step draws depths: a channel that nothing reads costs 4 % of it."""
+    """Test if a step renders depth, an unused channel of which would cost 4 %.
+
+    Args:
+      effects: Effects of the scene.
+      frames: Training frames.
+
+    Returns:
+      True if depth is rendered.
+    """
     read = any("depths" in effect.required_data for effect in effects)
     return read and frames.depths is not None
 
@@ -331,7 +355,7 @@ def loss_of(
 def observe(
     frames: Frames, row: Int[Array, ""] | int, rendering: Rendering | None
 ) -> Observation:
-    """What the losses compare: a frame that was drawn with the one that was filmed."""
+    """Assemble the input of the losses: a render and the observed frame."""
     return Observation(
         rendering,
         frames.images[frames.image_row(row)].astype(frames.times.dtype) / 255,

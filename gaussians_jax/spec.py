@@ -1,4 +1,4 @@
-"""Which scene of Gaussians: its settings, and the effects that they ask for."""
+"""Settings of a scene of Gaussians, and the effects that they enable."""
 
 import dataclasses
 
@@ -93,7 +93,7 @@ WITHOUT_NETWORKS = PolynomialMotionSpec, SplineMotionSpec  # all in their rows
 
 @dataclasses.dataclass(frozen=True)
 class SplatScene:
-    """Which scene of Gaussians; `None` for an effect means that it is not there."""
+    """Settings of a scene of Gaussians, with `None` for disabled components."""
 
     steps: int
     batch_size: int = 1  # views a step; all rates are times its root
@@ -154,10 +154,17 @@ Scene = SplatScene  # the public name
 
 
 def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
-    """How to draw this capture: the raster's near plane before all that was filmed.
+    """Return rasterizer settings whose near plane is in front of all observed surfaces.
 
-    Scenes with a far background are small in the units of a box around all points: a
-    plane at 0.01 then lies meters before the camera.
+    Scenes with a distant background are small in the units of a box around all points.
+    A plane at 0.01 would then be meters in front of the camera.
+
+    Args:
+      spec: Settings.
+      metadata: Metadata of the capture.
+
+    Returns:
+      Settings of the rasterizer.
     """
     near = min(spec.raster.near, metadata.near)
     return dataclasses.replace(spec.raster, near=near)
@@ -170,7 +177,14 @@ def optimizer_of(spec: SplatScene) -> Optimizer:
 
 
 def carried_count(spec: SplatScene) -> int | None:
-    """How many Gaussians each row carries; None where rows are what is drawn."""
+    """Return the number of children per Gaussian, None without children.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      The number.
+    """
     if isinstance(spec.motion, AnchorMotionSpec):
         return spec.motion.count
     return None if spec.carried is None else spec.carried.count
@@ -288,7 +302,7 @@ def _fading(motion):
 
 
 def _embedded(motion):
-    """What of a motion its neighbors keep alike; ValueError where it has no such."""
+    """Return the motion parameter that neighbors keep similar, or raise ValueError."""
     if type(motion) not in EMBEDDED:
         raise ValueError(
             "neighbors keep embeddings or coefficients alike, and this motion has "
@@ -299,7 +313,9 @@ def _embedded(motion):
 
 
 def motion_of(spec: SplatScene, metadata: SceneMetadata) -> SplatRecord | None:
-    """The motion that the spec asks for; one that starts from tracks moves at once."""
+    """Return the motion of the settings, without warm-up if it is initialized from
+    tracks.
+    """
     motion = spec.motion
     if motion is None:
         return None

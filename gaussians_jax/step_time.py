@@ -105,7 +105,9 @@ def _own_of_effects(effects, state, frames, condition):
 
 
 def _update(spec, metadata, effects, state, now, frames):
-    """What follows the gradient, with parameters for gradients of their shape."""
+    """Apply the update that follows the gradient, with parameters as stand-in
+    gradients.
+    """
     optimizer = optimizer_of(spec)
 
     def descend(state, grads):

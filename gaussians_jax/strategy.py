@@ -32,7 +32,7 @@ def select(
     rows: Int[np.ndarray, " count"],
     fresh: Bool[np.ndarray, " count"] | None = None,
 ) -> Population:
-    """Keep, copy and drop Gaussians; host side.
+    """Keep, copy and drop Gaussians, on the host.
 
     Arrays grow and shrink in few sizes, so that few programs are compiled.
 

@@ -1,4 +1,4 @@
-"""What follows the gradients of a step: an update, and statistics for what grows."""
+"""Update of the parameters by gradients, and statistics for densification."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from nerfies_jax.training.updates import apply_updates
 
 
 class Drawn(NamedTuple):
-    """What one frame showed of the Gaussians."""
+    """Observation of the Gaussians in one frame."""
 
     mean2d_grad: Float[Array, "drawn 2"]  # of the loss, per pixel
     footprints: Footprints

@@ -62,7 +62,7 @@ def from_knots(
     interpolation: str = "linear",
     static_threshold: float = 0.0,
 ) -> Faster:
-    """The model with its motion read from a table of `knots` instants; host side."""
+    """Return the model with its motion read from a table of `knots` times."""
     stages = _stages(model, "--knots")
     time_knots.check(knots, interpolation)
     params = state.params
@@ -95,7 +95,7 @@ def from_knots(
 
 
 def without_static(model: Model, state: TrainState, static_threshold: float) -> Faster:
-    """The model with the deformation evaluated for moving Gaussians alone; host side.
+    """Return the model with the deformation evaluated for moving Gaussians only.
 
     Those are the ones that move farther than `static_threshold` (scene units), or come
     and go, over `INSTANTS` instants of [0, 1].
@@ -130,7 +130,7 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
 def without_moving(
     model: Model, state: TrainState, farther_than: float
 ) -> tuple[TrainState, str]:
-    """The state without the Gaussians that move, and what was left out; host side.
+    """Return the state without moving Gaussians, and a summary, on the host.
 
     Those are the ones of which a point moves farther than `farther_than` (scene units)
     over `INSTANTS` instants of [0, 1]: what is left is the static scene. What was

@@ -1,9 +1,9 @@
-"""What hardly moves shall not move at all; what moves is free.
+"""Penalty on small motions, which leaves large motions free.
 
-MoBa-GS, section 3.3 ("intrinsic structural prior"), speaks of an acceleration penalty
-that decays exponentially for moving points and gives no formula. This one has the
-second difference in time of SC-GS, arXiv:2312.14937, with a weight that falls with the
-distance from the canonical place, and the first difference beside it.
+MoBa-GS, section 3.3 ("intrinsic structural prior"), describes an acceleration penalty
+that decays exponentially for moving points, without a formula. This one uses the second
+difference in time of SC-GS, arXiv:2312.14937, with a weight that falls with the
+distance from the canonical position, and adds the first difference.
 """
 
 import dataclasses
@@ -26,13 +26,13 @@ _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the choice of
 
 @dataclasses.dataclass(frozen=True)
 class AccelerationSpec:
-    """How much unrest costs, and at which distance it is free.
+    """Settings of the acceleration penalty.
 
-    `decay` is the distance from the canonical place at which the weight has fallen to
-    1/e, as a share of the scene's extent; it is also the unit of the differences, so
+    `decay` is the distance from the canonical position at which the weight has fallen
+    to 1/e, as a share of the scene's extent. It is also the unit of the differences, so
     that `weight` means the same in every scene. `drift` is the weight of the first
-    difference beside that of the second, which does not see a steady drift: points
-    that should rest went 9 cm at an acceleration of 1e-17.
+    difference relative to the second, which does not see a steady drift: static points
+    drifted by 9 cm at an acceleration of 1e-17.
     """
 
     weight: float = 1e-2
@@ -104,7 +104,16 @@ def _stillness(canonical, now, decay):
 def draw_active(
     key: Key[Array, ""], active: Bool[Array, " gaussians"], count: int
 ) -> Int[Array, " count"]:
-    """Rows drawn evenly from those `active`, with replacement; any, if none are."""
+    """Sample active Gaussians uniformly, with replacement.
+
+    Args:
+      key: Random key.
+      active: True for active Gaussians. If there are none, any are sampled.
+      count: Number of samples.
+
+    Returns:
+      Indices.
+    """
     rank = jnp.cumsum(active)
     drawn = jax.random.randint(key, (count,), 1, jnp.maximum(rank[-1], 1) + 1)
     rows = jnp.searchsorted(rank, drawn.astype(rank.dtype))

@@ -1,4 +1,4 @@
-"""Anchors with features, from which the Gaussians they carry and all motion are made.
+"""Anchors whose features produce child Gaussians and their motion.
 
 ADC-GS (Huang et al. 2025, IJCAI, arXiv:2505.08196, "Anchor-driven deformable and
 compressed Gaussian splatting"): an anchor has a place, scales, a turn and a color, a
@@ -70,9 +70,14 @@ NUMBER_BITS = 32  # of what has no law
 
 
 def kept_bytes(params: Params, spec: AnchorMotionSpec) -> tuple[float, float]:
-    """Of a trained scene: bytes of the features, and of all else; host side.
+    """Compute the bytes of a trained scene, on the host.
 
-    Features by their bits, where there is a law, everything else at 32 bits a number.
+    Args:
+      params: Trained parameters.
+      spec: Settings. With a prior, features count by their bits.
+
+    Returns:
+      Bytes of the features, and of all other parameters at 32 bits each.
     """
     own, net = params.rows[NAME], params.nets[NAME]
     active = np.asarray(splats.active_mask(params.rows["splats"]))
@@ -92,7 +97,17 @@ def offsets(
     features: Float[Array, "*rows reads"],
     code: Float[Array, " code"],
 ) -> Offsets:
-    """What a moving network says of features at the time of a code."""
+    """Evaluate a deformation network on features and a time code.
+
+    Args:
+      network: Parameters.
+      spec: Settings of the network.
+      features: Features of the anchors or children.
+      code: Code of the time.
+
+    Returns:
+      Offsets.
+    """
     at_time = mlp.with_known(spec, network, code)
     alone = dataclasses.replace(spec, inputs=features.shape[-1])
     return Offsets(**mlp.apply(alone, at_time, features))
@@ -105,9 +120,17 @@ def posed(
     rows: Gaussians,
     code: Float[Array, " code"] | None,
 ) -> Gaussians:
-    """What anchors carry where the anchors are now, moved finely at the time of a code.
+    """Compute the child Gaussians of moved anchors, with their own motion at a time.
 
-    Anchors moved by hand take it along; None leaves the fine motion out.
+    Args:
+      net: Parameters of the networks.
+      spec: Settings.
+      derived: Children in canonical position.
+      rows: Anchors, moved by the motion or by hand.
+      code: Code of the time. None disables the motion of the children.
+
+    Returns:
+      The child Gaussians.
     """
     still, (own, features) = derived
     if code is None:
@@ -121,9 +144,13 @@ def posed(
 
 
 def significance(gaussians: Gaussians) -> Float[Array, " gaussians"]:
-    """How much of each is to be seen: its opacity, a little less where it is small.
+    """Weight Gaussians by their visibility: opacity times a small power of the volume.
 
-    Opacity times the volume over one that is large among all, to a small power.
+    Args:
+      gaussians: The Gaussians.
+
+    Returns:
+      Weights in [0, 1].
     """
     volume = jnp.prod(gaussians.scale, axis=1)
     every = -(-len(volume) // VOLUME_ROWS)
@@ -207,7 +234,7 @@ def _derive(spec, scene, derived, rows, condition):
 def penalty(
     spec: AnchorMotionSpec, _: Anchors, context: PenaltyContext
 ) -> dict[str, Term]:
-    """Bits of a number of the features, on the mean; none before rounding starts."""
+    """Compute the mean bits of a feature value, zero before quantization starts."""
     scene = context.params
     active = splats.active_mask(scene.rows["splats"])
     numbers = spec.reference + spec.count * residual_width(spec)
@@ -247,7 +274,7 @@ class Bound:
 
     @property
     def moves(self) -> bool:
-        """Whether anchors move at all."""
+        """Whether anchors have a motion."""
         return self.spec.moves
 
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:

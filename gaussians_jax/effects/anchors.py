@@ -29,7 +29,7 @@ from nerfies_jax.training.step_counts import steps
 
 @dataclasses.dataclass(frozen=True)
 class RateSpec:
-    """What bits cost, from which step on, and the first steps of rounding."""
+    """Weight of the bits, its first step, and the first steps of quantization."""
 
     weight: float = 1e-3  # of the mean bits of a number of the features
     start: int = steps(20_000)  # of noise and cost
@@ -51,11 +51,12 @@ class RateSpec:
 
 @dataclasses.dataclass(frozen=True)
 class AnchorMotionSpec:
-    """Sizes and schedules; those of ADC-GS's code for all of HyperNeRF's films.
+    """Sizes and schedules, by default those of ADC-GS's code for HyperNeRF's videos.
 
-    Features start as normal draws of deviation `spread`, where the code has zeros, and
-    what is carried `first_scale` as large as its anchor. Without `moves` there is
-    neither coarse nor fine motion, nor what they would read: what is carried rests.
+    Features are initialized from a normal distribution of deviation `spread`, where the
+    code has zeros, and children are `first_scale` as large as their anchor. Without
+    `moves` there is neither coarse nor fine motion, nor its inputs, and children are
+    static.
     """
 
     count: int = 10  # Gaussians of an anchor
@@ -113,7 +114,7 @@ class Features(NamedTuple):
 
 
 class Law(NamedTuple):
-    """What is known of features before they are: for each channel, and by a network."""
+    """Prior of the features: one distribution per channel, or one from a network."""
 
     mean: Float[Array, " reference"]
     log_scale: Float[Array, " reference"]
@@ -276,9 +277,9 @@ def noised(key: Key[Array, ""], features: Features, law: Law) -> Features:
 def bits(
     features: Features, law: Law, spec: AnchorMotionSpec
 ) -> tuple[Float[Array, "anchors reference"], Float[Array, "anchors carried residual"]]:
-    """What an ideal coder takes for each number of features that are noised or kept.
+    """Compute the bits of an ideal coder for each quantized feature value.
 
-    `entropy.bits`, under the laws of reference and residual features.
+    `entropy.bits`, under the priors of reference and residual features.
     """
     step, residual_step = _steps(law)
     first = entropy.bits(features.reference, law.mean, law.log_scale, step)
@@ -289,7 +290,7 @@ def bits(
 def made(
     net: Anchors, spec: AnchorMotionSpec, features: Features, rest: int
 ) -> Carried:
-    """What anchors carry at rest; `rest` higher harmonics are the anchors' own."""
+    """Produce the children of anchors in canonical position, with `rest` harmonics."""
     half = spec.residual // 2
     shape = (*features.residual.shape[:2], spec.reference)
     reference = jnp.broadcast_to(features.reference[:, None], shape)

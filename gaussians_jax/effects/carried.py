@@ -1,4 +1,4 @@
-"""Gaussians that rows carry: each row is a core, and what is drawn moves with it.
+"""Child Gaussians: each row is a core, and its children move with it and are rendered.
 
 D-MiSo (Waczyńska et al. 2024, NeurIPS, arXiv:2405.14276, "Multi-Gaussians soup",
 section 3): a core Gaussian (equation 1) carries k sub-Gaussians in its own coordinates
@@ -41,11 +41,11 @@ NAME = "carried"
 
 @dataclasses.dataclass(frozen=True)
 class TurnSpec:
-    """The network that turns what is carried, from its own turn and the time.
+    """Settings of the network that rotates children by their own rotation and the time.
 
-    The paper's has one layer (`depth` 0), and what it answers is added to the rotation
-    (section 3.1), in its code as a quaternion; here it is a rotation vector that turns
-    what is carried, and starts near zero.
+    The paper's network has one layer (`depth` 0), and its output is added to the
+    rotation (section 3.1), as a quaternion in its code. Here it is a rotation vector
+    that starts near zero.
     """
 
     time: EncodingSpec = EncodingSpec(10)
@@ -68,12 +68,12 @@ def network_spec(spec: TurnSpec) -> MLPSpec:
 
 @dataclasses.dataclass(frozen=True)
 class CarriedSpec:
-    """How many Gaussians a row carries, where they start, and how fast they learn.
+    """Settings of child Gaussians: number, initialization and learning rates.
 
-    25 is the paper's number; its code starts all of them in the middle of the core,
-    where slopes alone tell them apart, and as large as it. Rates are those of its code
-    but for that of offsets, which there are in scene units and have 1e-3, and that of
-    the higher harmonics, which there learn as fast as the first.
+    25 is the paper's number. Its code starts all of them in the center of the core,
+    where only gradients distinguish them, and at its size. Rates are those of its code,
+    except for those of offsets, which there are in scene units and have 1e-3, and of
+    the higher harmonics, which there have the rate of the first.
     """
 
     count: int = 25
@@ -107,7 +107,7 @@ class CarriedSpec:
 
 
 class Carried(NamedTuple):
-    """What each row carries, against itself: in its axes, its scales and its looks."""
+    """Parameters of child Gaussians relative to their core: axes, scales and colors."""
 
     offset: Float[Array, "rows carried 3"]  # of the mean, in scales of the row
     log_scale: Float[Array, "rows carried 3"]  # added to the logarithm
@@ -118,7 +118,16 @@ class Carried(NamedTuple):
 
 
 def init_rows(key: Key[Array, ""], spec: CarriedSpec, rows: Splats) -> Carried:
-    """What rows carry at first: smaller copies of themselves, spread about."""
+    """Initialize children as smaller copies of their core, spread around it.
+
+    Args:
+      key: Random key.
+      spec: Settings.
+      rows: Raw parameters of the cores.
+
+    Returns:
+      Parameters of the children.
+    """
     shape, kind = (len(rows.mean), spec.count), rows.mean.dtype
     drawn = jax.random.normal(key, (*shape, 3), jnp.float32).astype(kind)
     return Carried(
@@ -132,7 +141,7 @@ def init_rows(key: Key[Array, ""], spec: CarriedSpec, rows: Splats) -> Carried:
 
 
 def at_rest(rows: Splats, own: Carried) -> Splats:
-    """What rows carry, those of the first row first, as rows of their own.
+    """Return the raw parameters of all children in canonical position, core by core.
 
     An inactive row carries inactive ones, as long as `own.opacity_logit` is below 250.
     """
@@ -153,13 +162,21 @@ def posed(
     still: Splats,
     rows: Gaussians,
 ) -> Gaussians:
-    """What rows carry where the rows are now, moved by a network or by hand. Pure.
+    """Compute the children of moved cores (equation 2, with offsets in the core's
+    scales).
 
-    Equation 2, with the offset in the row's scales.
+    A core of zero size has all children at its center, and one with a zero quaternion
+    has the axes of the world.
 
-    `turn` are rotation vectors (rad) in the axes of the row, after what is carried has
-    its own turn; `still` is `at_rest`, for the opacities. A row of no size has all in
-    its middle; one without a direction (a quaternion of zero) the axes of the world.
+    Args:
+      own: Parameters of the children.
+      turn: Rotation vectors (rad) in the axes of the core, after the child's own
+        rotation.
+      still: Children in canonical position (`at_rest`), for their opacities.
+      rows: Cores, moved by a network or by hand.
+
+    Returns:
+      The child Gaussians.
     """
     mean, turned, scale = _standing(own, turn, rows)
     return Gaussians(mean, turned, scale, jax.nn.sigmoid(still.opacity_logit))
@@ -190,7 +207,7 @@ def _standing(own, turn, rows):
 def turns(
     network: MLP, spec: TurnSpec, own: Carried, time: Float[Array, ""]
 ) -> Float[Array, "rows carried 3"]:
-    """How what is carried turns at a time by itself, rad, in the axes of its row."""
+    """Evaluate the rotation of children at a time (rad, axes of their core)."""
     moment = encoding.encode(spec.time, time[None], None)
     at_time = mlp.with_known(network_spec(spec), network, moment)
     unit = jax.vmap(jax.vmap(quaternion.normalize))(own.quaternion)
@@ -201,7 +218,7 @@ def turns(
 def follow(
     params: Params, spec: CarriedSpec, rows: Gaussians, time: Float[Array, ""]
 ) -> Gaussians:
-    """What is drawn at a time of rows that stand anywhere: of a scene edited by hand.
+    """Compute the children of cores that were moved, rotated or scaled by hand.
 
     `rows` are those of `deformation.deform_rows`, moved, turned or enlarged.
     """
@@ -214,7 +231,7 @@ def follow(
 
 
 def effect(spec: CarriedSpec, steps: int, warm_up: int) -> SplatRecord:
-    """The seams that this fills, for a run of `steps`; nothing turns before `warm_up`.
+    """Assemble the hooks of child Gaussians, which do not rotate before `warm_up`.
 
     Opacities and looks are those at rest: a motion of the rows that changes opacities
     has no say in them.

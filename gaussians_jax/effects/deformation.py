@@ -1,7 +1,7 @@
-"""The motion of a scene: every effect that deforms, one after the other.
+"""Motion of a scene: all deforming effects, one after the other.
 
-Effects deform the rows. Where one of them has rows that carry several Gaussians each
-(`derive_rows`, `derive`), those are what is drawn; without one it is the rows.
+Effects deform the Gaussians of the scene. If one of them defines children
+(`derive_rows`, `derive`), the children are rendered instead.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ def deform(
     prepared: dict[str, PyTree],
     time: Float[Array, ""],
 ) -> Gaussians:
-    """What is drawn at one time of a trained scene, from what `prepare` returned."""
+    """Compute the Gaussians to render at one time of a trained scene."""
     moved = deform_rows(effects, params, prepared, time)
     by = derives(effects)
     if by is None:
@@ -62,7 +62,7 @@ def deform_rows(
 
 
 def derives(effects: Effects) -> SplatRecord | None:
-    """The effect by which rows carry what is drawn; None where they are drawn."""
+    """Return the effect that defines child Gaussians, None if there is none."""
     return next((effect for effect in effects if effect.derive is not None), None)
 
 
@@ -82,7 +82,7 @@ def check_derived(effects: Effects) -> None:
 
 
 def drawn_rows(effects: Effects, params: Params) -> Splats:
-    """What is drawn once trained, as rows at rest: the rows, or what they carry."""
+    """Return the raw parameters of the rendered Gaussians in canonical position."""
     by = derives(effects)
     if by is None:
         return params.rows["splats"]
@@ -92,7 +92,7 @@ def drawn_rows(effects: Effects, params: Params) -> Splats:
 def drawn(
     effects: Effects, params: Params, moved: Gaussians, condition: FrameCondition
 ) -> tuple[Splats, Gaussians]:
-    """What is drawn of moved rows in training: as rows at rest, and as it stands."""
+    """Return the rendered Gaussians in training: canonical parameters, and moved."""
     by = derives(effects)
     if by is None:
         return params.rows["splats"], moved
@@ -103,7 +103,7 @@ def drawn(
 def significance(
     effects: Effects, gaussians: Gaussians
 ) -> Float[Array, " gaussians"] | None:
-    """How much each of what is drawn counts for its row; None: all alike."""
+    """Weight the children of each Gaussian; None for equal weights."""
     by = derives(effects)
     if by is None or by.significance is None:
         return None
@@ -111,7 +111,7 @@ def significance(
 
 
 def carried_by_each(effects: Effects, params: Params) -> int:
-    """How many Gaussians are drawn of each row."""
+    """Return the number of children per Gaussian."""
     if derives(effects) is None:
         return 1
     drawn = jax.eval_shape(lambda params: drawn_rows(effects, params), params)
@@ -132,12 +132,21 @@ def deform_in_training(
     condition: FrameCondition,
     states: dict[str, PyTree] | None = None,
 ) -> Gaussians:
-    """`gaussians`, a scene's rows, as they are at a moment of training.
+    """Deform the Gaussians of a scene at a frame time in training.
 
-    `states` are those of effects that are `ready_by_state`; without them these are
-    prepared anew. An effect is not evaluated before its warm-up is over: under the
-    loop's scan the switch is a branch, and such a step costs what it costs without the
-    effect.
+    An effect is not evaluated before its warm-up ends. Under the loop's scan the
+    condition is a branch, so such a step costs as much as without the effect.
+
+    Args:
+      effects: Effects of the scene.
+      params: Trained parameters.
+      gaussians: Canonical Gaussians.
+      condition: Frame time, codes, step and key.
+      states: State of effects that are `ready_by_state`. Without it they are prepared
+        anew.
+
+    Returns:
+      The deformed Gaussians.
     """
     for effect in effects:
         if effect.deform is None:

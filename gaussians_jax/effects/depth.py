@@ -1,4 +1,4 @@
-"""Depth that was filmed, or guessed from single pictures, as a second truth.
+"""Depth supervision from sensors or monocular estimates.
 
 "Sonata" names a depth loss and leaves its form open. A depth of one picture is known up
 to scale and offset only; the forms here are those of Ranftl et al. 2020 ("MiDaS"),
@@ -28,19 +28,19 @@ FLATTEST = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class DepthSpec:
-    """What of the depths is compared, and how much it counts beside the colors.
+    """Form and weight of the depth loss.
 
-    "correlation" is 1 - r, Pearson's, blind to a positive scale and any offset. A
-    least-squares scale and offset leave a share 1 - r^2 of the variance, which is as
-    content with a depth turned inside out; this turns it back. "affine" takes from both
-    depths their median and divides by their mean distance from it, which bends less
-    where a part of the depths is wildly wrong; but it is level where every pixel is on
-    the wrong side of the median, and from random starts it ended short of the truth in
-    two of five fits, correlation in none. "metric" compares the depths as they are, for
-    sensors and renderers.
+    "correlation" is 1 - r, Pearson's, invariant to a positive scale and any offset. A
+    least-squares scale and offset leave a share 1 - r^2 of the variance, which also
+    accepts an inverted depth. "affine" normalizes both depths by their median and their
+    mean distance from it, which is more robust to large errors of a part. It is
+    constant where every pixel is on the wrong side of the median, and from random
+    initializations two of five fits ended early, and none with correlation. "metric"
+    compares depths as they are, for sensors and renderers.
 
-    `space="disparity"` compares 1 / z, of which the far counts less. An affine guess
-    of disparities is no affine guess of depths: choose what the guess was made in.
+    `space="disparity"` compares 1 / z, in which distant surfaces count less. An
+    estimate that is affine in disparity is not affine in depth: choose the space of the
+    estimate.
     """
 
     kind: str = "correlation"
@@ -94,7 +94,16 @@ def correlation(
     truth: Float[Array, " pixels"],
     known: Bool[Array, " pixels"],
 ) -> Float[Array, ""]:
-    """1 - Pearson's r over the known pixels, in [0, 2]; zero with fewer than two."""
+    """Compute 1 - Pearson's r over the known pixels.
+
+    Args:
+      depth: Rendered depths.
+      truth: Reference depths.
+      known: True where both are known.
+
+    Returns:
+      A value in [0, 2], zero with fewer than two known pixels.
+    """
     depth, truth = widened(depth), widened(truth)
     known = known & (jnp.sum(known) > 1)
     # Half the mean square of the difference of standardized depths: 1 - r itself would
@@ -109,9 +118,17 @@ def metric(
     truth: Float[Array, " pixels"],
     known: Bool[Array, " pixels"],
 ) -> Float[Array, ""]:
-    """Mean |depth - truth| over the mean of the known truth; zero without any.
+    """Compute mean |depth - truth| over the mean of the known truth.
 
-    Relative, so that its weight means the same in every unit of length.
+    It is relative, so its weight means the same in every unit of length.
+
+    Args:
+      depth: Rendered depths.
+      truth: Reference depths.
+      known: True where both are known.
+
+    Returns:
+      The relative error, zero without known pixels.
     """
     depth, truth = widened(depth), widened(truth)
     scale = losses.masked_mean(truth[:, None], known)
@@ -120,7 +137,9 @@ def metric(
 
 
 def _about_median(depth, known):
-    """Zero where unknown; slopes go through the median and the deviation too."""
+    """Normalize by median and deviation, with gradients through both; zero where
+    unknown.
+    """
     middle = _median(depth, known)
     offset = jnp.where(known, depth - middle, 0)
     return _divided(offset, losses.masked_mean(jnp.abs(offset)[:, None], known), middle)
@@ -142,7 +161,7 @@ def _divided(offset, deviation, middle):
 
 
 def _median(depth, known):
-    """The lower median of positive depths, as a choice of one pixel; 0 without any."""
+    """Return the lower median of positive depths, 0 without any."""
     count = jnp.sum(known)
     fixed = jax.lax.stop_gradient(jnp.where(known, depth, 1))
     middle = nth_smallest(fixed, known, jnp.maximum(count - 1, 0) // 2)
@@ -153,7 +172,7 @@ def _median(depth, known):
 def nth_smallest(
     values: Float[Array, " n"], known: Bool[Array, " n"], rank: Int[Array, ""]
 ) -> Float[Array, ""]:
-    """The known value that has `rank` known ones below it; all values are positive.
+    """Return the known value that has `rank` known ones below it, for positive values.
 
     The bits of positive floats are ordered like the floats, so the answer is built from
     its highest bit down, one count for each bit. Exact; 130k values, one core: 1.3 ms,

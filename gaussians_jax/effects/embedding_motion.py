@@ -1,4 +1,5 @@
-"""Motion of a code for each Gaussian and the time, a coarse network and a fine one.
+"""Deformation by a per-Gaussian embedding and a time code, with a coarse and a fine
+network.
 
 Bae et al. 2024, "Per-Gaussian embedding-based deformation", arXiv:2404.03613 (E-D3DGS),
 with the sizes of its code. A network makes residuals of the codes (section 3.2,
@@ -37,7 +38,8 @@ NAME = "embedding_motion"
 
 @dataclasses.dataclass(frozen=True)
 class EmbeddingMotionSpec:
-    """Sizes, growth and penalties; defaults of E-D3DGS's code for HyperNeRF's films.
+    """Sizes, growth and penalties, by default those of E-D3DGS's code for HyperNeRF's
+    videos.
 
     Rotations are rotation vectors where the code adds to quaternions, and the last
     layers start at zero, where its start as any layer; for other films it fades offsets
@@ -97,7 +99,7 @@ class Decoder(NamedTuple):
 
 
 class EmbeddingMotion(NamedTuple):
-    """Parameters that all Gaussians share; the embeddings are rows."""
+    """Shared parameters. The embeddings are per-Gaussian parameters."""
 
     times: Float[Array, "moments code"]  # evenly over [0, 1]
     # As if of so many the table was read by the fine network; an event sets it, and no
@@ -146,7 +148,7 @@ def prepare(
     embedding: Float[Array, "gaussians embedding"],
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Float[Array, "gaussians features"]:
-    """What the embeddings add to both first layers, side by side, whatever the time."""
+    """Compute the time-independent part of both first layers from the embeddings."""
     weight = jnp.concatenate(
         [one.first.weight[: spec.embedding] for one in (params.coarse, params.fine)],
         axis=1,

@@ -27,10 +27,10 @@ HELD = 1e-6  # squared error a pixel that a change of one in one number counts f
 
 @dataclasses.dataclass(frozen=True)
 class ExposureSpec:
-    """How fast exposures are learned.
+    """Learning rate of the exposure model.
 
-    Each row of the table learns from its own frames alone, once in so many steps as
-    there are frames; Adam's step then counts some eight times.
+    Each exposure is updated by its own frames only, once in as many steps as there are
+    frames, and then by about eight of Adam's steps.
     """
 
     learning_rate: float = 1e-2
@@ -53,11 +53,20 @@ def init(key: Key[Array, ""], exposures: int) -> Float[Array, "exposures 3 4"]:
 def of_id(
     table: Float[Array, "exposures 3 4"], places: Places, appearance: Int[Array, ""]
 ) -> Float[Array, "3 4"]:
-    """The change of one appearance id; of one never learned from, between two in time.
+    """Look up the exposure of an appearance id; untrained ones are interpolated in
+    time.
 
-    The mean of all is no change, and counts as constant: a slope through it would
-    reach the rows of all other frames, and Adam makes whole steps of the smallest. An
-    id that no capture had is that of the nearest number.
+    The mean of all exposures is the identity, and is treated as constant: a gradient
+    through it would reach all other frames, and Adam normalizes even the smallest
+    gradients. An unknown id uses the nearest one.
+
+    Args:
+      table: Affine color transforms.
+      places: Interpolation of untrained exposures.
+      appearance: Appearance id.
+
+    Returns:
+      The transform.
     """
     left, right, progress = (np.asarray(column) for column in zip(*places, strict=True))
     one = jnp.clip(appearance, 0, len(places) - 1)
@@ -71,7 +80,15 @@ def of_id(
 def changed(
     picture: Float[Array, "*pixels 3"], change: Float[Array, "3 4"]
 ) -> Float[Array, "*pixels 3"]:
-    """Colors after a change, sRGB; not clipped."""
+    """Apply an exposure to colors, without clipping.
+
+    Args:
+      picture: sRGB colors.
+      change: Affine transform.
+
+    Returns:
+      sRGB colors.
+    """
     mixed = exact_product(picture, change[:, :3].T)
     return picture + mixed + change[:, 3]
 

@@ -71,7 +71,7 @@ class Bound:
         return self.spec.weight
 
     def state(self, params: Params) -> Neighbors:
-        """Find the neighbors; host side."""
+        """Find the neighbors, on the host."""
         return neighbors.find(self.spec.graph(), params, self.extent)
 
     def loss(self, params: Params, context: PenaltyContext) -> Float[Array, ""]:

@@ -38,14 +38,16 @@ NETWORKS = ("kan", "mlp", "bspline")
 
 @dataclasses.dataclass(frozen=True)
 class KanMotionSpec:
-    """Sizes and schedule; the paper gives only the embedding's, the rest is E-D3DGS'.
+    """Sizes and schedule; the paper gives the size of the embedding, and E-D3DGS the
+    rest.
 
-    `position`, `scale` and `rotation` say which residuals there are (the paper's
-    ablation): a head that is off has no parameters. `network` "bspline" is the KAN that
-    the paper argues against, with cubic B-splines for Gaussians (equations 4 and 5);
-    "mlp" is its ablation of the KAN: ReLU layers of the same inputs and heads, as many,
-    and as wide as makes the number of parameters equal, unless `mlp_width` says
-    otherwise.
+    `position`, `scale` and `rotation` enable the residuals (the paper's ablation). A
+    disabled head has no parameters. `network` "bspline" is the KAN that the paper
+    argues against, with cubic B-splines instead of Gaussians (equations 4 and 5). "mlp"
+    is its ablation without a KAN: as many ReLU layers of the same inputs and heads, and
+    as wide as makes the
+      number of
+    parameters equal, unless `mlp_width` is given.
     """
 
     embedding: int = 32
@@ -127,7 +129,7 @@ class KanMotionSpec:
 
 
 class KanMotion(NamedTuple):
-    """Parameters that all Gaussians share; the embeddings are rows."""
+    """Shared parameters. The embeddings are per-Gaussian parameters."""
 
     times: Float[Array, "moments code"]  # evenly over [0, 1]
     field: KAN | MLP  # the fine one of two
@@ -138,7 +140,7 @@ class KanMotion(NamedTuple):
 
 
 class Offsets(NamedTuple):
-    """How far Gaussians are from their canonical state; None where that is off."""
+    """Residuals of position, scale and rotation, None where disabled."""
 
     position: Float[Array, "gaussians 3"] | None  # scene units
     log_scale: Float[Array, "gaussians 3"] | None  # added to the logarithm
@@ -199,7 +201,15 @@ def equal_width(spec: KANSpec) -> int:
 
 
 def parameter_count(spec: KANSpec | MLPSpec) -> int:
-    """How many numbers the network learns, whatever the number of Gaussians."""
+    """Count the parameters of the network, which do not depend on the number of
+    Gaussians.
+
+    Args:
+      spec: Settings of the network.
+
+    Returns:
+      Number of parameters.
+    """
     each, trained = 1, 0
     if isinstance(spec, KANSpec):
         widths = spec.widths()
@@ -246,14 +256,21 @@ def prepare(
     embedding: Float[Array, "gaussians embedding"],
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Float[Array, "gaussians features"]:
-    """What the embeddings add to the first layer, whatever the time. Pure.
+    """Compute the time-independent contribution of the embeddings to the first layer.
 
-    Of two networks both, side by side.
+    With two networks, both contributions are next to each other. They take 4 bytes per
+    feature of the first layer and Gaussian: 5 MB for 10,000 Gaussians with the default
+    sizes. On one core, deforming 10,000 takes 68 ms without and 58 with this, or 10 and
+    7 in the small sizes.
 
-    4 bytes for each feature of the first layer and Gaussian: 5 MB for 10,000 Gaussians
-    with the default sizes. Measured on one core at 10,000, deforming takes 68 ms with
-    nothing kept and 58 with this, 10 and 7 in the small sizes. Rows of blocks without
-    an active one are zero.
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      embedding: Per-Gaussian embeddings.
+      active: Active Gaussians. Blocks without any are zero.
+
+    Returns:
+      Contributions [gaussians, features].
     """
 
     def both(rows):
@@ -270,7 +287,9 @@ def deform(
     prepared: Float[Array, "gaussians features"],
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Offsets of every Gaussian at one time; zero in blocks without an active row."""
+    """Evaluate the residuals of all Gaussians at a time, zero in blocks without active
+    ones.
+    """
     fields = _fields(params)
     if params.coarse is None:
         read = (codes.at_time(params.times, time),)
@@ -299,7 +318,9 @@ def _fields(params):
 
 
 def _first_layer_part(spec, field, part, start):
-    """What the inputs from `start` on add to the first layer, without its bias."""
+    """Compute the contribution of the inputs from `start` on to the first layer,
+    without bias.
+    """
     if isinstance(field, KAN):
         return kan.first_layer_part(field_spec(spec), field, part, start)
     return part @ field.hidden[0].weight[start : start + part.shape[-1]]

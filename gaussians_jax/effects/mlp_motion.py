@@ -51,12 +51,12 @@ class SmoothingSpec:
 
 @dataclasses.dataclass(frozen=True)
 class MotionSpec:
-    """The network and its schedule; the defaults are the paper's for real captures.
+    """The network and its schedule, by default those of the paper for real captures.
 
-    `time_code` is the width of a code that a small network makes of the encoded time
-    (30 for the paper's synthetic scenes, where the time has six bands). `scale_rule`
-    "log" multiplies the scales by an exponential; "linear" adds to them as the paper
-    does, which lets them pass through zero.
+    `time_code` is the width of a code that a small network computes from the encoded
+    time (30 for the paper's synthetic scenes, where the time has six bands).
+    `scale_rule` "log" multiplies scales by an exponential. "linear" adds to them as in
+    the paper, which may make them negative.
     """
 
     position: EncodingSpec = EncodingSpec(10)
@@ -105,7 +105,7 @@ class Motion(NamedTuple):
 
 
 class Offsets(NamedTuple):
-    """How far Gaussians are from their canonical state."""
+    """Residuals of position, scale and rotation."""
 
     mean: Float[Array, "gaussians 3"]  # scene units
     quaternion: Float[Array, "gaussians 4"]  # added to the unit quaternion
@@ -113,11 +113,17 @@ class Offsets(NamedTuple):
 
 
 def trunk_spec(spec: MotionSpec) -> MLPSpec:
-    """The network from [encoded position, time features] to the three heads.
+    """Settings of the network from [encoded position, time features] to three heads.
 
-    The heads start at 1e-4 of a Glorot draw's scale in effect, so that motion sets in
-    smoothly when the warm-up ends; the paper's code draws them like hidden layers, and
-    the scene jumps.
+    The heads start at 1e-4 of a Glorot initialization in effect, so that motion is
+    continuous when the warm-up ends. The paper's code initializes them like hidden
+    layers, and the scene jumps.
+
+    Args:
+      spec: Settings of the motion.
+
+    Returns:
+      Settings of the network.
     """
     heads = (
         ("mean", HeadSpec(3, "small")),
@@ -154,11 +160,21 @@ def deform(
     time: Float[Array, ""],
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Offsets of every Gaussian at one time.
+    """Evaluate the residuals of all Gaussians at a time.
 
-    No gradient reaches the means through the network, as in the paper: they would
-    chase a moving target. Blocks in which no row is `active` are not evaluated, so
-    compacted rows do not pay for the capacity behind them; their offsets are zero.
+    No gradient reaches the means through the network, as in the paper, because they
+    would follow a moving target. Blocks without active Gaussians are not evaluated and
+    are zero.
+
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      mean: Canonical means.
+      time: Normalized time.
+      active: Active Gaussians.
+
+    Returns:
+      The residuals.
     """
     at_time = fold_time(params, spec, time)
     if mean.shape[0] == 0:
@@ -194,10 +210,18 @@ def offsets_at_time(
 
 
 def apply(gaussians: Gaussians, offsets: Offsets, scale_rule: str) -> Gaussians:
-    """Gaussians moved by their offsets.
+    """Apply residuals to Gaussians.
 
-    The rotation is q / |q| + offset, which the renderer normalizes; a zero quaternion
+    The rotation is q / |q| + offset, which the renderer normalizes. A zero quaternion
     counts as the identity.
+
+    Args:
+      gaussians: Canonical Gaussians.
+      offsets: Residuals.
+      scale_rule: "log" or "linear".
+
+    Returns:
+      The deformed Gaussians.
     """
     unit = jax.vmap(quaternion.normalize)(gaussians.quaternion)
     if scale_rule == "log":

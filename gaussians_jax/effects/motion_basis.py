@@ -37,16 +37,15 @@ _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the noise on 
 
 @dataclasses.dataclass(frozen=True)
 class BasisMotionSpec:
-    """The three networks and their schedule; sizes are the paper's where it has them.
+    """The three networks and their schedule, with the paper's sizes where it has them.
 
-    `count` is K; None leaves the basis out and lets the weight network give the
-    residual displacement itself, the paper's ablation "base + residual". All networks
-    use SiLU: the paper calls its motion C1 in time, which ReLU networks are not.
+    `count` is K. None removes the basis, and the weight network predicts the residual
+    displacement, the paper's ablation "base + residual". All networks use SiLU: the
+    paper calls its motion C1 in time, which ReLU networks are not.
 
-    V w = (V A)(A^-1 w) for every invertible A, so the size of V means nothing by
-    itself. "bounded" shortens directions longer than one to length one: then w is in
-    scene units, and |V w| <= sum |w| whatever the basis network does. "free" leaves
-    them as they are.
+    V w = (V A)(A^-1 w) for every invertible A, so the size of V has no meaning alone.
+    The form "bounded" shortens directions longer than one to length one. Then w is in
+    scene units, and |V w| <= sum |w| for any basis network. The form "free" keeps them.
     """
 
     position: EncodingSpec = EncodingSpec(10)
@@ -109,12 +108,11 @@ class BasisMotion(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """What the canonical means alone decide, a row for each Gaussian.
+    """Time-independent quantities of each Gaussian.
 
-    4 (3 K + base_width) bytes each: 608 with the paper's sizes, 24 MB for its 39,000
-    Gaussians. Measured on one core at 10,000, deforming them takes 160 ms with nothing
-    kept, 154 with the directions kept, 147 with both; 10.2, 8.5 and 6.8 in the small
-    sizes.
+    They take 4 (3 K + base_width) bytes each: 608 with the paper's sizes, 24 MB for its
+    39,000 Gaussians. On one core, deforming 10,000 takes 160 ms without, 154 with the
+    directions, 147 with both, and 10.2, 8.5 and 6.8 in the small sizes.
     """
 
     base: Float[Array, "gaussians width"]  # p's share of the base's first layer
@@ -122,7 +120,7 @@ class Prepared(NamedTuple):
 
 
 class Offsets(NamedTuple):
-    """How far Gaussians are from their canonical state."""
+    """Residuals of position, scale and rotation."""
 
     mean: Float[Array, "*gaussians 3"]  # scene units
     turn: Float[Array, "*gaussians 3"]  # rotation vector, rad, in world axes
@@ -150,10 +148,17 @@ def basis_spec(spec: BasisMotionSpec) -> MLPSpec:
 
 
 def weights_spec(spec: BasisMotionSpec) -> MLPSpec:
-    """From [encoded p', encoded time] to weights, turn and stretch.
+    """Settings of the network from [encoded p', encoded time] to weights, rotation and
+    scale.
 
-    All heads start near zero, so that a Gaussian starts at its canonical state while
-    its directions are not zero; were both zero, neither would get a gradient.
+    All heads start near zero, so that a Gaussian starts in its canonical state while
+    its directions are nonzero. If both were zero, neither would get a gradient.
+
+    Args:
+      spec: Settings of the motion.
+
+    Returns:
+      Settings of the network.
     """
     heads = (
         ("weights", HeadSpec(spec.count or 3, "small")),
@@ -245,7 +250,7 @@ def fold_time(
 def base_displacement(
     base: MLP, spec: BasisMotionSpec, share: Float[Array, " width"]
 ) -> Float[Array, "3"]:
-    """D(p, t), equation 3, of one Gaussian; `base` is folded, `share` prepared."""
+    """Compute D(p, t), equation 3, of one Gaussian from prepared parameters."""
     first, *others = base.hidden
     hidden = mlp.ACTIVATIONS[spec.activation](share + first.bias)
     rest = dataclasses.replace(
@@ -257,7 +262,7 @@ def base_displacement(
 def residual(
     weights: MLP, spec: BasisMotionSpec, moved: Float[Array, "3"]
 ) -> dict[str, Float[Array, " outputs"]]:
-    """w(p', t), equation 5, with turn and stretch, of one Gaussian; folded."""
+    """Compute w(p', t), equation 5, with rotation and scale, of one Gaussian."""
     encoded = encoding.encode(spec.position, moved, None)
     position_only = dataclasses.replace(weights_spec(spec), inputs=len(encoded))
     return mlp.apply(position_only, weights, encoded)
@@ -302,7 +307,8 @@ def deform(
     prepared: Prepared,
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Offsets of every Gaussian at one time; zero in blocks without an active row.
+    """Evaluate the residuals of all Gaussians at a time, zero in blocks without active
+    ones.
 
     `mean` is canonical, and what `prepared` was made of.
     """
@@ -320,12 +326,19 @@ def _seen(spec, mean):
 
 
 def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
-    """Gaussians moved by their offsets.
+    """Apply residuals to Gaussians.
 
-    The turn follows the Gaussian's own rotation, exp(turn) q / |q|, which has unit
-    length whatever the network says. The paper adds to q as Deformable 3DGS does; near
-    q + dq = 0 rounding then decides the rotation (1e-4 rad at |q + dq| = 1e-3). The
-    logarithm of the factor of the scale is held to the range of the scale's own.
+    The rotation is exp(turn) q / |q|, which has unit length for any network output. The
+    paper adds to q as Deformable 3DGS does. Near q + dq = 0, rounding would then decide
+    the rotation (1e-4 rad at |q + dq| = 1e-3). The logarithm of the factor of the scale
+    is clamped to the range of the scale.
+
+    Args:
+      gaussians: Canonical Gaussians.
+      offsets: Residuals.
+
+    Returns:
+      The deformed Gaussians.
     """
     factor = jnp.exp(jnp.clip(offsets.log_scale, *splats.LOG_SCALE_RANGE))
     return Gaussians(

@@ -1,4 +1,4 @@
-"""Optical flow tells Gaussians how things move, once what the camera does is taken off.
+"""Optical flow loss on the motion of Gaussians, without the flow of the camera.
 
 Zhu et al. 2024 (MotionGS), arXiv:2410.07707, section 4.2 (equations 4 to 8) and
 appendix A.1. Flow from one frame to the next is that of the camera, which the drawn
@@ -41,7 +41,7 @@ LEAST_SHARE = 1e-10  # of opacity that is divided by
 
 @dataclasses.dataclass(frozen=True)
 class FlowSpec:
-    """What the flow counts for beside the colors, and from which step on.
+    """Weight of the flow loss, and its first step.
 
     Weight and form are the paper's code's: absolute differences of flows in units of
     the picture's sides, each held to one side; 0.5 is for NeRF-DS, and for HyperNeRF
@@ -84,7 +84,7 @@ class Drawn(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """The `Regularizer` of a `FlowSpec`; a capture without flow has no term."""
+    """The `Regularizer` of a `FlowSpec`, without a term if the capture has no flow."""
 
     spec: FlowSpec
     picture: RasterSpec
@@ -202,10 +202,17 @@ def _matrix(a, b, c, d):
 def camera_flow(
     pair: tuple[Camera, Camera], depth: Float[Array, "height width"]
 ) -> Float[Array, "height width 2"]:
-    """Where a still scene's pixels go from the first camera to the second, px.
+    """Compute the optical flow of a static scene from one camera to another.
 
-    Equations 4 to 6. `depth` is z-depth in scene units; where it is not positive the
-    flow means nothing, and is finite. Of cameras without distortion.
+    Equations 4 to 6, for cameras without distortion.
+
+    Args:
+      pair: Both cameras.
+      depth: z-depth in scene units. Where it is not positive, the flow is meaningless
+        and finite.
+
+    Returns:
+      Flow in pixels.
     """
     first, second = pair
     height, width = depth.shape
@@ -226,10 +233,18 @@ def error(
     things: Float[Array, "height width 2"],
     seen: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
-    """Mean absolute difference where `seen`, in sides of the picture; zero of none.
+    """Compute the mean absolute difference of two flows.
 
-    Equation 8. Horizontal flow by the width and vertical by the height, each held to
-    ±1.
+    Equation 8. Horizontal flow is divided by the width and vertical flow by the height,
+    and each is clamped to ±1.
+
+    Args:
+      drawn: Flow of the Gaussians in pixels.
+      things: Flow of the objects in pixels.
+      seen: Pixels to compare.
+
+    Returns:
+      The mean, zero without pixels.
     """
     height, width = seen.shape
     side = jnp.asarray((width, height), drawn.dtype)

@@ -24,21 +24,21 @@ from nerfies_jax.training.step_counts import steps
 PyTree = Any
 FORMS = ("soft", "hard")
 # At most so many rows give the median of all. Measured at 10k rows, one core: 0.2 ms
-# for all of `travelled`, against 5.6 ms with every row, nearly all of it sorting.
+# for all of `traveled`, against 5.6 ms with every row, nearly all of it sorting.
 MEDIAN_ROWS = 512
 
 
 @dataclasses.dataclass(frozen=True)
 class MotionGrowthSpec:
-    """How the motion of a Gaussian bears on its growth.
+    """Settings of motion-guided densification.
 
-    `start` is the step before which the plain rule holds; let the motion's own warm-up
-    and some hundred steps pass first. In the soft form a Gaussian at rest needs 1 +
-    `beta` times the gradient, one at the threshold `motion` needs twice as much, and a
-    fast one needs no more than without this effect. The paper does not say how large
-    the threshold is. Where all Gaussians move by more than ours, growth is what it is
-    without this effect, bit for bit: so in the built-in scene from tracks, where what
-    is at rest is moved by 0.015 to 0.03 of the extent.
+    `start` is the step from which motion counts. It should be some hundred steps after
+    the warm-up of the motion. In the soft form a static Gaussian needs 1 + `beta` times
+    the gradient, one at the threshold `motion` needs twice as much, and a fast one no
+    more than without this effect. The paper does not give the threshold. Where all
+    Gaussians move by more than ours, growth is unchanged, bit for bit. This is so in
+    the built-in scene from tracks, where static objects move by 0.015 to 0.03 of the
+    extent.
     """
 
     form: str = "soft"  # or "hard", the conjunction as printed
@@ -79,7 +79,7 @@ def no_travel(gaussians: Splats | Gaussians) -> Travel:
     return Travel(jnp.full_like(mean, most), jnp.full_like(mean, -most))
 
 
-def travelled(state: Travel, canonical: Gaussians, moved: Gaussians) -> Travel:
+def traveled(state: Travel, canonical: Gaussians, moved: Gaussians) -> Travel:
     """One more instant.
 
     A displacement counts relative to the median displacement of the active rows at that
@@ -102,10 +102,18 @@ def travelled(state: Travel, canonical: Gaussians, moved: Gaussians) -> Travel:
 def common_motion(
     displacement: Float[Array, "gaussians 3"], counts: Bool[Array, " gaussians"]
 ) -> Float[Array, "3"]:
-    """The median of each component over the rows that count; zero if none does.
+    """Compute the median displacement of the selected Gaussians, zero if there are
+    none.
 
-    Of every k-th row only, at most `MEDIAN_ROWS` of them: where most are at rest, or
-    are moved as one, such a sample says so as well as all do.
+    It uses every k-th Gaussian, at most `MEDIAN_ROWS`. If most are static, or move
+    together, such a sample suffices.
+
+    Args:
+      displacement: Displacements.
+      counts: Selected Gaussians.
+
+    Returns:
+      The median of each component.
     """
     every = max(1, -(-displacement.shape[0] // MEDIAN_ROWS))
     counts, displacement = counts[::every], displacement[::every]
@@ -116,13 +124,20 @@ def common_motion(
 
 
 def motion(state: Travel) -> Float[np.ndarray, " gaussians"]:
-    """How far each row was seen to move, in scene units; zero if never seen. Host side.
+    """Compute the observed motion of each Gaussian, on the host.
 
-    Half the diagonal of its box, which does not depend on the order of the frames. On a
-    straight path through evenly spread instants that is the largest distance from its
-    mean place; in general it is between 1/2 and sqrt(3) times as large, and one instant
-    makes no motion. Kept instead, the largest distance from the mean so far depends on
-    the order: 0.9 to 1.6 times on a path that swings once through 24 frames.
+    It is half the diagonal of the bounding box of its positions, which does not depend
+    on the order of the frames. On a straight path with evenly spaced times it is the
+    largest distance from the mean position. In general it is between 1/2 and sqrt(3)
+    times as large, and one time gives no motion. A running largest distance from the
+    mean would depend on the order: 0.9 to 1.6 times on a path that swings once through
+    24 frames.
+
+    Args:
+      state: Bounding boxes.
+
+    Returns:
+      Distances in scene units, zero if never observed.
     """
     low, high = (np.asarray(x, np.float64) for x in state)
     seen = (low <= high).all(axis=1, keepdims=True)
@@ -136,12 +151,21 @@ def motion(state: Travel) -> Float[np.ndarray, " gaussians"]:
 def growth_factor(
     spec: MotionGrowthSpec, motion: Float[np.ndarray, " gaussians"], threshold: float
 ) -> Float[np.ndarray, " gaussians"]:
-    """What the gradient counts, in [0, 1]; `motion` and `threshold` in one unit.
+    """Compute the factor of the gradient in [0, 1].
 
-    Soft: 1 / (1 + beta^(1 - m/tau)). Of the threshold tau_grad (1 + beta exp(-m/tau)),
-    the obvious softening, no limit is equation 7: as beta grows it stops everything
-    that moves less than tau log(beta), in the end all. With m log(beta) / tau in the
-    exponent the half-way point stays at tau, and beta to infinity is the hard form.
+    Soft: 1 / (1 + beta^(1 - m/tau)). The obvious softening, a threshold tau_grad (1 +
+      beta
+    exp(-m/tau)), does not converge to equation 7: with increasing beta it stops
+    everything that moves less than tau log(beta). With m log(beta) / tau in the
+    exponent the midpoint stays at tau, and the limit of beta is the hard form.
+
+    Args:
+      spec: Settings.
+      motion: Motion of each Gaussian.
+      threshold: Threshold tau in the same unit.
+
+    Returns:
+      Factors.
     """
     if spec.form == "hard":
         return (motion > threshold).astype(np.float64)
@@ -152,7 +176,7 @@ def growth_factor(
 def grow_score(
     spec: MotionGrowthSpec, extent: float, state: Travel, step: int
 ) -> Float[np.ndarray, " gaussians"]:
-    """The factor of each row's gradient at a step; host side."""
+    """Compute the factor of each Gaussian's gradient at a step, on the host."""
     rows, dtype = state.low.shape[0], state.low.dtype
     if step < spec.start:
         return np.ones(rows, dtype)
@@ -192,7 +216,7 @@ class MotionGuided:
 
     def update(self, state: Guided, info: StepInfo) -> Guided:
         """Return the state after one more view."""
-        travel = travelled(state.travel, info.canonical, info.moved)
+        travel = traveled(state.travel, info.canonical, info.moved)
         return Guided(self.base.update(state.stats, info), travel)
 
     def events(self, steps: int) -> tuple[StrategyEvent, ...]:

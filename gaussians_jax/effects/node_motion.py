@@ -1,4 +1,5 @@
-"""Motion of all Gaussians by a few control nodes that a network moves as rigid bodies.
+"""Sparse control nodes that a network moves as rigid bodies, and that move all
+Gaussians.
 
 SC-GS (Huang et al. 2024, CVPR, arXiv:2312.14937, "Sparse-Controlled Gaussian
 Splatting"): nodes with a place and a radius of influence, a network that makes a turn
@@ -70,7 +71,7 @@ ROWS_AT_ONCE, NODES_AT_ONCE = 512, 32  # blocks that are passed over where nothi
 
 @dataclasses.dataclass(frozen=True)
 class MaskSpec:
-    """A learned mask of nodes: which of them move at all (EDGS).
+    """A learned mask that selects moving nodes (EDGS).
 
     Each node keeps a number of its own, where EDGS has a small network of an anchor's
     feature; its kernel and loss were not at hand. Sizes and weights are our choice.
@@ -92,7 +93,7 @@ class MaskSpec:
 
 @dataclasses.dataclass(frozen=True)
 class NodeMotionSpec:
-    """How many nodes, how many carry a Gaussian, and the network that moves them.
+    """Number of nodes, nodes per Gaussian, and the network that moves the nodes.
 
     Nodes, nearest nodes and the network are the paper's; the number of links and the
     weight of the rigid term, of squared scene extents, are our choice. `moving_share`
@@ -144,7 +145,7 @@ class NodeMotionSpec:
 
 
 class Nodes(NamedTuple):
-    """What is trained of the nodes, and the network that moves them."""
+    """Trained parameters of the nodes, and their network."""
 
     position: Float[Array, "nodes 3"]  # scene units
     log_radius: Float[Array, " nodes"]  # of the influence, scene units
@@ -153,7 +154,7 @@ class Nodes(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What is found when rows change and kept until they do again."""
+    """Neighborhoods, which are updated when the number of Gaussians changes."""
 
     near: Int[Array, "gaussians near"]
     links: Links | None  # None where nothing asks for them
@@ -190,19 +191,31 @@ def init(key: Key[Array, ""], spec: NodeMotionSpec, dtype=jnp.float32) -> Nodes:
 
 
 def openness(mask: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
-    """How much of its motion a node has, in [0, 1]: a logistic function, stretched.
+    """Compute the mask of each node in [0, 1], a stretched logistic function.
 
-    Exactly zero where that function is below 1/12 (and one above 11/12), without a
-    slope from there on: such a node stays at rest and nothing is computed for it. The
-    stretch is that of Louizos et al. 2018, arXiv:1712.01312, without its noise.
+    It is exactly zero where the function is below 1/12 (and one above 11/12), without a
+    gradient beyond. Such a node is static and nothing is computed for it. The stretch
+    is that of Louizos et al. 2018, arXiv:1712.01312, without noise.
+
+    Args:
+      mask: Logits.
+
+    Returns:
+      The mask.
     """
     return jnp.clip(STRETCH * jax.nn.sigmoid(mask) - (STRETCH - 1) / 2, 0, 1)
 
 
 def placed(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes:
-    """The nodes at these places, each as wide as its neighbors are far; host side.
+    """Initialize nodes at positions, with the distance to their neighbors as radius.
 
-    Fewer places than nodes are taken in turn: nodes that coincide share the influence.
+    Args:
+      nodes: Parameters of the nodes.
+      position: Positions. Fewer than nodes are repeated, and coincident nodes share
+        their influence.
+
+    Returns:
+      Parameters of the nodes.
     """
     count, kind = len(nodes.position), nodes.position.dtype
     everywhere = position[np.arange(count) % len(position)]
@@ -216,7 +229,7 @@ def placed(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes:
 def moves(
     nodes: Nodes, spec: NodeMotionSpec, extent: float, time: Float[Array, ""]
 ) -> Moves:
-    """How the nodes stand at a time; `extent` is the unit of shifts, scene units."""
+    """Evaluate the motion of the nodes at a time, in units of `extent`."""
     place = jax.vmap(lambda one: encoding.encode(spec.position, one, None))
     moment = encoding.encode(spec.time, time[None], None)
     features = place(nodes.position)
@@ -259,7 +272,9 @@ def find(
 def displaced(
     nodes: Nodes, now: Moves, found: Found, mean: Float[Array, "gaussians 3"]
 ) -> skinning.Displaced:
-    """What the nodes do to Gaussians; blocks in which none moves are passed over."""
+    """Evaluate the motion of Gaussians by their nodes, skipping blocks that do not
+    move.
+    """
 
     def evaluate(near, mean):
         return skinning.displaced(nodes.position, nodes.log_radius, now, near, mean)
@@ -276,7 +291,7 @@ def arap_loss(
     linked: Links,
     times: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> Float[Array, ""]:
-    """How far linked nodes are from moving as one body, in squared extents."""
+    """Measure the deviation of linked nodes from rigid motion, in squared extents."""
     places = [nodes.position + moves(nodes, spec, extent, time).shift for time in times]
     return skinning.arap_error(*(place / extent for place in places), linked)
 
@@ -284,10 +299,19 @@ def arap_loss(
 def fit_to_paths(
     spec: NodeMotionSpec, extent: float, paths: Paths, key: Key[Array, ""]
 ) -> Guess:
-    """Nodes spread over what moves and over what is at rest; host side.
+    """Distribute nodes over moving and static points, on the host.
 
-    Paths are brought to the middle of the film by the rigid bodies they belong to. The
-    network starts from no motion, and is asked for none at the nodes at rest.
+    Paths are moved to the middle of the video by the rigid bodies they belong to. The
+    network starts without motion, and is penalized for motion of static nodes.
+
+    Args:
+      spec: Settings.
+      extent: Scene extent in scene units.
+      paths: 3D paths of points.
+      key: Random key.
+
+    Returns:
+      Initial guess of a fit.
     """
     unit, canonical = paths.unit, path_fit.places_at_one_moment(paths)
     still = np.zeros((0, 3))
@@ -347,7 +371,9 @@ class Bound:
         return MotionParams(shared=Nodes(place, radius, now, mask))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
-        """Initialize the network, with nodes spread over the Gaussians; host side."""
+        """Initialize the network, with nodes distributed over the Gaussians, on the
+        host.
+        """
         _, shared_key = jax.random.split(key)
         means = np.asarray(gaussians.mean)
         places = means[skinning.farthest_points(means, self.spec.nodes)]

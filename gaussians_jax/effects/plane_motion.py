@@ -1,4 +1,4 @@
-"""Motion of all Gaussians from planes over space and time, read by a tiny network.
+"""Motion from planes over space and time (4DGS), decoded by a small network.
 
 4DGS (Wu et al. 2024, arXiv:2310.08528): six planes at several resolutions are read at
 the canonical mean and the time (equation 7, the product over planes, levels side by
@@ -46,7 +46,8 @@ Features = Float[Array, "gaussians levels features"]
 
 @dataclasses.dataclass(frozen=True)
 class PlaneMotionSpec:
-    """Planes, network, and what keeps the planes smooth; sizes as for HyperNeRF scenes.
+    """Planes, network, and regularization of the planes, with the sizes for HyperNeRF
+    scenes.
 
     Rates of planes do not depend on the scene's unit, heads answer in its extents.
     Weights are of the sums over planes and levels; zero leaves a term out.
@@ -130,7 +131,7 @@ def places(
 def prepare(
     params: Motion, spec: PlaneMotionSpec, place: Float[Array, "gaussians 3"]
 ) -> Features:
-    """What the planes of space say, for all times the same while parameters are."""
+    """Read the spatial planes, which do not depend on the time."""
     return jax.vmap(lambda one: planes.space_features(spec.planes, params.planes, one))(
         place
     )
@@ -143,9 +144,17 @@ def offsets(
     time: Float[Array, ""],
     ready: Features,
 ) -> Offsets:
-    """Offsets at one time of Gaussians at places in the unit cube; means in extents.
+    """Compute the offsets of Gaussians at a time.
 
-    `ready` is what `prepare` made of the same places.
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      place: Positions in the unit cube.
+      time: Normalized time.
+      ready: Result of `prepare` for the same positions.
+
+    Returns:
+      Offsets, those of means in scene extents.
     """
     lines = planes.at_time(params.planes, time)
 

@@ -1,4 +1,4 @@
-"""Motion of each Gaussian as a polynomial of the time of its own.
+"""Motion of each Gaussian as a polynomial in time, about a time of its own.
 
 Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812): a Gaussian has a time of its own
 m, at which it is where its row says; s = t - m later its mean is off by a cubic in s
@@ -39,7 +39,7 @@ NAME = "polynomial_motion"
 
 @dataclasses.dataclass(frozen=True)
 class FadingSpec:
-    """How opacities come and go; the first width is in films.
+    """Opacity over time, with the initial width in units of the video.
 
     One film of width leaves 1/e of the opacity at its far end: the published start.
     Times of their own are drawn over the film; without fading all are its middle.
@@ -55,7 +55,7 @@ class FadingSpec:
 
 @dataclasses.dataclass(frozen=True)
 class PolynomialMotionSpec:
-    """The degree, and how coefficients learn; rates of means are in scene extents."""
+    """Degree and learning rates. Rates of means are in scene extents."""
 
     degree: int = 3
     fading: FadingSpec | None = FadingSpec()
@@ -81,7 +81,7 @@ class PolynomialMotionSpec:
 
 
 class Polynomials(NamedTuple):
-    """What is kept of each Gaussian."""
+    """Per-Gaussian parameters of the motion."""
 
     shift: Float[Array, "gaussians degree 3"]  # scene units a film, a film squared, ...
     turn: Float[Array, "gaussians 3"]  # rotation vector, rad a film, in world axes

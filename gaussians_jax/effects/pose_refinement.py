@@ -1,15 +1,15 @@
-"""Cameras of the frames that are learned from, refined while the scene is.
+"""Refinement of the training cameras during training.
 
-A screw for each frame, in the camera's own frame, descends with the Gaussians: the pose
-refinement of BARF (Lin et al. 2021, arXiv:2104.06405) for splats, as MotionGS has it
-beside its flow (Zhu et al. 2024, arXiv:2410.07707, section 4.3; there by turns with the
-Gaussians, here together) and gsplat as an option. The mean of all screws is taken off,
-or cameras and scene could drift away together. No slope goes through that mean: each
-frame's would reach all others, and Adam makes whole steps of the smallest slopes, so
-that cameras walk off until they are seen themselves.
+One screw per frame, in the camera's frame, is optimized with the Gaussians. This is the
+pose refinement of BARF (Lin et al. 2021, arXiv:2104.06405) for splats, which MotionGS
+uses with its flow (Zhu et al. 2024, arXiv:2410.07707, section 4.3, there alternating
+with the Gaussians) and gsplat as an option. The mean of all screws is subtracted, or
+cameras and scene could drift together. No gradient passes through that mean: each
+frame's would reach all others, and Adam normalizes even the smallest gradients, so that
+cameras would drift before their frame is first used.
 
-What it is worth where cameras are off by a pixel, and where they come from a structure
-from motion that left out what moves: `docs/results/ablate_poses.md` and
+The gain for cameras that are wrong by a pixel, and for cameras from structure from
+motion with masked objects, is in `docs/results/ablate_poses.md` and
 `ablate_poses_bookshelf.md`.
 """
 
@@ -33,11 +33,12 @@ Screws = Float[Array, "frames 6"]  # turn, and shift over the depth of the scene
 
 @dataclasses.dataclass(frozen=True)
 class PoseRefinementSpec:
-    """How fast the cameras learn, in rad of a turn and of a shift seen at mid depth.
+    """Learning rate of the cameras, in rad of a rotation and of a translation at mid
+    depth.
 
-    A frame's own screw learns once in so many steps as there are frames, and Adam's
-    step then counts some eight times. Beside a flow (`motion_flow`) it learns in the
-    steps of the frame before, too.
+    A frame's screw is updated once in as many steps as there are frames, and then by
+    about eight of Adam's steps. With a flow loss (`motion_flow`) it is also updated in
+    the steps of the previous frame.
     """
 
     learning_rate: float = 1e-4
@@ -69,10 +70,18 @@ def _moved(screws, cameras, depth):
 
 
 def found(screws: Screws, capture: Capture, depth: float) -> Capture:
-    """A capture with its cameras as training found them; host side.
+    """Return a capture with refined cameras, on the host.
 
-    A frame that was not learned from lies between the corrections of those before and
-    after it of the same physical camera; what no such camera filmed stays as it is.
+    The correction of a held-out frame is interpolated between the previous and next
+    training frame of the same physical camera. Frames of other cameras are unchanged.
+
+    Args:
+      screws: Corrections.
+      capture: The capture.
+      depth: Mid depth in scene units.
+
+    Returns:
+      The capture.
     """
     own = np.asarray(screws)
     own = own - own.mean(axis=0)
@@ -118,5 +127,5 @@ class Bound:
         return refined(params, cameras, self.depth)
 
     def apply_to_capture(self, params: Screws, capture: Capture) -> Capture:
-        """Return the capture with the refined cameras of all frames; host side."""
+        """Return the capture with the refined cameras of all frames, on the host."""
         return found(params, capture, self.depth)

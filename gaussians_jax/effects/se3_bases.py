@@ -43,12 +43,12 @@ SMOOTHNESS, TURN_SMOOTHNESS = 0.02, 0.002  # weights of second differences of kn
 
 @dataclasses.dataclass(frozen=True)
 class SE3BasesSpec:
-    """How many bases over how many knots, and how they learn.
+    """Number of bases and knots, and their learning rates.
 
-    `still_logit` is the first logit of staying; from 4 on points at rest keep 13 % of
-    their neighbors' motion, from 9 on 0.1 %. At 100 they could never move: 35.5 for
-    36.7 dB on a film of a hand before books, whose cameras are off by half a pixel. The
-    rate of shifts is in scene extents.
+    `still_logit` is the initial logit of the static basis. From 4 on static points keep
+    13 % of their neighbors' motion, from 9 on 0.1 %. At 100 they could never move: 35.5
+    instead of 36.7 dB on a video of a hand in front of books, whose cameras are wrong
+    by half a pixel. The rate of translations is in scene extents.
     """
 
     bases: int = 8
@@ -172,7 +172,15 @@ def deform(
 
 
 def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
-    """Groups of points that move as rigid bodies, a basis for each; host side."""
+    """Group points into rigid bodies, with one basis for each, on the host.
+
+    Args:
+      spec: Settings.
+      paths: 3D paths of points.
+
+    Returns:
+      Initial guess of a fit.
+    """
     times, position, known, unit, *_ = paths
     canonical_frame = len(times) // 2
     label = rigid_groups.labels(position, known, spec.bases)
@@ -206,7 +214,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
 
 
 def _at_knots(track, times, spec):
-    """[bases, knots, 3] values between frames; bases without a group stay at rest."""
+    """Interpolate values at the knots: [bases, knots, 3], static without a group."""
     knots = np.linspace(0, 1, spec.knots)
     table = np.zeros((spec.bases, spec.knots, 3))
     for group, one in enumerate(track):

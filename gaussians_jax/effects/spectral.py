@@ -43,9 +43,9 @@ def _positive(what, **values):
 class WaveletSpec:
     """Mean squared differences of the high bands of `levels` levels, finest first.
 
-    Level l counts `level_factor`**l times. Equation 13 has equal weights; natural
-    errors grow 2 to 10 times from level to level, so it sees mostly the coarsest.
-    1/4 takes out what orthonormal coefficients of a smooth error gain each level.
+    Level l has the weight `level_factor`**l. Equation 13 has equal weights. Typical
+    errors grow 2 to 10 times from level to level, so it measures mostly the coarsest.
+    1/4 compensates the growth of orthonormal coefficients of a smooth error.
     """
 
     most: float = 0.1  # weight where the gate is fully open
@@ -63,7 +63,9 @@ class WaveletSpec:
 
 @dataclasses.dataclass(frozen=True)
 class FourierSpec:
-    """Mean squared differences of amplitudes; the mean color counts `dc_weight`."""
+    """Mean squared differences of amplitudes, with weight `dc_weight` for the mean
+    color.
+    """
 
     most: float = 0.1  # weight where the gate is fully open
     dc_weight: float = 1.0
@@ -79,13 +81,13 @@ class FourierSpec:
 
 @dataclasses.dataclass(frozen=True)
 class SpectralSpec:
-    """Which losses, and what becomes of their weights; each starts at opening * most.
+    """The losses, and the schedule of their weights, which start at opening * most.
 
     `gate` "learned" is equation 16. The loss grows with the gate, so descent can only
-    shut it: it acts as an annealing that paces itself by `learning_rate`, whatever the
-    losses are. "floor" stops at `floor` of `most`, "fixed" stays at its opening,
-    "schedule" falls to zero along half a cosine. docs/results/frequency_gates.md
-    compares them.
+    close it: it acts as an annealing whose pace is `learning_rate`, for any losses.
+    With "floor" they stop at `floor` of `most`, with "fixed" they stay constant, and
+    with "schedule" they fall to zero along half a cosine.
+    docs/results/frequency_gates.md compares them.
     """
 
     wavelet: WaveletSpec | None = WaveletSpec()
@@ -122,7 +124,7 @@ class SpectralSpec:
 
 
 class Bands(NamedTuple):
-    """The high bands of one level; the first letter is along the width."""
+    """High bands of one level, whose first letter is along the width."""
 
     hl: Float[Array, "height width channels"]  # across upright edges
     lh: Float[Array, "height width channels"]  # across level edges
@@ -137,7 +139,7 @@ class Pyramid(NamedTuple):
 
 
 class Gates(NamedTuple):
-    """Logits, or weights, of the two losses; None for one that is not there."""
+    """Logits, or weights, of the two losses, None for a disabled one."""
 
     wavelet: Float[Array, ""] | None
     fourier: Float[Array, ""] | None
@@ -145,11 +147,18 @@ class Gates(NamedTuple):
 
 @checked
 def haar_pyramid(image: Float[Array, "height width channels"], levels: int) -> Pyramid:
-    """Split a picture of any size `levels` times; orthonormal.
+    """Decompose an image of any size by an orthonormal Haar transform.
 
     An odd last row or column is repeated (half-sample symmetric extension), so that a
-    constant has no high bands. The energy kept is that of the extended picture. From
-    one pixel on, further levels have zero bands.
+    constant has no high bands. The energy is that of the extended image. From one pixel
+    on, further levels have zero bands.
+
+    Args:
+      image: The image.
+      levels: Number of levels.
+
+    Returns:
+      Bands of each level, and the low band.
     """
     high, low = [], image
     for _ in range(levels):
@@ -181,10 +190,18 @@ def filled(
 ) -> tuple[
     Float[Array, "height width channels"], Float[Array, "height width channels"]
 ]:
-    """Both pictures, widened, with the truth for the render where it is not valid.
+    """Fill invalid pixels of the render with the truth, in at least float32.
 
-    A spectrum needs whole pictures. Pixels that are not valid then add no difference
-    and have no slope; a truth that is not finite there counts as black in both.
+    A spectrum needs a complete image. Invalid pixels then add no difference and have no
+    gradient. A truth that is not finite there counts as black in both.
+
+    Args:
+      render: Rendered image.
+      truth: Reference image.
+      valid: Valid pixels.
+
+    Returns:
+      Both images.
     """
     render, truth = widened(render), widened(truth)
     if valid is None:
@@ -220,7 +237,8 @@ def fourier_loss(
     truth: Float[Array, "height width channels"],
     valid: Bool[Array, "height width"] | None = None,
 ) -> Float[Array, ""]:
-    """Equations 14 and 15: the mean squared difference of all Fourier amplitudes.
+    """Compute the mean squared difference of all Fourier amplitudes, equations 14 and
+    15.
 
     The transform is orthonormal; unscaled it would be height * width times as much.
     Amplitudes are blind to phase: a picture that is shifted around its edges costs
@@ -250,7 +268,7 @@ def amplitudes(
 
 
 def _times_in_whole_spectrum(width, dtype):
-    """How often a column of the half spectrum stands in the whole one: 1 or 2."""
+    """Return how often columns of the half spectrum occur in the full one: 1 or 2."""
     columns = jnp.arange(width // 2 + 1)
     alone = (columns == 0) | (2 * columns == width)
     return jnp.where(alone, 1, 2).astype(dtype)
@@ -275,9 +293,16 @@ def _start_of_sigmoid(spec):
 def weights(
     spec: SpectralSpec, gates: Gates | None, step: Int[Array, ""], steps: int
 ) -> Gates:
-    """The weights of the losses at one step of `steps`; equation 16 for "learned".
+    """Compute the weights of the losses at a step.
 
-    `gates` are the logits, None where the gate has none.
+    Args:
+      spec: Settings.
+      gates: Logits of a learned gate (equation 16), None otherwise.
+      step: Traced step.
+      steps: Total number of steps.
+
+    Returns:
+      The weights.
     """
     begun = jnp.where(step < spec.after, 0.0, 1.0)
 
@@ -312,7 +337,7 @@ def terms(
     truth: Float[Array, "height width channels"],
     valid: Bool[Array, "height width"] | None = None,
 ) -> dict[str, Term]:
-    """Those of equation 17, and their weights to log."""
+    """Compute the losses of equation 17, and their weights for logging."""
     weighed = {}
     parts = (
         ("wavelet", wavelet_loss, spec.wavelet, weight.wavelet),

@@ -1,4 +1,4 @@
-"""Motion of each Gaussian along a cubic spline of its own.
+"""Motion of each Gaussian along its own cubic spline.
 
 SplineGS (Park et al. 2025, CVPR, arXiv:2412.09982), section 4.2, its motion-adaptive
 spline (equations 3 and 4): control points at even times, and between them a cubic
@@ -31,7 +31,7 @@ NAME = "spline_motion"
 
 @dataclasses.dataclass(frozen=True)
 class SplineMotionSpec:
-    """How many control points, and how they learn; shifts in scene extents."""
+    """Number and learning rates of control points, with shifts in scene extents."""
 
     knots: int = 12  # evenly over the film
     warm_up: int = steps(0)  # steps without motion
@@ -54,7 +54,7 @@ class SplineMotionSpec:
 
 
 class Splines(NamedTuple):
-    """What is kept of each Gaussian."""
+    """Per-Gaussian parameters of the motion."""
 
     shift: Float[Array, "gaussians knots 3"]  # from the mean of its row, scene units
     turn: Float[Array, "gaussians knots 3"]  # rotation vectors, rad, in world axes
@@ -67,7 +67,7 @@ def init(spec: SplineMotionSpec, gaussians: int, dtype=jnp.float32) -> Splines:
 
 
 def deform(rows: Splines, gaussians: Gaussians, time: Float[Array, ""]) -> Gaussians:
-    """Gaussians as they are at one time in [0, 1]; outside it, at its nearer end.
+    """Move Gaussians along their splines, with the time clamped to [0, 1].
 
     Equation 3, of shifts from the mean of the row.
     """

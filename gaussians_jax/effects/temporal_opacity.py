@@ -1,4 +1,4 @@
-"""Gaussians that are there for a part of the film only.
+"""Gaussians that are visible during a part of the video only.
 
 The temporal opacity of Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812, equation
 7 as readers quote it: the text was not at hand) by itself, beside any motion: what
@@ -31,10 +31,10 @@ ALWAYS = LOG_WIDTH_RANGE[1] / 2  # 90 films: the least share of one film is 0.99
 
 @dataclasses.dataclass(frozen=True)
 class TemporalOpacitySpec:
-    """How long a Gaussian is first seen, and how that is learned.
+    """Initial duration of visibility, and its learning rates.
 
-    `width` is over the time for which tracks near it were followed: 1/e of the opacity
-    is left so far from its own time.
+    `width` is relative to the duration of nearby tracks. 1/e of the opacity is left at
+    that distance from the Gaussian's own time.
     """
 
     width: float = 0.5
@@ -59,11 +59,18 @@ class Fading(NamedTuple):
 def visible_share(
     since: Float[Array, "*gaussians"], log_width: Float[Array, "*gaussians"]
 ) -> Float[Array, "*gaussians"]:
-    """exp(-(s / w)^2) of a time s from the middle, w = exp(`log_width`), in films.
+    """Compute exp(-(s / w)^2) with w = exp(`log_width`).
 
-    As in the paper's code; the paper writes exp(-c s^2), and c is 1 / w^2. Finite with
-    its slopes whatever the width: the published exponential of a width that is not held
-    is 0/0 at s = 0 once the width has underflowed.
+    The paper's code has the same, and the paper writes exp(-c s^2) with c = 1 / w^2.
+    Value and gradients are finite for any width. The published exponential of an
+    unclamped width is 0/0 at s = 0 once the width has underflowed.
+
+    Args:
+      since: Time s from the Gaussian's own time, in units of the video.
+      log_width: Logarithm of the width.
+
+    Returns:
+      Factors of the opacity.
     """
     held = jnp.clip(log_width, *LOG_WIDTH_RANGE)
     return jnp.exp(-jnp.square(since * jnp.exp(-held)))
@@ -86,9 +93,15 @@ def around(
     time: Float[np.ndarray, " gaussians"],
     followed: Float[np.ndarray, " gaussians"],
 ) -> Fading:
-    """Seen around a time, for as long as tracks near were followed; both in films.
+    """Initialize visibility around a time, for as long as nearby tracks, on the host.
 
-    Host side.
+    Args:
+      spec: Settings.
+      time: Normalized times.
+      followed: Durations of nearby tracks, in units of the video.
+
+    Returns:
+      Per-Gaussian parameters.
     """
     least = math.exp(LOG_WIDTH_RANGE[0])
     return Fading(time, np.log(np.maximum(spec.width * followed, least)))

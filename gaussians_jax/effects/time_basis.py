@@ -1,4 +1,5 @@
-"""Motion along a few trajectories that all Gaussians share, each in its own measure.
+"""Motion along a few trajectories that all Gaussians share, with their own
+coefficients.
 
 DynMF (Kratimenos et al. 2024, arXiv:2312.00112): a tiny network of the time alone makes
 K trajectories b_k(t), a Gaussian keeps K coefficients c_k, and is at p + sum_k c_k
@@ -45,12 +46,12 @@ REST = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class TimeBasisSpec:
-    """How many trajectories, the network that makes them, and how both learn.
+    """Number of trajectories, their network, and learning rates.
 
-    Trajectories are in scene extents (shifts) and rad (turns), coefficients are
-    numbers. Ten trajectories are published, their network is called tiny and costs the
-    same however many Gaussians there are: its size, the weight of the sparsity and the
-    rates are our choice, for no code of the paper is public.
+    Trajectories are in scene extents (translations) and rad (rotations), coefficients
+    are numbers. Ten trajectories are published, and their network is called tiny. Its
+    size, the weight of the sparsity and the rates are our choice, because no code of
+    the paper is public.
     """
 
     count: int = 10
@@ -122,7 +123,7 @@ def init_coefficients(spec: TimeBasisSpec, gaussians: int, dtype=jnp.float32):
 def at_time(
     params: MLP, spec: TimeBasisSpec, extent: float, time: Float[Array, ""]
 ) -> Trajectories:
-    """The trajectories at one time; `extent`, in scene units, is their unit."""
+    """Evaluate the trajectories at a time, with `extent` (scene units) as unit."""
     encoded = encoding.encode(spec.time, time[None], None)
     made = mlp.apply(network_spec(spec), params, encoded)
     shift, turn = (made[name].reshape(spec.count, 3) for name in ("shift", "turn"))
@@ -145,12 +146,19 @@ def deform(
 def sparsity(
     coefficients: Float[Array, "gaussians count"], active: Bool[Array, " gaussians"]
 ) -> Float[Array, ""]:
-    """Mean over the active rows of sum_k |c_k| / max_k |c_k|: how many are in use.
+    """Compute the mean over the active Gaussians of sum_k |c_k| / max_k |c_k|.
 
-    The sparsity term of DynMF, as accounts have it. It does not see how far a Gaussian
-    moves, only along how many trajectories: from one, where a single coefficient is not
-    zero, to K. The plain quotient is 0/0 for a Gaussian at rest; with `REST` added to
-    its denominator it falls to zero there, and its slope is at most K / REST.
+    The sparsity term of DynMF, as others describe it. It measures the number of
+    trajectories in use, from 1 to K, and not the distance. The plain quotient is 0/0
+    for a static Gaussian. With `REST` added to its denominator it goes to zero there,
+    and its gradient is at most K / REST.
+
+    Args:
+      coefficients: Coefficients of the Gaussians.
+      active: Active Gaussians.
+
+    Returns:
+      The mean.
     """
     # Not `abs`, whose slope at zero is one: all that rests would be pushed one way.
     size = coefficients * jnp.sign(coefficients)

@@ -49,7 +49,7 @@ def watch(canonical, displacements):
 
     def body(state, displacement):
         moved = canonical._replace(mean=canonical.mean + displacement)
-        return motion_growth.travelled(state, canonical, moved), None
+        return motion_growth.traveled(state, canonical, moved), None
 
     first = motion_growth.no_travel(canonical)  # its means are all that is read
     return jax.lax.scan(body, first, displacements)[0]
