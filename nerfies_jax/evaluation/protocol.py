@@ -4,7 +4,7 @@ Everything is in scene units. `heldout.heldout_metrics` computes the metrics.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.synthetic import TRUTH_FILE, SceneTruth
 from nerfies_jax.capture.synthetic import truth as truths
 from nerfies_jax.measure import geometry_quality
-from nerfies_jax.training.model import TrainState
 
 CORRECT_WITHIN = 0.01  # scene units: a quarter of the default cube's half-side
 STATIC_POINTS = 500  # of the capture's static points, to see whether they drift
@@ -191,5 +190,5 @@ def _track_errors(path, truth, seen):
     return geometry_quality.track_errors(path, truth, seen, CORRECT_WITHIN)
 
 
-# (spec, metadata, state, capture, known) -> None where nothing is warped
-Follow = Callable[[Any, Any, TrainState, Capture, GroundTruth], PointTracks | None]
+# (spec, metadata, state, capture, known, effects=()) -> None where nothing is warped
+Follow = Callable[..., PointTracks | None]

@@ -138,7 +138,7 @@ def follow(
     Returns:
       The changed config, and lines of text.
     """
-    advice = advise_for(findings, config.preset)
+    advice = advise_for(findings, config.preset_name)
     lines = [
         *table(findings, prices.format_prices(findings)),
         f"effects: {advice.arguments()}",

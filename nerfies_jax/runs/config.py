@@ -94,6 +94,20 @@ class RunConfig:
     overrides: tuple[str, ...] = ()  # of the preset's fields, as PATH=VALUE
     seed: int = 0
 
+    @property
+    def preset_name(self) -> str:
+        """Name of the preset.
+
+        Raises:
+          ValueError: If none is chosen yet.
+        """
+        if self.preset is None:
+            raise ValueError(
+                "these settings name no preset yet; choose one, or let "
+                "`adviser.by_tracks` choose it by the tracks of the capture"
+            )
+        return self.preset
+
 
 @dataclasses.dataclass(frozen=True)
 class Preparation:

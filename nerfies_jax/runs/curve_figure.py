@@ -36,7 +36,7 @@ def save(path: pathlib.Path, run: Run, trained: Trained, scored: Scored):
         counts = len(scored.rows), len(trained.watched)
         psnr = evaluation.known_mean(scored.psnr)
         final = pictures.Final(trained.result.seconds, psnr, *counts)
-    pictures.curve({run.config.preset: points}, path, final)
+    pictures.curve({run.config.preset_name: points}, path, final)
     return path
 
 

@@ -87,7 +87,8 @@ def make(
     # Products that replace earlier ones stay together.
     attempt = Attempts(together=(folder / METRICS).exists())
     with _staged(folder) as place:
-        player, unplayed = attempt(([], []), save_player, place, run, trained)
+        nothing: tuple[list[report.Figure], list[str]] = ([], [])
+        player, unplayed = attempt(nothing, save_player, place, run, trained)
         # Compiles while all else is written, but for the player, whose own compiling
         # fills both cores.
         with step_profile.profiling(run, state) as profile:
@@ -417,7 +418,7 @@ def save_player(
     first = evaluation.view_of(run.capture, int(run.capture.train[0]))
     try:
         state = trained.result.state
-        poster = evaluation.as_picture(trained.renderer(state, first).color)
+        poster = evaluation.as_picture(np.asarray(trained.renderer(state, first).color))
         player = write(
             folder / "player.html",
             f"{run.capture.name}: {run.config.preset}",

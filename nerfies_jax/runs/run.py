@@ -71,7 +71,7 @@ def new_run(config: RunConfig, stored: Capture | None = None) -> Run:
     Raises:
       ValueError: If it cannot be opened, or has no held-out frames.
     """
-    representation = representations.of_preset(config.preset)
+    representation = representations.of_preset(config.preset_name)
     run = open_run(config, representation, scene_spec(config), stored)
     if not len(run.capture.heldout):  # before a training that ends without a score
         raise ValueError(
@@ -186,8 +186,8 @@ def scene_spec(config: RunConfig) -> Any:
     Returns:
       The spec, with schedules stretched to the number of steps.
     """
-    representation = representations.of_preset(config.preset)
-    spec = representation.presets[config.preset]
+    representation = representations.of_preset(config.preset_name)
+    spec = representation.presets[config.preset_name]
     steps = config.steps
     for words in config.overrides:
         if words.startswith("steps="):
@@ -375,7 +375,7 @@ def saved_run(
             "leave them out to continue it, or start anew in another folder, out=..."
         )
     source = dataclasses.replace(config.source, **moved)
-    if source.capture is not None and not source.capture.exists():
+    if source.capture is not None and not pathlib.Path(source.capture).exists():
         raise CaptureNotFound(folder, source.capture)
     run = open_run(dataclasses.replace(config, source=source), kind, spec)
     same_capture.check(folder, run.capture)

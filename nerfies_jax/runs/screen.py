@@ -80,12 +80,13 @@ class Screen:
           The Gaussians.
         """
         if look.without not in self._splatting:
-            run = self.run
-            self._splatting[look.without] = run.representation.splatting(
+            run, splatting = self.run, self.run.representation.splatting
+            assert splatting is not None  # `in_browser`
+            self._splatting[look.without] = splatting(
                 run.spec, run.metadata, look.without
             )
-        splatting = self._splatting[look.without]
-        return splatting(state, look.time, look.appearance, np.asarray(eye.position))
+        draw = self._splatting[look.without]
+        return draw(state, look.time, look.appearance, np.asarray(eye.position))
 
     def tile_seconds(self, look: Look) -> float | None:
         """Return the time of a tile, without compilation.
@@ -121,18 +122,17 @@ class Screen:
         renderer = self._renderer(look.without)
         camera = interactive.camera_of(eye, self.pyramid.size(level))
         camera = interactive.tile_camera(camera, self.pyramid, cell)
-        view = in_default_precision(
-            View(camera, np.float32(look.time), np.int32(look.appearance))
-        )
+        leaves = camera, np.float32(look.time), np.int32(look.appearance)
+        view = in_default_precision(View._make(leaves))
         rendering = renderer(state, view)
         limits = self._limits.get(look.channel)
         distance = None
-        if look.channel == "motion":
+        if look.channel == "motion" and self._move is not None:
             start = view._replace(time=in_default_precision(np.float32(0)))
             distance = model_flow.picture_distance(
                 self._move, state, view, start, rendering
             )
-            if level:
+            if level and limits is not None:
                 # A tile of its own range would differ in color from its neighbors.
                 distance = np.minimum(distance, limits[1])
         image = interactive.as_channel(look.channel, rendering, distance, limits)

@@ -217,10 +217,11 @@ class Viewer:
         away = float(np.linalg.norm(focus - first.position))
         server.scene.set_up_direction(tuple(camera_paths.up_axis(capture)))
         start = server.initial_camera
-        start.position = first.position
+        position, rows = map(np.asarray, (first.position, first.camera_from_world))
+        start.position = position
         # On the viewing axis, so that the page opens with the first training view.
-        start.look_at = first.position + away * first.camera_from_world[2]
-        start.up = -first.camera_from_world[1]
+        start.look_at = position + away * rows[2]
+        start.up = -rows[1]
         start.fov = vertical_fov(first, capture.size)
         # At the start one stands among them: their lines would hide the scene.
         self._frusta = server.scene.add_frame(
@@ -239,7 +240,7 @@ class Viewer:
                 thickness_units="screen",
                 color=(255, 150, 40),
                 wxyz=turn.as_quat(scalar_first=True),
-                position=one.position,
+                position=np.asarray(one.position),
             )
         return away
 

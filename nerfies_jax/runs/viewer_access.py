@@ -7,6 +7,7 @@ resolves to 127.0.0.1 (DNS rebinding), and operate the viewer.
 
 import contextlib
 import http
+import importlib
 import logging
 import threading
 import urllib.parse
@@ -60,7 +61,7 @@ def guarded() -> Iterator[None]:
     Yields:
       None.
     """
-    import websockets.asyncio.server as websockets_server
+    websockets_server: Any = importlib.import_module("websockets.asyncio.server")
 
     with _patching:
         original = websockets_server.serve

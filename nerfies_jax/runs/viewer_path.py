@@ -4,7 +4,7 @@ import pathlib
 import shlex
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import Any
 
 import numpy as np
@@ -54,11 +54,11 @@ class PathPanel:
         run_folder: pathlib.Path,
         seconds: float,
         frustum_scale: float,
-        ordered: Callable[[Callable], Callable],
+        ordered: Callable[..., Callable],
         show_time: Callable[[float], None],
     ):
         self.keyframes: list[Keyframe] = []
-        self.rendering: Iterator[int] | None = None
+        self.rendering: Generator[int, TrainState, None] | None = None
         self._server, self._screen, self._folder = server, screen, run_folder
         self._scale, self._ordered, self._show_time = frustum_scale, ordered, show_time
         self._preview: tuple[Any, CameraPath, float] | None = (

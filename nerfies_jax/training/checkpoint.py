@@ -78,7 +78,9 @@ class Checkpoints:
                 "resume it, or choose another folder"
             )
         for step in present:
-            if step > after:  # left behind by a fall-back, never to be continued
+            if (
+                after is not None and step > after
+            ):  # left behind by a fall-back, never to be continued
                 shutil.rmtree(self.folder / str(step))
         self._remove_unfinished()
         self._writer = concurrent.futures.ThreadPoolExecutor(1, "checkpoints")
@@ -102,7 +104,7 @@ class Checkpoints:
         about = {**self._about, "step": step, "record": record, "leaves": notes}
         self._writing = self._writer.submit(self._write, step, leaves, about)
 
-    def failure(self, wait: bool = False) -> SaveError | None:
+    def failure(self, wait: bool = False) -> BaseException | None:
         """Return the error of the last save, once.
 
         Args:

@@ -137,7 +137,8 @@ class Program:
         self._step = jax.jit(model.step, inline=True)
         self._devices, self._options = model.devices, model.compiler_options
         self._shapes = jax.tree.map(_abstract, (self._on_all(state), frames))
-        self._lowered, self._programs = {}, {}
+        self._lowered: dict[int, jax.stages.Lowered] = {}  # by the number of steps
+        self._programs: dict[int, jax.stages.Compiled] = {}
         self.length = 1 if steps < FEW_STEPS else self._most_at_once()
         self._lower(self.length)
 
@@ -191,7 +192,8 @@ class Program:
         """The state after `count` steps, or after one not finite, and the outcome."""
         self.prepare(count)
         state = self._on_all(state)
-        done, total, outcome = 0, {}, None
+        total: dict[str, float] = {}
+        done, outcome = 0, None
         for length in self._lengths(count):
             state, outcome = self._programs[length](state, frames)
             outcome = jax.device_get(outcome)
@@ -200,6 +202,7 @@ class Program:
                 total[name] = total.get(name, 0.0) + mean * (length / count)
             if not outcome.finite:
                 break
+        assert outcome is not None, count
         state = data_parallel.first_copy(state, self._devices)
         return state, outcome._replace(done=done, metrics=total)
 

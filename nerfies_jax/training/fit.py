@@ -142,10 +142,11 @@ def refine_camera(
 
     import optimistix
 
+    solver: optimistix.LevenbergMarquardt[Array, Array, None]
     solver = optimistix.LevenbergMarquardt(
         rtol=spec.tolerance / 10, atol=spec.tolerance / 10
     )
-    solution = optimistix.least_squares(
+    solution: optimistix.Solution[Array, None] = optimistix.least_squares(
         scaled, solver, start, max_steps=spec.max_steps, throw=False
     )
     step = lax.stop_gradient(solution.value)

@@ -155,6 +155,12 @@ def fit(
 class _Run:
     """The host side of one call of `fit`."""
 
+    history: History
+    checkpoints: Checkpoints | None
+    limits: tuple[float, float]  # seconds of training, and between two checkpoints
+    trained_before: float  # seconds
+    stage: event_stream.Stage
+
     def __init__(self, model, state, frames, steps, events, hooks):
         self.model, self.steps, self.hooks = model, steps, hooks
         self.step = int(state.step)
@@ -355,11 +361,11 @@ class _Run:
         if self.checkpoints is None or not trained:
             return
         if time.monotonic() - self.saved_at >= self.limits[1]:
-            self._save()
+            self._save(self.checkpoints)
 
-    def _save(self) -> None:
-        self._tell_failed_save(self.checkpoints.failure(wait=True))
-        self.checkpoints.save(self.state, self.step, self.history._asdict())
+    def _save(self, checkpoints: Checkpoints) -> None:
+        self._tell_failed_save(checkpoints.failure(wait=True))
+        checkpoints.save(self.state, self.step, self.history._asdict())
         self.saved_at = time.monotonic()
 
     def _add(self, **more: float) -> None:
@@ -387,7 +393,7 @@ class _Run:
             message += f" by {reason}"
         failure = None
         if self.checkpoints is not None:
-            self._save()
+            self._save(self.checkpoints)
             failure = self.checkpoints.failure(wait=True)
             if failure is None:
                 message += f"; saved in {self.checkpoints.folder}"

@@ -78,7 +78,8 @@ def step_ms(model: Model, state: TrainState, frames: Frames, steps: int) -> floa
       Milliseconds per step.
     """
     program, frames, _ = chunk.compiled(model, state, frames, steps)
-    left, seconds = jax.tree.map(jnp.copy, state), []
+    left = jax.tree.map(jnp.copy, state)
+    seconds: list[float] = []
     while len(seconds) < REPEATS and sum(seconds) < REPEAT_SECONDS:
         began = time.perf_counter()
         left, _ = program(left, frames, program.length)  # waits

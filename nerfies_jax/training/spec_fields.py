@@ -96,7 +96,7 @@ def field_words(kind: type) -> dict[str, str]:
     Returns:
       One line for each field, "" if it has no description.
     """
-    words = {}
+    words: dict[str, str] = {}
     for each in reversed(kind.__mro__):
         if dataclasses.is_dataclass(each):
             words |= _own_words(each)

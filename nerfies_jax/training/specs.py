@@ -147,7 +147,7 @@ def _is_record(kind):
     )
 
 
-def build_record(kind: type, fields: dict[str, Any]) -> Any:
+def build_record(kind: type[Any], fields: dict[str, Any]) -> Any:
     """Build a dataclass or NamedTuple from its fields.
 
     Args:
@@ -205,7 +205,7 @@ def record_named(name: Any) -> type:
     """
     module, _, attribute = str(name).rpartition(".")
     top, *parts = module.split(".")
-    kind = None
+    kind: Any = None
     if top in PACKAGES and all(x.isidentifier() and x[0] != "_" for x in parts):
         with contextlib.suppress(ImportError):
             kind = getattr(importlib.import_module(module), attribute, None)
