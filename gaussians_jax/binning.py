@@ -47,7 +47,7 @@ class TileRects(NamedTuple):
     left: Int[Array, " gaussians"]
     top: Int[Array, " gaussians"]
     columns: Int[Array, " gaussians"]
-    count: Int[Array, " gaussians"]  # columns times rows, zero if not rendered
+    tiles: Int[Array, " gaussians"]  # columns times rows, zero if not rendered
 
 
 class Cursor(NamedTuple):
@@ -163,7 +163,7 @@ def next_intersections(
     Returns:
       The pairs of the chunk, and the start of the following chunk.
     """
-    rank, within, following = _expand(cursor, rects.count, capacity)
+    rank, within, following = _expand(cursor, rects.tiles, capacity)
     in_use = rank >= 0
     rank = jnp.maximum(rank, 0)
     rect_columns = rects.columns[rank]
@@ -176,7 +176,7 @@ def next_intersections(
     keep = in_use & _ellipse_meets_tile(shape, row, column, log_cut, grid)
     keep &= open_tiles[jnp.where(in_use, tile, 0)]
     tile = jnp.where(keep, tile, grid.tiles)
-    return sort_pairs(tile, rank, cursor.rank, rects.count.shape[0], grid), following
+    return sort_pairs(tile, rank, cursor.rank, rects.tiles.shape[0], grid), following
 
 
 def advance(cursor: Cursor, count: Int[Array, " gaussians"], capacity: int) -> Cursor:
@@ -184,7 +184,7 @@ def advance(cursor: Cursor, count: Int[Array, " gaussians"], capacity: int) -> C
 
     Args:
       cursor: Start of this chunk.
-      count: Number of tiles of each Gaussian (`TileRects.count`).
+      count: Number of tiles of each Gaussian (`TileRects.tiles`).
       capacity: Number of pairs in a chunk.
 
     Returns:

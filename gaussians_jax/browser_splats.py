@@ -1,5 +1,7 @@
 """Trained Gaussians at one time, as a rasterizer outside this package draws them."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -53,14 +55,15 @@ def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
         behind = background.astype(color.dtype)
         color = _exposed(every, params, color, appearance)
         behind = _exposed(every, params, behind[None], appearance)[0]
-        return SplatCloud(
+        leaves: dict[str, Any] = dict(
             centers=gaussians.mean,
             covariances=jax.vmap(_covariance)(gaussians.quaternion, gaussians.scale),
             rgb=color,
             opacity=gaussians.opacity,
             background=behind,
             view_dependent=degree > 0,
-        ), splats.active_mask(rows)
+        )
+        return SplatCloud(**leaves), splats.active_mask(rows)
 
     def cloud(state: TrainState, time, appearance, position) -> SplatCloud:
         dtype = state.params.rows["splats"].mean.dtype

@@ -102,7 +102,7 @@ def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
         elif path.suffix.lower() == ".splat":
             data = _splat_bytes(kept)
         else:
-            data = spz.encode(spz.Unpacked(*kept, notes=()), spz_version)
+            data = spz.encode(spz.Unpacked._make((*kept, ())), spz_version)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; not written") from error
     with replaced_file(path) as partial:

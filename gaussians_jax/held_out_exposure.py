@@ -6,6 +6,7 @@ scene stays as it is, and the other half is scored.
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -34,13 +35,14 @@ def score(
     renderer = evaluation.Renderer(model, capture.size)
 
     def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
-        drawn = renderer(state, view).color[:, : left.shape[1]]
+        color = np.asarray(renderer(state, view).color)
+        drawn = color[:, : left.shape[1]]
         return exposure.fitted(drawn, left.astype(np.float32) / 255, valid)
 
     def render(view: View, change: np.ndarray) -> Rendering:
         drawn = renderer(state, view)
         picture = jnp.asarray(drawn.color)
         color = exposure.changed(picture, jnp.asarray(change, picture.dtype))
-        return drawn._replace(color=np.asarray(color))
+        return drawn._replace(color=jax.device_get(color))
 
     return evaluation.score_halves(fit_code, render, capture, rows)

@@ -141,6 +141,8 @@ def initial_count(spec: InitSpec, capture: Capture) -> int:
     if not uses_capture_points(spec, capture):
         return spec.random
     extra = of_start(spec, False).extra_random
+    assert capture.points is not None
+    assert extra is not None
     return min(len(capture.points.position), spec.points) + extra
 
 
@@ -162,6 +164,7 @@ def initial_points(spec: InitSpec, capture: Capture, seed: int):
     if not uses_capture_points(spec, capture):
         return _random_points(rng, capture, spec.random, (capture.near, capture.far))
     cloud = capture.points
+    assert cloud is not None
     position, color = cloud.position, cloud.color / 255
     if len(position) > spec.points:
         kept = np.sort(rng.choice(len(position), spec.points, replace=False))

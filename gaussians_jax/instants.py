@@ -82,8 +82,23 @@ def splats_at(model: Model, state: TrainState) -> Callable[[float], Splats]:
       A host function of a time in [0, 1].
     """
     deformed_at, as_rows = gaussians_at(model, state), jax.jit(_as_rows)
-    rows = model.stages.rows(state.params)
+    rows = written_rows(model, state)
     return lambda time: as_rows(rows, deformed_at(time))
+
+
+def written_rows(model: Model, state: TrainState) -> Splats:
+    """Return the rows of a run of Gaussians that a file holds.
+
+    Args:
+      model: The model.
+      state: Trained state.
+
+    Returns:
+      The rows.
+    """
+    assert model.stages is not None
+    assert model.stages.rows is not None
+    return model.stages.rows(state.params)
 
 
 def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:

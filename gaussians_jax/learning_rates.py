@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Int
@@ -68,7 +69,7 @@ def at_step(
         mean = extent * decay(step)
     else:
         mean = jnp.zeros(())
-    return Splats(
+    rates: dict[str, Any] = dict(
         mean=mean,
         log_scale=spec.log_scale,
         quaternion=spec.quaternion,
@@ -76,3 +77,4 @@ def at_step(
         sh_dc=spec.sh_dc,
         sh_rest=spec.sh_rest,
     )
+    return Splats(**rates)

@@ -73,7 +73,8 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
     }
     content = io.BytesIO()
     text = np.frombuffer(json.dumps(about).encode(), np.uint8)
-    np.savez_compressed(content, **{ABOUT: text}, **arrays)
+    members: dict[str, Any] = {ABOUT: text, **arrays}
+    np.savez_compressed(content, **members)
     with replaced_file(path) as partial:
         partial.write_bytes(content.getvalue())
     return path.stat().st_size

@@ -203,12 +203,12 @@ def guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
     rows, nets = own
     row_rate = None if rows is None else 1.0
     points = Points(canonical, rows, nets)
-    rates = Points(paths.unit, row_rate, None if nets is None else 0.4)
+    rates = Points._make((paths.unit, row_rate, None if nets is None else 0.4, None))
     if still is None:
         return Guess(points, rates)
     return Guess(
         points._replace(resting=Resting(still, still_rows)),
-        rates._replace(resting=Resting(0.0, row_rate)),
+        rates._replace(resting=Resting._make((0.0, row_rate))),
         _unrest_of(effect, paths.unit),
     )
 

@@ -38,6 +38,7 @@ def follow(
     if all(effect.deform is None for effect in every) or not len(known.path):
         return None
     stages = scene.build(spec, metadata).stages
+    assert stages is not None
     prepared = jax.jit(stages.prepare)(state.params)
     deform = jax.jit(lambda params, ready, time: stages.deform(params, ready, time))
     times = in_default_precision(capture.times[known.moments])
@@ -71,6 +72,7 @@ def mover(spec, metadata) -> Move | None:
     if all(effect.deform is None for effect in every):
         return None
     stages = scene.build(spec, metadata).stages
+    assert stages is not None
 
     @jax.jit
     def deform(params, time):

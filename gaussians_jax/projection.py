@@ -89,7 +89,7 @@ def project(
     # By columns, which fill whole vectors.
     *vectors, opacity = gaussians
     columns = [components(rows) for rows in vectors]
-    by_column = Footprints(1, 1, 0, 0, 1)
+    by_column = Footprints._make((1, 1, 0, 0, 1))
     drawn = jax.vmap(one, (0, 0), by_column)(columns, opacity)
     return drawn._replace(
         mean_px=drawn.mean_px.T,

@@ -52,7 +52,7 @@ class Residuals(NamedTuple):
     """Chunks sorted in the forward pass, for the backward pass."""
 
     chunks: Intersections  # leading axis: the first `kept_chunks` chunks
-    count: Int[Array, ""]  # chunks there were
+    chunk_count: Int[Array, ""]  # chunks there were
 
 
 @checked
@@ -103,9 +103,9 @@ def _in_depth_order(footprints, values, grid):
     rects = binning.tile_rects(
         lax.stop_gradient(footprints.mean_px), footprints.extent_px, grid
     )
-    order = binning.depth_order(lax.stop_gradient(footprints.depth), rects.count)
+    order = binning.depth_order(lax.stop_gradient(footprints.depth), rects.tiles)
     rects = binning.TileRects(*(x[order] for x in rects))
-    log_opacity = jnp.log(jnp.where(rects.count > 0, footprints.opacity[order], 1))
+    log_opacity = jnp.log(jnp.where(rects.tiles > 0, footprints.opacity[order], 1))
     table = [
         footprints.mean_px[order],
         footprints.whitening[order],
@@ -220,7 +220,7 @@ def _next_intersections(layout, cursor, rects, table, state):
 
 
 def _more(cursor, state, rects):
-    drawn = jnp.sum(rects.count > 0, dtype=jnp.int32)
+    drawn = jnp.sum(rects.tiles > 0, dtype=jnp.int32)
     return (cursor.rank < drawn) & (jnp.max(state[:, 0]) > 0)
 
 
@@ -237,14 +237,14 @@ def _stream(layout, rects, table, through=False):
         # What early stopping left out is not looked at again in the backward pass.
         isects = isects._replace(ends=isects.starts + used)
         chunks = jax.tree.map(
-            lambda all_, one: all_.at[residuals.count].set(one, mode="drop"),
+            lambda all_, one: all_.at[residuals.chunk_count].set(one, mode="drop"),
             residuals.chunks,
             isects,
         )
         return (
             cursor,
             state,
-            Residuals(chunks, residuals.count + 1),
+            Residuals(chunks, residuals.chunk_count + 1),
         )
 
     keep = spec.kept_chunks
@@ -294,13 +294,15 @@ def _stream_back(layout, rects, table, final, residuals, cotangent):
         state,
         jnp.zeros_like(rows),
     )
-    *_, gradient = lax.while_loop(lambda carry: carry[0] < residuals.count, body, start)
+    *_, gradient = lax.while_loop(
+        lambda carry: carry[0] < residuals.chunk_count, body, start
+    )
     return gradient[:-1]
 
 
 def _kept_intersections(layout, residuals, number, cursor, rects):
     isects = jax.tree.map(lambda x: x[number], residuals.chunks)
-    return isects, binning.advance(cursor, rects.count, layout.capacity)
+    return isects, binning.advance(cursor, rects.tiles, layout.capacity)
 
 
 def _to_tiles(image, grid):

@@ -205,6 +205,7 @@ def rasterization(
         sh_degree,
     )
     settings = _Settings(spec, size, sh_degree, render_mode, radius_clip)
+    fields: tuple[Array, Array, Array, Array, Array, Array]
     image, alpha, fields = _batch(settings, gaussians, colors, views)
     cameras = views.viewmat.shape[-3]
     return image, alpha, RasterizationInfo(*fields, *size, tile_size, cameras)
@@ -283,8 +284,8 @@ def _checked(arrays: dict[str, Any], sh_degree):
                 f"{value.shape}; N={count}, C={cameras} and the batch axes {batch} are "
                 "those of means and viewmats"
             )
-    gaussians = Gaussians(*(arrays[k] for k in ("means", "quats", "scales")),
-                          arrays["opacities"])  # fmt: skip
+    leaves = ("means", "quats", "scales", "opacities")
+    gaussians = Gaussians._make(arrays[name] for name in leaves)
     views = _Views(
         arrays["viewmats"],
         arrays["Ks"],

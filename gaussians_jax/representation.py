@@ -182,7 +182,8 @@ def default_preset(capture: Capture) -> Choice:
     """
     evidence = record.cached(capture, CACHE / "evidence")
     reason = usable_paths.unusable(evidence)
-    name, start, notes = "splats-tracked-small", (), []
+    start: tuple[str, ...] = ()
+    name, notes = "splats-tracked-small", []
     if reason and usable_paths.stands_still(evidence, capture.times):
         name, notes = "splats-static-small", [reason]
     elif reason:

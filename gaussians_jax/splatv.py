@@ -238,7 +238,7 @@ def decode(data: bytes) -> Curves:
     bell = rows["bell"].astype(np.float64)
     names = ("position", "motion", "quaternion", "turning", "scale")
     parts = (rows[name].astype(np.float64) for name in names)
-    return Curves(*parts, rgba[:, :3], rgba[:, 3], bell[:, 0], bell[:, 1])
+    return Curves._make((*parts, rgba[:, :3], rgba[:, 3], bell[:, 0], bell[:, 1]))
 
 
 def write(path: pathlib.Path, instants: Instants, capture: Capture) -> Curves:

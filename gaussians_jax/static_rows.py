@@ -33,7 +33,7 @@ class StaticDynamicSplit(NamedTuple):
     """A trained scene with moving and static Gaussians separated."""
 
     static: Gaussians  # all Gaussians at the middle time
-    index: RowIndex
+    row_index: RowIndex
     dynamic: Params  # the parameters of the rows that move, and all networks
 
 
@@ -157,7 +157,8 @@ def of_rows(params: Params, drawn: np.ndarray) -> np.ndarray:
     Returns:
       [gaussians] bool; `drawn` itself if Gaussians have no children.
     """
-    return np.asarray(drawn).reshape(len(params.rows["splats"].mean), -1).any(axis=1)
+    by_row = np.asarray(drawn).reshape(len(params.rows["splats"].mean), -1)
+    return np.any(by_row, axis=1)
 
 
 def deform(
@@ -166,7 +167,7 @@ def deform(
     """All Gaussians at one time, the deformation evaluated for those that move."""
     if not len(parts.dynamic.rows["splats"].mean):
         return parts.static
-    return merge(parts.static, deform_rows(parts.dynamic, time), parts.index)
+    return merge(parts.static, deform_rows(parts.dynamic, time), parts.row_index)
 
 
 def merge(static: Gaussians, moved: Gaussians, table: RowIndex) -> Gaussians:

@@ -38,7 +38,7 @@ class Knots(NamedTuple):
 
     times: Float[Array, " knots"]  # evenly over [0, 1]
     track: Track  # of the rows that move
-    index: RowIndex
+    row_index: RowIndex
     static: Gaussians  # all rows, as they are at the middle knot
 
     @property
@@ -126,7 +126,7 @@ def at(
         # Not interpolated: merged only to be overwritten.
         opacity=jnp.zeros_like(mean[:, 0]),
     )
-    merged = static_rows.merge(knots.static, moved, knots.index)
+    merged = static_rows.merge(knots.static, moved, knots.row_index)
     return merged._replace(opacity=knots.static.opacity)
 
 

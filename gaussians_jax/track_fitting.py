@@ -112,7 +112,7 @@ def fit_tracks(
             "tracks must have shape [points, times, 3] with at least two times, got "
             f"{position.shape}"
         )
-    known = np.isfinite(position).all(axis=-1)
+    known = np.all(np.isfinite(position), axis=-1)
     if visible is not None:
         visible = np.asarray(visible)
         if visible.shape != known.shape or visible.dtype != bool:
@@ -137,7 +137,7 @@ def fit_tracks(
     places = position[known]
     unit = float(np.sqrt(np.mean(np.sum((places - places.mean(0)) ** 2, axis=-1))))
     unit = max(unit, float(np.finfo(np.float32).tiny) ** 0.5)
-    box = tuple(map(tuple, (places.min(0) - unit, places.max(0) + unit)))
+    box = tuple(places.min(0) - unit), tuple(places.max(0) + unit)
     metadata = SceneMetadata(unit, (0.0, 0.0, 0.0), count, box=box)
     moving = protocols.bound(protocols.moving_at_once(motion), steps, metadata)
     effect = protocols.compile_motion(moving)

@@ -40,7 +40,7 @@ def reduced(spec, metadata, without: tuple[str, ...]):
       ValueError: If the scene cannot be rendered without one of them.
     """
     check_there(without, parts(spec, metadata).removable)
-    left = {name: None for name in REMOVABLE if name in without}
+    left: dict[str, Any] = {name: None for name in REMOVABLE if name in without}
     if "motion" in left and isinstance(spec.motion, AnchorMotionSpec):
         # Of the same features as the motion is what anchors carry at rest.
         left["motion"] = dataclasses.replace(spec.motion, moves=False)
@@ -74,10 +74,8 @@ def from_knots(
         static_threshold,
         stages.rows(params).mean.dtype,
     )
-    summary = (
-        f"{knots} knots, {interpolation}, of {_moving(table.index, static_threshold)}: "
-        f"{table.bytes / 1e6:.1f} MB"
-    )
+    moving = _moving(table.row_index, static_threshold)
+    summary = f"{knots} knots, {interpolation}, of {moving}: {table.bytes / 1e6:.1f} MB"
     return _with(
         model,
         state,
@@ -123,7 +121,7 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
             draw=lambda both, *rest: stages.draw(both[0], *rest),
             rows=lambda both: stages.rows(both[0]),
         ),
-        f"the deformation of {_moving(parts.index, static_threshold)}",
+        f"the deformation of {_moving(parts.row_index, static_threshold)}",
     )
 
 
@@ -145,7 +143,7 @@ def without_moving(
     parts = static_rows.split(
         state.params, deform_rows, times, farther_than, fading=False
     )
-    moves = static_rows.of_rows(state.params, np.asarray(parts.index.moves))
+    moves = static_rows.of_rows(state.params, np.asarray(parts.row_index.moves))
     rows = state.params.rows
     active = int(splats.active_mask(rows["splats"]).sum())
     if int(moves.sum()) == active:

@@ -109,6 +109,8 @@ def first_distances(
     plan = spec.sampling
     if guide is None:
         return sampling.stratified(key, ray.near, ray.far, plan.coarse, plan.spacing)
+    assert spec.extent is not None
+    assert plan.occupancy is not None
     # Even parts whatever the spacing: cells are even.
     filled = filled_along(guide, ray, spec.extent)
     empty = plan.occupancy.empty

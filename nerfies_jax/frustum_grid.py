@@ -53,9 +53,10 @@ def resolves(bound: Bound) -> bool:
     if any((effect.lift, effect.mark) != (None, None) for effect in bound.effects):
         return False
     waves = [e.shortest_wave for e in bound.effects if e.displace is not None]
-    if not waves or None in waves:
+    known = [wave for wave in waves if wave is not None]
+    if not waves or len(known) < len(waves):
         return False
-    return CELLS_A_WAVE * cell <= min(waves)
+    return CELLS_A_WAVE * cell <= min(known)
 
 
 def displacements(

@@ -79,7 +79,9 @@ def events(field: Field) -> tuple[Event, ...]:
 
 def _survey(field: Field) -> Callable[[PyTree, Int[Array, ""]], Cells]:
     """Cells that any level fills."""
-    return lambda params, step: field.survey(params, step)[skipping.GUIDE]
+    survey = field.survey
+    assert survey is not None
+    return lambda params, step: survey(params, step)[skipping.GUIDE]
 
 
 def meets(occupied: Cells, ray: Ray, half_side: float) -> Bool[Array, ""]:
@@ -126,11 +128,13 @@ def learned_from(field: Field, occupied: Cells, candidates: Batch) -> Batch:
     Returns:
       The rays of the step.
     """
-    spec = field.spec.sampling.occupancy
+    spec, extent = field.spec.sampling.occupancy, field.spec.extent
+    assert spec is not None
+    assert extent is not None
     lines = jax.vmap(functools.partial(field_ray, field.metadata))(
         candidates.origin, candidates.direction, candidates.cosine
     )
-    meeting = jax.vmap(lambda ray: meets(occupied, ray, field.spec.extent))(lines)
+    meeting = jax.vmap(lambda ray: meets(occupied, ray, extent))(lines)
     count = len(meeting) // spec.candidates
     rows = chosen(meeting & candidates.valid, count, round(spec.anywhere * count))
     return jax.tree.map(lambda leaf: leaf[rows], candidates)

@@ -102,6 +102,7 @@ def mean_flow(
     flowing = [effect for effect in bound.effects if effect.name == scene_flow.NAME]
     media = _media(bound, flowing, ray, condition, samples, radiance)
     (medium,) = media.values()
+    assert medium.share is not None  # as that of a scene flow has
     moving = (jax.nn.sigmoid(medium.share) * medium.density)[0]
     static = (jax.nn.sigmoid(-medium.share) * radiance.density)[0]
     there = moving + static > 0

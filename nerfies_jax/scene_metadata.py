@@ -57,7 +57,7 @@ def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
     return SceneMetadata(
         near=near,
         far=far,
-        center=tuple(float(x) for x in center),
+        center=(float(center[0]), float(center[1]), float(center[2])),
         scale=float(scale),
         background=capture.background,
         times=tuple(float(time) for time in times),

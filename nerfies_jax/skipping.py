@@ -167,6 +167,7 @@ def shown_cells(bound: Bound, camera: Camera, size: tuple[int, int]) -> occupanc
       Booleans, [cells, cells, cells].
     """
     metadata, dtype = bound.metadata, camera.position.dtype
+    assert bound.spec.extent is not None  # of the cells
 
     def seen(direction):
         return exact_einsum("ij,...j->...i", camera.camera_from_world, direction)

@@ -17,7 +17,7 @@ from gaussians_jax.player.sampled import Instants
 STILL_PX = 0.1
 STILL = {"quaternion": 5e-3, "log_scale": 1e-2, "opacity": 4e-3}
 BRIGHTEST = 4.0  # of a color, 1 being white
-OFFSET_TYPES = {
+OFFSET_TYPES: dict[str, type[np.signedinteger]] = {
     "mean": np.int16,
     "quaternion": np.int8,  # 1/254 of how far the row turns: 0.2 degrees of 60
     "log_scale": np.int8,

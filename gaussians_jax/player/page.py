@@ -17,7 +17,7 @@ import numpy as np
 import PIL.Image
 from jaxtyping import Array, Int
 
-from gaussians_jax.instants import gaussians_at
+from gaussians_jax.instants import gaussians_at, written_rows
 from gaussians_jax.player import packing
 from gaussians_jax.player.limits import camera_limits
 from gaussians_jax.player.sampled import (
@@ -72,7 +72,7 @@ def write(
     Returns:
       Summary of the player.
     """
-    at, rows = gaussians_at(model, state), model.stages.rows(state.params)
+    at, rows = gaussians_at(model, state), written_rows(model, state)
     seen = seen_in_training(at, rows, raster, degree, capture)
     count = count_for(capture)
     instants, packed = _packed(at, rows, capture, seen, count)
@@ -144,10 +144,10 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
     """
     train = cameras.take(capture.cameras, capture.train)
     first = cameras.take(train, 0)
-    forward = first.camera_from_world[2].astype(np.float64)
+    forward = np.asarray(first.camera_from_world, np.float64)[2]
     focus = camera_paths.focus_point(train, capture.near, capture.far)
     away = float(np.clip((focus - first.position) @ forward, capture.near, capture.far))
-    target = first.position + away * forward
+    target = np.asarray(first.position) + away * forward
     up = camera_paths.up_axis(capture)
     half_diagonal = float(np.hypot(*capture.size) / 2 / first.focal_px)
     view = {

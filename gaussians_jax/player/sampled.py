@@ -67,17 +67,17 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
             "camera; train for more steps"
         )
     poses = [jax.device_get(at(float(time))) for time in np.linspace(0, 1, count)]
-    stacked = Gaussians(
-        *(np.stack([leaf[kept] for leaf in each]) for each in zip(*poses, strict=True))
+    mean, quaternion, scale, opacity = (
+        np.stack([leaf[kept] for leaf in each]) for each in zip(*poses, strict=True)
     )
     return Instants(
-        mean=stacked.mean,
-        quaternion=steady(stacked.quaternion),
+        mean=mean,
+        quaternion=steady(quaternion),
         log_scale=np.clip(
-            np.log(np.maximum(np.abs(stacked.scale), np.finfo(np.float32).tiny)),
+            np.log(np.maximum(np.abs(scale), np.finfo(np.float32).tiny)),
             *splats.LOG_SCALE_RANGE,
         ),
-        opacity=stacked.opacity,
+        opacity=opacity,
         color=seen.color[kept],
         left_out=int(splats.active_mask(rows).sum()) - kept.size,
     )
@@ -125,7 +125,8 @@ def seen_in_training(
     coefficients = splats.active_harmonics(rows, degree)
     toward = jax.jit(harmonics.color_toward)
     moves = _moves(at, capture)
-    most, total, color = 0.0, 0.0, 0.0
+    most: np.ndarray | float = 0.0
+    total, color = 0.0, 0.0
     for row in evaluation.spread(capture.train, MOST_VIEWS):
         view = evaluation.resized(evaluation.view_of(capture, row), capture.size, size)
         deformed = at(float(view.time))
@@ -141,7 +142,7 @@ def seen_in_training(
         total = total + weight
         color = color + weight[:, None] * jax.device_get(colors)
     seen = np.maximum(total, np.finfo(np.float32).tiny)
-    return Seen(most, color / seen[:, None])
+    return Seen(np.asarray(most), color / seen[:, None])
 
 
 def _shown(how, gaussians: Gaussians, camera: Camera):

@@ -1,6 +1,6 @@
 """Interface of a representation to the training loop, the renderer and the report."""
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -128,7 +128,7 @@ class Surveyed(NamedTuple):
 class Model(NamedTuple):
     """A representation: pure functions closed over a static spec."""
 
-    spec: Hashable  # written into the checkpoint
+    spec: Any  # hashable; written into the checkpoint
     init: Callable[[Any, Any], TrainState]  # (Capture, key) -> state; host
     step: Callable[[TrainState, Frames], tuple[TrainState, dict[str, Array]]]
     # (params, view, size, step): `step` says how far the parameters are trained, since

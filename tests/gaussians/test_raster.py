@@ -282,7 +282,7 @@ def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
     alpha = np.asarray(footprints.opacity)[:, None, None] * np.exp(-exponent)
     shows = (alpha >= 1 / 255).reshape(60, 8, 8, 12, 8).any((2, 4)).reshape(60, -1)
     np.testing.assert_array_equal(kept, shows)
-    assert shows.sum() < 0.5 * int(rects.count.sum())
+    assert shows.sum() < 0.5 * int(rects.tiles.sum())
 
 
 @pytest.mark.full

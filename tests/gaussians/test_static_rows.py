@@ -103,7 +103,7 @@ def test_what_is_left_out_is_off_by_no_more_than_the_tolerance(static_threshold,
     parts = static_rows.split(params, deform, TIMES, static_threshold)
     count = len(parts.dynamic.rows["speed"])
     inactive = ~np.asarray(splats.active_mask(params.rows["splats"]))
-    moves = np.asarray(parts.index.moves)
+    moves = np.asarray(parts.row_index.moves)
     assert 0 < count == moves.sum() < len(moves)
     assert not moves[inactive].any()
     assert moves[1]  # its motion is not a number: not taken for static
@@ -128,13 +128,13 @@ def test_what_comes_and_goes_is_drawn_while_it_is_there(rng):
 
     params.rows["width"] = width
     parts = static_rows.split(params, fading, TIMES, 0.01)
-    assert parts.index.moves[:4].tolist() == [True, True, False, False]
+    assert parts.row_index.moves[:4].tolist() == [True, True, False, False]
     early = np.float32(TIMES[1])
     drawn = jax.jit(static_rows.deform, static_argnums=1)(parts, fading, early)
     np.testing.assert_allclose(drawn.opacity, fading(params, early).opacity, rtol=1e-6)
     # To be hidden, a row must move: one at rest stays, however short it is there.
     parts = static_rows.split(params, fading, TIMES, 0.01, fading=False)
-    assert parts.index.moves[:4].tolist() == [True, False, False, False]
+    assert parts.row_index.moves[:4].tolist() == [True, False, False, False]
 
 
 def test_where_nothing_moves_nothing_is_evaluated(rng):

@@ -111,7 +111,7 @@ def catmull_rom(times, values, at):
 def test_cubic_is_a_hermite_spline_with_central_slopes(count, dtype):
     knots = time_knots.bake(lambda t: moving(t, dtype), count, dtype=dtype)
     times, even = np.linspace(0, 1, 57), np.linspace(0, 1, count)
-    rows = np.flatnonzero(knots.index.moves)
+    rows = np.flatnonzero(knots.row_index.moves)
     interpolated = at_all(knots, times, "cubic")
     rounding = {"float32": 1e-5, "float64": 1e-13}[dtype]
     for leaf, ours in zip(
@@ -196,7 +196,7 @@ def test_scales_that_shrink_through_zero_stay_positive_and_finite(size, dtype):
 @pytest.mark.parametrize("static_threshold", [0.5, *full(0.0, 1e9)])
 def test_static_rows_are_stored_once_and_stay_within_the_tolerance(static_threshold):
     knots = time_knots.bake(moving, 9, static_threshold)
-    moves = np.asarray(knots.index.moves)
+    moves = np.asarray(knots.row_index.moves)
     assert not moves[::2].any()
     assert knots.bytes == time_knots.BYTES * 9 * moves.sum()
     for time in np.asarray(knots.times):
