@@ -9,8 +9,7 @@ import importlib
 import operator
 import pathlib
 import sys
-from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -70,7 +69,7 @@ def _main(arguments):
     main_of(name)(rest)
 
 
-def main_of(name: str) -> Callable:
+def main_of(name: str) -> options.Command:
     """Import the function that runs a command.
 
     Args:
@@ -94,7 +93,7 @@ def print_completion(words: list[str]) -> None:
         Annotated[options.offered(main_of(name).settings), tyro.conf.subcommand(name)]
         for name in commands()
     ]
-    union = functools.reduce(operator.or_, kinds)
+    union: Any = functools.reduce(operator.or_, kinds)
     tyro.cli(union, prog="nerfies", args=words, config=options.READ_BY)
 
 

@@ -14,10 +14,12 @@ import pathlib
 import re
 import shlex
 import sys
+import typing
 from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
+from tyro.conf import Positional
 
 from experiments import options
 from nerfies_jax import console, stopping
@@ -34,15 +36,26 @@ from nerfies_jax.runs.config import (
 from nerfies_jax.runs.representations import PRESETS
 from nerfies_jax.training.specs import OverrideError
 
-Positional = tyro.conf.Positional
 # Those of `nerfies_jax.capture.synthetic`, which loads JAX.
-SCENES = (
-    *("default", "static", "rigid", "fast", "non-rigid", "articulated"),
-    *("exposure", "transient", "specular", "topology", "pose-error"),
-)
+Scene = Literal[
+    "default",
+    "static",
+    "rigid",
+    "fast",
+    "non-rigid",
+    "articulated",
+    "exposure",
+    "transient",
+    "specular",
+    "topology",
+    "pose-error",
+]
+SCENES: tuple[str, ...] = typing.get_args(Scene)
 # Arguments of the library that have an option of the same name; "..." is any value.
-ARGUMENTS = ("device", "heldout", "max_side", "missing", "out", "overwrite")
-ARGUMENTS += ("scene", "train")
+ARGUMENTS = (
+    *("device", "heldout", "max_side", "missing", "out", "overwrite"),
+    *("scene", "train"),
+)
 _ARGUMENT = re.compile(
     rf"\b(?P<name>{'|'.join(ARGUMENTS)})=(?P<value>\"[^\"]*\"|\.\.\.|[^\s;,)]*[^\s;:,.)])"
 )
@@ -58,9 +71,10 @@ class NamedSource(CaptureSource):
 
     capture: Positional[pathlib.Path | None] = None
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF, COLMAP or LLFF layout."""
-    scene: Annotated[str | None, options.Known(SCENES)] = None
+    # None in these two is what the command line leaves to the class below.
+    scene: Annotated[str | None, options.Known(SCENES)] = None  # type: ignore[assignment]
     """Built-in scene to use if no capture is given (default: default)."""
-    missing: Literal["refuse", "skip"] | None = None
+    missing: Literal["refuse", "skip"] | None = None  # type: ignore[assignment]
     """Handling of frames whose image is missing (default: refuse)."""
     files: Annotated[GivenFiles, tyro.conf.arg(name="")] = GivenFiles()
 
@@ -172,7 +186,7 @@ class Ended(NamedTuple):
     code: int
 
 
-def command(settings: Any) -> Callable[[Callable], Callable]:
+def command(settings: Any) -> Callable[[Callable], options.Command]:
     """Make `main(arguments)` of a function of settings that returns the result as JSON.
 
     With `--json` the result is printed as one document, and all other output, also of

@@ -42,8 +42,17 @@ class Export:
     """Run folder that experiments.reconstruct made."""
     format: cli.Positional[
         Literal[
-            *("ply", "splat", "spz", "splatv", "transforms", "colmap", "nerfies"),
-            *("path", "nerfies-path", "tracks", "exr"),
+            "ply",
+            "splat",
+            "spz",
+            "splatv",
+            "transforms",
+            "colmap",
+            "nerfies",
+            "path",
+            "nerfies-path",
+            "tracks",
+            "exr",
         ]
     ]
     """Gaussians as ply, splat or spz, or with their motion, on cubics, as splatv.
@@ -113,7 +122,7 @@ class Export:
     @property
     def place(self) -> pathlib.Path:
         """Where to write."""
-        name = self.format
+        name: str = self.format
         if self.gaussians and self.frames is None:
             name = f"at-{self.time or 0:g}"
         elif self.gaussians:

@@ -23,7 +23,7 @@ class MakeScene:
 
     out: cli.Positional[pathlib.Path]
     """Folder to write. It must be empty or missing."""
-    preset: Literal[cli.SCENES] = "default"
+    preset: cli.Scene = "default"
     """Scene to render."""
     frames: int | None = None
     """Number of timestamps (default: the preset's)."""

@@ -13,7 +13,7 @@ import operator
 import pathlib
 import re
 import typing
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import tyro
 
@@ -24,6 +24,17 @@ DEFAULT = re.compile(r"\s*\((default: [^()]*)\)")
 JSON = "--json"
 JSON_HELP = "Print the result as one JSON document, and words to standard error."
 COMPLETION = "--tyro-print-completion"
+
+Entry = tuple[str, Any, Any]  # name, type and field, for `dataclasses.make_dataclass`
+
+
+class Command(Protocol):
+    """A function that runs a command line, with the settings that it reads."""
+
+    settings: Any
+
+    def __call__(self, arguments: list[str] | None = None) -> Any:
+        """Run the command, with the words of the process if none are given."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +62,7 @@ def parse(settings: Any, arguments: list[str], prog: str) -> Any:
     offering = any(word.startswith(COMPLETION) for word in arguments)
     by_shown = {shown(kind, offering): kind for kind in _kinds(settings)}
     union = functools.reduce(operator.or_, by_shown)
-    parsed = tyro.cli(union, prog=prog, args=arguments, config=READ_BY)
+    parsed: Any = tyro.cli(union, prog=prog, args=arguments, config=READ_BY)
     return _settled(by_shown[type(parsed)], parsed)
 
 
@@ -61,7 +72,7 @@ def offered(settings: Any) -> type:
     if len(kinds) == 1:
         return kinds[0]
     marks = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-    union = Annotated[(functools.reduce(operator.or_, kinds), *marks)]
+    union: Any = Annotated[(functools.reduce(operator.or_, kinds), *marks)]
     return _made("Several", [("kind", union, dataclasses.field())], "")
 
 
@@ -77,19 +88,22 @@ def shown(settings: type, offering: bool = False, top: bool = True) -> type:
     is told the names that are known.
     """
     heading_of, docs = _headings(settings), field_words(settings)
-    parts, under = [], {heading: [] for heading in heading_of.values()}
+    parts: list[Entry] = []
+    under: dict[str, list[Entry]] = {heading: [] for heading in heading_of.values()}
     for field, kind, marks in _fields(settings):
-        if dataclasses.is_dataclass(kind):
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
             kind = shown(kind, offering, top=False)
             entry = dataclasses.field(default_factory=kind)
-            words = {"help": docs[field.name]} if docs[field.name] else {}
+            words: dict[str, Any] = {}
+            if docs[field.name]:
+                words["help"] = docs[field.name]
         else:
             entry = dataclasses.field(default=field.default)
             words = _words(docs.get(field.name, ""), field)
             kind = _plain(kind, marks, offering)
         if field.default is False:
             marks = (*marks, tyro.conf.FlagCreatePairsOff)
-        annotated = Annotated[(kind, tyro.conf.arg(**words), *marks)]
+        annotated: Any = Annotated[(kind, tyro.conf.arg(**words), *marks)]
         place = under.get(heading_of.get(field.name), parts)
         place.append((field.name, annotated, entry))
     if top:

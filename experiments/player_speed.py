@@ -318,9 +318,11 @@ def _processor_ms(process):
 
 def page(stored) -> str:
     """Render the tables of the page in docs/results below the docstring."""
-    heads = ("scene", "Gaussians", "moving", "ours, ms", "gsplat.js, ms")
-    heads += ("times as fast", "ours, CPU ms", "gsplat.js, CPU ms", "times as fast")
-    heads += ("alike, dB",)
+    heads = (
+        *("scene", "Gaussians", "moving", "ours, ms", "gsplat.js, ms"),
+        *("times as fast", "ours, CPU ms", "gsplat.js, CPU ms", "times as fast"),
+        "alike, dB",
+    )
     rows, work = [], []
     for row in stored["rows"]:
         rows.append(
@@ -335,8 +337,10 @@ def page(stored) -> str:
         )
         work.append(_work_row(row))
     machine = stored["machine"]
-    heads_of_work = ("scene", "vertices", "shaded, M", "blended, M", "GB", "sort, ms")
-    heads_of_work += ("sort of 1 M, ms", "bandwidth, ms", "fill, ms")
+    heads_of_work = (
+        *("scene", "vertices", "shaded, M", "blended, M", "GB", "sort, ms"),
+        *("sort of 1 M, ms", "bandwidth, ms", "fill, ms"),
+    )
     return "\n".join(
         [
             markdown.table(heads, rows),

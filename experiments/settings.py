@@ -61,7 +61,7 @@ def described_preset(kind: Any, preset: str) -> dict[str, Any]:
 
 def lines(described: dict[str, Any]) -> list[str]:
     """For a person: fields under the settings that have them."""
-    groups = {}
+    groups: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]] = {}
     for path, field in described["fields"].items():
         above = path.rpartition(".")[0]
         groups.setdefault((above, field["source"]), []).append((path, field))

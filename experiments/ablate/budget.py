@@ -44,6 +44,7 @@ def affordable(
         before, earlier = shorter.notes["steps"], shorter.numbers[budget.measure]
         if before != done and earlier > 0:
             power = math.log(took / earlier) / math.log(done / before)
+    assert budget.seconds is not None
     # Outside it is the machine's other work that was timed.
     power = min(max(power, 1.0), 2.0)
     return max(1, round(done * (budget.seconds / took) ** (1 / power)))

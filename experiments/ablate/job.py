@@ -117,9 +117,9 @@ class Job:
         if note:
             log(note)
 
-    def _listen(self, event, seconds, **_):
+    def _listen(self, event: str, duration_secs: float, **_: str | int) -> None:
         if event == SAVED:
-            self._cache_saved += seconds
+            self._cache_saved += duration_secs
 
     def spec(self, name: str, steps: int | None) -> Any:
         """The preset of an arm over so many steps, with what is changed in it."""

@@ -68,6 +68,8 @@ def draw(
     row = int(known.rows[shown])
     if not known.exact:
         return _draw_filmed(capture, row, color, depth)
+    assert capture.depths is not None
+    assert capture.moving is not None
     truth, true_depth = capture.images[row], capture.depths[row]
     colored = pictures.color_depth(true_depth)
     limits = colored.low, colored.high

@@ -43,7 +43,9 @@ def score(
             )
         preset = outcome.run.config.preset
         write_json(about, {"preset": preset, "machine": clock.machine()})
-    return kept.one(about, MADE) | {"metrics": kept.one(metrics, SCORED)}
+    made = kept.one(about, MADE)
+    assert made is not None, about
+    return made | {"metrics": kept.one(metrics, SCORED)}
 
 
 def _check_capture(config, folder):

@@ -21,7 +21,7 @@ saves effect_cost.json, effect_cost.md and effect_cost.png.
 import dataclasses
 import pathlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 from experiments import cli
@@ -275,7 +275,8 @@ def measure(
     capture = runs.read_capture(CaptureSource())
     # The same scene may stand under several names: "without" the one effect is "bare".
     first = {arm.spec: arm.name for arm in reversed(scenes)}
-    calls, counted = {}, {}
+    calls: dict[str, Callable[[], Any]] = {}
+    counted = {}
     for spec, arm_name in first.items():
         programs, counted[spec] = _compile(representation, capture, spec, at)
         calls |= {f"{arm_name} {name}": call for name, call in programs.items()}

@@ -22,8 +22,10 @@ MEASURES = (
     ("seconds", "s", 0.5),
 )
 RATIO_TOLERANCE = 0.25  # of a time over that of the bare scene of the same run
-PAGE_HEADS = ("scene", "parameters", "Mflop", "matmul Mflop", "MB", "temporary MB")
-PAGE_HEADS += ("compile s", "step ms", "over bare")
+PAGE_HEADS = (
+    *("scene", "parameters", "Mflop", "matmul Mflop", "MB", "temporary MB"),
+    *("compile s", "step ms", "over bare"),
+)
 MILLIONS = ("flops", "matrix_flops", "bytes_accessed", "temporary_bytes")
 PAGE_KEYS = ("parameters", *(f"step.{x}" for x in MILLIONS))
 PAGE_KEYS += ("step.compile_seconds", "step.seconds", "step.over_bare")
@@ -49,8 +51,10 @@ def heading() -> str:
 
 def table(preset, rows) -> str:
     """All scenes of one preset."""
-    names = ("", "parameters", "Mflop", "", "matmul", "", "MB", "", "temp MB", "")
-    names += ("comp. s", "", "CPU ms", "")
+    names = (
+        *("", "parameters", "Mflop", "", "matmul", "", "MB", "", "temp MB", ""),
+        *("comp. s", "", "CPU ms", ""),
+    )
     lines = [f"\n{preset}", _line(names) + "   price"]
     by_name = {row.arm.name: row for row in rows}
     for row in rows:

@@ -31,8 +31,10 @@ def page(stored) -> str:
     Returns:
       Markdown.
     """
-    heads = ("scene", "mask", "false %", "track px", "lost %", "place %", "said %")
-    heads += ("tracks", "paths", "groups", "static points", "CPU s")
+    heads = (
+        *("scene", "mask", "false %", "track px", "lost %", "place %", "said %"),
+        *("tracks", "paths", "groups", "static points", "CPU s"),
+    )
     scenes = [
         [
             row["scene"],

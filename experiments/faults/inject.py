@@ -6,7 +6,7 @@ import signal
 import subprocess
 import threading
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import psutil
 
@@ -91,7 +91,7 @@ def disturbed(
         }
     log = work.with_name(f"{work.name}.log")
     with log.open("wb") as file:
-        streams = {"stdout": file, "stderr": file}
+        streams: dict[str, Any] = {"stdout": file, "stderr": file}
         if fault == "reader gone":
             streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         elif fault == "full log":

@@ -6,7 +6,7 @@ twice, curvature. `hard_cases` prints the table, and tests check the bounds.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -40,7 +40,7 @@ class Case(NamedTuple):
     textbook: Callable
     exact: Callable
     # By precision: largest error of value, slope (and curvature). See `errors`.
-    bounds: dict[str, tuple[float, ...]]
+    bounds: Mapping[str, tuple[float, ...]]
     # Errors are relative to the largest entry of the truth, which counts as at least
     # this: by order, for the points where the truth itself is or nears zero.
     floors: tuple[float, ...] = (0.0, 0.0, 0.0)

@@ -50,7 +50,7 @@ def drawn(count: int, seed: int, only: str = "") -> list[Fault]:
             if faults:
                 by_module.append(faults)
     chance.shuffle(by_module)
-    chosen = []
+    chosen: list[Fault] = []
     while by_module and len(chosen) < count:
         chosen += [faults.pop() for faults in by_module]
         by_module = [faults for faults in by_module if faults]

@@ -5,10 +5,11 @@ import os
 import pathlib
 import sys
 import threading
+import types
 
 from experiments.mutants.faults import PACKAGES, ROOT
 
-_entered = set()
+_entered: set[types.CodeType] = set()
 
 
 def _note(frame, _event, _argument):

@@ -54,7 +54,7 @@ def measure(preset: str, all_cores: bool) -> dict[str, Any]:
     state = model.init(capture, jax.random.key(0))
     frames = evaluation.frames_of(capture, model.required_data)
     step = step_time(model, state, frames, spec.steps)
-    record = {
+    record: dict[str, Any] = {
         "step_ms": 1e3 * step.seconds,
         "compile_seconds": step.compile_seconds,
         "devices": model.devices,

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from typing import Any
 
 from nerfies_jax.runs import platform
 
@@ -191,7 +192,7 @@ def time_case(text: str, yardstick: pathlib.Path | None) -> dict:
             with np.load(file) as stored:
                 scene = {name: stored[name] for name in stored.files}
     forward, both = compiled(text, scene)
-    row = {
+    row: dict[str, Any] = {
         "case": text,
         "forward_ms": median_ms(forward),
         "forward_backward_ms": median_ms(both),
