@@ -381,7 +381,7 @@ def _camera_image(settings, gaussians, colors, view):
         footprints.depth,
         _conics(footprints.whitening),
         footprints.opacity,
-        rects.count,
+        rects.tiles,
     )
     return image, alpha, fields
 

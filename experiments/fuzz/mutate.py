@@ -130,10 +130,14 @@ def _remove_token(data, draw):
     return data[:start] + data[end:]
 
 
-_OF_BYTES = (_flip, _flip, _set_integer, _set_integer, _cut, _remove, _repeat, _noise)
-_OF_BYTES += (_replace_number,)  # headers of .ply and .npy are text
-_OF_TEXT = (_replace_token, _replace_token, _replace_number, _remove_token, _flip, _cut)
-_OF_TEXT += (_remove, _repeat, _noise)
+_OF_BYTES = (
+    *(_flip, _flip, _set_integer, _set_integer, _cut, _remove, _repeat, _noise),
+    _replace_number,  # headers of .ply and .npy are text
+)
+_OF_TEXT = (
+    *(_replace_token, _replace_token, _replace_number, _remove_token, _flip, _cut),
+    *(_remove, _repeat, _noise),
+)
 
 
 def _in_zip(data, draw):
