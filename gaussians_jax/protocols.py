@@ -209,7 +209,10 @@ class Strategy(Protocol):
       cap_max: Largest number of Gaussians.
     """
 
-    cap_max: int
+    @property
+    def cap_max(self) -> int:
+        """Largest number of Gaussians."""
+        ...
 
     def init(self, gaussians: Splats) -> PyTree:
         """Return the state between two events: arrays, or () without any."""

@@ -331,6 +331,9 @@ def loss_of(
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The loss of one frame with what every effect adds, and numbers to log."""
     truth, valid = observation.truth, observation.valid
+    assert observation.rendering is not None
+    assert condition.step is not None
+    assert condition.key is not None
     color = observation.rendering.color
     photometric = losses.photometric(
         color, truth, valid, dssim_weight=spec.dssim_weight
@@ -345,7 +348,7 @@ def loss_of(
     )
     terms = penalty_terms(effects, params.nets, context, states)
     strategy = spec.strategy
-    if hasattr(strategy, "loss"):
+    if strategy is not None and hasattr(strategy, "loss"):
         for name, term in as_terms(strategy.loss(params, context)).items():
             terms[f"{name_of(strategy)}/{name}"] = term
     metrics = {"mse": losses.mse(color, truth, valid)} | values(terms)

@@ -29,6 +29,14 @@ from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.spec import SplatScene
 from nerfies_jax.nets.encoding import EncodingSpec
 
+SMALL_STRATEGY = DefaultStrategySpec(
+    refine_every=200,
+    refine_start_iter=300,
+    refine_stop_iter=2000,
+    reset_every=100_000,
+    cap_max=10_000,
+)
+
 # For a CPU: the same parts with fewer Gaussians, a smaller network, a shorter run.
 # Measured on the built-in scene at 2000 steps (held-out PSNR and SSIM, one seed):
 #   motion from 10 % of the run on, network rate 2e-3   18.20 / 0.466, worse than static
@@ -42,13 +50,7 @@ SMALL_STATIC = SplatScene(
     init=InitSpec(points=4000, random=5000, extra_random=2000),
     sh_degree=1,
     sh_every=1000,
-    strategy=DefaultStrategySpec(
-        refine_every=200,
-        refine_start_iter=300,
-        refine_stop_iter=2000,
-        reset_every=100_000,
-        cap_max=10_000,
-    ),
+    strategy=SMALL_STRATEGY,
     # Looks and shapes learn twice as fast as published, for a tenth of the steps. At
     # 1500 steps, one seed: built-in still scene 32.29 -> 33.02 dB, `SMALL_TRACKED` on
     # the default one 30.39 -> 30.74, on a film of 256x192 36.22 -> 36.65; four times as
@@ -72,6 +74,12 @@ SMALL_MCMC = dataclasses.replace(
         refine_every=50, refine_start_iter=300, refine_stop_iter=2500, cap_max=10_000
     ),
 )
+STRATEGY_FROM_TRACKS = dataclasses.replace(
+    SMALL_STRATEGY,
+    refine_every=130,
+    refine_start_iter=200,
+    refine_stop_iter=1300,
+)
 # Two views a step, on a core each: 37 ms for 32 (10,000 Gaussians, 256x192).
 # What the small scenes that start from tracks share.
 SMALL_FROM_TRACKS = dataclasses.replace(
@@ -80,12 +88,7 @@ SMALL_FROM_TRACKS = dataclasses.replace(
     batch_size=2,
     init=InitSpec(points=4000, random=5000, extra_random=None),
     sh_every=700,
-    strategy=dataclasses.replace(
-        SMALL_STATIC.strategy,
-        refine_every=130,
-        refine_start_iter=200,
-        refine_stop_iter=1300,
-    ),
+    strategy=STRATEGY_FROM_TRACKS,
     start=StartSpec(motion="tracks"),
 )
 # What moves has no larger weight, for that gains nothing: of three times, 31.71 dB are
@@ -162,7 +165,7 @@ SMALL_D_MISO = dataclasses.replace(
     SMALL_FROM_TRACKS,
     init=InitSpec(points=1500, random=1500, extra_random=None),
     start=StartSpec(motion="tracks", moving_points=800),
-    strategy=dataclasses.replace(SMALL_FROM_TRACKS.strategy, cap_max=2500),
+    strategy=dataclasses.replace(STRATEGY_FROM_TRACKS, cap_max=2500),
     motion=SMALL_DEFORMABLE.motion,
     carried=CarriedSpec(
         count=4,
@@ -180,7 +183,7 @@ SMALL_ADC_GS = dataclasses.replace(
     init=InitSpec(points=500, random=600, extra_random=None),
     start=StartSpec(motion="tracks", moving_points=350),
     sh_degree=0,
-    strategy=dataclasses.replace(SMALL_FROM_TRACKS.strategy, cap_max=1000),
+    strategy=dataclasses.replace(STRATEGY_FROM_TRACKS, cap_max=1000),
     motion=AnchorMotionSpec(
         time_code=16,
         width=64,
@@ -224,7 +227,7 @@ SMALL_SONATA = dataclasses.replace(
 # time, 21.90 with these.
 SMALL_MOBA = dataclasses.replace(
     SMALL_STATIC,
-    strategy=dataclasses.replace(SMALL_STATIC.strategy, refine_stop_iter=1500),
+    strategy=dataclasses.replace(SMALL_STRATEGY, refine_stop_iter=1500),
     motion=dataclasses.replace(
         SMALL_BASIS_MOTION,
         time=EncodingSpec(6),

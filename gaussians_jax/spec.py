@@ -43,9 +43,9 @@ from gaussians_jax.phases import AlternationSpec, AnnealingSpec
 from gaussians_jax.protocols import Appearance, CameraOptimizer, Motion, Strategy
 from gaussians_jax.raster_spec import RasterSpec
 from gaussians_jax.records import SplatRecord
+from nerfies_jax.training import step_counts
 from nerfies_jax.training.extensions import Settings, check
 from nerfies_jax.training.protocols import Optimizer, Regularizer
-from nerfies_jax.training.step_counts import steps
 
 OPTIMIZERS = {"adam": scale_by_row_adam, "radam": scale_by_row_radam}
 AnyMotion = (
@@ -99,7 +99,7 @@ class SplatScene:
     batch_size: int = 1  # views a step; all rates are times its root
     init: InitSpec = InitSpec()
     sh_degree: int = 3
-    sh_every: int = steps(1000)  # steps between one degree and the next
+    sh_every: int = step_counts.steps(1000)  # steps between one degree and the next
     dssim_weight: float = 0.2
     learning_rates: LearningRateSpec = LearningRateSpec()
     raster: RasterSpec = RasterSpec()

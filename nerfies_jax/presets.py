@@ -235,20 +235,19 @@ SMALL_NERF_DS = dataclasses.replace(
         EncodingSpec(2), EncodingSpec(2), closed_steps=300, anneal_steps=600, slope=0.1
     ),
 )
+SMALL_SCENE_FLOW = SceneFlowSpec(
+    network=TemplateSpec(EncodingSpec(8), EncodingSpec(2), depth=4, width=96, skips=()),
+    time=EncodingSpec(4),
+    # After 600 steps of 192 rays, against a bound of 1 and a decay at a sixth:
+    # 19.49 for 19.34 dB, flow 0.54 for 0.95 px off (both sides), depth 9 for 12 %.
+    flow_bound=0.2,
+    decay_steps=3000,
+)
 SMALL_NSFF = dataclasses.replace(
     SMALL_NERF,
     micro_batches=4,  # each moment thrice: 233 ms a step on two cores, 265 of two
     sampling=SamplingSpec(48, 0),
-    scene_flow=SceneFlowSpec(
-        network=TemplateSpec(
-            EncodingSpec(8), EncodingSpec(2), depth=4, width=96, skips=()
-        ),
-        time=EncodingSpec(4),
-        # After 600 steps of 192 rays, against a bound of 1 and a decay at a sixth:
-        # 19.49 for 19.34 dB, flow 0.54 for 0.95 px off (both sides), depth 9 for 12 %.
-        flow_bound=0.2,
-        decay_steps=3000,
-    ),
+    scene_flow=SMALL_SCENE_FLOW,
 )
 
 
@@ -268,19 +267,20 @@ GRID_TEMPLATE = TemplateSpec(
     color_width=32,
     density="exp",
 )
+COARSE_GRID_TEMPLATE = TemplateSpec(
+    HashGridSpec(levels=3, coarsest=16, finest=48, rows=2**17),
+    None,
+    depth=1,
+    width=16,
+    skips=(),
+    color_width=16,
+    density="exp",
+)
 SMALL_NERF_GRID = dataclasses.replace(
     SMALL_NERF,
     rays=1024,
     template=GRID_TEMPLATE,
-    coarse=TemplateSpec(
-        HashGridSpec(levels=3, coarsest=16, finest=48, rows=2**17),
-        None,
-        depth=1,
-        width=16,
-        skips=(),
-        color_width=16,
-        density="exp",
-    ),
+    coarse=COARSE_GRID_TEMPLATE,
     template_rate=6.0,
 )
 
@@ -343,7 +343,7 @@ PLANES_MEDIUM = dataclasses.replace(
 #   48 in filled cells, no coarse level      26.62       99      (512) 29.34 61
 # 64 wide networks gain nothing (24.33 in 90 s); a finer grid of 512 cells gains 0.3 dB
 # of lego and loses 2 of the other.
-EMPTIER = {"density_bias": -3.0}
+EMPTIER = -3.0  # added to the density
 STILL_NERF_GRID = dataclasses.replace(
     SMALL_NERF_GRID,
     steps=8000,
@@ -352,8 +352,8 @@ STILL_NERF_GRID = dataclasses.replace(
     # one busy core, without that and with: 24.68 dB in 66 s and 25.26 in 73 after 1200
     # steps, 25.38 in 137 and 25.91 in 136 after 2400 (1024 rays, samples all along).
     sampling=SamplingSpec(24, 24, occupancy=OccupancySpec()),
-    template=dataclasses.replace(SMALL_NERF_GRID.template, **EMPTIER),
-    coarse=dataclasses.replace(SMALL_NERF_GRID.coarse, **EMPTIER),
+    template=dataclasses.replace(GRID_TEMPLATE, density_bias=EMPTIER),
+    coarse=dataclasses.replace(COARSE_GRID_TEMPLATE, density_bias=EMPTIER),
 )
 
 PRESETS = {
@@ -384,7 +384,7 @@ PRESETS = {
         _on_grid(SMALL_NSFF),
         rays=256,
         scene_flow=dataclasses.replace(
-            SMALL_NSFF.scene_flow, network=PLANES_MEDIUM, flow_trunk=True
+            SMALL_SCENE_FLOW, network=PLANES_MEDIUM, flow_trunk=True
         ),
     ),
 }

@@ -288,8 +288,9 @@ def learning_rates(
     common = schedules.log_linear(
         spec.learning_rate, spec.learning_rate_end, spec.steps
     )(step)
+    rates: dict[str, PyTree]
     rates = {name: own[name](step) if name in own else common for name in params}
-    held = 1.0
+    held: Array | float = 1.0
     if spec.start.motion == "tracks":
         held = schedules.log_linear(spec.start.first_rate, 1.0, spec.steps)(step)
         warps = [effect for effect in effects if effect.displace is not None]
@@ -305,18 +306,20 @@ def learning_rates(
         on_tables = flow.network.tables is not None
         # Beside a warp it was not fitted (`build`).
         of_flow = held * rate if apart and spec.warp is None else rate
-        rates[scene_flow.NAME] = scene_flow.SceneFlow(
+        flow_rates: dict[str, PyTree] = dict(
             network=spec.template_rate * rate if on_tables else rate,
             flow=of_flow,
             disocclusion=rate,
             blend=rate,
             flow_trunk=of_flow if apart else None,
         )
-    template = spec.template_rate * common
+        rates[scene_flow.NAME] = scene_flow.SceneFlow(**flow_rates)
+    rate = spec.template_rate * common
+    template: PyTree = rate
     if spec.table_rate != 1:
-        tables = spec.table_rate * template
+        table_rate = spec.table_rate * rate
         template = {
-            name: net._replace(trunk=template, color=template, tables=tables)
+            name: net._replace(trunk=rate, color=rate, tables=table_rate)
             for name, net in params["template"].items()
         }
     return rates | {"template": template}
@@ -423,6 +426,7 @@ def _color_terms(
     coarse_weight = 1.0
     uncertain = render_ray.says_beta(effects, last.media)
     if uncertain is not None:
+        assert last.beta is not None
         likelihood = transient.photometric(
             last.color, batch.color, last.beta, batch.valid, uncertain.beta_power
         )
@@ -453,8 +457,8 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     # Of parts from other packages nothing is known.
     for net in (spec.warp, spec.ambient, spec.mask):
         widths += samples * getattr(net, "depth", 0) * getattr(net, "width", 0)
-    net = spec.transient
-    widths += last * getattr(net, "depth", 0) * getattr(net, "width", 0)
+    fog = spec.transient
+    widths += last * getattr(fog, "depth", 0) * getattr(fog, "width", 0)
     if spec.scene_flow is not None:
         medium = spec.scene_flow.network
         trunk = spec.scene_flow.flow_trunk * medium.depth * medium.width
@@ -468,7 +472,7 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     return 4 * activations + frame_bytes(capture, devices)
 
 
-def _width_of(one: TemplateSpec) -> int:
+def _width_of(one: object) -> int:
     """Floats that are kept of a sample: of its layers, and those read from planes."""
     if not isinstance(one, TemplateSpec):
         return 0  # unknown

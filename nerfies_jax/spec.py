@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import TypeVar
 
 import optax
 
@@ -224,15 +225,17 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecor
         widths = {name: net.width for name, net in templates_of(spec).items()}
         return surface.effect(one, widths)
 
-    smooth = spec.smoothness
-    if smooth is not None:
-        smooth = smoothness.Bound(smooth, templates_of(spec))
+    smooth = None
+    if spec.smoothness is not None:
+        smooth = smoothness.Bound(spec.smoothness, templates_of(spec))
     bent, slice_ = spec.warp, spec.ambient
     if isinstance(bent, WarpSpec) and spec.start.motion == "tracks":
         # Fitted with all bands open, and closing them would undo it.
         bent = dataclasses.replace(bent, anneal_steps=None)
-    if spec.mask is not None:
-        bent, slice_ = guided(bent), guided(slice_)
+    if spec.mask is not None and isinstance(bent, WarpSpec):
+        bent = guided(bent)
+    if spec.mask is not None and slice_ is not None:
+        slice_ = guided(slice_)
     built = (
         (spec.appearance, conditioning),
         (spec.transient, medium),
@@ -257,7 +260,10 @@ def optimizer_of(spec: RadianceScene) -> Optimizer:
     return OPTIMIZERS[own]() if isinstance(own, str) else own
 
 
-def guided(one: WarpSpec | AmbientSpec | None) -> WarpSpec | AmbientSpec | None:
+GuidedT = TypeVar("GuidedT", WarpSpec, AmbientSpec)
+
+
+def guided(one: GuidedT) -> GuidedT:
     """Add the mask of moving points to the guides of a warp or ambient surface.
 
     Args:
@@ -266,14 +272,14 @@ def guided(one: WarpSpec | AmbientSpec | None) -> WarpSpec | AmbientSpec | None:
     Returns:
       The changed settings.
     """
-    if one is None or moving_mask.NAME in one.guides:
+    if moving_mask.NAME in one.guides:
         return one
     return dataclasses.replace(one, guides=(*one.guides, moving_mask.NAME))
 
 
 def tables_of(effects: tuple[FieldRecord, ...]) -> tuple[Table, ...]:
     """The latent tables of all effects, each once."""
-    tables = {}
+    tables: dict[str, Table] = {}
     for effect in effects:
         for table in effect.tables:
             if tables.setdefault(table.name, table) != table:

@@ -149,14 +149,19 @@ class Bound:
         interval = spec.interval / (self.frames - 1)
         decay = spec.decay * self.extent
         active = splats.active_mask(params.rows["splats"])
+        assert condition.key is not None
+        assert condition.step is not None
         key = jax.random.fold_in(condition.key, _STREAM)
         rows = draw_active(key, active, min(spec.samples, active.shape[0]))
+
+        assert context.at_time is not None
+        at_time = context.at_time
 
         def evaluate(params):
             some = splats.take_rows(params, rows)
             canonical = some.rows["splats"].mean
             times = instants(condition.time, interval)
-            before, now, after = (context.at_time(some, t).mean for t in times)
+            before, now, after = (at_time(some, t).mean for t in times)
             value = acceleration_loss(canonical, before, now, after, decay, spec.drift)
             still = jnp.mean(_stillness(canonical, now, decay))
             there = jnp.any(active)

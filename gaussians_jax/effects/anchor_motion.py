@@ -136,7 +136,10 @@ def posed(
     if code is None:
         return carried.posed(own, None, still, rows)
     reads = features.residual[..., spec.residual // 2 :]
+    assert net.fine is not None
     fine = offsets(net.fine, fine_spec(spec), reads, code)
+    assert fine.position is not None
+    assert fine.log_scale is not None
     own = own._replace(
         offset=own.offset + fine.position, log_scale=own.log_scale + fine.log_scale
     )
@@ -183,7 +186,8 @@ def fit_to_paths(
 
     rows = init_features(rows_key, spec, len(points))
     start = Points(points, rows, init(nets_key, spec, frames))
-    return Guess(start, Points(paths.unit, 1.0, 0.4), penalty)
+    rates = Points._make((paths.unit, 1.0, 0.4, None))
+    return Guess(start, rates, penalty)
 
 
 def features_of(
@@ -195,6 +199,7 @@ def features_of(
         return own
     if condition is None or condition.step is None:
         return kept(own, net.law, spec)
+    assert condition.key is not None
     key = jax.random.fold_in(condition.key, stream(NAME))
     return jax.lax.cond(
         condition.step < spec.rate.start,
@@ -235,6 +240,7 @@ def penalty(
     spec: AnchorMotionSpec, _: Anchors, context: PenaltyContext
 ) -> dict[str, Term]:
     """Compute the mean bits of a feature value, zero before quantization starts."""
+    assert spec.rate is not None
     scene = context.params
     active = splats.active_mask(scene.rows["splats"])
     numbers = spec.reference + spec.count * residual_width(spec)

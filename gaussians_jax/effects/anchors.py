@@ -170,6 +170,7 @@ def context_spec(spec: AnchorMotionSpec) -> MLPSpec:
     """From a reference feature to the law of the residual ones of its anchor."""
     each = spec.count * residual_width(spec)
     heads = (("mean", HeadSpec(each, "zero")), ("log_scale", HeadSpec(each, "zero")))
+    assert spec.rate is not None
     return MLPSpec(spec.reference, 1, spec.rate.width, heads, (), "relu", "he")
 
 

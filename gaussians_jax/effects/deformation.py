@@ -40,10 +40,11 @@ def deform(
 ) -> Gaussians:
     """Compute the Gaussians to render at one time of a trained scene."""
     moved = deform_rows(effects, params, prepared, time)
-    by = derives(effects)
-    if by is None:
+    derivation = _derivation(effects)
+    if derivation is None:
         return moved
-    return by.derive(params, by.derive_rows(params, None), moved, FrameCondition(time))
+    derive_rows, derive = derivation
+    return derive(params, derive_rows(params, None), moved, FrameCondition(time))
 
 
 def deform_rows(
@@ -66,6 +67,12 @@ def derives(effects: Effects) -> SplatRecord | None:
     return next((effect for effect in effects if effect.derive is not None), None)
 
 
+def _derivation(effects):
+    """Return `derive_rows` and `derive` of the effect that has them, or None."""
+    by = derives(effects)
+    return None if by is None else (by.derive_rows, by.derive)
+
+
 def check_derived(effects: Effects) -> None:
     """Raise ValueError where more than one effect says what is drawn, or half of it."""
     named = [e.name for e in effects if e.derive is not None]
@@ -83,21 +90,23 @@ def check_derived(effects: Effects) -> None:
 
 def drawn_rows(effects: Effects, params: Params) -> Splats:
     """Return the raw parameters of the rendered Gaussians in canonical position."""
-    by = derives(effects)
-    if by is None:
+    derivation = _derivation(effects)
+    if derivation is None:
         return params.rows["splats"]
-    return by.derive_rows(params, None)[0]
+    derive_rows, _ = derivation
+    return derive_rows(params, None)[0]
 
 
 def drawn(
     effects: Effects, params: Params, moved: Gaussians, condition: FrameCondition
 ) -> tuple[Splats, Gaussians]:
     """Return the rendered Gaussians in training: canonical parameters, and moved."""
-    by = derives(effects)
-    if by is None:
+    derivation = _derivation(effects)
+    if derivation is None:
         return params.rows["splats"], moved
-    derived = by.derive_rows(params, condition)
-    return derived[0], by.derive(params, derived, moved, condition)
+    derive_rows, derive = derivation
+    derived = derive_rows(params, condition)
+    return derived[0], derive(params, derived, moved, condition)
 
 
 def significance(
@@ -163,6 +172,7 @@ def deform_in_training(
         if not effect.warm_up:
             gaussians = moved(params, gaussians)
             continue
+        assert condition.step is not None
         gaussians = jax.lax.cond(
             condition.step < effect.warm_up,
             lambda params, gaussians: gaussians,

@@ -65,6 +65,7 @@ class DepthSpec:
 
     def loss(self, params: Any, context: PenaltyContext) -> dict[str, Term]:
         """Compute the difference of rendered and known depth in one frame."""
+        assert context.observation is not None
         return terms(self, context.observation)
 
 
@@ -205,6 +206,8 @@ def terms(spec: DepthSpec, observation: Observation) -> dict[str, Term]:
     truth, rendering = observation.depth, observation.rendering
     if truth is None:
         return {}
+    assert rendering is not None
+    assert rendering.depth is not None  # as drawn for `required_data`
     # Depths are often kept in half precision, which neither counts nor centers them.
     truth, drawn = widened(truth), widened(rendering.depth)
     known = (truth > 0) & jnp.isfinite(truth) & (drawn > 0) & jnp.isfinite(drawn)

@@ -73,8 +73,8 @@ def of_id(
     share = jnp.asarray(progress, table.dtype)[one]
     own = table - jax.lax.stop_gradient(jnp.mean(table, axis=0))
     flat = own.reshape(len(table), 12)
-    rows = (jnp.asarray(side, jnp.int32)[one] for side in (left, right))
-    return codes.blend(flat, *rows, share).reshape(3, 4)
+    before, after = (jnp.asarray(side, jnp.int32)[one] for side in (left, right))
+    return codes.blend(flat, before, after, share).reshape(3, 4)
 
 
 def changed(

@@ -80,10 +80,11 @@ class Bound:
         count = min(self.spec.samples, active.shape[0])
         rows = draw_active(context.key, active, count)
         graph = context.state
-        every = jnp.concatenate([rows[:, None], graph.index[rows]], axis=1)
+        every = jnp.concatenate([rows[:, None], graph.neighbor[rows]], axis=1)
         some = splats.take_rows(params, every.ravel())
         shape = (*every.shape, 3)
         canonical = some.rows["splats"].mean.reshape(shape) / self.extent
+        assert context.at_time is not None
         moved = context.at_time(some, context.condition.time).mean
         return change_of_distances(
             canonical, moved.reshape(shape) / self.extent, graph.weight[rows]

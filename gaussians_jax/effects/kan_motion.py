@@ -291,9 +291,11 @@ def deform(
     ones.
     """
     fields = _fields(params)
+    read: tuple[Float[Array, " code"], ...]
     if params.coarse is None:
         read = (codes.at_time(params.times, time),)
     else:
+        assert params.rows is not None
         read = motion_codes.read(spec, params.times, params.rows, time)
     shares = [
         _first_layer_part(spec, one, code, spec.embedding)

@@ -136,6 +136,7 @@ def trunk_spec(spec: MotionSpec) -> MLPSpec:
 
 def time_spec(spec: MotionSpec) -> MLPSpec:
     """The network from the encoded time to its code."""
+    assert spec.time_code is not None
     heads = (("code", HeadSpec(spec.time_code)),)
     return MLPSpec(spec.time.width(1), 1, spec.width, heads, (), "relu", "he")
 
@@ -293,6 +294,7 @@ class Bound:
         """Move the Gaussians to a time, which is noisy early in training."""
         time, smoothing = frame.time, self.spec.smoothing
         if smoothing is not None and frame.step is not None:
+            assert frame.key is not None
             key = jax.random.fold_in(frame.key, _STREAM)
             time = smooth_time(key, smoothing, time, frame.step, self.frames)
         active = splats.in_use(gaussians)

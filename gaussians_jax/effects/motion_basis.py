@@ -142,6 +142,7 @@ def basis_spec(spec: BasisMotionSpec) -> MLPSpec:
     One hidden layer and the output are the paper's "2 layers": its storage column
     leaves room for 570k to 590k numbers in all networks, and this makes 589k.
     """
+    assert spec.count is not None
     heads = (("directions", HeadSpec(3 * spec.count)),)
     inputs = spec.position.width(3)
     return MLPSpec(inputs, 1, spec.basis_width, heads, (), spec.activation, "he")
@@ -390,6 +391,7 @@ class Bound:
         """Move the Gaussians to a time, which is noisy early in training."""
         time, smoothing = frame.time, self.spec.smoothing
         if smoothing is not None and frame.step is not None:
+            assert frame.key is not None
             key = jax.random.fold_in(frame.key, _STREAM)
             time = mlp_motion.smooth_time(key, smoothing, time, frame.step, self.frames)
         active, mean = splats.in_use(gaussians), gaussians.mean

@@ -230,7 +230,7 @@ def penalty(
 
     A term of weight zero is not computed.
     """
-    terms = {}
+    terms: dict[str, Term] = {}
     if spec.smoothness > 0:
         bend = {"smoothness": Term(second_differences(times), spec.smoothness)}
         terms |= from_step(spec.warm_up, context.step, bend)

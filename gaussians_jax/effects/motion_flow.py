@@ -98,6 +98,7 @@ class Bound:
 
     def loss(self, params: Params, context: PenaltyContext) -> dict[str, Term]:
         """Compute the difference of the Gaussians' flow and that of the capture."""
+        assert context.observation is not None
         frames, spec = context.observation.frames, self.spec
         if frames is None or frames.flow is None:
             return {}
@@ -121,16 +122,22 @@ def compared(
     spec: FlowSpec, picture: RasterSpec, params: Any, context: PenaltyContext
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Error of the frame of a step, and the share of its pixels that are compared."""
-    frames, row = context.observation.frames, context.observation.row
+    observation, at_time = context.observation, context.at_time
+    assert observation is not None
+    assert at_time is not None
+    frames, row = observation.frames, observation.row
+    assert frames is not None
+    assert frames.flow is not None
     other = frames.flow.next_row[row]
-    here, there = (context.at_time(params, frames.times[at]) for at in (row, other))
-    pair = tuple(cameras.take(frames.cameras, at) for at in (row, other))
+    here, there = (at_time(params, frames.times[at]) for at in (row, other))
+    first, second = (cameras.take(frames.cameras, at) for at in (row, other))
+    pair = first, second
     size = frames.images.shape[2], frames.images.shape[1]
     drawn = drawn_flow(here, there, pair, size, picture)
     shift = frames.flow.forward[row].astype(drawn.flow.dtype)
     seen = frames.flow.forward_seen[row] & (drawn.share >= spec.opaque)
-    if context.observation.valid is not None:
-        seen = seen & context.observation.valid
+    if observation.valid is not None:
+        seen = seen & observation.valid
     if spec.moving_only and frames.moving is not None:
         seen = seen & frames.moving[row]
     things = shift - camera_flow(pair, drawn.depth)

@@ -73,7 +73,7 @@ class Neighbors(NamedTuple):
     weight zero.
     """
 
-    index: Int[Array, "gaussians neighbors"]
+    neighbor: Int[Array, "gaussians neighbors"]
     weight: Float[Array, "gaussians neighbors"]  # in [0, 1]
 
 
@@ -152,10 +152,10 @@ def inconsistency(
         length = jnp.sqrt(weight * distance_sq + floor)
         return total + jnp.sum(jnp.where(active, length, 0)), None
 
-    pairs = neighbors.index.T, neighbors.weight.T.astype(embedding.dtype)
+    pairs = neighbors.neighbor.T, neighbors.weight.T.astype(embedding.dtype)
     total, _ = jax.lax.scan(one_neighbor, jnp.zeros((), embedding.dtype), pairs)
     active_count = jnp.sum(active)
-    each = jnp.minimum(neighbors.index.shape[1], active_count - 1)
+    each = jnp.minimum(neighbors.neighbor.shape[1], active_count - 1)
     return total / jnp.maximum(active_count * each, 1).astype(embedding.dtype)
 
 

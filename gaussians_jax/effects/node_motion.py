@@ -243,6 +243,7 @@ def moves(
         made = network(inputs)
         turn, shift = made["turn"], made["shift"]
     else:
+        assert nodes.mask is not None
         share = openness(nodes.mask)
         made = in_blocks(network, (inputs,), share > 0, NODES_AT_ONCE)
         turn, shift = (share[:, None] * made[name] for name in ("turn", "shift"))
@@ -260,6 +261,7 @@ def find(
     near = skinning.nearest(mean, nodes.position, spec.near)
     moving = None
     if spec.mask is not None:
+        assert nodes.mask is not None
         moving = jnp.any((openness(nodes.mask) > 0)[near], axis=1)
     if spec.rigidity is None or not linked:
         return Found(near, None, moving)
@@ -292,8 +294,11 @@ def arap_loss(
     times: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> Float[Array, ""]:
     """Measure the deviation of linked nodes from rigid motion, in squared extents."""
-    places = [nodes.position + moves(nodes, spec, extent, time).shift for time in times]
-    return skinning.arap_error(*(place / extent for place in places), linked)
+    before, after = (
+        (nodes.position + moves(nodes, spec, extent, time).shift) / extent
+        for time in times
+    )
+    return skinning.arap_error(before, after, linked)
 
 
 def fit_to_paths(
@@ -323,6 +328,7 @@ def fit_to_paths(
     nodes = placed(init(key, spec), np.concatenate([moving_nodes, resting]))
     at_rest = slice(len(moving_nodes), len(moving_nodes) + len(resting))
     if spec.mask is not None:
+        assert nodes.mask is not None
         nodes = nodes._replace(mask=nodes.mask.at[at_rest].set(spec.mask.still))
 
     def penalty(points, times):
@@ -339,7 +345,8 @@ def fit_to_paths(
 
     start = Points(jnp.asarray(canonical, jnp.float32), None, nodes)
     mask = None if spec.mask is None else 1.0
-    rates = Points(unit, None, Nodes(0.0, 1.0, 0.4, mask))
+    node_rates = Nodes._make((0.0, 1.0, 0.4, mask))
+    rates = Points._make((unit, None, node_rates, None))
     return Guess(start, rates, penalty if len(resting) else None)
 
 
@@ -368,7 +375,7 @@ class Bound:
         share = now / spec.learning_rate
         mask = None if spec.mask is None else spec.mask.rate * share
         place, radius = self.extent * spec.place_rate * share, spec.radius_rate * share
-        return MotionParams(shared=Nodes(place, radius, now, mask))
+        return MotionParams(shared=Nodes._make((place, radius, now, mask)))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the network, with nodes distributed over the Gaussians, on the

@@ -36,11 +36,12 @@ from nerfies_jax.training.effects import (
     PenaltyContext,
     Term,
     from_step,
+    total,
 )
 from nerfies_jax.training.step_counts import steps
 
 NAME = "plane_motion"
-Corner = tuple[float, float, float]
+Corner = tuple[float, ...]  # of three coordinates
 Features = Float[Array, "gaussians levels features"]
 
 
@@ -179,7 +180,7 @@ def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Te
         "unrest": (planes.l1_time_planes, time, spec.unrest),
     }
     return {
-        name: Term(sum(map(of_one, every)), weight)
+        name: Term(total(map(of_one, every)), weight)
         for name, (of_one, every, weight) in asked.items()
         if weight > 0
     }
@@ -219,7 +220,7 @@ class Bound:
         spec, run = self.spec, self.steps
         planes = schedules.log_linear(spec.plane_rate, spec.plane_rate_end, run)
         network = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run)
-        return MotionParams(shared=Motion(planes(step), network(step)))
+        return MotionParams(shared=Motion._make((planes(step), network(step))))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the planes and the network."""
@@ -228,6 +229,7 @@ class Bound:
 
     def precompute(self, params: MotionParams, gaussians: Splats) -> Features:
         """Read the planes of space."""
+        assert self.box is not None
         return prepare(params.shared, self.spec, places(self.box, gaussians.mean))
 
     def apply(
@@ -238,6 +240,7 @@ class Bound:
         frame: FrameCondition,
     ) -> Gaussians:
         """Move the Gaussians to their state at a time."""
+        assert self.box is not None
         place = places(self.box, gaussians.mean)
         off = offsets(params.shared, self.spec, place, frame.time, cache)
         return apply(gaussians, off._replace(mean=self.extent * off.mean))

@@ -132,8 +132,8 @@ def fit_to_paths(spec: PolynomialMotionSpec, paths: Paths) -> Guess:
         rate = 0.0
     rows = Polynomials(fitted[:, 1:], jnp.zeros((count, 3), jnp.float32), fading)
     points = path_fit.Points(fitted[:, 0], rows, None)
-    rates = Polynomials(paths.unit, 0.0, rate)
-    return Guess(points, path_fit.Points(paths.unit, rates, None))
+    rates = Polynomials._make((paths.unit, 0.0, rate))
+    return Guess(points, path_fit.Points._make((paths.unit, rates, None, None)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,11 +155,12 @@ class Bound:
         """Evaluate the learning rates of the coefficients."""
         spec, fading = self.spec, None
         if spec.fading is not None:
-            fading = Fading(spec.fading.time_rate, spec.fading.width_rate)
+            fading = Fading._make((spec.fading.time_rate, spec.fading.width_rate))
         rate = schedules.log_linear(
             spec.learning_rate, spec.learning_rate_end, self.steps
         )
-        rows = Polynomials(self.extent * rate(step), spec.turn_rate, fading)
+        rates = self.extent * rate(step), spec.turn_rate, fading
+        rows = Polynomials._make(rates)
         return MotionParams(rows)
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:

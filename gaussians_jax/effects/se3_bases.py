@@ -159,8 +159,8 @@ def deform(
     weights = jax.nn.softmax(logits, axis=-1)[:, 1:]
     rows = len(motion.turn)
     flat = jnp.concatenate([motion.linear.reshape(rows, 9), motion.offset], axis=-1)
-    mixed = exact_product(weights, jnp.concatenate([flat, motion.turn], axis=-1))
-    mixed, mean = components(mixed), components(gaussians.mean)
+    table = jnp.concatenate([flat, motion.turn], axis=-1)
+    mixed, mean = components(exact_product(weights, table)), components(gaussians.mean)
     linear, offset, turn = mixed[:9], mixed[9:12], stacked(mixed[12:])
     moved = [
         own + (dot(linear[3 * i : 3 * i + 3], mean) + offset[i])
@@ -192,7 +192,8 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     shift = _at_knots(rigid_groups.smoothed(moved - middle[:, None]), times, spec)
     middle = np.concatenate([middle, np.zeros((spec.bases - len(middle), 3))])
     none = np.zeros((spec.bases, spec.coarse_knots, 3))
-    bases = Bases(Poses(turn, shift), Poses(none, none), middle)
+    fine, coarse = Poses._make((turn, shift)), Poses._make((none, none))
+    bases = Bases._make((fine, coarse, middle))
     bases = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), bases)
     logits = np.zeros((len(position), 1 + spec.bases), np.float32)
     logits[:, 0] = STILL_LOGIT
@@ -209,7 +210,9 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
         shift, turn = bend(fine.shift) / unit, bend(fine.turn)
         return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn
 
-    rates = Points(unit, 10.0, Bases(Poses(3.0, unit), Poses(0.0, 0.0), 0.0))
+    fine_rates, coarse_rates = Poses._make((3.0, unit)), Poses._make((0.0, 0.0))
+    base_rates = Bases._make((fine_rates, coarse_rates, 0.0))
+    rates = Points._make((unit, 10.0, base_rates, None))
     return Guess(guess, rates, penalty, rigid=True)
 
 

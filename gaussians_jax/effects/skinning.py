@@ -41,7 +41,7 @@ class Displaced(NamedTuple):
 class Links(NamedTuple):
     """Pairs of nodes that should move rigidly, and their weights."""
 
-    index: Int[Array, "nodes links"]
+    neighbor: Int[Array, "nodes links"]
     weight: Float[Array, "nodes links"]  # sums to one over the links of a node
 
 
@@ -223,7 +223,7 @@ def arap_error(
       The error in squared units of the positions.
     """
     edges, turned = (
-        places[:, None] - places[linked.index] for places in (before, after)
+        places[:, None] - places[linked.neighbor] for places in (before, after)
     )
     spread = exact_einsum("nk,nki,nkj->nij", linked.weight, edges, turned)
     left, _, right = jax.vmap(matrix3.svd)(jax.lax.stop_gradient(spread))

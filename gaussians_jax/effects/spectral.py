@@ -19,7 +19,7 @@ from gaussians_jax.splats import Params
 from nerfies_jax.contract import checked
 from nerfies_jax.geometry.precision import widened
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import PenaltyContext, Term
+from nerfies_jax.training.effects import PenaltyContext, Term, total
 from nerfies_jax.training.step_counts import steps
 
 NAME = "spectral"
@@ -223,7 +223,7 @@ def wavelet_loss(
     # The transform is linear: one pyramid, of the difference, instead of two.
     pyramid = haar_pyramid(render - truth, spec.levels)
     factors = [spec.level_factor**level for level in range(spec.levels)]
-    return sum(
+    return total(
         factor * jnp.mean(jnp.square(band))
         for factor, bands in zip(factors, pyramid.high, strict=True)
         for band in bands
@@ -338,15 +338,16 @@ def terms(
     valid: Bool[Array, "height width"] | None = None,
 ) -> dict[str, Term]:
     """Compute the losses of equation 17, and their weights for logging."""
+    sizes = {}
+    if spec.wavelet is not None:
+        size = wavelet_loss(spec.wavelet, render, truth, valid)
+        sizes["wavelet"] = size, weight.wavelet
+    if spec.fourier is not None:
+        size = fourier_loss(spec.fourier, render, truth, valid)
+        sizes["fourier"] = size, weight.fourier
     weighed = {}
-    parts = (
-        ("wavelet", wavelet_loss, spec.wavelet, weight.wavelet),
-        ("fourier", fourier_loss, spec.fourier, weight.fourier),
-    )
-    for name, unweighted, part, factor in parts:
-        if part is None:
-            continue
-        size = unweighted(part, render, truth, valid)
+    for name, (size, factor) in sizes.items():
+        assert factor is not None
         weighed[name] = Term(size, factor.astype(size.dtype))
         weighed[f"{name}_weight"] = Term(factor, None)
     return weighed
@@ -373,6 +374,8 @@ class Bound:
         seen = context.observation
         gates = self._gates(params)
         weight = weights(self.spec, gates, context.step, self.steps)
+        assert seen is not None
+        assert seen.rendering is not None
         return terms(self.spec, weight, seen.rendering.color, seen.truth, seen.valid)
 
     def _gates(self, params):

@@ -88,7 +88,8 @@ def fit_to_paths(spec: SplineMotionSpec, paths: Paths) -> Guess:
     shift = jnp.asarray(fitted - mean[:, None], jnp.float32)
     rows = Splines(shift, jnp.zeros_like(shift))
     points = Points(jnp.asarray(mean, jnp.float32), rows, None)
-    return Guess(points, Points(paths.unit, Splines(paths.unit, 0.0), None))
+    rates = Points._make((paths.unit, Splines._make((paths.unit, 0.0)), None, None))
+    return Guess(points, rates)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -104,7 +104,8 @@ def around(
       Per-Gaussian parameters.
     """
     least = math.exp(LOG_WIDTH_RANGE[0])
-    return Fading(time, np.log(np.maximum(spec.width * followed, least)))
+    width = np.log(np.maximum(spec.width * followed, least))
+    return Fading._make((time, width))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -204,11 +204,12 @@ def ambient_point(
     encoded = encoding.encode(spec.position, point, None)
     guides = guides_of(spec.guides, condition)
     inputs = jnp.concatenate([encoded, condition.codes[spec.table], *guides])
+    assert params is not None  # as a bent slice has
     return mlp.apply(network(spec), params, inputs)["ambient"]
 
 
 def window(
-    spec: AmbientSpec, step: Int[Array, ""], like: Float[Array, "..."]
+    spec: AmbientSpec, step: Int[Array, ""] | None, like: Float[Array, "..."]
 ) -> Float[Array, " bands"]:
     """Compute the coarse-to-fine window of the ambient encoding.
 
@@ -220,6 +221,7 @@ def window(
     Returns:
       Weights in [0, 1], [bands].
     """
+    assert step is not None
     return schedules.band_window(
         spec.encoding.bands,
         spec.anneal_steps,

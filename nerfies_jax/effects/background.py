@@ -68,7 +68,9 @@ def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:
     """
     # The official code draws frames and jitter with one key.
     choice_key, frame_key, noise_key = jax.random.split(context.key, 3)
+    assert context.frames is not None
     point = context.frames.points
+    assert point is not None  # `required_data`
     if point.shape[0] > spec.points:
         rows = jax.random.randint(choice_key, (spec.points,), 0, point.shape[0])
         point = point[rows]
@@ -96,6 +98,8 @@ def mean_drift(
     Returns:
       A scalar.
     """
+    assert context.condition_of is not None
+    assert context.displace is not None
     conditions = jax.vmap(context.condition_of)(rows)
     moved = jax.vmap(context.displace)(point, conditions)
     # ρ takes the square: the length has no slope where nothing moves

@@ -26,6 +26,7 @@ from nerfies_jax.training.effects import (
     PenaltyContext,
     Table,
     Term,
+    total,
 )
 
 NAME = "mask"
@@ -157,13 +158,15 @@ def penalty(
     Returns:
       The term "error", or none if the frames have no masks.
     """
-    if context.frames.moving is None:
+    frames = context.frames
+    assert frames is not None
+    if frames.moving is None:
         return {}
     batch = context.batch
     column, line = jnp.floor(batch.pixel).astype(jnp.int32).T
-    moves = context.frames.moving[batch.row, line, column]
+    moves = frames.moving[batch.row, line, column]
     asked = jax.vmap(jax.vmap(functools.partial(share, spec, params), (0, None)))
-    error = sum(
+    error = total(
         difference(asked(level.point, context.condition), level, moves, batch.valid)
         for level in context.levels
     )

@@ -24,7 +24,7 @@ from nerfies_jax.nets import encoding, mlp
 from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.radiance import compositing, template
 from nerfies_jax.radiance.template import Template, TemplateSpec
-from nerfies_jax.training.effects import FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.effects import FrameCondition, PenaltyContext, Term, total
 from nerfies_jax.training.step_counts import steps
 
 NAME = "scene_flow"
@@ -356,7 +356,7 @@ def penalty(
         "dynamic": lambda: flow_losses.weighted_mean(
             jnp.square(_alone(level, weight, own.color) - batch.color), mask
         ),
-        "warped": lambda: sum(
+        "warped": lambda: total(
             flow_losses.warped(
                 one.color,
                 batch.color,
@@ -366,17 +366,17 @@ def penalty(
             )
             for one in sides
         ),
-        "disocclusion": lambda: sum(
+        "disocclusion": lambda: total(
             flow_losses.mean_where(one.disocclusion, one.present) for one in sides
         ),
-        "cycle": lambda: sum(
+        "cycle": lambda: total(
             flow_losses.cycle(one.flow, one.back, one.visible, one.present)
             for one in sides
         ),
-        "magnitude": lambda: sum(
+        "magnitude": lambda: total(
             flow_losses.magnitude(one.flow, weight, one.present) for one in sides
         ),
-        "smoothness": lambda: sum(
+        "smoothness": lambda: total(
             flow_losses.smoothness(one.flow, one.present) for one in sides
         ),
         "kinetic": lambda: flow_losses.kinetic(
@@ -389,12 +389,14 @@ def penalty(
     for name, value in values.items():
         if getattr(spec.weights, name) > 0:
             terms[name] = Term(value(), getattr(spec.weights, name))
-    if spec.weights.depth > 0 and context.frames.depths is not None:
-        value = depth_term(context, weight)
-        terms["depth"] = Term(value, spec.weights.depth * fade)
-    if spec.weights.flow > 0 and context.frames.flow is not None:
-        value = flow_term(context, learned_moments.interval(len(times)), weight, sides)
-        terms["flow"] = Term(value, spec.weights.flow * fade)
+    frames = context.frames
+    assert frames is not None
+    if spec.weights.depth > 0 and frames.depths is not None:
+        error = depth_term(context, weight)
+        terms["depth"] = Term(error, spec.weights.depth * fade)
+    if spec.weights.flow > 0 and frames.flow is not None:
+        error = flow_term(context, learned_moments.interval(len(times)), weight, sides)
+        terms["flow"] = Term(error, spec.weights.flow * fade)
     return terms
 
 
@@ -435,6 +437,7 @@ def depth_term(context: PenaltyContext, weight: Float[Array, "rays samples"]) ->
       The error, a scalar.
     """
     batch, level = context.batch, context.levels[-1]
+    assert context.frames is not None
     known = _pixels(context.frames.depths, batch.row, batch.pixel)
     distance = flow_losses.settle(weight, level.distances[..., None])[..., 0]
     predicted = distance * batch.cosine / context.box.scale
@@ -464,6 +467,8 @@ def flow_term(
       The error in pixels, a scalar.
     """
     batch, frames, level = context.batch, context.frames, context.levels[-1]
+    assert frames is not None
+    assert frames.flow is not None
     flow = frames.flow
     pairs = (
         (flow.forward, flow.forward_seen, flow.next_row),

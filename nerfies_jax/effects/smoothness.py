@@ -9,6 +9,7 @@ every step.
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from nerfies_jax.nets.encoding import EncodingSpec
 from nerfies_jax.nets.grids import HashGridSpec
 from nerfies_jax.nets.voxels import VoxelGridSpec
 from nerfies_jax.radiance.template import Template, TemplateSpec
-from nerfies_jax.training.effects import PenaltyContext, PyTree, Term
+from nerfies_jax.training.effects import PenaltyContext, PyTree, Term, total
 from nerfies_jax.training.step_counts import steps
 
 VARIED = 1024  # vertices of each level of a hashed grid that are drawn in a step
@@ -50,7 +51,7 @@ class Bound:
     """The `Regularizer` of a `SmoothnessSpec` on the templates of a field, by level."""
 
     spec: SmoothnessSpec
-    templates: dict[str, TemplateSpec]
+    templates: Mapping[str, object]  # of others than `TemplateSpec` nothing is known
 
     name = "smoothness"
 
@@ -63,21 +64,26 @@ class Bound:
 
     def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
         """Compute the variation of the tables."""
-        tabled = {k: one for k, one in self.templates.items() if has_tables(one)}
+        tabled = {
+            name: one
+            for name, one in self.templates.items()
+            if isinstance(one, TemplateSpec) and has_tables(one)
+        }
         found = []
         for number, (name, one) in enumerate(tabled.items()):
             key = jax.random.fold_in(context.key, number)
             found.append(variation(one, params["template"][name], key))
-        weight = self.spec.weight
+        weight: Scalar | float = self.spec.weight
         if self.spec.until is not None:
             weight = jnp.where(context.step < self.spec.until, weight, 0)
-        return {"variation": Term(sum(found), weight)}
+        return {"variation": Term(total(found), weight)}
 
 
-def has_tables(spec: TemplateSpec) -> bool:
+def has_tables(spec: object) -> bool:
     """Whether the template reads a point from tables."""
-    own = isinstance(spec, TemplateSpec)  # of others nothing is known
-    return own and not isinstance(spec.position, EncodingSpec)
+    return isinstance(spec, TemplateSpec) and not isinstance(
+        spec.position, EncodingSpec
+    )
 
 
 def variation(spec: TemplateSpec, params: Template, key: Key[Array, ""]) -> Scalar:
@@ -100,4 +106,4 @@ def variation(spec: TemplateSpec, params: Template, key: Key[Array, ""]) -> Scal
     if isinstance(position, HashGridSpec):
         return grids.variation_at_random(position, tables, key, VARIED)
     every = [planes.total_variation(plane) for level in tables for plane in level.space]
-    return sum(every) / (2 * len(every))  # the mean over both axes as well
+    return total(every) / (2 * len(every))  # the mean over both axes as well

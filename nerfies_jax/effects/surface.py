@@ -137,7 +137,7 @@ def look(
 def window(
     spec: SurfaceSpec,
     one: EncodingSpec,
-    step: Int[Array, ""],
+    step: Int[Array, ""] | None,
     like: Float[Array, "..."],
 ) -> Float[Array, " bands"] | None:
     """Compute the coarse-to-fine window of an encoding.
@@ -153,6 +153,7 @@ def window(
     """
     if one.bands == 0:
         return None
+    assert step is not None
     return schedules.band_window(
         one.bands, spec.anneal_steps, step, like.dtype, after=spec.closed_steps
     )

@@ -174,7 +174,7 @@ def displace(
 
 
 def window(
-    spec: WarpSpec, step: Int[Array, ""], like: Float[Array, "..."]
+    spec: WarpSpec, step: Int[Array, ""] | None, like: Float[Array, "..."]
 ) -> Float[Array, " bands"] | None:
     """Compute the coarse-to-fine window of the point's encoding.
 
@@ -189,6 +189,7 @@ def window(
     if spec.anneal_steps is None or spec.position.bands == 0:
         return None
     bands = spec.position.bands
+    assert step is not None
     return schedules.band_window(bands, spec.anneal_steps, step, like.dtype)
 
 

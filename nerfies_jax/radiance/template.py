@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,7 @@ def exponential(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     return jnp.exp(jnp.minimum(raw, LARGEST_LOG)) * (1 + beyond)
 
 
+PyTree = Any
 # Encodings with tables of their own, by the module that reads them.
 GRIDS = {HashGridSpec: grids, VoxelGridSpec: voxels, PlanesSpec: planes}
 DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu, "exp": exponential}
@@ -115,7 +116,7 @@ class Template(NamedTuple):
     trunk: mlp.MLP  # heads "density" and "bottleneck"
     color: mlp.MLP  # reads [bottleneck, condition]; head "color"
     # Tables of a grid or of planes, if there are any.
-    tables: grids.Tables | tuple[planes.Level, ...] | None = None
+    tables: PyTree = None
 
 
 class Radiance(NamedTuple):

@@ -8,8 +8,10 @@ without parts is that of a static scene.
 """
 
 import dataclasses
+import functools
+import operator
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -197,7 +199,7 @@ def penalty_terms(
     states: Mapping[str, PyTree],
 ) -> dict[str, Term]:
     """The terms of all effects by `effect/term`, each effect with a key of its own."""
-    terms = {}
+    terms: dict[str, Term] = {}
     for effect in effects:
         if effect.penalty is None:
             continue
@@ -211,7 +213,7 @@ def penalty_terms(
 
 
 def from_step(
-    first: int, step: Int[Array, ""] | None, terms: Mapping[str, Term]
+    first: int, step: Int[Array, ""], terms: Mapping[str, Term]
 ) -> dict[str, Term]:
     """Return the same terms, of no weight before step `first`.
 
@@ -222,11 +224,12 @@ def from_step(
         return dict(terms)
     begun = jnp.where(step < first, 0.0, 1.0)
     return {
-        name: term._replace(weight=begun * term.weight) for name, term in terms.items()
+        name: term if term.weight is None else term._replace(weight=begun * term.weight)
+        for name, term in terms.items()
     }
 
 
-def weighted_sum(terms: Mapping[str, Term], first: Scalar | int = 0) -> Scalar:
+def weighted_sum(terms: Mapping[str, Term], first: Scalar | None = None) -> Scalar:
     """Compute the loss, the sum of terms with their weights.
 
     Args:
@@ -236,8 +239,20 @@ def weighted_sum(terms: Mapping[str, Term], first: Scalar | int = 0) -> Scalar:
     Returns:
       The sum, in the order of the terms.
     """
-    weighted = (t.weight * t.value for t in terms.values() if t.weight is not None)
-    return sum(weighted, first)
+    weighted = [t.weight * t.value for t in terms.values() if t.weight is not None]
+    return total(weighted if first is None else [first, *weighted])
+
+
+def total(values: Iterable[Scalar]) -> Scalar:
+    """Add scalars.
+
+    Args:
+      values: The scalars, at least one.
+
+    Returns:
+      Their sum.
+    """
+    return functools.reduce(operator.add, values)
 
 
 def values(terms: Mapping[str, Term]) -> dict[str, Scalar]:

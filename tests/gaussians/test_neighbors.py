@@ -44,7 +44,7 @@ def some_places(count=40, seed=1):
 
 def listed(graph, row):
     """The neighbors of a row that have a weight."""
-    return set(graph.index[row][graph.weight[row] > 0].tolist())
+    return set(graph.neighbor[row][graph.weight[row] > 0].tolist())
 
 
 @pytest.mark.parametrize("scale", ["extent", "spacing", *full("units")])
@@ -68,10 +68,10 @@ def test_the_graph_is_that_of_all_distances(scale, dtype):
     weight = np.exp(-3.0 * (distance / unit) ** 2)
     weight[~active] = 0
     nearest[~active] = np.flatnonzero(~active)[:, None]
-    np.testing.assert_array_equal(graph.index, nearest)
+    np.testing.assert_array_equal(graph.neighbor, nearest)
     tolerance = {"float32": 1e-6, "float64": 1e-13}[dtype]
     np.testing.assert_allclose(graph.weight, weight, rtol=tolerance)
-    assert (graph.index.dtype, graph.weight.dtype) == (jnp.int32, jnp.dtype(dtype))
+    assert (graph.neighbor.dtype, graph.weight.dtype) == (jnp.int32, jnp.dtype(dtype))
 
 
 @pytest.mark.hard_cases
@@ -85,7 +85,7 @@ def test_the_weight_is_that_of_the_published_code():
 def test_weights_by_spacing_do_not_depend_on_the_unit():
     places, spec = some_places(), NeighborSpec(count=5)
     (_, graph), (_, large) = (graph_of(spec, size * places) for size in (1, 1e3))
-    np.testing.assert_array_equal(graph.index, large.index)
+    np.testing.assert_array_equal(graph.neighbor, large.neighbor)
     np.testing.assert_allclose(graph.weight, large.weight, rtol=1e-5)
     middle = np.median(graph.weight[:, -1])
     np.testing.assert_allclose(middle, np.exp(-2000 * 0.03**2), rtol=1e-6)
@@ -99,7 +99,7 @@ def test_with_few_active_rows_the_rest_names_itself(active_count, dtype):
     others = set(np.flatnonzero(active).tolist())
     for row in range(8):
         assert listed(graph, row) == (others - {row} if active[row] else set())
-        assert (graph.index[row][graph.weight[row] == 0] == row).all()
+        assert (graph.neighbor[row][graph.weight[row] == 0] == row).all()
     value, grad = value_and_slope(code, graph, active)
     assert finite((value, grad))
     assert (active_count >= 2) == grad.any()
@@ -113,9 +113,9 @@ def test_clones_at_one_place_are_neighbors_but_never_oneself(copies, dtype):
     places = np.repeat(some_places(6), copies, axis=0)
     _, graph = graph_of(FEW, places, dtype=dtype)
     for row in range(len(places)):
-        assert row not in graph.index[row]
-        assert len(set(graph.index[row].tolist())) == 4
-        alike = graph.index[row] // copies == row // copies
+        assert row not in graph.neighbor[row]
+        assert len(set(graph.neighbor[row].tolist())) == 4
+        alike = graph.neighbor[row] // copies == row // copies
         assert alike.sum() == min(copies - 1, 4)
         np.testing.assert_array_equal(graph.weight[row][alike], 1)
     assert np.isfinite(graph.weight).all()
@@ -124,7 +124,7 @@ def test_clones_at_one_place_are_neighbors_but_never_oneself(copies, dtype):
 def slow_inconsistency(code, graph, active, count):
     total, pairs = 0.0, 0
     for i in np.flatnonzero(active):
-        for k, w in zip(graph.index[i], graph.weight[i], strict=True):
+        for k, w in zip(graph.neighbor[i], graph.weight[i], strict=True):
             total += np.sqrt(w * np.sum((code[i] - code[k]) ** 2) + 1e-20)
         pairs += count
     return total / pairs

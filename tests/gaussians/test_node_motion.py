@@ -284,7 +284,7 @@ def test_links_are_to_what_stays_near_over_the_film(dtype):
     paths[1, :, 0], paths[3, :, 0] = 1.0, 3.0
     paths[2, :, 0] = 0.1 + 10 * time
     linked = skinning.links(put(paths, dtype), put(np.zeros(4), dtype), 2)
-    assert linked.index[0].tolist() == [1, 3]
+    assert linked.neighbor[0].tolist() == [1, 3]
     share = np.exp([-0.5, -4.5])
     np.testing.assert_allclose(linked.weight[0], share / share.sum(), rtol=1e-5)
 
