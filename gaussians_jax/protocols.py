@@ -60,7 +60,10 @@ class Motion(Protocol):
         of these for each leaf, or for several leaves at once.
     """
 
-    learning_rate: LearningRate
+    @property
+    def learning_rate(self) -> LearningRate:
+        """Learning rate of the parameters."""
+        ...
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the parameters, on the host.
@@ -100,7 +103,10 @@ class Motion(Protocol):
 class Appearance(Protocol):
     """Change of the rendered image from one appearance id (exposure) to the next."""
 
-    learning_rate: LearningRate
+    @property
+    def learning_rate(self) -> LearningRate:
+        """Learning rate of the parameters."""
+        ...
 
     def init(self, key: Key[Array, ""]) -> PyTree:
         """Initialize the parameters."""
@@ -124,7 +130,10 @@ class CameraOptimizer(Protocol):
     refined cameras of all frames, those held out as well; host side.
     """
 
-    learning_rate: LearningRate
+    @property
+    def learning_rate(self) -> LearningRate:
+        """Learning rate of the parameters."""
+        ...
 
     def init(self, key: Key[Array, ""]) -> PyTree:
         """Initialize the parameters."""
@@ -273,7 +282,8 @@ def compile_motion(motion: Motion) -> SplatRecord:
             motion.loss(own(context.params), context)
         )
     if hasattr(motion, "project"):
-        more["revise"], more["revise_at"] = motion.project, motion.project_steps
+        more["revise"] = motion.project
+        more["revise_at"] = getattr(motion, "project_steps", ())
     return SplatRecord(
         name,
         init=motion.init,

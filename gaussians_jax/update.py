@@ -42,10 +42,11 @@ def descend(
     updates, opt_state = optimizer.update(grads, state.optimizer, state.params)
     by_part = _learning_rates(spec, metadata, effects, state.params, state.step)
     trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
-    if hasattr(spec.strategy, "perturb"):
+    perturb = getattr(spec.strategy, "perturb", None)
+    if perturb is not None:
         key = growth.stream_key(state, growth.NOISE)
         rate = by_part.rows["splats"].mean
-        params = spec.strategy.perturb(key, trained.params, rate)
+        params = perturb(key, trained.params, rate)
         trained = trained._replace(params=params)
     if spec.alternation is not None:
         mask = phases.update_mask(spec.alternation, state.step)

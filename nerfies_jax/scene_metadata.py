@@ -95,12 +95,6 @@ def _box(capture, near, far):
         points = _frustum_points(capture, near, far)
         low, high = np.quantile(points, (0.1, 0.9), axis=0)
     half_side = float(np.max(high - low)) / 2
-    # No least size: units are the capture's own, and in meters a cell is 1e-5 wide.
-    if not half_side > 0:
-        raise ValueError(
-            f"what is filmed between near = {near:g} and far = {far:g} around "
-            f"{(low + high) / 2} has no width; move the scene nearer to the origin"
-        )
     return (low + high) / 2, half_side
 
 

@@ -129,7 +129,7 @@ def main() -> None:
     """Run what the arguments say."""
     import resource
 
-    from nerfies_jax import children
+    from nerfies_jax import children, console
 
     children.end_with_parent()
     folder, name, first, last, seed = sys.argv[1:]
@@ -137,7 +137,7 @@ def main() -> None:
     if limit:
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     seen = run(pathlib.Path(folder), name, int(first), int(last), int(seed))
-    sys.stdout.write(json.dumps(seen) + "\n")
+    console.say(json.dumps(seen))
 
 
 if __name__ == "__main__":

@@ -129,8 +129,15 @@ class Conditioning(Protocol):
         the name of the conditioning.
     """
 
-    features: int
-    target: str
+    @property
+    def features(self) -> int:
+        """Number of features that `apply` returns."""
+        ...
+
+    @property
+    def target(self) -> str:
+        """Branch of the template that reads them."""
+        ...
 
     def apply(
         self, params: PyTree, point: Vector | None, frame: FrameCondition

@@ -60,7 +60,7 @@ def compile_warp(warp: Warp) -> FieldRecord:
     """Compile a warp to the internal record that a field is built from."""
     hooks = _hooks(warp, "warp")
     if hasattr(warp, "lift"):
-        hooks |= {"lift": warp.lift, "lift_width": warp.features}
+        hooks |= {"lift": warp.lift, "lift_width": getattr(warp, "features", 0)}
     wave = getattr(warp, "shortest_wave", None)
     return FieldRecord(**hooks, displace=warp.apply, shortest_wave=wave)
 

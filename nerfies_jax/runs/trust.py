@@ -68,8 +68,11 @@ def outside_names(stored: Any, spec_type: type) -> tuple[str, ...]:
         isinstance(each, str) for each in overrides
     ):
         raise ValueError(f"its overrides are {overrides!r}, which are no texts")
-    parts = extensions.names_in(stored.get("spec"), specs.TYPE)
     known = specs.allowed_names(spec_type)
-    parts = [name for name in parts if name not in known]
+    parts = [
+        name
+        for name in extensions.names_in(stored.get("spec"), specs.TYPE)
+        if name not in known
+    ]
     named = extensions.names_in_assignments(overrides)
     return tuple(dict.fromkeys((*named, *parts)))

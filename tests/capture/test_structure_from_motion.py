@@ -122,7 +122,7 @@ def test_doubtful_cameras_say_what_to_do():
     _, *doubts = good._replace(placed=60, error_px=2.5, angle_deg=0.4).lines()
     for doubt, words in zip(doubts, ("2.50 px", "0.4 degrees", "40 pict"), strict=True):
         assert words in doubt
-    assert "--frames 200" in doubts[2]
+    assert "200 frames" in doubts[2]
 
 
 def test_a_child_that_dies_is_an_error_not_our_end(tmp_path, monkeypatch):
