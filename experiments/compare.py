@@ -120,10 +120,10 @@ def read(folders, trusted=None) -> list[Compared]:
             stored = json.loads((folder / run_folder.CONFIG).read_text())
             config = stored["config"]
             source = config["source"]
+            kind = representations.named(stored["representation"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{folder}: not a run ({error!r})") from error
         if trusted is not None:
-            kind = representations.named(stored["representation"])
             trust.check(folder, stored, kind.spec_type, trusted)
         compared.append(Compared(name, folder, metrics, curve, remark))
         same = {key: source.get(key) for key in SAME}

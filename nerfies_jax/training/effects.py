@@ -213,7 +213,7 @@ def penalty_terms(
 
 
 def from_step(
-    first: int, step: Int[Array, ""], terms: Mapping[str, Term]
+    first: int, step: Int[Array, ""] | None, terms: Mapping[str, Term]
 ) -> dict[str, Term]:
     """Return the same terms, of no weight before step `first`.
 
@@ -222,6 +222,7 @@ def from_step(
     """
     if first == 0:
         return dict(terms)
+    assert step is not None  # a loss is of a step where it has a warm-up
     begun = jnp.where(step < first, 0.0, 1.0)
     return {
         name: term if term.weight is None else term._replace(weight=begun * term.weight)

@@ -138,12 +138,11 @@ def names_in_assignments(assignments: Iterable[str]) -> tuple[str, ...]:
 
 def members(protocol: type) -> list[str]:
     """Return the names of the members that a protocol requires."""
-    functions = [
+    return sorted(
         name
         for name, value in vars(protocol).items()
-        if callable(value) and not name.startswith("_")
-    ]
-    return sorted({*protocol.__annotations__, *functions})
+        if (callable(value) or isinstance(value, property)) and name[0] != "_"
+    )
 
 
 def check(field: str, part: Any, protocol: type) -> None:

@@ -15,7 +15,7 @@ from nerfies_jax.training.loop import History
 def stored(film):
     """What a run of a film has in its config.json, as far as it is compared."""
     config = RunConfig("nerf", CaptureSource(f"/films/{film}"))
-    return json.dumps({"config": specs.as_json(config)})
+    return json.dumps({"config": specs.as_json(config), "representation": "radiance"})
 
 
 def run_folder(folder, psnr, seconds=(1.0, 3.0)):
@@ -109,6 +109,7 @@ def test_other_machines_and_frames_are_remarked(tmp_path):
         ),
         (lambda folder: (folder / "curve.json").write_text("{}"), "not the curve"),
         (lambda folder: (folder / "metrics.json").unlink(), "not a run"),
+        (lambda folder: (folder / "config.json").write_text("{}"), "not a run"),
         (
             lambda folder: (folder / "config.json").write_text(stored("dog")),
             "capture is /films/dog and /films/cat",

@@ -240,10 +240,11 @@ def test_an_event_lets_the_rows_of_a_scene_grow():
 def test_opacity_and_bends_of_the_codes_cost_what_they_are(rng):
     effects = effects_of(SCENE, scene.metadata_of(scenes.tiny_capture()))
     logit = np.array([-3, 0.2, splats.INACTIVE_LOGIT, 1, 9])
-    params = Params({"splats": rows_of(some_gaussians(5, np.float32), logit)}, {})
     times = rng.normal(size=(6, 4)).astype(np.float32)
     own = filled("float32")._replace(times=times)
     own = jax.tree.map(jnp.asarray, own)
+    rows = rows_of(some_gaussians(5, np.float32), logit)
+    params = Params({"splats": rows}, {"embedding_motion": own})
     terms = effects[0].penalty(own, PenaltyContext(None, None, None, params))
     opacity = np.mean(1 / (1 + np.exp(-np.delete(logit, 2))))
     np.testing.assert_allclose(terms["opacity"].value, opacity, rtol=1e-6)

@@ -208,7 +208,7 @@ def test_a_record_of_another_program_does_not_come_back(trained, tmp_path):
     params, about = trained
     odd = Params(params.rows, {"beside": Beside(put(np.zeros(3)))})
     model_file.save(tmp_path / "model.npz", odd, about)
-    refused(tmp_path / "model.npz", "which is no record or setting")
+    refused(tmp_path / "model.npz", "of another package, which runs code")
 
 
 @pytest.mark.full
