@@ -72,8 +72,8 @@ def thin(share: float) -> Callable[[Capture], Capture]:
 
 
 def from_the_lens(capture: Capture) -> Capture:
-    """A near plane at next to nothing."""
-    return dataclasses.replace(capture, near=1e-9, points=None)
+    """A near plane as near as a capture may have it."""
+    return dataclasses.replace(capture, near=1e-6, points=None)
 
 
 def rounded(frames: Frames) -> Frames:
@@ -203,8 +203,8 @@ OF_FILMS = {
     "near 1e-6 before far": Start(film=thin(1e-6)),
     "near as far as far": Start(film=thin(1e-9)),
     "near at the lens": Start(film=from_the_lens),
-    "box of 1e-6 units": Start(film=scaled(1e-6)),
-    "box of 1e6 units": Start(film=scaled(1e6)),
+    "box of 1e-5 units": Start(film=scaled(1e-5)),
+    "box of 1e5 units": Start(film=scaled(1e5)),
 }
 OF_PARAMETERS = {
     "opaque": Start(params=denser(100.0)),
