@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable
 from typing import NamedTuple
 
-from nerfies_jax.capture import gate, times_file
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath
 
@@ -246,6 +245,8 @@ def load(
         missing=missing,
         **options,
     )
+    from nerfies_jax.capture import gate, times_file  # both load decoders
+
     if times is not None:
         capture = times_file.with_times(capture, times)
     return gate.checked(capture)
