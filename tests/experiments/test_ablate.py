@@ -21,7 +21,7 @@ from experiments.ablate.job import Job
 from experiments.ablate.measures import MEASURES
 from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
-from nerfies_jax.capture import synthetic
+from nerfies_jax.capture import cache_files, synthetic
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.measure import clock
 from nerfies_jax.runs import platform
@@ -259,6 +259,7 @@ def test_the_command_measures_arms_and_goes_on_where_it_stopped(
         arrays.unlink()
         if cut is not None:
             arrays.write_bytes(cut)
+        monkeypatch.setattr(cache_files, "_reported", set())
         with pytest.raises(AssertionError, match="trained an arm"):
             run(*tiny, "--arms", "static")
         assert "static-0.json: of no use" in capsys.readouterr().err
