@@ -82,14 +82,25 @@ class Command:
 
 
 # In the order in which the main job imports them. `experiments.faults` tries others.
-MODULES = ("tyro", "jaxlib", "jax._src.core", "orbax.checkpoint")
-LATE = ("orbax.checkpoint",)
+MODULES = (
+    "tyro",
+    "experiments.cli",
+    "numpy",
+    "jaxlib",
+    "jax._src.core",
+    "jax.numpy",
+    "jax.random",
+    "jax",
+    "optax",
+    "orbax.checkpoint",
+)
+CORE = ("tyro", "jaxlib", "jax._src.core")
 
 
 @pytest.mark.parametrize(
     ("module", "number"),
     [
-        pytest.param(module, number, marks=pytest.mark.slow if module in LATE else ())
+        pytest.param(module, number, marks=() if module in CORE else pytest.mark.slow)
         for module, number in zip(MODULES, itertools.cycle(SIGNALS))
     ],
 )
