@@ -46,6 +46,7 @@ from gaussians_jax.effects.anchors import (
     residual_width,
 )
 from gaussians_jax.effects.blocks import in_blocks
+from gaussians_jax.effects.bound import BoundMotion
 from gaussians_jax.effects.carried import Carried
 from gaussians_jax.effects.kan_motion import Offsets
 from gaussians_jax.path_fit import Guess, Paths, Points
@@ -263,20 +264,14 @@ def penalty(
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(BoundMotion):
     """The `Motion` of an `AnchorMotionSpec` in a run of `steps` over `frames`."""
 
     spec: AnchorMotionSpec
-    steps: int
     frames: int
 
     name = NAME
     significance = staticmethod(significance)
-
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
 
     @property
     def moves(self) -> bool:

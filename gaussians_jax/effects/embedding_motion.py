@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects import kan_motion, motion_codes
@@ -28,8 +28,6 @@ from nerfies_jax.nets.mlp import MLP, HeadSpec, Layer, MLPSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.effects import (
     FrameCondition,
-    PenaltyContext,
-    Term,
 )
 from nerfies_jax.training.step_counts import steps
 
@@ -188,25 +186,12 @@ def deform(
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(motion_codes.BoundCodes):
     """The `Motion` of a `EmbeddingMotionSpec` in a run of `steps`."""
 
     spec: EmbeddingMotionSpec
-    steps: int
-    frames: int
 
     name = NAME
-
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
-
-    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
-        """Evaluate the learning rates of embeddings, and of networks and time codes."""
-        first, last = self.spec.learning_rate, self.spec.learning_rate_end
-        rate = schedules.log_linear(first, last, self.steps)
-        return MotionParams(jnp.full((), self.spec.embedding_rate), rate(step))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the embeddings, the time codes and the networks."""
@@ -234,20 +219,6 @@ class Bound:
         active = splats.in_use(gaussians)
         offsets = deform(params.shared, self.spec, frame.time, cache, active)
         return kan_motion.apply(gaussians, offsets)
-
-    def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
-        """Compute the penalties on codes that bend, and on opacity."""
-        return motion_codes.penalty(self.spec, params.shared.times, context)
-
-    @property
-    def project_steps(self) -> tuple[int, ...]:
-        """Steps after which the fine network reads more rows of the table."""
-        count = motion_codes.moments(self.spec, self.frames)
-        return motion_codes.growth_steps(self.spec, count)
-
-    def project(self, shared: EmbeddingMotion, step: int) -> EmbeddingMotion:
-        """Return the shared parameters with the rows that are read from a step."""
-        return motion_codes.revised(self.spec, shared, step)
 
 
 # 30 codes for the built-in scene: the coarse network reads six, the fine one six to 30.

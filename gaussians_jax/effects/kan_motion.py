@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects import motion_codes
@@ -29,7 +29,7 @@ from nerfies_jax.nets import codes, kan, mlp
 from nerfies_jax.nets.kan import KAN, KANSpec
 from nerfies_jax.nets.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import FrameCondition, PenaltyContext, Term
+from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.step_counts import steps
 
 NAME = "kan_motion"
@@ -360,25 +360,12 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(motion_codes.BoundCodes):
     """The `Motion` of a `KanMotionSpec` in a run of `steps`."""
 
     spec: KanMotionSpec
-    steps: int
-    frames: int
 
     name = NAME
-
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
-
-    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
-        """Evaluate the learning rates of embeddings, and of networks and time codes."""
-        first, last = self.spec.learning_rate, self.spec.learning_rate_end
-        rate = schedules.log_linear(first, last, self.steps)
-        return MotionParams(jnp.full((), self.spec.embedding_rate), rate(step))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the embeddings, the time codes and the networks."""
@@ -406,19 +393,3 @@ class Bound:
         active = splats.in_use(gaussians)
         offsets = deform(params.shared, self.spec, frame.time, cache, active)
         return apply(gaussians, offsets)
-
-    def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
-        """Compute the penalties on codes that bend, and on opacity."""
-        return motion_codes.penalty(self.spec, params.shared.times, context)
-
-    @property
-    def project_steps(self) -> tuple[int, ...]:
-        """Steps after which the fine network reads more rows of the table."""
-        if self.spec.coarser is None:
-            return ()
-        count = motion_codes.moments(self.spec, self.frames)
-        return motion_codes.growth_steps(self.spec, count)
-
-    def project(self, shared: KanMotion, step: int) -> KanMotion:
-        """Return the shared parameters with the rows that are read from a step."""
-        return motion_codes.revised(self.spec, shared, step)

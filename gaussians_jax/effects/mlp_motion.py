@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
 from gaussians_jax.effects.blocks import in_blocks
+from gaussians_jax.effects.bound import BoundMotion
 from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.protocols import MotionParams
 from gaussians_jax.splats import Gaussians, Splats
@@ -259,25 +260,17 @@ def smooth_time(
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(BoundMotion):
     """The `Motion` of a `MotionSpec` in a run of `steps`."""
 
     spec: MotionSpec
-    steps: int
     frames: int
 
     name = NAME
 
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
-
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rate of the networks."""
-        first, last = self.spec.learning_rate, self.spec.learning_rate_end
-        rate = schedules.log_linear(first, last, self.steps)
-        return MotionParams(shared=rate(step))
+        return MotionParams(shared=self.rate(step))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the networks."""

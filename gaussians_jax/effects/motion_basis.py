@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from gaussians_jax import splats
 from gaussians_jax.effects import mlp_motion
 from gaussians_jax.effects.blocks import in_blocks
+from gaussians_jax.effects.bound import BoundMotion
 from gaussians_jax.effects.mlp_motion import SmoothingSpec
 from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.protocols import MotionParams
@@ -351,25 +352,17 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(BoundMotion):
     """The `Motion` of a `BasisMotionSpec` in a run of `steps`."""
 
     spec: BasisMotionSpec
-    steps: int
     frames: int
 
     name = NAME
 
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
-
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rate of the networks."""
-        first, last = self.spec.learning_rate, self.spec.learning_rate_end
-        rate = schedules.log_linear(first, last, self.steps)
-        return MotionParams(shared=rate(step))
+        return MotionParams(shared=self.rate(step))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the networks."""

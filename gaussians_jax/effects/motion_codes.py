@@ -6,14 +6,17 @@ time: a coarse one as if it had a fifth of its rows, a fine one with ever more o
 so that slow motion is found before fast motion.
 """
 
+import dataclasses
 import math
 from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import splats
+from gaussians_jax.effects.bound import BoundMotion
+from gaussians_jax.protocols import MotionParams
 from gaussians_jax.splats import Params
 from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nets import codes
@@ -237,3 +240,33 @@ def penalty(
     if spec.opacity > 0:
         terms["opacity"] = Term(mean_opacity(context.params), spec.opacity)
     return terms
+
+
+@dataclasses.dataclass(frozen=True)
+class BoundCodes(BoundMotion):
+    """Base of the motions that read codes of Gaussians and of time.
+
+    Attributes:
+      frames: Number of training frames.
+    """
+
+    frames: int
+
+    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
+        """Evaluate the learning rates of embeddings, and of networks and time codes."""
+        return MotionParams(jnp.full((), self.spec.embedding_rate), self.rate(step))
+
+    def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the penalties on codes that bend, and on opacity."""
+        return penalty(self.spec, params.shared.times, context)
+
+    @property
+    def project_steps(self) -> tuple[int, ...]:
+        """Steps after which the fine network reads more rows of the table."""
+        if self.spec.coarser is None:
+            return ()
+        return growth_steps(self.spec, moments(self.spec, self.frames))
+
+    def project(self, shared: Any, step: int) -> Any:
+        """Return the shared parameters with the rows that are read from a step."""
+        return revised(self.spec, shared, step)

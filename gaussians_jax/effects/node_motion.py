@@ -45,6 +45,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from gaussians_jax import path_fit, splats
 from gaussians_jax.effects import skinning
 from gaussians_jax.effects.blocks import in_blocks
+from gaussians_jax.effects.bound import BoundMotion
 from gaussians_jax.effects.skinning import Links, Moves
 from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.path_fit import Guess, Paths, Points
@@ -351,27 +352,18 @@ def fit_to_paths(
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(BoundMotion):
     """The `Motion` of a `NodeMotionSpec` in a run of `steps`."""
 
     spec: NodeMotionSpec
-    steps: int
     extent: float  # of the scene, the unit of shifts, scene units
 
     name = NAME
 
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
-
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rates of the nodes and their network."""
         spec = self.spec
-        rate = schedules.log_linear(
-            spec.learning_rate, spec.learning_rate_end, self.steps
-        )
-        now = rate(step)
+        now = self.rate(step)
         share = now / spec.learning_rate
         mask = None if spec.mask is None else spec.mask.rate * share
         place, radius = self.extent * spec.place_rate * share, spec.radius_rate * share

@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
+from gaussians_jax.effects.bound import BoundMotion
 from gaussians_jax.effects.motion_basis import Offsets, apply
 from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.protocols import MotionParams
@@ -187,14 +188,13 @@ def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Te
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(BoundMotion):
     """The `Motion` of a `PlaneMotionSpec` in a run of `steps`.
 
     `box` is the low and the high corner of the volume of the planes, scene units.
     """
 
     spec: PlaneMotionSpec
-    steps: int
     extent: float  # of the scene, the unit of shifts, scene units
     box: tuple[Corner, Corner] | None
 
@@ -210,17 +210,11 @@ class Bound:
                 "does"
             )
 
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
-
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rates of the planes and of the network."""
-        spec, run = self.spec, self.steps
-        planes = schedules.log_linear(spec.plane_rate, spec.plane_rate_end, run)
-        network = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run)
-        return MotionParams(shared=Motion._make((planes(step), network(step))))
+        first, last = self.spec.plane_rate, self.spec.plane_rate_end
+        planes = schedules.log_linear(first, last, self.steps)(step)
+        return MotionParams(shared=Motion._make((planes, self.rate(step))))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the planes and the network."""

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import path_fit, splats
 from gaussians_jax.effects import temporal_opacity
+from gaussians_jax.effects.bound import BoundMotion
 from gaussians_jax.effects.temporal_opacity import Fading
 from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.path_fit import Guess, Paths
@@ -137,29 +138,20 @@ def fit_to_paths(spec: PolynomialMotionSpec, paths: Paths) -> Guess:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(BoundMotion):
     """The `Motion` of a `PolynomialMotionSpec` in a run of `steps`."""
 
     spec: PolynomialMotionSpec
-    steps: int
     extent: float  # of the scene, the unit of shifts, scene units
 
     name = NAME
-
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
 
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rates of the coefficients."""
         spec, fading = self.spec, None
         if spec.fading is not None:
             fading = Fading._make((spec.fading.time_rate, spec.fading.width_rate))
-        rate = schedules.log_linear(
-            spec.learning_rate, spec.learning_rate_end, self.steps
-        )
-        rates = self.extent * rate(step), spec.turn_rate, fading
+        rates = self.extent * self.rate(step), spec.turn_rate, fading
         rows = Polynomials._make(rates)
         return MotionParams(rows)
 

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import splats, time_knots
+from gaussians_jax.effects.bound import BoundMotion
 from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.protocols import MotionParams
@@ -227,25 +228,18 @@ def _at_knots(track, times, spec):
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(BoundMotion):
     """The `Motion` of a `SE3BasesSpec` in a run of `steps`."""
 
     spec: SE3BasesSpec
-    steps: int
     extent: float  # of the scene, the unit of shifts, scene units
 
     name = NAME
 
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
-
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rates of logits and bases."""
         # A center and a shift say the same twice over; centers stay.
-        first, last = self.spec.learning_rate, self.spec.learning_rate_end
-        now = schedules.log_linear(first, last, self.steps)(step)
+        now = self.rate(step)
         coarse = Poses(now, self.extent * now)
         fine = jax.tree.map(lambda own: self.spec.fine_rate * own, coarse)
         bases = Bases(fine, coarse, jnp.zeros_like(now))

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax import path_fit, splats, time_knots
+from gaussians_jax.effects.bound import BoundMotion
 from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.path_fit import Guess, Paths, Points
 from gaussians_jax.protocols import MotionParams
@@ -93,25 +94,17 @@ def fit_to_paths(spec: SplineMotionSpec, paths: Paths) -> Guess:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(BoundMotion):
     """The `Motion` of a `SplineMotionSpec` in a run of `steps`."""
 
     spec: SplineMotionSpec
-    steps: int
     extent: float  # of the scene, the unit of shifts, scene units
 
     name = NAME
 
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
-
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rates of the control points."""
-        first, last = self.spec.learning_rate, self.spec.learning_rate_end
-        rate = schedules.log_linear(first, last, self.steps)
-        return MotionParams(Splines(self.extent * rate(step), rate(step)))
+        return MotionParams(Splines(self.extent * self.rate(step), self.rate(step)))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize control points with which nothing moves."""

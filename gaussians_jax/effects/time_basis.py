@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax import splats
+from gaussians_jax.effects.bound import BoundMotion
 from gaussians_jax.metadata import SceneMetadata
 from gaussians_jax.protocols import MotionParams
 from gaussians_jax.splats import Gaussians, Splats
@@ -169,28 +170,21 @@ def sparsity(
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound:
+class Bound(BoundMotion):
     """The `Motion` of a `TimeBasisSpec` in a run of `steps`."""
 
     spec: TimeBasisSpec
-    steps: int
     extent: float  # of the scene, the unit of shifts, scene units
 
     name = NAME
 
-    @property
-    def warm_up(self) -> int:
-        """Number of steps without motion."""
-        return self.spec.warm_up
-
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rates of coefficients and network."""
-        spec, run = self.spec, self.steps
+        spec = self.spec
         coefficients = schedules.log_linear(
-            spec.coefficient_rate, spec.coefficient_rate_end, run
+            spec.coefficient_rate, spec.coefficient_rate_end, self.steps
         )
-        network = schedules.log_linear(spec.learning_rate, spec.learning_rate_end, run)
-        return MotionParams(coefficients(step), network(step))
+        return MotionParams(coefficients(step), self.rate(step))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the network, and coefficients with which nothing moves."""
