@@ -52,7 +52,7 @@ class Compare:
     """Code from other packages that the run was trained with, as MODULE:NAME. It is
     loaded only if it is named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
-    """Where to render."""
+    """Device to render on."""
 
     def __post_init__(self):
         if len(self.runs) < 2 or len(set(self.runs)) < len(self.runs):

@@ -70,7 +70,7 @@ class Export:
     points: int | None = None
     """Number of points to track (default: 1000)."""
     path: str | None = None
-    """Where the camera goes, as for experiments.render (default: sway)."""
+    """Camera path, as for experiments.render (default: sway)."""
     units: Literal["scene", "world"] | None = None
     """Lengths as in the run's own files, or as in those of the capture (default:
     scene)."""
@@ -82,7 +82,7 @@ class Export:
     """Code from other packages that the run was trained with, as MODULE:NAME. It is
     loaded only if it is named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
     def __post_init__(self):
         names = {name for known in OPTIONS.values() for name in known}
@@ -108,7 +108,7 @@ class Export:
 
     @property
     def gaussians(self) -> bool:
-        """Whether Gaussians are exported."""
+        """True if Gaussians are exported."""
         return OPTIONS[self.format] == GAUSSIANS
 
     @property
@@ -121,7 +121,7 @@ class Export:
 
     @property
     def place(self) -> pathlib.Path:
-        """Where to write."""
+        """Path of the output."""
         name: str = self.format
         if self.gaussians and self.frames is None:
             name = f"at-{self.time or 0:g}"

@@ -34,7 +34,7 @@ class MakeScene:
     set: cli.Overrides = ()
     """Any other setting of the scene, as path.to.field=value."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
-    """Where to trace the rays."""
+    """Device to trace rays on."""
 
 
 @cli.command(MakeScene)

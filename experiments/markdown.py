@@ -71,5 +71,5 @@ def title_and_text(docstring: str | None) -> tuple[str, str]:
 
 
 def machine(about: Mapping[str, Any]) -> str:
-    """Where numbers were taken, as in "AMD EPYC, cpu, JAX 0.10.2"."""
+    """Describe the machine of a measurement, as in "AMD EPYC, cpu, JAX 0.10.2"."""
     return f"{about['cpu']}, {about['backend']}, JAX {about['jax']}"

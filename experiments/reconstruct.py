@@ -58,7 +58,7 @@ class Reconstruct:
     """Continue the run in --out from its last checkpoint. Without --out, the newest run
     of the given capture or video in the folder runs."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
     seed: int | None = None
     """Seed of all random numbers (default: 0)."""
     set: cli.Overrides = ()
@@ -106,7 +106,7 @@ def main(args):
 
 
 def _result(outcome):
-    """Where it ended, and what `metrics.json` has where it came so far."""
+    """Return how the run ended, with the metrics if it has any."""
     return {
         "folder": str(outcome.folder),
         "preset": outcome.run.config.preset,

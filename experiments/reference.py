@@ -49,12 +49,12 @@ def main(args):
 
 
 def page(folder: pathlib.Path, module: str) -> pathlib.Path:
-    """Where the reference has a module."""
+    """Return the path of the page of a module."""
     return folder.joinpath(*module.split(".")).with_suffix(".html")
 
 
 def public_names() -> dict[str, list[str]]:
-    """By module, the functions and classes it defines, or the face that it has."""
+    """List the public functions and classes, or the face, of each module."""
     names = {}
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):

@@ -86,7 +86,7 @@ class Render:
     """Code from other packages that the run was trained with, as MODULE:NAME. It is
     loaded only if it is named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
     def __post_init__(self):
         cli.check_frames(self.frames, self.path)

@@ -36,7 +36,7 @@ class View:
     """Code from other packages that the run was trained with, as MODULE:NAME. It is
     loaded only if it is named here again."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
     def __post_init__(self):
         cli.check_port(self.port)

@@ -51,7 +51,7 @@ class TileRects(NamedTuple):
 
 
 class Cursor(NamedTuple):
-    """Where the next chunk starts in the list of pairs."""
+    """Start of the next chunk in the list of pairs."""
 
     rank: Int[Array, ""]  # Gaussian, in depth order
     skip: Int[Array, ""]  # its tiles that earlier chunks have already taken

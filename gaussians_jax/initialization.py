@@ -1,4 +1,4 @@
-"""Where the first Gaussians come from: the capture's own points, and random ones."""
+"""Initial Gaussians, from the points of the capture and from random points."""
 
 import dataclasses
 import math

@@ -254,7 +254,7 @@ def scene_of(effect: SplatRecord, points: Points) -> Params:
 def places(
     effect: SplatRecord, points: Points, time: Float[Array, ""]
 ) -> Float[Array, "points 3"]:
-    """Where the motion carries the points at a time."""
+    """Compute the positions to which the motion carries the points at a time."""
     return _deformer(effect, points)(time).mean
 
 

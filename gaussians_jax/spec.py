@@ -297,7 +297,7 @@ def _refuse_late(spec, still):
 
 
 def _fading(motion):
-    """How the opacities of a motion come and go; None where they stay."""
+    """Return the settings of opacity over time, or None if it is constant."""
     return motion.fading if isinstance(motion, PolynomialMotionSpec) else None
 
 

@@ -1,4 +1,4 @@
-"""Where the time of a training step of Gaussians goes."""
+"""Time of the parts of a training step of Gaussians."""
 
 import jax
 import jax.numpy as jnp

@@ -130,7 +130,7 @@ def _follow_flow(field, state, capture, known):
 
 
 def _flow_mover(field) -> Move | None:
-    """By scene flow, one interval of the capture after the other.
+    """Follow the scene flow, one interval of the capture after the other.
 
     Between two views that are no whole number of intervals apart, each hop is that much
     shorter or longer than what the flow says. A point that runs to no finite place is

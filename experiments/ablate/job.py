@@ -375,7 +375,7 @@ class Job:
         return all(self.kept(name, seed, b) is not None for b in self.budgets)
 
     def finished(self, budget: Budget) -> dict[tuple[str, int], ArmResult]:
-        """By arm and seed, what is there."""
+        """Return the finished results by arm and seed."""
         stored = {task: self.kept(*task, budget) for task in self.tasks()}
         return {task: kept for task, kept in stored.items() if kept is not None}
 

@@ -53,7 +53,7 @@ class Ablate:
     set: cli.Overrides = ()
     """Fields changed in every arm, as strategy.cap_max=5000 template.depth=4."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
     @property
     def all_seeds(self) -> range:

@@ -96,7 +96,7 @@ class EffectCost:
     check: pathlib.Path | None = None
     """An earlier effect_cost.json: says what got worse since, exit code 1 if any."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
     def __post_init__(self):
         if not self.presets:

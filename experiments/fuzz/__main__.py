@@ -33,7 +33,7 @@ class Fuzz:
     """Damage small valid files at random and check how they are read."""
 
     mutations: int = 1_000_000
-    """How many, over all readers."""
+    """Number of mutations over all readers."""
     seconds: float | None = None
     """Stop after so long (default: when all mutations are done)."""
     only: str | None = None
@@ -117,7 +117,7 @@ def _extend(stored, name, count, args):
 
 
 def _run(out, name, first, last, seed):
-    """What the process saw; what it did not live to tell is a failure of its own."""
+    """Run mutations in a process, whose death is a failure as well."""
     from experiments.fuzz import worker
     from nerfies_jax import children
 

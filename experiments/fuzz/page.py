@@ -4,7 +4,7 @@ from experiments import markdown
 
 
 def page(stored: dict) -> str:
-    """How many damaged files each reader took or refused, and what went wrong."""
+    """Count the damaged files that each reader read or refused, and the failures."""
     rows, failures = [], []
     for name, one in stored["targets"].items():
         wrong = sum(one["failures"].values())

@@ -83,7 +83,7 @@ def _peak(resource):
 
 
 def _read(target, work, seen):
-    """What is wrong with how a reader took its input, and the processor time."""
+    """Read an input, and return the failure or None, and the processor time."""
     from nerfies_jax.capture.errors import FileError
 
     begun = time.process_time()

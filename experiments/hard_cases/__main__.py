@@ -74,7 +74,7 @@ class HardCases:
     document: pathlib.Path | None = None
     """Write the table into this Markdown file, between its two markers."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "cpu"
-    """Where to compute."""
+    """Device to compute on."""
 
     def __post_init__(self):
         if not self.topics or not set(self.topics) <= set(TOPICS):

@@ -19,7 +19,7 @@ def _half_turns(angles):
 
 
 def _textbook_log(q):
-    """By the arc cosine of the scalar."""
+    """Compute the logarithm from the arc cosine of the scalar."""
     q = q / jnp.sqrt(jnp.sum(q**2))
     q = jnp.where(q[0] < 0, -q, q)
     half = jnp.arccos(q[0])
@@ -61,7 +61,7 @@ def _turned(w):
 
 
 def _textbook_matrix_log(w):
-    """By the arc cosine of the trace."""
+    """Compute the logarithm from the arc cosine of the trace."""
     rotation = _turned(w)
     angle = jnp.arccos((jnp.trace(rotation) - 1) / 2)
     skew = rotation - rotation.T

@@ -275,7 +275,7 @@ class Bound(BoundMotion):
 
     @property
     def moves(self) -> bool:
-        """Whether anchors have a motion."""
+        """True if anchors have a motion."""
         return self.spec.moves
 
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:

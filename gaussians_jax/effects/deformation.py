@@ -21,7 +21,7 @@ Effects = tuple[SplatRecord, ...]
 
 
 def prepare(effects: Effects, params: Params) -> dict[str, PyTree]:
-    """By the name of the effect, what depends on the parameters but not on the time.
+    """Compute what depends on the parameters but not on the time, by effect name.
 
     A pure function: what it returned is right as long as `params` are the same arrays.
     """

@@ -34,7 +34,7 @@ class Pose(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """Where points lie in the images of several cameras."""
+    """Projections of points into the images of several cameras."""
 
     pixel: np.ndarray  # [frames, points, 2]
     depth: np.ndarray  # [frames, points]

@@ -80,7 +80,7 @@ class Bound:
 
 
 def has_tables(spec: object) -> bool:
-    """Whether the template reads a point from tables."""
+    """Return True if the template reads a point from tables."""
     return isinstance(spec, TemplateSpec) and not isinstance(
         spec.position, EncodingSpec
     )

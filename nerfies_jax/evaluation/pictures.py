@@ -396,7 +396,7 @@ def _bar(row, left, right, width):
 
 
 def _enlarged(pictures):
-    """By a whole factor and without smoothing: what is seen is what was rendered."""
+    """Enlarge by a whole factor, without smoothing, to show rendered pixels."""
     factor = max(1, math.ceil(PANEL_WIDTH / pictures.shape[2]))
     return pictures.repeat(factor, 1).repeat(factor, 2)
 

@@ -130,7 +130,7 @@ def gains(light: np.ndarray) -> np.ndarray:
 
 
 def _along_widest(points):
-    """Where points lie along the direction in which they spread most."""
+    """Compute coordinates along the direction in which points spread most."""
     centered = points - np.median(points, axis=0)
     _, _, axes = np.linalg.svd(centered, full_matrices=False)
     return centered @ axes[0]

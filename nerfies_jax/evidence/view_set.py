@@ -334,7 +334,7 @@ def _matrix(cameras, row):
 
 
 def _textured(gray):
-    """Where the picture varies in every direction: no aperture problem.
+    """Find where an image varies in every direction and has no aperture problem.
 
     The lesser eigenvalue of the structure tensor over 2 px, as a slope in gray levels.
     """

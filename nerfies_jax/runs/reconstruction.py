@@ -312,7 +312,7 @@ def _restored(folder, run):
 
 
 def _opened(held, folder, run, state, after):
-    """Where the run saves, with its state saved there: nothing done is ever lost."""
+    """Open the checkpoints of a run, and save the state of a new one."""
     line = commands.resume(folder, run.code)
     stopping.advise(f"continue with: {line}")
     checkpoints = held.enter_context(train.open_checkpoints(folder, run, after))
