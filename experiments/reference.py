@@ -61,8 +61,8 @@ def public_names() -> dict[str, list[str]]:
             parts = path.relative_to(ROOT).with_suffix("").parts
             module = ".".join(part for part in parts if part != "__init__")
             face = path.with_suffix(".pyi")
-            tree = ast.parse((face if face.exists() else path).read_text())
-            names[module] = list(_public(tree, path.parent))
+            source = face if face.exists() else path
+            names[module] = list(_public(source))
     return names
 
 
@@ -72,7 +72,8 @@ def _has_face(package):
     return not package or "__all__" in path.read_text()
 
 
-def _public(tree, folder):
+def _public(path):
+    tree = ast.parse(path.read_text())
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             yield from ast.literal_eval(node.value)
@@ -81,8 +82,9 @@ def _public(tree, folder):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             if not node.name.startswith("_"):
                 yield node.name
-        elif isinstance(node, ast.ImportFrom):  # of a face: `from .a import b as b`
-            source = folder.joinpath(*(node.module or "").split("."))
+        # Of a face, `from .a import b as b`. Elsewhere the name is on the page of `a`.
+        elif isinstance(node, ast.ImportFrom) and path.suffix == ".pyi":
+            source = path.parent.joinpath(*(node.module or "").split("."))
             for alias in node.names:
                 # A module in a face has a page of its own.
                 is_module = (source / f"{alias.name}.py").exists()
