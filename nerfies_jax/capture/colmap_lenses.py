@@ -19,8 +19,8 @@ def undistort(
     """Resample images to one pinhole camera.
 
     The pinhole is the one that COLMAP's own undistorter chooses for the first lens.
-    Images are sampled bilinearly, masks at the nearest pixel. Pixels that look past the
-    outermost pixel centers of the source do not exist and are black.
+    Images are sampled with a Lanczos filter, masks at the nearest pixel. Pixels that
+    look past the outermost pixel centers of the source do not exist and are black.
 
     Args:
       images: uint8 images, [frames, height, width, 3].
@@ -59,7 +59,7 @@ def undistort(
                 "its undistorted picture; calibrate it again"
             )
         exists[row] = inside
-        out[row] = resampling.bilinear(images[row], place) * inside[..., None]
+        out[row] = resampling.lanczos(images[row], place) * inside[..., None]
         for target, mask in zip(bent, masks, strict=True):
             if target is not None and mask is not None:
                 target[row] = resampling.nearest(mask[row], place) & inside

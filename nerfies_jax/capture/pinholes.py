@@ -19,9 +19,9 @@ def as_pinholes(capture: Capture) -> Capture:
     """Undistort a capture to pinhole cameras.
 
     Focal lengths, principal points and image sizes are unchanged. Pixels that the lens
-    did not observe are marked in `valid`. Color is sampled bilinearly, masks and depth
-    at the nearest pixel. z-depth needs no change, since a ray keeps its points. Flow is
-    dropped, since both of its ends would move.
+    did not observe are marked in `valid`. Color is sampled with a Lanczos filter, masks
+    and depth at the nearest pixel. z-depth needs no change, since a ray keeps its
+    points. Flow is dropped, since both of its ends would move.
 
     Args:
       capture: The capture.
@@ -41,7 +41,7 @@ def as_pinholes(capture: Capture) -> Capture:
     with events.stage("undistorting images", len(images)) as stage:
         for row in range(len(images)):
             place, inside = maps.of(cameras.take(capture.cameras, row))
-            images[row] = resampling.bilinear(capture.images[row], place)
+            images[row] = resampling.lanczos(capture.images[row], place)
             images[row][~inside] = 0
             filmed[row] = inside
             if capture.valid is not None:

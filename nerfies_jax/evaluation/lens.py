@@ -11,9 +11,10 @@ class ThroughLens:
     """Renderer of distorted images, on top of a renderer of pinhole images.
 
     The render of the undistorted camera is sampled where each distorted pixel looks:
-    color and opacity bilinearly, and depth, which must not be mixed across edges, at
-    the nearest pixel. Everything is 0 outside of the pinhole image. Those pixels are
-    not `valid` in `pinholes.scorable`. Views without distortion are passed through.
+    color and opacity with a Lanczos filter, and depth, which must not be mixed across
+    edges, at the nearest pixel. Everything is 0 outside of the pinhole image. Those
+    pixels are not `valid` in `pinholes.scorable`. Views without distortion are passed
+    through.
     """
 
     def __init__(self, draw: Draw, size: tuple[int, int]):
@@ -28,7 +29,10 @@ class ThroughLens:
         drawn = self._draw(state, straight)
         place, inside = self._maps.of(view.camera)
         flat = np.concatenate([drawn.color, np.asarray(drawn.alpha)[..., None]], -1)
-        flat = np.where(inside[..., None], resampling.bilinear(flat, place), 0)
+        flat = np.asarray(flat, np.float32)
+        flat = np.where(inside[..., None], resampling.lanczos(flat, place), 0)
+        # The filter has negative lobes.
+        flat = np.clip(flat, 0, 1)
         depth = np.asarray(drawn.depth)
         bent = np.where(inside, resampling.nearest(depth, place), 0).astype(depth.dtype)
         return Rendering._make((flat[..., :3], flat[..., 3], bent))

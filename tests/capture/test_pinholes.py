@@ -5,8 +5,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.ndimage as nd
 
-from nerfies_jax.capture import pinholes
+from nerfies_jax.capture import pinholes, resampling
 from nerfies_jax.geometry import camera as cameras
 from tests import scenes
 
@@ -51,8 +52,19 @@ def test_an_undistorted_picture_is_the_pinhole_s_own():
         if flat.valid is not None:
             seen = flat.valid[row]
         assert seen.mean() > 0.7
-        # Bilinear sampling of a pattern with a curvature of 0.05 levels per pixel.
+        # Rounding, of the pattern and of what is sampled from it.
         assert np.abs(flat.images[row].astype(int) - expected)[seen].max() <= 2
+
+
+def test_resampling_there_and_back_keeps_fine_texture(rng):
+    noise = nd.gaussian_filter(rng.normal(size=(64, 80, 3)), (1, 1, 0))
+    image = np.uint8(np.clip(127 + 40 * noise / noise.std(), 0, 255).round())
+    rows, columns = np.indices(image.shape[:2], np.float32)
+    shifted = resampling.lanczos(image, np.stack([rows + 0.5, columns + 0.5]))
+    back = resampling.lanczos(shifted, np.stack([rows - 0.5, columns - 0.5]))
+    error = (back.astype(float) - image)[8:-8, 8:-8]
+    # 47 dB; 38 dB with a cubic filter and 28 dB with a bilinear one.
+    assert 10 * np.log10(255**2 / np.mean(error**2)) > 44
 
 
 def test_pixels_the_lens_did_not_film_are_marked():
