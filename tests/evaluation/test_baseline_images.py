@@ -149,7 +149,7 @@ def test_a_pinhole_s_render_is_bent_as_the_lens_films(bulge):
     assert (seen.mean() < 0.99) == (bulge < 0)
     # Rounding to levels, before and after the filter with its negative lobes.
     away = np.abs(255 * render.color - bent.images[0])[seen]
-    assert away.max() <= 1.01
+    assert away.max() <= 1.5
     assert (
         np.abs(
             255 * draw(NOBODY, evaluation.view_of(capture, 0)).color - bent.images[0]
