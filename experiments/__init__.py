@@ -24,11 +24,8 @@ def _leave_current_folder() -> None:
 
 _leave_current_folder()
 
-from nerfies_jax import (  # noqa: E402 (found without the current folder)
-    children,
-    console,
-    stopping,
-)
+# Found without the current folder.
+from nerfies_jax.runtime import children, console, stopping  # noqa: E402
 
 # Before anything else can open a file under the number of a closed stream.
 console.open_descriptors()

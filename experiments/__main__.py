@@ -14,8 +14,8 @@ from typing import Annotated, Any
 import tyro
 
 from experiments import options
-from nerfies_jax import console
 from nerfies_jax.capture.nearest import known_names
+from nerfies_jax.runtime import console
 
 HERE = pathlib.Path(__file__).resolve().parent
 

@@ -22,7 +22,6 @@ import tyro
 from tyro.conf import Positional
 
 from experiments import options
-from nerfies_jax import console, stopping
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
@@ -34,6 +33,7 @@ from nerfies_jax.runs.config import (
     check_budget,
 )
 from nerfies_jax.runs.representations import PRESETS
+from nerfies_jax.runtime import console, stopping
 from nerfies_jax.training.specs import OverrideError
 
 # Those of `nerfies_jax.capture.synthetic`, which loads JAX.

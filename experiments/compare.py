@@ -17,8 +17,8 @@ import pathlib
 from typing import Any, Literal, NamedTuple
 
 from experiments import cli
-from nerfies_jax import console
 from nerfies_jax.runs import platform, representations, run_folder, trust
+from nerfies_jax.runtime import console
 
 LARGEST_ERROR = 0.2
 SAME = ("capture", "scene", "factor", "max_side", "heldout")
@@ -187,7 +187,7 @@ def _columns(compared):
 
 def legend(compared) -> list[str]:
     """Explain the columns of the table, a line each."""
-    from nerfies_jax.measure.metric_table import METRICS
+    from nerfies_jax.metrics.metric_table import METRICS
 
     better = {"higher": " Higher is better.", "lower": " Lower is better.", "equal": ""}
     entries = [(head, METRICS[key]) for key, head, *_ in _columns(compared)]
@@ -259,7 +259,7 @@ def remarks(compared) -> list[str]:
 def save(folder: pathlib.Path, compared, goals) -> None:
     """compare.json and curves.png."""
     from nerfies_jax.capture.json_files import write_json
-    from nerfies_jax.evaluation import pictures
+    from nerfies_jax.visualization import panels
 
     reached = times(compared, goals)
     write_json(
@@ -274,18 +274,18 @@ def save(folder: pathlib.Path, compared, goals) -> None:
         },
     )
     histories = {
-        run.name: pictures.History(run.curve.seconds, run.curve.psnr)
+        run.name: panels.History(run.curve.seconds, run.curve.psnr)
         for run in compared
         if run.curve.psnr
     }
     if histories:
-        pictures.curve(histories, folder / "curves.png")
+        panels.curve(histories, folder / "curves.png")
 
 
 def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
     """Held-out frames: the truth and every run's picture, below them the errors."""
     from nerfies_jax import evaluation, runs
-    from nerfies_jax.evaluation import pictures
+    from nerfies_jax.visualization import panels
 
     scored = []
     for each in compared:
@@ -296,24 +296,24 @@ def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
         draw = runs.drawer(run, evaluation.Renderer(run.model, run.capture.size))
         scored.append(evaluation.score(draw, state, run.filmed, rows))
         capture = run.filmed
-    panels, captions = [], []
+    tiles, captions = [], []
     for place, row in enumerate(scored[0].rows):
         truth = capture.images[row]
         filmed = None if capture.valid is None else capture.valid[row][..., None]
         drawn = [evaluation.as_picture(each.color[place]) for each in scored]
         if filmed is not None:  # what was not filmed is no error
             truth, drawn = truth * filmed, [picture * filmed for picture in drawn]
-        errors = [pictures.color_error(x, truth, LARGEST_ERROR).picture for x in drawn]
+        errors = [panels.color_error(x, truth, LARGEST_ERROR).picture for x in drawn]
         blank = truth * 0 + 255
-        panels += [truth, *drawn, blank, *errors]
+        tiles += [truth, *drawn, blank, *errors]
         captions += [capture.ids[row]]
         captions += [
             f"{run.name}: {each.psnr[place]:.2f} dB"
             for run, each in zip(compared, scored, strict=True)
         ]
         captions += ["", *(f"error, to {LARGEST_ERROR:g}" for _ in scored)]
-    sheet = pictures.contact_sheet(panels, captions, columns=1 + len(compared))
-    pictures.save(sheet, path)
+    sheet = panels.contact_sheet(tiles, captions, columns=1 + len(compared))
+    tiles.save(sheet, path)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ import pathlib
 from typing import Any, Literal
 
 from experiments import cli, render_folder
-from nerfies_jax import console, events
 from nerfies_jax.runs import platform, representations, run_folder
+from nerfies_jax.runtime import console, events
 
 # Which options each format knows, beside --out, --overwrite and --device.
 GAUSSIANS = ("time", "frames", "units")
@@ -155,7 +155,7 @@ def main(args):
 
 
 def _gaussians(args: Export, run: Any) -> str:
-    from gaussians_jax import files, instants
+    from gaussians_jax.io import files, instants
     from nerfies_jax import runs
 
     state = runs.restore(args.run, run).state
@@ -175,9 +175,9 @@ def _gaussians(args: Export, run: Any) -> str:
 
 
 def _splatv(args: Export, run: Any) -> str:
-    from gaussians_jax import instants, splats, splatv
-    from gaussians_jax.player import sampled
-    from gaussians_jax.spec import raster_of
+    from gaussians_jax.core import splats
+    from gaussians_jax.io import instants, sampled, splatv
+    from gaussians_jax.scene.spec import raster_of
     from nerfies_jax import evaluation, runs
 
     state, spec, capture = runs.restore(args.run, run).state, run.spec, run.capture

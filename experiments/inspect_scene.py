@@ -11,8 +11,8 @@ import dataclasses
 import pathlib
 
 from experiments import cli
-from nerfies_jax import console
 from nerfies_jax.runs import platform
+from nerfies_jax.runtime import console
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,10 +44,10 @@ def main(args):
         from nerfies_jax.capture import gate
         from nerfies_jax.capture.capture import describe
         from nerfies_jax.capture.json_files import write_json
-        from nerfies_jax.evaluation import pictures
-        from nerfies_jax.evidence import inspection
+        from nerfies_jax.preprocessing import inspection
         from nerfies_jax.runs import adviser
         from nerfies_jax.runs.platform import CACHE
+        from nerfies_jax.visualization import panels
 
         source = cli.plain(args.source)
         capture = runs.stored_capture(source, args.seed)
@@ -59,7 +59,7 @@ def main(args):
             console.say(line)
         path = args.picture or _free(pathlib.Path("runs"), f"inspect-{_name(capture)}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        pictures.save(inspected.sheet, path)
+        panels.save(inspected.sheet, path)
         console.say(f"contact sheet: {path}")
         record = as_json(capture, inspected, advice)
         if args.findings is not None:
@@ -70,7 +70,7 @@ def main(args):
 
 def report(inspected, advice, source):
     """Lines for a person: the table, then the commands."""
-    from nerfies_jax.evidence import findings
+    from nerfies_jax.preprocessing import findings
     from nerfies_jax.runs import commands, prices
     from nerfies_jax.runs.config import RunConfig
 

@@ -9,8 +9,8 @@ import shlex
 from typing import Literal
 
 from experiments import cli
-from nerfies_jax import console
 from nerfies_jax.runs import platform
+from nerfies_jax.runtime import console
 from nerfies_jax.training import specs
 
 

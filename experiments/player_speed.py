@@ -37,7 +37,7 @@ import shutil
 import statistics
 
 from experiments import cli, markdown
-from nerfies_jax import console
+from nerfies_jax.runtime import console
 
 ARGUMENTS = (
     "--use-angle=swiftshader",
@@ -245,7 +245,7 @@ def main(args):
         except ImportError:
             raise ValueError("this needs playwright: pip install playwright") from None
     from nerfies_jax.capture.json_files import write_json
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
 
     rows = []
     with sync_playwright() as playwright:

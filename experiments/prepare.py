@@ -13,8 +13,8 @@ from typing import Annotated
 import tyro
 
 from experiments import cli
-from nerfies_jax import console
 from nerfies_jax.runs.config import Preparation
+from nerfies_jax.runtime import console
 
 How = Annotated[Preparation, tyro.conf.OmitArgPrefixes]
 

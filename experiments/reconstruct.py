@@ -14,9 +14,9 @@ import signal
 from typing import ClassVar, Literal
 
 from experiments import cli
-from nerfies_jax import console, stopping
 from nerfies_jax.runs import commands, platform, representations, run_folder
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
+from nerfies_jax.runtime import console, stopping
 from nerfies_jax.training import extensions
 
 

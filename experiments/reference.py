@@ -10,8 +10,8 @@ import dataclasses
 import pathlib
 
 from experiments import cli
-from nerfies_jax import console
 from nerfies_jax.capture import extras
+from nerfies_jax.runtime import console
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PACKAGES = ("nerfies_jax", "gaussians_jax")

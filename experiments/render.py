@@ -23,8 +23,8 @@ import numpy as np
 import tyro
 
 from experiments import cli, render_folder
-from nerfies_jax import console, events
 from nerfies_jax.runs import platform, representations
+from nerfies_jax.runtime import console, events
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,7 +199,7 @@ def _shown(args, model, state):
     """The state without what is hidden in all pictures."""
     if args.hide_moving is None:
         return state
-    from gaussians_jax import variants
+    from gaussians_jax.scene import variants
 
     state, summary = variants.without_moving(model, state, args.hide_moving)
     console.say(summary)
@@ -208,7 +208,7 @@ def _shown(args, model, state):
 
 def _faster(args, model, state):
     """The model and its state, the motion from a table or of what moves alone."""
-    from gaussians_jax import variants
+    from gaussians_jax.scene import variants
 
     static_threshold = 0.0 if args.static_threshold is None else args.static_threshold
     if args.knots is not None:
@@ -227,7 +227,7 @@ def _blended(args, run, views):
     """Views with, where that is wanted, each its share of the two appearances."""
     import jax.numpy as jnp
 
-    from nerfies_jax import variants
+    from nerfies_jax.scene import variants
     from nerfies_jax.training.model import in_default_precision
 
     if args.appearance is None:
@@ -323,25 +323,26 @@ class _Pictures:
 
     def __call__(self, rendering, place):
         from nerfies_jax import evaluation
-        from nerfies_jax.evaluation import pictures
+        from nerfies_jax.visualization import panels
 
         if self.show == "color":
             return evaluation.as_picture(rendering.color)
         if self.show == "flow":
             return self._drawn_flow(rendering, place)
         known = rendering.alpha > 0.5
-        colored = pictures.color_depth(rendering.depth, known, self.limits)
+        colored = panels.color_depth(rendering.depth, known, self.limits)
         if known.any():
             self.limits = colored.low, colored.high
         return colored.picture
 
     def _drawn_flow(self, rendering, place):
         """Draw the flow to the next image; zero for the last one."""
-        from nerfies_jax.evaluation import model_flow, pictures
+        from nerfies_jax.evaluation import model_flow
+        from nerfies_jax.visualization import panels
 
         here, there = self._views[place], self._views[place : place + 2][-1]
         flow = model_flow.picture_flow(self._move, self._state, here, there, rendering)
-        colored = pictures.color_flow(flow, self.limits)
+        colored = panels.color_flow(flow, self.limits)
         if np.nanmax(np.abs(flow), initial=0) > 0:
             self.limits = colored.high
         return colored.picture

@@ -17,7 +17,7 @@ import shutil
 from typing import Any, NamedTuple
 
 from experiments import cli, markdown
-from nerfies_jax import console
+from nerfies_jax.runtime import console
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "results"

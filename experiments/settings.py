@@ -13,8 +13,8 @@ import textwrap
 from typing import Any
 
 from experiments import cli
-from nerfies_jax import console
 from nerfies_jax.runs import platform, representations
+from nerfies_jax.runtime import console
 
 WIDTH, COLUMN = 88, 40  # of the page, and where words begin beside a field
 

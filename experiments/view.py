@@ -11,8 +11,8 @@ import time
 from typing import Literal
 
 from experiments import cli
-from nerfies_jax import console, stopping
 from nerfies_jax.runs import platform, representations
+from nerfies_jax.runtime import console, stopping
 
 
 @dataclasses.dataclass(frozen=True)

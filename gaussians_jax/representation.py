@@ -5,24 +5,22 @@ from typing import Any
 
 import numpy as np
 
-from gaussians_jax import (
-    browser_splats,
-    files,
+from gaussians_jax.core import splats
+from gaussians_jax.io import files, model_file
+from gaussians_jax.motion import anchor_motion, deformation
+from gaussians_jax.motion.anchors import AnchorMotionSpec
+from gaussians_jax.motion.basis import BasisMotionSpec
+from gaussians_jax.player import browser_splats, page
+from gaussians_jax.scene import (
     first_state,
     held_out_exposure,
-    model_file,
     point_tracks,
     presets,
     scene,
-    splats,
     step_time,
     variants,
 )
-from gaussians_jax.effects import anchor_motion, deformation
-from gaussians_jax.effects.anchors import AnchorMotionSpec
-from gaussians_jax.effects.motion_basis import BasisMotionSpec
-from gaussians_jax.player import page
-from gaussians_jax.spec import OF_MOTION, raster_of
+from gaussians_jax.scene.spec import OF_MOTION, raster_of
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import (
@@ -33,8 +31,8 @@ from nerfies_jax.evaluation.representation import (
     Representation,
     Saved,
 )
-from nerfies_jax.evidence import record, rigid_groups, usable_paths
-from nerfies_jax.evidence.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
+from nerfies_jax.preprocessing import record, rigid_groups, usable_paths
+from nerfies_jax.preprocessing.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
 from nerfies_jax.training import specs
 from nerfies_jax.training.model import Model, TrainState
 from nerfies_jax.training.track_start import FROM_REST

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from gaussians_jax import optimizer as row_optimizer
-from gaussians_jax import splats
-from gaussians_jax.densification import DefaultStrategySpec
-from gaussians_jax.mcmc import MCMCStrategySpec
-from gaussians_jax.protocols import Population, StepInfo, Strategy, StrategyEvent
+from gaussians_jax.core import splats
+from gaussians_jax.core.protocols import Population, StepInfo, Strategy, StrategyEvent
+from gaussians_jax.optim import optimizer as row_optimizer
+from gaussians_jax.optim.densification import DefaultStrategySpec
+from gaussians_jax.optim.mcmc import MCMCStrategySpec
 
 MCMC = MCMCStrategySpec
 Default = DefaultStrategySpec

@@ -1,6 +1,13 @@
 """The representation of radiance fields of the NeRF family, for `nerfies_jax.runs`."""
 
-from nerfies_jax import (
+from nerfies_jax.evaluation.representation import (
+    Choice,
+    Pair,
+    Representation,
+    Saved,
+)
+from nerfies_jax.preprocessing.findings import BACKGROUND, LIGHT, MOTION, TRANSIENT
+from nerfies_jax.scene import (
     held_out_codes,
     point_tracks,
     presets,
@@ -8,13 +15,6 @@ from nerfies_jax import (
     step_time,
     variants,
 )
-from nerfies_jax.evaluation.representation import (
-    Choice,
-    Pair,
-    Representation,
-    Saved,
-)
-from nerfies_jax.evidence.findings import BACKGROUND, LIGHT, MOTION, TRANSIENT
 from nerfies_jax.training.track_start import FROM_REST
 
 # Between these advice chooses by whether anything moves.

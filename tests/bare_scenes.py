@@ -11,32 +11,27 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from gaussians_jax import (
-    densification,
-    harmonics,
-    optimizer,
-    projection,
-    raster,
-    splats,
-)
-from gaussians_jax import learning_rates as splat_rates
-from gaussians_jax import presets as splat_presets
-from gaussians_jax.effects.anchors import AnchorMotionSpec
-from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
-from gaussians_jax.effects.kan_motion import KanMotionSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.effects.node_motion import NodeMotionSpec
-from gaussians_jax.effects.plane_motion import PlaneMotionSpec
-from gaussians_jax.effects.se3_bases import SE3BasesSpec
-from gaussians_jax.effects.time_basis import TimeBasisSpec
-from gaussians_jax.initialization import InitSpec, StartSpec
-from gaussians_jax.splats import Params
-from nerfies_jax import presets as field_presets
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Params
+from gaussians_jax.init.points import InitSpec, StartSpec
+from gaussians_jax.motion.anchors import AnchorMotionSpec
+from gaussians_jax.motion.embedding import EmbeddingMotionSpec
+from gaussians_jax.motion.kan import KanMotionSpec
+from gaussians_jax.motion.mlp import MotionSpec
+from gaussians_jax.motion.nodes import NodeMotionSpec
+from gaussians_jax.motion.planes import PlaneMotionSpec
+from gaussians_jax.motion.se3_bases import SE3BasesSpec
+from gaussians_jax.motion.time_basis import TimeBasisSpec
+from gaussians_jax.optim import densification, optimizer
+from gaussians_jax.optim import learning_rates as splat_rates
+from gaussians_jax.scene import presets as splat_presets
+from gaussians_jax.splatting import harmonics, projection, raster
+from nerfies_jax.fields import compositing, sampling, template
 from nerfies_jax.geometry import rays
-from nerfies_jax.nets import encoding
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.nets.voxels import VoxelGridSpec
-from nerfies_jax.radiance import compositing, sampling, template
+from nerfies_jax.nn import encoding
+from nerfies_jax.nn.encoding import EncodingSpec
+from nerfies_jax.nn.voxels import VoxelGridSpec
+from nerfies_jax.scene import presets as field_presets
 from nerfies_jax.training import losses, schedules
 from nerfies_jax.training.model import TrainState
 from nerfies_jax.training.updates import apply_updates

@@ -5,32 +5,29 @@ import dataclasses
 
 import pytest
 
-from gaussians_jax import protocols
-from gaussians_jax.effects import (
-    acceleration,
+from gaussians_jax.core import protocols
+from gaussians_jax.losses import acceleration, depth, neighbors, spectral
+from gaussians_jax.losses import flow as motion_flow
+from gaussians_jax.motion import (
     anchor_motion,
     anchors,
     carried,
-    depth,
-    embedding_motion,
-    exposure,
-    kan_motion,
-    mlp_motion,
-    motion_basis,
-    motion_flow,
-    motion_growth,
-    neighbors,
-    node_motion,
-    plane_motion,
-    polynomial_motion,
-    pose_refinement,
     se3_bases,
-    spectral,
-    spline_motion,
     temporal_opacity,
     time_basis,
 )
-from nerfies_jax.effects import (
+from gaussians_jax.motion import basis as motion_basis
+from gaussians_jax.motion import embedding as embedding_motion
+from gaussians_jax.motion import growth as motion_growth
+from gaussians_jax.motion import kan as kan_motion
+from gaussians_jax.motion import mlp as mlp_motion
+from gaussians_jax.motion import nodes as node_motion
+from gaussians_jax.motion import planes as plane_motion
+from gaussians_jax.motion import polynomial as polynomial_motion
+from gaussians_jax.motion import splines as spline_motion
+from gaussians_jax.per_frame import exposure
+from gaussians_jax.per_frame import poses as pose_refinement
+from nerfies_jax.fields.effects import (
     ambient,
     appearance,
     background,
@@ -45,8 +42,8 @@ from nerfies_jax.effects import (
     transient,
     warp,
 )
-from nerfies_jax.effects.time_warp import TimeWarpSpec
-from nerfies_jax.spec import RadianceScene, templates_of
+from nerfies_jax.fields.effects.time_warp import TimeWarpSpec
+from nerfies_jax.fields.spec import RadianceScene, templates_of
 
 FIELD_MODULES = {
     "appearance": appearance,

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.capture.flow import FrameFlow
-from nerfies_jax.effects import scene_flow
-from nerfies_jax.effects.effect import Batch, Box, RayOutput, Sample
-from nerfies_jax.effects.scene_flow import SceneFlowSpec
+from nerfies_jax.fields.effects import scene_flow
+from nerfies_jax.fields.effects.effect import Batch, Box, RayOutput, Sample
+from nerfies_jax.fields.effects.scene_flow import SceneFlowSpec
+from nerfies_jax.fields.template import TemplateSpec
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from nerfies_jax.training.model import Frames
 from tests.oracles import networks

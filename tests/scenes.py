@@ -5,26 +5,26 @@ import functools
 
 import jax
 
-from gaussians_jax.densification import DefaultStrategySpec
-from gaussians_jax.effects.acceleration import AccelerationSpec
-from gaussians_jax.effects.depth import DepthSpec
-from gaussians_jax.effects.kan_motion import KanMotionSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
-from gaussians_jax.effects.motion_basis import BasisMotionSpec
-from gaussians_jax.effects.motion_growth import MotionGrowthSpec
-from gaussians_jax.effects.neighbors import NeighborSpec
-from gaussians_jax.effects.spectral import SpectralSpec
-from gaussians_jax.phases import AlternationSpec, AnnealingSpec
-from gaussians_jax.spec import SplatScene
+from gaussians_jax.losses.acceleration import AccelerationSpec
+from gaussians_jax.losses.depth import DepthSpec
+from gaussians_jax.losses.neighbors import NeighborSpec
+from gaussians_jax.losses.spectral import SpectralSpec
+from gaussians_jax.motion.basis import BasisMotionSpec
+from gaussians_jax.motion.growth import MotionGrowthSpec
+from gaussians_jax.motion.kan import KanMotionSpec
+from gaussians_jax.motion.mlp import MotionSpec, SmoothingSpec
+from gaussians_jax.optim.densification import DefaultStrategySpec
+from gaussians_jax.optim.phases import AlternationSpec, AnnealingSpec
+from gaussians_jax.scene.spec import SplatScene
 from nerfies_jax import evaluation
-from nerfies_jax import scene as nerf_scene
 from nerfies_jax.capture import synthetic
-from nerfies_jax.effects.appearance import AppearanceSpec
-from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.evaluation import protocol
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.radiance.template import TemplateSpec
-from nerfies_jax.spec import RadianceScene, SamplingSpec
+from nerfies_jax.fields.effects.appearance import AppearanceSpec
+from nerfies_jax.fields.effects.warp import WarpSpec
+from nerfies_jax.fields.spec import RadianceScene, SamplingSpec
+from nerfies_jax.fields.template import TemplateSpec
+from nerfies_jax.nn.encoding import EncodingSpec
+from nerfies_jax.scene import scene as nerf_scene
 
 TINY_FILM = dataclasses.replace(
     synthetic.DEFAULT, size=(40, 30), frames=6, supersampling=1, points=200, tracks=8

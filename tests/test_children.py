@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from nerfies_jax import processes
+from nerfies_jax.runtime import processes
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="process ids of POSIX")
 

@@ -15,7 +15,7 @@ from unittest import mock
 import pytest
 import rich.console
 
-from nerfies_jax import console, events, progress
+from nerfies_jax.runtime import console, events, progress
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PACKAGES = ("nerfies_jax", "gaussians_jax", "experiments")
@@ -24,7 +24,7 @@ QUIET = rich.console.Console(quiet=True)
 
 
 def raw_writes(path):
-    """Calls that write to the terminal past `nerfies_jax.console`."""
+    """Calls that write to the terminal past `nerfies_jax.runtime.console`."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "print":
             yield f"{path}:{node.lineno}: print"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from nerfies_jax.contract import checked
 from nerfies_jax.geometry.camera import Camera, look_at
+from nerfies_jax.runtime.contract import checked
 
 
 @checked

@@ -19,28 +19,32 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax.raster_spec import GSPLAT
-from nerfies_jax.nets import grids, kan, mlp, planes
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.nets.grids import HashGridSpec
-from nerfies_jax.nets.kan import KANSpec
-from nerfies_jax.nets.mlp import HeadSpec, MLPSpec
-from nerfies_jax.nets.planes import PlanesSpec
-from nerfies_jax.nets.voxels import VoxelGridSpec
-from nerfies_jax.radiance import template
-from nerfies_jax.radiance.template import TemplateSpec
+from gaussians_jax.splatting.raster_spec import GSPLAT
+from nerfies_jax.fields import template
+from nerfies_jax.fields.template import TemplateSpec
+from nerfies_jax.nn import grids, kan, mlp, planes
+from nerfies_jax.nn.encoding import EncodingSpec
+from nerfies_jax.nn.grids import HashGridSpec
+from nerfies_jax.nn.kan import KANSpec
+from nerfies_jax.nn.mlp import HeadSpec, MLPSpec
+from nerfies_jax.nn.planes import PlanesSpec
+from nerfies_jax.nn.voxels import VoxelGridSpec
 
 MODULES = (
     *(f"nerfies_jax.geometry.{name}" for name in ("lie", "quaternion", "stumpff")),
     *(f"nerfies_jax.geometry.{name}" for name in ("matrix3", "camera", "distortion")),
     *("nerfies_jax.geometry.rays", "nerfies_jax.geometry.precision"),
-    *(f"nerfies_jax.nets.{name}" for name in ("codes", "encoding", "kan", "mlp")),
-    *("nerfies_jax.nets.grids", "nerfies_jax.nets.planes", "nerfies_jax.nets.voxels"),
-    "nerfies_jax.nets.entropy",
-    *(f"nerfies_jax.radiance.{name}" for name in ("compositing", "sampling")),
-    *("nerfies_jax.radiance.template", "nerfies_jax.training.losses"),
-    *("gaussians_jax.projection", "gaussians_jax.splats", "gaussians_jax.harmonics"),
-    *("gaussians_jax.blending", "gaussians_jax.faces"),
+    *(f"nerfies_jax.nn.{name}" for name in ("codes", "encoding", "kan", "mlp")),
+    *("nerfies_jax.nn.grids", "nerfies_jax.nn.planes", "nerfies_jax.nn.voxels"),
+    "nerfies_jax.nn.entropy",
+    *(f"nerfies_jax.fields.{name}" for name in ("compositing", "sampling")),
+    *("nerfies_jax.fields.template", "nerfies_jax.training.losses"),
+    *(
+        "gaussians_jax.splatting.projection",
+        "gaussians_jax.core.splats",
+        "gaussians_jax.splatting.harmonics",
+    ),
+    *("gaussians_jax.splatting.blending", "gaussians_jax.core.faces"),
 )
 # No function of arrays alone, or held where the reason says.
 EXCUSED = {

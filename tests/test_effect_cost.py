@@ -17,25 +17,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import presets as splat_presets
-from gaussians_jax import scene as splat_scene
-from gaussians_jax.effects import (
+from gaussians_jax.motion import (
     anchor_motion,
     carried,
-    motion_codes,
-    node_motion,
     skinning,
     temporal_opacity,
     time_basis,
 )
-from gaussians_jax.effects.exposure import ExposureSpec
-from gaussians_jax.effects.pose_refinement import PoseRefinementSpec
+from gaussians_jax.motion import codes as motion_codes
+from gaussians_jax.motion import nodes as node_motion
+from gaussians_jax.per_frame.exposure import ExposureSpec
+from gaussians_jax.per_frame.poses import PoseRefinementSpec
+from gaussians_jax.scene import presets as splat_presets
+from gaussians_jax.scene import scene as splat_scene
 from nerfies_jax import evaluation
-from nerfies_jax import presets as field_presets
-from nerfies_jax import scene as field_scene
-from nerfies_jax import spec as field_spec
-from nerfies_jax.measure import clock
-from nerfies_jax.nets import entropy, planes
+from nerfies_jax.fields import spec as field_spec
+from nerfies_jax.metrics import clock
+from nerfies_jax.nn import entropy, planes
+from nerfies_jax.scene import presets as field_presets
+from nerfies_jax.scene import scene as field_scene
 from tests import bare_scenes, hand_made_effects, scenes
 from tests.bare_scenes import parts_of, without
 from tests.hand_made_effects import FIELD_MODULES

@@ -10,34 +10,30 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from gaussians_jax import presets as splat_presets
-from gaussians_jax import scene as splat_scene
-from gaussians_jax.effects import (
-    anchors,
-    carried,
-    embedding_motion,
-    kan_motion,
-    mlp_motion,
-    motion_basis,
-    node_motion,
-    plane_motion,
-    se3_bases,
-    spectral,
-    time_basis,
-)
-from gaussians_jax.effects.anchors import AnchorMotionSpec
-from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
-from gaussians_jax.effects.kan_motion import KanMotionSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.effects.node_motion import NodeMotionSpec
-from gaussians_jax.effects.plane_motion import PlaneMotionSpec
-from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
-from gaussians_jax.effects.se3_bases import SE3BasesSpec
-from gaussians_jax.effects.spline_motion import SplineMotionSpec
-from gaussians_jax.effects.time_basis import TimeBasisSpec
-from nerfies_jax import field as fields
-from nerfies_jax import presets as field_presets
-from nerfies_jax.effects import (
+from gaussians_jax.losses import spectral
+from gaussians_jax.motion import anchors, carried, se3_bases, time_basis
+from gaussians_jax.motion import basis as motion_basis
+from gaussians_jax.motion import embedding as embedding_motion
+from gaussians_jax.motion import kan as kan_motion
+from gaussians_jax.motion import mlp as mlp_motion
+from gaussians_jax.motion import nodes as node_motion
+from gaussians_jax.motion import planes as plane_motion
+from gaussians_jax.motion.anchors import AnchorMotionSpec
+from gaussians_jax.motion.embedding import EmbeddingMotionSpec
+from gaussians_jax.motion.kan import KanMotionSpec
+from gaussians_jax.motion.mlp import MotionSpec
+from gaussians_jax.motion.nodes import NodeMotionSpec
+from gaussians_jax.motion.planes import PlaneMotionSpec
+from gaussians_jax.motion.polynomial import PolynomialMotionSpec
+from gaussians_jax.motion.se3_bases import SE3BasesSpec
+from gaussians_jax.motion.splines import SplineMotionSpec
+from gaussians_jax.motion.time_basis import TimeBasisSpec
+from gaussians_jax.scene import presets as splat_presets
+from gaussians_jax.scene import scene as splat_scene
+from nerfies_jax.capture.scene_metadata import SceneMetadata
+from nerfies_jax.fields import field as fields
+from nerfies_jax.fields import template
+from nerfies_jax.fields.effects import (
     ambient,
     moving_mask,
     scene_flow,
@@ -46,12 +42,11 @@ from nerfies_jax.effects import (
     transient,
     warp,
 )
-from nerfies_jax.effects.time_warp import TimeWarpSpec
-from nerfies_jax.nets import mlp
-from nerfies_jax.nets.grids import HashGridSpec
-from nerfies_jax.nets.voxels import VoxelGridSpec
-from nerfies_jax.radiance import template
-from nerfies_jax.scene_metadata import SceneMetadata
+from nerfies_jax.fields.effects.time_warp import TimeWarpSpec
+from nerfies_jax.nn import mlp
+from nerfies_jax.nn.grids import HashGridSpec
+from nerfies_jax.nn.voxels import VoxelGridSpec
+from nerfies_jax.scene import presets as field_presets
 from tests import bare_scenes, scenes
 
 QUICK = ("nerf-w", "hypernerf")

@@ -14,10 +14,11 @@ import pytest
 
 import gaussians_jax as gj
 import nerfies_jax as nj
-from gaussians_jax import model_file
-from gaussians_jax.spec import SplatScene
-from gaussians_jax.splats import Params
-from nerfies_jax import evaluation, scene
+from gaussians_jax.core.splats import Params
+from gaussians_jax.io import model_file
+from gaussians_jax.scene.spec import SplatScene
+from nerfies_jax import evaluation
+from nerfies_jax.scene import scene
 from nerfies_jax.training import specs
 from tests import bare_scenes, scenes
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import gaussians_jax.scene
-import nerfies_jax.scene
+import gaussians_jax.scene.scene
+import nerfies_jax.scene.scene
 from nerfies_jax import evaluation
 from nerfies_jax.training.model import in_default_precision
 from tests import scenes
@@ -19,11 +19,15 @@ FIELDS = ("nerf-w", "hypernerf", "nsff")
 def one_step(name):
     """The first parameters, and shapes of the second state, its log and its picture."""
     if name in SPLATS:
-        capture, spec, kind = scenes.tiny_capture(), SPLATS[name], gaussians_jax.scene
+        capture, spec, kind = (
+            scenes.tiny_capture(),
+            SPLATS[name],
+            gaussians_jax.scene.scene,
+        )
         metadata = kind.metadata_of(capture)
     else:
         capture, spec = scenes.tiny_capture(), tiny_fields.tiny(name)
-        kind = nerfies_jax.scene
+        kind = nerfies_jax.scene.scene
         metadata = kind.metadata_of(capture, spec)
     model = kind.build(spec, metadata)
     first = model.init(capture, jax.random.key(0))

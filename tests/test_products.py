@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from jax import lax
 
-from gaussians_jax import presets as splat_presets
-from gaussians_jax import projection, raster
-from gaussians_jax.effects import se3_bases
-from gaussians_jax.effects.se3_bases import Bases, Poses
-from gaussians_jax.raster_spec import GSPLAT
-from nerfies_jax import presets as field_presets
+from gaussians_jax.motion import se3_bases
+from gaussians_jax.motion.se3_bases import Bases, Poses
+from gaussians_jax.scene import presets as splat_presets
+from gaussians_jax.splatting import projection, raster
+from gaussians_jax.splatting.raster_spec import GSPLAT
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.measure import matrix_flops
+from nerfies_jax.scene import presets as field_presets
+from nerfies_jax.training import matrix_flops
 from tests import bare_scenes
 from tests.gaussians.shared import put, same_bits, some_gaussians
 from tests.test_effect_cost import started_field, started_splats
@@ -29,14 +29,14 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 ROOMS = (ROOT / "nerfies_jax", ROOT / "gaussians_jax")
 # Where networks multiply.
 NETWORKS = {
-    *(f"nerfies_jax/nets/{name}.py" for name in ("dense", "kan", "mlp")),
-    "nerfies_jax/radiance/template.py",
-    "nerfies_jax/effects/warp.py",
+    *(f"nerfies_jax/nn/{name}.py" for name in ("dense", "kan", "mlp")),
+    "nerfies_jax/fields/template.py",
+    "nerfies_jax/fields/effects/warp.py",
 }
 FIRST_LAYERS = {
-    ("gaussians_jax/effects/embedding_motion.py", "prepare"),
-    ("gaussians_jax/effects/embedding_motion.py", "deform"),
-    ("gaussians_jax/effects/motion_basis.py", "prepare_point"),
+    ("gaussians_jax/motion/embedding.py", "prepare"),
+    ("gaussians_jax/motion/embedding.py", "deform"),
+    ("gaussians_jax/motion/basis.py", "prepare_point"),
 }
 
 

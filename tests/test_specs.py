@@ -6,13 +6,13 @@ import math
 
 import pytest
 
-from gaussians_jax import presets
-from gaussians_jax.densification import DefaultStrategySpec
-from gaussians_jax.mcmc import MCMCStrategySpec
-from gaussians_jax.raster_spec import INRIA
-from gaussians_jax.spec import SplatScene
-from gaussians_jax.splats import Params
-from nerfies_jax import presets as fields
+from gaussians_jax.core.splats import Params
+from gaussians_jax.optim.densification import DefaultStrategySpec
+from gaussians_jax.optim.mcmc import MCMCStrategySpec
+from gaussians_jax.scene import presets
+from gaussians_jax.scene.spec import SplatScene
+from gaussians_jax.splatting.raster_spec import INRIA
+from nerfies_jax.scene import presets as fields
 from nerfies_jax.training import spec_fields, specs
 
 
@@ -115,8 +115,19 @@ def test_a_spec_of_another_version_is_refused():
 @pytest.mark.parametrize(
     "name",
     [
-        *("os.system", "gaussians_jax.spec.effects_of", "nowhere.Spec", "Spec", ""),
-        *("nerfies_jax.spec.RadianceScene", "subprocess.Popen", ["os.abort"], None),
+        *(
+            "os.system",
+            "gaussians_jax.scene.spec.effects_of",
+            "nowhere.Spec",
+            "Spec",
+            "",
+        ),
+        *(
+            "nerfies_jax.fields.spec.RadianceScene",
+            "subprocess.Popen",
+            ["os.abort"],
+            None,
+        ),
     ],
 )
 def test_a_name_that_is_no_setting_is_refused(name):
@@ -127,13 +138,18 @@ def test_a_name_that_is_no_setting_is_refused(name):
 @pytest.mark.parametrize(
     "name",
     [
-        *("collections.OrderedDict", "gaussians_jax.spec.SplatScene", "Params", None),
+        *(
+            "collections.OrderedDict",
+            "gaussians_jax.scene.spec.SplatScene",
+            "Params",
+            None,
+        ),
         # Found by another name, through an import; private modules and `__main__`
-        *("gaussians_jax.model_file.Params", "nerfies_jax._private.Params"),
+        *("gaussians_jax.io.model_file.Params", "nerfies_jax._private.Params"),
         *("gaussians_jax.__main__.Params", "gaussians_jax..splats.Params"),
     ],
 )
 def test_only_a_named_tuple_where_it_is_defined_is_a_record_of_arrays(name):
-    assert specs.record_named("gaussians_jax.splats.Params") is Params
+    assert specs.record_named("gaussians_jax.core.splats.Params") is Params
     with pytest.raises(ValueError, match="no record or setting"):
         specs.record_named(name)

@@ -16,8 +16,8 @@ continues where it was stopped.
 from experiments import cli
 from experiments.ablate import settings, suites
 from experiments.ablate.settings import Ablate
-from nerfies_jax import console
 from nerfies_jax.runs import platform, representations
+from nerfies_jax.runtime import console
 
 
 @cli.command(Ablate)

@@ -16,15 +16,16 @@ from experiments.ablate.budget import Budget, affordable
 from experiments.ablate.log import line, log
 from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
-from nerfies_jax import console, evaluation, runs
+from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import pinholes, synthetic
 from nerfies_jax.capture.json_files import scratch_folder
 from nerfies_jax.capture.synthetic import truth as truths
 from nerfies_jax.evaluation import heldout, moving_masks, protocol
 from nerfies_jax.evaluation.lens import ThroughLens
-from nerfies_jax.measure import clock
+from nerfies_jax.metrics import clock
 from nerfies_jax.runs import platform, representations
 from nerfies_jax.runs.config import CaptureSource
+from nerfies_jax.runtime import console
 from nerfies_jax.training import loop, specs
 
 # Arms with their programs, which hold 4,000 mappings of memory and more. Linux lets a

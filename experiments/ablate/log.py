@@ -1,7 +1,7 @@
 """Messages of a running ablation."""
 
 from experiments.ablate.measures import MEASURES
-from nerfies_jax import console
+from nerfies_jax.runtime import console
 
 
 def log(text: str) -> None:

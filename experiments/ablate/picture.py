@@ -11,9 +11,9 @@ import PIL.Image
 import PIL.ImageDraw
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evaluation import pictures
 from nerfies_jax.evaluation.protocol import GroundTruth
 from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.visualization import panels
 
 WIDTH = 352  # pixels of a panel, at least
 DRAWN = 24  # tracks
@@ -71,37 +71,37 @@ def draw(
     assert capture.depths is not None
     assert capture.moving is not None
     truth, true_depth = capture.images[row], capture.depths[row]
-    colored = pictures.color_depth(true_depth)
+    colored = panels.color_depth(true_depth)
     limits = colored.low, colored.high
     moving = np.where(capture.moving[row][..., None], truth, truth // 4)
-    panels = [truth, moving, colored.picture]
-    panels = [_enlarged(panel) for panel in panels]
-    panels.append(_tracks(capture, known, known.path, row))
+    tiles = [truth, moving, colored.picture]
+    tiles = [_enlarged(panel) for panel in tiles]
+    tiles.append(_tracks(capture, known, known.path, row))
     labels = [f"truth: {capture.ids[row]}", "what moves", "true depth", "true tracks"]
     for arm, rendered in color.items():
-        error = pictures.color_error(rendered, truth, LARGEST_ERROR).picture
-        deep = pictures.color_depth(depth[arm], limits=limits).picture
-        panels += [_enlarged(panel) for panel in (rendered, error, deep)]
-        panels.append(_tracks(capture, known, path[arm], row))
+        error = panels.color_error(rendered, truth, LARGEST_ERROR).picture
+        deep = panels.color_depth(depth[arm], limits=limits).picture
+        tiles += [_enlarged(panel) for panel in (rendered, error, deep)]
+        tiles.append(_tracks(capture, known, path[arm], row))
         labels += [arm, f"error, to {LARGEST_ERROR:g}", "depth", captions[arm]]
-    return pictures.contact_sheet(panels, labels)
+    return panels.contact_sheet(tiles, labels)
 
 
 def _draw_filmed(capture, row, color, depth):
-    truth, limits, panels, labels = capture.images[row], None, [], []
+    truth, limits, tiles, labels = capture.images[row], None, [], []
     for arm, rendered in color.items():
-        error = pictures.color_error(rendered, truth, LARGEST_ERROR).picture
-        colored = pictures.color_depth(depth[arm], limits=limits)
+        error = panels.color_error(rendered, truth, LARGEST_ERROR).picture
+        colored = panels.color_depth(depth[arm], limits=limits)
         limits = colored.low, colored.high
         shown = (truth, rendered, error, colored.picture)
-        panels += [_enlarged(panel) for panel in shown]
+        tiles += [_enlarged(panel) for panel in shown]
         labels += [capture.ids[row], arm, f"error, to {LARGEST_ERROR:g}", "depth"]
-    return pictures.contact_sheet(panels, labels)
+    return panels.contact_sheet(tiles, labels)
 
 
 def _enlarged(picture):
     factor = math.ceil(WIDTH / picture.shape[1])
-    return pictures.as_bytes(picture).repeat(factor, 0).repeat(factor, 1)
+    return tiles.as_bytes(picture).repeat(factor, 0).repeat(factor, 1)
 
 
 def _moment(known, capture, row):
@@ -150,4 +150,4 @@ def _pixels(camera, points):
 
 def save(picture: np.ndarray, path: pathlib.Path) -> None:
     """Save an image as PNG, atomically."""
-    pictures.save(picture, path)
+    tiles.save(picture, path)

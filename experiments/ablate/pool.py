@@ -10,8 +10,8 @@ import time
 from typing import NamedTuple
 
 from experiments.ablate.log import line, log
-from nerfies_jax import children, stopping
 from nerfies_jax.capture.json_files import probe, write_json
+from nerfies_jax.runtime import children, stopping
 from nerfies_jax.training import specs
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]  # where `experiments` is imported

@@ -6,10 +6,10 @@ from experiments import asked
 from experiments.ablate import arms, measures, picture, verdicts
 from experiments.ablate.measures import MEASURES
 from experiments.ablate.verdicts import Numbers
-from nerfies_jax import console
 from nerfies_jax.evaluation import protocol
-from nerfies_jax.measure import clock
-from nerfies_jax.measure.clock import Metric
+from nerfies_jax.metrics import clock
+from nerfies_jax.metrics.clock import Metric
+from nerfies_jax.runtime import console
 from nerfies_jax.training import specs
 
 

@@ -19,9 +19,9 @@ import re
 
 from experiments import cli, kept
 from experiments.benchmark import job
-from nerfies_jax import children, console
 from nerfies_jax.runs import representations
 from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runtime import children, console
 
 STORED = "benchmark.json"
 
@@ -104,7 +104,7 @@ def _run_all(args, label, configs):
 def keep(path: pathlib.Path, label: str, seed: int, scored: dict) -> None:
     """Add one run to the kept numbers, in the place of an older one."""
     from nerfies_jax.capture.json_files import write_json
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
 
     stored = kept.rows(path, runs=dict) or {"runs": {}}
     scored = dict(scored)

@@ -28,7 +28,7 @@ def score(
         platform.start_jax("cpu", *(wanted if alone else ("one",)))
         from nerfies_jax import runs
         from nerfies_jax.capture.json_files import write_json
-        from nerfies_jax.measure import clock
+        from nerfies_jax.metrics import clock
 
         if begun:
             outcome = runs.resume(folder)

@@ -25,8 +25,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 from experiments import cli
-from nerfies_jax import console
 from nerfies_jax.runs import platform, run_folder
+from nerfies_jax.runtime import console
 
 PRESETS = (
     "nerf-w-small",
@@ -149,7 +149,7 @@ def main(args):
         # Compiling is one of the prices; JAX asks once, when it first compiles.
         jax.config.update("jax_enable_compilation_cache", False)
         from experiments.effect_cost import report
-        from nerfies_jax.measure import baselines
+        from nerfies_jax.metrics import baselines
 
         before = None
         if args.check is not None:
@@ -180,7 +180,7 @@ def _arms(name, args):
 
 
 def _spec(name, args):
-    from gaussians_jax import initialization
+    from gaussians_jax.init import points as initialization
     from nerfies_jax.runs import representations
     from nerfies_jax.training import specs
 
@@ -266,7 +266,7 @@ def measure(
 ) -> list[SceneCost]:
     """Compile the programs of every scene once and time all of them in turn."""
     from nerfies_jax import runs
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
     from nerfies_jax.runs import representations
     from nerfies_jax.runs.config import CaptureSource
     from nerfies_jax.training import chunk
@@ -309,8 +309,8 @@ def _compile(representation, capture, spec, at):
     import jax.numpy as jnp
 
     from nerfies_jax import evaluation
-    from nerfies_jax.measure import clock, matrix_flops
-    from nerfies_jax.training import chunk
+    from nerfies_jax.metrics import clock
+    from nerfies_jax.training import chunk, matrix_flops
 
     metadata = representation.metadata_of(capture, spec)
     model = representation.build(spec, metadata)

@@ -3,7 +3,7 @@
 import textwrap
 
 from experiments.effect_cost import report
-from nerfies_jax.measure.clock import Metric
+from nerfies_jax.metrics.clock import Metric
 
 OFF = """\
 A disabled effect is `None` in the settings of a scene and costs nothing. This page

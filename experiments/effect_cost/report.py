@@ -6,9 +6,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from nerfies_jax.capture.json_files import replaced_file
-from nerfies_jax.evaluation import figures
-from nerfies_jax.measure import clock
-from nerfies_jax.measure.clock import Metric
+from nerfies_jax.metrics import clock
+from nerfies_jax.metrics.clock import Metric
+from nerfies_jax.visualization import figures
 
 # (field of `Priced`, unit, share of the new value by which it may be above the old, so
 # that a half is twice as much). Counts repeat exactly under one version of XLA; times

@@ -1,7 +1,7 @@
 """The page of `experiments.evidence` in docs/results."""
 
 from experiments import markdown
-from nerfies_jax.evidence.against_truth import LATER
+from nerfies_jax.preprocessing.against_truth import LATER
 
 SCENES = f"""\
 ## The built-in scenes

@@ -6,23 +6,25 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from nerfies_jax import console, runs
+from nerfies_jax import runs
 from nerfies_jax.capture.capture import Capture, describe
 from nerfies_jax.capture.json_files import write_json
 from nerfies_jax.capture.synthetic import SceneTruth
-from nerfies_jax.evaluation import pictures, protocol
-from nerfies_jax.evidence import (
+from nerfies_jax.evaluation import protocol
+from nerfies_jax.preprocessing import (
     against_truth,
     contact_sheet,
     record,
     summary,
     view_set,
 )
-from nerfies_jax.evidence.against_truth import LATER, Errors
-from nerfies_jax.evidence.record import Evidence
+from nerfies_jax.preprocessing.against_truth import LATER, Errors
+from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.runs import run_folder
 from nerfies_jax.runs.config import CaptureSource
 from nerfies_jax.runs.platform import CACHE
+from nerfies_jax.runtime import console
+from nerfies_jax.visualization import panels
 
 
 def look(source: CaptureSource, seed: int, out: pathlib.Path | None) -> dict[str, Any]:
@@ -48,7 +50,7 @@ def look(source: CaptureSource, seed: int, out: pathlib.Path | None) -> dict[str
         errors = errors_of(capture, truth, evidence)
         console.say("\n".join(error_lines(errors)))
         stored["errors"] = as_json(errors._asdict())
-    pictures.save(contact_sheet.followed(views, evidence), results / "tracks.png")
+    panels.save(contact_sheet.followed(views, evidence), results / "tracks.png")
     write_json(results / "evidence.json", stored)
     console.say(f"frames with tracks: {results / 'tracks.png'}")
     console.say(f"record: {path if path.exists() else 'not kept'}")

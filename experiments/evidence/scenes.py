@@ -8,18 +8,13 @@ import numpy as np
 from skimage import registration
 
 from experiments.evidence import report
-from nerfies_jax import console
 from nerfies_jax.capture import synthetic
 from nerfies_jax.capture.json_files import write_json
-from nerfies_jax.evidence import (
-    dense_flow,
-    record,
-    summary,
-    view_set,
-)
-from nerfies_jax.measure import clock
+from nerfies_jax.metrics import clock
+from nerfies_jax.preprocessing import dense_flow, record, summary, view_set
 from nerfies_jax.runs import run_folder
 from nerfies_jax.runs.platform import CACHE
+from nerfies_jax.runtime import console
 
 FLOW_SCENES = ("default", "fast", "articulated", "exposure")
 PAIRS = 5  # of neighbors in each of these, evenly over the film

@@ -25,7 +25,7 @@ import threading
 
 from experiments import cli
 from experiments.faults import chain, inject, jobs
-from nerfies_jax import console, stopping
+from nerfies_jax.runtime import console, stopping
 
 STORED = "faults.json"
 
@@ -64,7 +64,7 @@ class Faults:
 def main(args):
     """Run the chains. Lost results end with exit code 1."""
     from nerfies_jax.capture.json_files import write_json
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
     from nerfies_jax.training.provenance import revision
 
     # A campaign in the background of a script, or under nohup, was started with these

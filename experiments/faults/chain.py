@@ -9,7 +9,7 @@ import time
 from typing import Any, NamedTuple
 
 from experiments.faults import inject, jobs
-from nerfies_jax import children
+from nerfies_jax.runtime import children
 
 FAULTS = 5  # of a chain
 LATEST = 0.9  # share of the processor time at which a fault happens

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from nerfies_jax import children
+from nerfies_jax.runtime import children
 
 KINDS = {
     "kill": ("SIGKILL",),

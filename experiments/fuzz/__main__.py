@@ -21,7 +21,7 @@ import sys
 import time
 
 from experiments import cli
-from nerfies_jax import console, stopping
+from nerfies_jax.runtime import console, stopping
 
 STORED = "fuzz.json"
 SILENCE = 120.0  # seconds of one mutation before its process is killed
@@ -55,7 +55,7 @@ def main(args):
     """Run the mutations; exit code 1 where a reader failed."""
     from experiments.fuzz.targets import TARGETS
     from nerfies_jax.capture.json_files import write_json
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
     from nerfies_jax.training.provenance import revision
 
     with cli.user_errors():
@@ -119,7 +119,7 @@ def _extend(stored, name, count, args):
 def _run(out, name, first, last, seed):
     """Run mutations in a process, whose death is a failure as well."""
     from experiments.fuzz import worker
-    from nerfies_jax import children
+    from nerfies_jax.runtime import children
 
     (out / "current").unlink(missing_ok=True)
     command = [sys.executable, "-m", "experiments.fuzz.worker", str(out), name]

@@ -62,7 +62,7 @@ def _capture():
 def _gaussians(count=12):
     import jax.numpy as jnp
 
-    from gaussians_jax.splats import Splats
+    from gaussians_jax.core.splats import Splats
 
     rng = np.random.default_rng(0)
 
@@ -263,21 +263,21 @@ def _read_points(folder):
 
 
 def _splats(folder, name, **options):
-    from gaussians_jax import files
+    from gaussians_jax.io import files
 
     files.save(folder / name, _gaussians(), **options)
 
 
 def _read_splats(folder):
-    from gaussians_jax import files
+    from gaussians_jax.io import files
 
     for path in folder.iterdir():
         files.load(path, drop_broken=True)
 
 
 def _model(folder):
-    from gaussians_jax import model_file
-    from gaussians_jax.splats import Params
+    from gaussians_jax.core.splats import Params
+    from gaussians_jax.io import model_file
 
     about = {"step": 3, "name": "fuzz", "size": [12, 8]}
     params = Params({"splats": _gaussians(5)}, {"net": {"w": np.ones((2, 2))}})
@@ -285,7 +285,7 @@ def _model(folder):
 
 
 def _read_model(folder):
-    from gaussians_jax import model_file
+    from gaussians_jax.io import model_file
 
     model_file.load(folder / "model.npz")
 
@@ -337,7 +337,7 @@ def _external(folder):
 
 def _read_external(folder):
     from nerfies_jax.capture.given import GivenFiles
-    from nerfies_jax.evidence import given_files
+    from nerfies_jax.preprocessing import given_files
 
     files = GivenFiles(*(folder / n for n in ("tracks.npz", "masks", "depths", "flow")))
     given_files.attached(_capture(), files)
@@ -372,7 +372,7 @@ def _weights(folder):
 
 
 def _read_weights(folder):
-    from nerfies_jax.measure import weight_files
+    from nerfies_jax.metrics import weight_files
 
     for path in sorted(folder.iterdir()):
         weight_files.read_tensors(path)
@@ -402,7 +402,7 @@ def _read_run(folder):
 
 
 def _metrics(folder):
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
 
     clock.write_metrics(folder / "metrics.json", [])
     content = json.loads((folder / "metrics.json").read_text())
@@ -419,7 +419,7 @@ def _metrics(folder):
 
 
 def _read_metrics(folder):
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
     from nerfies_jax.runs import curves
 
     clock.read_metrics(folder / "metrics.json")
@@ -435,8 +435,8 @@ def _cache(folder):
 
 def _read_cache(folder):
     """Never refused: what is damaged is made again."""
-    from nerfies_jax import console
     from nerfies_jax.capture import cache_files
+    from nerfies_jax.runtime import console
 
     cache_files._reported.clear()
     warn, console.warn = console.warn, lambda words: None

@@ -129,7 +129,7 @@ def main() -> None:
     """Run what the arguments say."""
     import resource
 
-    from nerfies_jax import children, console
+    from nerfies_jax.runtime import children, console
 
     children.end_with_parent()
     folder, name, first, last, seed = sys.argv[1:]

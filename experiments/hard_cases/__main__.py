@@ -38,9 +38,9 @@ from experiments.hard_cases import (
     volume,
 )
 from experiments.hard_cases.case import ORDERS, Case
-from nerfies_jax import console
-from nerfies_jax.measure import clock
+from nerfies_jax.metrics import clock
 from nerfies_jax.runs import platform, run_folder
+from nerfies_jax.runtime import console
 
 # The cases of each topic and, in tests/experiments/hard_cases, the file of their tests.
 TOPICS = {

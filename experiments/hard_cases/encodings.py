@@ -5,8 +5,8 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case
-from nerfies_jax.nets import encoding, grids, sines
-from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nn import encoding, grids, sines
+from nerfies_jax.nn.encoding import EncodingSpec
 
 BANDS = 10
 TIMES_PI = EncodingSpec(BANDS, identity=False, times_pi=True)

@@ -7,9 +7,9 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from gaussians_jax import harmonics, projection
-from gaussians_jax.raster_spec import GSPLAT
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.splatting import harmonics, projection
+from gaussians_jax.splatting.raster_spec import GSPLAT
 from nerfies_jax.geometry.camera import Camera
 
 SIZE = (64, 48)

@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments.hard_cases.case import Case, constant
 from nerfies_jax.capture.synthetic import texture
-from nerfies_jax.effects import transient
+from nerfies_jax.fields.effects import transient
 from nerfies_jax.training import losses
 
 AXIS = np.array([2.0, -1.0, 2.0]) / 3

@@ -6,8 +6,8 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from gaussians_jax.effects import skinning, temporal_opacity, time_basis
-from nerfies_jax.nets import entropy, planes
+from gaussians_jax.motion import skinning, temporal_opacity, time_basis
+from nerfies_jax.nn import entropy, planes
 
 NEAR = 1e-6  # how close to a switch its two sides are tried, as a share of it
 _SHARES = np.array([1.0, -0.25, 0.125])

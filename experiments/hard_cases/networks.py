@@ -8,10 +8,10 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from gaussians_jax import optimizer
-from nerfies_jax.nets import bsplines, kan
-from nerfies_jax.nets.kan import KAN, KANLayer, KANSpec, Kernels
-from nerfies_jax.nets.mlp import HeadSpec
+from gaussians_jax.optim import optimizer
+from nerfies_jax.nn import bsplines, kan
+from nerfies_jax.nn.kan import KAN, KANLayer, KANSpec, Kernels
+from nerfies_jax.nn.mlp import HeadSpec
 
 KERNELS = 8
 # Centers at whole numbers, which every precision holds, and w = h = 1.

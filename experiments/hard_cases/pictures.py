@@ -5,7 +5,7 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from gaussians_jax.effects import depth, spectral
+from gaussians_jax.losses import depth, spectral
 from nerfies_jax.training import losses
 
 # Two rows of three pixels: every sum of them is exact enough to see only the amplitude.

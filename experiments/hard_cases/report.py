@@ -6,9 +6,9 @@ import numpy as np
 
 from experiments.hard_cases.case import ORDERS
 from nerfies_jax.capture.json_files import replaced_file
-from nerfies_jax.evaluation import figures
-from nerfies_jax.measure import clock
-from nerfies_jax.measure.clock import Metric
+from nerfies_jax.metrics import clock
+from nerfies_jax.metrics.clock import Metric
+from nerfies_jax.visualization import figures
 
 BEGIN = "<!-- begin: python -m experiments.hard_cases -->"
 END = "<!-- end: python -m experiments.hard_cases -->"

@@ -9,11 +9,13 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from gaussians_jax import densification, mcmc, raster, splats
-from gaussians_jax.effects import acceleration
-from gaussians_jax.projection import Footprints
-from gaussians_jax.raster_spec import GSPLAT
-from gaussians_jax.splats import Splats
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Splats
+from gaussians_jax.losses import acceleration
+from gaussians_jax.optim import densification, mcmc
+from gaussians_jax.splatting import raster
+from gaussians_jax.splatting.projection import Footprints
+from gaussians_jax.splatting.raster_spec import GSPLAT
 
 NEAR = 1e-6  # how close to a switch its two sides are tried, as a share of it
 OPEN = dataclasses.replace(

@@ -6,9 +6,9 @@ import mpmath
 import numpy as np
 
 from experiments.hard_cases.case import Case, constant
-from nerfies_jax.effects import surface
-from nerfies_jax.radiance import compositing, sampling
-from nerfies_jax.radiance.compositing import AT_INFINITY, EMPTY_BELOW, THIN_BELOW
+from nerfies_jax.fields import compositing, sampling
+from nerfies_jax.fields.compositing import AT_INFINITY, EMPTY_BELOW, THIN_BELOW
+from nerfies_jax.fields.effects import surface
 
 
 def _times(sizes, pattern):

@@ -22,7 +22,7 @@ from experiments import cli, kept
 from experiments.mutants.faults import ROOT, drawn
 from experiments.mutants.page import page
 from experiments.mutants.witnesses import default_tests, reached_by, tried
-from nerfies_jax import console
+from nerfies_jax.runtime import console
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ def main(args):
     with cli.user_errors():
         faults = drawn(args.count, args.seed, args.only)
     from nerfies_jax.capture.json_files import write_json
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
 
     rows = _stored(args.out, args.seed)
     left = [fault for fault in faults if not any(_is_row_of(fault, r) for r in rows)]

@@ -30,8 +30,8 @@ import time
 
 from experiments import cli, kept
 from experiments.speed import job, raster
-from nerfies_jax import children, console
 from nerfies_jax.runs import representations
+from nerfies_jax.runtime import children, console
 
 STORED = "speed.json"
 
@@ -69,7 +69,7 @@ class Speed:
 def main(args):
     """Measure and store. Wrong input ends with exit code 2."""
     from experiments.speed import tolerances
-    from nerfies_jax.measure import baselines
+    from nerfies_jax.metrics import baselines
 
     before = None
     with cli.user_errors():
@@ -106,7 +106,7 @@ def keep(path: pathlib.Path, machine: dict, keys: tuple[str, ...], record) -> No
     """Put a record in its place in the file, which keeps all others."""
     from experiments.speed import tolerances
     from nerfies_jax.capture.json_files import write_json
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
 
     stored = kept.rows(path)
     stored["machine"] = clock.beside(machine, stored.get("machine", {}))
@@ -163,7 +163,7 @@ def main_job(checkout: pathlib.Path | None = None) -> dict:
         )
         seconds = time.perf_counter() - began
         metrics = json.loads((run / "metrics.json").read_text())
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
     from nerfies_jax.training.provenance import revision
 
     wanted = ("train.seconds", "train.compile_seconds", "heldout.psnr")

@@ -14,7 +14,7 @@ def prepare() -> None:
     """
     platform.start_jax("cpu")
     from nerfies_jax import runs
-    from nerfies_jax.evidence import record
+    from nerfies_jax.preprocessing import record
 
     record.cached(runs.built_in_scene("default"), platform.CACHE / "evidence")
 
@@ -43,7 +43,7 @@ def measure(preset: str, all_cores: bool) -> dict[str, Any]:
 
     from nerfies_jax import evaluation, runs
     from nerfies_jax.evaluation import Renderer
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
     from nerfies_jax.training.rate import step_time
 
     representation = representations.of_preset(preset)

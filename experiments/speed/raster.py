@@ -33,7 +33,7 @@ def measure(cases: tuple[str, ...], yardstick: pathlib.Path | None) -> dict:
       The machine and one row for each case.
     """
     platform.start_jax("cpu", "one")
-    from nerfies_jax.measure import clock
+    from nerfies_jax.metrics import clock
 
     rows = [time_case(text, yardstick) for text in cases]
     return {"machine": clock.machine(), "rows": rows}
@@ -71,8 +71,8 @@ def compiled(text: str, scene: dict) -> tuple:
     import jax
     import jax.numpy as jnp
 
-    from gaussians_jax import raster
-    from gaussians_jax.raster_spec import GSPLAT
+    from gaussians_jax.splatting import raster
+    from gaussians_jax.splatting.raster_spec import GSPLAT
 
     # The clamp of the other rasterizer.
     spec = dataclasses.replace(GSPLAT, alpha_max=0.999)
@@ -129,7 +129,7 @@ def footprints_of(scene: dict, alpha_threshold: float):
     import jax.numpy as jnp
     import numpy as np
 
-    from gaussians_jax.projection import Footprints
+    from gaussians_jax.splatting.projection import Footprints
 
     a, b, c = scene["covs"].astype(np.float64).T
     opacity = scene["opacities"].astype(np.float64)

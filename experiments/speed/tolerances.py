@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from nerfies_jax.measure.clock import Metric
+from nerfies_jax.metrics.clock import Metric
 
 # Shares of a value; quiet machines of one kind repeat times to a tenth.
 TIMES, COMPILING, MEMORY, RATIO = 0.25, 0.5, 0.1, 0.15

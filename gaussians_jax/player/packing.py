@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gaussians_jax import splats
-from gaussians_jax.player.sampled import Instants
+from gaussians_jax.core import splats
+from gaussians_jax.io.sampled import Instants
 
 # Offsets shorter than this stay out: a tenth of a pixel in the nearest training view
 # for the means, and what changes a picture by less than one of 255 for the others.

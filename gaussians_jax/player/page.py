@@ -17,16 +17,11 @@ import numpy as np
 import PIL.Image
 from jaxtyping import Array, Int
 
-from gaussians_jax.instants import gaussians_at, written_rows
+from gaussians_jax.io.instants import gaussians_at, written_rows
+from gaussians_jax.io.sampled import Instants, count_for, gathered, seen_in_training
 from gaussians_jax.player import packing
 from gaussians_jax.player.limits import camera_limits
-from gaussians_jax.player.sampled import (
-    Instants,
-    count_for,
-    gathered,
-    seen_in_training,
-)
-from gaussians_jax.raster_spec import RasterSpec
+from gaussians_jax.splatting.raster_spec import RasterSpec
 from nerfies_jax.capture import camera_paths
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import replaced_file

@@ -17,10 +17,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from nerfies_jax import console
 from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.json_files import new_folder, replaced_file
 from nerfies_jax.capture.json_files import write_json as write_plain_json
+from nerfies_jax.runtime import console
 
 SEAL = "seal"  # a member of archives and JSON objects, next to the content
 MANIFEST = "manifest.json"  # of a folder

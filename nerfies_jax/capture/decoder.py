@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax import children
 from nerfies_jax.capture.errors import FileError
+from nerfies_jax.runtime import children
 
 CPU_SECONDS = 5.0  # for a file of any size, besides what `request` adds
 WALL_SECONDS = 120.0  # without an answer: other programs may take the processor

@@ -12,8 +12,8 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 
-from nerfies_jax import children
 from nerfies_jax.capture.errors import FileError
+from nerfies_jax.runtime import children
 
 try:
     import resource

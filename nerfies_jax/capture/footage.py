@@ -20,7 +20,6 @@ import PIL.Image
 import PIL.ImageOps
 import scipy.ndimage
 
-from nerfies_jax import events
 from nerfies_jax.capture import decoder, frames
 from nerfies_jax.capture import masks as mask_files
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
@@ -28,6 +27,7 @@ from nerfies_jax.capture.colmap_library import MIN_TRACK
 from nerfies_jax.capture.formats import VIDEOS
 from nerfies_jax.capture.images import MAX_PIXELS, write_png
 from nerfies_jax.capture.video import notes_of, read_video, transfer_of
+from nerfies_jax.runtime import events
 
 PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 HEIC = (".heic", ".heif")  # read where pillow-heif is installed

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerfies_jax import events
 from nerfies_jax.capture import (
     decoder,
     frame_memory,
@@ -25,6 +24,7 @@ from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import CaptureError, PointCloud, blocks, shrink
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.runtime import events
 
 MAX_FRAMES = 100_000
 MAX_BYTES = 16 * 2**30  # of decoded pictures

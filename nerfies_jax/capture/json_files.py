@@ -19,10 +19,10 @@ from typing import Any
 
 import msgspec
 
-from nerfies_jax import processes, stopping
 from nerfies_jax.capture import safe_files, text_files
 from nerfies_jax.capture.errors import CaptureError
 from nerfies_jax.capture.safe_files import AnyPath as AnyPath
+from nerfies_jax.runtime import processes, stopping
 
 # 20 000 frames of transforms.json are 20 MB. Decoded, a file may take 20 times as much.
 MAX_JSON_BYTES = 64 * 2**20

@@ -7,12 +7,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from nerfies_jax import events
 from nerfies_jax.capture import resampling
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import distortion, rays
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.runtime import events
 
 
 def as_pinholes(capture: Capture) -> Capture:

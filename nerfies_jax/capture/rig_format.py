@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax import events
 from nerfies_jax.capture import formats, frames, llff_format, name_times, video
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.capture import Capture, CaptureError, shrink
 from nerfies_jax.capture.json_files import AnyPath
 from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.geometry import camera
+from nerfies_jax.runtime import events
 
 SPARE = 8  # frames of a video beyond those that its file states
 

@@ -19,11 +19,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from nerfies_jax import children, console, events
 from nerfies_jax.capture import extras, frames
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import MIN_TRACK, library
 from nerfies_jax.capture.json_files import AnyPath, new_folder, probe
+from nerfies_jax.runtime import children, console, events
 
 EXHAUSTIVE_UP_TO = 40  # pictures; above, matching every pair takes most of the time
 SEED = 0  # of RANSAC: by the clock, 24 to 26 of the same 30 pictures found a place

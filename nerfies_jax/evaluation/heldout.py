@@ -16,10 +16,10 @@ from nerfies_jax.evaluation.model_flow import Flow
 from nerfies_jax.evaluation.protocol import GroundTruth, PointTracks
 from nerfies_jax.evaluation.scores import Scored, known_mean
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.measure import geometry_quality, image_quality, perceptual
-from nerfies_jax.measure.clock import Metric
-from nerfies_jax.measure.metric_table import metric
-from nerfies_jax.measure.perceptual import LpipsParams, Network
+from nerfies_jax.metrics import geometry_quality, image_quality, perceptual
+from nerfies_jax.metrics.clock import Metric
+from nerfies_jax.metrics.metric_table import metric
+from nerfies_jax.metrics.perceptual import LpipsParams, Network
 from nerfies_jax.training.model import in_default_precision
 
 # Five scales halve an image four times, and the window of 11 must fit into the last.

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerfies_jax.evaluation import pictures
-from nerfies_jax.evaluation.pictures import Colored
 from nerfies_jax.evaluation.renderer import as_picture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training.model import Rendering
+from nerfies_jax.visualization import panels
+from nerfies_jax.visualization.panels import Colored
 
 CHANNELS = ("color", "depth", "opacity", "motion")
 MOVING_SECONDS = 0.1  # an image may take while the view changes: ten a second
@@ -191,7 +191,7 @@ def as_channel(
         return Colored(np.repeat(gray, 3, axis=-1), 0.0, 1.0)
     if channel == "depth":
         solid = np.asarray(rendering.alpha) > 0.5
-        return pictures.color_depth(np.asarray(rendering.depth), solid, limits)
+        return panels.color_depth(np.asarray(rendering.depth), solid, limits)
     if channel == "motion" and distance is not None:
-        return pictures.color_distance(distance, 0.0 if limits is None else limits[1])
+        return panels.color_distance(distance, 0.0 if limits is None else limits[1])
     raise ValueError(f"channel {channel!r}: there are {', '.join(CHANNELS)}")

@@ -9,8 +9,8 @@ import numpy as np
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import pinholes, resampling
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import frame_masks, record
 from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.preprocessing import frame_masks, record
 
 MOST_PIXELS = 4_000_000  # of all frames looked at: 45 s on one core
 

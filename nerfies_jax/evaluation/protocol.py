@@ -14,7 +14,7 @@ from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.synthetic import TRUTH_FILE, SceneTruth
 from nerfies_jax.capture.synthetic import truth as truths
-from nerfies_jax.measure import geometry_quality
+from nerfies_jax.metrics import geometry_quality
 
 CORRECT_WITHIN = 0.01  # scene units: a quarter of the default cube's half-side
 STATIC_POINTS = 500  # of the capture's static points, to see whether they drift

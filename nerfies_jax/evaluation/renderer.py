@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nerfies_jax import events
+from nerfies_jax.runtime import events
 from nerfies_jax.training.model import (
     Model,
     Rendering,

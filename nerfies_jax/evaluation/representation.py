@@ -14,7 +14,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Mover
 from nerfies_jax.evaluation.protocol import Follow
 from nerfies_jax.evaluation.scores import Halves
-from nerfies_jax.measure.part_time import StepParts
+from nerfies_jax.metrics.part_time import StepParts
 from nerfies_jax.training.model import Model, TrainState
 
 Spec = Any
@@ -107,7 +107,7 @@ class Representation(NamedTuple):
     # (spec, metadata, model, state, frames) -> the parts of a step
     step_parts: Callable[..., StepParts]
     # (spec, metadata, names left out, whether appearances are blended) -> model; it
-    # draws a `nerfies_jax.variants.Between` instead of a view where they are.
+    # draws a `nerfies_jax.scene.variants.Between` instead of a view where they are.
     variant: Callable[..., Model]
     parts: Callable[..., Parts]  # (spec, metadata)
     # (spec, metadata, state, capture, rows), codes fitted to half a frame;
@@ -126,7 +126,7 @@ class Representation(NamedTuple):
     advise: Callable[[dict[str, bool | None], bool, str | None], Choice]
     # Preset of a capture if the user names none.
     default_preset: Callable[[Capture], Choice] | None
-    prices: dict[str, Pair]  # by effect, as in `nerfies_jax.evidence.findings`
+    prices: dict[str, Pair]  # by effect, as in `nerfies_jax.preprocessing.findings`
     # (spec, metadata, names left out) -> the Gaussians of a trained scene
     # for a rasterizer elsewhere; None where a scene has none.
     splatting: Callable[..., Splatting] | None = None

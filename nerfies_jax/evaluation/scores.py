@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from nerfies_jax import events
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.frames import view_of
-from nerfies_jax.measure import image_quality
+from nerfies_jax.metrics import image_quality
+from nerfies_jax.runtime import events
 from nerfies_jax.training.model import Rendering, TrainState, View
 
 Draw = Callable[[TrainState, View], Rendering]  # as a `Renderer` does

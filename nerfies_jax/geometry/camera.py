@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.contract import checked
 from nerfies_jax.geometry import distortion, lie, matrices
 from nerfies_jax.geometry.precision import exact_product, refuse_half
+from nerfies_jax.runtime.contract import checked
 
 # Both keep what is at or behind the camera finite in float32, where 1/z² overflows
 # below 1e-19 and the seventh power of a slope above 1e5.

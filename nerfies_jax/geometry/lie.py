@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nerfies_jax.contract import checked
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.geometry.jacobi import cross
 from nerfies_jax.geometry.precision import at_least_float32, exact_product
 from nerfies_jax.geometry.stumpff import stumpff
+from nerfies_jax.runtime.contract import checked
 
 Vector = Float[Array, "3"]
 Matrix = Float[Array, "3 3"]

@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nerfies_jax.contract import checked
 from nerfies_jax.geometry import jacobi
 from nerfies_jax.geometry.jacobi import dot
 from nerfies_jax.geometry.precision import at_least_float32
+from nerfies_jax.runtime.contract import checked
 
 Matrix = Float[Array, "3 3"]
 Scalar = Float[Array, ""]

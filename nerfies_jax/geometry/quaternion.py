@@ -8,11 +8,11 @@ exactly one.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nerfies_jax.contract import checked
 from nerfies_jax.geometry.fusion import components, stacked
 from nerfies_jax.geometry.jacobi import cross, dot
 from nerfies_jax.geometry.precision import at_least_float32, near_one
 from nerfies_jax.geometry.stumpff import stumpff
+from nerfies_jax.runtime.contract import checked
 
 Quaternion = Float[Array, "4"]
 

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.contract import checked
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.runtime.contract import checked
 
 # Component of a unit direction below which the ray runs along the face. With 1e-20
 # quotients would be finite, but gradients, over 1e-40, would not be in float32.

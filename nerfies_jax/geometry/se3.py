@@ -11,9 +11,9 @@ function is differentiable to any order, also at the identity.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nerfies_jax.contract import checked
 from nerfies_jax.geometry import lie
 from nerfies_jax.geometry.precision import at_least_float32, exact_product
+from nerfies_jax.runtime.contract import checked
 
 Twist = Float[Array, "6"]
 Transform = Float[Array, "4 4"]

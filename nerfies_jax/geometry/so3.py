@@ -8,9 +8,9 @@ function is differentiable to any order, also at the identity.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nerfies_jax.contract import checked
 from nerfies_jax.geometry import lie
 from nerfies_jax.geometry.precision import at_least_float32, exact_product
+from nerfies_jax.runtime.contract import checked
 
 Vector = Float[Array, "3"]
 Matrix = Float[Array, "3 3"]

@@ -4,7 +4,7 @@ import dataclasses
 
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import Representation
-from nerfies_jax.evidence.findings import Finding, table
+from nerfies_jax.preprocessing.findings import Finding, table
 from nerfies_jax.runs import prices, representations
 from nerfies_jax.runs.config import RunConfig
 

@@ -3,10 +3,12 @@
 import math
 import pathlib
 
-from nerfies_jax import evaluation, events
-from nerfies_jax.evaluation import Scored, pictures
+from nerfies_jax import evaluation
+from nerfies_jax.evaluation import Scored
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runs.train import Trained
+from nerfies_jax.runtime import events
+from nerfies_jax.visualization import panels
 
 
 @events.stage("drawing the curve")
@@ -27,7 +29,7 @@ def save(path: pathlib.Path, run: Run, trained: Trained, scored: Scored):
     history = trained.result.history
     if not history.evaluations:
         return None
-    points = pictures.History(
+    points = panels.History(
         [row["seconds"] for row in history.evaluations],
         [row["psnr"] for row in history.evaluations],
     )
@@ -35,8 +37,8 @@ def save(path: pathlib.Path, run: Run, trained: Trained, scored: Scored):
     if _is_partial(trained, scored):
         counts = len(scored.rows), len(trained.watched)
         psnr = evaluation.known_mean(scored.psnr)
-        final = pictures.Final(trained.result.seconds, psnr, *counts)
-    pictures.curve({run.config.preset_name: points}, path, final)
+        final = panels.Final(trained.result.seconds, psnr, *counts)
+    panels.curve({run.config.preset_name: points}, path, final)
     return path
 
 

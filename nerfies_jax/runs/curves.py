@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.json_files import read_json, write_json
-from nerfies_jax.events import Event
-from nerfies_jax.measure import clock
+from nerfies_jax.metrics import clock
 from nerfies_jax.runs import event_log
+from nerfies_jax.runtime.events import Event
 from nerfies_jax.training.loop import History
 
 CURVE = "curve.json"

@@ -14,8 +14,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from nerfies_jax import console
-from nerfies_jax.events import Event
+from nerfies_jax.runtime import console
+from nerfies_jax.runtime.events import Event
 
 EVENTS = "events.jsonl"
 TRAIN_SECONDS = 0.5  # between two rows of training, and of the progress of a stage

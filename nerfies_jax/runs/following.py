@@ -5,11 +5,11 @@ import pathlib
 import uuid
 from collections.abc import Iterator, Sequence
 
-from nerfies_jax import events
-from nerfies_jax.measure import clock
+from nerfies_jax.metrics import clock
 from nerfies_jax.runs import trackers
 from nerfies_jax.runs.event_log import EventLog, read_events
 from nerfies_jax.runs.run import Run
+from nerfies_jax.runtime import events
 from nerfies_jax.training import specs
 from nerfies_jax.training.loop import FitResult
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.evidence import frame_masks, record
+from nerfies_jax.preprocessing import frame_masks, record
 
 LEAST_SHARE = 0.005  # of the pixels: cameras hardly notice less
 

@@ -2,8 +2,9 @@
 
 import math
 
-from nerfies_jax import evaluation, events
+from nerfies_jax import evaluation
 from nerfies_jax.runs.run import Run, with_steps
+from nerfies_jax.runtime import events
 from nerfies_jax.training import rate
 from nerfies_jax.training.model import TrainState
 

@@ -10,9 +10,9 @@ from typing import Literal
 
 import psutil
 
-from nerfies_jax import events
 from nerfies_jax.capture.cache import CACHE
-from nerfies_jax.compiler import UNDIVIDED
+from nerfies_jax.runtime import events
+from nerfies_jax.runtime.compiler import UNDIVIDED
 
 Device = Literal["auto", "cpu", "gpu", "tpu"]
 # Number of cores that XLA:CPU sees, which each representation chooses.

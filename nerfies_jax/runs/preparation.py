@@ -22,7 +22,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from nerfies_jax import console, events
 from nerfies_jax.capture import colmap, footage, formats, nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, describe
 from nerfies_jax.capture.footage import Taken
@@ -34,10 +33,11 @@ from nerfies_jax.capture.structure_from_motion import (
     Poses,
     run_sfm,
 )
-from nerfies_jax.evidence import masks_without_cameras
+from nerfies_jax.preprocessing import masks_without_cameras
 from nerfies_jax.runs import movers, run_folder
 from nerfies_jax.runs.config import Preparation
 from nerfies_jax.runs.run_folder import PREPARED as RECORD
+from nerfies_jax.runtime import console, events
 from nerfies_jax.training import specs
 
 # Masks are of a pinhole and features lie beside edges: this share of the longer side

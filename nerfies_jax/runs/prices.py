@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 
 from nerfies_jax.evaluation.representation import Pair
-from nerfies_jax.evidence.findings import Finding
-from nerfies_jax.measure import clock
-from nerfies_jax.measure.clock import Metric
+from nerfies_jax.metrics import clock
+from nerfies_jax.metrics.clock import Metric
+from nerfies_jax.preprocessing.findings import Finding
 from nerfies_jax.runs import representations
 
 EFFECT_COST = "effect_cost.json"  # beside this file; the study writes it

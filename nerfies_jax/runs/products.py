@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from nerfies_jax import console, evaluation, events
+from nerfies_jax import evaluation
 from nerfies_jax.capture import camera_paths, exr, video
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.json_files import merged_folder, write_json
-from nerfies_jax.evaluation import Renderer, Scored, heldout, pictures
+from nerfies_jax.evaluation import Renderer, Scored, heldout
 from nerfies_jax.evaluation.representation import Saved
-from nerfies_jax.measure import clock
-from nerfies_jax.measure.clock import Metric
-from nerfies_jax.measure.metric_table import metric
+from nerfies_jax.metrics import clock
+from nerfies_jax.metrics.clock import Metric
+from nerfies_jax.metrics.metric_table import metric
 from nerfies_jax.runs import (
     baselines_text,
     budget,
@@ -37,8 +37,10 @@ from nerfies_jax.runs.attempts import Attempts
 from nerfies_jax.runs.run import Run, with_found_cameras
 from nerfies_jax.runs.run_folder import CONFIG, LEFT_OUT
 from nerfies_jax.runs.train import Trained
+from nerfies_jax.runtime import console, events
 from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
+from nerfies_jax.visualization import panels
 
 METRICS = "metrics.json"
 SHOWN = 4  # held-out frames in the comparison
@@ -342,14 +344,14 @@ def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
     if capture.valid is not None:  # what was not filmed is black in both: no error
         filmed = capture.valid[scored.rows[shown]][..., None]
         truth, color = np.where(filmed, truth, 0), np.where(filmed, color, 0)
-    picture = pictures.comparison(
+    picture = panels.comparison(
         truth,
         color,
         scored.depth[shown],
         captions,
         known_depth=scored.alpha[shown] > 0.5,
     )
-    pictures.save(picture, path)
+    panels.save(picture, path)
     return path
 
 
@@ -429,7 +431,7 @@ def save_player(
             poster,
         )
         picture = folder / "player.png"
-        pictures.save(poster, picture)
+        panels.save(poster, picture)
     except (OSError, CaptureError):  # a full disk is told with all that is not written
         raise
     except Exception as error:  # whatever it is, the run keeps all its other products

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerfies_jax import evaluation, events
+from nerfies_jax import evaluation
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.evaluation import (
     Scored,
@@ -18,10 +18,11 @@ from nerfies_jax.evaluation import (
 from nerfies_jax.evaluation.baseline_images import Baselines
 from nerfies_jax.evaluation.heldout import Lpips
 from nerfies_jax.evaluation.scores import Draw
-from nerfies_jax.measure import perceptual
+from nerfies_jax.metrics import perceptual
 from nerfies_jax.runs import budget
 from nerfies_jax.runs.config import MoreMetrics
 from nerfies_jax.runs.run import Run
+from nerfies_jax.runtime import events
 from nerfies_jax.training.loop import History
 from nerfies_jax.training.model import TrainState
 

@@ -7,11 +7,10 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
-from nerfies_jax import console, stopping
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import CaptureError, describe
 from nerfies_jax.capture.given import GivenFiles
-from nerfies_jax.evidence import inspection, record
+from nerfies_jax.preprocessing import inspection, record
 from nerfies_jax.runs import (
     adviser,
     commands,
@@ -38,6 +37,7 @@ from nerfies_jax.runs.run import (
     stored_capture,
 )
 from nerfies_jax.runs.train import Pace
+from nerfies_jax.runtime import console, stopping
 from nerfies_jax.training import checkpoint
 from nerfies_jax.training.loop import FitResult, Hook
 

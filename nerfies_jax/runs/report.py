@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import PIL.Image
 
-from nerfies_jax import events
 from nerfies_jax.capture import images
 from nerfies_jax.capture.json_files import replaced_file
-from nerfies_jax.measure.clock import Metric
-from nerfies_jax.measure.metric_table import GROUPS, METRICS, Entry
+from nerfies_jax.metrics.clock import Metric
+from nerfies_jax.metrics.metric_table import GROUPS, METRICS, Entry
 from nerfies_jax.runs import relative_paths
 from nerfies_jax.runs.report_style import STYLE
+from nerfies_jax.runtime import events
 
 # A larger video stays beside the page: base64 adds a third, and mail stops near 10 MB.
 EMBEDDED_VIDEO_BYTES = 6 * 2**20

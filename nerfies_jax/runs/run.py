@@ -12,7 +12,6 @@ import jax
 import psutil
 
 from nerfies_jax import capture as captures
-from nerfies_jax import events
 from nerfies_jax.capture import frame_memory, gate, pinholes, synthetic
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
@@ -23,10 +22,11 @@ from nerfies_jax.evaluation import Renderer, as_found
 from nerfies_jax.evaluation.lens import ThroughLens
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.evaluation.scores import Draw
-from nerfies_jax.evidence import frame_flow, frame_masks, given_files
+from nerfies_jax.preprocessing import frame_flow, frame_masks, given_files
 from nerfies_jax.runs import representations, same_capture, trust
 from nerfies_jax.runs.config import CaptureNotFound, CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG, LEFT_OUT
+from nerfies_jax.runtime import events
 from nerfies_jax.training import checkpoint, specs
 from nerfies_jax.training.model import Model, TrainState
 from nerfies_jax.training.provenance import provenance

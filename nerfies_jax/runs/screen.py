@@ -11,11 +11,11 @@ from nerfies_jax.capture import camera_paths
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import Renderer, interactive, model_flow
 from nerfies_jax.evaluation.interactive import Eye, Look
-from nerfies_jax.evaluation.pictures import Colored
 from nerfies_jax.evaluation.representation import SplatCloud, Splatting
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.runs.run import Run
 from nerfies_jax.training.model import Model, TrainState, View, in_default_precision
+from nerfies_jax.visualization.panels import Colored
 
 # Pixels of a tile. A change of the view waits until a tile is rendered: rays are traced
 # one by one, while a rasterizer goes through all Gaussians for every tile.

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 from nerfies_jax.capture import extras
 from nerfies_jax.capture.nearest import known_names
-from nerfies_jax.events import Event
+from nerfies_jax.runtime.events import Event
 
 PROJECT = "nerfies-jax"
 

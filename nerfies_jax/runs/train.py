@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax import evaluation, events
+from nerfies_jax import evaluation
 from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.runs import budget, run_folder
 from nerfies_jax.runs.run import Run, drawer
+from nerfies_jax.runtime import events
 from nerfies_jax.training import chunk, loop
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult, History, Hook

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerfies_jax import console, evaluation, stopping
+from nerfies_jax import evaluation
 from nerfies_jax.capture import camera_paths, extras
 from nerfies_jax.evaluation.interactive import Look
 from nerfies_jax.geometry import camera as cameras
@@ -26,6 +26,7 @@ from nerfies_jax.runs.screen import Screen
 from nerfies_jax.runs.viewer_path import PathPanel, vertical_fov
 from nerfies_jax.runs.viewer_training import TrainingPanel
 from nerfies_jax.runs.viewer_window import COMPILING, Window, eye_of
+from nerfies_jax.runtime import console, stopping
 from nerfies_jax.training.loop import Hook
 from nerfies_jax.training.model import TrainState
 

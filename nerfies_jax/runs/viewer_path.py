@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerfies_jax import console
 from nerfies_jax.capture import keyframes, path_files
 from nerfies_jax.capture.camera_paths import CameraPath
 from nerfies_jax.capture.capture import CaptureError
@@ -23,6 +22,7 @@ from nerfies_jax.runs import path_images
 from nerfies_jax.runs.run_folder import EXPORTS, RENDERS
 from nerfies_jax.runs.screen import Screen
 from nerfies_jax.runs.viewer_window import departing
+from nerfies_jax.runtime import console
 from nerfies_jax.training.model import TrainState, View, in_default_precision
 
 RATE = 24.0  # images per second of a path

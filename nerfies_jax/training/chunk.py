@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from nerfies_jax import compiler, data_parallel, events
-from nerfies_jax.measure import matrix_flops
+from nerfies_jax.runtime import compiler, data_parallel, events
+from nerfies_jax.training import matrix_flops
 from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
 LENGTH = 10  # steps of a scan

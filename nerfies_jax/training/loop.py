@@ -11,10 +11,10 @@ import psutil
 import rich.console
 from jaxtyping import Array, Key
 
-from nerfies_jax import data_parallel
-from nerfies_jax import events as event_stream
-from nerfies_jax.progress import duration
-from nerfies_jax.stopping import StopRequests
+from nerfies_jax.runtime import data_parallel
+from nerfies_jax.runtime import events as event_stream
+from nerfies_jax.runtime.progress import duration
+from nerfies_jax.runtime.stopping import StopRequests
 from nerfies_jax.training import chunk
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
@@ -115,8 +115,8 @@ def fit(
 
     An event happens when its step is completed, before a checkpoint of that step, so a
     resumed run repeats the uninterrupted one bit for bit (on XLA:CPU with the same
-    PJRT_NPROC). Progress goes to the sinks of `nerfies_jax.events`: `train` events, and
-    `evaluation` events of hooks that return numbers.
+    PJRT_NPROC). Progress goes to the sinks of `nerfies_jax.runtime.events`: `train`
+    events, and `evaluation` events of hooks that return numbers.
 
     Steps are scanned. One program serves all chunks of a shape, and a second one the
     remainder where events or the end fall between them (`chunk.Program`).

@@ -13,10 +13,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.contract import checked
 from nerfies_jax.geometry.fusion import materialized
 from nerfies_jax.geometry.linear_call import linear_call
 from nerfies_jax.geometry.precision import at_least_float32, widened
+from nerfies_jax.runtime.contract import checked
 
 # PSNR is reported to 100 dB, where 8-bit images ended long ago (51 dB for one level).
 LEAST_MSE = 1e-10

@@ -146,5 +146,5 @@ class Model(NamedTuple):
     # (params, capture) -> the capture with its cameras as training found them; None
     # where they stay those of the capture.
     found: Callable[[PyTree, Any], Any] | None = None
-    # Compiler options of steps and renders (`nerfies_jax.compiler`).
+    # Compiler options of steps and renders (`nerfies_jax.runtime.compiler`).
     compiler_options: Mapping[str, str] | None = None

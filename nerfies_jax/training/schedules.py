@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
-from nerfies_jax.nets import encoding
+from nerfies_jax.nn import encoding
 
 Schedule = Callable[..., Float[Array, "*steps"]]  # of an integer step
 

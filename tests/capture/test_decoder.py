@@ -11,10 +11,10 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from nerfies_jax import children
 from nerfies_jax.capture import colmap, decoder, images
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
+from nerfies_jax.runtime import children
 from tests.capture import test_colmap
 
 

@@ -7,7 +7,6 @@ import sys
 
 import pytest
 
-from nerfies_jax import processes
 from nerfies_jax.capture import json_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import (
@@ -16,6 +15,7 @@ from nerfies_jax.capture.json_files import (
     replaced_folder,
     sweep,
 )
+from nerfies_jax.runtime import processes
 
 
 def fill(path):

@@ -6,10 +6,10 @@ import pytest
 import scipy.ndimage
 
 from nerfies_jax import capture as room
-from nerfies_jax import events
 from nerfies_jax.capture import structure_from_motion as mapping
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.geometry import camera
+from nerfies_jax.runtime import events
 
 SIZE = (240, 180)
 FOCAL = 220.0

@@ -5,17 +5,17 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.evidence import films
 
 from nerfies_jax import evaluation
 from nerfies_jax.capture import pinholes
 from nerfies_jax.evaluation import baseline_images, moving_masks
 from nerfies_jax.evaluation.lens import ThroughLens
-from nerfies_jax.evidence import record
 from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.preprocessing import record
 from nerfies_jax.runs import baselines_text
 from nerfies_jax.training.model import Rendering, TrainState
 from tests.capture.test_pinholes import pattern, through_a_lens
-from tests.evidence import films
 
 SIZE = (24, 18)
 NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), None)

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import scene as splat_scene
-from nerfies_jax import evaluation, scene
+from gaussians_jax.scene import scene as splat_scene
+from nerfies_jax import evaluation
 from nerfies_jax.capture import pinholes
 from nerfies_jax.evaluation import fitted_cameras, heldout
 from nerfies_jax.evaluation.fitted_cameras import CameraFitSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import rays
+from nerfies_jax.scene import scene
 from nerfies_jax.training.model import (
     Model,
     Rendering,

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from nerfies_jax import evaluation
-from nerfies_jax import scene as radiance
 from nerfies_jax.capture import frame_memory
 from nerfies_jax.capture.images import write_png
+from nerfies_jax.scene import scene as radiance
 from tests.capture.test_capture import make
 
 

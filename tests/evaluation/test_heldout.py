@@ -6,26 +6,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.measure.test_perceptual import TINY, state_dict
 
-from gaussians_jax import scene as splat_scene
-from nerfies_jax import evaluation, runs, scene
+from gaussians_jax.scene import scene as splat_scene
+from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import synthetic
-from nerfies_jax.effects.warp import WarpSpec
 from nerfies_jax.evaluation import heldout, model_flow, protocol
 from nerfies_jax.evaluation.baseline_images import Averages, Baselines
 from nerfies_jax.evaluation.heldout import heldout_metrics
 from nerfies_jax.evaluation.model_flow import Flow, Moved
 from nerfies_jax.evaluation.scores import Scored
+from nerfies_jax.fields.effects.warp import WarpSpec
+from nerfies_jax.fields.spec import RadianceScene, SamplingSpec
+from nerfies_jax.fields.template import TemplateSpec
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.measure import image_quality, perceptual
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.radiance.template import TemplateSpec
+from nerfies_jax.metrics import image_quality, perceptual
+from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.runs import quality, representations
 from nerfies_jax.runs.config import CaptureSource, RunConfig
-from nerfies_jax.spec import RadianceScene, SamplingSpec
+from nerfies_jax.scene import scene
 from nerfies_jax.training.model import TrainState
 from tests import scene_oracle, scenes
-from tests.measure.test_perceptual import TINY, state_dict
 
 # Two frames of the second camera: one has a next one, so a flow.
 FILM = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import skimage.metrics
 
-from gaussians_jax import scene
+from gaussians_jax.scene import scene
 from nerfies_jax import evaluation
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training.model import Model, Rendering, Stages, Surveyed, TrainState

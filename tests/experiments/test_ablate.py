@@ -23,7 +23,7 @@ from experiments.ablate.results import ArmResult
 from experiments.ablate.settings import Ablate
 from nerfies_jax.capture import cache_files, synthetic
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.measure import clock
+from nerfies_jax.metrics import clock
 from nerfies_jax.runs import platform
 from nerfies_jax.training.track_start import FieldStartSpec
 from tests import scenes

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from experiments import compare
-from nerfies_jax.measure import clock
+from nerfies_jax.metrics import clock
 from nerfies_jax.runs import curves, event_log
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.training import specs

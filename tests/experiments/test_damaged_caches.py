@@ -20,7 +20,7 @@ from experiments.ablate.results import ArmResult
 from experiments.benchmark.job import SCORED
 from nerfies_jax.capture import cache_files, synthetic
 from nerfies_jax.capture.synthetic import record as scenes_record
-from nerfies_jax.evidence import record
+from nerfies_jax.preprocessing import record
 from tests import scenes
 
 pytestmark = pytest.mark.slow

@@ -9,11 +9,13 @@ import pytest
 from experiments.effect_cost import __main__ as effect_cost
 from experiments.effect_cost import report
 from experiments.effect_cost.__main__ import EffectCost, Priced, PricedScene, SceneCost
-from gaussians_jax import presets as splat_presets
-from nerfies_jax import presets as field_presets
-from nerfies_jax import runs, scene
-from nerfies_jax.field_ray import Ray
-from nerfies_jax.measure import baselines, clock, matrix_flops
+from gaussians_jax.scene import presets as splat_presets
+from nerfies_jax import runs
+from nerfies_jax.fields.field_ray import Ray
+from nerfies_jax.metrics import baselines, clock
+from nerfies_jax.scene import presets as field_presets
+from nerfies_jax.scene import scene
+from nerfies_jax.training import matrix_flops
 from nerfies_jax.training.effects import FrameCondition
 from tests import bare_scenes, scenes
 

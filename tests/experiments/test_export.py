@@ -11,7 +11,7 @@ import plyfile
 import pytest
 
 from experiments import cli, export
-from gaussians_jax import splatv
+from gaussians_jax.io import splatv
 from nerfies_jax import runs
 from nerfies_jax.capture import camera_paths, exr, load, nerfies_format
 from nerfies_jax.evaluation import exr_series

@@ -1,4 +1,4 @@
-"""A room reads only lower floors, and most tests do so too; modules form no circles."""
+"""A package imports only from the layers below it, and modules form no circles."""
 
 import ast
 import graphlib
@@ -7,88 +7,69 @@ import pathlib
 import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-# Longest prefix wins. gaussians_jax reads floors 1-5 of nerfies_jax, experiments all.
-FLOORS = {
-    "nerfies_jax.contract": 1,
-    "nerfies_jax.geometry": 1,
-    "nerfies_jax.children": 1,
-    "nerfies_jax.compiler": 1,
-    "nerfies_jax.console": 1,
-    "nerfies_jax.progress": 1,
-    "nerfies_jax.events": 1,
-    "nerfies_jax.processes": 1,
-    "nerfies_jax.stopping": 1,
-    "nerfies_jax.data_parallel": 1,
-    "nerfies_jax.nets": 2,
-    "nerfies_jax.capture": 3,
-    "nerfies_jax.training": 4,
-    "nerfies_jax.measure": 5,
-    "nerfies_jax.measure.matrix_flops": 3,  # of a traced program; reads `nets` alone
-    "nerfies_jax.evaluation": 5,
-    "nerfies_jax.evidence": 5,
-    "nerfies_jax.radiance": 6,
-    "nerfies_jax.effects": 7,
-    "nerfies_jax.scene_metadata": 5,  # of a capture; reads nothing else
-    "nerfies_jax.spec": 8,
-    "nerfies_jax.field_ray": 8,
-    "nerfies_jax.render_ray": 8,
-    "nerfies_jax.occupied_rays": 8,
-    "nerfies_jax.frustum_grid": 8,
-    "nerfies_jax.skipping": 8,
-    "nerfies_jax.field": 8,
-    "nerfies_jax.scene": 8,
-    "nerfies_jax.held_out_codes": 8,
-    "nerfies_jax.path_fit": 8,
-    "nerfies_jax.point_tracks": 8,
-    "nerfies_jax.step_time": 8,
-    "nerfies_jax.variants": 8,
-    "nerfies_jax.presets": 8,
-    "nerfies_jax.representation": 8,
-    "nerfies_jax.runs": 9,
-    "nerfies_jax": 10,  # the face of the package
-    "gaussians_jax.effects": 7,
-    "gaussians_jax.losses": 8,
-    "gaussians_jax.motion": 8,
-    "gaussians_jax.strategy": 8,
-    "gaussians_jax.spec": 8,
-    "gaussians_jax.first_state": 8,
-    "gaussians_jax.growth": 8,
-    "gaussians_jax.model_file": 8,
-    "gaussians_jax.held_out_exposure": 8,
-    "gaussians_jax.scene": 8,
-    "gaussians_jax.track_start": 8,
-    "gaussians_jax.track_fitting": 8,
-    "gaussians_jax.point_tracks": 8,
-    "gaussians_jax.step_time": 8,
-    "gaussians_jax.update": 8,
-    "gaussians_jax.browser_splats": 8,
-    "gaussians_jax.variants": 8,
-    "gaussians_jax.presets": 8,
-    "gaussians_jax.small_presets": 8,
-    "gaussians_jax.representation": 8,
-    "gaussians_jax": 6,
-    "experiments": 11,
-}
+# From the lowest layer up. `nerfies_jax` and `gaussians_jax` themselves stand for the
+# modules beside their packages: the public names and the `Representation`.
+LAYERS = (
+    "nerfies_jax.runtime",
+    "nerfies_jax.geometry",
+    "nerfies_jax.nn",
+    "nerfies_jax.capture",
+    "nerfies_jax.training",
+    "nerfies_jax.visualization",
+    "nerfies_jax.metrics",
+    "nerfies_jax.preprocessing",
+    "nerfies_jax.evaluation",
+    "nerfies_jax.runs",
+    "nerfies_jax.fields",
+    "nerfies_jax.scene",
+    "nerfies_jax",
+    "gaussians_jax.core",
+    "gaussians_jax.splatting",
+    "gaussians_jax.optim",
+    "gaussians_jax.init",
+    "gaussians_jax.motion",
+    "gaussians_jax.losses",
+    "gaussians_jax.per_frame",
+    "gaussians_jax.scene",
+    "gaussians_jax.io",
+    "gaussians_jax.player",
+    "gaussians_jax",
+    "experiments",
+)
 OURS = ("nerfies_jax", "gaussians_jax", "experiments")
-# Folders of tests read their room and lower ones, `tests/gaussians` what gaussians_jax
-# may. What is not named here (evaluation, evidence, runs, hard cases) takes scenes of
-# both packages and reads both; only `tests/experiments` reads experiments.
+# The two representations and the runs of any of them do not know each other.
+SHARED = LAYERS[: LAYERS.index("nerfies_jax.runs")]
+# Tests of a package import that package and lower ones. What is not named here
+# (evaluation, preprocessing, runs, hard cases) takes scenes of both representations.
 TESTED = {
-    "geometry": 1,
-    "nets": 2,
-    "capture": 3,
-    "training": 4,
-    "measure": 5,
-    "radiance": 8,
-    "effects": 8,
+    "geometry": "nerfies_jax.geometry",
+    "nn": "nerfies_jax.nn",
+    "capture": "nerfies_jax.capture",
+    "training": "nerfies_jax.training",
+    "metrics": "nerfies_jax.metrics",
+    "visualization": "nerfies_jax.visualization",
+    "fields": "nerfies_jax.scene",
+    "gaussians": "gaussians_jax",
 }
 
 
-def floor(module):
-    best = max(
-        (room for room in FLOORS if (module + ".").startswith(room + ".")), key=len
-    )
-    return FLOORS[best], best.split(".")[0], best
+def layer(module):
+    """Return the package of a module, or of a name in a module."""
+    return max((p for p in LAYERS if (module + ".").startswith(p + ".")), key=len)
+
+
+def readable(package):
+    """Return the packages that a package may import from, besides itself."""
+    below = LAYERS[: LAYERS.index(package)]
+    root = package.split(".")[0]
+    if package == "experiments":
+        return below
+    if package == "nerfies_jax":  # public names
+        return [p for p in below if p.startswith(root)]
+    if package in SHARED or package == "nerfies_jax.runs":
+        return below
+    own = [p for p in below if p.startswith(root + ".") and p != "nerfies_jax.runs"]
+    return [*SHARED, *own]
 
 
 def imports(path):
@@ -119,33 +100,27 @@ def modules(root):
 
 def violations(root):
     for module, path in modules(root):
-        level, package, room = floor(module)
+        package = layer(module)
         for name, _ in imports(path):
-            if name.split(".")[0] not in OURS:
-                continue
-            other_level, other_package, other_room = floor(name)
-            across = package != other_package and package != "experiments"
-            if across and not (package == "gaussians_jax" and 1 <= other_level <= 5):
-                yield f"{module} reads {name}"
-            elif other_level > level and room != "nerfies_jax":
-                yield f"{module} (floor {level}) reads {other_room} ({other_level})"
+            if name.split(".")[0] in OURS:
+                other = layer(name)
+                if other != package and other not in readable(package):
+                    yield f"{module} imports {name}"
 
 
 def violations_of_tests(root):
     for path in sorted((root / "tests").rglob("*.py")):
         folder = path.relative_to(root / "tests").parts[0]
         for name, _ in imports(path):
-            package = name.split(".")[0]
-            if package not in OURS or folder == "experiments":
+            if name.split(".")[0] not in OURS or folder == "experiments":
                 continue
-            if package == "experiments":
-                yield f"{path}: reads {name}; only tests/experiments may"
-                continue
-            level, other, _ = floor(name)
-            if folder in TESTED and (other != "nerfies_jax" or level > TESTED[folder]):
-                yield f"{path}: reads {name}, above its room"
-            elif folder == "gaussians" and other == "nerfies_jax" and level > 5:
-                yield f"{path}: reads {name}, which gaussians_jax may not"
+            other = layer(name)
+            if other == "experiments":
+                yield f"{path}: imports {name}; only tests/experiments may"
+            elif folder in TESTED:
+                package = TESTED[folder]
+                if other != package and other not in readable(package):
+                    yield f"{path}: imports {name}, above its package"
 
 
 def circle(root):
@@ -170,11 +145,11 @@ def circle(root):
     return []
 
 
-def test_rooms_read_only_lower_floors():
+def test_packages_import_from_lower_layers():
     assert list(violations(ROOT)) == []
 
 
-def test_tests_read_their_room_and_lower_ones():
+def test_tests_import_their_package_and_lower_ones():
     assert list(violations_of_tests(ROOT)) == []
 
 
@@ -184,10 +159,10 @@ def test_no_modules_import_each_other():
 
 FAULTS = {
     "nerfies_jax/geometry/lie.py": "from nerfies_jax.training import loop\n",
-    "gaussians_jax/raster.py": "import nerfies_jax.scene\n",
-    "tests/nets/test_mlp.py": "from nerfies_jax.training import loop\n",
+    "gaussians_jax/splatting/raster.py": "import nerfies_jax.scene.scene\n",
+    "tests/nn/test_mlp.py": "from nerfies_jax.training import loop\n",
     "tests/gaussians/test_files.py": "from experiments import cli\n",
-    "tests/gaussians/test_scene.py": "import nerfies_jax.scene\n",
+    "tests/gaussians/test_scene.py": "import nerfies_jax.scene.scene\n",
 }
 
 

@@ -13,14 +13,15 @@ import pytest
 from matplotlib import colormaps
 
 from experiments import compare, export, reconstruct, render
-from gaussians_jax import step_time
+from gaussians_jax.scene import step_time
 from nerfies_jax import runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
-from nerfies_jax.evaluation import baseline_images, pictures
-from nerfies_jax.measure import part_time
+from nerfies_jax.evaluation import baseline_images
+from nerfies_jax.metrics import part_time
 from nerfies_jax.runs import products, quality, reconstruction, run_folder, train
 from nerfies_jax.runs.run_folder import CHECKPOINTS
 from nerfies_jax.training import rate
+from nerfies_jax.visualization import panels
 from tests import event_checks, scenes
 
 QUICK = (
@@ -135,7 +136,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
 def test_runs_are_drawn_beside_each_other(run, tmp_path, monkeypatch, capsys):
     """A run beside a copy of itself: the truth, twice the same picture and error."""
     shutil.copytree(run, tmp_path / "again")
-    laid, sheet = {}, pictures.contact_sheet
+    laid, sheet = {}, panels.contact_sheet
 
     def caught(panels, captions, columns):
         laid.update(panels=panels, captions=captions, columns=columns)

@@ -6,6 +6,8 @@ import shlex
 
 import numpy as np
 import pytest
+from tests.evidence import films
+from tests.measure.test_perceptual import state_dict
 
 from experiments import cli, reconstruct
 from nerfies_jax import runs
@@ -18,8 +20,6 @@ from nerfies_jax.runs import (
 )
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
-from tests.evidence import films
-from tests.measure.test_perceptual import state_dict
 
 
 @pytest.fixture

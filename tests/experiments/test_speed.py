@@ -7,7 +7,7 @@ import pytest
 
 from experiments.speed import __main__ as speed
 from experiments.speed import raster, tolerances
-from nerfies_jax.measure import clock
+from nerfies_jax.metrics import clock
 
 ONE = {"step_ms": 40.0, "compile_seconds": 9.0, "frame_ms": 7.0, "peak_mb": 1400.0}
 STORED = {

@@ -14,7 +14,7 @@ import pytest
 
 from experiments import __main__ as commands
 from experiments import cli
-from gaussians_jax import model_file
+from gaussians_jax.io import model_file
 from nerfies_jax import runs
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.runs import curves, train, trust

@@ -1,7 +1,7 @@
-"""Motions bound to a small scene, as `gaussians_jax.scene.build` binds them."""
+"""Motions bound to a small scene, as `gaussians_jax.scene.scene.build` binds them."""
 
-from gaussians_jax import protocols
-from gaussians_jax.metadata import SceneMetadata
+from gaussians_jax.core import protocols
+from gaussians_jax.core.metadata import SceneMetadata
 
 
 def motion(spec, steps=100, extent=1.0, frames=9, box=None):

@@ -13,10 +13,10 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from gaussians_jax.io.sampled import Instants
 from gaussians_jax.player import packing
 from gaussians_jax.player import page as player_page
-from gaussians_jax.player.sampled import Instants
-from gaussians_jax.raster_spec import RasterSpec
+from gaussians_jax.splatting.raster_spec import RasterSpec
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 

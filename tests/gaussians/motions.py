@@ -7,13 +7,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gaussians_jax import splats
-from gaussians_jax.effects import kan_motion, mlp_motion, motion_basis
-from gaussians_jax.effects.kan_motion import KanMotionSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
-from gaussians_jax.effects.motion_basis import BasisMotionSpec
-from gaussians_jax.splats import Params
-from nerfies_jax.nets.encoding import EncodingSpec
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Params
+from gaussians_jax.motion import basis as motion_basis
+from gaussians_jax.motion import kan as kan_motion
+from gaussians_jax.motion import mlp as mlp_motion
+from gaussians_jax.motion.basis import BasisMotionSpec
+from gaussians_jax.motion.kan import KanMotionSpec
+from gaussians_jax.motion.mlp import MotionSpec, SmoothingSpec
+from nerfies_jax.nn.encoding import EncodingSpec
 from tests import scenes
 from tests.gaussians.shared import jitted, put, rows_of, some_gaussians
 

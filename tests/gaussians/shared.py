@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.spatial.transform
 
-from gaussians_jax.splats import Gaussians, Params, Splats
+from gaussians_jax.core.splats import Gaussians, Params, Splats
 
 
 def full(*rows):

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import splats as rows
-from gaussians_jax.effects import acceleration
-from gaussians_jax.effects.acceleration import AccelerationSpec
-from gaussians_jax.splats import Params
+from gaussians_jax.core import splats as rows
+from gaussians_jax.core.splats import Params
+from gaussians_jax.losses import acceleration
+from gaussians_jax.losses.acceleration import AccelerationSpec
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import gradients
 from tests.gaussians.shared import any_nonzero, finite, full, jitted, put

@@ -10,13 +10,15 @@ import pytest
 import scipy.stats
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import representation, scene, splats, variants
-from gaussians_jax.effects import anchor_motion, anchors
-from gaussians_jax.effects.anchors import AnchorMotionSpec, RateSpec
-from gaussians_jax.initialization import InitSpec
-from gaussians_jax.splats import Gaussians, Params
+from gaussians_jax import representation
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Gaussians, Params
+from gaussians_jax.init.points import InitSpec
+from gaussians_jax.motion import anchor_motion, anchors
+from gaussians_jax.motion.anchors import AnchorMotionSpec, RateSpec
+from gaussians_jax.scene import scene, variants
 from nerfies_jax import evaluation
-from nerfies_jax.nets import entropy
+from nerfies_jax.nn import entropy
 from nerfies_jax.training import loop
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import scenes

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import browser_splats, scene, variants
-from gaussians_jax.effects.exposure import ExposureSpec
-from gaussians_jax.spec import raster_of
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.per_frame.exposure import ExposureSpec
+from gaussians_jax.player import browser_splats
+from gaussians_jax.scene import scene, variants
+from gaussians_jax.scene.spec import raster_of
 from nerfies_jax import evaluation
 from tests import scenes
 from tests.oracles import dense_splats

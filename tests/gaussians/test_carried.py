@@ -9,16 +9,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import densification, faces, files, instants, scene, splats, variants
-from gaussians_jax.effects import carried, deformation
-from gaussians_jax.effects.carried import Carried, CarriedSpec, TurnSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.initialization import InitSpec
-from gaussians_jax.mcmc import MCMCStrategySpec
-from gaussians_jax.records import SplatRecord
-from gaussians_jax.splats import Params
+from gaussians_jax.core import faces, splats
+from gaussians_jax.core.records import SplatRecord
+from gaussians_jax.core.splats import Params
+from gaussians_jax.init.points import InitSpec
+from gaussians_jax.io import files, instants
+from gaussians_jax.motion import carried, deformation
+from gaussians_jax.motion.carried import Carried, CarriedSpec, TurnSpec
+from gaussians_jax.motion.mlp import MotionSpec
+from gaussians_jax.optim import densification
+from gaussians_jax.optim.mcmc import MCMCStrategySpec
+from gaussians_jax.scene import scene, variants
 from nerfies_jax import evaluation
-from nerfies_jax.nets.encoding import EncodingSpec
+from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.training import loop
 from nerfies_jax.training.effects import FrameCondition
 from tests import scenes

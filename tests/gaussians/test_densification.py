@@ -8,10 +8,10 @@ import numpy as np
 import optax
 import pytest
 
-from gaussians_jax import densification, optimizer
-from gaussians_jax import splats as rows
-from gaussians_jax.densification import DefaultStrategySpec
-from gaussians_jax.splats import Params, Splats
+from gaussians_jax.core import splats as rows
+from gaussians_jax.core.splats import Params, Splats
+from gaussians_jax.optim import densification, optimizer
+from gaussians_jax.optim.densification import DefaultStrategySpec
 from tests.gaussians.shared import full, put, rotations, same_bits, with_rows
 
 EXTENT = 2.0  # so that 0.02 separates small from large

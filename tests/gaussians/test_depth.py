@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from gaussians_jax.effects import depth
-from gaussians_jax.effects.depth import DepthSpec
+from gaussians_jax.losses import depth
+from gaussians_jax.losses.depth import DepthSpec
 from nerfies_jax.training.effects import (
     Observation,
     PenaltyContext,

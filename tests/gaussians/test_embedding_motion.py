@@ -7,19 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import scene, splats
-from gaussians_jax.effects import embedding_motion, motion_codes
-from gaussians_jax.effects.embedding_motion import (
-    Decoder,
-    EmbeddingMotion,
-    EmbeddingMotionSpec,
-)
-from gaussians_jax.effects.kan_motion import Offsets
-from gaussians_jax.effects.neighbors import NeighborSpec
-from gaussians_jax.spec import effects_of
-from gaussians_jax.splats import Params
-from nerfies_jax.nets import codes
-from nerfies_jax.nets.mlp import MLP, Layer
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Params
+from gaussians_jax.losses.neighbors import NeighborSpec
+from gaussians_jax.motion import codes as motion_codes
+from gaussians_jax.motion import embedding as embedding_motion
+from gaussians_jax.motion.embedding import Decoder, EmbeddingMotion, EmbeddingMotionSpec
+from gaussians_jax.motion.kan import Offsets
+from gaussians_jax.scene import scene
+from gaussians_jax.scene.spec import effects_of
+from nerfies_jax.nn import codes
+from nerfies_jax.nn.mlp import MLP, Layer
 from nerfies_jax.training.effects import PenaltyContext
 from tests import gradients, scenes
 from tests.gaussians.shared import put, rows_of, some_gaussians

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import held_out_exposure, scene, variants
-from gaussians_jax.effects import exposure
-from gaussians_jax.effects.exposure import ExposureSpec
+from gaussians_jax.per_frame import exposure
+from gaussians_jax.per_frame.exposure import ExposureSpec
+from gaussians_jax.scene import held_out_exposure, scene, variants
 from nerfies_jax import evaluation
 from tests import scenes
 

@@ -9,8 +9,10 @@ import numpy as np
 import plyfile
 import pytest
 
-from gaussians_jax import files, harmonics, model_file, splats, spz
-from gaussians_jax.splats import INACTIVE_LOGIT, Params, Splats
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import INACTIVE_LOGIT, Params, Splats
+from gaussians_jax.io import files, model_file, spz
+from gaussians_jax.splatting import harmonics
 from tests.gaussians.shared import full, put, rotations, same_bits
 
 

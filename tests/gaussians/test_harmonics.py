@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.special
 
-from gaussians_jax import harmonics
+from gaussians_jax.splatting import harmonics
 from tests import gradients
 from tests.gaussians.shared import full, jitted, put
 

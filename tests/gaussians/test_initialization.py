@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gaussians_jax import initialization
-from gaussians_jax.initialization import InitSpec
+from gaussians_jax.init import points as initialization
+from gaussians_jax.init.points import InitSpec
 from tests.gaussians.test_refusals import capture_with
 
 SPEC = InitSpec(points=10**4, random=70, extra_random=30)

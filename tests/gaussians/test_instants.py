@@ -7,7 +7,9 @@ import numpy as np
 import plyfile
 import pytest
 
-from gaussians_jax import instants, scene, splats
+from gaussians_jax.core import splats
+from gaussians_jax.io import instants
+from gaussians_jax.scene import scene
 from nerfies_jax import evaluation
 from nerfies_jax.training.model import TrainState
 from tests import scenes

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax.effects.isometry import IsometrySpec, change_of_distances
-from gaussians_jax.metadata import SceneMetadata
-from gaussians_jax.splats import Params
+from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.splats import Params
+from gaussians_jax.losses.isometry import IsometrySpec, change_of_distances
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests.gaussians.shared import put, rows_of, some_gaussians
 from tests.gradients import directional_error

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import splats as rows
-from gaussians_jax.effects import kan_motion, motion_codes
-from gaussians_jax.effects.kan_motion import KanMotion, KanMotionSpec, Offsets
-from gaussians_jax.protocols import MotionParams
-from gaussians_jax.splats import Params
-from nerfies_jax.nets import kan, mlp
+from gaussians_jax.core import splats as rows
+from gaussians_jax.core.protocols import MotionParams
+from gaussians_jax.core.splats import Params
+from gaussians_jax.motion import codes as motion_codes
+from gaussians_jax.motion import kan as kan_motion
+from gaussians_jax.motion.kan import KanMotion, KanMotionSpec, Offsets
+from nerfies_jax.nn import kan, mlp
 from nerfies_jax.training.effects import PenaltyContext
 from tests.gaussians import bound
 from tests.gaussians.motions import FRAMES, MOTIONS, deformed, read_by, strong

@@ -13,11 +13,12 @@ import pytest
 import rich.console
 import scipy.special
 
-from gaussians_jax import densification, mcmc, optimizer, scene
-from gaussians_jax import splats as rows
-from gaussians_jax.mcmc import MCMCStrategySpec
-from gaussians_jax.phases import AlternationSpec
-from gaussians_jax.splats import Params, Splats
+from gaussians_jax.core import splats as rows
+from gaussians_jax.core.splats import Params, Splats
+from gaussians_jax.optim import densification, mcmc, optimizer
+from gaussians_jax.optim.mcmc import MCMCStrategySpec
+from gaussians_jax.optim.phases import AlternationSpec
+from gaussians_jax.scene import scene
 from nerfies_jax import evaluation
 from nerfies_jax.training import checkpoint, loop
 from tests import gradients, scenes

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax.effects import mlp_motion
-from gaussians_jax.effects.mlp_motion import Motion, MotionSpec, Offsets, SmoothingSpec
-from nerfies_jax.nets import mlp
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.nets.mlp import Layer
+from gaussians_jax.motion import mlp as mlp_motion
+from gaussians_jax.motion.mlp import Motion, MotionSpec, Offsets, SmoothingSpec
+from nerfies_jax.nn import mlp
+from nerfies_jax.nn.encoding import EncodingSpec
+from nerfies_jax.nn.mlp import Layer
 from tests import gradients
 from tests.gaussians.motions import MLP as SMALL
 from tests.gaussians.motions import deformed, strong

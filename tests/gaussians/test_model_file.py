@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import model_file, scene, splats
-from gaussians_jax.splats import Params
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Params
+from gaussians_jax.io import model_file
+from gaussians_jax.scene import scene
 from nerfies_jax import evaluation
 from tests import scenes
 from tests.gaussians.motions import moving_scene
@@ -159,7 +161,10 @@ def edited(path, change, arrays=()):
         (lambda a: a.update(params={"dict": {}}), r"no Gaussians in it"),
         (lambda a: a.update(params=3), "not iterable"),
         (lambda a: a["params"].update(record="os.system"), "'os.system', which is no"),
-        (lambda a: a["params"].update(record="gaussians_jax.files.os"), "which is no"),
+        (
+            lambda a: a["params"].update(record="gaussians_jax.io.files.os"),
+            "which is no",
+        ),
         (lambda a: a["params"].update(record="gaussians_jax.none.X"), "which is no"),
         (
             lambda a: a["description"]["spec"].update(type="subprocess.Popen"),

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax.effects import motion_basis
-from gaussians_jax.effects.motion_basis import BasisMotionSpec, Offsets
+from gaussians_jax.motion import basis as motion_basis
+from gaussians_jax.motion.basis import BasisMotionSpec, Offsets
 from tests.gaussians.motions import BASIS as SMALL
 from tests.gaussians.motions import deformed, strong
 from tests.gaussians.shared import finite, full, jitted, some_gaussians

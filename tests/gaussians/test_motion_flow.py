@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import scipy.spatial.transform
 
-from gaussians_jax import scene
-from gaussians_jax.effects import motion_flow, pose_refinement
-from gaussians_jax.effects.motion_flow import FlowSpec
-from gaussians_jax.effects.pose_refinement import PoseRefinementSpec
-from gaussians_jax.raster_spec import GSPLAT
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.losses import flow as motion_flow
+from gaussians_jax.losses.flow import FlowSpec
+from gaussians_jax.per_frame import poses as pose_refinement
+from gaussians_jax.per_frame.poses import PoseRefinementSpec
+from gaussians_jax.scene import scene
+from gaussians_jax.splatting.raster_spec import GSPLAT
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.evaluation import frames_of
 from nerfies_jax.geometry import camera as cameras

@@ -8,17 +8,13 @@ import jax
 import numpy as np
 import pytest
 
-from gaussians_jax import densification, optimizer, splats
-from gaussians_jax.densification import DefaultStrategySpec
-from gaussians_jax.effects import motion_growth
-from gaussians_jax.effects.motion_growth import (
-    Guided,
-    MotionGrowthSpec,
-    MotionGuided,
-    Travel,
-)
-from gaussians_jax.protocols import Population
-from gaussians_jax.splats import Gaussians, Params, Splats
+from gaussians_jax.core import splats
+from gaussians_jax.core.protocols import Population
+from gaussians_jax.core.splats import Gaussians, Params, Splats
+from gaussians_jax.motion import growth as motion_growth
+from gaussians_jax.motion.growth import Guided, MotionGrowthSpec, MotionGuided, Travel
+from gaussians_jax.optim import densification, optimizer
+from gaussians_jax.optim.densification import DefaultStrategySpec
 from tests.gaussians.shared import full, jitted, put
 
 EXTENT = 2.0

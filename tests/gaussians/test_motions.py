@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import splats
-from gaussians_jax.effects import deformation, kan_motion
-from gaussians_jax.effects.kan_motion import KanMotionSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec
-from gaussians_jax.effects.motion_basis import BasisMotionSpec
+from gaussians_jax.core import splats
+from gaussians_jax.motion import deformation
+from gaussians_jax.motion import kan as kan_motion
+from gaussians_jax.motion.basis import BasisMotionSpec
+from gaussians_jax.motion.kan import KanMotionSpec
+from gaussians_jax.motion.mlp import MotionSpec
 from nerfies_jax.training.effects import FrameCondition
 from tests import gradients
 from tests.gaussians import bound

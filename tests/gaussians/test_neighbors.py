@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import splats as rows
-from gaussians_jax.effects import neighbors
-from gaussians_jax.effects.neighbors import Neighbors, NeighborSpec
-from gaussians_jax.splats import Params, Splats
+from gaussians_jax.core import splats as rows
+from gaussians_jax.core.splats import Params, Splats
+from gaussians_jax.losses import neighbors
+from gaussians_jax.losses.neighbors import Neighbors, NeighborSpec
 from nerfies_jax.training.effects import PenaltyContext, weighted_sum
 from tests import gradients
 from tests.gaussians.shared import finite, full, jitted, put

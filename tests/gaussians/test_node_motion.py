@@ -10,14 +10,16 @@ import pytest
 import scipy.special
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import path_fit, protocols, splats
-from gaussians_jax.effects import deformation, node_motion, skinning
-from gaussians_jax.effects.node_motion import MaskSpec, NodeMotionSpec
-from gaussians_jax.effects.skinning import Links, Moves
-from gaussians_jax.path_fit import Paths
-from gaussians_jax.protocols import MotionParams
-from gaussians_jax.splats import Params
-from nerfies_jax.nets.encoding import EncodingSpec
+from gaussians_jax.core import protocols, splats
+from gaussians_jax.core.protocols import MotionParams
+from gaussians_jax.core.splats import Params
+from gaussians_jax.init import path_fit
+from gaussians_jax.init.path_fit import Paths
+from gaussians_jax.motion import deformation, skinning
+from gaussians_jax.motion import nodes as node_motion
+from gaussians_jax.motion.nodes import MaskSpec, NodeMotionSpec
+from gaussians_jax.motion.skinning import Links, Moves
+from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests.gaussians import bound
 from tests.gaussians.shared import put, rows_of, some_gaussians

@@ -9,8 +9,8 @@ import numpy as np
 import optax
 import pytest
 
-from gaussians_jax import optimizer
-from gaussians_jax.splats import INACTIVE_LOGIT, Params, Splats
+from gaussians_jax.core.splats import INACTIVE_LOGIT, Params, Splats
+from gaussians_jax.optim import optimizer
 from tests.gaussians.shared import full, jitted, put, rows_and_nets, same_bits
 
 COUNT = 6

@@ -7,8 +7,8 @@ import jax
 import pytest
 import rich.console
 
-from gaussians_jax import scene
-from gaussians_jax.spec import effects_of
+from gaussians_jax.scene import scene
+from gaussians_jax.scene.spec import effects_of
 from nerfies_jax import evaluation
 from nerfies_jax.training import loop
 from tests import scenes

@@ -10,10 +10,16 @@ import numpy as np
 import optax
 import pytest
 
-from gaussians_jax import phases, scene
-from gaussians_jax.optimizer import scale_by_row_adam
-from gaussians_jax.phases import AlternationSpec, AnnealingSpec, Trained, UpdateMask
-from gaussians_jax.splats import Params, Splats
+from gaussians_jax.core.splats import Params, Splats
+from gaussians_jax.optim import phases
+from gaussians_jax.optim.optimizer import scale_by_row_adam
+from gaussians_jax.optim.phases import (
+    AlternationSpec,
+    AnnealingSpec,
+    Trained,
+    UpdateMask,
+)
+from gaussians_jax.scene import scene
 from nerfies_jax import evaluation
 from tests import gradients, scenes
 from tests.gaussians.shared import (

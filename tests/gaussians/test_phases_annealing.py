@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import learning_rates, phases
-from gaussians_jax.learning_rates import LearningRateSpec
-from gaussians_jax.phases import AnnealingSpec
-from gaussians_jax.splats import Params, Splats
+from gaussians_jax.core.splats import Params, Splats
+from gaussians_jax.optim import learning_rates, phases
+from gaussians_jax.optim.learning_rates import LearningRateSpec
+from gaussians_jax.optim.phases import AnnealingSpec
 from nerfies_jax.training import schedules, step_counts
 from nerfies_jax.training.updates import apply_updates
 from tests.gaussians.shared import jitted, put

@@ -8,19 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.nets.test_planes import expected
 
-from gaussians_jax import initialization
-from gaussians_jax.effects import plane_motion
-from gaussians_jax.effects.plane_motion import PlaneMotionSpec
-from gaussians_jax.protocols import MotionParams
-from gaussians_jax.splats import Params
-from nerfies_jax.nets.planes import PlanesSpec
+from gaussians_jax.core.protocols import MotionParams
+from gaussians_jax.core.splats import Params
+from gaussians_jax.init import points as initialization
+from gaussians_jax.motion import planes as plane_motion
+from gaussians_jax.motion.planes import PlaneMotionSpec
+from nerfies_jax.nn.planes import PlanesSpec
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
 from tests import scenes
 from tests.gaussians import bound
 from tests.gaussians.shared import put, rows_of, some_gaussians
 from tests.gradients import directional_error
-from tests.nets.test_planes import expected
 
 ROWS, EXTENT, NAME = 7, 2.0, plane_motion.NAME
 BOX = ((-1.0, -2.0, -0.5), (1.5, 1.0, 2.0))

@@ -11,11 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import projection, rendering, representation, scene, splats
-from gaussians_jax.player import packing, sampled
+from gaussians_jax import representation
+from gaussians_jax.core import splats
+from gaussians_jax.core.records import SplatRecord
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.io import sampled
+from gaussians_jax.player import packing
 from gaussians_jax.player import page as player_page
-from gaussians_jax.records import SplatRecord
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.scene import scene
+from gaussians_jax.splatting import projection, rendering
 from nerfies_jax import evaluation
 from nerfies_jax.geometry import camera as cameras
 from tests import scenes

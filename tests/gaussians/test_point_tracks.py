@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import scipy.spatial.transform
 
-from gaussians_jax import point_tracks
-from gaussians_jax import scene as splat_scene
-from gaussians_jax.splats import Gaussians, Params, deactivate
+from gaussians_jax.core.splats import Gaussians, Params, deactivate
+from gaussians_jax.scene import point_tracks
+from gaussians_jax.scene import scene as splat_scene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.training.model import Stages

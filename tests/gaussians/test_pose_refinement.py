@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import presets, scene
-from gaussians_jax.effects import pose_refinement
-from gaussians_jax.effects.pose_refinement import PoseRefinementSpec
+from gaussians_jax.per_frame import poses as pose_refinement
+from gaussians_jax.per_frame.poses import PoseRefinementSpec
+from gaussians_jax.scene import presets, scene
 from nerfies_jax import evaluation
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training import loop

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import projection
-from gaussians_jax.raster_spec import GSPLAT
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.splatting import projection
+from gaussians_jax.splatting.raster_spec import GSPLAT
 from nerfies_jax.geometry.camera import Camera
 from tests import gradients
 from tests.gaussians.shared import finite, jitted, put

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import binning, raster
-from gaussians_jax.binning import Grid
-from gaussians_jax.projection import Footprints
-from gaussians_jax.raster_spec import GSPLAT
+from gaussians_jax.splatting import binning, raster
+from gaussians_jax.splatting.binning import Grid
+from gaussians_jax.splatting.projection import Footprints
+from gaussians_jax.splatting.raster_spec import GSPLAT
 from tests.gaussians.shared import close, full, jitted, put
 from tests.oracles import dense_splats
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import raster
-from gaussians_jax.raster_spec import GSPLAT
+from gaussians_jax.splatting import raster
+from gaussians_jax.splatting.raster_spec import GSPLAT
 from tests.gaussians.test_raster import footprints_from
 
 SIZE, COUNT = (13, 9), 12

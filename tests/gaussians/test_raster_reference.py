@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import rasterization_api
-from gaussians_jax.raster_spec import GSPLAT
+from gaussians_jax.splatting import rasterization as rasterization_api
+from gaussians_jax.splatting.raster_spec import GSPLAT
 from tests.gaussians.shared import put
 
 SLOW = [

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import gaussians_jax as gj
-from gaussians_jax import rasterization_api, rendering
-from gaussians_jax.raster_spec import GSPLAT
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.splatting import rasterization as rasterization_api
+from gaussians_jax.splatting import rendering
+from gaussians_jax.splatting.raster_spec import GSPLAT
 from nerfies_jax.geometry.camera import Camera
 from tests.gaussians.shared import jitted, put
 from tests.oracles import dense_splats

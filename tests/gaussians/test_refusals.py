@@ -7,43 +7,38 @@ import jax
 import numpy as np
 import pytest
 
-from gaussians_jax import (
-    harmonics,
-    initialization,
-    optimizer,
-    phases,
-    raster,
-    rendering,
-    spec,
-    splats,
-    static_rows,
-    time_knots,
-)
-from gaussians_jax.densification import DefaultStrategySpec
-from gaussians_jax.effects import acceleration, kan_motion, motion_growth, spectral
-from gaussians_jax.effects.acceleration import AccelerationSpec
-from gaussians_jax.effects.anchors import AnchorMotionSpec, RateSpec
-from gaussians_jax.effects.carried import CarriedSpec
-from gaussians_jax.effects.depth import DepthSpec
-from gaussians_jax.effects.embedding_motion import EmbeddingMotionSpec
-from gaussians_jax.effects.kan_motion import KanMotionSpec
-from gaussians_jax.effects.mlp_motion import MotionSpec, SmoothingSpec
-from gaussians_jax.effects.motion_basis import BasisMotionSpec
-from gaussians_jax.effects.motion_flow import FlowSpec
-from gaussians_jax.effects.motion_growth import MotionGrowthSpec
-from gaussians_jax.effects.neighbors import NeighborSpec
-from gaussians_jax.effects.polynomial_motion import PolynomialMotionSpec
-from gaussians_jax.effects.spectral import FourierSpec, SpectralSpec, WaveletSpec
-from gaussians_jax.effects.spline_motion import SplineMotionSpec
-from gaussians_jax.effects.temporal_opacity import TemporalOpacitySpec
-from gaussians_jax.initialization import InitSpec, StartSpec
-from gaussians_jax.learning_rates import LearningRateSpec
-from gaussians_jax.mcmc import MCMCStrategySpec
-from gaussians_jax.phases import AlternationSpec, AnnealingSpec
-from gaussians_jax.projection import Footprints
-from gaussians_jax.raster_spec import GSPLAT, RasterSpec
-from gaussians_jax.spec import SplatScene
-from gaussians_jax.splats import Params
+from gaussians_jax.core import splats, static_rows, time_knots
+from gaussians_jax.core.splats import Params
+from gaussians_jax.init import points as initialization
+from gaussians_jax.init.points import InitSpec, StartSpec
+from gaussians_jax.losses import acceleration, spectral
+from gaussians_jax.losses.acceleration import AccelerationSpec
+from gaussians_jax.losses.depth import DepthSpec
+from gaussians_jax.losses.flow import FlowSpec
+from gaussians_jax.losses.neighbors import NeighborSpec
+from gaussians_jax.losses.spectral import FourierSpec, SpectralSpec, WaveletSpec
+from gaussians_jax.motion import growth as motion_growth
+from gaussians_jax.motion import kan as kan_motion
+from gaussians_jax.motion.anchors import AnchorMotionSpec, RateSpec
+from gaussians_jax.motion.basis import BasisMotionSpec
+from gaussians_jax.motion.carried import CarriedSpec
+from gaussians_jax.motion.embedding import EmbeddingMotionSpec
+from gaussians_jax.motion.growth import MotionGrowthSpec
+from gaussians_jax.motion.kan import KanMotionSpec
+from gaussians_jax.motion.mlp import MotionSpec, SmoothingSpec
+from gaussians_jax.motion.polynomial import PolynomialMotionSpec
+from gaussians_jax.motion.splines import SplineMotionSpec
+from gaussians_jax.motion.temporal_opacity import TemporalOpacitySpec
+from gaussians_jax.optim import optimizer, phases
+from gaussians_jax.optim.densification import DefaultStrategySpec
+from gaussians_jax.optim.learning_rates import LearningRateSpec
+from gaussians_jax.optim.mcmc import MCMCStrategySpec
+from gaussians_jax.optim.phases import AlternationSpec, AnnealingSpec
+from gaussians_jax.scene import spec
+from gaussians_jax.scene.spec import SplatScene
+from gaussians_jax.splatting import harmonics, raster, rendering
+from gaussians_jax.splatting.projection import Footprints
+from gaussians_jax.splatting.raster_spec import GSPLAT, RasterSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training import schedules
 from tests import scenes

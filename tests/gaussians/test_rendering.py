@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import rendering
-from gaussians_jax.raster_spec import GSPLAT, INRIA
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.splatting import rendering
+from gaussians_jax.splatting.raster_spec import GSPLAT, INRIA
 from nerfies_jax.geometry.camera import Camera
 from tests import gradients
 from tests.gaussians.shared import close, jitted, put

@@ -7,13 +7,16 @@ import jax
 import numpy as np
 import pytest
 
-from gaussians_jax import first_state, initialization, learning_rates, presets, scene
-from gaussians_jax.densification import DefaultStrategySpec
-from gaussians_jax.initialization import InitSpec
-from gaussians_jax.learning_rates import LearningRateSpec
-from gaussians_jax.spec import SceneMetadata, raster_of
-from gaussians_jax.splats import Params, Splats
-from nerfies_jax import compiler, evaluation
+from gaussians_jax.core.splats import Params, Splats
+from gaussians_jax.init import points as initialization
+from gaussians_jax.init.points import InitSpec
+from gaussians_jax.optim import learning_rates
+from gaussians_jax.optim.densification import DefaultStrategySpec
+from gaussians_jax.optim.learning_rates import LearningRateSpec
+from gaussians_jax.scene import first_state, presets, scene
+from gaussians_jax.scene.spec import SceneMetadata, raster_of
+from nerfies_jax import evaluation
+from nerfies_jax.runtime import compiler
 from nerfies_jax.training.updates import apply_updates
 from tests import scenes
 from tests.gaussians.shared import finite, full, jitted, put, with_rows

@@ -7,9 +7,9 @@ import pytest
 import scipy.interpolate
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax.effects import se3_bases
-from gaussians_jax.effects.se3_bases import Bases, Poses, SE3BasesSpec
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.motion import se3_bases
+from gaussians_jax.motion.se3_bases import Bases, Poses, SE3BasesSpec
 from tests.gradients import directional_error
 
 BASES, KNOTS, COARSE, ROWS = 3, 6, 4, 5

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import protocols
-from gaussians_jax.effects import spectral
-from gaussians_jax.effects.spectral import FourierSpec, Gates, SpectralSpec, WaveletSpec
-from gaussians_jax.splats import Params
+from gaussians_jax.core import protocols
+from gaussians_jax.core.splats import Params
+from gaussians_jax.losses import spectral
+from gaussians_jax.losses.spectral import FourierSpec, Gates, SpectralSpec, WaveletSpec
 from nerfies_jax.training.effects import (
     Observation,
     PenaltyContext,

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import rendering
-from gaussians_jax import splats as rows
-from gaussians_jax.splats import Params, Splats
+from gaussians_jax.core import splats as rows
+from gaussians_jax.core.splats import Params, Splats
+from gaussians_jax.splatting import rendering
 from nerfies_jax.geometry.camera import Camera
 from tests import gradients
 from tests.gaussians.shared import finite, full, jitted, put, same_bits

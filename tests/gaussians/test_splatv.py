@@ -7,8 +7,8 @@ import struct
 import numpy as np
 import pytest
 
-from gaussians_jax import splatv
-from gaussians_jax.player.sampled import Instants
+from gaussians_jax.io import splatv
+from gaussians_jax.io.sampled import Instants
 from tests import scenes
 
 TIMES = np.linspace(0, 1, 25)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import splats, static_rows
-from gaussians_jax.splats import Gaussians, Params
+from gaussians_jax.core import splats, static_rows
+from gaussians_jax.core.splats import Gaussians, Params
 from tests import gradients
 from tests.gaussians.shared import (
     full,

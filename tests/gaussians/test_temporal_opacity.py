@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import presets, spec, track_start
-from gaussians_jax.effects import temporal_opacity
-from gaussians_jax.effects.temporal_opacity import Fading, TemporalOpacitySpec
-from gaussians_jax.splats import Params
-from gaussians_jax.track_start import TrackStart
+from gaussians_jax.core.splats import Params
+from gaussians_jax.init import tracks as track_start
+from gaussians_jax.init.tracks import TrackStart
+from gaussians_jax.motion import temporal_opacity
+from gaussians_jax.motion.temporal_opacity import Fading, TemporalOpacitySpec
+from gaussians_jax.scene import presets, spec
 from nerfies_jax.training.effects import FrameCondition
 from tests.gaussians import bound
 from tests.gaussians.shared import put, rows_of, some_gaussians

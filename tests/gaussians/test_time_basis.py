@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax import path_fit, spec
-from gaussians_jax.effects import polynomial_motion, spline_motion, time_basis
-from gaussians_jax.effects.polynomial_motion import FadingSpec, PolynomialMotionSpec
-from gaussians_jax.effects.spline_motion import SplineMotionSpec
-from gaussians_jax.effects.time_basis import TimeBasisSpec
-from gaussians_jax.path_fit import Paths, Points
-from gaussians_jax.splats import Gaussians, Params
-from nerfies_jax.nets.encoding import EncodingSpec
+from gaussians_jax.core.splats import Gaussians, Params
+from gaussians_jax.init import path_fit
+from gaussians_jax.init.path_fit import Paths, Points
+from gaussians_jax.motion import polynomial as polynomial_motion
+from gaussians_jax.motion import splines as spline_motion
+from gaussians_jax.motion import time_basis
+from gaussians_jax.motion.polynomial import FadingSpec, PolynomialMotionSpec
+from gaussians_jax.motion.splines import SplineMotionSpec
+from gaussians_jax.motion.time_basis import TimeBasisSpec
+from gaussians_jax.scene import spec
+from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.training.effects import FrameCondition
 from tests.gaussians.shared import put, rows_of, some_gaussians
 from tests.gaussians.test_se3_bases import splined

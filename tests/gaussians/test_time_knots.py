@@ -9,8 +9,8 @@ import pytest
 import scipy.interpolate
 import scipy.spatial.transform
 
-from gaussians_jax import static_rows, time_knots
-from gaussians_jax.splats import LOG_SCALE_RANGE, Gaussians
+from gaussians_jax.core import static_rows, time_knots
+from gaussians_jax.core.splats import LOG_SCALE_RANGE, Gaussians
 from tests import gradients
 from tests.gaussians.shared import finite, full, jitted, put, rotations, same_bits
 

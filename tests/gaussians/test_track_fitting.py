@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import gaussians_jax as gj
-from gaussians_jax.effects.time_basis import TimeBasisSpec
+from gaussians_jax.motion.time_basis import TimeBasisSpec
 
 TIMES = np.linspace(0, 1, 10)
 

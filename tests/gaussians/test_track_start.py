@@ -8,18 +8,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-
-from gaussians_jax import path_fit, presets, scene, spec, splats, track_start
-from gaussians_jax.effects import se3_bases, temporal_opacity
-from gaussians_jax.effects.se3_bases import SE3BasesSpec
-from gaussians_jax.initialization import StartSpec
-from gaussians_jax.path_fit import Depth, Paths, Points
-from gaussians_jax.splats import Params
-from nerfies_jax import evaluation
-from nerfies_jax.capture.capture import PointCloud
-from nerfies_jax.evidence import hidden_points, record, usable_paths
 from tests.evidence import films
 from tests.evidence.test_tracks import MOVES
+
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Params
+from gaussians_jax.init import path_fit
+from gaussians_jax.init import tracks as track_start
+from gaussians_jax.init.path_fit import Depth, Paths, Points
+from gaussians_jax.init.points import StartSpec
+from gaussians_jax.motion import se3_bases, temporal_opacity
+from gaussians_jax.motion.se3_bases import SE3BasesSpec
+from gaussians_jax.scene import presets, scene, spec
+from nerfies_jax import evaluation
+from nerfies_jax.capture.capture import PointCloud
+from nerfies_jax.preprocessing import hidden_points, record, usable_paths
 from tests.gradients import directional_error
 
 FRAMES = 24

@@ -6,10 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from gaussians_jax import scene, splats, static_rows, variants
-from gaussians_jax.presets import PRESETS
-from gaussians_jax.spec import effects_of, motion_of
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.core import splats, static_rows
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.scene import scene, variants
+from gaussians_jax.scene.presets import PRESETS
+from gaussians_jax.scene.spec import effects_of, motion_of
 from nerfies_jax import evaluation
 from nerfies_jax.training.model import TrainState
 from tests import scenes

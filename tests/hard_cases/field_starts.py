@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.effects.time_warp import TimeWarp
+from nerfies_jax.fields.effects.time_warp import TimeWarp
 from nerfies_jax.training.model import Frames
 from tests.hard_cases import hostile
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax import scene
 from nerfies_jax.capture.capture import select
-from nerfies_jax.effects import scene_flow_losses as flow_losses
+from nerfies_jax.fields.effects import scene_flow_losses as flow_losses
+from nerfies_jax.scene import scene
 from tests import scenes
 from tests.hard_cases import field_starts, hostile, linear_warps, tiny_fields
 from tests.hard_cases.field_starts import Start

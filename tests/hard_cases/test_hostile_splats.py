@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax import growth, representation, scene, splats
-from gaussians_jax.growth import AuxState
-from gaussians_jax.initialization import InitSpec
-from gaussians_jax.protocols import Strategy
-from gaussians_jax.spec import effects_of, strategy_of
+from gaussians_jax import representation
+from gaussians_jax.core import splats
+from gaussians_jax.core.protocols import Strategy
+from gaussians_jax.init.points import InitSpec
+from gaussians_jax.scene import growth, scene
+from gaussians_jax.scene.growth import AuxState
+from gaussians_jax.scene.spec import effects_of, strategy_of
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.training.model import Frames, Model, TrainState, View
 from tests import bare_scenes, scenes

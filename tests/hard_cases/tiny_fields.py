@@ -12,12 +12,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from nerfies_jax import evaluation, presets, scene
+from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.nets.encoding import EncodingSpec
-from nerfies_jax.radiance.template import TemplateSpec
-from nerfies_jax.scene_metadata import SceneMetadata
-from nerfies_jax.spec import RadianceScene
+from nerfies_jax.capture.scene_metadata import SceneMetadata
+from nerfies_jax.fields.spec import RadianceScene
+from nerfies_jax.fields.template import TemplateSpec
+from nerfies_jax.nn.encoding import EncodingSpec
+from nerfies_jax.scene import presets, scene
 from nerfies_jax.training.model import Frames, Model, Rendering, TrainState
 from tests import bare_scenes, scenes
 from tests.hard_cases import hostile

@@ -4,10 +4,10 @@ import itertools
 
 import pytest
 
-from gaussians_jax.effects.exposure import ExposureSpec
-from gaussians_jax.spec import refuse_what_cannot_train
-from nerfies_jax.effects.appearance import AppearanceSpec
-from nerfies_jax.evidence.findings import CANNOT_TELL, CERTAIN, Finding
+from gaussians_jax.per_frame.exposure import ExposureSpec
+from gaussians_jax.scene.spec import refuse_what_cannot_train
+from nerfies_jax.fields.effects.appearance import AppearanceSpec
+from nerfies_jax.preprocessing.findings import CANNOT_TELL, CERTAIN, Finding
 from nerfies_jax.runs import adviser, representations
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.run import scene_spec

@@ -6,9 +6,9 @@ import pathlib
 
 import pytest
 
-from nerfies_jax import events
 from nerfies_jax.runs import curves, event_log
 from nerfies_jax.runs.event_log import EVENTS, EventLog, EventReader, read_events
+from nerfies_jax.runtime import events
 from nerfies_jax.training.loop import History
 
 FULL = pathlib.Path("/dev/full")

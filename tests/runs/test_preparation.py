@@ -13,7 +13,7 @@ from nerfies_jax.capture import images, video
 from nerfies_jax.capture import masks as mask_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.structure_from_motion import FewPlaced, Poses
-from nerfies_jax.evidence import masks_without_cameras
+from nerfies_jax.preprocessing import masks_without_cameras
 from nerfies_jax.runs import movers, preparation, reconstruction
 from nerfies_jax.runs.config import (
     CaptureSource,

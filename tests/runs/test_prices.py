@@ -5,8 +5,9 @@ import math
 
 import pytest
 
-from nerfies_jax.evidence import findings as all_findings
-from nerfies_jax.evidence.findings import (
+from nerfies_jax.metrics.clock import Metric
+from nerfies_jax.preprocessing import findings as all_findings
+from nerfies_jax.preprocessing.findings import (
     BACKGROUND,
     CERTAIN,
     DEPTH,
@@ -19,7 +20,6 @@ from nerfies_jax.evidence.findings import (
     TRANSIENT,
     Finding,
 )
-from nerfies_jax.measure.clock import Metric
 from nerfies_jax.runs import adviser, prices, representations
 from nerfies_jax.training import specs
 

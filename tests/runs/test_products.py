@@ -11,7 +11,6 @@ import pytest
 
 from nerfies_jax.capture import images, nerfies_format
 from nerfies_jax.capture.capture import CaptureError
-from nerfies_jax.evaluation import pictures
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.evaluation.scores import Scored
 from nerfies_jax.runs import (
@@ -26,6 +25,7 @@ from nerfies_jax.runs.run import Run, scene_spec, stored_capture
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.training.loop import History
 from nerfies_jax.training.model import Rendering, TrainState
+from nerfies_jax.visualization import panels
 from tests import scenes
 
 
@@ -111,7 +111,7 @@ def test_a_profile_that_fails_loses_nothing_but_itself():
 def test_the_curve_and_the_headline_agree_visibly(tmp_path, monkeypatch):
     """The curve is of a few frames; its figure and caption have the score as well."""
     drawn = []
-    monkeypatch.setattr(pictures, "curve", lambda *parts: drawn.append(parts))
+    monkeypatch.setattr(panels, "curve", lambda *parts: drawn.append(parts))
     capture = scenes.tiny_capture()
     config = RunConfig("splats-static-small")
     run = Run(config, capture, capture, None, None, None, None)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from nerfies_jax.evaluation import pictures
-from nerfies_jax.measure.metric_table import METRICS, metric
+from nerfies_jax.metrics.metric_table import METRICS, metric
 from nerfies_jax.runs import report
+from nerfies_jax.visualization import panels
 from tests.gaussians import browser as shared
 
 pytestmark = pytest.mark.slow
@@ -25,7 +25,7 @@ def address(tmp_path_factory):
     (folder / "scene.mp4").write_bytes(b"not really a video")
     broad = np.zeros((90, report.BROAD_PX + 1, 3), np.uint8)
     for name, picture in (("broad", broad), ("small", broad[:, :100])):
-        pictures.save(picture, folder / f"{name}.png")
+        panels.save(picture, folder / f"{name}.png")
     path = report.write(
         folder,
         "a run with a name that is longer than a phone is wide",

@@ -6,7 +6,8 @@ import json
 import jax
 import pytest
 
-from gaussians_jax import files, model_file, splats
+from gaussians_jax.core import splats
+from gaussians_jax.io import files, model_file
 from nerfies_jax import runs
 from nerfies_jax.evaluation.representation import MODEL
 from nerfies_jax.runs import representations, run

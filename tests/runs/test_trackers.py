@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from nerfies_jax import events
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.runs import trackers
+from nerfies_jax.runtime import events
 
 # Of each tracker the module that reads what it wrote.
 READERS = {

@@ -16,11 +16,12 @@ import PIL.Image
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerfies_jax import evaluation, runs, stopping
+from nerfies_jax import evaluation, runs
 from nerfies_jax.capture import path_files
 from nerfies_jax.evaluation.interactive import Eye, Look
 from nerfies_jax.runs import representations, screen, viewer, viewer_training
 from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.runtime import stopping
 from nerfies_jax.training import loop
 from tests import scenes
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax import data_parallel
+from nerfies_jax.runtime import data_parallel
 from tests import fresh_process
 from tests.training import toy
 

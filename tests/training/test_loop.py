@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import rich.console
 
-from nerfies_jax.progress import duration
+from nerfies_jax.runtime.progress import duration
 from nerfies_jax.training import chunk, loop, rate
 from nerfies_jax.training.model import Event
 from tests.training import toy

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
-from nerfies_jax import data_parallel, events
 from nerfies_jax.capture import cache_files, nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.flow import FrameFlow
@@ -17,6 +16,7 @@ from nerfies_jax.capture.synthetic import film, trace, truth
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.capture.synthetic.truth import SceneTruth
 from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.runtime import data_parallel, events
 
 VERSION = 3  # raise it when the same spec gives other pictures: caches then renew
 TRUTH_FILE = "truth.npz"  # beside the Nerfies files, which other readers pass over

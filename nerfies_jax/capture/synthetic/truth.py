@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax import compiler, data_parallel
 from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.given import Given
@@ -20,6 +19,7 @@ from nerfies_jax.capture.synthetic.film import Schedule
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import rays
+from nerfies_jax.runtime import compiler, data_parallel
 
 
 class SceneTruth(NamedTuple):

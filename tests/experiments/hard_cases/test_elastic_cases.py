@@ -7,7 +7,7 @@ import pytest
 import scipy.spatial.transform
 
 from experiments.hard_cases.elastic import CASES
-from nerfies_jax.effects import elastic
+from nerfies_jax.fields.effects import elastic
 from nerfies_jax.geometry import lie, matrix3
 from tests.experiments.hard_cases import checks
 

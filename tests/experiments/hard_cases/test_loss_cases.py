@@ -7,8 +7,8 @@ import pytest
 
 from experiments.hard_cases import losses as loss_cases
 from experiments.hard_cases import pictures as picture_cases
-from gaussians_jax.effects import spectral
-from nerfies_jax.measure import geometry_quality, image_quality
+from gaussians_jax.losses import spectral
+from nerfies_jax.metrics import geometry_quality, image_quality
 from nerfies_jax.training import losses
 from tests.experiments.hard_cases import checks
 

@@ -10,10 +10,11 @@ import pytest
 
 from experiments.hard_cases import footprints as hard_footprints
 from experiments.hard_cases import splats as hard_splats
-from gaussians_jax import projection, raster, splats
-from gaussians_jax.projection import Footprints
-from gaussians_jax.raster_spec import GSPLAT, INRIA
-from gaussians_jax.splats import Gaussians
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.splatting import projection, raster
+from gaussians_jax.splatting.projection import Footprints
+from gaussians_jax.splatting.raster_spec import GSPLAT, INRIA
 from nerfies_jax.geometry.camera import Camera
 from tests.experiments.hard_cases import checks
 

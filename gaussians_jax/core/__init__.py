@@ -1,0 +1,1 @@
+"""Arrays of Gaussians, and the protocols of the parts of a scene."""

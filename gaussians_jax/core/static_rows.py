@@ -1,0 +1,193 @@
+"""Separation of moving from static Gaussians, so that only the former are deformed.
+
+Most of a scene is static, and a deformation network would evaluate every Gaussian at
+every time. `split` evaluates it once, on the host, at a few times. From then on
+`deform` evaluates the moving Gaussians only.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Gaussians, Params
+from nerfies_jax.geometry import quaternion
+
+FADES = 1 / 512  # change of opacity that is invisible in 8-bit images
+# The deformation of any choice of rows: (parameters of those rows, time) -> Gaussians.
+DeformRows = Callable[[Params, Float[Array, ""]], Gaussians]
+
+
+class RowIndex(NamedTuple):
+    """Index of each Gaussian among the moving ones, and whether it moves."""
+
+    moves: Bool[Array, " gaussians"]
+    place: Int[Array, " gaussians"]  # 0 where it does not move
+
+
+class StaticDynamicSplit(NamedTuple):
+    """A trained scene with moving and static Gaussians separated."""
+
+    static: Gaussians  # all Gaussians at the middle time
+    row_index: RowIndex
+    dynamic: Params  # the parameters of the rows that move, and all networks
+
+
+def max_displacement(before: Gaussians, after: Gaussians) -> Float[Array, " gaussians"]:
+    """Bound the displacement of the surface of each Gaussian.
+
+    A point of the one-sigma ellipsoid, mean + R S u with |u| = 1, moves by no more than
+    |Δmean| + max |ΔS| + 2 sin(θ/2) max S, with θ the angle between the rotations and S
+    the scales before. This is exact for a translation or a growth, and an upper bound
+    for a rotation, which is invisible on an isotropic Gaussian. Its gradient is
+    undefined where nothing moves.
+
+    Args:
+      before: Gaussians.
+      after: The same Gaussians at another time.
+
+    Returns:
+      Displacement in scene units.
+    """
+    shift = jnp.linalg.norm(after.mean - before.mean, axis=-1)
+    growth = jnp.max(jnp.abs(after.scale - before.scale), axis=-1)
+    widest = jnp.max(jnp.abs(before.scale), axis=-1)
+    first, second = (
+        jax.vmap(quaternion.normalize)(g.quaternion) for g in (before, after)
+    )
+    # |q - q'| = 2 sin(θ/4) for the nearer sign: 1 - q·q' would lose small angles.
+    apart = jnp.minimum(
+        jnp.linalg.norm(second - first, axis=-1),
+        jnp.linalg.norm(second + first, axis=-1),
+    )
+    chord = 2 * apart * jnp.sqrt(jnp.maximum(1 - apart**2 / 4, 0))
+    return shift + growth + chord * widest
+
+
+def row_index(moves: np.ndarray) -> RowIndex:
+    """Index the moving Gaussians, on the host.
+
+    Args:
+      moves: [gaussians] bool.
+
+    Returns:
+      The index.
+    """
+    place = np.where(moves, np.cumsum(moves) - 1, 0)
+    return RowIndex(jnp.asarray(moves), jnp.asarray(place, jnp.int32))
+
+
+def dynamic_mask(
+    static: Gaussians, now: Gaussians, static_threshold: float
+) -> np.ndarray:
+    """Select the Gaussians that move farther than a threshold, on the host.
+
+    A Gaussian with zero opacity at both times does not count as moving.
+
+    Args:
+      static: Gaussians at a reference time.
+      now: The same Gaussians at another time.
+      static_threshold: Threshold in scene units.
+
+    Returns:
+      [gaussians] bool.
+    """
+    if not static_threshold >= 0:
+        raise ValueError(
+            f"static_threshold={static_threshold} is a distance in scene units; it "
+            "cannot be negative (0 keeps every row that moves at all)"
+        )
+    # "not <=": a row whose motion is not a number is not taken for static.
+    far = ~(np.asarray(_max_displacement(static, now)) <= static_threshold)
+    drawn = (np.asarray(static.opacity) > 0) | (np.asarray(now.opacity) > 0)
+    return far & drawn
+
+
+def split(
+    params: Params,
+    deform: DeformRows,
+    times: np.ndarray,
+    static_threshold: float,
+    fading: bool = True,
+) -> StaticDynamicSplit:
+    """Separate moving from static Gaussians, on the host.
+
+    Gaussians are compared with the middle time, at which static ones stay. At `times`,
+    no point of a Gaussian is farther than `static_threshold` from its deformed
+    position. A Gaussian that moves only between two of the times is not detected.
+
+    Args:
+      params: Trained parameters.
+      deform: The deformation.
+      times: Normalized times in [0, 1].
+      static_threshold: Threshold in scene units.
+      fading: Count Gaussians whose opacity changes by more than `FADES` as moving.
+
+    Returns:
+      The separated scene.
+    """
+    if not len(times):
+        raise ValueError("no times to look for motion at; 16 over [0, 1] will do")
+    dtype = params.rows["splats"].mean.dtype
+    deformed = jax.jit(deform)
+    static = deformed(params, jnp.asarray(times[len(times) // 2], dtype))
+    moves = np.zeros(len(static.mean), bool)
+    for time in times:
+        now = deformed(params, jnp.asarray(time, dtype))
+        moves |= dynamic_mask(static, now, static_threshold)
+        if fading:
+            moves |= ~(np.abs(np.asarray(now.opacity - static.opacity)) <= FADES)
+    carrying = of_rows(params, moves)
+    rows = jnp.asarray(np.flatnonzero(carrying), jnp.int32)
+    every = np.repeat(carrying, len(moves) // len(carrying))
+    return StaticDynamicSplit(static, row_index(every), splats.take_rows(params, rows))
+
+
+def of_rows(params: Params, drawn: np.ndarray) -> np.ndarray:
+    """Select the Gaussians of which any child is selected, on the host.
+
+    Args:
+      params: Trained parameters.
+      drawn: [children] bool.
+
+    Returns:
+      [gaussians] bool; `drawn` itself if Gaussians have no children.
+    """
+    by_row = np.asarray(drawn).reshape(len(params.rows["splats"].mean), -1)
+    return np.any(by_row, axis=1)
+
+
+def deform(
+    parts: StaticDynamicSplit, deform_rows: DeformRows, time: Float[Array, ""]
+) -> Gaussians:
+    """All Gaussians at one time, the deformation evaluated for those that move."""
+    if not len(parts.dynamic.rows["splats"].mean):
+        return parts.static
+    return merge(parts.static, deform_rows(parts.dynamic, time), parts.row_index)
+
+
+def merge(static: Gaussians, moved: Gaussians, table: RowIndex) -> Gaussians:
+    """Combine moved and static Gaussians.
+
+    Args:
+      static: All Gaussians at the reference time.
+      moved: The moving Gaussians.
+      table: Index of the moving Gaussians.
+
+    Returns:
+      All Gaussians.
+    """
+
+    def leaf(static, moved):
+        # A gather, not a scatter: XLA:CPU runs a scatter row by row.
+        moves = table.moves.reshape(-1, *[1] * (static.ndim - 1))
+        return jnp.where(moves, moved[table.place], static)
+
+    return jax.tree.map(leaf, static, moved)
+
+
+_max_displacement = jax.jit(max_displacement)

@@ -1,0 +1,244 @@
+"""A trained motion as a table: Gaussians at knots in time, interpolated in between.
+
+The deformation is evaluated once per knot. A time then costs reading two or four
+entries of a table, independent of the network. The error falls with the number of knots
+(docs/results/deformation_cost.md), and the table takes 40 bytes (ten float32) per knot
+and moving Gaussian: 10 000 of them at 32 knots are 13 MB. A static Gaussian is stored
+once.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from gaussians_jax.core import splats, static_rows
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.core.static_rows import RowIndex
+from nerfies_jax.geometry import quaternion
+
+MIN_KNOTS = {"linear": 2, "cubic": 4}  # knots that an interpolation reads at once
+BYTES = 40  # of a moving Gaussian at a knot, in float32
+
+
+class Track(NamedTuple):
+    """Pose and opacity of the Gaussians at every knot."""
+
+    mean: Float[Array, "knots moving 3"]  # scene units
+    log_scale: Float[Array, "knots moving 3"]
+    # Unit length, with the sign nearer to the previous knot.
+    quaternion: Float[Array, "knots moving 4"]
+
+
+class Knots(NamedTuple):
+    """A motion over [0, 1] as a table."""
+
+    times: Float[Array, " knots"]  # evenly over [0, 1]
+    track: Track  # of the rows that move
+    row_index: RowIndex
+    static: Gaussians  # all rows, as they are at the middle knot
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the table, without what every scene has."""
+        return sum(leaf.nbytes for leaf in self.track)
+
+
+def bake(
+    deform: Callable[[Float[Array, ""]], Gaussians],
+    knots: int,
+    static_threshold: float = 0.0,
+    dtype=jnp.float32,
+) -> Knots:
+    """Evaluate a motion at all knots, on the host.
+
+    Args:
+      deform: The motion, from a normalized time to Gaussians. It is called as it is, so
+        compile it.
+      knots: Number of knots.
+      static_threshold: Gaussians none of whose points moves farther than this from the
+        middle knot (scene units) are stored once.
+      dtype: Floating-point type of the table.
+
+    Returns:
+      The table.
+    """
+    if knots < MIN_KNOTS["linear"]:
+        raise ValueError(
+            f"knots={knots}: a motion needs at least {MIN_KNOTS['linear']}, its first "
+            "and its last instant"
+        )
+    times = jnp.linspace(0, 1, knots, dtype=dtype)
+    frames = [jax.device_get(deform(time)) for time in times]
+    static = frames[knots // 2]
+    moves = np.zeros(len(static.mean), bool)
+    for time, now in zip(times, frames, strict=True):
+        if not np.array_equal(now.opacity, static.opacity):
+            raise ValueError(
+                f"the opacities at time {float(time):g} are not those at "
+                f"{float(times[knots // 2]):g}; a table of knots keeps them fixed, so "
+                "draw this motion without one"
+            )
+        moves |= static_rows.dynamic_mask(static, now, static_threshold)
+    rows = np.flatnonzero(moves)
+    tracks = [_track(jax.tree.map(lambda leaf: leaf[rows], now)) for now in frames]
+    track = Track(*(jnp.stack(leaves) for leaves in zip(*tracks, strict=True)))
+    track = track._replace(quaternion=_aligned(track.quaternion))
+    static = jax.tree.map(jnp.asarray, static)
+    return Knots(times, track, static_rows.row_index(moves), static)
+
+
+def at(
+    knots: Knots, time: Float[Array, ""], interpolation: str = "linear"
+) -> Gaussians:
+    """Interpolate the Gaussians at one time.
+
+    Scales are interpolated in the logarithm and stay positive. Quaternions are
+    interpolated as vectors of one sign and normalized. Neighbors are at most 90 degrees
+    apart as vectors, so the interpolated ones are never short.
+
+    Args:
+      knots: The table.
+      time: Normalized time, clamped to [0, 1].
+      interpolation: "linear" is continuous, with an error of second order in the
+        distance of the knots. "cubic" (Catmull-Rom) has a continuous velocity and an
+        error of third order. Both are exact at the knots, up to rounding.
+
+    Returns:
+      The Gaussians.
+    """
+    if not knots.track.mean.shape[1]:
+        return knots.static
+    start, weights = _window(knots.times, time, interpolation)
+
+    def between(leaf):
+        rows = [leaf[start + k] * weight for k, weight in enumerate(weights)]
+        return sum(rows[1:], rows[0])
+
+    mean, log_scale, turn = (between(leaf) for leaf in knots.track)
+    moved = Gaussians(
+        mean=mean,
+        quaternion=jax.vmap(quaternion.normalize)(turn),
+        scale=jnp.exp(log_scale),
+        # Not interpolated: merged only to be overwritten.
+        opacity=jnp.zeros_like(mean[:, 0]),
+    )
+    merged = static_rows.merge(knots.static, moved, knots.row_index)
+    return merged._replace(opacity=knots.static.opacity)
+
+
+def check(knots: int, interpolation: str) -> None:
+    """Refuse a table too short for its interpolation, on the host.
+
+    Args:
+      knots: Number of knots.
+      interpolation: "linear" or "cubic".
+
+    Raises:
+      ValueError: If there are too few knots, or the interpolation is unknown.
+    """
+    if interpolation not in MIN_KNOTS:
+        raise ValueError(
+            f"unknown interpolation {interpolation!r}; choose from "
+            f"{', '.join(MIN_KNOTS)}"
+        )
+    if knots < MIN_KNOTS[interpolation]:
+        raise ValueError(
+            f"{interpolation} interpolation reads {MIN_KNOTS[interpolation]} knots at "
+            f"once, got {knots}; take more, or linear"
+        )
+
+
+def _window(
+    times: Float[Array, " knots"], time: Float[Array, ""], interpolation: str
+) -> tuple[Int[Array, ""], list[Float[Array, ""]]]:
+    """The first of the knots to read, and the weight of each."""
+    count = times.shape[0]
+    check(count, interpolation)
+    held = jnp.clip(time, times[0], times[-1])
+    # Searched for, not floor(time * (count - 1)): at a knot the share is exactly 0 or
+    # 1 whatever the rounding of the product.
+    left = jnp.searchsorted(times, held, side="right") - 1
+    left = jnp.clip(left, 0, count - 2).astype(jnp.int32)
+    u = (held - times[left]) / (times[left + 1] - times[left])
+    if interpolation == "linear":
+        return left, [1 - u, u]
+    before, here, there, after = catmull_rom(u)
+    # In the first and the last interval the missing neighbor is the continuation of
+    # the parabola through three knots, 3a - 3b + c: its weight goes to those three.
+    first, last = left == 0, left == count - 2
+    start = jnp.clip(left - 1, 0, count - 4)
+    zero = jnp.zeros_like(u)
+    at_first = here + 3 * before, there - 3 * before, after + before, zero
+    at_last = zero, before + after, here - 3 * after, there + 3 * after
+    inside = before, here, there, after
+    weights = [
+        jnp.where(first, a, jnp.where(last, b, c))
+        for a, b, c in zip(at_first, at_last, inside, strict=True)
+    ]
+    return start, weights
+
+
+def catmull_rom(
+    u: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Weights of four even knots at the share `u` between the middle two.
+
+    At 0 and 1 exactly those of one knot. Catmull and Rom 1974, tension 1/2.
+    """
+    return (
+        u * (u * (2 - u) - 1) / 2,
+        (u * u * (3 * u - 5) + 2) / 2,
+        u * (u * (4 - 3 * u) + 1) / 2,
+        u * u * (u - 1) / 2,
+    )
+
+
+def spline_weights(knots: int, time: Float[Array, ""]) -> Float[Array, " knots"]:
+    """Compute the weights of evenly spaced knots over [0, 1] in a Catmull-Rom spline.
+
+    The weights and their derivative are continuous. The end knots stand for those
+    beyond them. All weights are returned, four of them nonzero: a product with a table
+    of few knots is cheaper than reading four of its columns and scattering into them in
+    the gradient.
+
+    Args:
+      knots: Number of knots.
+      time: Normalized time, clamped to [0, 1].
+
+    Returns:
+      Weights that sum to one.
+    """
+    last = knots - 1
+    place = jnp.clip(time, 0, 1) * last
+    left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, last - 1)
+    part = place - left.astype(place.dtype)
+    rows = jnp.clip(left + jnp.arange(-1, 3, dtype=jnp.int32), 0, last)
+    return jnp.zeros(knots, place.dtype).at[rows].add(jnp.stack(catmull_rom(part)))
+
+
+@jax.jit
+def _track(gaussians):
+    """Convert Gaussians to table entries."""
+    # A scale that the motion made negative counts by its absolute value.
+    scale = jnp.clip(jnp.abs(gaussians.scale), *np.exp(splats.LOG_SCALE_RANGE).tolist())
+    return Track(
+        gaussians.mean,
+        jnp.log(scale),
+        jax.vmap(quaternion.normalize)(gaussians.quaternion),
+    )
+
+
+@jax.jit
+def _aligned(turns):
+    """The same rotations, each quaternion of the sign nearer to the knot before."""
+
+    def step(before, turn):
+        same = jnp.sum(before * turn, axis=-1, keepdims=True) >= 0
+        turn = jnp.where(same, turn, -turn)
+        return turn, turn
+
+    return jax.lax.scan(step, turns[0], turns)[1]

@@ -1,1 +1,0 @@
-"""Optional components of a scene of Gaussians, one file each."""

@@ -1,0 +1,1 @@
+"""Initialization of Gaussians from points and from tracks."""

@@ -1,0 +1,237 @@
+"""Initial Gaussians, from the points of the capture and from random points."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import Splats
+from nerfies_jax.capture.capture import Capture, point_depths
+from nerfies_jax.training.track_start import TrackStartSpec
+
+SOURCES = ("auto", "points", "random")
+
+
+@dataclasses.dataclass(frozen=True)
+class InitSpec:
+    """Settings of the initial Gaussians.
+
+    `source` "auto" uses the capture's points if there are at least `min_points`, and
+    random ones otherwise. "points" and "random" require one of them, as MoBa-GS does
+    with either (it claims to need no points from structure from motion).
+
+    `extra_random` points are sampled in the views in addition to the capture's points.
+    None means half as many as `points`, or none if tracks initialize the motion
+    (`of_start`).
+    """
+
+    points: int = 100_000  # at most so many of the capture's own points
+    random: int = 10_000  # sampled in the views instead
+    min_points: int = 100
+    extra_random: int | None = 0
+    opacity: float = 0.1
+    scale: float = 1.0  # over the distance to the nearest neighbors
+    max_scale: float = 0.03  # first scale, over the distance to the nearest camera
+    source: str = "auto"
+
+    def __post_init__(self):
+        if self.source not in SOURCES:
+            raise ValueError(f"unknown source {self.source!r}; choose from {SOURCES}")
+        if self.points < 1 or self.random < 1 or (self.extra_random or 0) < 0:
+            raise ValueError(
+                f"a scene starts from at least one Gaussian, got points={self.points}, "
+                f"random={self.random} and extra_random={self.extra_random}"
+            )
+        if not 0 < self.opacity < 1:
+            raise ValueError(f"opacity={self.opacity} must be between 0 and 1")
+        for name in ("scale", "max_scale"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}={getattr(self, name)} must be positive")
+
+
+@dataclasses.dataclass(frozen=True)
+class StartSpec(TrackStartSpec):
+    """Settings of the initial motion."""
+
+    fit_steps: int = 3000
+    fit_rate: float = 5e-3
+    moving_points: int = 3000  # Gaussians lifted from moving pixels
+    fill_hidden: bool = (
+        True  # guess what stands where something hides it in every frame
+    )
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.moving_points < 1:
+            raise ValueError(
+                "a start from tracks takes at least one moving point, got "
+                f"moving_points={self.moving_points}"
+            )
+
+
+def point_count(capture: Capture) -> int:
+    """Count the points of a capture.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Number of points.
+    """
+    return 0 if capture.points is None else len(capture.points.position)
+
+
+def uses_capture_points(spec: InitSpec, capture: Capture) -> bool:
+    """Test if the initial Gaussians are the capture's points, on the host.
+
+    Args:
+      spec: Settings.
+      capture: The capture.
+
+    Returns:
+      True if they are, False if they are random.
+    """
+    points = point_count(capture)
+    if spec.source == "points" and not points:
+        raise ValueError(
+            f"{capture.path or capture.name}: the scene shall start from the capture's "
+            'own points, and it has none; choose source="random", or "auto" for random '
+            "ones only where there are no others"
+        )
+    enough = 1 if spec.source == "points" else max(spec.min_points, 1)
+    return spec.source != "random" and points >= enough
+
+
+def of_start(spec: InitSpec, tracked: bool, most: int | None = None) -> InitSpec:
+    """Resolve the number of extra random points.
+
+    Structure from motion finds static surfaces only. Moving objects are initialized by
+    tracks, or grow from random points in the volume.
+
+    Args:
+      spec: Settings.
+      tracked: Whether tracks initialize the motion.
+      most: Largest number of Gaussians.
+
+    Returns:
+      Settings with a number for `extra_random`.
+    """
+    if spec.extra_random is not None:
+        return spec
+    extra = 0 if tracked else spec.points // 2
+    if most is not None:
+        extra = max(min(extra, most - spec.points), 0)
+    return dataclasses.replace(spec, extra_random=extra)
+
+
+def initial_count(spec: InitSpec, capture: Capture) -> int:
+    """Compute the number of initial Gaussians, on the host.
+
+    Args:
+      spec: Settings.
+      capture: The capture.
+
+    Returns:
+      Number of Gaussians.
+    """
+    if not uses_capture_points(spec, capture):
+        return spec.random
+    extra = of_start(spec, False).extra_random
+    assert capture.points is not None
+    assert extra is not None
+    return min(len(capture.points.position), spec.points) + extra
+
+
+def initial_points(spec: InitSpec, capture: Capture, seed: int):
+    """Sample positions and colors of the initial Gaussians, on the host.
+
+    Random points lie between the near and far planes of the capture.
+
+    Args:
+      spec: Settings.
+      capture: The capture.
+      seed: Seed of the random points.
+
+    Returns:
+      Positions [n, 3] in scene units, and colors [n, 3] in [0, 1].
+    """
+    spec = of_start(spec, False)
+    rng = np.random.default_rng(seed)
+    if not uses_capture_points(spec, capture):
+        return _random_points(rng, capture, spec.random, (capture.near, capture.far))
+    cloud = capture.points
+    assert cloud is not None
+    position, color = cloud.position, cloud.color / 255
+    if len(position) > spec.points:
+        kept = np.sort(rng.choice(len(position), spec.points, replace=False))
+        position, color = position[kept], color[kept]
+    span = filmed_depths(capture)
+    more, more_color = _random_points(rng, capture, spec.extra_random, span)
+    return np.concatenate([position, more]), np.concatenate([color, more_color])
+
+
+def filmed_box(
+    capture: Capture, span: tuple[float, float] | None = None
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Compute the bounding box of the observed volume, on the host.
+
+    It is the central 98 % along each axis of points sampled in the views, between the
+    depths of the capture's points.
+
+    Args:
+      capture: The capture.
+      span: Smallest and largest depth, if they are known already.
+
+    Returns:
+      Low and high corner in scene units.
+    """
+    rng = np.random.default_rng(0)
+    point, _ = _random_points(rng, capture, 4000, span or filmed_depths(capture))
+    low, high = np.quantile(point, (0.01, 0.99), axis=0)
+    return tuple(low.tolist()), tuple(high.tolist())
+
+
+def _random_points(rng, capture, count, span):
+    filmed = jax.tree.map(lambda leaf: leaf[capture.train], capture.cameras)
+    position = splats.random_in_views(rng, filmed, capture.size, *span, count)
+    return position, rng.uniform(size=position.shape)
+
+
+def clamp_scales(rows: Splats, capture: Capture, max_scale: float) -> Splats:
+    """Limit the scale of Gaussians to a share of the distance to the nearest camera.
+
+    An isolated point gets the distance to its neighbors as its scale. Close to a camera
+    it would cover the image: the first steps on a capture with such points took 2 s
+    each.
+
+    Args:
+      rows: Raw parameters.
+      capture: The capture.
+      max_scale: Largest scale as a share of the distance.
+
+    Returns:
+      Raw parameters with clamped scales.
+    """
+    cameras = scipy.spatial.cKDTree(capture.cameras.position[capture.train])
+    distance, _ = cameras.query(np.asarray(rows.mean))
+    bound = np.log(np.maximum(max_scale * distance, 1e-8)).astype(np.float32)
+    return rows._replace(log_scale=jnp.minimum(rows.log_scale, bound[:, None]))
+
+
+def filmed_depths(capture):
+    """Compute the z-depths that contain the capture's points, slightly widened.
+
+    The near plane is often much nearer than any surface (0.05 where the first point is
+    at 0.4), and a Gaussian there covers the whole image: 20 times slower steps.
+    """
+    depth = point_depths(capture)
+    # Points beyond the far plane are rendered, but surfaces are in front of it.
+    depth = depth[depth < capture.far]
+    if not depth.size:
+        return capture.near, capture.far
+    low, high = np.quantile(depth, (0.02, 0.98))
+    return max(capture.near, 0.7 * float(low)), min(capture.far, 1.1 * float(high))

@@ -1,0 +1,315 @@
+"""Gaussian files: 3DGS .ply, antimatter15 .splat and Niantic .spz.
+
+docs/formats.md lists what each format stores. Files are written to a temporary name
+next to the target and renamed, so a crash leaves the old file or the new one.
+"""
+
+import os
+import pathlib
+import re
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from gaussians_jax.core import splats
+from gaussians_jax.core.splats import SH_DC, Splats
+from gaussians_jax.io import spz
+from nerfies_jax.capture import ply_files, safe_files, text_files
+from nerfies_jax.capture.errors import FileError
+from nerfies_jax.capture.json_files import replaced_file
+
+MOST_HEADER_BYTES = ply_files.MAX_HEADER  # 62 properties take 1.5 kB
+MOST_BYTES = 4 * 2**30  # of a .splat or .spz file: 100 million Gaussians
+SUFFIXES = (".ply", ".splat", ".spz")
+MOST_ROUNDING = 0.1  # of coordinates in double, in sizes of the median Gaussian
+_REQUIRED = (
+    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+_SPLAT_ROW = np.dtype(
+    [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)]
+)
+
+
+class Loaded(NamedTuple):
+    """The Gaussians of a file, and what the reader did not take over as it stood."""
+
+    splats: Splats  # float32
+    dropped: int  # rows with a value that is not finite
+    notes: tuple[str, ...]
+
+
+def load(path: str | os.PathLike, *, drop_broken: bool = False) -> Loaded:
+    """Load Gaussians from a .ply, .splat or .spz file.
+
+    Args:
+      path: The file, whose suffix selects the format.
+      drop_broken: Leave out and count Gaussians with NaN or infinity, instead of
+        refusing the file.
+
+    Returns:
+      Raw parameters and notes.
+
+    Raises:
+      FileError: If the file is damaged or of another format.
+    """
+    path = pathlib.Path(path)
+    readers = dict(zip(SUFFIXES, (_read_ply, _read_splat, _read_spz), strict=True))
+    if path.suffix.lower() not in readers:
+        raise FileError(
+            f"{path}: no reader for {path.suffix or 'a name without suffix'}; "
+            f"known are {', '.join(SUFFIXES)}"
+        )
+    if not path.is_file():
+        raise FileError(f"{path}: no such file")
+    try:
+        rows, notes = readers[path.suffix.lower()](path)
+        rows, dropped = _without_broken(rows, drop_broken)
+    except FileError:  # it names the path already
+        raise
+    except (ValueError, OSError, MemoryError, OverflowError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FileError(f"{path}: {reason}") from error
+    return Loaded(Splats(*map(jnp.asarray, rows)), dropped, notes)
+
+
+def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
+    """Save the active Gaussians in the format of the suffix.
+
+    Args:
+      path: File to write, ending in .ply, .splat or .spz.
+      rows: Raw parameters. Inactive Gaussians are left out.
+      spz_version: Version of SPZ files.
+
+    Returns:
+      Number of Gaussians written.
+
+    Raises:
+      ValueError: If a Gaussian is not finite, or the format is unknown.
+    """
+    path = pathlib.Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(
+            f"{path}: no writer for {path.suffix or 'a name without suffix'}; "
+            f"known are {', '.join(SUFFIXES)}"
+        )
+    active = splats.rows_to_write(rows, path)
+    kept = Splats(*(np.asarray(leaf, np.float32)[active] for leaf in rows))
+    try:
+        kept, _ = _without_broken(kept, False)
+        if path.suffix.lower() == ".ply":
+            data = _ply_bytes(kept)
+        elif path.suffix.lower() == ".splat":
+            data = _splat_bytes(kept)
+        else:
+            data = spz.encode(spz.Unpacked._make((*kept, ())), spz_version)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; not written") from error
+    with replaced_file(path) as partial:
+        partial.write_bytes(data)
+    return int(active.sum())
+
+
+def _without_broken(rows, drop):
+    whole = np.ones(len(rows.mean), bool)
+    for leaf in rows:
+        whole &= np.isfinite(leaf.reshape(len(whole), -1)).all(axis=1)
+    broken = int((~whole).sum())
+    if broken and not drop:
+        first = np.flatnonzero(~whole)[0]
+        name = next(
+            name
+            for name, leaf in zip(rows._fields, rows, strict=True)
+            if not np.isfinite(leaf[first]).all()
+        )
+        raise ValueError(
+            f"row {first} has a {name} that is not finite, {broken} such rows in all; "
+            "load with drop_broken=True to leave them out"
+        )
+    if not whole.any():
+        raise ValueError("every row has a value that is not finite")
+    return Splats(*(leaf[whole] for leaf in rows)), broken
+
+
+# The PLY of 3D Gaussian splatting ---------------------------------------------------
+
+
+def _read_ply(path):
+    header = _ply_header(path)
+    text = b"\nformat ascii" in header
+    try:
+        ply = ply_files.read(path)
+    except ValueError as error:
+        raise ValueError(f"damaged PLY ({error})") from error
+    if "vertex" not in ply:
+        raise ValueError("no element 'vertex' in it")
+    vertex = ply["vertex"].data
+    _refuse_other_ply(ply, vertex)
+    names = vertex.dtype.names
+    rest = sorted(
+        (name for name in names if re.fullmatch(r"f_rest_\d+", name)),
+        key=lambda name: int(name.rsplit("_", 1)[1]),
+    )
+    if len(rest) not in (0, 9, 24, 45):
+        raise ValueError(
+            f"{len(rest)} properties f_rest_*; spherical harmonics of degree 0, 1, 2 "
+            "and 3 have 0, 9, 24 and 45"
+        )
+
+    def columns(*which):
+        if not which:
+            return np.zeros((len(vertex), 0), np.float32)
+        # A float64 or text column may hold what float32 cannot: inf, caught as broken.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.stack([vertex[name] for name in which], -1).astype(np.float32)
+
+    _refuse_map_coordinates(vertex)
+    channels = columns(*rest).reshape(len(vertex), 3, -1)  # all red, then green, blue
+    rows = Splats(
+        mean=columns("x", "y", "z"),
+        log_scale=columns("scale_0", "scale_1", "scale_2"),
+        quaternion=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        opacity_logit=columns("opacity")[:, 0],
+        sh_dc=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
+        sh_rest=np.ascontiguousarray(channels.transpose(0, 2, 1)),
+    )
+    known = {*_REQUIRED, *rest, "nx", "ny", "nz"}
+    extra = [name for name in names if name not in known]
+    extra += [f"element {part.name}" for part in ply.elements if part.name != "vertex"]
+    notes = (f"left out: {', '.join(extra)}",) if extra else ()
+    behind = path.stat().st_size - len(header) - vertex.nbytes
+    if behind > 0 and not text and len(ply.elements) == 1:
+        notes += (f"left out: {behind} bytes after the last row",)
+    return rows, notes
+
+
+def _refuse_map_coordinates(vertex):
+    """Refuse coordinates in double that float32 would move by the size of Gaussians."""
+    axes = [axis for axis in "xyz" if vertex[axis].dtype == np.float64]
+    if not axes or not len(vertex):
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = max(
+            float(np.nanmax(np.abs(vertex[axis] - vertex[axis].astype(np.float32))))
+            for axis in axes
+        )
+        scales = [np.float64(vertex[f"scale_{number}"]) for number in range(3)]
+        size = float(np.exp(np.median(scales)))
+    if np.isfinite(moved) and moved > MOST_ROUNDING * size:
+        raise ValueError(
+            f"float32 would move its coordinates in double by up to {moved:.2g}, where "
+            f"the median Gaussian has a size of {size:.2g}; subtract an origin from "
+            "them and write the file again"
+        )
+
+
+def _ply_header(path):
+    """The header's bytes, once it is short and its counts can be true."""
+    with safe_files.open_file(path) as stream:
+        head = text_files.utf8(stream.read(MOST_HEADER_BYTES))
+    return ply_files.check_header(head, path.stat().st_size)
+
+
+def _refuse_other_ply(ply, vertex):
+    names = vertex.dtype.names
+    if "chunk" in ply and "packed_position" in names:
+        raise ValueError(
+            "a compressed PLY of SuperSplat; convert it with `splat-transform in.ply "
+            "out.spz`"
+        )
+    missing = [name for name in _REQUIRED if name not in names]
+    if "x" in names and "f_dc_0" in missing:
+        raise ValueError(
+            "points or a mesh, not Gaussians: no property f_dc_0; start from its "
+            "points with splats.from_points"
+        )
+    if missing:
+        raise ValueError(f"properties missing: {', '.join(missing)}")
+    lists = [name for name in names if vertex.dtype[name].kind not in "fiu"]
+    if lists:
+        raise ValueError(f"properties that are no numbers: {', '.join(lists)}")
+    if not len(vertex):
+        raise ValueError("no Gaussians in it: element vertex 0")
+
+
+def _ply_bytes(rows):
+    rest = rows.sh_rest.shape[1]
+    blocks = {
+        ("x", "y", "z"): rows.mean,
+        ("nx", "ny", "nz"): np.zeros_like(rows.mean),  # unused, but viewers expect them
+        ("f_dc_0", "f_dc_1", "f_dc_2"): rows.sh_dc[:, 0],
+        tuple(f"f_rest_{i}" for i in range(3 * rest)): rows.sh_rest.transpose(
+            0, 2, 1
+        ).reshape(len(rows.mean), -1),
+        ("opacity",): rows.opacity_logit[:, None],
+        ("scale_0", "scale_1", "scale_2"): rows.log_scale,
+        ("rot_0", "rot_1", "rot_2", "rot_3"): rows.quaternion,
+    }
+    names = [name for block in blocks for name in block]
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"element vertex {len(rows.mean)}"]
+    header += [f"property float {name}" for name in names] + ["end_header\n"]
+    table = np.concatenate(list(blocks.values()), axis=1).astype("<f4")
+    return "\n".join(header).encode() + table.tobytes()
+
+
+# .splat: 32 bytes a row, no harmonics -----------------------------------------------
+
+
+def _read_splat(path):
+    data = safe_files.read_bytes(path, MOST_BYTES)
+    if not data:
+        raise ValueError("empty: no Gaussians in it")
+    if len(data) % _SPLAT_ROW.itemsize:
+        raise ValueError(
+            f"{len(data)} bytes is no multiple of {_SPLAT_ROW.itemsize}: truncated, or "
+            "not a .splat file"
+        )
+    table = np.frombuffer(data, _SPLAT_ROW)
+    with np.errstate(invalid="ignore"):  # a signaling NaN, refused later
+        scale = table["scale"].astype(np.float64)
+    bounds = np.exp(splats.LOG_SCALE_RANGE)
+    # A flat Gaussian of scale 0 gets the smallest scale. NaN stays NaN.
+    log_scale = np.where(scale >= 0, np.log(np.clip(scale, *bounds)), np.nan)
+    rows = Splats(
+        mean=table["mean"].astype(np.float32),
+        log_scale=log_scale.astype(np.float32),
+        quaternion=(table["turn"].astype(np.float32) - 128) / 128,
+        opacity_logit=spz.logit_of_byte(table["rgba"][:, 3]),
+        sh_dc=((table["rgba"][:, None, :3] / 255 - 0.5) / SH_DC).astype(np.float32),
+        sh_rest=np.zeros((len(table), 0, 3), np.float32),
+    )
+    return rows, ()
+
+
+def _splat_bytes(rows):
+    # Viewers draw such a file while it loads: what covers most comes first. Opacity
+    # times volume, as logarithms, which cannot overflow.
+    seen = -np.logaddexp(0, -rows.opacity_logit.astype(np.float64))
+    log_scale = np.clip(rows.log_scale.astype(np.float64), *splats.LOG_SCALE_RANGE)
+    largest_first = np.argsort(-(seen + log_scale.sum(axis=1)), kind="stable")
+    rows = Splats(*(leaf[largest_first] for leaf in rows))
+    log_scale = log_scale[largest_first]
+    table = np.zeros(len(rows.mean), _SPLAT_ROW)
+    table["mean"] = rows.mean
+    table["scale"] = np.exp(log_scale)
+    logit = np.clip(rows.opacity_logit.astype(np.float64), -700, 700)
+    rgba = np.concatenate(
+        [0.5 + SH_DC * rows.sh_dc[:, 0], 1 / (1 + np.exp(-logit))[:, None]], axis=1
+    )
+    table["rgba"] = _nearest_byte(rgba * 255)
+    length = np.linalg.norm(rows.quaternion.astype(np.float64), axis=1, keepdims=True)
+    turn = np.where(length > 0, rows.quaternion / np.where(length > 0, length, 1), 0)
+    turn[length[:, 0] == 0] = [1, 0, 0, 0]
+    table["turn"] = _nearest_byte(turn * 128 + 128)
+    return table.tobytes()
+
+
+def _nearest_byte(values):
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _read_spz(path):
+    unpacked = spz.decode(safe_files.read_bytes(path, MOST_BYTES))
+    return Splats(*unpacked[:-1]), unpacked.notes

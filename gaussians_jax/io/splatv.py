@@ -1,0 +1,315 @@
+"""`.splatv`: a dynamic scene in one file for antimatter15's viewer of that name.
+
+Each Gaussian moves on a cubic in time, rotates by a quaternion linear in time, and has
+an opacity that is a Gaussian in time, as in SpacetimeGaussians (Li et al. 2024,
+arXiv:2312.16812, equations 7 to 9). Its color does not depend on the direction and its
+size is constant. The trained motion is fitted by these curves, and the error is
+reported.
+"""
+
+import json
+import pathlib
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gaussians_jax.core.splats import Gaussians
+from gaussians_jax.io.sampled import Instants
+from gaussians_jax.splatting import rendering
+from gaussians_jax.splatting.raster_spec import RasterSpec
+from nerfies_jax import evaluation
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.evaluation.scores import Draw
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.metrics.image_quality import psnr, quantize
+from nerfies_jax.training.model import TrainState
+
+MAGIC = 0x674B
+TEXELS_ACROSS = 4096  # of the viewer's texture, four for each Gaussian
+ALWAYS = 1e4  # width of a constant opacity, in units of the video: 1 - 3e-9 at its ends
+FARTHEST_CENTER = 10.0  # largest center of a fading opacity, in units of the video
+FAINTEST = 1e-3  # weight in the fit of motion of what cannot be seen at all
+FAINTEST_SEEN = 0.05  # opacity; fainter Gaussians are not measured
+MEASURED = 12  # views
+MOST = 6e4  # of a number in the file, whose half floats end at 65504
+NEAREST = 0.2  # scene units: what is nearer the viewer does not draw
+_ROW = np.dtype(
+    [
+        ("position", "<f4", 3),
+        ("quaternion", "<f2", 4),
+        ("scale", "<f2", 3),
+        ("_", "<f2"),
+        ("rgba", "u1", 4),
+        ("motion", "<f2", (3, 3)),
+        ("__", "<f2"),
+        ("turning", "<f2", 4),
+        ("bell", "<f2", 2),
+    ]
+)
+
+
+class Curves(NamedTuple):
+    """Curves of the file, as float64 in scene units.
+
+    With u the time since `center`, in units of the video: a mean is `position +
+    motion[0] u + motion[1] u² + motion[2] u³`, a rotation `quaternion + turning u` at
+    unit length, and an opacity `opacity exp(-(u / width)²)`.
+    """
+
+    position: np.ndarray  # [gaussians, 3]
+    motion: np.ndarray  # [gaussians, 3 powers, 3]
+    quaternion: np.ndarray  # [gaussians, 4] wxyz
+    turning: np.ndarray  # [gaussians, 4]
+    scale: np.ndarray  # [gaussians, 3]
+    color: np.ndarray  # [gaussians, 3] in [0, 1]
+    opacity: np.ndarray  # [gaussians]
+    center: np.ndarray  # [gaussians]
+    width: np.ndarray  # [gaussians]
+
+
+class Fit(NamedTuple):
+    """Error of the curves with respect to the trained motion."""
+
+    rms: float  # of the visible means at all times, scene units
+    most: float  # of 99 of 100 Gaussians at their worst time
+    psnr: float  # dB, renders of the curves against the run's own
+    views: int
+
+
+def fit(instants: Instants) -> Curves:
+    """Fit curves to Gaussians at evenly spaced times by least squares.
+
+    Args:
+      instants: Gaussians at evenly spaced times. Faint ones have less weight.
+
+    Returns:
+      The curves.
+    """
+    times = np.linspace(0, 1, len(instants.mean))
+    opacity, center, width = _bells(times, instants.opacity.astype(np.float64))
+    since = times - 0.5
+    weight = instants.opacity.astype(np.float64) + FAINTEST
+    means = instants.mean.astype(np.float64)
+    place = _polynomials(since, weight, means, 4)
+    turn = _polynomials(since, weight, instants.quaternion.astype(np.float64), 2)
+    # From powers of the time since the middle to those of the time since the center.
+    shift = (center - 0.5)[:, None]
+    a, b, c, d = np.moveaxis(place, 1, 0)
+    motion = np.stack([b + shift * (2 * c + 3 * d * shift), c + 3 * d * shift, d], 1)
+    return Curves(
+        position=a + shift * (b + shift * (c + shift * d)),
+        motion=motion,
+        quaternion=turn[:, 0] + shift * turn[:, 1],
+        turning=turn[:, 1],
+        scale=np.exp(instants.log_scale.astype(np.float64).mean(axis=0)),
+        color=np.clip(instants.color, 0, 1).astype(np.float64),
+        opacity=opacity,
+        center=center,
+        width=width,
+    )
+
+
+def _polynomials(since, weight, values, terms):
+    """Return coefficients [gaussians, terms, parts] of values [times, gaussians,
+    parts].
+    """
+    powers = since[:, None] ** np.arange(terms)
+    squares = np.einsum("tn,ti,tj->nij", weight, powers, powers, optimize=True)
+    right = np.einsum("tn,ti,tnd->nid", weight, powers, values, optimize=True)
+    return np.linalg.solve(squares, right)
+
+
+def _bells(times, opacity):
+    """Return height, center and width of the curves nearest to opacities [times,
+    gaussians].
+
+    A parabola is fitted to the logarithm, and used if it opens downward and is closer
+    than a constant opacity.
+    """
+    constant = opacity.mean(axis=0)
+    logarithm = np.log(np.maximum(opacity, 1e-4))[..., None]
+    # An error of the logarithm is one of the opacity times the opacity.
+    weight = np.maximum(opacity, 1e-4) ** 2
+    since = times - 0.5
+    fitted = _polynomials(since, weight, logarithm, 3)[..., 0]
+    opens_down = fitted[:, 2] < -((1 / ALWAYS) ** 2)
+    curvature = np.where(opens_down, -fitted[:, 2], 1.0)
+    offset = fitted[:, 1] / (2 * curvature)
+    opens_down &= np.abs(offset) < FARTHEST_CENTER
+    offset = np.where(opens_down, offset, 0.0)
+    height = np.exp(np.minimum(fitted[:, 0] + curvature * offset**2, 0))
+    bell = height * np.exp(-curvature * (since[:, None] - offset) ** 2)
+    nearer = ((bell - opacity) ** 2).sum(0) < ((constant - opacity) ** 2).sum(0)
+    taken = opens_down & nearer
+    return (
+        np.where(taken, height, constant),
+        0.5 + np.where(taken, offset, 0.0),
+        np.where(taken, curvature**-0.5, ALWAYS),
+    )
+
+
+def at(curves: Curves, time: float) -> Gaussians:
+    """Evaluate the curves as the viewer does.
+
+    Args:
+      curves: The curves.
+      time: Normalized time in [0, 1].
+
+    Returns:
+      The Gaussians.
+    """
+    since = (time - curves.center)[:, None]
+    first, second, third = np.moveaxis(curves.motion, 1, 0)
+    mean = curves.position + since * (first + since * (second + since * third))
+    turn = curves.quaternion + curves.turning * since
+    bell = np.exp(-((since[:, 0] / curves.width) ** 2))
+    parts = mean, turn, curves.scale, curves.opacity * bell
+    return Gaussians(*(jnp.asarray(part, jnp.float32) for part in parts))
+
+
+def encode(curves: Curves, capture: Capture) -> bytes:
+    """Encode the file.
+
+    Args:
+      curves: The curves.
+      capture: The capture, whose training cameras are stored.
+
+    Returns:
+      Bytes of the file.
+    """
+    for name, values in curves._asdict().items():
+        if not np.abs(values).max(initial=0) < MOST:
+            raise ValueError(
+                f"{name} of {np.abs(values).max():.3g}: .splatv holds numbers below "
+                f"{MOST:g}; scale the capture down"
+            )
+    count = len(curves.position)
+    rows = np.zeros(-(-count // 1024) * 1024, _ROW)
+    for name in ("position", "quaternion", "scale", "motion", "turning"):
+        rows[name][:count] = getattr(curves, name)
+    rgba = np.concatenate([curves.color, curves.opacity[:, None]], axis=1)
+    rows["rgba"][:count] = np.round(255 * rgba)
+    rows["bell"][:count] = np.stack([curves.center, curves.width], axis=1)
+    about = {
+        "type": "splat",
+        "size": rows.nbytes,
+        "texwidth": TEXELS_ACROSS,
+        "texheight": len(rows) * 4 // TEXELS_ACROSS,
+        "cameras": [_camera(capture, row) for row in capture.train],
+    }
+    header = json.dumps([about]).encode()
+    sizes = np.array([MAGIC, len(header)], "<u4")
+    return sizes.tobytes() + header + rows.tobytes()
+
+
+def _camera(capture, row):
+    one = cameras.take(capture.cameras, row)
+    focal = float(one.focal_px)
+    return {
+        "id": int(row),
+        "img_name": capture.ids[row],
+        "width": capture.size[0],
+        "height": capture.size[1],
+        "position": one.position.tolist(),
+        "rotation": one.camera_from_world.T.tolist(),  # world from camera
+        "fx": focal,
+        "fy": focal * float(one.pixel_aspect),
+    }
+
+
+def decode(data: bytes) -> Curves:
+    """Decode the curves from the bytes of a file, as a viewer does.
+
+    Args:
+      data: Bytes of the file.
+
+    Returns:
+      The curves.
+    """
+    magic, length = np.frombuffer(data[:8], "<u4")
+    if magic != MAGIC:
+        raise ValueError(f"begins with {magic:#x}, not {MAGIC:#x}: not a .splatv file")
+    rows = np.frombuffer(data[8 + int(length) :], _ROW)
+    rows = rows[rows["bell"][:, 1] > 0]  # the rest of the texture is empty
+    rgba = rows["rgba"] / 255
+    bell = rows["bell"].astype(np.float64)
+    names = ("position", "motion", "quaternion", "turning", "scale")
+    parts = (rows[name].astype(np.float64) for name in names)
+    return Curves._make((*parts, rgba[:, :3], rgba[:, 3], bell[:, 0], bell[:, 1]))
+
+
+def write(path: pathlib.Path, instants: Instants, capture: Capture) -> Curves:
+    """Fit curves and write the file.
+
+    Args:
+      path: File to write.
+      instants: Gaussians at evenly spaced times.
+      capture: The capture.
+
+    Returns:
+      The curves as they are read from the file.
+    """
+    data = encode(fit(instants), capture)
+    with replaced_file(path) as partial:
+        partial.write_bytes(data)
+    return decode(data)
+
+
+def measured(
+    curves: Curves,
+    instants: Instants,
+    draw: Draw,
+    state: TrainState,
+    raster: RasterSpec,
+    capture: Capture,
+) -> Fit:
+    """Measure the error of the curves at their times and in captured views.
+
+    Args:
+      curves: The curves.
+      instants: Gaussians at evenly spaced times.
+      draw: Renderer of the run.
+      state: Trained state.
+      raster: Settings of the rasterizer.
+      capture: The capture, of which at most `MEASURED` views are used, held-out ones
+        first.
+
+    Returns:
+      The errors.
+    """
+    times = np.linspace(0, 1, len(instants.mean))
+    fitted = np.stack([np.asarray(at(curves, time).mean) for time in times])
+    off = np.linalg.norm(fitted - instants.mean, axis=-1)
+    off = np.where(instants.opacity > FAINTEST_SEEN, off, 0)
+    background = jnp.asarray(capture.background or (0.0, 0.0, 0.0), jnp.float32)
+    colors = jnp.asarray(curves.color, jnp.float32)
+    pictured = jax.jit(
+        lambda gaussians, camera: (
+            rendering.render(
+                gaussians,
+                colors,
+                camera,
+                capture.size,
+                raster,
+                background,
+                depth=False,
+            ).rendering.color
+        )
+    )
+    rows = capture.heldout if len(capture.heldout) else capture.train
+    rows, scores = evaluation.spread(rows, MEASURED), []
+    for row in rows:
+        view = evaluation.view_of(capture, row)
+        camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), view.camera)
+        picture = pictured(at(curves, float(view.time)), camera)
+        own = jnp.clip(draw(state, view).color, 0, 1)
+        scores.append(float(psnr(quantize(picture), quantize(own))))
+    return Fit(
+        rms=float(np.sqrt(np.mean(off**2))),
+        most=float(np.quantile(off.max(axis=0), 0.99)),
+        psnr=float(np.mean(scores)),
+        views=len(rows),
+    )

@@ -1,0 +1,1 @@
+"""Optimization and density control of Gaussians."""

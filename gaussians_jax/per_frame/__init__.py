@@ -1,0 +1,1 @@
+"""Quantities learned for each frame: exposure and camera."""

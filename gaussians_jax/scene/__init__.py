@@ -1,0 +1,1 @@
+"""Gaussians, motion and losses composed to a model, and presets."""

@@ -1,0 +1,253 @@
+"""Scenes that train on a CPU in minutes: the parts of the papers' ones, smaller."""
+
+import dataclasses
+
+from gaussians_jax.init.points import InitSpec, StartSpec
+from gaussians_jax.losses.acceleration import AccelerationSpec
+from gaussians_jax.losses.depth import DepthSpec
+from gaussians_jax.losses.flow import FlowSpec
+from gaussians_jax.losses.neighbors import NeighborSpec
+from gaussians_jax.losses.spectral import SpectralSpec
+from gaussians_jax.motion.anchors import AnchorMotionSpec, RateSpec
+from gaussians_jax.motion.basis import SMALL_BASIS_MOTION
+from gaussians_jax.motion.carried import CarriedSpec, TurnSpec
+from gaussians_jax.motion.embedding import SMALL_EMBEDDING_MOTION
+from gaussians_jax.motion.growth import MotionGrowthSpec
+from gaussians_jax.motion.kan import SMALL_KAN_MOTION
+from gaussians_jax.motion.mlp import MotionSpec
+from gaussians_jax.motion.nodes import SMALL_NODE_MOTION, MaskSpec
+from gaussians_jax.motion.planes import SMALL_PLANE_MOTION
+from gaussians_jax.motion.polynomial import PolynomialMotionSpec
+from gaussians_jax.motion.se3_bases import SE3BasesSpec
+from gaussians_jax.motion.splines import SplineMotionSpec
+from gaussians_jax.motion.temporal_opacity import TemporalOpacitySpec
+from gaussians_jax.motion.time_basis import SMALL_TIME_BASIS
+from gaussians_jax.optim.densification import DefaultStrategySpec
+from gaussians_jax.optim.learning_rates import LearningRateSpec
+from gaussians_jax.optim.mcmc import MCMCStrategySpec
+from gaussians_jax.optim.phases import AlternationSpec, AnnealingSpec
+from gaussians_jax.scene.spec import SplatScene
+from nerfies_jax.nn.encoding import EncodingSpec
+
+SMALL_STRATEGY = DefaultStrategySpec(
+    refine_every=200,
+    refine_start_iter=300,
+    refine_stop_iter=2000,
+    reset_every=100_000,
+    cap_max=10_000,
+)
+
+# For a CPU: the same parts with fewer Gaussians, a smaller network, a shorter run.
+# Measured on the built-in scene at 2000 steps (held-out PSNR and SSIM, one seed):
+#   motion from 10 % of the run on, network rate 2e-3   18.20 / 0.466, worse than static
+#   motion from 35 % on, rate 8e-4                      20.36 / 0.740
+#   and random points beside the static ones            21.61 / 0.802
+#   and 96 wide, 6 bands of time, no smoothing          21.89 / 0.807
+# A field that may move everything before the static part stands bends the background to
+# follow the camera; without points of its own, what moves is painted onto the walls.
+SMALL_STATIC = SplatScene(
+    steps=3000,
+    init=InitSpec(points=4000, random=5000, extra_random=2000),
+    sh_degree=1,
+    sh_every=1000,
+    strategy=SMALL_STRATEGY,
+    # Looks and shapes learn twice as fast as published, for a tenth of the steps. At
+    # 1500 steps, one seed: built-in still scene 32.29 -> 33.02 dB, `SMALL_TRACKED` on
+    # the default one 30.39 -> 30.74, on a film of 256x192 36.22 -> 36.65; four times as
+    # fast 36.69 there, opacities, too 36.57, means alone (4e-4) 36.24.
+    learning_rates=LearningRateSpec(
+        mean_end=3.2e-6,
+        log_scale=1e-2,
+        quaternion=2e-3,
+        sh_dc=5e-3,
+        sh_rest=2.5e-4,
+    ),
+)
+# Built-in scene, 1500 steps, up to 10,000 Gaussians (held-out PSNR and SSIM, one seed):
+#   clone and split (`SMALL_STATIC`)              22.41 / 0.816
+#   this                                          22.04 / 0.799
+#   with the paper's first opacity and scale      21.92 / 0.797
+#   and events every 100 steps (7692 Gaussians)   21.93 / 0.795
+SMALL_MCMC = dataclasses.replace(
+    SMALL_STATIC,
+    strategy=MCMCStrategySpec(
+        refine_every=50, refine_start_iter=300, refine_stop_iter=2500, cap_max=10_000
+    ),
+)
+STRATEGY_FROM_TRACKS = dataclasses.replace(
+    SMALL_STRATEGY,
+    refine_every=130,
+    refine_start_iter=200,
+    refine_stop_iter=1300,
+)
+# Two views a step, on a core each: 37 ms for 32 (10,000 Gaussians, 256x192).
+# What the small scenes that start from tracks share.
+SMALL_FROM_TRACKS = dataclasses.replace(
+    SMALL_STATIC,
+    steps=2000,
+    batch_size=2,
+    init=InitSpec(points=4000, random=5000, extra_random=None),
+    sh_every=700,
+    strategy=STRATEGY_FROM_TRACKS,
+    start=StartSpec(motion="tracks"),
+)
+# What moves has no larger weight, for that gains nothing: of three times, 31.71 dB are
+# held out and 29.39 where it moves for 31.69 and 29.34 (built-in scene, 900 steps, one
+# seed), 36.22 and 32.32 for 36.38 and 32.22 (a hand before books, 600 steps).
+SMALL_TRACKED = dataclasses.replace(
+    SMALL_FROM_TRACKS,
+    motion=SE3BasesSpec(bases=8),
+    temporal_opacity=TemporalOpacitySpec(),
+)
+# Other motions from tracks. Built-in scene, one seed, as many steps as fitted into a
+# minute or two of a shared core (held-out PSNR, and where it moves):
+#   1300 steps: dynmf      29.83 / 26.51    738, from rest: 20.28 / 13.83
+#    940 steps: spline     28.57 / 26.28   1562, from rest: 20.04 / 13.81
+#   1600 steps: spacetime  28.63 / 24.03    700, from rest: 20.42 / 13.95
+#    649 steps: 4dgs       28.39 / 25.03    306, from rest: 20.32 / 13.90
+# A cubic is too stiff for the cloth and the box of this scene: its edges are soft.
+SMALL_DYNMF = dataclasses.replace(
+    SMALL_FROM_TRACKS,
+    motion=dataclasses.replace(SMALL_TIME_BASIS, warm_up=600),
+    neighbors=NeighborSpec(start=600),
+)
+SMALL_SPACETIME = dataclasses.replace(SMALL_FROM_TRACKS, motion=PolynomialMotionSpec())
+SMALL_SPLINE = dataclasses.replace(SMALL_FROM_TRACKS, motion=SplineMotionSpec())
+SMALL_FOUR_D = dataclasses.replace(
+    SMALL_FROM_TRACKS,
+    motion=dataclasses.replace(SMALL_PLANE_MOTION, warm_up=600),
+)
+# From tracks and with D-SSIM, as the others above; the paper has neither.
+SMALL_E_D3DGS = dataclasses.replace(
+    SMALL_FROM_TRACKS,
+    motion=dataclasses.replace(
+        SMALL_EMBEDDING_MOTION,
+        warm_up=600,
+        learning_rate=1e-3,
+        learning_rate_end=1e-5,
+        embedding_rate=1e-3,
+    ),
+    neighbors=NeighborSpec(start=600),
+)
+# Built-in scene, 600 steps of one view each, one seed (held-out PSNR, and where it
+# moves): 28.69 / 24.54, without the rigid term 28.59 / 24.49, with a weight of 1 28.28
+# / 23.93. `SMALL_EDGS` has 28.85 / 24.83, `SMALL_TRACKED` 29.66 / 26.72: the network's
+# fit to the tracks is off by 0.47 % of the scene's depth, that of bases by 0.17 %.
+SMALL_SC_GS = dataclasses.replace(
+    SMALL_FROM_TRACKS,
+    motion=dataclasses.replace(SMALL_NODE_MOTION, warm_up=600),
+)
+SMALL_EDGS = dataclasses.replace(
+    SMALL_FROM_TRACKS,
+    motion=dataclasses.replace(
+        SMALL_NODE_MOTION, rigidity=None, mask=MaskSpec(), warm_up=600
+    ),
+)
+SMALL_DEFORMABLE = dataclasses.replace(
+    SMALL_STATIC,
+    motion=MotionSpec(
+        position=EncodingSpec(5),
+        time=EncodingSpec(6),
+        depth=4,
+        width=96,
+        skips=(2,),
+        warm_up=600,
+        smoothing=None,
+        learning_rate=5e-4,
+        learning_rate_end=5e-6,
+    ),
+)
+
+# A quarter of the rows of the others, and four Gaussians of each. Built-in scene, 600
+# steps of one view each, one seed: 29.23 dB, and 24.63 where it moves (`SMALL_SC_GS`
+# 28.69 / 24.54); followed points are off by 0.0099 scene units.
+SMALL_D_MISO = dataclasses.replace(
+    SMALL_FROM_TRACKS,
+    init=InitSpec(points=1500, random=1500, extra_random=None),
+    start=StartSpec(motion="tracks", moving_points=800),
+    strategy=dataclasses.replace(STRATEGY_FROM_TRACKS, cap_max=2500),
+    motion=SMALL_DEFORMABLE.motion,
+    carried=CarriedSpec(
+        count=4,
+        turns=TurnSpec(time=EncodingSpec(6), learning_rate_end=8e-6),
+        log_scale_rate=1e-2,
+        quaternion_rate=2e-3,
+        sh_dc_rate=5e-3,
+        sh_rest_rate=2.5e-4,
+    ),
+)
+
+# A tenth of the rows, and ten Gaussians of each.
+SMALL_ADC_GS = dataclasses.replace(
+    SMALL_FROM_TRACKS,
+    init=InitSpec(points=500, random=600, extra_random=None),
+    start=StartSpec(motion="tracks", moving_points=350),
+    sh_degree=0,
+    strategy=dataclasses.replace(STRATEGY_FROM_TRACKS, cap_max=1000),
+    motion=AnchorMotionSpec(
+        time_code=16,
+        width=64,
+        rate=RateSpec(start=700, learning_rate=1e-2, learning_rate_end=1e-4),
+        warm_up=600,
+        learning_rate=1e-3,
+        learning_rate_end=1e-5,
+    ),
+)
+
+# Measured (held-out PSNR and SSIM, one seed):
+#   built-in, 1000 steps: RAdam                          21.84 / 0.755
+#                         Adam, network, embedding 1e-3  22.77 / 0.822
+#   D-NeRF lego, 1500:    codes drawn one by one         19.4
+#                         codes as waves over space      19.4
+#                         and over time                  20.1 (deformable 20.7)
+# Per-row RAdam takes 0.15 of Adam's step after 50 updates of a newborn row and 0.5
+# after 556, which a short run cannot afford. Codes that start alike for what is near
+# in space and time let the first steps move more than one Gaussian in one frame.
+#
+# The network's rate is E-D3DGS', 1.6e-4. At 1e-3 the kernels, of which each input
+# always has some at work, move all Gaussians together, and motion stands in for depth.
+# Built-in scene, 900 steps (held-out PSNR, where it moves, median error of depth), one
+# seed, 1e-3 -> 2e-4: from tracks 28.61 / 22.85, 0.0080 -> 29.60 / 24.12, 0.0064; and
+# without the depth term 21.88 / 17.59, 0.0712 -> 29.38 / 23.98, 0.0153 (an MLP at 1e-3:
+# 30.44 / 25.21, 0.0135); from rest 23.53 / 17.23 -> 23.79 / 17.50.
+SMALL_SONATA = dataclasses.replace(
+    SMALL_STATIC,
+    motion=dataclasses.replace(
+        SMALL_KAN_MOTION,
+        waves=2.0,
+        spread=0.5,
+        warm_up=600,
+        embedding_rate=1e-3,
+    ),
+    neighbors=NeighborSpec(start=600),
+    spectral=SpectralSpec(),
+    depth=DepthSpec(),
+)
+# D-NeRF lego at 3000 steps: 20.96 dB with networks 32 and 48 wide and four bands of
+# time, 21.90 with these.
+SMALL_MOBA = dataclasses.replace(
+    SMALL_STATIC,
+    strategy=dataclasses.replace(SMALL_STRATEGY, refine_stop_iter=1500),
+    motion=dataclasses.replace(
+        SMALL_BASIS_MOTION,
+        time=EncodingSpec(6),
+        base_width=64,
+        width=96,
+        warm_up=600,
+        learning_rate=5e-4,
+        learning_rate_end=5e-6,
+    ),
+    alternation=AlternationSpec(1500, 2250),
+    annealing=AnnealingSpec(2250),
+    motion_growth=MotionGrowthSpec(start=900),
+    acceleration=AccelerationSpec(start=600),
+)
+# Built-in scene, 600 steps of one view each, one seed: 28.76 dB, and 24.52 where it
+# moves; followed points are off by 0.0097 scene units. Flow counts everywhere: where
+# things move alone, as in the paper, it is 0.25 ± 0.22 dB less over 435 steps, three
+# seeds (`docs/results/benchmark.md`): what is at rest stays so by it, too.
+SMALL_MOTION_GS = dataclasses.replace(
+    SMALL_FROM_TRACKS,
+    motion=SMALL_DEFORMABLE.motion,
+    flow=FlowSpec(start=600, moving_only=False),
+)

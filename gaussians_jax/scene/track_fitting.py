@@ -1,0 +1,165 @@
+"""Fit a motion model to given 3D tracks, without images."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from gaussians_jax.core import protocols
+from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.protocols import Motion
+from gaussians_jax.core.records import SplatRecord
+from gaussians_jax.core.splats import Params
+from gaussians_jax.init import path_fit
+from gaussians_jax.init.path_fit import Paths, Points
+from nerfies_jax.training.extensions import check
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackFit:
+    """A motion fitted to tracks by `fit_tracks`.
+
+    Attributes:
+      params: Parameters of a scene whose Gaussians are the tracked points at their
+        canonical places (`params.rows["splats"].mean`), with the motion's rows and
+        networks next to them.
+      error_before: Mean distance from the tracks before the descent, scene units.
+      error_after: The same after it.
+    """
+
+    params: Params
+    error_before: float
+    error_after: float
+    _effect: SplatRecord
+    _points: Points
+    _span: tuple[float, float]
+
+    def positions(self, times: ArrayLike) -> Float[Array, "points times 3"]:
+        """Evaluate the fitted motion.
+
+        Args:
+          times: Times [times] in the unit of the `times` of the fit.
+
+        Returns:
+          Places of the tracked points at these times, scene units.
+        """
+        first, last = self._span
+        share = (np.asarray(times, np.float64) - first) / (last - first)
+        if share.ndim != 1:
+            raise ValueError(f"times must have shape [times], got {share.shape}")
+        kind = self._points.canonical.dtype
+        return _positions(self._effect, self._points, jnp.asarray(share, kind))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _positions(effect, points, times):
+    one = functools.partial(path_fit.places, effect, points)
+    return jnp.swapaxes(jax.vmap(one)(times), 0, 1)
+
+
+def fit_tracks(
+    motion: Any,
+    tracks: ArrayLike,
+    visible: ArrayLike | None = None,
+    times: ArrayLike | None = None,
+    *,
+    key: Array | None = None,
+    steps: int = 1000,
+    learning_rate: float = 5e-3,
+) -> TrackFit:
+    """Fit a motion model to the paths of points in 3D.
+
+    Adam minimizes the mean distance between the moved points and the tracks where they
+    are visible, softened near zero so that single wrong tracks bend nothing. Motions
+    made of rigid bodies (`SE3BasesSpec`) start from a closed-form fit of groups of
+    points. Runs on the host and compiles one program; computed in float32.
+
+    Args:
+      motion: Settings of the motion, such as `SE3BasesSpec(bases=8)`: any that
+        `SplatScene.motion` takes.
+      tracks: Places of the points over time, [points, times, 3], scene units.
+      visible: Where a place is known, [points, times] bool. None: everywhere. Places
+        that are not finite count as unknown.
+      times: Increasing times of the columns, [times], in any unit. None: evenly spaced
+        from 0 to 1.
+      key: Random key of the initialization and of the drawn times. None: key 0.
+      steps: Number of Adam steps.
+      learning_rate: Learning rate, relative to the rates of the motion's own parts.
+
+    Returns:
+      The fitted motion.
+
+    Raises:
+      ValueError: A shape or setting is not one of the above, or a track is never
+        visible.
+
+    References:
+      Wang et al. 2024 (Shape of Motion, arXiv:2407.13764), Section 3.3, for the
+      initialization of SE(3) bases from tracks.
+    """
+    check("motion", motion, Motion)
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1, got {steps}")
+    if not 0 < learning_rate < np.inf:
+        raise ValueError(f"learning_rate must be positive, got {learning_rate}")
+    position = np.asarray(tracks, np.float64)
+    if position.ndim != 3 or position.shape[2] != 3 or position.shape[1] < 2:
+        raise ValueError(
+            "tracks must have shape [points, times, 3] with at least two times, got "
+            f"{position.shape}"
+        )
+    known = np.all(np.isfinite(position), axis=-1)
+    if visible is not None:
+        visible = np.asarray(visible)
+        if visible.shape != known.shape or visible.dtype != bool:
+            raise ValueError(
+                f"visible must be bool of shape {known.shape}, got {visible.dtype} of "
+                f"shape {visible.shape}"
+            )
+        known &= visible
+    unseen = np.flatnonzero(~known.any(axis=1))
+    if len(unseen) or not len(known):
+        raise ValueError(
+            f"every track must be visible somewhere, got {len(unseen)} of "
+            f"{len(known)} that never are (rows {unseen[:5].tolist()}); leave them out"
+        )
+    count = position.shape[1]
+    times = np.linspace(0, 1, count) if times is None else np.asarray(times, np.float64)
+    if times.shape != (count,) or not (np.diff(times) > 0).all():
+        raise ValueError(
+            f"times must be {count} increasing numbers, one for each column of tracks, "
+            f"got {times}"
+        )
+    places = position[known]
+    unit = float(np.sqrt(np.mean(np.sum((places - places.mean(0)) ** 2, axis=-1))))
+    unit = max(unit, float(np.finfo(np.float32).tiny) ** 0.5)
+    box = tuple(places.min(0) - unit), tuple(places.max(0) + unit)
+    metadata = SceneMetadata(unit, (0.0, 0.0, 0.0), count, box=box)
+    moving = protocols.bound(protocols.moving_at_once(motion), steps, metadata)
+    effect = protocols.compile_motion(moving)
+    share = (times - times[0]) / (times[-1] - times[0])
+    fitted = path_fit.fit(
+        effect,
+        Paths(
+            share.astype(np.float32),
+            np.where(known[..., None], position, np.nan).astype(np.float32),
+            known,
+            unit,
+        ),
+        jax.random.key(0) if key is None else key,
+        rate=learning_rate,
+        steps=steps,
+    )
+    return TrackFit(
+        path_fit.scene_of(effect, fitted.points),
+        fitted.first,
+        fitted.last,
+        effect,
+        fitted.points,
+        (float(times[0]), float(times[-1])),
+    )

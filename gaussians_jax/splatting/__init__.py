@@ -1,0 +1,1 @@
+"""Projection, binning and blending: differentiable rasterization."""

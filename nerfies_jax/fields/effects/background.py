@@ -1,0 +1,107 @@
+"""Background regularization: static points must not be moved by the warp.
+
+Park et al. 2021 (Nerfies), arXiv:2011.12948. Without it the warp and the template may
+drift together, which images do not show.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nerfies_jax.fields.effects.effect import Scalar
+from nerfies_jax.training import losses
+from nerfies_jax.training.effects import PenaltyContext, PyTree, Term
+
+
+@dataclasses.dataclass(frozen=True)
+class BackgroundSpec:
+    """Settings of the background regularization: number and noise of points, and its
+    cost.
+
+    Each of a step's micro-batches draws as many `points`.
+
+    `noise` (standard deviation) and `width` are in units of the field, whose box is the
+    captured volume. The official code's scenes are scaled to fill one of diagonal one.
+    `width` is the displacement at which ρ leaves the parabola. The official `scaling`
+    is the default. Its `weight` of one is 1e-3 of that of the paper's ρ (`losses`).
+
+    A scene of a capture without static points is refused when it is built.
+    """
+
+    points: int = 16_384
+    noise: float = 1e-3
+    width: float = 1e-3
+    scaling: str = "official"
+    weight: float = 1.0
+
+    name = "background"
+    required_data = frozenset({"points"})
+
+    def __post_init__(self):
+        if self.points < 1:
+            raise ValueError(f"points={self.points} of a step must be at least 1")
+        for name in ("noise", "weight"):
+            value = getattr(self, name)
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"{name}={value} must be finite and not negative")
+        losses.check_geman_mcclure(self.width, self.scaling)
+
+    def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
+        """Compute how far random static points are moved in random frames."""
+        return {"background": Term(drift(self, context), self.weight)}
+
+
+def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:
+    """Compute the mean over static points of ρ(|displacement|²).
+
+    All points are used if there are at most `spec.points`. Otherwise as many are drawn
+    with replacement. Each point is evaluated in a random frame, with noise.
+
+    Args:
+      spec: Settings.
+      context: Context of the step.
+
+    Returns:
+      A scalar.
+    """
+    # The official code draws frames and jitter with one key.
+    choice_key, frame_key, noise_key = jax.random.split(context.key, 3)
+    assert context.frames is not None
+    point = context.frames.points
+    assert point is not None  # `required_data`
+    if point.shape[0] > spec.points:
+        rows = jax.random.randint(choice_key, (spec.points,), 0, point.shape[0])
+        point = point[rows]
+    point = (point - context.box.center) * context.box.scale
+    noise = jax.random.normal(noise_key, point.shape, point.dtype)
+    frames = context.frames.times.shape[0]
+    rows = jax.random.randint(frame_key, point.shape[:1], 0, frames)
+    return mean_drift(spec, context, point + spec.noise * noise, rows)
+
+
+def mean_drift(
+    spec: BackgroundSpec,
+    context: PenaltyContext,
+    point: Float[Array, "points 3"],
+    rows: Int[Array, " points"],
+) -> Scalar:
+    """Compute the mean of ρ(|displacement|²) over points.
+
+    Args:
+      spec: Settings.
+      context: Context of the step.
+      point: Points in units of the field, [points, 3].
+      rows: Training frame of each point, [points].
+
+    Returns:
+      A scalar.
+    """
+    assert context.condition_of is not None
+    assert context.displace is not None
+    conditions = jax.vmap(context.condition_of)(rows)
+    moved = jax.vmap(context.displace)(point, conditions)
+    # ρ takes the square: the length has no slope where nothing moves
+    costs = losses.geman_mcclure(jnp.sum(moved**2, axis=-1), spec.width, spec.scaling)
+    return jnp.mean(costs)

@@ -1,0 +1,171 @@
+"""Extension points of a radiance field.
+
+A value of a field of `RadianceScene` is either the object with the functions of its
+protocol, or settings with `bind(steps, metadata)`, which returns that object for a run
+of so many steps of a capture. Functions are of one point of one ray, in units of the
+field, and are vectorized by their caller.
+
+Optional members of all parts: `init(key)` returns parameters, of which there are none
+without it. `learning_rate` is a float, a schedule of the traced step or a tree of
+these; without it the rate of the field is used. `tables` are the tables of latent codes
+that it reads in `frame.codes`. `loss(params, context)` adds terms to the loss, as
+`Regularizer.loss` does, but gets the part's own parameters; `required_data` names what
+it reads of the capture. `name` is the key of the parameters and metrics.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from nerfies_jax.fields.effects.effect import Medium as MediumSample
+from nerfies_jax.fields.effects.effect import Sample as Sample
+from nerfies_jax.nn.adapters import Network
+from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.effects import Table as Table
+from nerfies_jax.training.protocols import Regularizer as Regularizer
+
+PyTree = Any
+Scalar = Float[Array, ""]
+Vector = Float[Array, "3"]
+
+
+class TemplateInputs(NamedTuple):
+    """Inputs of a template at one sample of a ray.
+
+    Attributes:
+      point: Point in the template, units of the field: where a warp puts the sample.
+      direction: Unit direction of the ray. Density must not depend on it.
+      features: Features of the conditionings with the target "trunk".
+      condition: Features of those with the target "color". Density must not depend on
+        them.
+      step: Training step, for schedules.
+    """
+
+    point: Vector
+    direction: Vector
+    features: Float[Array, " features"]
+    condition: Float[Array, " condition"]
+    step: Int[Array, ""] | None
+
+
+@runtime_checkable
+class Template(Protocol):
+    """Density and color in the coordinates of the template."""
+
+    def init(self, key: Key[Array, ""], features: int, condition: int) -> PyTree:
+        """Initialize the parameters.
+
+        Args:
+          key: PRNG key.
+          features: Number of `TemplateInputs.features`.
+          condition: Number of `TemplateInputs.condition`.
+        """
+        ...
+
+    def apply(self, params: PyTree, inputs: TemplateInputs) -> tuple[Scalar, Vector]:
+        """Compute density (not negative, per unit of the field) and color (sRGB)."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkTemplate:
+    """A network as `Template`, such as one of `nets.adapters`.
+
+    Attributes:
+      network: Reads [point, features] and [direction, condition] of one sample and
+        returns density and color.
+    """
+
+    network: Network
+
+    def init(self, key: Key[Array, ""], features: int, condition: int) -> PyTree:
+        """Initialize the parameters of the network."""
+        return self.network.init(key)
+
+    def apply(self, params: PyTree, inputs: TemplateInputs) -> tuple[Scalar, Vector]:
+        """Evaluate the network at one sample."""
+        place = jnp.concatenate([inputs.point, inputs.features])
+        ray = jnp.concatenate([inputs.direction, inputs.condition])
+        return self.network.apply(params, place, ray)
+
+
+@runtime_checkable
+class Warp(Protocol):
+    """Deformation from the observed scene to the template.
+
+    Optional member: `shortest_wave`, the shortest wavelength of the displacement in
+    space. Warps that are smooth enough are evaluated on a grid when an image is
+    rendered; without it each sample is evaluated.
+    """
+
+    def init(self, key: Key[Array, ""]) -> PyTree:
+        """Initialize the parameters, with a displacement near zero."""
+        ...
+
+    def apply(self, params: PyTree, point: Vector, frame: FrameCondition) -> Vector:
+        """Compute the displacement of an observed point.
+
+        Args:
+          params: Parameters of the warp.
+          point: An observed point.
+          frame: Time, codes and training step of the frame.
+
+        Returns:
+          The point in the template minus the observed point.
+        """
+        ...
+
+
+@runtime_checkable
+class Conditioning(Protocol):
+    """Features of a frame, or of a point at its time, that networks of the field read.
+
+    Attributes:
+      features: Number of features.
+      target: Reader of the features: "trunk" (density and color), "color", whose
+        features are those of a frame, or "warp", which finds them in `frame.codes` by
+        the name of the conditioning.
+    """
+
+    @property
+    def features(self) -> int:
+        """Number of features that `apply` returns."""
+        ...
+
+    @property
+    def target(self) -> str:
+        """Branch of the template that reads them."""
+        ...
+
+    def apply(
+        self, params: PyTree, point: Vector | None, frame: FrameCondition
+    ) -> Float[Array, " features"]:
+        """Compute the features.
+
+        Args:
+          params: Parameters of the conditioning; None without `init`.
+          point: The observed point; None where color is the target.
+          frame: Time, codes and training step of the frame.
+        """
+        ...
+
+
+@runtime_checkable
+class Medium(Protocol):
+    """Second medium along a ray, next to the static scene.
+
+    Optional members: `beta_min`, the least standard deviation of a ray's color, is
+    needed where the medium has a `beta`. `beta_power` weights the likelihood.
+    """
+
+    def init(self, key: Key[Array, ""], features: int) -> PyTree:
+        """Initialize the parameters, for a trunk with so many features."""
+        ...
+
+    def apply(
+        self, params: PyTree, sample: Sample, frame: FrameCondition
+    ) -> MediumSample:
+        """Compute density and color of the medium at one sample of a ray."""
+        ...

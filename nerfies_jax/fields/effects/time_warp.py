@@ -1,0 +1,179 @@
+"""Motion of TiNeuVox: a small network shifts points by an embedding of the time.
+
+Fang et al. 2022, arXiv:2205.15285, "coordinate deformation" and "radiance network". The
+text with its equations was not at hand, so its code (hustvl/TiNeuVox) is followed. One
+network embeds the encoded time. A second, small one reads the embedding and the encoded
+point and returns the shift to the template. The radiance network reads the embedding
+and the encoded observed point as well, and so corrects errors of such a small
+deformation. Time 0 is not special.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from nerfies_jax.fields.effects.effect import Scalar, Vector
+from nerfies_jax.nn import encoding, mlp
+from nerfies_jax.nn.encoding import EncodingSpec
+from nerfies_jax.nn.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training.effects import FrameCondition
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeWarpSpec:
+    """Sizes of the networks. The defaults are those of the code's larger model.
+
+    `embedding` is the width of the time embedding, computed with one hidden layer of
+    `width`. The shift has `depth` of them. It starts near zero, where that of the code
+    starts like any layer.
+    """
+
+    position: EncodingSpec = EncodingSpec(10)
+    time: EncodingSpec = EncodingSpec(8)
+    embedding: int = 30
+    depth: int = 2
+    width: int = 256
+
+    def __post_init__(self):
+        if self.embedding < 1:
+            raise ValueError(
+                f"embedding={self.embedding} must be at least 1: all times would be "
+                "alike"
+            )
+        shift_network(self)  # refuses wrong depths and widths
+
+    @property
+    def features(self) -> int:
+        """Number of features that the trunk reads in addition."""
+        return self.position.width(3) + self.embedding
+
+    def init(self, key: Key[Array, ""]) -> "TimeWarp":
+        """Initialize the networks."""
+        return init(self, key)
+
+    def apply(self, params: "TimeWarp", point: Vector, frame: FrameCondition) -> Vector:
+        """Compute the displacement of a point."""
+        return displace(self, params, point, frame)
+
+    def lift(
+        self, params: "TimeWarp", point: Vector, frame: FrameCondition
+    ) -> Float[Array, " features"]:
+        """Compute what the trunk reads in addition."""
+        return features(self, params, point, frame)
+
+
+class TimeWarp(NamedTuple):
+    """Parameters."""
+
+    time: MLP  # head "embedding"
+    shift: MLP  # of [encoded point, embedding]; head "linear"
+
+
+def time_network(spec: TimeWarpSpec) -> MLPSpec:
+    """Return the settings of the network that embeds the encoded time.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      Settings of an MLP with the head "embedding".
+    """
+    heads = (("embedding", HeadSpec(spec.embedding)),)
+    return MLPSpec(spec.time.width(1), 1, spec.width, heads)
+
+
+def shift_network(spec: TimeWarpSpec) -> MLPSpec:
+    """Return the settings of the network from [encoded point, embedding] to the shift.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      Settings of an MLP with the head "linear".
+    """
+    inputs = spec.position.width(3) + spec.embedding
+    heads = (("linear", HeadSpec(3, "small")),)
+    return MLPSpec(inputs, spec.depth, spec.width, heads)
+
+
+def init(spec: TimeWarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> TimeWarp:
+    """Initialize near the identity: in a box of side two no point moves by more than
+    1e-4.
+
+    Args:
+      spec: Settings.
+      key: PRNG key.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters.
+    """
+    time_key, shift_key = jax.random.split(key)
+    network = shift_network(spec)
+    shift = mlp.init(network, shift_key, dtype)
+    head = shift.heads["linear"]
+    # mlp.SMALL bounds what each feature adds; their sum has random signs.
+    head = head._replace(weight=head.weight / math.sqrt(network.features))
+    shift = shift._replace(heads={"linear": head})
+    return TimeWarp(mlp.init(time_network(spec), time_key, dtype), shift)
+
+
+def embed(
+    spec: TimeWarpSpec, params: TimeWarp, time: Scalar
+) -> Float[Array, " embedding"]:
+    """Embed a time.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      time: Time in [0, 1].
+
+    Returns:
+      The embedding, [embedding].
+    """
+    encoded = encoding.encode(spec.time, time[None], None)
+    return mlp.apply(time_network(spec), params.time, encoded)["embedding"]
+
+
+def displace(
+    spec: TimeWarpSpec, params: TimeWarp, point: Vector, condition: FrameCondition
+) -> Vector:
+    """Compute the displacement from an observed point to the template.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      Template point minus observed point in units of the field, [3].
+    """
+    network = shift_network(spec)
+    # Under vmap over the samples of a ray the time's product is made once.
+    known = embed(spec, params, condition.time)
+    at_time = mlp.with_known(network, params.shift, known)
+    encoded = encoding.encode(spec.position, point, None)
+    return mlp.apply(network, at_time, encoded)["linear"]
+
+
+def features(
+    spec: TimeWarpSpec, params: TimeWarp, point: Vector, condition: FrameCondition
+) -> Float[Array, " features"]:
+    """Compute the features that the radiance network reads next to the grid.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      point: Observed point in units of the field, [3].
+      condition: Conditioning of the frame.
+
+    Returns:
+      The encoded observed point and the embedding of the time, [features].
+    """
+    encoded = encoding.encode(spec.position, point, None)
+    return jnp.concatenate([encoded, embed(spec, params, condition.time)])

@@ -1,0 +1,242 @@
+"""Transient objects of single exposures, and the uncertainty of their colors.
+
+NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "transient objects"): next to the
+static field each photograph has a medium of its own, with density, color and an
+uncertainty `beta`, which represents people and cars. Renders show it, held-out ones
+with codes between those of their neighbors in time, unless it is left out
+(`variants.without_effects`), as in the paper and in `held_out_codes.score`.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from nerfies_jax.fields.effects.effect import Medium, Sample
+from nerfies_jax.nn import mlp
+from nerfies_jax.nn.mlp import MLP, HeadSpec, MLPSpec
+from nerfies_jax.training import losses
+from nerfies_jax.training.effects import (
+    APPEARANCE,
+    FrameCondition,
+    PenaltyContext,
+    Table,
+    Term,
+)
+
+NAME = TABLE = "transient"
+
+
+@dataclasses.dataclass(frozen=True)
+class TransientSpec:
+    """Settings of the medium and its costs. Defaults of the paper and its
+    reimplementation.
+
+    `beta_min` is the least standard deviation of a ray's color, in units of color. It
+    bounds the loss from below. Without it a pixel that is matched exactly would have an
+    unbounded likelihood. `density_weight` is the paper's lambda_u, which keeps the
+    static scene out of the transient medium. `beta_power` is that of `photometric`.
+    Zero is the paper's loss, and one lets a short run learn regions that it called
+    uncertain.
+    """
+
+    code_width: int = 16
+    depth: int = 4
+    width: int = 128
+    beta_min: float = 0.03
+    density_weight: float = 0.01
+    beta_power: float = 0.0
+
+    name = NAME
+
+    def __post_init__(self):
+        if self.code_width < 1:
+            raise ValueError(
+                f"code_width={self.code_width} must be at least 1: all exposures would "
+                "share one transient"
+            )
+        if not (math.isfinite(self.beta_min) and self.beta_min > 0):
+            raise ValueError(
+                f"beta_min={self.beta_min} must be positive: the logarithm of beta is "
+                "unbounded below; the paper has 0.03"
+            )
+        if not (math.isfinite(self.density_weight) and self.density_weight >= 0):
+            raise ValueError(
+                f"density_weight={self.density_weight} must be finite and not negative"
+            )
+        if not 0 <= self.beta_power <= 2:
+            raise ValueError(
+                f"beta_power={self.beta_power} must be in [0, 2]: 0 is the likelihood, "
+                "at 2 colors learn as from a squared error"
+            )
+        network(self, 1)  # refuses wrong depths and widths
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Table of the codes that it reads."""
+        return (Table(TABLE, APPEARANCE, self.code_width),)
+
+    def init(self, key: Key[Array, ""], features: int) -> MLP:
+        """Initialize the network, for a trunk with so many features."""
+        return init(self, key, features)
+
+    def apply(self, params: MLP, sample: Sample, frame: FrameCondition) -> Medium:
+        """Compute the medium at one sample."""
+        return medium(self, params, sample, frame)
+
+    def loss(self, params: MLP | None, context: PenaltyContext) -> dict[str, Term]:
+        """Compute the penalty on its density."""
+        return penalty(self, context)
+
+
+def network(spec: TransientSpec, features: int) -> MLPSpec:
+    """Return the settings of the network from [template features, code] to the medium.
+
+    Args:
+      spec: Settings.
+      features: Width of the template's trunk.
+
+    Returns:
+      Settings of an MLP with the heads "density", "color" and "beta", before
+      activation.
+    """
+    heads = (("density", 1), ("color", 3), ("beta", 1))
+    return MLPSpec(
+        inputs=features + spec.code_width,
+        depth=spec.depth,
+        width=spec.width,
+        heads=tuple((name, HeadSpec(width)) for name, width in heads),
+    )
+
+
+def init(
+    spec: TransientSpec, key: Key[Array, ""], features: int, dtype=jnp.float32
+) -> MLP:
+    """Initialize with Glorot weights: the medium starts about as dense as the static
+    field.
+
+    Args:
+      spec: Settings.
+      key: PRNG key.
+      features: Width of the template's trunk.
+      dtype: Floating-point type of the parameters.
+
+    Returns:
+      The parameters.
+    """
+    return mlp.init(network(spec, features), key, dtype)
+
+
+def medium(
+    spec: TransientSpec, params: MLP, sample: Sample, condition: FrameCondition
+) -> Medium:
+    """Evaluate density, color and uncertainty of the medium at one sample.
+
+    The trunk is shared and gets gradients from both media, as in the paper.
+
+    Args:
+      spec: Settings.
+      params: Parameters.
+      sample: The sample.
+      condition: Conditioning of the frame.
+
+    Returns:
+      The medium.
+    """
+    inputs = jnp.concatenate([sample.features, condition.codes[TABLE]])
+    raw = mlp.apply(network(spec, sample.features.shape[-1]), params, inputs)
+    return Medium(
+        density=jax.nn.softplus(raw["density"][0]),
+        color=jax.nn.sigmoid(raw["color"]),
+        beta=jax.nn.softplus(raw["beta"][0]),
+    )
+
+
+def uncertainty(
+    beta_min: float,
+    weights: Float[Array, "*rays samples"],
+    beta: Float[Array, "*rays samples"],
+) -> Float[Array, "*rays"]:
+    """Compute the standard deviation of a ray's color, beta_min + Σ w β over its
+    samples.
+
+    The paper has β_min inside the sum, so that a ray without a transient has a β of
+    zero and an infinite loss. Like the public reimplementation this adds it outside.
+
+    Args:
+      beta_min: Least standard deviation.
+      weights: Rendering weights of the transient medium, [..., samples].
+      beta: Uncertainty of the samples, [..., samples].
+
+    Returns:
+      Standard deviations, [...].
+    """
+    return beta_min + jnp.sum(weights * beta, axis=-1)
+
+
+def photometric(
+    color: Float[Array, "*rays 3"],
+    truth: Float[Array, "*rays 3"],
+    beta: Float[Array, "*rays"],
+    valid: Bool[Array, "*rays"] | None,
+    beta_power: float = 0.0,
+) -> Float[Array, ""]:
+    """Compute the mean over rays of (|color - truth|² / 2β² + log β) [β]^beta_power.
+
+    At a power of zero these are the first two terms of equation 13, where the second
+    reads log β² / 2. At a given residual the loss is least at β = |color - truth|, and
+    never less than log beta_min. It is negative for good fits. The public
+    reimplementation adds 3 so that curves stay above zero, which changes no gradient,
+    and takes the mean over the channels, which makes the first term a third.
+
+    [β] is β without a gradient. With a power of zero, colors learn at 1/β² of their
+    residuals: regions that a short run has not learned yet are called uncertain, and
+    uncertain regions are not learned, so that the pattern of a floor never appears.
+    With one they learn at 1/β, with two uniformly, and β still converges to |color -
+    truth|.
+
+    Args:
+      color: Rendered colors, [..., 3].
+      truth: Observed colors, [..., 3].
+      beta: Standard deviations, positive, [...].
+      valid: True for observed pixels, [...]. None for all.
+      beta_power: Power in [0, 2].
+
+    Returns:
+      The loss, a scalar.
+
+    References:
+      Martin-Brualla et al. 2021, equation 13. Seitzer et al. 2022, arXiv:2203.09168
+      (β-NLL, whose β is half of this power).
+    """
+    if valid is not None:
+        # Selected before anything is squared or divided: unfilmed pixels may hold NaN.
+        color = jnp.where(valid[..., None], color, 0)
+        truth = jnp.where(valid[..., None], truth, 0)
+        beta = jnp.where(valid, beta, 1)
+    # Divided first: the square of a residual far below beta must not underflow alone.
+    scaled = (color - truth) / beta[..., None]
+    each = jnp.sum(jnp.square(scaled), axis=-1) / 2 + jnp.log(beta)
+    if beta_power:
+        each = each * jax.lax.stop_gradient(beta) ** beta_power
+    return losses.masked_mean(each[..., None], valid)
+
+
+def penalty(spec: TransientSpec, context: PenaltyContext) -> dict[str, Term]:
+    """Compute the mean transient density of the finest samples of the valid rays.
+
+    It is the last term of equation 13, in units of the field. If the box is scaled by
+    s, the same image has densities 1/s times as large.
+
+    Args:
+      spec: Settings.
+      context: Context of the step.
+
+    Returns:
+      The term "density".
+    """
+    density = context.levels[-1].media[NAME].density
+    value = losses.masked_mean(density, context.batch.valid)
+    return {"density": Term(value, spec.density_weight)}

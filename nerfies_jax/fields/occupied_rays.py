@@ -1,0 +1,140 @@
+"""Selection of training rays by occupancy, since empty rays have little left to teach.
+
+Of more candidate rays than a step has, those are used that meet an occupied cell, and a
+share of any (`OccupancySpec`). The grid is recomputed during training, and a cell that
+was found empty stays empty. Müller et al. 2022, arXiv:2201.05989, appendix E.2, skip
+samples in empty cells instead. A step then has as many rays as its samples pay for,
+whereas here it always has the same number of both. Rendering does not depend on the
+selection. The losses of a step are those of its rays, which are harder than the mean.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
+
+from nerfies_jax.fields import skipping
+from nerfies_jax.fields.effects.effect import Batch
+from nerfies_jax.fields.field import Field
+from nerfies_jax.fields.field_ray import Ray, field_ray, filled_along
+from nerfies_jax.fields.occupancy import Cells
+from nerfies_jax.fields.render_ray import is_moved
+from nerfies_jax.training.model import Event, Frames, TrainState
+
+
+def first(field: Field) -> Cells | tuple[()]:
+    """Return the initial cells, all of which may be occupied.
+
+    Args:
+      field: The field.
+
+    Returns:
+      Cells, or an empty tuple if the spec uses no occupancy.
+    """
+    if field.spec.sampling.occupancy is None:
+        return ()
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    found = jax.eval_shape(_survey(field), params, jnp.zeros((), jnp.int32))
+    return jnp.ones(found.shape, bool)
+
+
+def events(field: Field) -> tuple[Event, ...]:
+    """Return the events that recompute the occupancy grid.
+
+    After an event, `aux_state` are the cells that are still occupied.
+
+    Args:
+      field: The field.
+
+    Returns:
+      One event or none.
+
+    Raises:
+      ValueError: If the field's occupancy cannot be computed.
+    """
+    spec = field.spec.sampling.occupancy
+    if spec is None:
+        return ()
+    if field.survey is None or is_moved(field.effects):
+        raise ValueError(
+            "occupancy looks for space that is always empty, and this field cannot be "
+            "surveyed once for all: it moves, has a transient medium, normals, or no "
+            "extent; leave it out (sampling.occupancy=none)"
+        )
+    survey = jax.jit(_survey(field))
+
+    def apply(state: TrainState, frames: Frames) -> TrainState:
+        del frames
+        # Surveyed alone, cells that no ray sees any more fill with what the tables of a
+        # hash grid happen to say there: after 2400 steps of Blender lego 10 in a
+        # hundred, and 25.6 dB for 25.9.
+        left = state.aux_state & survey(state.params, state.step)
+        return state._replace(aux_state=left)
+
+    when = tuple(range(spec.start, field.spec.steps, spec.every))
+    return (Event("survey", when, apply),)
+
+
+def _survey(field: Field) -> Callable[[PyTree, Int[Array, ""]], Cells]:
+    """Cells that any level fills."""
+    survey = field.survey
+    assert survey is not None
+    return lambda params, step: survey(params, step)[skipping.GUIDE]
+
+
+def meets(occupied: Cells, ray: Ray, half_side: float) -> Bool[Array, ""]:
+    """Return whether a ray meets an occupied cell, or leaves the grid.
+
+    Args:
+      occupied: Occupied cells.
+      ray: The ray in units of the field.
+      half_side: Half side of the grid in units of the field.
+
+    Returns:
+      A boolean scalar.
+    """
+    return jnp.any(filled_along(occupied, ray, half_side))
+
+
+def chosen(
+    meeting: Bool[Array, " candidates"], count: int, anywhere: int
+) -> Int[Array, " count"]:
+    """Choose the rays of a step: the first `anywhere`, then those that meet a cell.
+
+    Other candidates fill up if too few do.
+
+    Args:
+      meeting: True for candidates that meet an occupied cell, [candidates].
+      count: Number of rays.
+      anywhere: Number of rays that need not meet a cell.
+
+    Returns:
+      Indices of candidates, [count].
+    """
+    order = jnp.argsort(~meeting[anywhere:], stable=True)[: count - anywhere]
+    return jnp.concatenate([jnp.arange(anywhere), anywhere + order])
+
+
+def learned_from(field: Field, occupied: Cells, candidates: Batch) -> Batch:
+    """Choose the rays of a step from candidates.
+
+    Args:
+      field: The field.
+      occupied: Occupied cells.
+      candidates: `OccupancySpec.candidates` times as many rays as a step has.
+
+    Returns:
+      The rays of the step.
+    """
+    spec, extent = field.spec.sampling.occupancy, field.spec.extent
+    assert spec is not None
+    assert extent is not None
+    lines = jax.vmap(functools.partial(field_ray, field.metadata))(
+        candidates.origin, candidates.direction, candidates.cosine
+    )
+    meeting = jax.vmap(lambda ray: meets(occupied, ray, extent))(lines)
+    count = len(meeting) // spec.candidates
+    rows = chosen(meeting & candidates.valid, count, round(spec.anywhere * count))
+    return jax.tree.map(lambda leaf: leaf[rows], candidates)

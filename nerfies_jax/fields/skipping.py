@@ -1,0 +1,413 @@
+"""Rendering of a frame of a radiance field with empty-space skipping.
+
+The samples are those of `render_ray`, so the image is that of the full quadrature
+except for the contributions of skipped samples. A sample is skipped in a cell that was
+found empty (`survey`) or behind an opaque region. The others are gathered into dense
+batches, and the networks are evaluated at these alone. Warps with long wavelengths are
+evaluated on a `frustum_grid` of the frame, and then the cells are those of the
+template, the same at all times.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from nerfies_jax.fields import compositing, frustum_grid, occupancy, sampling
+from nerfies_jax.fields.field_ray import (
+    field_ray_through,
+    fine_distances,
+    first_distances,
+)
+from nerfies_jax.fields.render_ray import (
+    Bound,
+    asked_at,
+    color_offset,
+    is_moved,
+    radiance_at,
+)
+from nerfies_jax.geometry import rays
+from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.geometry.precision import exact_einsum
+from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.model import Rendering
+
+PyTree = Any
+# By level, "coarse" and "fine", and of all levels together what guides the samples.
+Occupancy = dict[str, occupancy.Cells]
+GUIDE = "guide"
+
+# Optical depth that all samples skipped on a ray straight ahead have together at most,
+# as far as the survey saw the densest of each cell: 5 % of the light. Four frames of
+# Blender lego after 3000 steps: 67 to 72 dB from the whole quadrature, 27.515 dB from
+# the truth for 27.512, in 514 ms for 619 with 0.01, at which it was 69 to 78.
+SKIPPED_DEPTH = 0.05
+# Optical depth from near to far above which a cell guides samples. Thinner cells are
+# haze that no ray has trained yet: with 0.01 two of three cells of Blender lego are
+# occupied after 1000 steps, with this 3 of a hundred.
+GUIDE_DEPTH = 3.0
+OPAQUE_DEPTH = 7.0  # e^-7 = 9e-4 of the light passes
+# Dynamic fields, unless their warps are read on a grid, are surveyed anew for every
+# frame, and each look costs a warp of every cell.
+STILL_CELLS, MOVING_CELLS = 64, 40
+LOOKS = 2  # at each cell
+BATCH = 2048  # points asked at once
+# Rays drawn at once. Twice as many need more memory than an allocator keeps (32 MB with
+# glibc): a frame of `nerfies-grid-small` took 238 ms for 224, 13 of them the system's.
+BLOCK = 8192
+STAGES = 4  # in which a ray is followed; behind what is opaque no further one is
+
+
+def usable(spec, effects) -> bool:
+    """Return whether a field can be surveyed before its frames are rendered.
+
+    This is not possible if a second medium shares its rays, if color depends on
+    surfaces, or if the size of the captured volume is unknown.
+
+    Args:
+      spec: The scene.
+      effects: The effects of the field.
+
+    Returns:
+      True if it can.
+    """
+    return (
+        spec.extent is not None
+        and all(effect.medium is None for effect in effects)
+        and all(effect.surface is None for effect in effects)
+    )
+
+
+def survey(
+    bound: Bound,
+    condition: FrameCondition,
+    shown: occupancy.Cells | None = None,
+) -> Occupancy:
+    """Find the cells that each level's density fills at the time of one frame.
+
+    A cell is filled if a random point in it is so dense that light passing through
+    nothing else from near to far would meet an optical depth above `SKIPPED_DEPTH`.
+    Samples are guided (`OccupancySpec`) by the cells of any level above `GUIDE_DEPTH`.
+
+    Args:
+      bound: The field with its parameters.
+      condition: Conditioning of the frame.
+      shown: Cells that the image can show. Cells that are neither shown nor adjacent to
+        such a cell are not evaluated and count as filled. None for all.
+
+    Returns:
+      Occupied cells by level.
+    """
+    spec, metadata = bound.spec, bound.metadata
+    cells = cells_across(bound)
+    asked = jnp.ones(cells**3, bool)
+    if shown is not None:
+        asked = occupancy.dilated(shown).ravel()
+    span = (metadata.far - metadata.near) * metadata.scale
+    names = tuple(bound.params["template"])
+    dtype = jax.tree.leaves(bound.params["template"])[0].dtype
+    direction = jnp.zeros(3, dtype).at[2].set(1)  # no density depends on it
+    offset = {n: color_offset(bound, n, direction, condition) for n in names}
+
+    def look(found, number):
+        key = jax.random.fold_in(jax.random.key(0), number)
+
+        def densities(point):
+            place = asked_at(bound, point, condition)
+            return {
+                name: radiance_at(bound, name, place, offset[name], condition).density
+                for name in names
+            }
+
+        index = jnp.arange(cells**3, dtype=jnp.int32)
+        point = occupancy.random_points(key, index, cells, spec.extent, dtype)
+        seen = compacted(lambda cell: jax.vmap(densities)(point[cell]), asked)
+        filled = {name: new * span > SKIPPED_DEPTH for name, new in seen.items()}
+        if guided:
+            most = functools.reduce(jnp.maximum, seen.values())
+            filled[GUIDE] = most * span > GUIDE_DEPTH
+        return jax.tree.map(jnp.logical_or, found, filled), None
+
+    guided = spec.sampling.occupancy is not None
+    kinds = (*names, GUIDE) if guided else names
+    start = {name: jnp.zeros(cells**3, bool) for name in kinds}
+    found, _ = jax.lax.scan(look, start, jnp.arange(LOOKS, dtype=jnp.int32))
+    whole = (cells,) * 3
+    return {
+        name: occupancy.dilated(occupied.reshape(whole)) | ~asked.reshape(whole)
+        for name, occupied in found.items()
+    }
+
+
+def cells_across(bound: Bound) -> int:
+    """Return the number of cells of a survey along each axis.
+
+    Args:
+      bound: The field with its parameters.
+
+    Returns:
+      The number of cells.
+    """
+    return MOVING_CELLS if is_moved(bound.effects) else STILL_CELLS
+
+
+def shown_cells(bound: Bound, camera: Camera, size: tuple[int, int]) -> occupancy.Cells:
+    """Find the cells that rays of an image may meet between the near and far planes.
+
+    Cells are excluded if their eight corners lie beyond one of six planes: these two,
+    and four that bound the rays of the image's border.
+
+    Args:
+      bound: The field with its parameters.
+      camera: The camera.
+      size: Width and height of the image in pixels.
+
+    Returns:
+      Booleans, [cells, cells, cells].
+    """
+    metadata, dtype = bound.metadata, camera.position.dtype
+    assert bound.spec.extent is not None  # of the cells
+
+    def seen(direction):
+        return exact_einsum("ij,...j->...i", camera.camera_from_world, direction)
+
+    centers = rays.pixel_centers(size, dtype)
+    border = jnp.concatenate([centers[0], centers[-1], centers[:, 0], centers[:, -1]])
+    ray = seen(jax.vmap(lambda at: rays.pixel_ray(camera, at).direction)(border))
+    slope = ray[:, :2] / ray[:, 2:]
+    corner = occupancy.corners(cells_across(bound), bound.spec.extent, dtype)
+    world = corner / metadata.scale + jnp.asarray(metadata.center, dtype)
+    place = seen(world - camera.position)
+    lateral, depth = place[..., :2], place[..., 2:]
+    beyond = jnp.concatenate(
+        [
+            depth < metadata.near,
+            depth > metadata.far,
+            lateral < slope.min(0) * depth,
+            lateral > slope.max(0) * depth,
+        ],
+        axis=-1,
+    )
+    window = (2, 2, 2, 1)
+    all_beyond = jax.lax.reduce_window(
+        beyond, True, jax.lax.bitwise_and, window, (1, 1, 1, 1), "VALID"
+    )
+    return ~jnp.any(all_beyond, axis=-1)
+
+
+def draw(
+    bound: Bound,
+    occupied: Occupancy,
+    camera: Camera,
+    condition: FrameCondition,
+    size: tuple[int, int],
+) -> Rendering:
+    """Render a whole frame. Not differentiable, since the number of evaluations varies.
+
+    Args:
+      bound: The field with its parameters.
+      occupied: Occupied cells from `survey`.
+      camera: The camera.
+      condition: Conditioning of the frame.
+      size: Width and height of the image in pixels.
+
+    Returns:
+      The rendered image.
+    """
+    width, height = size
+    pixels = width * height
+    blocks = -(-pixels // BLOCK)
+    block = -(-pixels // blocks)
+    centers = rays.pixel_centers(size, camera.position.dtype).reshape(-1, 2)
+    centers = jnp.pad(centers, ((0, blocks * block - pixels), (0, 0)), mode="edge")
+    grid = None
+    if frustum_grid.resolves(bound):
+        grid = frustum_grid.displacements(bound, camera, condition, size)
+
+    def part(position):
+        columns = None
+        if grid is not None:
+            columns = jax.vmap(lambda at: frustum_grid.column(grid, at, size))(position)
+        return _block(bound, occupied, camera, condition, position, columns)
+
+    drawn = jax.lax.map(part, centers.reshape(blocks, block, 2))
+    return jax.tree.map(
+        lambda x: x.reshape(-1, *x.shape[2:])[:pixels].reshape(
+            height, width, *x.shape[2:]
+        ),
+        drawn,
+    )
+
+
+def _block(bound, occupied, camera, condition, position, columns):
+    """Render the rays of some pixels, with `columns` of a grid if any."""
+    plan, behind = bound.spec.sampling, bound.metadata.background
+    ray, cosine = jax.vmap(lambda p: field_ray_through(bound.metadata, camera, p))(
+        position
+    )
+    guide = occupied.get(GUIDE)
+    distance = jax.vmap(lambda ray: first_distances(bound.spec, ray, None, guide))(ray)
+
+    def spacing_of(distance, far):
+        end = compositing.AT_INFINITY
+        if behind is not None:
+            end = jnp.maximum(far - distance[-1], 0)
+        return compositing.intervals(distance, end)
+
+    def ask(name, distance, values, before=None):
+        spacing = jax.vmap(spacing_of)(distance, ray.far)
+        moved = None
+        if columns is not None:
+            moved = jax.vmap(frustum_grid.along)(columns, ray, distance)
+        seen = name, occupied[name], ray, condition
+        answer, asked = _ask(bound, *seen, distance, spacing, values, before, moved)
+        return answer[..., 0] * spacing, answer[..., 1:], asked
+
+    before = None
+    if plan.fine:
+        depth, _, asked = ask("fine" if plan.shared else "coarse", distance, 1)
+
+        def refined(distance, depth, asked):
+            weights = compositing.weights(depth)
+            drawn = sampling.refine(None, distance, weights, plan.fine)
+            every = fine_distances(bound.spec, bound.metadata, distance, drawn)
+            if asked is None or not plan.union:
+                return every, None
+            place = sampling.merged_places(distance, drawn)[: plan.coarse]
+
+            def among(x):
+                return jnp.zeros((len(every), *x.shape[1:]), x.dtype).at[place].set(x)
+
+            return every, jax.tree.map(among, asked)
+
+        distance, before = jax.vmap(refined)(distance, depth, asked)
+    depth, color, _ = ask("fine", distance, 4, before)
+    background = None if behind is None else jnp.asarray(behind, distance.dtype)
+    whole = jax.vmap(
+        lambda depth, color, distance: compositing.composite(
+            compositing.weights(depth), color, distance, background
+        )
+    )(depth, color, distance)
+    z_depth = whole.distance * cosine / bound.metadata.scale
+    return Rendering(whole.color, whole.alpha, z_depth)
+
+
+class _Asked(NamedTuple):
+    """Coordinates at which the template was evaluated, zero for skipped samples."""
+
+    known: Bool[Array, "rays samples"]
+    place: tuple[Float[Array, "rays samples 3"], tuple[Array, ...]]
+
+
+def _ask(
+    bound, name, occupied, ray, condition, distance, spacing, values, before, moved
+):
+    """Density, or density and color, [rays, samples, values], zero if skipped.
+
+    `moved` is the displacement of all samples, if warps are read on a grid. Otherwise
+    warps and ambient coordinates of the samples `before` are not computed again.
+    Without those the ones computed here are returned as well.
+    """
+    count, samples = distance.shape
+    point = ray.origin[:, None] + distance[..., None] * ray.direction[:, None]
+    if moved is not None:
+        point = point + moved
+    wanted = occupancy.at(occupied, point, bound.spec.extent)
+    if bound.metadata.background is None:
+        wanted = wanted.at[:, -1].set(True)  # it stands for all behind it
+    offset = jax.vmap(lambda d: color_offset(bound, name, d, condition))(ray.direction)
+    width = -(-samples // STAGES)  # samples of a stage
+
+    def staged(x):
+        padding = ((0, 0), (0, STAGES * width - samples), *[(0, 0)] * (x.ndim - 2))
+        x = jnp.pad(x, padding).reshape(count, STAGES, width, *x.shape[2:])
+        return jnp.moveaxis(x, 1, 0)
+
+    def whole(x):
+        x = jnp.moveaxis(x.reshape(STAGES, count, width, *x.shape[2:]), 0, 1)
+        return x.reshape(count, STAGES * width, *x.shape[3:])[:, :samples]
+
+    def said(index, place):
+        radiance = radiance_at(bound, name, place, offset[index // width], condition)
+        every = jnp.concatenate([radiance.density[None], radiance.color])
+        return every[:values]
+
+    def stage(passed, given):
+        spacing, wanted, distance, before, moved = given
+        wanted = wanted & (passed < OPAQUE_DEPTH)[:, None]
+        wanted, distance, before, moved = jax.tree.map(
+            lambda x: x.reshape(-1, *x.shape[2:]), (wanted, distance, before, moved)
+        )
+
+        def place_of(index):
+            row = index // width
+            at = rays.point_at(ray.origin[row], ray.direction[row], distance[index])
+            if moved is None:
+                return asked_at(bound, at, condition)
+            return at + moved[index], ()
+
+        if before is None:
+            kept = moved is None and is_moved(bound.effects)
+
+            def anew(index):
+                place = place_of(index)
+                return said(index, place), place if kept else None
+
+            answer, place = compacted(jax.vmap(anew), wanted)
+            asked = _Asked(wanted, place) if kept else None
+        else:
+            more = compacted(jax.vmap(place_of), wanted & ~before.known)
+            place = jax.tree.map(jnp.add, before.place, more)  # one of both is zero
+
+            def again(index):
+                return said(index, jax.tree.map(lambda x: x[index], place))
+
+            answer, asked = compacted(jax.vmap(again), wanted), None
+        depth = answer[:, 0].reshape(spacing.shape) * spacing
+        return passed + jnp.sum(depth, axis=1), (answer, asked)
+
+    given = jax.tree.map(staged, (spacing, wanted, distance, before, moved))
+    _, found = jax.lax.scan(stage, jnp.zeros(count, distance.dtype), given)
+    return jax.tree.map(whole, found)
+
+
+def compacted(
+    ask: Callable[[Int[Array, " batch"]], PyTree], wanted: Bool[Array, " places"]
+) -> PyTree:
+    """Evaluate a function only where it is wanted, batch by batch.
+
+    Args:
+      ask: Function of indices [batch], whose results have a leading axis [batch].
+      wanted: True for places to evaluate, [places].
+
+    Returns:
+      Results with a leading axis [places], zero where not wanted.
+    """
+    places = wanted.shape[0]
+    order = jnp.cumsum(wanted, dtype=jnp.int32)
+    rows = math.ceil(places / BATCH) * BATCH
+    slot = jnp.where(wanted, order - 1, rows)
+    listed = jnp.zeros(rows, jnp.int32)
+    listed = listed.at[slot].set(jnp.arange(places, dtype=jnp.int32), mode="drop")
+
+    def more(state):
+        return state[0] * BATCH < order[-1]
+
+    def batch(state):
+        number, answers = state
+        start = number * BATCH
+        place = jax.lax.dynamic_slice(listed, (start,), (BATCH,))
+        given = start + jnp.arange(BATCH, dtype=jnp.int32) < order[-1]
+        row = jnp.where(given, place, places)
+        answers = jax.tree.map(
+            lambda all_, some: all_.at[row].set(some, mode="drop"), answers, ask(place)
+        )
+        return number + 1, answers
+
+    one = jax.eval_shape(ask, jnp.zeros(BATCH, jnp.int32))
+    start = jax.tree.map(lambda x: jnp.zeros((places, *x.shape[1:]), x.dtype), one)
+    return jax.lax.while_loop(more, batch, (jnp.zeros((), jnp.int32), start))[1]

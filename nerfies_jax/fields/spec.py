@@ -1,0 +1,297 @@
+"""Settings of a radiance field and of its training."""
+
+import dataclasses
+import math
+from typing import TypeVar
+
+import optax
+
+from nerfies_jax.capture.scene_metadata import SceneMetadata
+from nerfies_jax.fields.effects import moving_mask, records, smoothness, surface
+from nerfies_jax.fields.effects.ambient import AmbientSpec
+from nerfies_jax.fields.effects.appearance import AppearanceSpec
+from nerfies_jax.fields.effects.background import BackgroundSpec
+from nerfies_jax.fields.effects.elastic import ElasticSpec
+from nerfies_jax.fields.effects.moving_mask import MovingMaskSpec
+from nerfies_jax.fields.effects.protocols import Conditioning, Medium, Template, Warp
+from nerfies_jax.fields.effects.records import FieldRecord
+from nerfies_jax.fields.effects.scene_flow import SceneFlowSpec
+from nerfies_jax.fields.effects.smoothness import SmoothnessSpec
+from nerfies_jax.fields.effects.surface import SurfaceSpec
+from nerfies_jax.fields.effects.time_condition import TimeSpec
+from nerfies_jax.fields.effects.time_warp import TimeWarpSpec
+from nerfies_jax.fields.effects.transient import TransientSpec
+from nerfies_jax.fields.effects.warp import WarpSpec
+from nerfies_jax.fields.occupancy import OccupancySpec
+from nerfies_jax.fields.template import TemplateSpec
+from nerfies_jax.training import schedules
+from nerfies_jax.training.effects import Table
+from nerfies_jax.training.extensions import Settings, check
+from nerfies_jax.training.protocols import Optimizer, Regularizer
+from nerfies_jax.training.track_start import FieldStartSpec
+
+OPTIMIZERS = {"adam": optax.scale_by_adam}
+PROTOCOLS = {"transient": Medium, "warp": Warp}
+
+
+@dataclasses.dataclass(frozen=True)
+class SamplingSpec:
+    """Settings of the samples along a ray. The defaults are those of NeRF.
+
+    `fine` samples are drawn by the weights of the coarse level, and 0 leaves one level.
+    The fine level evaluates both, or only the new ones if `union` is false. Then half
+    as many samples are evaluated by the larger network, and few of them in empty space.
+    `block` rays are rendered at a time in a whole frame, so memory does not grow with
+    the image.
+    """
+
+    coarse: int = 64
+    fine: int = 128
+    spacing: str = "linear"  # or "disparity"
+    jitter: bool = True  # while training
+    shared: bool = False  # one network for both levels (D-NeRF)
+    union: bool = True  # the fine level sees the coarse samples too
+    block: int = 1024
+    occupancy: OccupancySpec | None = None  # None: the rays of a step are any
+
+    def __post_init__(self):
+        if self.coarse < 3 or self.fine < 0 or self.block < 1:
+            raise ValueError(
+                "sampling needs coarse >= 3, fine >= 0 and block >= 1, got "
+                f"coarse={self.coarse}, fine={self.fine}, block={self.block}"
+            )
+        if self.spacing not in ("linear", "disparity"):
+            raise ValueError(
+                f"spacing={self.spacing!r} must be 'linear' or 'disparity'"
+            )
+        if self.spacing != "linear" and self.occupancy is not None:
+            raise ValueError(
+                f"spacing={self.spacing!r} is of samples along all of a ray, and with "
+                "occupancy they are where cells are filled: set occupancy=none, or "
+                "spacing='linear'"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class RadianceScene:
+    """Settings of a radiance field and of its training. An effect of None is absent."""
+
+    steps: int
+    template: TemplateSpec | Template = TemplateSpec()
+    coarse: TemplateSpec | Template | None = (
+        None  # of the coarse level; None is like the fine one
+    )
+    sampling: SamplingSpec = SamplingSpec()
+    rays: int = 1024  # in a step
+    # In so many equal parts, on as many devices or one after the other: less memory.
+    # A part's losses are means over its own valid rays.
+    micro_batches: int = 1
+    # Longest half-side of the filmed volume in units of the field; None keeps the
+    # capture's own coordinates.
+    extent: float | None = 1.0
+    # Of Adam, falling to `learning_rate_end` along a line in the logarithm.
+    learning_rate: float = 5e-4
+    learning_rate_end: float = 5e-5
+    template_rate: float = 1.0  # times that: of the template, for tables learn faster
+    table_rate: float = 1.0  # times that again: of the tables alone
+    optimizer: str | Optimizer = "adam"
+    density_noise: float = 0.0  # standard deviation, while training
+    appearance: AppearanceSpec | None = None
+    transient: TransientSpec | Medium | Settings | None = None
+    time: TimeSpec | None = None
+    warp: WarpSpec | TimeWarpSpec | Warp | Settings | None = None
+    ambient: AmbientSpec | None = None
+    elastic: ElasticSpec | None = None
+    background: BackgroundSpec | None = None
+    scene_flow: SceneFlowSpec | None = None
+    smoothness: SmoothnessSpec | None = None
+    mask: MovingMaskSpec | None = None
+    surface: SurfaceSpec | None = None
+    # Beside those with a field of their own.
+    conditioning: tuple[Conditioning | Settings, ...] = ()
+    regularizers: tuple[Regularizer | Settings, ...] = ()
+    start: FieldStartSpec = FieldStartSpec()
+
+    def __post_init__(self):
+        for name, protocol in PROTOCOLS.items():
+            if getattr(self, name) is not None:
+                check(name, getattr(self, name), protocol)
+        for one in self.conditioning:
+            check("conditioning", one, Conditioning)
+        for one in self.regularizers:
+            check("regularizers", one, Regularizer)
+        if self.steps < 1 or self.rays < 1:
+            raise ValueError(
+                f"train for at least one step of one ray, got steps={self.steps}, "
+                f"rays={self.rays}"
+            )
+        if self.micro_batches < 1 or self.rays % self.micro_batches:
+            raise ValueError(
+                f"rays={self.rays} cannot be split into micro_batches="
+                f"{self.micro_batches} equal parts; choose a multiple, or "
+                "micro_batches=1"
+            )
+        if isinstance(self.optimizer, str) and self.optimizer not in OPTIMIZERS:
+            raise ValueError(
+                f"unknown optimizer {self.optimizer!r}; choose from "
+                f"{sorted(OPTIMIZERS)}, or pass a gradient transformation of optax"
+            )
+        if not 0 <= self.density_noise < math.inf:
+            raise ValueError(
+                f"density_noise={self.density_noise} must be finite and not negative"
+            )
+        for name in ("template_rate", "table_rate"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"{name}={getattr(self, name)} must be positive and finite"
+                )
+        templates = (self.template, self.coarse or self.template)
+        others = [one for one in templates if not isinstance(one, TemplateSpec)]
+        for one in others:
+            check("template", one, Template)
+        if others:
+            _refuse_beside_other_template(self)
+        if any(getattr(one, "reads_time", False) for one in templates):
+            raise ValueError(
+                "a template is read at a point, at whatever time, and its planes have "
+                "none: set position.moments=none (scene_flow.network may have them)"
+            )
+        if self.extent is not None and not 0 < self.extent < math.inf:
+            raise ValueError(
+                f"extent={self.extent} must be positive and finite, or none"
+            )
+        schedules.check_falling(self.learning_rate, self.learning_rate_end)
+        for name in ("elastic", "background"):
+            if getattr(self, name) is not None and self.warp is None:
+                raise ValueError(
+                    f"{name} holds the warp in check, and there is none; set warp or "
+                    f"{name}=none"
+                )
+        if self.mask is not None and not isinstance(self.warp, WarpSpec):
+            raise ValueError(
+                "a mask of what moves guides a warp, and there is none that reads it; "
+                "set warp=WarpSpec or mask=none"
+            )
+        moves = self.warp is not None or self.scene_flow is not None
+        if self.start.motion == "tracks" and not moves:
+            raise ValueError(
+                'start.motion="tracks" fits a warp or a scene flow to tracks, and '
+                "there is neither; set one of them, or start.motion=none"
+            )
+
+
+def _refuse_beside_other_template(spec):
+    """Raise ValueError for what only the built-in template can serve."""
+    alone = {
+        "density_noise": spec.density_noise == 0,
+        "table_rate": spec.table_rate == 1,
+        "transient": spec.transient is None,
+        "scene_flow": spec.scene_flow is None,
+        "surface": spec.surface is None,
+        "smoothness": spec.smoothness is None,
+    }
+    for name, fine in alone.items():
+        if not fine:
+            raise ValueError(
+                f"{name}={getattr(spec, name)!r} needs the layers of the built-in "
+                "template (TemplateSpec), and this scene has another; leave it out"
+            )
+
+
+def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecord, ...]:
+    """The effects that the spec asks for, in the order in which they act."""
+
+    def bound(part):
+        return part.bind(spec.steps, metadata) if hasattr(part, "bind") else part
+
+    def conditioning(part):
+        return records.compile_conditioning(bound(part))
+
+    def medium(part):
+        return records.compile_medium(bound(part), spec.template.width)
+
+    def warp(part):
+        return records.compile_warp(bound(part))
+
+    def regularizer(part):
+        return records.compile_regularizer(bound(part))
+
+    def surfaces(one):
+        widths = {name: net.width for name, net in templates_of(spec).items()}
+        return surface.effect(one, widths)
+
+    smooth = None
+    if spec.smoothness is not None:
+        smooth = smoothness.Bound(spec.smoothness, templates_of(spec))
+    bent, slice_ = spec.warp, spec.ambient
+    if isinstance(bent, WarpSpec) and spec.start.motion == "tracks":
+        # Fitted with all bands open, and closing them would undo it.
+        bent = dataclasses.replace(bent, anneal_steps=None)
+    if spec.mask is not None and isinstance(bent, WarpSpec):
+        bent = guided(bent)
+    if spec.mask is not None and slice_ is not None:
+        slice_ = guided(slice_)
+    built = (
+        (spec.appearance, conditioning),
+        (spec.transient, medium),
+        (spec.time, conditioning),
+        (bent, warp),
+        (slice_, conditioning),
+        (spec.elastic, regularizer),
+        (spec.background, regularizer),
+        (spec.scene_flow, medium),
+        (smooth, regularizer),
+        (spec.mask, conditioning),
+        (spec.surface, surfaces),
+        *((one, conditioning) for one in spec.conditioning),
+        *((one, regularizer) for one in spec.regularizers),
+    )
+    return tuple(make(one) for one, make in built if one is not None)
+
+
+def optimizer_of(spec: RadianceScene) -> Optimizer:
+    """Return the optimizer of a field, whose updates are scaled by learning rates."""
+    own = spec.optimizer
+    return OPTIMIZERS[own]() if isinstance(own, str) else own
+
+
+GuidedT = TypeVar("GuidedT", WarpSpec, AmbientSpec)
+
+
+def guided(one: GuidedT) -> GuidedT:
+    """Add the mask of moving points to the guides of a warp or ambient surface.
+
+    Args:
+      one: Settings, or None.
+
+    Returns:
+      The changed settings.
+    """
+    if moving_mask.NAME in one.guides:
+        return one
+    return dataclasses.replace(one, guides=(*one.guides, moving_mask.NAME))
+
+
+def tables_of(effects: tuple[FieldRecord, ...]) -> tuple[Table, ...]:
+    """The latent tables of all effects, each once."""
+    tables: dict[str, Table] = {}
+    for effect in effects:
+        for table in effect.tables:
+            if tables.setdefault(table.name, table) != table:
+                raise ValueError(
+                    f"two effects share the codes {table.name!r} and disagree: "
+                    f"{tables[table.name]} and {table}; give them one code_width"
+                )
+    return tuple(tables.values())
+
+
+def templates_of(spec: RadianceScene) -> dict[str, TemplateSpec | Template]:
+    """The networks of all levels that have one, by name."""
+    single = spec.sampling.fine == 0 or spec.sampling.shared
+    names = ("fine",) if single else ("coarse", "fine")
+    return {name: template_of(spec, name) for name in names}
+
+
+def template_of(spec: RadianceScene, level: str) -> TemplateSpec | Template:
+    """The network of one level, "coarse" or "fine"."""
+    return spec.coarse if level == "coarse" and spec.coarse else spec.template

@@ -1,0 +1,236 @@
+"""Name, unit, direction and meaning of the metrics in `metrics.json`."""
+
+from typing import NamedTuple
+
+from nerfies_jax.metrics.clock import Metric
+
+GROUPS = ("Quality", "Geometry", "Motion", "Time", "Memory", "Size")
+
+
+class Entry(NamedTuple):
+    """Name, group, unit, direction and explanation of a metric."""
+
+    name: str
+    group: str  # one of GROUPS
+    unit: str  # "dB", "ms", "bytes"; "" for a share or a count
+    direction: str  # which is better: "higher", "lower", or "equal" for neither
+    explanation: str  # one sentence
+
+
+METRICS: dict[str, Entry] = {
+    "heldout.psnr": Entry(
+        *("PSNR", "Quality", "dB", "higher"),
+        "Mean peak signal-to-noise ratio between the rendered and the observed 8-bit "
+        "images, over the held-out frames.",
+    ),
+    "heldout.ssim": Entry(
+        *("SSIM", "Quality", "", "higher"),
+        "Mean structural similarity over the held-out frames; 1 means identical.",
+    ),
+    "heldout.ms_ssim": Entry(
+        *("MS-SSIM", "Quality", "", "higher"),
+        "Mean structural similarity over five scales of the held-out frames; 1 means "
+        "identical.",
+    ),
+    "heldout.lpips": Entry(
+        *("LPIPS", "Quality", "", "lower"),
+        "Mean perceptual distance between network features of the rendered and the "
+        "observed images, over the held-out frames.",
+    ),
+    "heldout.moving_psnr": Entry(
+        *("PSNR, dynamic regions", "Quality", "dB", "higher"),
+        "The PSNR of the pixels that show moving objects.",
+    ),
+    "heldout.moving_ssim": Entry(
+        *("SSIM, dynamic regions", "Quality", "", "higher"),
+        "The SSIM of the pixels that show moving objects.",
+    ),
+    "heldout.static_psnr": Entry(
+        *("PSNR, static regions", "Quality", "dB", "higher"),
+        "The PSNR of the pixels that show the static part of the scene.",
+    ),
+    "heldout.fitted_psnr": Entry(
+        *("PSNR, fitted codes", "Quality", "dB", "higher"),
+        "The PSNR of the right half of held-out frames, with their appearance code or "
+        "exposure fitted to the left half.",
+    ),
+    "heldout.fitted_ssim": Entry(
+        *("SSIM, fitted codes", "Quality", "", "higher"),
+        "The SSIM of the right half of held-out frames, with their appearance code or "
+        "exposure fitted to the left half.",
+    ),
+    "heldout.camera_fitted_psnr": Entry(
+        *("PSNR, fitted cameras", "Quality", "dB", "higher"),
+        "The PSNR of held-out frames whose cameras were fitted to the observed image.",
+    ),
+    "heldout.frames": Entry(
+        *("Frames scored", "Quality", "", "equal"),
+        "Number of held-out frames that the scores are averaged over.",
+    ),
+    "heldout.unscored": Entry(
+        *("Pixels not scored", "Quality", "", "lower"),
+        "Share of the held-out pixels that were not observed, or that the model cannot "
+        "render.",
+    ),
+    "heldout.depth_abs_rel": Entry(
+        *("Relative depth error", "Geometry", "", "lower"),
+        "Mean absolute error of the rendered depth, divided by the true depth.",
+    ),
+    "heldout.depth_within_delta": Entry(
+        *("Depth accuracy", "Geometry", "", "higher"),
+        "Share of the pixels whose rendered depth is within a factor of 1.25 of the "
+        "true depth.",
+    ),
+    "heldout.depth_median": Entry(
+        *("Median depth error", "Geometry", "scene units", "lower"),
+        "Median absolute error of the rendered z-depth.",
+    ),
+    "heldout.depth_rmse": Entry(
+        *("RMS depth error", "Geometry", "scene units", "lower"),
+        "Root mean square error of the rendered z-depth.",
+    ),
+    "heldout.moving_depth_median": Entry(
+        *("Median depth error, dynamic regions", "Geometry", "scene units", "lower"),
+        "The median depth error of the pixels that show moving objects.",
+    ),
+    "heldout.moving_depth_rmse": Entry(
+        *("RMS depth error, dynamic regions", "Geometry", "scene units", "lower"),
+        "The RMS depth error of the pixels that show moving objects.",
+    ),
+    "cameras.ate": Entry(
+        *("Camera position error", "Geometry", "scene units", "lower"),
+        "Root mean square error of the fitted camera positions after rigid alignment.",
+    ),
+    "cameras.rotation_error": Entry(
+        *("Camera rotation error", "Geometry", "deg", "lower"),
+        "Mean error of the fitted rotation from each camera to the next.",
+    ),
+    "baseline.neighbor_mean": Entry(
+        *("Baseline: mean of two neighbors", "Motion", "dB", "equal"),
+        "The PSNR of the mean of the two training frames nearest in time; a model that "
+        "scores less has learned little.",
+    ),
+    "baseline.static": Entry(
+        *("Baseline: static scene", "Motion", "dB", "higher"),
+        "The PSNR of the model's own renders averaged over time, which have no motion.",
+    ),
+    "motion.gain": Entry(
+        *("Gain from motion", "Motion", "dB", "higher"),
+        "The PSNR of the held-out frames minus that of the static baseline.",
+    ),
+    "motion.moving_gain": Entry(
+        *("Gain from motion, dynamic regions", "Motion", "dB", "higher"),
+        "The gain from motion of the pixels that show moving objects.",
+    ),
+    "flow.epe": Entry(
+        *("Optical flow error", "Motion", "px", "lower"),
+        "Mean end-point error of the model's flow to the next frame.",
+    ),
+    "flow.moving_epe": Entry(
+        *("Optical flow error, dynamic regions", "Motion", "px", "lower"),
+        "The flow error of the pixels that show moving objects.",
+    ),
+    "flow.outliers": Entry(
+        *("Optical flow outliers", "Motion", "", "lower"),
+        "Share of the pixels whose flow is off by more than 3 px and more than 5 % of "
+        "its length.",
+    ),
+    "flow.missing": Entry(
+        *("Optical flow missing", "Motion", "", "lower"),
+        "Share of the pixels for which the model gives no flow.",
+    ),
+    "tracks.epe": Entry(
+        *("3D track error", "Motion", "scene units", "lower"),
+        "Mean distance of tracked points from their true positions.",
+    ),
+    "tracks.static_epe": Entry(
+        *("Baseline: static 3D tracks", "Motion", "scene units", "equal"),
+        "The 3D track error of points that are assumed not to move.",
+    ),
+    "tracks.correct": Entry(
+        *("3D track accuracy", "Motion", "", "higher"),
+        "Share of the tracked points within 0.01 scene units of their true positions.",
+    ),
+    "tracks.lost": Entry(
+        *("3D tracks lost", "Motion", "", "lower"),
+        "Share of the points that could not be followed through the model's motion.",
+    ),
+    "tracks.drift": Entry(
+        *("Drift of static points", "Motion", "scene units", "lower"),
+        "Mean distance that points of the static scene move over time.",
+    ),
+    "tracks.strain": Entry(
+        *("Strain of the deformation", "Motion", "", "lower"),
+        "Root mean square of the log singular values of the deformation's Jacobian; 0 "
+        "means rigid.",
+    ),
+    "train.seconds": Entry(
+        *("Training", "Time", "s", "lower"),
+        "Wall-clock time of all training steps, without compilation.",
+    ),
+    "train.compile_seconds": Entry(
+        *("Compilation", "Time", "s", "lower"),
+        "Wall-clock time of compiling the training programs.",
+    ),
+    "train.steps": Entry(
+        *("Steps", "Time", "", "equal"),
+        "Completed training steps.",
+    ),
+    "render.ms_per_frame": Entry(
+        *("Rendering a frame", "Time", "ms", "lower"),
+        "Median wall-clock time of rendering a held-out frame at the size of the "
+        "capture.",
+    ),
+    "render.fps": Entry(
+        *("Rendering speed", "Time", "frames/s", "higher"),
+        "Held-out frames rendered per second.",
+    ),
+    "total.seconds": Entry(
+        *("Whole run", "Time", "s", "lower"),
+        "Wall-clock time from reading the capture to this report.",
+    ),
+    "memory.peak_bytes": Entry(
+        *("Peak memory", "Memory", "bytes", "lower"),
+        "Largest resident memory of the process.",
+    ),
+    "memory.device_peak_bytes": Entry(
+        *("Peak device memory", "Memory", "bytes", "lower"),
+        "Largest memory in use on the first accelerator.",
+    ),
+    "gaussians": Entry(
+        *("Gaussians", "Size", "", "lower"),
+        "Active Gaussians that are rendered.",
+    ),
+    "rows": Entry(
+        *("Anchors", "Size", "", "lower"),
+        "Active anchors, each of which carries several Gaussians.",
+    ),
+    "parameters": Entry(
+        *("Parameters", "Size", "", "lower"),
+        "Trained numbers of the model.",
+    ),
+    "file.bytes": Entry(
+        *("Model file", "Size", "bytes", "lower"),
+        "Size of model.npz, which holds the whole model.",
+    ),
+}
+
+
+def metric(key: str, value: float | int, tolerance: float = 0.0) -> Metric:
+    """Make a metric with the unit and direction of the table.
+
+    Args:
+      key: A key of `METRICS`.
+      value: The measured value, in the unit of the table.
+      tolerance: Accepted decline of a later value, in the same unit.
+
+    Returns:
+      The metric.
+
+    Raises:
+      ValueError: If the table has no such key.
+    """
+    if key not in METRICS:
+        raise ValueError(f"metric {key}: not in the table of metrics; add it there")
+    entry = METRICS[key]
+    return Metric(key, value, entry.unit, entry.direction, tolerance)

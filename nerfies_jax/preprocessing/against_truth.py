@@ -1,0 +1,132 @@
+"""Errors of preprocessing against the ground truth of a synthetic scene.
+
+Ground truth points are followed from where they are first visible, by the computed
+flow, realigned, and placed in space, like the tracks of preprocessing.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.synthetic import SceneTruth
+from nerfies_jax.capture.synthetic import truth as truths
+from nerfies_jax.preprocessing import dense_flow, paths, record, view_set
+from nerfies_jax.preprocessing import tracks as tracking
+from nerfies_jax.preprocessing.record import Evidence
+from nerfies_jax.preprocessing.tracks import Tracks
+from nerfies_jax.preprocessing.usable_paths import scene_unit
+
+LATER = 24  # frames after which a track is held against the truth
+
+
+class TruePoints(NamedTuple):
+    """Moving points, in the frames and pixels of preprocessing."""
+
+    pixel: np.ndarray  # [points, frames, 2]
+    seen: np.ndarray  # [points, frames] bool
+    position: np.ndarray  # [points, frames, 3] scene units
+
+
+class Errors(NamedTuple):
+    """Errors of masks, tracks and paths, NaN where there is nothing to measure."""
+
+    mask_iou: float  # of what moves
+    false_share: float  # of all pixels, marked as moving and at rest
+    track_px: float  # median after `LATER` frames
+    track_lost: float  # share of the points still to be seen then that are lost
+    path_error: float  # median, as a share of the typical distance
+
+
+def true_points(capture: Capture, truth: SceneTruth, evidence: Evidence) -> TruePoints:
+    """Return the moving points of the ground truth.
+
+    Args:
+      capture: The capture.
+      truth: Its ground truth.
+      evidence: Its preprocessing, which determines frames and pixels.
+
+    Returns:
+      The points.
+
+    Raises:
+      ValueError: If the truth is not that of the capture.
+    """
+    position = truths.track_places(capture, truth, evidence.row)
+    scale = evidence.moving.shape[2] / truth.things.shape[2]
+    return TruePoints(
+        truth.track_pixel[:, evidence.row] * scale,
+        truth.track_seen[:, evidence.row],
+        position,
+    )
+
+
+def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
+    """Compute the errors of masks, tracks and paths.
+
+    Args:
+      capture: The capture with its true masks of moving pixels.
+      evidence: Its preprocessing.
+      points: Ground truth points.
+
+    Returns:
+      The errors.
+    """
+    small = record.looked_at(capture, evidence.factor)
+    assert small.moving is not None
+    true = small.moving[evidence.row]
+    either = (evidence.moving | true).sum()
+    iou = (evidence.moving & true).sum() / either if true.any() else np.nan
+    track_px = lost = path_error = np.nan
+    rows = np.flatnonzero(points.seen.any(1))
+    if len(rows):
+        points = TruePoints(*(part[rows] for part in points))
+        views = view_set.in_time_order(small)
+        followed = _followed(views, evidence, points)
+        track_px, lost = _track_error(followed, points)
+        path_error = _path_error(capture, views, evidence, followed, points)
+    return Errors(
+        mask_iou=float(iou),
+        false_share=float((evidence.moving & ~true).mean()),
+        track_px=track_px,
+        track_lost=lost,
+        path_error=path_error,
+    )
+
+
+def _followed(views, evidence, points):
+    start = points.seen.argmax(1)
+    place = points.pixel[np.arange(len(start)), start]
+    starts = np.concatenate([start[:, None], place], axis=1)
+    chained = tracking.chain(evidence.flow, starts)
+    return tracking.realigned(chained, dense_flow.leveled(views), views.size)
+
+
+def _track_error(followed: Tracks, points):
+    later = followed.start + LATER
+    rows = np.flatnonzero(later < points.seen.shape[1])
+    rows = rows[points.seen[rows, later[rows]]]
+    if not len(rows):
+        return np.nan, np.nan
+    kept = rows[followed.seen[rows, later[rows]]]
+    off = followed.pixel[kept, later[kept]] - points.pixel[kept, later[kept]]
+    error = np.linalg.norm(off, axis=-1)
+    median = float(np.median(error)) if len(error) else np.nan
+    return median, 1 - len(kept) / len(rows)
+
+
+def _path_error(capture, views, evidence, followed, points):
+    long = followed.seen.sum(1) >= min(record.SHORTEST_PATH, len(views.row))
+    followed = followed.take(long)
+    if not long.any():
+        return np.nan
+    still = evidence.score < paths.AT_REST
+    around = paths.depth_around(
+        followed, evidence.tracks.take(still), evidence.rest.take(still), capture.near
+    )
+    fitted = paths.least_acceleration(views, followed, capture.near, around)
+    error = np.linalg.norm(fitted.position - points.position[long], axis=-1)
+    known = fitted.known & points.seen[long]
+    if not known.any():
+        return np.nan
+    return float(np.median(error[known]) / scene_unit(evidence))

@@ -1,0 +1,68 @@
+"""Contact sheet of frames with moving pixels marked and tracks overlaid."""
+
+import cv2
+import numpy as np
+
+from nerfies_jax.preprocessing.record import MOVES, Evidence
+from nerfies_jax.preprocessing.view_set import Views
+from nerfies_jax.visualization import panels
+
+MOVING = np.array([255, 40, 40])
+FOLLOWED, DRAWN_WIDTH, TAIL = 8, 352, 8  # frames, px at least, frames of a tail
+TRACKS = 250  # drawn in a frame: moving ones first
+AT_REST, BY_ITSELF = (150, 200, 255), (255, 230, 0)
+
+
+def followed(views: Views, evidence: Evidence) -> np.ndarray:
+    """Show frames with moving pixels in red, and tracks with their recent positions.
+
+    Yellow tracks move, blue ones are static points, whose traces are the camera motion.
+    If preprocessing was not possible, the frames are shown alone.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+
+    Returns:
+      uint8 image, [height, width, 3].
+    """
+    frames = len(views.row)
+    shown = np.unique(np.linspace(0, frames - 1, FOLLOWED).round().astype(int))
+    if evidence.unusable:
+        captions = [f"time {views.time[frame]:.2f}" for frame in shown]
+        return panels.contact_sheet([views.image[f] for f in shown], captions)
+    times = -(-DRAWN_WIDTH // views.size[0])
+    cells, captions = [], []
+    for frame in shown:
+        mask = evidence.moving[frame]
+        picture = views.image[frame].astype(float)
+        picture = _tinted(picture, mask, MOVING, 0.4).round().astype(np.uint8)
+        picture = np.ascontiguousarray(picture.repeat(times, 0).repeat(times, 1))
+        _draw_tracks(picture, evidence, frame, times)
+        cells.append(picture)
+        time, share = views.time[frame], mask.mean()
+        captions.append(f"time {time:.2f}: {share:.1%} moving")
+    return panels.contact_sheet(cells, captions)
+
+
+def _draw_tracks(picture, evidence, frame, times):
+    tracks, moves = evidence.tracks, evidence.score > MOVES
+    here = np.flatnonzero(tracks.seen[:, frame])
+    chosen = [_spread(here[moves[here] == kind], TRACKS // 2) for kind in (False, True)]
+    for row in np.concatenate(chosen):
+        color = BY_ITSELF if moves[row] else AT_REST
+        tail = np.arange(max(0, frame - TAIL), frame + 1)
+        # From the last frame in which it was not seen.
+        gap = np.flatnonzero(~tracks.seen[row, tail])
+        tail = tail[gap[-1] + 1 :] if len(gap) else tail
+        line = np.round(tracks.pixel[row, tail] * times * 16).astype(np.int32)
+        cv2.polylines(picture, [line], False, color, 1, cv2.LINE_AA, shift=4)
+        cv2.circle(picture, tuple(line[-1].tolist()), 24, color, -1, cv2.LINE_AA, 4)
+
+
+def _spread(rows, most):
+    return rows[:: max(1, -(-len(rows) // most))]
+
+
+def _tinted(picture, where, color, share):
+    return np.where(where[..., None], (1 - share) * picture + share * color, picture)

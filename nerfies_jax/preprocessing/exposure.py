@@ -1,0 +1,136 @@
+"""Exposure and color: whether static points have the same colors in all frames."""
+
+import cv2
+import numpy as np
+
+from nerfies_jax.capture.images import linear_from_srgb
+from nerfies_jax.preprocessing import view_set
+from nerfies_jax.preprocessing.findings import LIGHT as EFFECT
+from nerfies_jax.preprocessing.findings import Finding, cannot_tell, judge
+from nerfies_jax.preprocessing.view_set import Views
+
+# A gain of a tenth of a stop, 7 %, left in the frames bounds a fit at 36 dB (3 % of a
+# mean sRGB value of 0.5, twice that in linear light): above what is reached otherwise.
+DRIFT_STOPS = 0.1
+GROUPS = 8  # of points by place: what all of them agree on is the frame's
+MIN_POINTS = 40  # points in a frame and group
+# Linear light between which a pixel measures gain: sRGB 15 of 255, where a level is
+# 0.1 stop, to where highlights are clipped.
+DARK, BRIGHT = 0.005, 0.9
+POLISHES = 12  # rounds of medians; the gains move by less than 1e-3 afterwards
+
+
+def exposure(views: Views, points: np.ndarray) -> Finding:
+    """Decide whether frames differ in brightness or color.
+
+    Args:
+      views: The frames.
+      points: Static points in scene units, [points, 3].
+
+    Returns:
+      The finding.
+    """
+    threshold = f"{DRIFT_STOPS:g} stops, root mean square over frames and channels"
+    if len(points) < GROUPS * MIN_POINTS:
+        return cannot_tell(
+            EFFECT,
+            f"{len(points)} points at rest; {GROUPS * MIN_POINTS} are needed",
+            threshold,
+        )
+    light = sightings(view_set.smaller(views, view_set.times_smaller(views)), points)
+    groups = np.array_split(np.argsort(_along_widest(points)), GROUPS)
+    each = np.stack([gains(light[:, group]) for group in groups])
+    known = np.isfinite(each).all(-1).sum(0) >= GROUPS // 2
+    if known.sum() < max(3, 0.5 * len(views.row)):
+        return cannot_tell(
+            EFFECT, f"only {known.sum()} frames see enough points at rest", threshold
+        )
+    each = each[:, known]
+    count = np.isfinite(each).sum(0)
+    common = np.nanmedian(each, axis=0)
+    common = common - common.mean(0)
+    # Standard error of a median over groups: 1.25 times that of their mean.
+    spread = np.nanmedian(np.abs(each - np.nanmedian(each, axis=0)), axis=0) * 1.48
+    error = float(np.sqrt(np.mean((1.25 * spread) ** 2 / count)))
+    total = float(np.sqrt(np.mean(common**2)))
+    drift = float(np.sqrt(max(total**2 - error**2, 0)))
+    brightness = float(np.sqrt(np.mean(common.mean(-1) ** 2)))
+    tint = float(np.sqrt(np.mean((common - common.mean(-1, keepdims=True)) ** 2)))
+    # Half of it: the error of a root mean square over dozens of frames is less still.
+    wanted, confidence = judge(drift, DRIFT_STOPS, error / 2)
+    evidence = (
+        f"frames differ by {drift:.3f} stops on points at rest (brightness "
+        f"{brightness:.3f}, color {tint:.3f}), known to {error:.3f}"
+    )
+    numbers = {
+        "drift_stops": drift,
+        "brightness_stops": brightness,
+        "color_stops": tint,
+        "noise_stops": error,
+        "points": float(len(points)),
+    }
+    return Finding(EFFECT, evidence, threshold, wanted, confidence, numbers)
+
+
+def sightings(views: Views, points: np.ndarray) -> np.ndarray:
+    """Measure the linear light of points in all frames.
+
+    Args:
+      views: The frames.
+      points: Static points in scene units, [points, 3].
+
+    Returns:
+      log2 of linear light [frames, points, 3], NaN where a point is not measured.
+    """
+    light = np.full((len(views.row), len(points), 3), np.nan)
+    for index in range(len(views.row)):
+        pixel, depth = view_set.project(views, index, points)
+        inside = view_set.in_picture(views, pixel, depth, 2)
+        picture = linear_from_srgb(views.image[index] / 255)
+        # A pixel's blur: points are known to a fraction of one.
+        picture = cv2.GaussianBlur(picture, (0, 0), 1)
+        place = pixel[inside]
+        at = (place - 0.5).astype(np.float32)[:, None]
+        # OpenCV takes one map of pairs, which its stubs do not know.
+        value = cv2.remap(picture, at, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+        value = value[:, 0]
+        shown = views.valid[index][tuple(place[:, ::-1].astype(int).T)]
+        usable = ((value > DARK) & (value < BRIGHT)).all(-1) & shown
+        light[index, inside] = np.where(usable[:, None], np.log2(value), np.nan)
+    return light
+
+
+def gains(light: np.ndarray) -> np.ndarray:
+    """Estimate the gain of each frame by median polish.
+
+    Args:
+      light: log2 of linear light, [frames, points, 3], which is a frame's gain plus a
+        point's color, except where the point is occluded.
+
+    Returns:
+      Gains in stops [frames, 3], NaN for frames that show too few points.
+
+    References:
+      Tukey 1977.
+    """
+    gain = np.zeros((len(light), 3))
+    seen = np.isfinite(light).all(-1)
+    enough = seen.sum(1) >= MIN_POINTS
+    kept = (seen & enough[:, None]).sum(0) >= 2
+    light = np.where(enough[:, None, None], light, np.nan)[:, kept]
+    if not enough.any() or not kept.any():
+        return np.full_like(gain, np.nan)
+    rows = light[enough]
+    for _ in range(POLISHES):
+        color = np.nanmedian(rows - gain[enough][:, None], axis=0)
+        gain[enough] = np.nanmedian(rows - color, axis=1)
+        gain[enough] -= gain[enough].mean(0)
+    gain[~enough] = np.nan
+    return gain
+
+
+def _along_widest(points):
+    """Compute coordinates along the direction in which points spread most."""
+    centered = points - np.median(points, axis=0)
+    _, _, axes = np.linalg.svd(centered, full_matrices=False)
+    return centered @ axes[0]

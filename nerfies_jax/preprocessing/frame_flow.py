@@ -1,0 +1,54 @@
+"""Optical flow between training frames, for a capture without flow."""
+
+import dataclasses
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.flow import FrameFlow
+from nerfies_jax.preprocessing import dense_flow, view_set
+
+
+def with_flow(capture: Capture) -> Capture:
+    """Compute flow to the next and the previous frame of the same camera.
+
+    Held-out frames neither have nor influence flow, since their contents are unknown
+    during training. Flow is computed by `dense_flow` in the images as they are. Large
+    displacements of a video are searched for again from the flow that a static scene
+    would have.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The capture with its flow.
+    """
+    width, height = capture.size
+    count = len(capture.images)
+    shape = (count, height, width)
+    own = np.arange(count, dtype=np.int32)
+    one_way = np.zeros((*shape, 2), np.float32), np.zeros(shape, bool), own
+    flow = FrameFlow._make(leaf.copy() for leaf in one_way * 2)
+    for camera in np.unique(capture.camera_ids[capture.train]):
+        mine = capture.train[capture.camera_ids[capture.train] == camera]
+        if len(mine) < 2:
+            continue
+        views = view_set.in_time_order(capture, mine)
+        # Images of one moment are no video: there is nothing to search twice for.
+        film = np.ptp(views.time) > 0
+        span = view_set.depth_span(capture, views) if film else None
+        pictures = dense_flow.leveled(views)
+        neighbors = dense_flow.between_neighbors(views, pictures, span)
+        flow.forward[views.row] = neighbors.forward
+        flow.forward_seen[views.row] = neighbors.forward_seen & views.valid
+        flow.next_row[views.row[:-1]] = views.row[1:]
+        flow.backward[views.row] = neighbors.backward
+        flow.backward_seen[views.row] = neighbors.backward_seen & views.valid
+        flow.previous_row[views.row[1:]] = views.row[:-1]
+    note = "optical flow between neighboring frames found in the pictures"
+    if (flow.next_row == own).all():
+        note = (
+            "no optical flow: no camera has two frames to learn from, so no two frames "
+            "are neighbors"
+        )
+    return dataclasses.replace(capture, flow=flow, notes=(*capture.notes, note))

@@ -1,0 +1,50 @@
+"""Masks of moving pixels in training frames, for a capture without masks."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+
+from nerfies_jax.capture.cache import CACHE
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.preprocessing import record
+
+
+def with_masks(capture: Capture, folder: pathlib.Path = CACHE / "evidence") -> Capture:
+    """Compute masks of the training frames by preprocessing.
+
+    Held-out frames, which are not used, have none.
+
+    Args:
+      capture: The capture.
+      folder: Cache folder of preprocessing.
+
+    Returns:
+      The capture with masks, or the same with a note if tracking fails.
+    """
+    evidence = record.cached(capture, folder)
+    if evidence.unusable:
+        note = f"no masks of what moves could be made: {evidence.unusable}"
+        return dataclasses.replace(capture, notes=(*capture.notes, note))
+    moving = np.zeros(capture.images.shape[:3], bool)
+    for row, mask in zip(evidence.row, evidence.moving, strict=True):
+        moving[row] = enlarged(mask, evidence.factor, capture.size)
+    note = f"masks of what moves found in the pictures, {evidence.moving.mean():.1%}"
+    return dataclasses.replace(capture, moving=moving, notes=(*capture.notes, note))
+
+
+def enlarged(mask: np.ndarray, factor: int, size: tuple[int, int]) -> np.ndarray:
+    """Enlarge a mask by an integer factor, and pad it by its edge.
+
+    Args:
+      mask: The mask, [lines, columns].
+      factor: Integer factor.
+      size: Width and height of the result in pixels.
+
+    Returns:
+      The mask, [height, width].
+    """
+    mask = mask.repeat(factor, 0).repeat(factor, 1)
+    width, height = size
+    short = (0, height - mask.shape[0]), (0, width - mask.shape[1])
+    return np.pad(mask, short, mode="edge")

@@ -1,0 +1,102 @@
+"""Guessed static points behind moving objects, where no image shows any.
+
+Regions occluded in every frame are black holes from other viewpoints, or without the
+object. The surrounding surfaces are continued behind it: inverse depth that is linear
+in the pixels is a plane, fitted to the known points around, except for those in front
+of it, as at an edge of the foreground.
+"""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from nerfies_jax.capture.capture import PointCloud
+from nerfies_jax.preprocessing import view_set
+from nerfies_jax.preprocessing.view_set import Views
+
+FRAMES = 12  # that are looked from, evenly over the video
+# Pixels of images made small; more of larger ones.
+EVERY_PX = 2
+# A pixel nearer than that to a known point shows it. `still_points` has one for every
+# second pixel of each of twelve frames, fewer where little texture tells depth.
+KNOWN_PX = 6.0
+AROUND = 32  # cells of that size with known points, around a pixel
+BEFORE, ROUNDS = 0.03, 8  # share of a depth by which a point lies before the plane
+# The slopes' ridge, beside squared pixels: points along one rim tell one slope alone.
+RIDGE_PX = 4.0
+
+
+def behind(views: Views, still: PointCloud, moving: np.ndarray) -> PointCloud:
+    """Place colored points on moving pixels far from any known point. Runs on the host.
+
+    Each frame counts the points of the frames before as known. A frame in which points
+    fill fewer than `AROUND` cells of `KNOWN_PX` adds none.
+
+    Args:
+      views: The frames.
+      still: Known static points.
+      moving: True for moving pixels, [frames, height, width].
+
+    Returns:
+      The additional points.
+    """
+    places, colors = np.asarray(still.position, np.float64), still.color
+    first = len(places)
+    frames = np.linspace(0, len(views.row) - 1, min(FRAMES, len(views.row)))
+    for frame in np.unique(frames.round().astype(int)).tolist():
+        more, color = _seen_from(views, frame, places, colors, moving[frame])
+        places, colors = np.concatenate([places, more]), np.append(colors, color, 0)
+    return PointCloud(places[first:].astype(np.float32), colors[first:])
+
+
+def _seen_from(views, frame, places, colors, moving):
+    larger = view_set.times_smaller(views)
+    cell_px, every = KNOWN_PX * larger, EVERY_PX * larger
+    row, column = np.nonzero((moving & views.valid[frame])[::every, ::every])
+    row, column = every * row, every * column
+    at = np.stack([column, row], -1) + 0.5
+    pixel, depth = view_set.project(views, frame, places)
+    inside = view_set.in_picture(views, pixel, depth, 0)
+    none = np.zeros((0, 3)), colors[:0]
+    if not inside.any() or not len(at):
+        return none
+    pixel, inverse, color = pixel[inside], 1 / depth[inside], colors[inside]
+    hidden = cKDTree(pixel).query(at)[0] > cell_px
+    at, row, column = at[hidden], row[hidden], column[hidden]
+    thin = _farthest_in_cells(pixel / cell_px, inverse)
+    if len(thin) < AROUND or not len(at):
+        return none
+    pixel, inverse, color = pixel[thin], inverse[thin], color[thin]
+    distance, near = cKDTree(pixel).query(at, AROUND)
+    known, offset = inverse[near], pixel[near] - at[:, None]
+    least, most = known.min(1), known.max(1)
+    near_by = weight = 1 / distance**2
+    for _ in range(ROUNDS):
+        guess, slope = _plane(offset, known, weight)
+        plane = guess[:, None] + np.einsum("nkc,nc->nk", offset, slope)
+        before = np.maximum(known / np.maximum(plane, least[:, None]) - 1, 0)
+        weight = near_by / (1 + (before / BEFORE) ** 2) ** 2
+    ray = view_set.rays(views, frame)[row, column]
+    place = views.position[frame] + ray / np.clip(guess, least, most)[:, None]
+    shade = color[near].astype(float)
+    shade = [_plane(offset, shade[..., channel], weight)[0] for channel in range(3)]
+    return place, np.clip(np.stack(shade, -1).round(), 0, 255).astype(np.uint8)
+
+
+def _farthest_in_cells(place, inverse):
+    """Rows of the farthest point of every cell that holds one: what lies all around."""
+    cell = np.floor(place).astype(int)
+    order = np.argsort(inverse, kind="stable")
+    return order[np.unique(cell[order], axis=0, return_index=True)[1]]
+
+
+def _plane(offset, value, weight):
+    """Planes over `offset` [n, k, 2]: value at offset zero [n], and gradient [n, 2]."""
+    weight = weight / weight.sum(1, keepdims=True)
+    middle = np.einsum("nk,nkc->nc", weight, offset)
+    mean = np.einsum("nk,nk->n", weight, value)
+    apart, above = offset - middle[:, None], value - mean[:, None]
+    normal = np.einsum("nk,nkc,nkd->ncd", weight, apart, apart)
+    right = np.einsum("nk,nkc,nk->nc", weight, apart, above)
+    ridge = RIDGE_PX**2 * np.eye(2)
+    slope = np.linalg.solve(normal + ridge, right[..., None])[..., 0]
+    return mean - np.einsum("nc,nc->n", slope, middle), slope

@@ -1,0 +1,173 @@
+"""Motion of a scene: by tracks, or by outlines if tracking fails."""
+
+import numpy as np
+
+from nerfies_jax.preprocessing import outlines, record, rest_points
+from nerfies_jax.preprocessing.findings import (
+    CANNOT_TELL,
+    CERTAIN,
+    Finding,
+    cannot_tell,
+    judge,
+)
+from nerfies_jax.preprocessing.findings import MOTION as EFFECT
+from nerfies_jax.preprocessing.record import MOVES, Evidence
+from nerfies_jax.preprocessing.view_set import Views
+
+# Share of tracks over all frames. Static built-in scenes have 0.03 %, and those with
+# the least motion 4 %.
+MOVING_SHARE = 0.005
+FALSE_SHARE = 0.001  # standard error: three times what still scenes leave
+# Where points at rest are missed by more than this, slow motion hides in it and "no"
+# cannot be said; and what cameras are off by passes for motion in some tracks, as the
+# square of it.
+CALM_PX = 0.75
+# Pixels that could not be tracked may still differ from the static scene: "no" needs a
+# small mask. Static videos have up to 0.8 % (`static` at 112x84 and 40 frames).
+MASKED_FOR_NO = 0.01
+# And nearly all of the textured pixels carried on, in videos of some length.
+CARRIED_FOR_NO, MIN_FOR_NO = 0.8, 9
+
+
+def motion(views: Views, evidence: Evidence) -> Finding:
+    """Decide whether anything moves.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+
+    Returns:
+      The finding.
+    """
+    if np.ptp(views.time) == 0:
+        return Finding(
+            EFFECT,
+            "all frames have the same time: a motion has nothing to depend on",
+            "two times",
+            False,
+            CERTAIN,
+        )
+    if evidence.unusable:
+        finding = cannot_tell(EFFECT, evidence.unusable, _threshold())
+    else:
+        finding = _by_tracks(views, evidence)
+    if finding.wanted is None:
+        shapes = outlines.outlines(views)
+        if shapes is not None:
+            return outlines.motion(views, shapes)
+    return finding
+
+
+def _threshold():
+    return f"{MOVING_SHARE:.1%} of what tracks see"
+
+
+def _by_tracks(views, evidence):
+    shares, share = frame_shares(evidence), moving_share(evidence)
+    masked, noise = float(evidence.moving.mean()), rest_noise(evidence)
+    error = FALSE_SHARE * max(1.0, noise / CALM_PX) ** 2
+    wanted, confidence = judge(share, MOVING_SHARE, error)
+    lost = _why_not_no(views, evidence, noise) if wanted is False else None
+    if lost is not None:
+        wanted, confidence = None, CANNOT_TELL
+    numbers = {
+        "moving_share": share,
+        "moving_share_most": float(shares.max()),
+        "masked_share": masked,
+        "noise_px": noise,
+    }
+    measurement = (
+        f"{share:.1%} of what tracks see (up to {shares.max():.1%} of a frame) and "
+        f"{masked:.1%} of the pixels move as no still point does; tracks at rest are "
+        f"explained to {noise:.2f} px"
+    )
+    if lost is not None:
+        measurement += f"; {lost}"
+    speed = speeds(views, evidence) if wanted else {}
+    if speed:
+        numbers |= speed
+        measurement += (
+            f"; {speed['speed_px']:.2g} px ({speed['speed_units']:.2g} scene units) a "
+            f"frame in the median, {speed['speed_px_fast']:.2g} px the fastest tenth"
+        )
+    return Finding(EFFECT, measurement, _threshold(), wanted, confidence, numbers)
+
+
+def frame_shares(evidence: Evidence) -> np.ndarray:
+    """Compute the share of moving tracks in each frame.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      Shares, [frames].
+    """
+    seen = evidence.tracks.seen
+    moves = seen[evidence.score > MOVES].sum(0)
+    return moves / np.maximum(seen.sum(0), 1)
+
+
+def moving_share(evidence: Evidence) -> float:
+    """Compute the share of moving tracks over all frames.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The share.
+    """
+    length = evidence.tracks.seen.sum(1)
+    return float(length[evidence.score > MOVES].sum() / max(length.sum(), 1))
+
+
+def rest_noise(evidence: Evidence) -> float:
+    """Compute the median reprojection error of static tracks.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The error in pixels, inf without static tracks.
+    """
+    still = evidence.score < MOVES
+    if not still.any():
+        return np.inf
+    return float(np.median(rest_points.miss(evidence.rest.take(still))))
+
+
+def _why_not_no(views, evidence, noise):
+    """Reason why motion may exist undetected, or None if it would be detected."""
+    if noise > CALM_PX:
+        return f"above {CALM_PX:g} px slow motion would not show"
+    frames = len(views.row)
+    if frames < MIN_FOR_NO:
+        return f"what moves far between {frames} frames cannot be followed"
+    kept = record.carried(views, evidence.flow)
+    if kept < CARRIED_FOR_NO:
+        return f"what is fast may be among the {1 - kept:.0%} that cannot be followed"
+    if evidence.moving.mean() > MASKED_FOR_NO:
+        return "what looks unlike the still scene may be too fast to be followed"
+    return None
+
+
+def speeds(views: Views, evidence: Evidence) -> dict[str, float]:
+    """Measure the speed of paths from one frame to the next.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+
+    Returns:
+      Speeds in scene units, and in pixels at their depth. Empty if no path is known.
+    """
+    paths = evidence.paths
+    both = paths.known[:, 1:] & paths.known[:, :-1]
+    if not both.any():
+        return {}
+    step = np.linalg.norm(np.diff(paths.position, axis=1), axis=-1)
+    px = step * views.intrinsics[:-1, 0, 0] / paths.depth[:, :-1]
+    return {
+        "speed_px": float(np.median(px[both])),
+        "speed_px_fast": float(np.quantile(px[both], 0.9)),
+        "speed_units": float(np.median(step[both])),
+    }

@@ -1,0 +1,219 @@
+"""Segmentation of moving tracks, and of moving pixels by the tracks."""
+
+import cv2
+import numpy as np
+import scipy.sparse as sparse
+from scipy.spatial import cKDTree
+
+from nerfies_jax.preprocessing import rest_points
+from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
+from nerfies_jax.preprocessing.view_set import Views
+
+# Half a pixel off a point at rest counts as half certain.
+HALF_CERTAIN_PX, STEEPNESS = 0.5, 3.0
+# Cameras of real videos are off by a pixel themselves: at least so many times what the
+# stillest quarter of the tracks is off. Without it 21 % of a video of a hand before
+# books counts as moving, with it 7 %: the hand.
+STILLEST, OVER_NOISE = 0.25, 3.0
+# Tracks near each other in shared frames move alike.
+NEIGHBORS, EVERY_FRAMES, NEAR_PX, NEIGHBOR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10
+# A pixel takes after the tracks around it, by place and color. What none is near to
+# may have come too quickly to be followed: a still scene's colors have the last word.
+VOTES, VOTE_PX, VOTE_COLOR, REACH_PX = 8, 4.0, 20.0, 8.0
+VOTE_STEP = 2  # pixels of a side that vote as one does; the sum is smoothed anyway
+FAR_FROM_TRACKS = 0.3
+# Pixels that may move are left out of the static scene that images are compared with.
+OPEN, RIM_PX = 0.3, 8
+SUREST = 0.02  # votes are no surer than that
+SMOOTH_REACH, SMOOTH_PX, SMOOTH_COLOR = 4, 3.0, 15.0
+
+
+def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
+    """Estimate how certainly each track moves.
+
+    Args:
+      tracks: The tracks.
+      rest: The static points that fit them best.
+
+    Returns:
+      Scores in [0, 1], [tracks].
+    """
+    count = len(tracks.seen)
+    if count == 0:
+        return np.zeros(0)
+    far = rest_points.miss(rest)
+    half = max(HALF_CERTAIN_PX, OVER_NOISE * np.quantile(far, STILLEST))
+    with np.errstate(divide="ignore"):
+        odds = STEEPNESS * np.log(np.maximum(far, 1e-3) / half)
+    own = 1 / (1 + np.exp(-np.minimum(odds, 50)))
+    alike = _neighborhood(tracks)
+    total = np.asarray(alike.sum(1)).ravel() + 1e-9
+    score = own
+    for _ in range(ROUNDS):
+        around = alike @ score / total
+        score = (own + NEIGHBOR_WEIGHT * around) / (1 + NEIGHBOR_WEIGHT)
+    return score
+
+
+def _neighborhood(tracks):
+    """[tracks, tracks] sparse: how near tracks are in frames that see both."""
+    rows, columns, weights = [], [], []
+    for frame in range(0, tracks.seen.shape[1], EVERY_FRAMES):
+        here = np.flatnonzero(tracks.seen[:, frame])
+        if len(here) <= NEIGHBORS:
+            continue
+        place = tracks.pixel[here, frame]
+        distance, near = cKDTree(place).query(place, NEIGHBORS + 1)
+        rows.append(np.repeat(here, NEIGHBORS))
+        columns.append(here[near[:, 1:]].ravel())
+        weights.append(np.exp(-0.5 * (distance[:, 1:] / NEAR_PX) ** 2).ravel())
+    shape = (len(tracks.seen),) * 2
+    if not rows:
+        return sparse.csr_matrix(shape)
+    entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
+    one_way = sparse.csr_matrix(entries, shape=shape)
+    return one_way + one_way.T
+
+
+def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
+    """Estimate the probability that a pixel moves, from the tracks near it.
+
+    Nearby tracks on pixels of similar color have the largest weights. A pixel far from
+    all tracks has `FAR_FROM_TRACKS`.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      score: Their scores, [tracks].
+
+    Returns:
+      Probabilities, [frames, height, width].
+    """
+    frames = len(views.row)
+    width, height = views.size
+    x, y = np.meshgrid(np.arange(0, width, VOTE_STEP), np.arange(0, height, VOTE_STEP))
+    at = np.stack([x, y], axis=-1).reshape(-1, 2)
+    shares = np.full((frames, height, width), FAR_FROM_TRACKS, np.float32)
+    for frame in range(frames):
+        here = np.flatnonzero(tracks.seen[:, frame])
+        if len(here) < VOTES:
+            continue
+        color = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
+        place = tracks.pixel[here, frame]
+        theirs = color[pixel_of(place, (height, width))]
+        distance, near = cKDTree(place).query(at + 0.5 * VOTE_STEP, VOTES)
+        distance = (distance / picture_scale(width)).astype(np.float32)
+        unlike = color[at[:, 1], at[:, 0], None] - theirs[near]
+        unlike = np.einsum("pvc,pvc->pv", unlike, unlike) / VOTE_COLOR**2
+        weight = np.exp(-0.5 * ((distance / VOTE_PX) ** 2 + unlike))
+        weight += 1e-9 * np.exp(-distance / VOTE_PX)
+        share = (weight * score[here][near]).sum(1) / weight.sum(1)
+        share[distance[:, 0] > REACH_PX] = FAR_FROM_TRACKS
+        share = share.reshape(x.shape)
+        share = share.repeat(VOTE_STEP, 0).repeat(VOTE_STEP, 1)
+        shares[frame] = share[:height, :width]
+    return shares
+
+
+def may_move(share: np.ndarray) -> np.ndarray:
+    """Find all pixels that may move, with a margin.
+
+    Args:
+      share: Probabilities, [frames, height, width].
+
+    Returns:
+      Booleans, [frames, height, width].
+    """
+    size = 2 * round(RIM_PX * picture_scale(share.shape[2])) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    seeds = (share > OPEN).astype(np.uint8)
+    return np.stack([cv2.dilate(one, disc) > 0 for one in seeds])
+
+
+def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
+    """Combine votes and colors to a mask, smoothed where colors are similar.
+
+    Args:
+      views: The frames.
+      share: Probabilities from `votes`, [frames, height, width].
+      odds: Log odds from `still_pictures.log_odds`, [frames, height, width].
+
+    Returns:
+      Booleans, [frames, height, width].
+    """
+    share = np.clip(share, SUREST, 1 - SUREST)
+    total = np.log(share / (1 - share)) + odds
+    moving = np.zeros(total.shape, bool)
+    for frame, one in enumerate(total):
+        color = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
+        moving[frame] = _smooth(one.astype(np.float32), color) > 0
+    return moving
+
+
+def settled(tracks: Tracks, score: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """Limit the scores of tracks to the share of their frames on moving pixels.
+
+    Flow drags static pixels along moving edges. In the built-in scenes they are up to a
+    fifth of the supposedly moving tracks, and hardly any after this step.
+
+    Args:
+      tracks: The tracks.
+      score: Their scores, [tracks].
+      moving: True for moving pixels, [frames, height, width].
+
+    Returns:
+      Scores, [tracks].
+    """
+    return np.minimum(score, share_on(tracks, moving))
+
+
+def share_on(tracks: Tracks, moving: np.ndarray) -> np.ndarray:
+    """Compute the share of its frames in which each track lies on moving pixels.
+
+    Args:
+      tracks: The tracks.
+      moving: True for moving pixels, [frames, height, width].
+
+    Returns:
+      Shares, [tracks].
+    """
+    row, column = pixel_of(tracks.pixel, moving.shape[1:])
+    on = moving[np.arange(len(moving)), row, column] & tracks.seen
+    return on.sum(1) / np.maximum(tracks.seen.sum(1), 1)
+
+
+def _smooth(values, color):
+    """[height, width] mean over pixels near and of like color (a bilateral filter)."""
+    height, width = values.shape
+    values, color = (
+        cv2.copyMakeBorder(one, *(SMOOTH_REACH,) * 4, cv2.BORDER_REFLECT)
+        for one in (values, color)
+    )
+    own = color[SMOOTH_REACH:-SMOOTH_REACH, SMOOTH_REACH:-SMOOTH_REACH]
+    total, weights = np.zeros((2, height, width), np.float32)
+    reach = range(-SMOOTH_REACH, SMOOTH_REACH + 1)
+    for down, right in ((i, j) for i in reach for j in reach if (i + j) % 2 == 0):
+        there = np.s_[
+            SMOOTH_REACH + down : SMOOTH_REACH + down + height,
+            SMOOTH_REACH + right : SMOOTH_REACH + right + width,
+        ]
+        unlike = color[there] - own
+        unlike = np.einsum("hwc,hwc->hw", unlike, unlike) / SMOOTH_COLOR**2
+        near = (down**2 + right**2) / SMOOTH_PX**2
+        weight = np.exp(-0.5 * (unlike + np.float32(near)))
+        total += weight * values[there]
+        weights += weight
+    return total / weights
+
+
+def picture_scale(width: int) -> float:
+    """Return the factor for constants that were tuned at a width of 176 pixels.
+
+    Args:
+      width: Width of the image in pixels.
+
+    Returns:
+      The factor, at least 1.
+    """
+    return max(1.0, width / 176)

@@ -1,0 +1,431 @@
+"""Preprocessing of a capture, computed once before any training and cached.
+
+    evidence = record.gather(capture)
+
+It consists of flow between neighbors in time, tracks, the tracks and pixels that move,
+their paths in space, and static points. It runs on the host, on one core, without
+gradients.
+"""
+
+import contextlib
+import math
+import pathlib
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import scipy.ndimage as nd
+
+from nerfies_jax.capture import cache_files, pinholes
+from nerfies_jax.capture import capture as captures
+from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
+from nerfies_jax.capture.given import Given
+from nerfies_jax.preprocessing import (
+    dense_flow,
+    given_depth,
+    moving,
+    paths,
+    rest_points,
+    rigid_bodies,
+    still_pictures,
+    still_points,
+    taken,
+    view_set,
+)
+from nerfies_jax.preprocessing import tracks as tracking
+from nerfies_jax.preprocessing.dense_flow import NeighborFlow
+from nerfies_jax.preprocessing.record_file import Evidence, digest, load, save
+from nerfies_jax.preprocessing.tracks import Tracks
+from nerfies_jax.preprocessing.view_set import Views
+from nerfies_jax.preprocessing.watch import (
+    A_BODY_TERM,
+    A_COMPARED_PIXEL,
+    A_PATH_FRAME,
+    A_POINT_FRAME,
+    A_SEARCHED_PIXEL,
+    A_TRACK_FRAME,
+    ENOUGH_WORK,
+    Watch,
+)
+from nerfies_jax.runtime import console
+
+# A path has as many frames at least, and a video as many; fewer say nothing of motion.
+SHORTEST_PATH, SHORTEST_FILM = 10, 6
+MOVES = 0.5  # score from which a track counts as moving
+MOST_PATHS = 1500
+MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between them
+# Where less of the images can be carried to the next frame, tracks are chance: a
+# camera that jumps.
+LEAST_CARRIED = 0.4
+# Shares of the budget after which there is none left for a part.
+FOR_WIDE_STEPS, FOR_TRACKS, FOR_COLORS = 0.4, 0.5, 0.6
+FOR_BODIES, FOR_POINTS = 0.7, 0.8
+# Share of the near plane, which is that of static points: a hand may be much closer.
+AT_CAMERA = 0.1
+LEAST_TEXTURED = 0.05  # of the pixels: too little to tell anything by
+MOST_UNKEPT = 2  # records in memory: of frames to learn from, and of all
+
+_unkept: dict[pathlib.Path, "Evidence"] = {}  # what could not be written
+_told_of: dict[pathlib.Path, str] = {}  # a note for each record without some parts
+
+
+def gather(
+    capture: Capture,
+    use_depths: bool = False,
+    tell: Callable[[str], None] = lambda part: None,
+) -> Evidence:
+    """Preprocess a capture, in about 0.25 s a frame of 176x132 or 480x270 on one core.
+
+    Parts beyond the budget of work (`capture.preprocessing`) are left out. The budget
+    counts work and not time, so the result depends on the capture alone and not on the
+    load of the machine.
+
+    Args:
+      capture: The capture. External results (`capture.given`) replace those computed
+        here.
+      use_depths: True to constrain paths by the capture's own depth, if it has any.
+      tell: Called with each of `PARTS` when it begins, and with everything left out.
+
+    Returns:
+      The results, with the names of the parts left out.
+    """
+    with contextlib.closing(Watch(tell, capture.preprocessing * ENOUGH_WORK)) as watch:
+        return _gathered(capture, use_depths, watch)
+
+
+def _gathered(capture, use_depths, watch):
+    watch.begin("flow")
+    factor, given = _factor(capture), capture.given or Given(capture.size)
+    capture = looked_at(capture, factor)
+    views = view_set.in_time_order(capture)
+    pictures = dense_flow.leveled(views)
+    flow = taken.flow(given, views)
+    if flow is None:
+        # Images of one moment are no video: there is nothing to search twice for.
+        film = np.ptp(views.time) > 0
+        span = view_set.depth_span(capture, views) if film else None
+        flow = _flow(views, pictures, span, watch)
+    watch.begin("tracks")
+    every = 1e-6 * A_TRACK_FRAME * tracking.work(views)
+    few = not watch.has_room(FOR_TRACKS, "half of the tracks", every)
+    watch.spend(every / 2 if few else 0.0)
+    tracks, first = _tracks(given, views, flow, pictures, 2 if few else 1)
+    rest = rest_points.fit(views, tracks)
+    watch.begin("moving")
+    mask = taken.moving(given, views)
+    if mask is None:
+        score = moving.track_scores(tracks, rest)
+        mask = _mask(views, flow, tracks, score, watch)
+        score = moving.settled(tracks, score, mask)
+    else:
+        score = moving.share_on(tracks, mask)
+    watch.begin("paths")
+    unusable = _unusable(views, flow)
+    which = np.zeros(0, int)
+    if not unusable:
+        which = _moved(tracks, score, first)
+    places = taken.places(given, views)
+    if places is None:
+        depths = _depths(capture, given, views, tracks, rest, score, use_depths)
+        moved_paths = _paths(capture, views, tracks, rest, score, which, depths, watch)
+    else:
+        near, moved = AT_CAMERA * capture.near, tracks.take(which)
+        moved_paths = paths.certain(views, moved, places[which - first], near)
+    watch.begin("still")
+    dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    points_work = 1e-6 * A_POINT_FRAME * still_points.work(views)
+    if watch.has_room(FOR_POINTS, "dense points at rest", points_work):
+        dense = still_points.dense(views, flow, mask)
+    return Evidence(
+        row=views.row,
+        flow=_rounded(flow),
+        moving=mask,
+        tracks=tracks,
+        score=score,
+        rest=rest,
+        moved=which,
+        paths=moved_paths,
+        still=dense,
+        unusable=unusable,
+        told=given.moving is not None or given.track_pixel is not None,
+        factor=factor,
+        left_out=watch.left_out,
+        seconds=watch.seconds(),
+    )
+
+
+def _flow(views, pictures, span, watch):
+    pixels = dense_flow.searched_pixels(views, pictures)
+    a_search = 1e-6 * A_SEARCHED_PIXEL * pixels
+    watch.spend(2 * (len(views.row) - 1) * a_search)
+
+    def room_for(count):
+        what, each = "a second look at wide steps", dense_flow.SECOND_LOOK * a_search
+        return watch.room_for(count, FOR_WIDE_STEPS, what, each)
+
+    return dense_flow.between_neighbors(views, pictures, span, room_for)
+
+
+def _rounded(flow):
+    """In half precision, as it is kept: gathered or read again, it is the same."""
+    forward, backward = (
+        side.astype(np.float16).astype(np.float32)
+        for side in (flow.forward, flow.backward)
+    )
+    return flow._replace(forward=forward, backward=backward)
+
+
+def _tracks(given, views, flow, pictures, sparser):
+    """All tracks, and the first of those whose paths are wanted.
+
+    Given ones stand behind our own, which still say what stands still: other tools may
+    have followed nothing but what moves.
+    """
+    own = tracking.from_flow(views, flow, pictures, sparser)
+    others = taken.tracks(given, views)
+    if others is None:
+        return own, 0
+    both = zip(own, others, strict=True)
+    return Tracks(*(np.concatenate(parts) for parts in both)), len(own.seen)
+
+
+def _mask(views, flow, tracks, score, watch):
+    """Segment moving pixels in reduced images, and enlarge the mask."""
+    (width, height), part = views.size, view_set.times_smaller(views)
+    small, near = (
+        view_set.smaller(views, part),
+        tracks._replace(pixel=tracks.pixel / part),
+    )
+    share = moving.votes(small, near, score)
+    open_to_doubt = _enlarged(moving.may_move(share), height, width)
+    odds = np.zeros(share.shape, np.float32)
+    work = 1e-6 * A_POINT_FRAME * still_points.work(views)
+    work += 1e-6 * A_COMPARED_PIXEL * views.valid.size
+    if watch.has_room(FOR_COLORS, "what colors say of what moves", work):
+        still = still_points.dense(views, flow, open_to_doubt)
+        odds = still_pictures.log_odds(small, still)
+    masks = moving.mask(small, share, odds)
+    return _enlarged(masks, height, width) & views.valid
+
+
+def _enlarged(masks, height, width):
+    if masks.shape[1:] == (height, width):
+        return masks
+    enlarged = [cv2.resize(np.float32(one), (width, height)) > 0.5 for one in masks]
+    return np.stack(enlarged)
+
+
+def _depths(capture, given, views, tracks, rest, score, use_depths):
+    """z-depths [frames, height, width] that constrain paths, None if there are none."""
+    depth = taken.depth(given, views)
+    if depth is None:
+        own = use_depths and capture.depths is not None
+        return capture.depths[views.row] if own else None
+    still = score < paths.AT_REST
+    depth, miss = given_depth.aligned(depth, tracks.take(still), rest.take(still))
+    if not np.isfinite(miss):
+        raise ValueError(
+            f"{capture.path or capture.name}: in every frame the given depths, or "
+            "their inverse, miss the points at rest, or too few of those are seen; "
+            "leave the depths out"
+        )
+    if miss > given_depth.USABLE:
+        raise ValueError(
+            f"{capture.path or capture.name}: the given depths, or their inverse, miss "
+            f"the points at rest by {miss:.0%} (median), more than "
+            f"{given_depth.USABLE:.0%}; give those of these frames, or leave them out"
+        )
+    return depth
+
+
+def _paths(capture, views, tracks, rest, score, which, depths, watch):
+    still, moved = score < paths.AT_REST, tracks.take(which)
+    watch.spend(1e-6 * A_PATH_FRAME * moved.seen.size)
+    around = paths.depth_around(
+        moved, tracks.take(still), rest.take(still), capture.near
+    )
+    least = AT_CAMERA * capture.near
+    if depths is not None:
+        measured = _measured(depths, moved)
+        return paths.least_acceleration(views, moved, least, around, measured)
+    alone = paths.least_acceleration(views, moved, least, around)
+
+    def has_room(terms):
+        what = "depths of what moves as one rigid thing"
+        return watch.has_room(FOR_BODIES, what, 1e-6 * A_BODY_TERM * terms)
+
+    return rigid_bodies.refined(views, moved, alone, has_room)
+
+
+def looked_at(capture: Capture, factor: int) -> Capture:
+    """Return the undistorted, reduced capture that preprocessing results refer to.
+
+    Args:
+      capture: The capture.
+      factor: Integer reduction.
+
+    Returns:
+      The capture.
+    """
+    return captures.downscale(pinholes.as_pinholes(capture), factor)
+
+
+def _factor(capture):
+    width, height = capture.size
+    return math.ceil(math.sqrt(len(capture.train) * width * height / MOST_PIXELS))
+
+
+def _unusable(views, flow):
+    frames = len(views.row)
+    if frames < SHORTEST_FILM:
+        return f"{frames} frames are too few to follow anything through"
+    if np.ptp(views.time) == 0:
+        return "all frames have the same time"
+    textured = views.textured.mean()
+    if textured < LEAST_TEXTURED:
+        return f"only {textured:.1%} of the pixels have texture to follow"
+    share = carried(views, flow)
+    if share < LEAST_CARRIED:
+        return (
+            f"only {share:.0%} of the textured pixels can be carried to the next frame "
+            f"(at least {LEAST_CARRIED:.0%} are needed): the camera jumps"
+        )
+    return ""
+
+
+def carried(views: Views, flow: NeighborFlow) -> float:
+    """Compute the share of textured pixels with consistent flow to the next frame.
+
+    Args:
+      views: The frames.
+      flow: Their flow.
+
+    Returns:
+      The share.
+    """
+    shown = views.textured[:-1]
+    return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
+
+
+def _moved(tracks, score, first):
+    long = tracks.seen.sum(1) >= min(SHORTEST_PATH, tracks.seen.shape[1])
+    wanted = np.arange(len(score)) >= first
+    which = np.flatnonzero(long & wanted & (score > MOVES))
+    if len(which) > MOST_PATHS:
+        # Long ones say most, but every place is to have some.
+        chance = tracks.seen[which].sum(1).astype(float)
+        rng = np.random.default_rng(0)
+        which = rng.choice(which, MOST_PATHS, replace=False, p=chance / chance.sum())
+    return np.sort(which)
+
+
+def _measured(depths, tracks):
+    """z-depths of the tracks where they are known and do not jump."""
+    measured = np.full(tracks.seen.shape, np.nan)
+    for frame, picture in enumerate(depths):
+        here = np.flatnonzero(tracks.seen[:, frame])
+        depth = steady_depth(picture)
+        at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
+        measured[here, frame] = depth[at]
+    return measured
+
+
+def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
+    """Select z-depth that is known and does not jump to that of a neighbor.
+
+    Args:
+      depth: z-depths, [height, width], 0 where unknown.
+      jump: Relative difference of a jump.
+
+    Returns:
+      z-depths [height, width], NaN elsewhere.
+    """
+    least, most = nd.minimum_filter(depth, 3), nd.maximum_filter(depth, 3)
+    return np.where((least > 0) & (most - least < jump * depth), depth, np.nan)
+
+
+def cached(
+    capture: Capture,
+    folder: pathlib.Path,
+    use_depths: bool = False,
+    tell: Callable[[str], None] = lambda part: None,
+) -> Evidence:
+    """Preprocess a capture, or read its results from a cache.
+
+    A distorted capture is undistorted first, so both share one record. If `folder`
+    cannot be written, which is reported, the record is kept in memory, so that no
+    command computes it twice. A warning lists the parts left out.
+
+    Args:
+      capture: The capture.
+      folder: Cache folder.
+      use_depths: As for `gather`.
+      tell: As for `gather`.
+
+    Returns:
+      The results.
+    """
+    capture = pinholes.as_pinholes(capture)
+    path = file_of(capture, folder, use_depths)
+    evidence = _unkept.get(path) or cache_files.read(path, load)
+    if evidence is None:
+        evidence = gather(capture, use_depths, tell)
+        try:
+            save(path, evidence)
+        except (OSError, CaptureError) as error:
+            tell(f"what the pictures say is not kept for the next time: {error}")
+            while len(_unkept) >= MOST_UNKEPT:
+                _unkept.pop(next(iter(_unkept)))
+            _unkept[path] = evidence
+    if evidence.left_out and path not in _told_of:
+        _told_of[path] = left_out_note(evidence)
+        console.warn(f"{capture.path or capture.name}: {_told_of[path]}")
+    return evidence
+
+
+def left_out_note(evidence: Evidence) -> str:
+    """Describe the parts of preprocessing left out, and the remedy.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The text, empty if nothing was left out.
+    """
+    if not evidence.left_out:
+        return ""
+    return (
+        f"Preprocessing left out {evidence.left_out}: its budget of work was used up. "
+        "With a larger multiple of the default budget (preprocessing) nothing is."
+    )
+
+
+def notes_on(capture: Capture, folder: pathlib.Path) -> list[str]:
+    """List the notes of `cached` in this process about parts left out for a capture.
+
+    Args:
+      capture: The capture.
+      folder: Cache folder.
+
+    Returns:
+      The notes.
+    """
+    paths = (file_of(capture, folder, use_depths) for use_depths in (False, True))
+    return list(dict.fromkeys(_told_of[path] for path in paths if path in _told_of))
+
+
+def file_of(
+    capture: Capture, folder: pathlib.Path, use_depths: bool = False
+) -> pathlib.Path:
+    """Return the file in which `cached` stores a record.
+
+    Args:
+      capture: The capture.
+      folder: Cache folder.
+      use_depths: As for `gather`.
+
+    Returns:
+      Path of the file.
+    """
+    capture = pinholes.as_pinholes(capture)
+    return folder / f"{digest(capture, use_depths)}.npz"

@@ -1,0 +1,138 @@
+"""Record of the preprocessing of a capture, and its file in the cache."""
+
+import hashlib
+import pathlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture import cache_files
+from nerfies_jax.capture.capture import Capture, PointCloud
+from nerfies_jax.capture.given import Given
+from nerfies_jax.preprocessing.dense_flow import NeighborFlow
+from nerfies_jax.preprocessing.paths import Paths
+from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.tracks import Tracks
+from nerfies_jax.preprocessing.watch import Seconds
+
+VERSION = 12
+
+
+class Evidence(NamedTuple):
+    """Preprocessing results of the training frames, in order of time."""
+
+    row: np.ndarray  # [frames] row of the capture
+    flow: NeighborFlow
+    moving: np.ndarray  # [frames, height, width] bool
+    tracks: Tracks
+    score: np.ndarray  # [tracks] in 0..1: how certainly it moves
+    rest: RestPoints  # of all tracks
+    moved: np.ndarray  # [paths] which tracks have a path
+    paths: Paths
+    still: PointCloud
+    unusable: str  # why tracks say nothing of the motion; empty where they do
+    told: bool  # masks or tracks of what moves are the user's: no noise, however few
+    factor: int  # of the capture's pixels for one of these
+    left_out: str  # what is beyond the budget of work; empty if that was enough
+    seconds: Seconds
+
+
+# The fields that are records of arrays or numbers.
+RECORDS: dict[str, type[NamedTuple]] = {
+    "flow": NeighborFlow,
+    "tracks": Tracks,
+    "rest": RestPoints,
+    "paths": Paths,
+    "still": PointCloud,
+    "seconds": Seconds,
+}
+
+
+def digest(capture: Capture, use_depths: bool = False) -> str:
+    """Compute a digest of all inputs of `gather`.
+
+    Args:
+      capture: The capture.
+      use_depths: As for `gather`.
+
+    Returns:
+      Hex digits.
+    """
+    checksum = hashlib.blake2b(digest_size=12)
+    budget = capture.preprocessing
+    checksum.update(f"evidence {VERSION} {use_depths} {budget}".encode())
+    images = capture.images
+    checksum.update(f"{images.dtype}{(len(capture.train), *images.shape[1:])}".encode())
+    for row in capture.train:  # a copy of all of them could be most of the memory
+        checksum.update(np.ascontiguousarray(images[row]).data)
+    parts = [capture.times, capture.train]
+    parts += [np.asarray([capture.near, capture.far])]
+    parts += map(np.asarray, capture.cameras)
+    if capture.points is not None:
+        parts.append(capture.points.position)
+    depths = capture.depths if use_depths else None
+    given = () if capture.given is None else capture.given
+    for name, part in zip(Given._fields, given, strict=False):
+        checksum.update(f"{name} {part is None}".encode())
+    parts += [part for part in (capture.valid, depths, *given) if part is not None]
+    for part in parts:
+        part = np.ascontiguousarray(part)
+        checksum.update(f"{part.dtype}{part.shape}".encode())
+        checksum.update(part.data)
+    return checksum.hexdigest()
+
+
+def save(path: pathlib.Path, evidence: Evidence) -> None:
+    """Write a record into one file, atomically, with flow in half precision.
+
+    Args:
+      path: The file.
+      evidence: The record.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    for name, part in evidence._asdict().items():
+        if name in RECORDS:
+            arrays |= {f"{name}.{key}": value for key, value in part._asdict().items()}
+        else:
+            arrays[name] = np.asarray(part)
+    for side in ("forward", "backward"):  # exact: `gather` rounds to it
+        arrays[f"flow.{side}"] = arrays[f"flow.{side}"].astype(np.float16)
+    cache_files.write_arrays(path, arrays, _identity(path))
+
+
+def _identity(path):
+    """Identity of the record in a file, whose name differs for each capture."""
+    return f"evidence {VERSION} {path.stem}"
+
+
+def load(path: pathlib.Path) -> Evidence:
+    """Read a file written by `save` under the same name.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The record.
+
+    Raises:
+      ValueError: If the content is anything else.
+      OSError: If it cannot be read.
+    """
+    arrays = cache_files.read_arrays(path, _identity(path))
+    parts: dict[str, Any] = {}
+    for name in Evidence._fields:
+        if name in RECORDS:
+            fields = RECORDS[name]._fields
+            leaves = (arrays[f"{name}.{key}"] for key in fields)
+            parts[name] = RECORDS[name]._make(leaves)
+        else:
+            parts[name] = arrays[name]
+    parts["seconds"] = Seconds(*(float(part) for part in parts["seconds"]))
+    kinds_of_one = {"unusable": str, "left_out": str, "told": bool, "factor": int}
+    parts |= {name: kind(parts[name]) for name, kind in kinds_of_one.items()}
+    flow = parts["flow"]
+    parts["flow"] = flow._replace(
+        forward=flow.forward.astype(np.float32),
+        backward=flow.backward.astype(np.float32),
+    )
+    return Evidence(**parts)

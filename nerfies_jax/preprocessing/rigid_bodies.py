@@ -1,0 +1,202 @@
+"""Paths of rigidly moving objects, refined by bundle adjustment.
+
+The path of least acceleration treats each track separately. An object that accelerates
+more than the camera comes out too near in one frame and too far in another. Its size in
+the images determines its distance better, up to one factor for the whole video. That
+factor is taken from the paths, whose errors have either sign.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from nerfies_jax.preprocessing import bundle, rigid_groups
+from nerfies_jax.preprocessing.bundle import Body
+from nerfies_jax.preprocessing.paths import Paths
+from nerfies_jax.preprocessing.tracks import TRACK_PX, Tracks
+from nerfies_jax.preprocessing.view_set import Views
+
+GROUPS = 12
+FEWEST = 20  # tracks of a body
+MOST = 300  # tracks that are adjusted; the others are placed afterwards
+# Frames in which a thing is adjusted: of longer videos every second, every third, ...;
+# its work grows with the cube of them.
+MOST_FRAMES = 80
+LEAST_SHARE = 0.5  # of a group's tracks that a body must explain
+WITHIN_PX = 2 * TRACK_PX  # of a track that is on a body; half of them within one
+# Deviation of depths: 0.075 of the built-in fast cube, 0.03 of the slower one, whose
+# paths are as good as its body.
+BADLY_TOLD = 0.05
+FEWEST_SEEN = 6  # tracks in a frame in which a body's place is known
+GROWTHS = 5  # rounds in which a body is followed into more frames
+LEAST_KNOWN = 6  # frames in which a path is known
+
+
+def refined(
+    views: Views,
+    tracks: Tracks,
+    paths: Paths,
+    has_room: Callable[[int], bool] = lambda terms: True,
+) -> Paths:
+    """Refine the paths on rigid objects. Other paths do not change.
+
+    Only objects whose depth is badly determined by the paths are refined. Where it is
+    well determined, a nearly rigid cloth would come out four times worse. A track is no
+    longer known in frames that show too little of its object.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      paths: Their paths.
+      has_room: Called before each object and each round of its growth with the work of
+        it, the number of tracks times the square of the number of frames. False stops.
+
+    Returns:
+      The paths.
+    """
+    position, known = paths.position.copy(), paths.known.copy()
+    every = -(-len(views.time) // MOST_FRAMES)
+    some_views, some_tracks, few = _some_frames(views, tracks, paths, every)
+    left = few.known.sum(1) >= LEAST_KNOWN
+    if left.sum() < FEWEST:
+        return paths
+    rows = np.flatnonzero(left)
+    label = np.full(len(left), -1)
+    label[rows] = rigid_groups.labels(few.position[rows], few.known[rows], GROUPS)
+    for group in np.argsort(-np.bincount(label[rows], minlength=GROUPS), kind="stable"):
+        own = np.flatnonzero((label == group) & left)
+        if len(own) < FEWEST or np.median(paths.depth_deviation[own]) < BADLY_TOLD:
+            continue
+        if not has_room(_work(own, few)):
+            break
+        rows = np.flatnonzero(left)
+        grown = _grown(some_views, some_tracks, few, own, rows, has_room)
+        if grown is None:
+            continue
+        own, body = grown
+        if every > 1:
+            body = _in_all_frames(views, tracks, paths, own, body, every)
+        position[own], known[own] = _at_paths_scale(views, paths, own, body)
+        left[own] = False
+    depth = views.depth_of(position)
+    return Paths(position, known, depth, paths.depth_deviation)
+
+
+def _work(own, paths):
+    return min(len(own), MOST) * paths.known.shape[1] ** 2
+
+
+def _some_frames(views, tracks, paths, every):
+    """Views, tracks and paths of every `every`-th frame."""
+    if every == 1:
+        return views, tracks, paths
+    kept = slice(None, None, every)
+    rarer = {
+        name: getattr(paths, name)[:, kept] for name in ("position", "known", "depth")
+    }
+    return (
+        Views(*(part[kept] for part in views)),
+        Tracks(tracks.start // every, tracks.pixel[:, kept], tracks.seen[:, kept]),
+        paths._replace(**rarer),
+    )
+
+
+def _in_all_frames(views, tracks, paths, own, body, every):
+    """A body of every so many frames, posed by what was seen of it in the others."""
+    frames = np.arange(len(views.time))
+    kept = frames[::every]
+    within = np.minimum(frames, kept[-1])  # it stays where it was last
+    turn = Slerp(kept, Rotation.from_matrix(body.rotation))(within).as_matrix()
+    shift = np.stack([np.interp(within, kept, axis) for axis in body.shift.T], -1)
+    some = np.isin(own, _fewer(paths, own))
+    seen = bundle.sight(views, tracks.take(own[some]), paths.known[own[some]])
+    posed = bundle.posed(views, seen, Body(body.point[some], turn, shift))
+    return posed._replace(point=body.point)
+
+
+def _grown(views, tracks, paths, own, rows, has_room):
+    """Paths on the rigid object that `own` are on, and the object, or None.
+
+    From the frames in which it is known, the object is followed into others by the
+    tracks that they share.
+    """
+    body = None
+    for _ in range(GROWTHS):
+        found = _body(views, tracks, paths, own)
+        if found is None:
+            break
+        own, body = found
+        there = paths.known[own].sum(0) >= FEWEST_SEEN
+        fits = _on(views, tracks, paths, body, rows, there)[1] < WITHIN_PX
+        if fits.sum() <= len(own) or not has_room(_work(rows[fits], paths)):
+            break
+        own = rows[fits]
+    if body is None:
+        return None
+    body, miss = _on(views, tracks, paths, body, rows, there)
+    fits = miss < WITHIN_PX
+    if fits.sum() < FEWEST or np.median(miss[fits]) > TRACK_PX:
+        return None
+    return rows[fits], body._replace(point=body.point[fits])
+
+
+def _body(views, tracks, paths, own):
+    """Rigid object that most of the tracks are on, and those tracks, or None."""
+    own = _fewer(paths, own)
+    for _ in range(2):  # once more without those that are on something else
+        body = _first(paths, own)
+        seen = bundle.sight(views, tracks.take(own), paths.known[own])
+        body = bundle.adjusted(views, seen, body)
+        miss = bundle.misses(views, seen, body)
+        fits = bundle.typical_misses(seen, miss, len(own)) < WITHIN_PX
+        if fits.mean() < LEAST_SHARE or fits.sum() < FEWEST:
+            return None
+        own, all_fit = own[fits], fits.all()
+        if all_fit:
+            break
+    return own, body
+
+
+def _fewer(paths, own):
+    """At most `MOST`, those first that are seen where few are."""
+    rare = paths.known[own] / np.maximum(paths.known[own].sum(0), 1)
+    return own[np.argsort(-rare.sum(1), kind="stable")[:MOST]]
+
+
+def _first(paths, own):
+    """A body by the paths alone."""
+    position, known = paths.position[own], paths.known[own]
+    canonical = position.shape[1] // 2
+    motion = rigid_groups.motion(position, known, np.zeros(len(own), int), canonical)
+    point, (middle,) = rigid_groups.centers(position, known, motion)
+    shift = motion.shift[0] + motion.rotation[0] @ middle
+    return Body(point - middle, motion.rotation[0], shift)
+
+
+def _on(views, tracks, paths, body, rows, there):
+    """The body with a point for each of the paths, and by how much they miss, px.
+
+    By the frames that are `there`; infinite where a path is known in too few of them.
+    """
+    known = paths.known[rows] & there
+    local = paths.position[rows] - body.shift
+    local = np.einsum("fji,nfj->nfi", body.rotation, local)
+    local = np.where(known[..., None], local, np.nan)
+    enough = known.sum(1) >= LEAST_KNOWN
+    point = np.zeros((len(rows), 3))
+    point[enough] = np.nanmedian(local[enough], axis=1)
+    seen = bundle.sight(views, tracks.take(rows), known & enough[:, None])
+    whole = bundle.placed(views, seen, body._replace(point=point))
+    miss = bundle.misses(views, seen, whole)
+    return whole, bundle.typical_misses(seen, miss, len(rows))
+
+
+def _at_paths_scale(views, paths, own, body):
+    """Places of the body's points over time, in the median as far as their paths."""
+    enough = paths.known[own].sum(0) >= FEWEST_SEEN
+    known = paths.known[own] & enough
+    depth = views.depth_of(body.world())
+    known &= depth > 0
+    factor = np.median(paths.depth[own][known] / depth[known])
+    return bundle.scaled(views, body, factor).world(), known

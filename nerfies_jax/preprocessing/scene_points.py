@@ -1,0 +1,211 @@
+"""Findings about a capture's static points: their number, coverage and consistency."""
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.preprocessing import rest_points, still_points, view_set
+from nerfies_jax.preprocessing import tracks as tracking
+from nerfies_jax.preprocessing.dense_flow import NeighborFlow
+from nerfies_jax.preprocessing.findings import (
+    BACKGROUND,
+    CERTAIN,
+    START,
+    Finding,
+    cannot_tell,
+    judge,
+)
+from nerfies_jax.preprocessing.motion import rest_noise
+from nerfies_jax.preprocessing.record import Evidence
+from nerfies_jax.preprocessing.still_points import CENTERS, REACH
+from nerfies_jax.preprocessing.view_set import MIN_POINTS, Views
+
+CELLS = (8, 6)  # across and down: an image is covered where a cell holds a point
+COVERED = 0.5  # of the cells that show anything
+# A point that a following frame's flow misses by so much is not where it should be.
+# Pixels of images made small; more of larger ones.
+AGREES_PX, AGREES_DEVIATIONS = 3.0, 4.0
+LEAST_FOLLOWED = 4  # frames that a point is followed to; fewer in shorter videos
+LEAST_MOVING = 0.005  # of a frame's pixels: still scenes have up to 0.4 % marked
+DEPTH_KNOWN, DEPTH_AGREES = 0.05, 0.2  # shares of a depth: its deviation, its bound
+STILL_SHARE = 0.8  # of the points that can be checked
+
+
+def coverage(views: Views, points: np.ndarray) -> float:
+    """Compute the share of image cells with observed pixels that contain a point.
+
+    Args:
+      views: The frames.
+      points: Points in scene units, [points, 3].
+
+    Returns:
+      The share.
+    """
+    across, down = CELLS
+    width, height = views.size
+    held = shown = 0
+    for index in range(len(views.row)):
+        pixel, depth = view_set.project(views, index, points)
+        inside = view_set.in_picture(views, pixel, depth, 0)
+        column = np.clip(pixel[inside, 0] * across / width, 0, across - 1).astype(int)
+        line = np.clip(pixel[inside, 1] * down / height, 0, down - 1).astype(int)
+        has = np.zeros((down, across), bool)
+        has[line, column] = True
+        lines = np.array_split(views.valid[index], down, axis=0)
+        scene = np.array(
+            [
+                [cell.mean() > 0.5 for cell in np.array_split(one, across, axis=1)]
+                for one in lines
+            ]
+        )
+        held, shown = held + (has & scene).sum(), shown + scene.sum()
+    return held / shown if shown else 0.0
+
+
+def moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> float:
+    """Compute the share of cells with moving pixels that contain a point.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+      points: Points in scene units, [points, 3].
+
+    Returns:
+      The share, NaN if nothing moves.
+    """
+    across, down = CELLS
+    width, height = views.size
+    size = height // down, width // across
+    held = shown = 0
+    for index in _looked_from(views):
+        moving = evidence.moving[index]
+        if moving.mean() < LEAST_MOVING:
+            continue
+        pixel, depth = view_set.project(views, index, points)
+        inside = view_set.in_picture(views, pixel, depth)
+        place = pixel[inside].astype(int)
+        near = np.zeros((height, width), bool)
+        near[place[:, 1], place[:, 0]] = True
+        line, column = np.nonzero(moving)
+        for i, j in set(zip(line // size[0], column // size[1], strict=True)):
+            box = np.s_[i * size[0] : (i + 1) * size[0]]
+            beside = np.s_[j * size[1] : (j + 1) * size[1]]
+            held += (near[box, beside] & moving[box, beside]).any()
+            shown += 1
+    return held / shown if shown else np.nan
+
+
+def _looked_from(views):
+    last = len(views.row) - 1
+    frames = np.linspace(0, last, min(CENTERS, last + 1)).round().astype(int)
+    return np.unique(frames).tolist()
+
+
+def start(
+    capture: Capture, views: Views, evidence: Evidence, points: np.ndarray
+) -> Finding:
+    """Decide whether the capture's points are enough to initialize Gaussians.
+
+    Args:
+      capture: The capture.
+      views: Its frames.
+      evidence: Its preprocessing.
+      points: Its points in scene units, [points, 3].
+
+    Returns:
+      The finding.
+    """
+    threshold = f"{MIN_POINTS} points that cover {COVERED:.0%} of the pictures"
+    count = 0 if capture.points is None else len(capture.points.position)
+    if count == 0:
+        measurement = "the capture has no points: Gaussians start at random"
+        return Finding(START, measurement, threshold, False, CERTAIN, {"points": 0.0})
+    covered = coverage(views, points)
+    inside = moving_coverage(views, evidence, points)
+    enough = judge(count, MIN_POINTS, np.sqrt(count))
+    spread = judge(covered, COVERED, 0.02)
+    # Both must hold; the less sure of two that agree, and whichever refuses.
+    wanted, confidence = min(
+        (enough, spread), key=lambda one: (one[0] is not False, one[1] == CERTAIN)
+    )
+    measurement = (
+        f"{count} points in {covered:.0%} of the pictures' {CELLS[0]}x{CELLS[1]} cells"
+    )
+    numbers = {"points": float(count), "covered_share": covered}
+    if np.isfinite(inside):
+        numbers["moving_covered_share"] = float(inside)
+        measurement += f", and on what moves in {inside:.0%} of its cells"
+    return Finding(START, measurement, threshold, wanted, confidence, numbers)
+
+
+def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
+    """Decide whether the capture's points are static, as the background prior needs.
+
+    Args:
+      views: The frames.
+      evidence: Their preprocessing.
+      points: Points in scene units, [points, 3].
+
+    Returns:
+      The finding.
+    """
+    threshold = f"{STILL_SHARE:.0%} of them within {AGREES_PX:g} px of the film's paths"
+    if not len(points):
+        measurement = "the capture has no points"
+        return Finding(BACKGROUND, measurement, threshold, False, CERTAIN)
+    seen, agree = np.zeros(len(points)), np.zeros(len(points))
+    if not evidence.unusable:
+        for frame in _looked_from(views):
+            which, stays = _stays(views, evidence, frame, points)
+            seen[which] += 1
+            agree[which] += stays
+    count = int((seen > 0).sum())
+    if count < MIN_POINTS:
+        return cannot_tell(
+            BACKGROUND,
+            f"{len(points)} points, but only {count} on pixels that can be followed",
+            threshold,
+        )
+    # A point is where it should be if most frames say so: rims make single ones err.
+    share = float((agree[seen > 0] > 0.5 * seen[seen > 0]).mean())
+    # On what strays, not on what stays: 1 % and 2 % astray differ by a factor of two.
+    moved, confidence = judge(
+        1 - share, 1 - STILL_SHARE, np.sqrt(share * (1 - share) / count)
+    )
+    wanted = None if moved is None else not moved
+    measurement = f"{share:.1%} of {count} points stay with the film's paths"
+    numbers = {"still_share": share}
+    return Finding(BACKGROUND, measurement, threshold, wanted, confidence, numbers)
+
+
+def _stays(views, evidence, frame, points):
+    """Points that the flow around a frame can check, and those among them that agree.
+
+    A point behind the surface that the flow shows is occluded and checks nothing. A
+    point in front of it, which is looked through, is misplaced. Without parallax flow
+    shows no depth, and only tests that the surface at the point stays with the point.
+    """
+    pixel, depth = view_set.project(views, frame, points)
+    which = np.flatnonzero(view_set.in_picture(views, pixel, depth))
+    span = slice(max(0, frame - REACH), frame + REACH + 1)
+    near, at = still_points.view_slice(views, span), frame - span.start
+    starts = np.concatenate([np.full((len(which), 1), at), pixel[which]], axis=-1)
+    flow = NeighborFlow(*(part[span] for part in evidence.flow))
+    tracks = tracking.chain(flow, starts)
+    enough = tracks.seen.sum(1) > min(LEAST_FOLLOWED, len(near.row) - 1)
+    which, tracks = which[enough], tracks.take(enough)
+    rest = rest_points.fit(near, tracks)
+    # One where the point lies on what is shown.
+    share = depth[which] / rest.depth[:, at]
+    deep = still_points.depth_deviation(near, tracks, rest) < DEPTH_KNOWN
+    checked = ~deep | (share < 1 + DEPTH_AGREES)
+    through = deep & (share < 1 - DEPTH_AGREES)
+    misses = np.full(tracks.seen.shape, np.nan)
+    for other in range(len(near.row)):
+        there, _ = view_set.project(near, other, points[which])
+        miss = np.linalg.norm(there - tracks.pixel[:, other], axis=-1)
+        misses[:, other] = np.where(tracks.seen[:, other], miss, np.nan)
+    misses[:, at] = np.nan
+    middle = np.nanmedian(misses, axis=1)
+    bound = AGREES_PX * view_set.times_smaller(views)
+    bound = max(bound, AGREES_DEVIATIONS * rest_noise(evidence))
+    return which[checked], (middle < bound)[checked] & ~through[checked]

@@ -1,0 +1,158 @@
+"""Findings about the data of a capture, and its usefulness: depth, masks, lens."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.geometry import distortion
+from nerfies_jax.preprocessing import still_points
+from nerfies_jax.preprocessing.findings import (
+    CERTAIN,
+    DEPTH,
+    LENS,
+    MASKS,
+    Finding,
+    cannot_tell,
+    judge,
+)
+from nerfies_jax.preprocessing.paths import AT_REST
+from nerfies_jax.preprocessing.record import MOVES, Evidence
+from nerfies_jax.preprocessing.tracks import pixel_of
+from nerfies_jax.preprocessing.view_set import MIN_POINTS, Views
+
+KNOWN_SHARE = 0.2  # of the pixels: fewer depths are points
+DEPTH_ERROR = 0.1  # median share that depth is off what parallax says
+DEPTH_SURE = 0.03  # deviation of a depth from parallax, to be compared with
+MISSED_SHARE = 0.3  # of what is seen to move may lie outside a mask
+MIN_MOVING = 200  # sightings of tracks, over all frames
+LENS_PX = 0.5  # half a pixel is what cameras are known to
+GRID = 9  # pixels across and down where a lens is asked
+
+
+def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
+    """Decide whether the capture's depth agrees with parallax, up to one scale.
+
+    Args:
+      capture: The capture.
+      views: Its frames.
+      evidence: Its preprocessing.
+
+    Returns:
+      The finding.
+    """
+    threshold = f"{KNOWN_SHARE:.0%} of the pixels, off parallax by {DEPTH_ERROR:.0%}"
+    if capture.depths is None:
+        return Finding(DEPTH, "the capture has none", threshold, False, CERTAIN)
+    pictures = capture.depths[views.row]
+    share = float((pictures > 0).mean())
+    if share < KNOWN_SHARE:
+        measurement = f"depth on {share:.1%} of the pixels"
+        return Finding(DEPTH, measurement, threshold, False, CERTAIN, {"share": share})
+    ratio = _over_parallax(pictures, views, evidence)
+    if len(ratio) < MIN_POINTS:
+        return cannot_tell(
+            DEPTH,
+            f"depth on {share:.1%} of the pixels, and no parallax to check it by",
+            threshold,
+        )
+    scale = float(np.median(ratio))
+    error = float(np.median(np.abs(ratio / scale - 1)))
+    wrong, confidence = judge(error, DEPTH_ERROR, 0.0)
+    measurement = (
+        f"depth on {share:.1%} of the pixels, {error:.1%} off parallax in the median "
+        f"once scaled by {1 / scale:.3g}"
+    )
+    numbers = {"share": share, "error_share": error, "scale": 1 / scale}
+    wanted = None if wrong is None else not wrong
+    return Finding(DEPTH, measurement, threshold, wanted, confidence, numbers)
+
+
+def _over_parallax(pictures, views, evidence):
+    """[sightings] stored depth over that of the points of tracks at rest."""
+    still = np.flatnonzero((evidence.score < AT_REST) & (not evidence.unusable))
+    tracks, rest = evidence.tracks.take(still), evidence.rest.take(still)
+    sure = still_points.depth_deviation(views, tracks, rest) < DEPTH_SURE
+    tracks, rest = tracks.take(sure), rest.take(sure)
+    row, column = pixel_of(tracks.pixel, pictures.shape[1:])
+    own = pictures[np.arange(len(pictures)), row, column]
+    known = tracks.seen & (own > 0) & (rest.depth > 0)
+    return own[known] / rest.depth[known]
+
+
+def masks(capture: Capture, evidence: Evidence) -> Finding:
+    """Decide whether the capture's masks contain the observed motion.
+
+    Args:
+      capture: The capture.
+      evidence: Its preprocessing.
+
+    Returns:
+      The finding.
+    """
+    threshold = f"at most {MISSED_SHARE:.0%} of what is seen to move outside them"
+    if capture.moving is None:
+        return Finding(MASKS, "the capture has none", threshold, False, CERTAIN)
+    moving = capture.moving[evidence.row]
+    share = float(moving.mean())
+    numbers = {"share": share}
+    measurement = f"masks on {share:.1%} of the pixels"
+    if share in (0.0, 1.0):
+        return Finding(MASKS, measurement, threshold, False, CERTAIN, numbers)
+    tracks = evidence.tracks.take((evidence.score > MOVES) & (not evidence.unusable))
+    seen, frames = int(tracks.seen.sum()), int(tracks.seen.any(0).sum())
+    if seen < MIN_MOVING:
+        return cannot_tell(
+            MASKS,
+            f"{measurement}, and too little seen to move to check them",
+            threshold,
+        )
+    row, column = pixel_of(tracks.pixel, moving.shape[1:])
+    inside = moving[np.arange(len(moving)), row, column] & tracks.seen
+    part = 1 - float(inside.sum() / seen)
+    # Whole regions are in or out: one region a frame.
+    error = np.sqrt(part * (1 - part) / frames)
+    wrong, confidence = judge(part, MISSED_SHARE, float(error))
+    wanted = None if wrong is None else not wrong
+    measurement += f"; {part:.1%} of what is seen to move lies outside"
+    return Finding(
+        MASKS, measurement, threshold, wanted, confidence, numbers | {"missed": part}
+    )
+
+
+def lens(capture: Capture) -> Finding:
+    """Measure the lens distortion of a capture as stored.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The finding, with the largest displacement of a pixel.
+    """
+    threshold = f"{LENS_PX:g} px"
+    cameras = capture.cameras
+    width, height = capture.size
+    across, down = np.meshgrid(
+        np.linspace(0, width, GRID), np.linspace(0, height, GRID)
+    )
+    pixel = np.stack([across, down], -1).reshape(-1, 2)
+    parameters = np.concatenate(
+        [cameras.radial, cameras.tangential, cameras.focal_px[:, None]], axis=1
+    )
+    worst = 0.0
+    for row in np.unique(parameters, axis=0, return_index=True)[1]:
+        focal = np.array([1, cameras.pixel_aspect[row]]) * cameras.focal_px[row]
+        slope = ((pixel - cameras.principal_point_px[row]) / focal).astype(np.float32)
+        bend = jax.vmap(distortion.distort, (None, None, 0))
+        bent = bend(
+            jnp.asarray(cameras.radial[row], jnp.float32),
+            jnp.asarray(cameras.tangential[row], jnp.float32),
+            jnp.asarray(slope),
+        )
+        moved = np.linalg.norm((np.asarray(bent) - slope) * focal, axis=-1)
+        worst = max(worst, float(moved.max()))
+    wanted, confidence = judge(worst, LENS_PX, 0.0)
+    measurement = f"the lens moves pixels by up to {worst:.2g} px"
+    if wanted:
+        measurement += "; splats learn from pictures without it and are scored with it"
+    return Finding(LENS, measurement, threshold, wanted, confidence, {"most_px": worst})

@@ -1,0 +1,87 @@
+"""Detail of the texture, in bands of a positional encoding."""
+
+import math
+
+import numpy as np
+
+from nerfies_jax.capture import scene_metadata
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.preprocessing import view_set
+from nerfies_jax.preprocessing.findings import CERTAIN, LIKELY, Finding, cannot_tell
+from nerfies_jax.preprocessing.findings import TEXTURE as EFFECT
+from nerfies_jax.preprocessing.view_set import Views
+
+SMALL = 8  # of the fields' small presets
+ENERGY = 0.95  # of the slopes' energy lies in coarser detail than "the finest"
+SHOWN = 8  # frames whose spectrum is taken
+
+
+def bands_for(cycles_per_unit: float) -> int:
+    """Return the number of bands sin 2^k x whose last one reaches a frequency.
+
+    Args:
+      cycles_per_unit: Frequency in cycles per unit of the coordinates.
+
+    Returns:
+      The number of bands, at least 1.
+    """
+    return max(1, 1 + math.ceil(math.log2(max(2 * math.pi * cycles_per_unit, 1))))
+
+
+def texture(capture: Capture, views: Views, factor: int) -> Finding:
+    """Estimate the number of bands that the texture needs in a field of extent 1.
+
+    It is derived from the spectrum of the images at the median depth.
+
+    Args:
+      capture: The capture.
+      views: Its frames.
+      factor: Reduction of the frames, compared with the capture's images, which may
+        hold finer detail.
+
+    Returns:
+      The finding.
+    """
+    threshold = f"{SMALL} bands, as the fields' small presets have"
+    seen = [one for one in _shown(views) if views.valid[one].mean() > 0.5]
+    if not seen:
+        return cannot_tell(
+            EFFECT, "plain background fills most of the views", threshold
+        )
+    cycles = float(np.median([_finest(views.gray[one]) for one in seen]))
+    near, far = view_set.depth_span(capture, views)
+    depth = math.sqrt(near * far)
+    scale = scene_metadata.metadata_of(capture, 1.0).scale
+    per_unit = cycles * views.intrinsics[0, 0, 0] / depth / scale
+    bands = bands_for(per_unit)
+    evidence = (
+        f"{ENERGY:.0%} of the detail is coarser than {1 / cycles:.1f} px at 1/{factor} "
+        f"of the size, {1 / per_unit:.3g} of a field's half-side: {bands} bands"
+    )
+    numbers = {"finest_px": 1 / cycles * factor, "bands": float(bands)}
+    sure = CERTAIN if abs(bands - SMALL) > 1 else LIKELY
+    return Finding(EFFECT, evidence, threshold, bands > SMALL, sure, numbers)
+
+
+def _shown(views):
+    return np.unique(np.linspace(0, len(views.row) - 1, SHOWN).round().astype(int))
+
+
+def _finest(gray):
+    """Cycles a pixel below which `ENERGY` of the slopes' energy lies, less the noise.
+
+    Noise is white, and what there is at the highest frequencies is taken for it.
+    """
+    height, width = gray.shape
+    window = np.hanning(height)[:, None] * np.hanning(width)
+    power = np.abs(np.fft.fft2((gray - gray.mean()) * window)) ** 2
+    across, down = np.fft.fftfreq(width), np.fft.fftfreq(height)
+    frequency = np.hypot(*np.meshgrid(across, down))
+    noise = np.median(power[frequency > 0.45])
+    slope = np.maximum(power - noise, 0) * frequency**2
+    order = np.argsort(frequency.ravel())
+    total = np.cumsum(slope.ravel()[order])
+    if not total[-1] > 0:
+        return 1 / max(width, height)
+    at = min(int(np.searchsorted(total, ENERGY * total[-1])), len(order) - 1)
+    return float(np.clip(frequency.ravel()[order][at], 1 / width, 0.5))

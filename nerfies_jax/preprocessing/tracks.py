@@ -1,0 +1,244 @@
+"""Point tracks through a video, realigned with the frames in which they began."""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from nerfies_jax.preprocessing.dense_flow import NeighborFlow
+from nerfies_jax.preprocessing.view_set import Views
+
+# Starts: every so many pixels in every third frame, about 10,000 tracks of 60 frames of
+# 176x132; larger images get as many.
+GRID_STEPS, EVERY_FRAMES = 29, 3  # across the image's width
+MOST_PLACES = 30_000_000  # tracks times frames, about 30 bytes each
+SHORTEST = 8  # frames: fewer say little of how a point moves
+# Flow's errors add up along a track. Each point is looked up again in the frame where
+# it began: the 95 % quantile of the drift of points at rest falls by half.
+WINDOW_PX, FARTHEST_PX = 9, 1.5
+TRACK_PX = 0.3  # error of a track, for weights
+ROUNDS, PRECISION_PX = 20, 0.01  # of Lucas-Kanade's search, enlarged pixels
+LEAST_EIGENVALUE = 1e-4  # of the window's structure: below it there is nothing to align
+
+
+class Tracks(NamedTuple):
+    """Positions of points in each frame."""
+
+    start: np.ndarray  # [tracks] frame in which each began
+    pixel: np.ndarray  # [tracks, frames, 2] float32; 0 where not seen
+    seen: np.ndarray  # [tracks, frames] bool
+
+    def take(self, which: np.ndarray) -> "Tracks":
+        """Select tracks.
+
+        Args:
+          which: Indices or mask.
+
+        Returns:
+          The selected tracks.
+        """
+        return Tracks(*(part[which] for part in self))
+
+
+def pixel_of(
+    place: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixel in which each position lies, or the nearest in the image.
+
+    Args:
+      place: Positions (x, y) with centers at +0.5, [..., 2].
+      shape: Height and width of the image in pixels.
+
+    Returns:
+      Rows and columns, [...].
+    """
+    column, row = np.moveaxis(np.floor(place).astype(int), -1, 0)
+    return np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)
+
+
+def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
+    """Make starting points of tracks: a shifted grid in every third frame.
+
+    Points on a plain background or on unobserved pixels are left out. A long video uses
+    fewer frames, such that tracks have at most `MOST_PLACES` positions in all frames
+    together.
+
+    Args:
+      views: The frames.
+      sparser: Factor by which fewer frames are used.
+      seed: Seed of the shifts.
+
+    Returns:
+      Frame, column and row in pixels, [starts, 3].
+    """
+    rng = np.random.default_rng(seed)
+    width, height = views.size
+    step = width / GRID_STEPS
+    starts, frames = [], len(views.row)
+    most = int(width / step + 1) * int(height / step + 1) * (frames // EVERY_FRAMES + 1)
+    sparser *= math.ceil(most * frames / MOST_PLACES)
+    for frame in range(0, frames, sparser * EVERY_FRAMES):
+        x, y = rng.uniform(1, 1 + step, 2)
+        x, y = np.meshgrid(
+            np.arange(x, width - 1, step), np.arange(y, height - 1, step)
+        )
+        pixel = np.stack([x.ravel(), y.ravel()], axis=-1)
+        shown = views.valid[frame][pixel[:, 1].astype(int), pixel[:, 0].astype(int)]
+        at = np.full((shown.sum(), 1), frame)
+        starts.append(np.concatenate([at, pixel[shown]], axis=-1))
+    return np.concatenate(starts)
+
+
+def work(views: Views, sparser: int = 1) -> int:
+    """Return the work of the tracks of a grid.
+
+    Args:
+      views: The frames.
+      sparser: As for `grid`.
+
+    Returns:
+      Number of starting points times number of frames.
+    """
+    return len(grid(views, sparser)) * len(views.row)
+
+
+def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
+    """Follow points from frame to frame in both directions until flow is inconsistent.
+
+    Args:
+      flow: Flow between neighboring frames.
+      starts: Frame, column and row in pixels, [tracks, 3], as from `grid`.
+
+    Returns:
+      The tracks.
+    """
+    frames = len(flow.forward)
+    count, each = len(starts), np.arange(len(starts))
+    start = starts[:, 0].astype(int)
+    pixel = np.zeros((count, frames, 2), np.float32)
+    seen = np.zeros((count, frames), bool)
+    pixel[each, start], seen[each, start] = starts[:, 1:], True
+    sides = ((1, flow.forward, flow.forward_seen), (-1, *flow[2:]))
+    for sign, shift, usable in sides:
+        for here in range(frames)[::sign]:
+            there = here + sign
+            if not 0 <= there < frames:
+                continue
+            # Only what began on this side: the other direction carries the rest.
+            goes = np.flatnonzero(seen[:, here] & (sign * (here - start) >= 0))
+            moved, kept = _step(pixel[goes, here], shift[here], usable[here])
+            pixel[goes[kept], there], seen[goes[kept], there] = moved[kept], True
+    return Tracks(start, pixel, seen)
+
+
+def _step(pixel, shift, usable):
+    """Move pixels by the bilinear mean of usable flow. Also returns validity."""
+    height, width = usable.shape
+    bound = np.array([width, height])
+    kept = usable[pixel_of(pixel, usable.shape)]
+    corner = np.clip(np.floor(pixel - 0.5).astype(int), 0, bound - 2)
+    part = np.clip(pixel - 0.5 - corner, 0, 1)
+    total, sum_of_weights = 0.0, 0.0
+    for right in (0, 1):
+        for down in (0, 1):
+            x, y = corner[:, 0] + right, corner[:, 1] + down
+            weight = np.abs(1 - right - part[:, 0]) * np.abs(1 - down - part[:, 1])
+            weight = (weight * usable[y, x])[:, None]
+            total, sum_of_weights = (
+                total + weight * shift[y, x],
+                sum_of_weights + weight,
+            )
+    moved = pixel + total / np.maximum(sum_of_weights, 1e-6)
+    kept &= ((moved > 0.5) & (moved < bound - 0.5)).all(-1)
+    return moved, kept
+
+
+def long_enough(tracks: Tracks) -> Tracks:
+    """Select long tracks.
+
+    Args:
+      tracks: The tracks.
+
+    Returns:
+      The long ones, by `is_long`.
+    """
+    return tracks.take(is_long(tracks))
+
+
+def is_long(tracks: Tracks) -> np.ndarray:
+    """Find tracks visible in at least `SHORTEST` frames, or in all of a shorter video.
+
+    Args:
+      tracks: The tracks.
+
+    Returns:
+      Booleans, [tracks].
+    """
+    return tracks.seen.sum(1) >= min(SHORTEST, tracks.seen.shape[1])
+
+
+def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tracks:
+    """Align each point with the image in which it began, by Lucas-Kanade.
+
+    The search starts from the chained position, without a pyramid. Points that move too
+    far become invisible.
+
+    Args:
+      tracks: The tracks.
+      pictures: Enlarged images from `dense_flow.leveled`.
+      size: Width and height in pixels of the images of the tracks.
+
+    Returns:
+      The tracks.
+    """
+    times = pictures.shape[2] // size[0]
+    pixel, seen = tracks.pixel.copy(), tracks.seen.copy()
+    criteria = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ROUNDS, PRECISION_PX
+    for start in np.unique(tracks.start):
+        rows = np.flatnonzero(tracks.start == start)
+        for frame in np.flatnonzero(tracks.seen[rows].any(0)):
+            if frame == start:
+                continue
+            which = rows[tracks.seen[rows, frame]]
+            first = _enlarged(tracks.pixel[which, start], times)
+            guess = _enlarged(tracks.pixel[which, frame], times)
+            place, status, _ = cv2.calcOpticalFlowPyrLK(
+                pictures[start],
+                pictures[frame],
+                first,
+                guess.copy(),
+                winSize=(WINDOW_PX, WINDOW_PX),
+                maxLevel=0,
+                criteria=criteria,
+                flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+                minEigThreshold=LEAST_EIGENVALUE,
+            )
+            moved = np.linalg.norm(place - guess, axis=-1) / times
+            fits = (status.ravel() == 1) & (moved < FARTHEST_PX)
+            pixel[which, frame] = (place + 0.5) / times
+            seen[which[~fits], frame] = False
+    return Tracks(tracks.start, np.where(seen[..., None], pixel, 0), seen)
+
+
+def _enlarged(pixel, times):
+    # OpenCV counts from the center of the first pixel, here centers lie at +0.5.
+    return np.ascontiguousarray(pixel * times - 0.5, np.float32)
+
+
+def from_flow(
+    views: Views, flow: NeighborFlow, pictures: np.ndarray, sparser: int = 1
+) -> Tracks:
+    """Track points from a regular grid through a video.
+
+    Args:
+      views: The frames.
+      flow: Flow between neighboring frames.
+      pictures: Enlarged images from `dense_flow.leveled`.
+      sparser: As for `grid`.
+
+    Returns:
+      Long tracks, static and moving ones.
+    """
+    tracks = long_enough(chain(flow, grid(views, sparser)))
+    return long_enough(realigned(tracks, pictures, views.size))

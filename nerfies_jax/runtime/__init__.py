@@ -1,0 +1,1 @@
+"""Contracts, messages, events, signals and processes."""

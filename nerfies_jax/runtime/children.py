@@ -1,0 +1,101 @@
+"""Child processes that end when their parent does, however that ends.
+
+The parent starts a Python program with `start`, or a pool of processes with
+`end_with_parent` as its initializer. The child calls `end_with_parent`. Linux then
+kills it together with its parent. Elsewhere a thread of the child looks for the parent.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from nerfies_jax.runtime import stopping
+
+PARENT = "NERFIES_JAX_PARENT"  # variable of the child's environment: a process id
+POLL_SECONDS = 0.5
+_SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of linux/prctl.h
+
+_started: "weakref.WeakSet[subprocess.Popen]" = weakref.WeakSet()
+
+
+def environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return an environment for a program that calls `end_with_parent`.
+
+    Args:
+      base: Other variables. None for the environment of this process.
+
+    Returns:
+      The variables.
+    """
+    return {**(os.environ if base is None else base), PARENT: str(os.getpid())}
+
+
+def start(command: Sequence[str | os.PathLike], **options: Any) -> subprocess.Popen:
+    """Start a program that calls `end_with_parent`.
+
+    Args:
+      command: The program and its arguments.
+      **options: Options of `subprocess.Popen`.
+
+    Returns:
+      The process.
+    """
+    child = subprocess.Popen(
+        command, env=environment(options.pop("env", None)), **options
+    )
+    _started.add(child)
+    stopping.at_end(_kill)
+    return child
+
+
+def _kill():
+    """Kill the children before what they write is removed."""
+    for child in list(_started):
+        if child.returncode is None:
+            child.kill()
+
+
+def end_with_parent(parent: int | None = None) -> None:
+    """Make this process end when its parent does. Call it early in a child.
+
+    Args:
+      parent: Process id of the parent. By default the one that `start` left in the
+        environment; nothing happens where there is none.
+    """
+    parent = parent or int(os.environ.pop(PARENT, "0"))
+    if not parent:
+        return
+    if sys.platform != "linux" or not _ask_kernel():
+        threading.Thread(target=_follow, args=(parent,), daemon=True).start()
+    if not _is_there(parent):  # it ended before
+        os._exit(128 + signal.SIGTERM)
+
+
+def _ask_kernel() -> bool:
+    import ctypes
+
+    try:
+        prctl = ctypes.CDLL(None).prctl
+    except (OSError, AttributeError):
+        return False
+    return prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL) == 0
+
+
+def _follow(parent):
+    while _is_there(parent):
+        time.sleep(POLL_SECONDS)
+    os._exit(128 + signal.SIGTERM)
+
+
+def _is_there(parent):
+    if os.name == "posix":  # an orphan gets another parent
+        return os.getppid() == parent
+    import psutil
+
+    return psutil.pid_exists(parent)

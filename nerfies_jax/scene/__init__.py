@@ -1,0 +1,1 @@
+"""A radiance field and its losses composed to a model, and presets."""

@@ -1,0 +1,311 @@
+"""Initialization of a field's motion from known paths of points, before ray tracing.
+
+A warp maps observed points back to the template. Tracked points determine it: positions
+of one point at all times map to one point of the template, and static points to
+themselves. A scene flow must lead from a point's position to its next and previous
+ones, and be zero at static points. Gradient descent on images does not find this for
+motion of more than a few pixels.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from nerfies_jax.fields.effects import learned_moments, scene_flow
+from nerfies_jax.fields.field import Field
+from nerfies_jax.preprocessing import usable_paths
+from nerfies_jax.preprocessing.record import Evidence
+from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.model import View
+from nerfies_jax.training.track_start import TrackStartSpec
+from nerfies_jax.training.updates import descended
+
+PyTree = Any
+FRAMES_AT_ONCE, POINTS_AT_ONCE, STILL_AT_ONCE = 12, 256, 128  # of each step
+SOFT = 1e-3  # field units: distances below it count squared
+SOFT_FLOW = 0.05  # the same for flow, over the mean flow that is known
+# Weight of the squared logarithm of how much a warp stretches moving objects, compared
+# with distances in field units. Without it moving objects shrink in the template, where
+# their positions are then close together: ||log Σ|| of the Jacobian is 2.75 there, and
+# tracked points of the built-in scene are 0.0176 units off. With it they are 0.15 and
+# 0.0094 (0.0240 if nothing moves).
+STRETCH = 0.3
+LEAST_STRETCH = 1e-6  # squared: a collapsed direction has a logarithm, too
+
+
+class FilmPaths(NamedTuple):
+    """Tracked points of a video, in units of the field."""
+
+    time: Float[np.ndarray, " frames"]
+    appearance: np.ndarray  # [frames] ids, for codes that go by them
+    position: Float[np.ndarray, "points frames 3"]  # any value where not known
+    known: Bool[np.ndarray, "points frames"]
+    still: Float[np.ndarray, "still 3"]  # points that nothing moves
+
+
+class WarpFit(NamedTuple):
+    """Fitted warp, and the mean distance from one position before and after."""
+
+    params: PyTree  # of the whole field
+    canonical: Float[Array, "points 3"]  # field units: places in the template
+    first: float  # field units
+    last: float
+
+
+class FlowFit(NamedTuple):
+    """Fitted scene flow, and its mean error before and after."""
+
+    params: PyTree  # of the whole field
+    first: float  # field units from one moment to the next
+    last: float
+
+
+def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
+    """Convert paths and static points of preprocessing to units of the field.
+
+    Args:
+      field: The field.
+      capture: The capture.
+      evidence: Its preprocessing.
+
+    Returns:
+      The paths.
+    """
+    metadata = field.metadata
+
+    def inside(place):
+        return ((place - np.asarray(metadata.center)) * metadata.scale).astype(
+            np.float32
+        )
+
+    position, known, _ = usable_paths.known_paths(evidence)
+    return FilmPaths(
+        capture.times[evidence.row].astype(np.float32),
+        capture.appearance_ids[evidence.row],
+        inside(np.where(known[..., None], position, 0)),
+        known,
+        inside(evidence.still.position),
+    )
+
+
+def fit(
+    field: Field,
+    params: PyTree,
+    paths: FilmPaths,
+    key: Key[Array, ""],
+    start: TrackStartSpec,
+) -> WarpFit:
+    """Fit the warp by gradient descent on the spread of each point in the template.
+
+    The optimized variables are the warps, the codes that they read, and the positions
+    in the template, which start where the points are in the middle of their own time.
+    Static points are kept in place, and moving objects keep their size.
+
+    Args:
+      field: The field.
+      params: Its initial parameters.
+      paths: Paths of points.
+      key: PRNG key.
+      start: Settings.
+
+    Returns:
+      The fitted parameters.
+
+    Raises:
+      ValueError: If no position is known.
+    """
+    if not paths.known.any():
+        raise ValueError("no path is known anywhere: nothing to fit a warp to")
+    distances = _distances(field, params, paths)
+    frames, points = len(paths.time), len(paths.known)
+
+    def loss(free, key):
+        key, direction_key = jax.random.split(key)
+        return sum(distances(*free, *_drawn(paths, frames, key), direction_key))
+
+    @jax.jit
+    def mean_distance(free):
+        nothing = jnp.zeros((0, 3), paths.position.dtype)
+        every = jnp.arange(frames), jnp.arange(points)
+        return distances(*free, *every, nothing, key)[0]
+
+    names = {effect.name for effect in field.effects if effect.displace is not None}
+    names &= params.keys()  # an effect of one's own may have none
+    free = (
+        {name: params[name] for name in (*sorted(names), "codes")},
+        jnp.asarray(_first_places(paths)),
+    )
+    fitted = descended(loss, free, start.fit_rate, key, start.fit_steps)
+    first, last = float(mean_distance(free)), float(mean_distance(fitted))
+    return WarpFit(params | fitted[0], fitted[1], first, last)
+
+
+def fit_flow(
+    field: Field,
+    params: PyTree,
+    paths: FilmPaths,
+    key: Key[Array, ""],
+    start: TrackStartSpec,
+) -> FlowFit:
+    """Fit the scene flow to the displacements of points between frames.
+
+    Displacements between frames that are not one interval apart are scaled. The
+    optimized variables are the network of the medium and everything that its flow
+    reads.
+
+    Args:
+      field: The field.
+      params: Its initial parameters.
+      paths: Paths of points.
+      key: PRNG key.
+      start: Settings.
+
+    Returns:
+      The fitted parameters.
+
+    Raises:
+      ValueError: If no point is known in two consecutive frames.
+    """
+    apart = np.diff(paths.time)
+    both = paths.known[:, 1:] & paths.known[:, :-1] & (apart > 0)
+    if not both.any():
+        raise ValueError(
+            "no path is known in two frames that follow each other: nothing to fit a "
+            "scene flow to"
+        )
+    moments = np.where(apart > 0, apart, 1)
+    moments = moments / learned_moments.interval(len(field.metadata.times))
+    shift = np.diff(paths.position, axis=1) / moments[:, None]
+    unit = max(float(np.linalg.norm(shift, axis=-1)[both].mean()), 1e-12)
+    away = _flow_distances(field, paths, shift, both)
+    frames, points = len(moments), len(paths.known)
+
+    def loss(own, key):
+        drawn = _drawn(paths, frames, key)
+        return sum(away(own, *drawn, SOFT_FLOW * unit)) / unit
+
+    @jax.jit
+    def mean_distance(own):
+        nothing = jnp.zeros((0, 3), paths.position.dtype)
+        return away(own, jnp.arange(frames), jnp.arange(points), nothing, 0.0)[0]
+
+    own = params[scene_flow.NAME]
+    fitted = descended(loss, own, start.fit_rate, key, start.fit_steps)
+    first, last = float(mean_distance(own)), float(mean_distance(fitted))
+    return FlowFit(params | {scene_flow.NAME: fitted}, first, last)
+
+
+def _flow_distances(field, paths, shift, both):
+    """(medium, frames, rows, points at rest, where distances count squared) ->
+
+    mean distances of the rows' flow, to the next moment and back, from what they did,
+    and of the flow at rest from none; field units.
+    """
+    spec, time = field.spec.scene_flow, jnp.asarray(paths.time)
+    position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
+    target = jnp.asarray(np.moveaxis(np.where(both[..., None], shift, 0), 1, 0))
+    weight = jnp.asarray(both.T, position.dtype)
+
+    def away(own, frames, rows, still, soft):
+        @functools.partial(jax.vmap, in_axes=(0, None))
+        def flow(point, time):
+            return scene_flow.dynamic(
+                spec, own, point, jnp.zeros_like(point), time
+            ).flow
+
+        def one(frame):
+            there = frame + 1
+            ahead = flow(position[frame][rows], time[frame])[:, scene_flow.FORWARD]
+            back = flow(position[there][rows], time[there])[:, scene_flow.BACKWARD]
+            goal = target[frame][rows]
+            moving = (_length(ahead - goal, soft) + _length(back + goal, soft)) / 2
+            return moving, _length(flow(still, time[frame]), soft)
+
+        return _means(*jax.vmap(one)(frames), weight[frames][:, rows])
+
+    return away
+
+
+def _distances(field, params, paths):
+    """(parts of params, places in the template, frames, rows, points at rest, key) ->
+
+    mean distances of the rows' points from their places, and of those at rest from
+    where they are, field units, and what it costs to stretch the rows' surroundings:
+    each in a direction that is drawn, an estimate of all of them.
+    """
+    position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
+    weight = jnp.asarray(paths.known.T, position.dtype)
+    time, appearance = jnp.asarray(paths.time), jnp.asarray(paths.appearance)
+    trained = jnp.asarray(field.spec.steps)  # all bands of the warp are open
+
+    def distances(own, canonical, frames, rows, still, key):
+        def one(frame, key):
+            view = View(None, time[frame], appearance[frame])
+            codes = field.codes_at(params | own, view)
+            condition = FrameCondition(view.time, codes, trained)
+
+            def warped(point):
+                return point + field.displace(params | own, point, condition)
+
+            def along(point, direction):
+                return jax.jvp(warped, (point,), (direction,))
+
+            here = position[frame][rows]
+            place, stretched = jax.vmap(along)(here, _directions(key, here))
+            # Computed from the square, since a norm has no gradient at zero.
+            stretch = jnp.log(jnp.sum(stretched**2, axis=-1) + LEAST_STRETCH) / 2
+            gap, rest = place - canonical[rows], jax.vmap(warped)(still) - still
+            return _length(gap), _length(rest), stretch**2
+
+        moving, resting, stretch = jax.vmap(one)(
+            frames, jax.random.split(key, len(frames))
+        )
+        counted = weight[frames][:, rows]
+        moving, resting = _means(moving, resting, counted)
+        return moving, resting, STRETCH * _mean(stretch, counted)
+
+    return distances
+
+
+def _directions(key, like):
+    """Unit vectors, all alike likely, as many as there are points."""
+    drawn = jax.random.normal(key, like.shape, like.dtype)
+    return drawn / jnp.linalg.norm(drawn, axis=-1, keepdims=True)
+
+
+def _length(gap, soft=SOFT):
+    return jnp.sqrt(jnp.sum(gap**2, axis=-1) + soft**2)
+
+
+def _drawn(paths, frames, key):
+    """Random frames, rows of points and static points of a step."""
+    frame_key, row_key, still_key = jax.random.split(key, 3)
+    together = min(FRAMES_AT_ONCE, frames)
+    chosen = jax.random.choice(frame_key, frames, (together,), replace=False)
+    rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, len(paths.known))
+    still = jnp.asarray(paths.still)
+    if len(still):
+        still = still[jax.random.randint(still_key, (STILL_AT_ONCE,), 0, len(still))]
+    return chosen, rows, still
+
+
+def _means(moving, resting, counted):
+    """Means of distances: of points where they are counted, and of those at rest."""
+    return _mean(moving, counted), jnp.sum(resting) / max(resting.size, 1)
+
+
+def _mean(values, counted):
+    return jnp.sum(values * counted) / jnp.maximum(jnp.sum(counted), 1)
+
+
+def _first_places(paths):
+    """[points, 3]: each where it is known nearest to the middle of its own time."""
+    places = np.zeros((len(paths.known), 3), np.float32)
+    for row, known in enumerate(paths.known):
+        seen = np.flatnonzero(known)
+        places[row] = paths.position[row, seen[len(seen) // 2]]
+    return places

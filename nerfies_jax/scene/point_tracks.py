@@ -1,0 +1,202 @@
+"""Point tracks by the warp or the scene flow of a radiance field."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax import evaluation
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation.model_flow import Move, Moved
+from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTracks
+from nerfies_jax.fields.effects import learned_moments, scene_flow
+from nerfies_jax.fields.render_ray import Bound, mean_flow
+from nerfies_jax.scene import scene
+from nerfies_jax.training import tracks
+from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.model import in_default_precision
+
+LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
+
+
+def follow(
+    spec,
+    metadata,
+    state,
+    capture: Capture,
+    known: GroundTruth,
+) -> PointTracks | None:
+    """Track points from the start to all other times, through the template of a field.
+
+    A point is mapped to the template by the warp of the start, and from there by the
+    inverse warp of every other time. Without a warp, a scene flow takes it from each
+    time to the next, and the strain is not defined.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      state: Trained state, of `scene.build`.
+      capture: The capture.
+      known: Ground truth, whose start points are tracked.
+
+    Returns:
+      The tracks in scene units. None without such motion or without points.
+    """
+    field = scene.field(spec, metadata)
+    if not len(known.path):
+        return None
+    if all(effect.displace is None for effect in field.effects):
+        return _follow_flow(field, state, capture, known)
+    views = [evaluation.view_of(capture, int(row)) for row in known.moments]
+    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
+    center = np.asarray(metadata.center, np.float32)
+
+    def to_field(points):
+        return in_default_precision((points - center) * np.float32(metadata.scale))
+
+    static = _static_points(capture)
+
+    @jax.jit
+    def solve(params, step, start, true, static):
+        def condition_of(view):
+            return FrameCondition(view.time, field.codes_at(params, view), step)
+
+        conditions = jax.vmap(condition_of)(views)
+        followed = tracks.point_tracks(
+            field.displace, params, start, conditions, known.start
+        )
+        each = jax.vmap(field.displace, (None, 0, None))  # point
+        moved = jax.vmap(each, (None, None, 0))(params, static, conditions)
+        grad = jax.vmap(jax.jacfwd(field.displace, 1), (None, 0, None))
+        grads = jax.vmap(grad, (None, 1, 0))(params, true, conditions)
+        apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
+        return followed, apart, grads
+
+    followed, apart, grads = jax.device_get(
+        solve(
+            state.params,
+            state.step,
+            to_field(known.start_points),
+            to_field(known.path),
+            to_field(static),
+        )
+    )
+    path = followed.points / np.float32(metadata.scale) + center
+    still_path = known.start_points[:, None]
+    path = np.where(followed.converged[..., None], path, still_path)
+    stretch = np.linalg.svd(np.eye(3) + grads.astype(float), compute_uv=False)
+    strain = np.log(np.maximum(stretch, LEAST_STRETCH))
+    return PointTracks(
+        path=path.astype(np.float32),
+        found=followed.converged,
+        drift=float(apart.mean() / metadata.scale) if apart.size else float("nan"),
+        strain=float(np.sqrt(np.mean(np.sum(strain**2, axis=-1)))),
+    )
+
+
+def _static_points(capture):
+    if capture.points is None:
+        return np.zeros((0, 3), np.float32)
+    return capture.points.position[:STATIC_POINTS]
+
+
+def _follow_flow(field, state, capture, known):
+    """Track outward from the start. None without a scene flow."""
+    move = _flow_mover(field)
+    if move is None:
+        return None
+    views = [evaluation.view_of(capture, int(row)) for row in known.moments]
+    static = _static_points(capture)
+    begin = np.concatenate([known.start_points, static])
+    places = {known.start: Moved(begin, np.ones(len(begin), bool))}
+    last = len(views) - 1
+    for step, stop in ((1, last), (-1, 0)):
+        for here in range(known.start, stop, step):
+            before, there = places[here], here + step
+            moved = move(state, before.points, views[here], views[there])
+            places[there] = Moved(moved.points, before.found & moved.found)
+    count = len(known.path)
+    path, found = (
+        np.stack(each, axis=1)
+        for each in zip(*(places[k] for k in range(len(views))), strict=True)
+    )
+    still = path[count:]
+    apart = np.linalg.norm(still - still.mean(axis=1, keepdims=True), axis=-1)
+    lost = ~found[:count, :, None]
+    return PointTracks(
+        path=np.where(lost, known.start_points[:, None], path[:count]).astype("f4"),
+        found=found[:count],
+        drift=float(apart.mean()) if apart.size else float("nan"),
+        strain=float("nan"),
+    )
+
+
+def _flow_mover(field) -> Move | None:
+    """Follow the scene flow, one interval of the capture after the other.
+
+    Between two views that are no whole number of intervals apart, each hop is that much
+    shorter or longer than what the flow says. A point that runs to no finite place is
+    lost.
+    """
+    if all(effect.name != scene_flow.NAME for effect in field.effects):
+        return None
+    metadata = field.metadata
+    center = np.asarray(metadata.center, np.float32)
+    gap = learned_moments.interval(len(metadata.times))
+
+    @jax.jit
+    def hop(params, step, points, view, side, length):
+        condition = FrameCondition(view.time, field.codes_at(params, view), step)
+        bound = Bound(field.spec, metadata, field.effects, params)
+        flow = jax.vmap(lambda point: mean_flow(bound, point, condition))(points)
+        return points + length * flow[:, side]
+
+    def move(state, points, here, there):
+        begin, end = float(here.time), float(there.time)
+        hops = max(round(abs(end - begin) / gap), 1)
+        length = in_default_precision(np.float32(abs(end - begin) / (hops * gap)))
+        side = scene_flow.FORWARD if end >= begin else scene_flow.BACKWARD
+        place = in_default_precision((points - center) * np.float32(metadata.scale))
+        for time in np.linspace(begin, end, hops, endpoint=False):
+            view = here._replace(time=jnp.asarray(time, here.time.dtype))
+            place = hop(state.params, state.step, place, view, side, length)
+        reached = np.asarray(place) / np.float32(metadata.scale) + center
+        known = np.isfinite(reached).all(axis=1)
+        return Moved(np.where(known[:, None], reached, points), known)
+
+    return move
+
+
+def mover(spec, metadata) -> Move | None:
+    """Return the motion of points from the time of one view to that of another.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+
+    Returns:
+      The motion, or None if nothing in the scene moves points.
+    """
+    field = scene.field(spec, metadata)
+    if all(effect.displace is None for effect in field.effects):
+        return _flow_mover(field)
+    center = np.asarray(metadata.center, np.float32)
+
+    @jax.jit
+    def solve(params, step, points, here, there):
+        def condition_of(view):
+            return FrameCondition(view.time, field.codes_at(params, view), step)
+
+        views = jax.tree.map(lambda *leaves: jnp.stack(leaves), here, there)
+        conditions = jax.vmap(condition_of)(views)
+        tracked = tracks.point_tracks(field.displace, params, points, conditions, 0)
+        return tracked.points[:, 1], tracked.converged[:, 1]
+
+    def move(state, points, here, there):
+        inside = in_default_precision((points - center) * np.float32(metadata.scale))
+        reached, known = jax.device_get(
+            solve(state.params, state.step, inside, here, there)
+        )
+        moved = reached / np.float32(metadata.scale) + center
+        return Moved(np.where(known[:, None], moved, points), known)
+
+    return move

@@ -1,0 +1,409 @@
+"""Named radiance fields with the papers' settings, and variants for a CPU.
+
+Samples, networks, rates and weights are those of the paper or code cited at each.
+Numbers without a comment are defaults of their specs, which cite their own source.
+Deviations from the paper are stated at each preset. All of them deviate in this:
+
+- Densities use a softplus instead of a ReLU, fine samples are stratified draws where
+  those of the papers are independent, and encodings have the identity next to the bands
+  and no factor of pi.
+- `nerf` and presets derived from it train without the crop of the first 500 steps, in
+  Euclidean space only (no normalized device coordinates), without noise on densities.
+- None of the full sizes was ever trained to its end, since they need a GPU.
+"""
+
+import dataclasses
+
+from nerfies_jax.fields.effects.ambient import AmbientSpec
+from nerfies_jax.fields.effects.appearance import AppearanceSpec
+from nerfies_jax.fields.effects.background import BackgroundSpec
+from nerfies_jax.fields.effects.elastic import ElasticSpec
+from nerfies_jax.fields.effects.moving_mask import MovingMaskSpec
+from nerfies_jax.fields.effects.scene_flow import SceneFlowSpec
+from nerfies_jax.fields.effects.smoothness import SmoothnessSpec
+from nerfies_jax.fields.effects.surface import SurfaceSpec
+from nerfies_jax.fields.effects.time_condition import TimeSpec
+from nerfies_jax.fields.effects.time_warp import TimeWarpSpec
+from nerfies_jax.fields.effects.transient import TransientSpec
+from nerfies_jax.fields.effects.warp import WarpSpec
+from nerfies_jax.fields.occupancy import OccupancySpec
+from nerfies_jax.fields.spec import RadianceScene, SamplingSpec
+from nerfies_jax.fields.template import TemplateSpec
+from nerfies_jax.nn.encoding import EncodingSpec
+from nerfies_jax.nn.grids import HashGridSpec
+from nerfies_jax.nn.planes import PlanesSpec
+from nerfies_jax.nn.voxels import VoxelGridSpec
+from nerfies_jax.training import step_counts
+
+# Mildenhall et al. 2020, arXiv:2003.08934. Under their ReLU a ray that starts without
+# any density never learns.
+NERF = RadianceScene(
+    steps=200_000,  # "100-300k iterations"
+    rays=4096,  # section 5.3
+    micro_batches=4,  # 6.4 GiB for 25.5
+    sampling=SamplingSpec(64, 128),  # section 5.3
+    template=TemplateSpec(EncodingSpec(10), EncodingSpec(4)),  # section 5.1
+    learning_rate=5e-4,  # section 5.3, and its end
+    learning_rate_end=5e-5,
+)
+
+# Martin-Brualla et al. 2021, arXiv:2008.02268, with the sizes of its public
+# reimplementation; beta_min is the paper's, and the trunk NeRF's, whose input the
+# reimplementation joins one layer earlier. beta_min is added outside the rendered sum.
+NERF_W = dataclasses.replace(
+    NERF,
+    appearance=AppearanceSpec(width=48),
+    transient=TransientSpec(
+        code_width=16, depth=4, width=128, beta_min=0.03, density_weight=0.01
+    ),
+)
+
+# Pumarola et al. 2020, arXiv:2011.13961, and its code: one network for both levels,
+# 500 rays, 800k steps at a rate that falls tenfold every 500k. Its curriculum, which
+# shows the frames one by one over the first 10k steps, is not there, nor are its crop
+# of the center and its total variation over time; rays come from all frames in every
+# step, where its step has one time.
+D_NERF = dataclasses.replace(
+    NERF,
+    steps=800_000,
+    rays=500,
+    sampling=SamplingSpec(64, 128, shared=True),
+    learning_rate_end=5e-4 * 10 ** (-8 / 5),
+    warp=WarpSpec(
+        kind="translation",
+        condition="time",
+        position=EncodingSpec(10),
+        time=EncodingSpec(10),
+        depth=8,
+        width=256,
+        skips=(5,),  # as NeRF's trunk
+    ),
+)
+
+# The same paper's baseline: the NeRF reads the time, and nothing is warped.
+T_NERF = dataclasses.replace(D_NERF, warp=None, time=TimeSpec())
+
+# Park et al. 2021, arXiv:2011.12948, the code's configuration for quarter resolution;
+# those for the validation rig and for full HD are no presets. Its penalties are scaled
+# as in that code, whose weights these are, but the elastic term is taken at 4 samples
+# of a ray, not at all 128, and a fold costs 1.0, not 0 (`ElasticSpec` says why). The
+# rig's camera codes are not there; codes between two frames are mixed linearly, not by
+# a cubic spline.
+NERFIES = RadianceScene(
+    steps=250_000,
+    rays=6144,
+    micro_batches=8,  # 9.7 GiB for 77.6
+    sampling=SamplingSpec(128, 128),
+    template=TemplateSpec(EncodingSpec(8), EncodingSpec(4), skips=(4,)),
+    extent=0.3,  # a box of diagonal one
+    learning_rate=1e-3,
+    learning_rate_end=1e-4,
+    appearance=AppearanceSpec(width=8),
+    warp=WarpSpec(anneal_steps=80_000),
+    elastic=ElasticSpec(
+        weight=1e-2, hold_steps=50_000, decay_steps=100_000, scaling="official"
+    ),
+    background=BackgroundSpec(),
+)
+
+# Park et al. 2021, arXiv:2106.13228: six bands of warp, a bent slicing surface, no
+# elastic penalty. Color reads an appearance code of each frame, as in Nerfies; the
+# code's own configuration for the validation rig has one for each camera.
+HYPERNERF = dataclasses.replace(
+    NERFIES,
+    warp=WarpSpec(position=EncodingSpec(6), anneal_steps=80_000),
+    ambient=AmbientSpec(),
+    elastic=None,
+)
+
+# Yan, Li and Lee 2023, arXiv:2303.14435, and its code's `nerf_ds.gin`: HyperNeRF with
+# four bands of warp, an ambient slice that is open from the start, 64 and 64 samples,
+# 512 rays, and neither appearance codes nor points at rest. Encodings are without
+# identity there. Its price on displacements (1e-3) and its ever sharper weights of the
+# mask are not there.
+NERF_DS = dataclasses.replace(
+    HYPERNERF,
+    rays=512,
+    micro_batches=1,
+    sampling=SamplingSpec(64, 64),
+    learning_rate=1e-3,
+    learning_rate_end=1e-5,
+    appearance=None,
+    background=None,
+    warp=WarpSpec(position=EncodingSpec(4), anneal_steps=50_000),
+    ambient=AmbientSpec(closed_steps=0, anneal_steps=1),
+    mask=MovingMaskSpec(table="mask"),
+    surface=SurfaceSpec(),
+)
+
+# Li et al. 2021, arXiv:2011.13084, and its code: one level of 128 samples, 1024 rays.
+# Not in its normalized device coordinates, which fit forward-facing captures alone, so
+# that the bound on the flow is one unit of the field. The kinetic term counts once; the
+# chain to frames two away and the rays drawn where the error is large are not there.
+# Flow and depth count where a capture has them; without, it trains on colors alone.
+NSFF = dataclasses.replace(
+    NERF,
+    steps=360_000,
+    rays=1024,
+    sampling=SamplingSpec(128, 0),
+    scene_flow=SceneFlowSpec(),
+)
+
+# Fang et al. 2022, arXiv:2205.15285, the code's larger model for HyperNeRF's captures.
+# Its grid grows at four steps; here the strides open one after the other over the first
+# 6000, coarse to fine, so that the program and the checkpoints keep their shapes: until
+# the finest opens, only the vertices of a grid of a quarter (then half) of the cells
+# learn. It marches through the box by half a cell and skips what is empty; here samples
+# go where a first look found weight. Densities are exponential, not a shifted softplus,
+# and begin as thin as there (1e-3 of opacity in a cell). The motion learns at the
+# common rate, there at 7e-4. Differences have the slope of there, 1e-5 / 4096 rays / 6
+# * 160 / 128; from step 10 000 on, there only where a step touched them. Losses of
+# samples' colors and the last transmittance, rest points, camera codes: not there.
+TINEUVOX = RadianceScene(
+    steps=20_000,
+    rays=4096,
+    micro_batches=4,
+    sampling=SamplingSpec(64, 128, shared=True),
+    template=TemplateSpec(
+        VoxelGridSpec(),
+        EncodingSpec(4),
+        depth=1,
+        skips=(),
+        density="exp",
+        density_bias=-2.5,
+        anneal_steps=6000,
+    ),
+    learning_rate=1e-3,
+    learning_rate_end=1e-4,
+    table_rate=100.0,
+    warp=TimeWarpSpec(),
+    smoothness=SmoothnessSpec(weight=0.02, until=None),
+)
+
+# For a CPU: a thin coarse level, a small network, few rays.
+SMALL_NERF = RadianceScene(
+    steps=3000,
+    rays=512,
+    micro_batches=2,  # on a core each
+    sampling=SamplingSpec(16, 16),
+    template=TemplateSpec(
+        EncodingSpec(8), EncodingSpec(2), depth=4, width=96, skips=(), color_width=48
+    ),
+    coarse=TemplateSpec(
+        EncodingSpec(6), None, depth=2, width=48, skips=(), color_width=32
+    ),
+    learning_rate=5e-3,
+    learning_rate_end=2e-4,
+)
+# All bands from the start. Opened one by one over a tenth or a third of so short a run,
+# under both penalties, the warp never leaves the identity (built-in scene, 700 steps:
+# what moves is seen at 16.5 dB, and at 18.0 with all bands open).
+SMALL_WARP = WarpSpec(position=EncodingSpec(4), depth=4, width=64, skips=())
+SMALL_NERF_W = dataclasses.replace(
+    SMALL_NERF,
+    appearance=AppearanceSpec(width=4),
+    transient=TransientSpec(code_width=8, depth=2, width=48, beta_power=1.0),
+)
+SMALL_D_NERF = dataclasses.replace(
+    SMALL_NERF,
+    warp=dataclasses.replace(
+        SMALL_WARP, kind="translation", condition="time", time=EncodingSpec(4)
+    ),
+)
+SMALL_T_NERF = dataclasses.replace(SMALL_NERF, time=TimeSpec(EncodingSpec(4)))
+SMALL_NERFIES = dataclasses.replace(
+    SMALL_NERF,
+    warp=SMALL_WARP,
+    # The paper's scaling of ρ, 33 times this, holds so short a run at the identity.
+    # Asked at one step of five: docs/results/ablate_lazy.md says what that loses.
+    elastic=ElasticSpec(weight=1e-3, every=5, scaling="official"),
+    background=BackgroundSpec(points=512),
+)
+SMALL_HYPERNERF = dataclasses.replace(
+    SMALL_NERFIES,
+    ambient=AmbientSpec(
+        depth=3, width=32, skips=(), closed_steps=100, anneal_steps=900
+    ),
+    elastic=None,
+)
+SMALL_NERF_DS = dataclasses.replace(
+    SMALL_NERF,
+    warp=SMALL_WARP,
+    ambient=AmbientSpec(depth=3, width=32, skips=(), closed_steps=0, anneal_steps=1),
+    mask=MovingMaskSpec(depth=3, width=32, skips=()),
+    surface=SurfaceSpec(
+        EncodingSpec(2), EncodingSpec(2), closed_steps=300, anneal_steps=600, slope=0.1
+    ),
+)
+SMALL_SCENE_FLOW = SceneFlowSpec(
+    network=TemplateSpec(EncodingSpec(8), EncodingSpec(2), depth=4, width=96, skips=()),
+    time=EncodingSpec(4),
+    # After 600 steps of 192 rays, against a bound of 1 and a decay at a sixth:
+    # 19.49 for 19.34 dB, flow 0.54 for 0.95 px off (both sides), depth 9 for 12 %.
+    flow_bound=0.2,
+    decay_steps=3000,
+)
+SMALL_NSFF = dataclasses.replace(
+    SMALL_NERF,
+    micro_batches=4,  # each moment thrice: 233 ms a step on two cores, 265 of two
+    sampling=SamplingSpec(48, 0),
+    scene_flow=SMALL_SCENE_FLOW,
+)
+
+
+# A grid of features in the place of waves, and a network that only has to read it.
+# Blender lego, 200 of 2000 steps, training PSNR and seconds of one core:
+#   2048 rays, 64 wide, softplus, rate 1e-2             21.3 dB in 56 s
+#   exponential densities                               22.2       58
+#   and rate 3e-2 (6e-2: 21.4)                          22.7       54
+#   and 32 wide                                         22.7       37
+#   and 1024 rays (300 steps)                           22.8       29
+GRID_TEMPLATE = TemplateSpec(
+    HashGridSpec(),
+    EncodingSpec(2),
+    depth=1,
+    width=32,
+    skips=(),
+    color_width=32,
+    density="exp",
+)
+COARSE_GRID_TEMPLATE = TemplateSpec(
+    HashGridSpec(levels=3, coarsest=16, finest=48, rows=2**17),
+    None,
+    depth=1,
+    width=16,
+    skips=(),
+    color_width=16,
+    density="exp",
+)
+SMALL_NERF_GRID = dataclasses.replace(
+    SMALL_NERF,
+    rays=1024,
+    template=GRID_TEMPLATE,
+    coarse=COARSE_GRID_TEMPLATE,
+    template_rate=6.0,
+)
+
+# A box that is not contracted, and few floats in a cell. Built-in `default`, 90 seconds
+# of one core from tracks (held-out PSNR, and where it moves): 96 cells of four floats
+# 23.20 / 19.21 dB contracted, 24.45 / 20.64 not; of two 25.93 / 22.03 (128: 25.54 /
+# 21.89). All distances are read from the first step: those 90 seconds are 750 steps.
+SMALL_TINEUVOX = dataclasses.replace(
+    SMALL_NERF_GRID,
+    template=dataclasses.replace(
+        GRID_TEMPLATE, position=VoxelGridSpec(cells=96, features=2, bands=1)
+    ),
+    warp=TimeWarpSpec(
+        position=EncodingSpec(4), time=EncodingSpec(4), embedding=8, width=64
+    ),
+    smoothness=SmoothnessSpec(weight=1.0, until=1500),
+    # Tables alone learn fast, as published (8e-2 beside 6e-4). With networks as fast a
+    # dark video, of a hand before books, became an opaque black wall before the cameras
+    # within ten steps, and stayed one.
+    template_rate=1.0,
+    table_rate=6.0,
+)
+
+
+def _on_grid(preset: RadianceScene) -> RadianceScene:
+    """A small preset with its template on a grid, whose motion starts from tracks."""
+    names = ("rays", "micro_batches", "template", "coarse", "template_rate")
+    grid = {name: getattr(SMALL_NERF_GRID, name) for name in names}
+    # A grid shows what does not move within seconds, and a warp that has found nothing
+    # by then stays at rest. Papers' own schedules stand with the MLPs.
+    moves = preset.warp is not None or preset.scene_flow is not None
+    start = dataclasses.replace(preset.start, motion="tracks" if moves else "none")
+    return dataclasses.replace(preset, start=start, **grid)
+
+
+# The dynamic medium, on planes of space and time as in HexPlane: it is evaluated three
+# times a sample. Built-in `default`, 90 seconds of one core (steps, held-out PSNR,
+# where it moves, and what motion is worth there):
+#   waves, 4 of 96 wide, 1024 rays           54    18.8  15.1
+#   and 256 rays                            220    21.29 16.60   0.0 dB
+#   waves, 3 of 64 wide                     410    21.97 16.82   0.0
+#   a hash grid of space and the time       820    22.16 16.96   0.1
+#   planes, exponential, template's rate    690    23.57 18.26   1.2
+PLANES_MEDIUM = dataclasses.replace(
+    GRID_TEMPLATE,
+    position=PlanesSpec(vertices=64, multiples=(1, 2), moments=30, features=8),
+    width=48,
+)
+
+# Without motion. It starts nearly empty, and what nobody needs stays so; beside a warp
+# the bias empties nothing in a minute. What counts is how many samples lie where
+# something is: the first ones are in filled cells, and the fine level sees them too.
+# 25 held-out frames of Blender lego and 15 of the built-in scene `static`, seconds of a
+# busy core:
+#   24 + 24 of 1024 rays, all along them     24.33 dB in 56 s    29.51 dB in 60 s
+#   and the finer ones see both              (32 + 24) 25.67 in 103
+#   in filled cells, each level its own      24.61       59
+#   in filled cells, the finer ones see both 26.29       97
+#   and 512 rays, twice the steps            26.52       89      30.56       76
+#   48 in filled cells, no coarse level      26.62       99      (512) 29.34 61
+# 64 wide networks gain nothing (24.33 in 90 s); a finer grid of 512 cells gains 0.3 dB
+# of lego and loses 2 of the other.
+EMPTIER = -3.0  # added to the density
+STILL_NERF_GRID = dataclasses.replace(
+    SMALL_NERF_GRID,
+    steps=8000,
+    rays=512,
+    # Few rays that meet nothing. Blender lego, eight held-out frames, seconds of
+    # one busy core, without that and with: 24.68 dB in 66 s and 25.26 in 73 after 1200
+    # steps, 25.38 in 137 and 25.91 in 136 after 2400 (1024 rays, samples all along).
+    sampling=SamplingSpec(24, 24, occupancy=OccupancySpec()),
+    template=dataclasses.replace(GRID_TEMPLATE, density_bias=EMPTIER),
+    coarse=dataclasses.replace(COARSE_GRID_TEMPLATE, density_bias=EMPTIER),
+)
+
+PRESETS = {
+    "nerf": NERF,
+    "nerf-w": NERF_W,
+    "d-nerf": D_NERF,
+    "t-nerf": T_NERF,
+    "nerfies": NERFIES,
+    "hypernerf": HYPERNERF,
+    "nsff": NSFF,
+    "tineuvox": TINEUVOX,
+    "nerf-ds": NERF_DS,
+    "nerf-small": SMALL_NERF,
+    "nerf-w-small": SMALL_NERF_W,
+    "d-nerf-small": SMALL_D_NERF,
+    "t-nerf-small": SMALL_T_NERF,
+    "nerfies-small": SMALL_NERFIES,
+    "hypernerf-small": SMALL_HYPERNERF,
+    "nsff-small": SMALL_NSFF,
+    "tineuvox-small": SMALL_TINEUVOX,
+    "nerf-ds-small": SMALL_NERF_DS,
+    "nerf-grid-small": STILL_NERF_GRID,
+    "nerf-w-grid-small": _on_grid(SMALL_NERF_W),
+    "d-nerf-grid-small": _on_grid(SMALL_D_NERF),
+    "nerfies-grid-small": _on_grid(SMALL_NERFIES),
+    "hypernerf-grid-small": _on_grid(SMALL_HYPERNERF),
+    "nsff-grid-small": dataclasses.replace(
+        _on_grid(SMALL_NSFF),
+        rays=256,
+        scene_flow=dataclasses.replace(
+            SMALL_SCENE_FLOW, network=PLANES_MEDIUM, flow_trunk=True
+        ),
+    ),
+}
+
+
+def with_steps(spec: RadianceScene, steps: int) -> RadianceScene:
+    """Change the number of steps of a radiance field.
+
+    Args:
+      spec: The scene.
+      steps: Number of steps.
+
+    Returns:
+      The scene with its schedules stretched in proportion.
+
+    Raises:
+      ValueError: If `steps` is below 1.
+    """
+    if steps < 1:
+        raise ValueError(f"steps={steps}: train for at least one step")
+    in_proportion = step_counts.stretched(spec, steps / spec.steps)
+    return dataclasses.replace(in_proportion, steps=steps)

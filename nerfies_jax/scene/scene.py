@@ -1,0 +1,492 @@
+"""A radiance field put together: a spec becomes a `Model` the loop can train."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Key
+
+from nerfies_jax.capture import scene_metadata
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.frame_memory import frame_bytes
+from nerfies_jax.capture.scene_metadata import SceneMetadata
+from nerfies_jax.fields import field_ray, occupied_rays, render_ray
+from nerfies_jax.fields.effects import moving_mask, scene_flow, transient
+from nerfies_jax.fields.effects.effect import Batch, Box, RayOutput
+from nerfies_jax.fields.effects.protocols import NetworkTemplate, Template
+from nerfies_jax.fields.effects.records import FieldRecord
+from nerfies_jax.fields.field import Codes, Field, field
+from nerfies_jax.fields.occupancy import Cells
+from nerfies_jax.fields.spec import RadianceScene, optimizer_of
+from nerfies_jax.fields.template import TemplateSpec
+from nerfies_jax.geometry import rays
+from nerfies_jax.nn import codes
+from nerfies_jax.nn.adapters import Network
+from nerfies_jax.nn.planes import PlanesSpec
+from nerfies_jax.preprocessing import usable_paths
+from nerfies_jax.runtime import data_parallel
+from nerfies_jax.scene import path_fit
+from nerfies_jax.training import loop, losses, schedules
+from nerfies_jax.training.effects import (
+    FrameCondition,
+    PenaltyContext,
+    Term,
+    penalty_terms,
+    values,
+    weighted_sum,
+)
+from nerfies_jax.training.model import (
+    Frames,
+    Model,
+    Surveyed,
+    TrainState,
+    View,
+    in_default_precision,
+)
+from nerfies_jax.training.updates import apply_updates
+
+__all__ = ["Field", "RadianceScene", "SceneMetadata", "build", "field", "metadata_of"]
+
+PyTree = Any
+
+
+def metadata_of(capture: Capture, spec: RadianceScene) -> SceneMetadata:
+    """Compute the scene metadata of a capture, on the host.
+
+    Args:
+      capture: The capture.
+      spec: The scene.
+
+    Returns:
+      The metadata.
+    """
+    return scene_metadata.metadata_of(capture, spec.extent)
+
+
+def build(
+    spec: RadianceScene,
+    metadata: SceneMetadata,
+    effects: tuple[FieldRecord, ...] = (),
+    *,
+    template: Template | Network | None = None,
+) -> Model:
+    """Build the model of a radiance field.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata, as of `metadata_of`.
+      effects: Internal records of further effects, behind those of the spec.
+      template: Template in the place of the spec's: an object of the protocol
+        `Template`, or a network of `nets.adapters` that reads [point, features] and
+        [direction, condition] of a sample and returns its density and color.
+
+    Returns:
+      What the training loop and the renderer need.
+
+    Raises:
+      ValueError: If a part needs data that the capture does not have, or a guide that
+        no part provides.
+    """
+    if isinstance(template, Network):
+        template = NetworkTemplate(template)
+    if template is not None:
+        spec = dataclasses.replace(spec, template=template, coarse=None)
+    radiance = field(spec, metadata, effects=effects)
+    _check_guides(spec, radiance.effects)
+    codes_at = radiance.codes_at
+    if spec.background is not None and "points" not in metadata.available_data:
+        raise ValueError(
+            "the background effect holds static points still, and this capture has "
+            "none; leave it out (background=none)"
+        )
+
+    devices = data_parallel.device_count(spec.micro_batches)
+
+    def init(capture, key):
+        codes.check_ids(
+            capture.appearance_ids, len(metadata.exposures), "appearance_ids"
+        )
+        start_key, run_key = jax.random.split(key)
+        params = radiance.init(start_key)
+        evidence = usable_paths.evidence_to_start_from(capture, spec.start)
+        if evidence is not None:
+            paths = path_fit.film_paths(radiance, capture, evidence)
+            fit = path_fit.fit_flow if spec.warp is None else path_fit.fit
+            params = fit(radiance, params, paths, start_key, spec.start).params
+        return first_state(params, run_key)
+
+    def example(_, key):
+        return first_state(radiance.init(key), key)
+
+    optimizer = optimizer_of(spec)
+
+    def first_state(params, key):
+        params = in_default_precision(params)
+        cells = occupied_rays.first(radiance)
+        return TrainState(
+            params, optimizer.init(params), cells, jnp.zeros((), jnp.int32), key
+        )
+
+    read = frozenset().union(*(effect.required_data for effect in radiance.effects))
+    return Model(
+        # By name alone: a run with other effects of one's own is another run.
+        spec=(spec, metadata, *(effect.name for effect in effects)),
+        init=init,
+        step=_stepper(spec, radiance, devices),
+        events=occupied_rays.events(radiance),
+        **drawing(radiance, lambda params, view: (view, codes_at(params, view))),
+        counts=count_parameters,
+        required_data=read,
+        example=example,
+        devices=devices,
+    )
+
+
+def _check_guides(spec, effects):
+    """Refuse what would end as a missing code where a warp or a slice is traced."""
+    there = tuple(effect.name for effect in effects if effect.mark is not None)
+    for part in ("warp", "ambient"):
+        for guide in getattr(getattr(spec, part), "guides", ()):
+            if guide not in there:
+                raise ValueError(
+                    f"{part}.guides names {guide!r}, and there is "
+                    f"{' and '.join(there) or 'none'}; leave it out, set mask for "
+                    f"{moving_mask.NAME!r}, or add a conditioning of that name whose "
+                    'target is "warp"'
+                )
+
+
+def drawing(radiance: Field, seen: Callable[..., tuple[View, Codes]]) -> dict[str, Any]:
+    """Return the `render` and `surveyed` functions of a field's model.
+
+    Args:
+      radiance: The field.
+      seen: Function `seen(params, given)` that returns a view and the codes of its
+        frame for the object to be rendered.
+
+    Returns:
+      The fields of `Model` by name.
+    """
+
+    def render(params, given, size, step):
+        view, frame_codes = seen(params, given)
+        return radiance.render(params, view.camera, view.time, frame_codes, size, step)
+
+    def draw(params, occupied, given, size, step):
+        view, frame_codes = seen(params, given)
+        return radiance.render_occupied(
+            params, occupied, view.camera, view.time, frame_codes, size, step
+        )
+
+    surveyed = None if radiance.survey is None else Surveyed(radiance.survey, draw)
+    return {"render": render, "surveyed": surveyed}
+
+
+def _stepper(spec, radiance, devices):
+    """One update from one batch of rays: (state, frames) -> (state, metrics), pure."""
+
+    def part(index, state, frames):
+        key = loop.step_key(state)
+        if spec.micro_batches > 1:
+            key = jax.random.fold_in(key, index)
+        batch_key, field_key = jax.random.split(key)
+        batch, guide = micro_batch(radiance, state, frames, batch_key)
+
+        def loss(params):
+            terms = loss_terms(
+                radiance, params, frames, batch, state.step, field_key, guide
+            )
+            return weighted_sum(terms), values(terms)
+
+        return jax.value_and_grad(loss, has_aux=True)(state.params)
+
+    def step(state: TrainState, frames: Frames):
+        if spec.micro_batches == 1:
+            (value, logged), grads = part(0, state, frames)
+        else:
+            each = data_parallel.on_devices(
+                part, spec.micro_batches, devices, state, frames
+            )
+            (value, logged), grads = jax.tree.map(lambda leaf: leaf.mean(0), each)
+        params, moments = descend(spec, radiance.effects, state, grads)
+        metrics = {"loss": value, "mse": logged["fine"], **logged}
+        state = TrainState(params, moments, state.aux_state, state.step + 1, state.key)
+        return state, metrics
+
+    return step
+
+
+def micro_batch(
+    radiance: Field, state: TrainState, frames: Frames, key: Key[Array, ""]
+) -> tuple[Batch, Cells | None]:
+    """Draw the rays of a micro-batch.
+
+    Args:
+      radiance: The field.
+      state: Training state.
+      frames: Training frames.
+      key: PRNG key.
+
+    Returns:
+      The rays, and the occupied cells that guide their samples (`OccupancySpec`) or
+      None.
+    """
+    spec = radiance.spec
+    count, plan = spec.rays // spec.micro_batches, spec.sampling.occupancy
+    if plan is None:
+        return draw_batch(frames, count, key), None
+    batch = draw_batch(frames, plan.candidates * count, key)
+    cells = state.aux_state
+    return occupied_rays.learned_from(radiance, cells, batch), cells
+
+
+def descend(
+    spec: RadianceScene,
+    effects: tuple[FieldRecord, ...],
+    state: TrainState,
+    grads: PyTree,
+) -> tuple[PyTree, optax.OptState]:
+    """The parameters and moments after one update along `grads`."""
+    # optax counts in int32 and multiplies float32 by it.
+    with jax.numpy_dtype_promotion("standard"):
+        updates, moments = optimizer_of(spec).update(
+            grads, state.optimizer, state.params
+        )
+    rates = learning_rates(spec, effects, state.params, state.step)
+    return apply_updates(state.params, updates, rates), moments
+
+
+def learning_rates(
+    spec: RadianceScene, effects: tuple[FieldRecord, ...], params: PyTree, step: Array
+) -> dict[str, PyTree]:
+    """Compute the learning rate of each part of the parameters.
+
+    It is the effect's own, or that of the schedule. A warp that is initialized from
+    tracks, and the codes that it reads, begin with a share of it, as does a scene flow
+    with a trunk of its own if there is no warp to fit. A medium on tables has the rate
+    of the template.
+
+    Args:
+      spec: The scene.
+      effects: Its effects.
+      params: Its parameters.
+      step: Number of completed steps.
+
+    Returns:
+      Rates, a prefix of the parameters.
+    """
+    own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
+    common = schedules.log_linear(
+        spec.learning_rate, spec.learning_rate_end, spec.steps
+    )(step)
+    rates: dict[str, PyTree]
+    rates = {name: own[name](step) if name in own else common for name in params}
+    held: Array | float = 1.0
+    if spec.start.motion == "tracks":
+        held = schedules.log_linear(spec.start.first_rate, 1.0, spec.steps)(step)
+        warps = [effect for effect in effects if effect.displace is not None]
+        tables = {table.name for effect in warps for table in effect.tables}
+        rates |= {e.name: held * rates[e.name] for e in warps if e.name in params}
+        rates["codes"] = {
+            name: held * rates["codes"] if name in tables else rates["codes"]
+            for name in params["codes"]
+        }
+    flow = params.get(scene_flow.NAME)
+    if isinstance(flow, scene_flow.SceneFlow):
+        rate, apart = rates[scene_flow.NAME], flow.flow_trunk is not None
+        on_tables = flow.network.tables is not None
+        # Beside a warp it was not fitted (`build`).
+        of_flow = held * rate if apart and spec.warp is None else rate
+        flow_rates: dict[str, PyTree] = dict(
+            network=spec.template_rate * rate if on_tables else rate,
+            flow=of_flow,
+            disocclusion=rate,
+            blend=rate,
+            flow_trunk=of_flow if apart else None,
+        )
+        rates[scene_flow.NAME] = scene_flow.SceneFlow(**flow_rates)
+    rate = spec.template_rate * common
+    template: PyTree = rate
+    if spec.table_rate != 1:
+        table_rate = spec.table_rate * rate
+        template = {
+            name: net._replace(trunk=rate, color=rate, tables=table_rate)
+            for name, net in params["template"].items()
+        }
+    return rates | {"template": template}
+
+
+def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
+    """Draw rays through random pixels of all frames, uniformly.
+
+    Args:
+      frames: Training frames.
+      count: Number of rays.
+      key: PRNG key.
+
+    Returns:
+      The rays and their observed colors.
+    """
+    row_key, column_key, line_key = jax.random.split(key, 3)
+    number, (height, width) = len(frames.times), frames.images.shape[1:3]
+    row = jax.random.randint(row_key, (count,), 0, number)
+    column = jax.random.randint(column_key, (count,), 0, width)
+    line = jax.random.randint(line_key, (count,), 0, height)
+    camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
+    pixel = jnp.stack([column, line], axis=1).astype(camera.position.dtype) + 0.5
+    ray = jax.vmap(rays.pixel_ray)(camera, pixel)
+    color = frames.images[frames.image_row(row), line, column].astype(pixel.dtype) / 255
+    valid = ray.valid
+    if frames.valid is not None:
+        valid = valid & frames.valid[row, line, column]
+    # Chosen here, once for all losses: what was not filmed may hold NaN, which stays
+    # NaN under a weight of zero.
+    color = jnp.where(valid[:, None], color, 0)
+    cosine = jax.vmap(rays.depth_per_distance)(camera, ray.direction)
+    return Batch(row, pixel, ray.origin, ray.direction, cosine, color, valid)
+
+
+def loss_terms(
+    radiance: Field,
+    params: PyTree,
+    frames: Frames,
+    batch: Batch,
+    step: Array,
+    key: Key[Array, ""],
+    guide: Cells | None = None,
+) -> dict[str, Term]:
+    """Compute every term of the loss of one batch.
+
+    "coarse" and "fine" are mean squared errors of color. "color" is NeRF-W's negative
+    log-likelihood, if a transient medium provides the uncertainty.
+
+    Args:
+      radiance: The field.
+      params: Its parameters.
+      frames: Training frames.
+      batch: Rays.
+      step: Number of completed steps.
+      key: PRNG key.
+      guide: Occupied cells, as in `render_ray`, or None.
+
+    Returns:
+      Terms by name.
+    """
+    ray_key, penalty_key = jax.random.split(key)
+    metadata = radiance.metadata
+
+    def condition_of(row):
+        view = View(
+            jax.tree.map(lambda leaf: leaf[row], frames.cameras),
+            frames.times[row],
+            frames.appearance[row],
+        )
+        return FrameCondition(view.time, radiance.codes_at(params, view), step)
+
+    conditions = jax.vmap(condition_of)(batch.row)
+    lines = jax.vmap(lambda *ray: field_ray.field_ray(metadata, *ray))(
+        batch.origin, batch.direction, batch.cosine
+    )
+    keys = jax.random.split(ray_key, len(batch.row))
+    levels = jax.vmap(lambda *ray: radiance.render_ray(params, *ray, guide))(
+        lines, conditions, keys
+    )
+    center = jnp.asarray(metadata.center, batch.origin.dtype)
+    context = PenaltyContext(
+        condition=conditions,
+        step=step,
+        key=penalty_key,
+        params=params,
+        displace=functools.partial(radiance.displace, params),
+        condition_of=condition_of,
+        batch=batch,
+        levels=levels,
+        frames=frames,
+        box=Box(center, jnp.asarray(metadata.scale, batch.origin.dtype)),
+    )
+    terms = _color_terms(radiance.effects, levels, batch)
+    return terms | penalty_terms(radiance.effects, params, context, {})
+
+
+def _color_terms(
+    effects: tuple[FieldRecord, ...], levels: tuple[RayOutput, ...], batch: Batch
+) -> dict[str, Term]:
+    last = levels[-1]
+    mse = losses.mse(last.color, batch.color, batch.valid)
+    terms = {"fine": Term(mse, 1.0)}
+    coarse_weight = 1.0
+    uncertain = render_ray.says_beta(effects, last.media)
+    if uncertain is not None:
+        assert last.beta is not None
+        likelihood = transient.photometric(
+            last.color, batch.color, last.beta, batch.valid, uncertain.beta_power
+        )
+        terms = {"fine": Term(mse, None), "color": Term(likelihood, 1.0)}
+        coarse_weight = 1.5  # as in NeRF-W: half of the sum over channels
+    if len(levels) > 1:
+        coarse = losses.mse(levels[0].color, batch.color, batch.valid)
+        terms["coarse"] = Term(coarse, coarse_weight)
+    return terms
+
+
+def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
+    """Estimate the memory of the frames, the first state and a step.
+
+    Nothing is allocated. The capture's own memory is counted, too.
+
+    Args:
+      spec: The scene.
+      capture: The capture.
+
+    Returns:
+      Number of bytes.
+    """
+    plan = spec.sampling
+    last = plan.coarse if plan.fine == 0 else plan.union * plan.coarse + plan.fine
+    samples = last if plan.fine == 0 else plan.coarse + last
+    widths = samples * _width_of(spec.template)
+    # Of parts from other packages nothing is known.
+    for net in (spec.warp, spec.ambient, spec.mask):
+        widths += samples * getattr(net, "depth", 0) * getattr(net, "width", 0)
+    fog = spec.transient
+    widths += last * getattr(fog, "depth", 0) * getattr(fog, "width", 0)
+    if spec.scene_flow is not None:
+        medium = spec.scene_flow.network
+        trunk = spec.scene_flow.flow_trunk * medium.depth * medium.width
+        # Asked for this moment and for those beside it.
+        widths += 3 * last * (_width_of(medium) + trunk)
+    # Every layer's output is kept for the backward pass, beside its gradient. Of steps
+    # of 256 rays of the small presets XLA's temporaries are 0.57 to 1.02 of this.
+    rays_at_once = spec.rays // spec.micro_batches
+    activations = 3 * rays_at_once * widths
+    devices = data_parallel.device_count(spec.micro_batches)
+    return 4 * activations + frame_bytes(capture, devices)
+
+
+def _width_of(one: object) -> int:
+    """Floats that are kept of a sample: of its layers, and those read from planes."""
+    if not isinstance(one, TemplateSpec):
+        return 0  # unknown
+    width, position = one.depth * one.width + one.color_width, one.position
+    if not isinstance(position, PlanesSpec):
+        return width  # of grids hardly any more: 0.77 to 1.02 of the estimate
+    corners = 4 * (3 if position.moments is None else 6)
+    return width + corners * position.levels * position.features
+
+
+def count_parameters(state: TrainState) -> dict[str, int]:
+    """Count the parameters of all networks and codes.
+
+    Args:
+      state: Training state.
+
+    Returns:
+      The number, under "parameters".
+    """
+    leaves = jax.tree.leaves(state.params)
+    return {"parameters": sum(math.prod(leaf.shape) for leaf in leaves)}

@@ -1,0 +1,1 @@
+"""Images that show depth, flow, errors and curves."""

@@ -1,0 +1,420 @@
+"""Images to inspect a run: comparisons, color maps, contact sheets, a curve.
+
+Functions take NumPy arrays and return uint8 [height, width, 3], or write one PNG.
+"""
+
+import functools
+import math
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import PIL.Image
+import PIL.ImageDraw
+import PIL.ImageFont
+import skimage.color
+
+from nerfies_jax.capture import images
+from nerfies_jax.capture.json_files import replaced_file
+from nerfies_jax.visualization import figures
+
+PANEL_WIDTH = 240  # pixels at least: smaller images are enlarged so labels fit
+GAP = 6  # pixels between panels
+TEXT_HEIGHT = 20
+INK, PAPER, FADED = (32, 33, 36), (255, 255, 255), (110, 113, 120)
+UNKNOWN = (128, 128, 128)  # gray is in none of the color maps
+# Rows of color_maps.png, 256 colors each, which are matplotlib's inferno and viridis
+# (CC0): a run is looked at without matplotlib.
+ERROR_MAP, DEPTH_MAP = 0, 1
+# The share of depths beyond each end of the shown range; one stray splat in front of
+# the camera would otherwise turn the whole image into one color.
+STRAY_SHARE = 0.01
+
+
+class Colored(NamedTuple):
+    """A quantity as a color-mapped image, with the values of the map's two ends."""
+
+    picture: np.ndarray  # [..., height, width, 3] uint8
+    low: float
+    high: float
+
+
+class History(NamedTuple):
+    """PSNR over the course of a run, with one entry for each evaluation."""
+
+    seconds: Sequence[float]  # of training, without compiling
+    psnr: Sequence[float]  # dB, held-out frames
+
+
+def color_depth(
+    depth: np.ndarray,
+    known: np.ndarray | None = None,
+    limits: tuple[float, float] | None = None,
+) -> Colored:
+    """Map depth to viridis, near bright and far dark, unknown gray.
+
+    All images share one range, so that frames can be compared.
+
+    Args:
+      depth: Depths, [..., height, width].
+      known: True where depth is known, of the same shape. None for all. Depths that are
+        not finite and positive are unknown in any case.
+      limits: Lowest and highest value. None for the 1st and 99th percentile of known
+        depths.
+
+    Returns:
+      The image and the range.
+    """
+    depth = np.asarray(depth, np.float32)
+    shown = np.isfinite(depth) & (depth > 0)
+    shown = shown if known is None else shown & known
+    if limits is None:
+        limits = _limits(depth[shown])
+    low, high = limits
+    nearness = 1 - np.where(shown, depth - low, 0) / _span(low, high)
+    return Colored(_mapped(nearness, shown, DEPTH_MAP), low, high)
+
+
+def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> Colored:
+    """Map the mean absolute difference over channels to inferno.
+
+    Args:
+      image: Images in [0, 1] or uint8, [..., height, width, 3].
+      truth: Ground truth of the same shape.
+      largest: Error shown in light yellow, as are larger ones.
+
+    Returns:
+      The image, black for 0 and gray where either is not finite.
+
+    Raises:
+      ValueError: If `largest` is not positive.
+    """
+    if not largest > 0:
+        raise ValueError(
+            f"the error that is drawn brightest is positive, got {largest}"
+        )
+    error = np.mean(np.abs(as_unit(image) - as_unit(truth)), axis=-1)
+    shown = np.isfinite(error)
+    return Colored(
+        _mapped(np.where(shown, error, 0) / largest, shown, ERROR_MAP), 0, largest
+    )
+
+
+def color_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Colored:
+    """Map displacements to inferno, black for none and gray for unknown.
+
+    Args:
+      distance: Displacements in scene units, [..., height, width].
+      at_least: Smallest value for the bright end of the map, which is otherwise the
+        99th percentile.
+
+    Returns:
+      The image and the range.
+    """
+    shown = np.isfinite(distance)
+    largest = max(float(at_least), _limits(distance[shown])[1] if shown.any() else 0.0)
+    unit = np.where(shown, distance, 0) / _span(0.0, largest)
+    return Colored(_mapped(unit, shown, ERROR_MAP), 0.0, largest)
+
+
+def color_flow(flow: np.ndarray, largest: float | int | None = None) -> Colored:
+    """Map optical flow to colors: direction as hue, length as saturation.
+
+    Static is white, right is red, down yellow-green, left cyan, up violet, and unknown
+    gray.
+
+    Args:
+      flow: Flow in pixels, [..., height, width, 2].
+      largest: Length of full saturation in pixels. None for the 99th percentile.
+
+    Returns:
+      The image and the range.
+    """
+    flow = np.asarray(flow, np.float32)
+    shown = np.all(np.isfinite(flow), axis=-1)
+    flow = np.where(shown[..., None], flow, 0)
+    length = np.linalg.norm(flow, axis=-1)
+    if largest is None:
+        largest = (
+            float(np.quantile(length[shown], 1 - STRAY_SHARE)) if shown.any() else 1
+        )
+    hue = np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi) % 1
+    saturation = np.clip(length / (largest or 1), 0, 1)
+    color = skimage.color.hsv2rgb(
+        np.stack([hue, saturation, np.ones_like(hue)], axis=-1)
+    )
+    picture = np.where(shown[..., None], as_bytes(color), np.array(UNKNOWN, np.uint8))
+    return Colored(picture, 0.0, float(largest))
+
+
+def comparison(
+    truth: np.ndarray,
+    render: np.ndarray,
+    depth: np.ndarray,
+    captions: Sequence[str],
+    largest_error: float = 0.2,
+    known_depth: np.ndarray | None = None,
+) -> np.ndarray:
+    """Show ground truth, render, error and depth side by side, one row for each frame.
+
+    Args:
+      truth: Images in [0, 1] or uint8, [frames, height, width, 3].
+      render: Renders of the same shape.
+      depth: Depths in scene units, [frames, height, width], with one color range.
+      captions: One caption above each row.
+      largest_error: Error shown in light yellow.
+      known_depth: True where depth is known, [frames, height, width]. None for all.
+
+    Returns:
+      The image, with color bars below.
+
+    Raises:
+      ValueError: If the numbers of frames differ.
+    """
+    frames = len(truth)
+    if not (len(render) == len(depth) == len(captions) == frames > 0):
+        raise ValueError(
+            "a comparison pairs frames, got "
+            f"{frames} true, {len(render)} rendered, {len(depth)} depths and "
+            f"{len(captions)} captions; pass one of each for every row"
+        )
+    error = color_error(render, truth, largest_error)
+    colored_depth = color_depth(depth, known_depth)
+    columns = [as_bytes(truth), as_bytes(render), error.picture, colored_depth.picture]
+    columns = [_enlarged(column) for column in columns]
+    width = columns[0].shape[2]
+    titles = ("truth", "render", "error", "depth")
+    rows = [_beside([_text(title, width) for title in titles])]
+    for frame, caption in enumerate(captions):
+        rows.append(_text(caption, 4 * width + 3 * GAP, color=FADED))
+        rows.append(_beside([column[frame] for column in columns]))
+    blank = _paper(2 * TEXT_HEIGHT + GAP, width)
+    far, near = colored_depth.high, colored_depth.low
+    rows.append(
+        _beside(
+            [
+                blank,
+                blank,
+                _bar(ERROR_MAP, f"{error.low:g}", f"{error.high:g} and more", width),
+                _bar(DEPTH_MAP, f"{far:.3g} far", f"near {near:.3g}", width),
+            ]
+        )
+    )
+    return _framed(_stacked(rows))
+
+
+def contact_sheet(
+    pictures: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
+) -> np.ndarray:
+    """Arrange captioned images of one size in a grid, row by row.
+
+    Args:
+      pictures: Images, [height, width, 3].
+      captions: One for each image.
+      columns: Number of columns.
+
+    Returns:
+      The image.
+
+    Raises:
+      ValueError: If the numbers of images and captions differ.
+    """
+    if not len(pictures) == len(captions) > 0:
+        raise ValueError(
+            f"a contact sheet needs one caption for each picture, got {len(pictures)} "
+            f"pictures and {len(captions)} captions"
+        )
+    cells = _enlarged(np.stack([as_bytes(picture) for picture in pictures]))
+    cells = [
+        _stacked([cell, _text(caption, cell.shape[1], color=FADED)])
+        for cell, caption in zip(cells, captions, strict=True)
+    ]
+    columns = min(columns, len(cells))
+    cells += [_paper(*cells[0].shape[:2])] * (-len(cells) % columns)
+    rows = [_beside(cells[i : i + columns]) for i in range(0, len(cells), columns)]
+    return _framed(_stacked(rows))
+
+
+class Final(NamedTuple):
+    """Final PSNR of a run, over more frames than its history."""
+
+    seconds: float  # of training
+    psnr: float  # dB
+    frames: int  # that it is the mean of
+    watched: int  # frames that the history is of
+
+
+def curve(
+    histories: Mapping[str, History],
+    path: str | pathlib.Path,
+    final: Final | None = None,
+):
+    """Draw the PSNR of held-out frames against seconds of training, as a PNG.
+
+    Args:
+      histories: One line for each, by name, with a mark at every evaluation.
+        Evaluations that are not finite leave a gap.
+      path: The PNG file.
+      final: A score that is marked next to the line of a single history.
+
+    Raises:
+      ValueError: There is no evaluation to draw.
+    """
+    if not any(len(history.seconds) for history in histories.values()):
+        raise ValueError(f"{path}: no evaluation to draw; evaluate at least once")
+    figure = figures.new_figure(figsize=(7.2, 4.2), dpi=130, layout="constrained")
+    axes = figure.add_subplot()
+    for name, history in histories.items():
+        (line,) = axes.plot(
+            history.seconds, history.psnr, marker="o", markersize=3.5, label=name
+        )
+        if len(history.psnr) and math.isfinite(history.psnr[-1]):
+            axes.annotate(
+                f"{history.psnr[-1]:.2f} dB",
+                (history.seconds[-1], history.psnr[-1]),
+                xytext=(0, 7),
+                textcoords="offset points",
+                ha="right",
+                color=line.get_color(),
+            )
+    if final is not None:
+        _mark_final(axes, final)
+    axes.set_xlabel("training time without compilation (s)")
+    axes.set_ylabel("mean PSNR of held-out frames (dB)")
+    axes.margins(y=0.12)
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    if len(histories) > 1 or final is not None:
+        axes.legend(frameon=False, loc="lower right")
+    with replaced_file(path) as partial:
+        figure.savefig(partial)
+
+
+def _mark_final(axes, final):
+    """Mark the score over all frames, below the end of the line over a few."""
+    (line,) = axes.get_lines()
+    line.set_label(f"{final.watched} frames during training")
+    label = f"all {final.frames} frames after training"
+    color = "#c2410c"
+    axes.plot(
+        [final.seconds], [final.psnr], "D", markersize=6, color=color, label=label
+    )
+    axes.annotate(
+        f"{final.psnr:.2f} dB",
+        (final.seconds, final.psnr),
+        xytext=(-9, -4),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        color=color,
+    )
+
+
+def save(picture: np.ndarray, path: str | pathlib.Path):
+    """Write an image as PNG, atomically.
+
+    Args:
+      picture: uint8 image.
+      path: The file.
+    """
+    images.write_png(path, picture)
+
+
+def as_bytes(picture: np.ndarray) -> np.ndarray:
+    """Convert an image to uint8.
+
+    Args:
+      picture: uint8, or floats in [0, 1].
+
+    Returns:
+      uint8 values, black for NaN.
+    """
+    if picture.dtype == np.uint8:
+        return picture
+    return np.round(np.clip(np.nan_to_num(picture, nan=0.0), 0, 1) * 255).astype(
+        np.uint8
+    )
+
+
+def as_unit(picture: np.ndarray) -> np.ndarray:
+    """Convert an image to floats.
+
+    Args:
+      picture: uint8, or floats in [0, 1].
+
+    Returns:
+      float32 values in [0, 1].
+    """
+    if picture.dtype == np.uint8:
+        return picture.astype(np.float32) / 255
+    return np.clip(picture, 0, 1).astype(np.float32)
+
+
+def _limits(values):
+    if values.size == 0:
+        return 0.0, 1.0
+    low, high = np.quantile(values, [STRAY_SHARE, 1 - STRAY_SHARE])
+    return float(low), float(high)
+
+
+def _span(low, high):
+    return high - low if high > low else 1.0  # a flat depth has one color
+
+
+def _mapped(unit, shown, row):
+    table = _tables()[row]
+    index = np.round(np.clip(unit, 0, 1) * 255).astype(np.uint8)
+    return np.where(shown[..., None], table[index], np.array(UNKNOWN, np.uint8))
+
+
+@functools.cache
+def _tables():
+    file = pathlib.Path(__file__).with_name("color_maps.png")
+    with PIL.Image.open(file) as picture:
+        return np.asarray(picture)
+
+
+@functools.cache
+def _font():
+    return PIL.ImageFont.load_default(15)  # the one that Pillow brings along
+
+
+def _text(words, width, color=INK, align="left"):
+    strip = PIL.Image.new("RGB", (width, TEXT_HEIGHT), PAPER)
+    draw = PIL.ImageDraw.Draw(strip)
+    at = 0 if align == "left" else width - draw.textlength(words, font=_font())
+    draw.text((at, 0), words, fill=color, font=_font())
+    return np.asarray(strip)
+
+
+def _bar(row, left, right, width):
+    """The color map from its low to its high end, with the two values below it."""
+    ramp = _tables()[row][np.linspace(0, 255, width).astype(int)]
+    ends = np.minimum(_text(left, width), _text(right, width, align="right"))
+    return _stacked([np.repeat(ramp[None], TEXT_HEIGHT, 0), ends])
+
+
+def _enlarged(pictures):
+    """Enlarge by a whole factor, without smoothing, to show rendered pixels."""
+    factor = max(1, math.ceil(PANEL_WIDTH / pictures.shape[2]))
+    return pictures.repeat(factor, 1).repeat(factor, 2)
+
+
+def _paper(height, width):
+    return np.full((height, width, 3), PAPER, np.uint8)
+
+
+def _beside(panels):
+    gap = _paper(panels[0].shape[0], GAP)
+    spaced = [part for panel in panels for part in (panel, gap)][:-1]
+    return np.concatenate(spaced, axis=1)
+
+
+def _stacked(rows):
+    gap = _paper(GAP, rows[0].shape[1])
+    return np.concatenate([part for row in rows for part in (row, gap)][:-1], axis=0)
+
+
+def _framed(picture):
+    return np.pad(picture, ((GAP, GAP), (GAP, GAP), (0, 0)), constant_values=255)

@@ -1,0 +1,269 @@
+"""Warps of fields fitted to known paths."""
+
+import dataclasses
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerfies_jax.fields.effects import scene_flow
+from nerfies_jax.fields.effects.appearance import AppearanceSpec
+from nerfies_jax.fields.effects.records import FieldRecord
+from nerfies_jax.scene import path_fit, presets, scene
+from nerfies_jax.scene.path_fit import FilmPaths
+from nerfies_jax.training.effects import FrameCondition
+from nerfies_jax.training.model import View
+from nerfies_jax.training.track_start import FieldStartSpec
+
+FRAMES = 16
+TRACKS = FieldStartSpec("tracks", fit_steps=300, fit_rate=2e-3)
+
+
+@pytest.fixture(autouse=True)
+def few_points_a_step(monkeypatch):
+    """One body and a wall ask for no more; a third of the time."""
+    monkeypatch.setattr(path_fit, "FRAMES_AT_ONCE", 8)
+    monkeypatch.setattr(path_fit, "STILL_AT_ONCE", 32)
+
+
+def turning_body(points=40):
+    """[points, FRAMES, 3] places of a body that turns by a radian and shifts."""
+    rng = np.random.default_rng(0)
+    time = np.linspace(0, 1, FRAMES, dtype=np.float32)
+    turn = Rotation.from_rotvec(time[:, None] * [0, 0.6, 0.8]).as_matrix()
+    body = rng.normal(0, 0.15, (points, 3))
+    path = np.einsum("tij,nj->nti", turn, body) + time[:, None] * [0.4, 0, 0]
+    return path.astype(np.float32), time
+
+
+def film(known=None, still=200):
+    path, time = turning_body()
+    if known is None:
+        known = np.random.default_rng(1).uniform(size=path.shape[:2]) < 0.6
+    rest = np.random.default_rng(2).uniform(-1, 1, (still, 3)).astype(np.float32)
+    rest[:, 2] = 1
+    return FilmPaths(time, np.zeros(FRAMES, int), path, known, rest)
+
+
+def narrow(network):
+    """A third as wide as a small preset's: one body is soon learned."""
+    return dataclasses.replace(network, depth=3, width=32)
+
+
+def field_of(name):
+    spec = dataclasses.replace(presets.PRESETS[name], start=TRACKS)
+    if spec.warp is not None:
+        spec = dataclasses.replace(spec, warp=narrow(spec.warp))
+    if spec.scene_flow is not None:
+        medium = narrow(spec.scene_flow.network)
+        medium = dataclasses.replace(spec.scene_flow, network=medium)
+        spec = dataclasses.replace(spec, scene_flow=medium)
+    metadata = scene.SceneMetadata(
+        0.1, 2.0, (0.0, 0.0, 0.0), 1.0, None,
+        tuple(np.linspace(0, 1, FRAMES).tolist()), ((0, 0, 0.0),),
+    )  # fmt: skip
+    return scene.field(spec, metadata)
+
+
+def carried(field, params, time, points):
+    def one(point, view):
+        codes = field.codes_at(params, view)
+        condition = FrameCondition(view.time, codes, jnp.int32(field.spec.steps))
+        return point + field.displace(params, point, condition)
+
+    view = View(None, np.float32(time), np.int32(0))
+    return jax.jit(jax.vmap(one, (0, None)))(points, view)
+
+
+@pytest.mark.parametrize(
+    "name", ["nerfies-small", pytest.param("d-nerf-small", marks=pytest.mark.full)]
+)
+def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
+    field, paths = field_of(name), film()
+    params = field.init(jax.random.key(0))
+    fitted = path_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
+    assert fitted.first > 0.1
+    assert fitted.last < 0.03
+    for frame in (3, 12):
+        back = carried(
+            field, fitted.params, paths.time[frame], paths.position[:, frame]
+        )
+        # Also where a path was not known.
+        off = np.linalg.norm(back - fitted.canonical, axis=-1)
+        assert np.median(off) < 0.04
+        # It keeps its size: all of it in one point would be near to its place, too.
+        size = np.linalg.norm(back - back.mean(0), axis=-1)
+        body = paths.position[:, frame]
+        true = np.linalg.norm(body - body.mean(0), axis=-1)
+        assert 0.9 < np.median(size / true) < 1.1
+        wall = carried(field, fitted.params, paths.time[frame], paths.still)
+        assert np.median(np.linalg.norm(wall - paths.still, axis=-1)) < 0.03
+
+
+@pytest.mark.hard_cases
+def test_a_warp_into_one_point_has_finite_slopes(dtype):
+    path, time = turning_body()
+    rest = np.zeros((1, 3), dtype)
+    ids = np.zeros(FRAMES, int)
+    paths = FilmPaths(time, ids, path.astype(dtype), path[..., 0] < 9, rest)
+    field = types.SimpleNamespace(
+        spec=types.SimpleNamespace(steps=1),
+        codes_at=lambda *_: {},
+        displace=lambda params, point, _: -params["share"] * point,
+    )
+    distances = path_fit._distances(field, {}, paths)
+    drawn = jnp.arange(4), jnp.arange(40), jnp.asarray(rest), jax.random.key(0)
+
+    @jax.jit
+    def stretch(share):
+        places = jnp.asarray(path[:, 0], dtype)
+        return distances({"share": share}, places, *drawn)[2]
+
+    value, slope = jax.jit(jax.value_and_grad(stretch))(jnp.asarray(1.0, dtype))
+    expected = path_fit.STRETCH * (np.log(path_fit.LEAST_STRETCH) / 2) ** 2
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+    assert np.isfinite(slope)
+    # What keeps its size costs nothing, half of it the square of its logarithm.
+    assert stretch(jnp.asarray(0.0, dtype)) < 1e-6
+    half = path_fit.STRETCH * np.log(2) ** 2
+    np.testing.assert_allclose(stretch(jnp.asarray(0.5, dtype)), half, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("start", "first"), [(TRACKS, 0.01), (FieldStartSpec(), 1.0)])
+def test_what_tracks_have_found_learns_slowly_at_first(start, first):
+    spec = dataclasses.replace(
+        presets.PRESETS["nerfies-small"], start=start, appearance=AppearanceSpec()
+    )
+    effects = field_of("nerfies-small").effects
+    codes = {"motion": None, "appearance": None}
+    params = dict.fromkeys(("warp", "template")) | {"codes": codes}
+    for step, share in ((0, first), (spec.steps // 2, first**0.5), (spec.steps, 1)):
+        rates = scene.learning_rates(spec, effects, params, jnp.int32(step))
+        of_codes = rates["codes"]
+        if start is TRACKS:
+            np.testing.assert_allclose(of_codes["appearance"], rates["template"])
+            of_codes = of_codes["motion"]
+        for own in (rates["warp"], of_codes):
+            np.testing.assert_allclose(own / rates["template"], share, rtol=1e-5)
+
+
+@pytest.mark.full
+def test_a_motion_of_one_s_own_may_have_no_parameters():
+    field = field_of("nerfies-small")
+    own = FieldRecord("own", displace=lambda params, point, condition: 0 * point)
+    field = field._replace(effects=(*field.effects, own))
+    params = field.init(jax.random.key(0))
+    assert "own" not in params
+    rates = scene.learning_rates(field.spec, field.effects, params, jnp.int32(0))
+    assert rates.keys() == params.keys()
+    start = dataclasses.replace(TRACKS, fit_steps=2)
+    fitted = path_fit.fit(field, params, film(), jax.random.key(0), start)
+    assert fitted.params.keys() == params.keys()
+
+
+def test_a_flow_with_a_trunk_of_its_own_learns_slowly_at_first_and_its_medium_not():
+    small = presets.PRESETS["nsff-small"]
+    flow = dataclasses.replace(small.scene_flow, flow_trunk=True)
+    spec = dataclasses.replace(small, start=TRACKS, scene_flow=flow)
+    field = scene.field(spec, field_of("nsff-small").metadata)
+    params = field.init(jax.random.key(0))
+    rates = scene.learning_rates(spec, field.effects, params, jnp.int32(0))
+    (own, common) = rates["scene_flow"], rates["template"]
+    for slow in (own.flow, own.flow_trunk):
+        np.testing.assert_allclose(slow / common, spec.start.first_rate, rtol=1e-5)
+    assert own.network == own.disocclusion == own.blend == common
+
+
+def test_a_flow_that_was_not_fitted_is_not_held_back():
+    """Beside a warp, which is fitted to the tracks alone."""
+    preset = presets.PRESETS["nsff-grid-small"]
+    warp = presets.PRESETS["nerfies-small"].warp
+    spec = dataclasses.replace(preset, start=TRACKS, warp=warp)
+    field = scene.field(spec, field_of("nsff-small").metadata)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    rates = scene.learning_rates(spec, field.effects, params, jnp.int32(0))
+    own, common = rates["scene_flow"], rates["scene_flow"].blend
+    assert own.flow == own.flow_trunk == common
+    np.testing.assert_allclose(rates["warp"] / common, spec.start.first_rate, rtol=1e-5)
+
+
+@pytest.mark.parametrize("motion", ["tracks", "none"])
+def test_a_medium_on_tables_learns_at_the_rate_of_the_template(motion):
+    preset = presets.PRESETS["nsff-grid-small"]
+    spec = dataclasses.replace(preset, start=FieldStartSpec(motion=motion))
+    field = scene.field(spec, field_of("nsff-small").metadata)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    rates = scene.learning_rates(spec, field.effects, params, jnp.int32(0))
+    own = rates["scene_flow"]
+    assert own.network == rates["template"] == spec.template_rate * own.blend
+
+
+def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
+    """Against the body's own velocity; also where frames are two moments apart.
+
+    Or none: two cameras saw the tenth.
+    """
+    field, paths = field_of("nsff-small"), film()
+    kept = np.array([*range(0, 8), 9, *range(9, FRAMES)])
+    paths = paths._replace(
+        time=paths.time[kept],
+        appearance=paths.appearance[kept],
+        position=paths.position[:, kept],
+        known=paths.known[:, kept],
+    )
+    params = field.init(jax.random.key(0))
+    fitted = path_fit.fit_flow(field, params, paths, jax.random.key(0), TRACKS)
+    path, time = turning_body()
+    assert fitted.last < 0.3 * fitted.first
+    medium = fitted.params["scene_flow"]
+
+    def flow(point, time):
+        spec, toward = field.spec.scene_flow, jnp.zeros(3)
+        return scene_flow.dynamic(spec, medium, point, toward, time).flow
+
+    ask = jax.jit(jax.vmap(flow, (0, None)))
+    for frame in (3, 8, 12):  # the ninth was never filmed
+        ahead, back = np.moveaxis(np.asarray(ask(path[:, frame], time[frame])), 1, 0)
+        true = path[:, frame + 1] - path[:, frame]
+        size = np.linalg.norm(true, axis=-1).mean()
+        assert np.linalg.norm(ahead - true, axis=-1).mean() < 0.3 * size
+        true = path[:, frame - 1] - path[:, frame]
+        assert np.linalg.norm(back - true, axis=-1).mean() < 0.3 * size
+        wall = np.asarray(ask(paths.still, time[frame]))
+        assert np.linalg.norm(wall, axis=-1).mean() < 0.1 * size
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("still", [0, 200])
+def test_points_seen_once_leave_everything_where_it_is(still):
+    """Each has one place: there is no motion to find, with or without a wall."""
+    known = np.zeros((40, FRAMES), bool)
+    known[np.arange(40), np.arange(40) % FRAMES] = True
+    field, paths = field_of("nerfies-small"), film(known, still)
+    params = field.init(jax.random.key(0))
+    fitted = path_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
+    assert fitted.last < 5e-3
+    places = paths.position[known]
+    assert np.abs(carried(field, fitted.params, 0.5, places) - places).max() < 0.03
+
+
+def test_what_cannot_be_fitted_is_refused_by_name():
+    field = field_of("nerfies-small")
+    params = field.init(jax.random.key(0))
+    with pytest.raises(ValueError, match="no path is known"):
+        path_fit.fit(
+            field, params, film(np.zeros((40, FRAMES), bool)), jax.random.key(0), TRACKS
+        )
+    alone = np.zeros((40, FRAMES), bool)
+    alone[:, 4] = True
+    with pytest.raises(ValueError, match="in two frames that follow each other"):
+        path_fit.fit_flow(
+            field_of("nsff-small"), params, film(alone), jax.random.key(0), TRACKS
+        )
+    with pytest.raises(ValueError, match=r'start\.motion="tracks" fits a warp'):
+        dataclasses.replace(presets.PRESETS["nerf-small"], start=TRACKS)
+    with pytest.raises(ValueError, match=r"start\.first_rate=0.0 must be a share"):
+        FieldStartSpec(first_rate=0.0)

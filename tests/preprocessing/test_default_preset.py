@@ -1,0 +1,101 @@
+"""The preset that a capture calls for where the user names none."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tests.evidence import films
+from tests.evidence.test_tracks import MOVES
+
+from gaussians_jax import representation
+from gaussians_jax.scene.presets import PRESETS
+from nerfies_jax.preprocessing import rigid_groups, usable_paths
+from nerfies_jax.training import specs
+
+UNTRACKED = "spacetime-small"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_cache(tmp_path_factory):
+    """What a film shows is found once for all tests of it, and nowhere else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(representation, "CACHE", tmp_path_factory.mktemp("cache"))
+        yield
+
+
+def noisy():
+    """Every picture of its own: there is nothing to carry from one to the next."""
+    film = films.film(frames=12)
+    noise = np.random.default_rng(0).integers(0, 255, film.images.shape, np.uint8)
+    return dataclasses.replace(film, images=noise)
+
+
+@pytest.mark.parametrize(
+    ("make", "preset", "words"),
+    [
+        (lambda: films.film(**MOVES, frames=24), "splats-tracked-small", ""),
+        (lambda: films.film(frames=24), "splats-static-small", "move by themselves"),
+        (noisy, UNTRACKED, "only 0 tracks of what moves"),
+    ],
+)
+def test_motion_is_chosen_by_what_tracks_say(make, preset, words):
+    choice = representation.default_preset(make())
+    assert choice.preset == preset
+    assert words in "".join(choice.notes)
+    spec = specs.override(PRESETS[preset], choice.overrides)
+    # Nothing is fitted to tracks that are of no use.
+    assert (spec.start.motion == "tracks") == (preset == "splats-tracked-small")
+
+
+def test_what_moves_and_cannot_be_followed_is_no_still_scene(monkeypatch):
+    monkeypatch.setattr(usable_paths, "LEAST_PATHS", 10**6)
+    choice = representation.default_preset(films.film(**MOVES, frames=24))
+    assert choice.preset == UNTRACKED
+    assert "are long enough to fit a motion to" in "".join(choice.notes)
+
+
+@pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (8, ())])
+def test_paths_of_many_things_get_more_bases(asked, overrides, monkeypatch):
+    monkeypatch.setattr(rigid_groups, "enough", lambda *_: asked)
+    choice = representation.default_preset(films.film(**MOVES, frames=24))
+    assert choice.overrides == overrides
+    spec = specs.override(PRESETS[choice.preset], choice.overrides)
+    assert spec.motion.bases == asked
+
+
+@pytest.mark.parametrize(("a_knot", "knots"), [(3, 20), (0.8, 30), (0.1, 60)])
+def test_long_films_get_more_knots(a_knot, knots, monkeypatch):
+    monkeypatch.setattr(representation, "FRAMES_A_KNOT", a_knot)
+    choice = representation.default_preset(films.film(**MOVES, frames=24))
+    spec = specs.override(PRESETS[choice.preset], choice.overrides)
+    assert spec.motion.knots == knots
+    assert ("for 24 frames" in choice.notes) == (knots > 20)
+
+
+@pytest.mark.parametrize(
+    ("preset", "changes"),
+    [
+        ("splats-tracked-small", ()),
+        ("splats-static-small", ()),
+        (UNTRACKED, (representation.FROM_REST,)),
+    ],
+)
+def test_larger_pictures_get_more_gaussians(preset, changes):
+    spec = specs.override(PRESETS[preset], changes)
+    assert representation.capacity(spec, (176, 132)) == ()
+    assert representation.capacity(spec, (88, 66)) == ()
+    larger = specs.override(spec, representation.capacity(spec, (352, 264)))
+    assert larger.strategy.cap_max == 2 * spec.strategy.cap_max
+    assert larger.init.points == 2 * spec.init.points
+    moving = larger.start.moving_points / spec.start.moving_points
+    assert moving == (2 if spec.start.motion == "tracks" else 1)
+
+
+@pytest.mark.parametrize(("followed", "times"), [(0.9, 1), (0.125, 2), (0.01, 3)])
+def test_what_is_followed_for_a_short_time_gets_more_gaussians(followed, times):
+    spec = PRESETS["splats-tracked-small"]
+    short = specs.override(spec, representation.capacity(spec, (176, 132), followed))
+    assert short.init.points == spec.init.points
+    assert short.start.moving_points == times * spec.start.moving_points
+    more = short.start.moving_points - spec.start.moving_points
+    assert short.strategy.cap_max == spec.strategy.cap_max + more

@@ -1,0 +1,41 @@
+"""Flow for a capture that came without."""
+
+import dataclasses
+
+import numpy as np
+from tests.evidence import films
+
+from nerfies_jax.preprocessing import frame_flow
+
+
+def test_flow_leads_to_the_next_frame_of_the_same_camera_and_past_held_out_ones():
+    # 18 px of 96 a frame, and 36 past one held out: the latter are found only by a
+    # search from where a still scene would be.
+    capture = films.film(camera=lambda t: (2.8 * t - 1.4, 0.0, 0.0), frames=8)
+    capture = dataclasses.replace(
+        capture,
+        train=np.array([0, 1, 2, 4, 5, 7]),
+        heldout=np.array([3, 6]),
+        camera_ids=np.array([0, 0, 0, 0, 0, 1, 1, 1]),
+    )
+    flow = frame_flow.with_flow(capture).flow
+    assert flow.next_row.tolist() == [1, 2, 4, 3, 4, 7, 6, 7]
+    assert flow.previous_row.tolist() == [0, 0, 1, 3, 2, 5, 6, 5]
+    alone = flow.next_row == np.arange(8)
+    assert not flow.forward_seen[alone].any()
+    # A wall at z = FAR before cameras that only shift moves by their parallax.
+    position = capture.cameras.position
+    for row in (0, 2):
+        step = position[row] - position[flow.next_row[row]]
+        wall = flow.forward_seen[row] & ~capture.moving[row]
+        assert wall.mean() > 0.5
+        off = flow.forward[row][wall] - films.FOCAL * step[:2] / films.FAR
+        assert np.median(np.linalg.norm(off, axis=-1)) < 0.2
+
+
+def test_cameras_of_one_frame_have_no_flow_and_a_note_says_so():
+    capture = films.film(frames=3)
+    capture = dataclasses.replace(capture, camera_ids=np.arange(3, dtype=np.int32))
+    found = frame_flow.with_flow(capture)
+    assert not found.flow.forward_seen.any()
+    assert found.notes[-1].startswith("no optical flow: no camera has two frames")

@@ -1,0 +1,53 @@
+"""Masks for a capture without: the evidence's, on the frames learned from alone."""
+
+import dataclasses
+import types
+
+import numpy as np
+import pytest
+
+from nerfies_jax.preprocessing import frame_masks
+from tests import scenes
+
+
+def found(capture, factor, unusable=""):
+    """Evidence of a capture, at pictures so many times smaller: its first pixel moves
+    in every frame, the others as they are drawn.
+    """
+    height, width = (side // factor for side in capture.images.shape[1:3])
+    moving = np.random.default_rng(0).uniform(size=(len(capture.train), height, width))
+    moving = moving < 0.3
+    moving[:, 0, 0] = True
+    return types.SimpleNamespace(
+        row=capture.train, moving=moving, factor=factor, unusable=unusable
+    )
+
+
+@pytest.mark.parametrize("factor", [1, 5])
+def test_masks_are_the_evidence_s_at_the_size_of_the_pictures(factor, monkeypatch):
+    bare = dataclasses.replace(scenes.tiny_capture(), moving=None)
+    evidence = found(bare, factor)
+    monkeypatch.setattr(frame_masks.record, "cached", lambda *_: evidence)
+    capture = frame_masks.with_masks(bare)
+    height, width = bare.images.shape[1:3]
+    for frame, row in enumerate(bare.train):
+        for line, column in np.ndindex(height, width):
+            small = tuple(
+                min(place // factor, side - 1)
+                for place, side in zip(
+                    (line, column), evidence.moving.shape[1:], strict=True
+                )
+            )
+            expected = evidence.moving[(frame, *small)]
+            assert capture.moving[row, line, column] == expected
+    assert not capture.moving[bare.heldout].any()
+    assert "masks of what moves found in the pictures" in capture.notes[-1]
+
+
+def test_a_film_that_cannot_be_followed_stays_without_masks(monkeypatch):
+    bare = dataclasses.replace(scenes.tiny_capture(), moving=None)
+    evidence = found(bare, 1, "one picture is no film")
+    monkeypatch.setattr(frame_masks.record, "cached", lambda *_: evidence)
+    capture = frame_masks.with_masks(bare)
+    assert capture.moving is None
+    assert "one picture is no film" in capture.notes[-1]

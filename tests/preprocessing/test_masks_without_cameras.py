@@ -1,0 +1,33 @@
+"""Masks for structure from motion, from pictures alone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from nerfies_jax.capture import images, synthetic
+from nerfies_jax.preprocessing import masks_without_cameras
+
+
+@pytest.mark.slow
+def test_what_moves_is_found_in_a_folder_of_pictures(tmp_path):
+    small = dataclasses.replace(
+        synthetic.PRESETS["default"], size=(112, 84), frames=40, heldout_every=20
+    )
+    capture, _ = synthetic.make(small, seed=5)
+    rows = capture.train
+    film = tmp_path / "film"
+    film.mkdir()
+    for row in rows:
+        images.write_png(film / f"{row:03d}.png", capture.images[row])
+    found = masks_without_cameras.moving_in(film)
+    assert list(found) == [f"{row:03d}.png" for row in rows]
+    masked, true = np.stack(list(found.values())), capture.moving[rows]
+    assert true.mean() > 0.15
+    assert masked[true].mean() > 0.5
+    assert (~masked[~true]).mean() > 0.85
+
+
+def test_too_few_pictures_say_how_many_it_takes(tmp_path):
+    with pytest.raises(ValueError, match="0 pictures; what moves shows in more than 6"):
+        masks_without_cameras.moving_in(tmp_path)
