@@ -1,7 +1,7 @@
 """Dynamic scenes as 3D Gaussians, in pure JAX.
 
-It imports the shared packages of `nerfies_jax` (`geometry`, `nn`, `capture`, `training`,
-`metrics`, `preprocessing`, `evaluation`) and nothing above them.
+It imports the packages of `nerfies_jax` that both representations share (`geometry`,
+`nn`, `capture`, `training`, `metrics`, `preprocessing`, `evaluation`), and no others.
 
 The public names are listed in `__init__.pyi`, and each is imported when it is used.
 """

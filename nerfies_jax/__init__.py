@@ -1,9 +1,9 @@
 """Radiance fields of dynamic scenes, and the modules that both representations share.
 
-`geometry`, `nn`, `capture`, `training`, `metrics`, `preprocessing` and `evaluation` hold
-what every reconstruction needs: cameras, small networks, captures, the training loop,
-metrics, tracks and masks, and a renderer. `gaussians_jax` imports only these, and a module
-imports from lower layers only (docs/architecture.md).
+`geometry`, `nn`, `capture`, `training`, `metrics`, `preprocessing` and `evaluation`
+hold what every reconstruction needs: cameras, small networks, captures, the training
+loop, metrics, tracks and masks, and a renderer. `gaussians_jax` imports only these.
+Modules import from lower layers only (docs/architecture.md).
 
 The names in `__init__.pyi` are the public API. Each is imported when it is used.
 """

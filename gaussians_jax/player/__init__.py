@@ -1,0 +1,1 @@
+"""The web player: a page that shows a moving scene in a browser."""

@@ -1,0 +1,1 @@
+"""Optical flow, tracks, masks, depth and inspection of captures."""

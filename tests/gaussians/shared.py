@@ -1,4 +1,4 @@
-"""Gaussians, tables and checks that the tests of this room share."""
+"""Gaussians, tables and checks that the tests of share."""
 
 import jax
 import numpy as np

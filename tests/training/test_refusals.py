@@ -1,4 +1,4 @@
-"""What the training room refuses where it is built, and in which words."""
+"""Refusals of `nerfies_jax.training`, where they are raised and in which words."""
 
 import math
 
