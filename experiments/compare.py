@@ -313,7 +313,7 @@ def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
         ]
         captions += ["", *(f"error, to {LARGEST_ERROR:g}" for _ in scored)]
     sheet = panels.contact_sheet(tiles, captions, columns=1 + len(compared))
-    tiles.save(sheet, path)
+    panels.save(sheet, path)
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ def _draw_filmed(capture, row, color, depth):
 
 def _enlarged(picture):
     factor = math.ceil(WIDTH / picture.shape[1])
-    return tiles.as_bytes(picture).repeat(factor, 0).repeat(factor, 1)
+    return panels.as_bytes(picture).repeat(factor, 0).repeat(factor, 1)
 
 
 def _moment(known, capture, row):
@@ -150,4 +150,4 @@ def _pixels(camera, points):
 
 def save(picture: np.ndarray, path: pathlib.Path) -> None:
     """Save an image as PNG, atomically."""
-    tiles.save(picture, path)
+    panels.save(picture, path)
