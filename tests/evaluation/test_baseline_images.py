@@ -5,7 +5,6 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.evidence import films
 
 from nerfies_jax import evaluation
 from nerfies_jax.capture import pinholes
@@ -16,6 +15,7 @@ from nerfies_jax.preprocessing import record
 from nerfies_jax.runs import baselines_text
 from nerfies_jax.training.model import Rendering, TrainState
 from tests.capture.test_pinholes import pattern, through_a_lens
+from tests.preprocessing import films
 
 SIZE = (24, 18)
 NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), None)

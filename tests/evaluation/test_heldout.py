@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.measure.test_perceptual import TINY, state_dict
 
 from gaussians_jax.scene import scene as splat_scene
 from nerfies_jax import evaluation, runs
@@ -27,6 +26,7 @@ from nerfies_jax.runs.config import CaptureSource, RunConfig
 from nerfies_jax.scene import scene
 from nerfies_jax.training.model import TrainState
 from tests import scene_oracle, scenes
+from tests.metrics.test_perceptual import TINY, state_dict
 
 # Two frames of the second camera: one has a next one, so a flow.
 FILM = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)

@@ -3,14 +3,14 @@
 import json
 
 import pytest
-from tests.evidence import films
-from tests.evidence.test_tracks import MOVES
 
 from experiments.evidence import __main__ as evidence
 from experiments.evidence import page, report
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.preprocessing import record
 from nerfies_jax.runs import platform
+from tests.preprocessing import films
+from tests.preprocessing.test_tracks import MOVES
 
 
 @pytest.mark.full

@@ -3,11 +3,11 @@
 import json
 
 import pytest
-from tests.evidence import films
 
 from experiments import inspect_scene
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.runs import platform
+from tests.preprocessing import films
 
 
 @pytest.mark.full

@@ -6,8 +6,6 @@ import shlex
 
 import numpy as np
 import pytest
-from tests.evidence import films
-from tests.measure.test_perceptual import state_dict
 
 from experiments import cli, reconstruct
 from nerfies_jax import runs
@@ -20,6 +18,8 @@ from nerfies_jax.runs import (
 )
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
+from tests.metrics.test_perceptual import state_dict
+from tests.preprocessing import films
 
 
 @pytest.fixture

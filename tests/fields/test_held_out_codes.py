@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.radiance.test_skipping import GUIDED, ORANGE, full_of_holes
 
 from nerfies_jax import evaluation
 from nerfies_jax.fields.effects.appearance import AppearanceSpec
@@ -14,6 +13,7 @@ from nerfies_jax.scene import held_out_codes
 from nerfies_jax.scene import scene as nerf_scene
 from nerfies_jax.training.model import TrainState
 from tests import scenes
+from tests.fields.test_skipping import GUIDED, ORANGE, full_of_holes
 from tests.scenes import TINY_FIELD
 
 

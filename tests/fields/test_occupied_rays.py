@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.radiance.test_skipping import GRID, STILL, with_holes
 
 from nerfies_jax import evaluation
 from nerfies_jax.fields import occupied_rays, skipping
@@ -20,6 +19,7 @@ from nerfies_jax.nn.grids import HashGridSpec
 from nerfies_jax.scene import scene
 from nerfies_jax.training import loop
 from tests import scenes
+from tests.fields.test_skipping import GRID, STILL, with_holes
 
 SPEC = dataclasses.replace(
     STILL,

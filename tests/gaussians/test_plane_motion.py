@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.nets.test_planes import expected
 
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Params
@@ -21,6 +20,7 @@ from tests import scenes
 from tests.gaussians import bound
 from tests.gaussians.shared import put, rows_of, some_gaussians
 from tests.gradients import directional_error
+from tests.nn.test_planes import expected
 
 ROWS, EXTENT, NAME = 7, 2.0, plane_motion.NAME
 BOX = ((-1.0, -2.0, -0.5), (1.5, 1.0, 2.0))

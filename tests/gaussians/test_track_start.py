@@ -8,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.evidence import films
-from tests.evidence.test_tracks import MOVES
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.splats import Params
@@ -24,6 +22,8 @@ from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import hidden_points, record, usable_paths
 from tests.gradients import directional_error
+from tests.preprocessing import films
+from tests.preprocessing.test_tracks import MOVES
 
 FRAMES = 24
 MOTIONS = {

@@ -7,11 +7,11 @@ import time
 import jax
 import numpy as np
 import pytest
-from tests.evidence import films
 
 from nerfies_jax.preprocessing import dense_flow, record, watch
 from nerfies_jax.runs import products, representations, run
 from nerfies_jax.runs.config import CaptureSource, RunConfig
+from tests.preprocessing import films
 
 pytestmark = pytest.mark.slow
 

@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.evidence import films
-from tests.evidence.test_tracks import MOVES
 
 from gaussians_jax import representation
 from gaussians_jax.scene.presets import PRESETS
 from nerfies_jax.preprocessing import rigid_groups, usable_paths
 from nerfies_jax.training import specs
+from tests.preprocessing import films
+from tests.preprocessing.test_tracks import MOVES
 
 UNTRACKED = "spacetime-small"
 

@@ -3,9 +3,9 @@
 import dataclasses
 
 import numpy as np
-from tests.evidence import films
 
 from nerfies_jax.preprocessing import frame_flow
+from tests.preprocessing import films
 
 
 def test_flow_leads_to_the_next_frame_of_the_same_camera_and_past_held_out_ones():

@@ -6,9 +6,6 @@ import numpy as np
 import OpenEXR
 import PIL.Image
 import pytest
-from tests.evidence import films
-from tests.evidence.test_summary import card_points
-from tests.evidence.test_tracks import MOVES, gathered
 
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import images
@@ -16,6 +13,9 @@ from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.preprocessing import given_depth, given_files, record, usable_paths
 from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
+from tests.preprocessing import films
+from tests.preprocessing.test_summary import card_points
+from tests.preprocessing.test_tracks import MOVES, gathered
 
 
 def with_files(capture=None, **files):

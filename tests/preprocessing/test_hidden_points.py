@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from tests.evidence import films
 
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import hidden_points, view_set
+from tests.preprocessing import films
 
 HOLE = 0.3  # half the side of what nothing shows, on the wall
 SLOPE = 0.4  # of the wall's z, per unit to the right

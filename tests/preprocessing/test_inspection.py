@@ -5,12 +5,12 @@ import functools
 
 import numpy as np
 import pytest
-from tests.evidence import films
 
 from nerfies_jax.preprocessing import findings, motion, texture
 from nerfies_jax.preprocessing import inspection as inspect_job
 from nerfies_jax.preprocessing import stored as inspect_stored
 from nerfies_jax.preprocessing.findings import CANNOT_TELL, CERTAIN, LIKELY
+from tests.preprocessing import films
 
 
 @functools.cache

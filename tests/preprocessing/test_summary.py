@@ -4,8 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.evidence import films
-from tests.evidence.test_tracks import MOVES, card_path, gathered
 
 from nerfies_jax.preprocessing import (
     against_truth,
@@ -15,6 +13,8 @@ from nerfies_jax.preprocessing import (
     view_set,
 )
 from nerfies_jax.preprocessing.against_truth import TruePoints
+from tests.preprocessing import films
+from tests.preprocessing.test_tracks import MOVES, card_path, gathered
 
 
 def views_of(capture):

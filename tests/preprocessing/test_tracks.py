@@ -6,7 +6,6 @@ import functools
 import numpy as np
 import pytest
 import scipy.ndimage as nd
-from tests.evidence import films
 
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import (
@@ -24,6 +23,7 @@ from nerfies_jax.preprocessing import (
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
 from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
+from tests.preprocessing import films
 
 
 def shaking(t):
