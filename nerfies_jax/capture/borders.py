@@ -4,19 +4,21 @@ import numpy as np
 import skimage.measure
 import skimage.morphology
 
-BLACK = 2  # of 255; a reduced picture ramps at the wedge's edge, its inside stays below
-# The mean inside: wedges have 0.04 to 0.73 (26 frames of a phone clip), black cloth at
-# the rim of a dark film has 1.29 to 1.86 (44 frames).
+# Largest value of a black pixel, of 255. In a downscaled image the edge of a wedge is
+# brighter than this, and its interior is not.
+BLACK = 2
+# Largest mean value of a wedge. Wedges have 0.04 to 0.73 (26 frames of a phone video),
+# black cloth at the border of a dark video has 1.29 to 1.86 (44 frames).
 EMPTY = 1.0
-SMALLEST = 1e-3  # share of the picture; less is a shadow at the rim
-LARGEST = 0.25  # more is a dark scene
+SMALLEST = 1e-3  # share of the image; smaller regions are shadows at the border
+LARGEST = 0.25  # share of the image; larger regions are a dark scene
 
 
 def black_borders(images: np.ndarray) -> np.ndarray | None:
     """Find black regions that touch the border of an image.
 
-    The regions are grown by two pixels, since their edge was mixed with black when the
-    image was resampled.
+    The regions are dilated by two pixels, since resampling mixed their edges with
+    black.
 
     Args:
       images: uint8 images, [frames, height, width, 3].
@@ -25,14 +27,15 @@ def black_borders(images: np.ndarray) -> np.ndarray | None:
       Booleans [frames, height, width], or None if there are no such regions.
     """
     borders = None
-    for row, image in enumerate(images):  # one at a time, to spare memory
+    for row, image in enumerate(images):  # one at a time, to save memory
         brightest = image.max(-1)
         dark = brightest <= BLACK
-        if not _rim(dark).any():
+        if not _outermost(dark).any():
             continue
         labels = skimage.measure.label(dark, connectivity=1)
+        outer_labels = _outermost(labels)
         border = np.zeros(dark.shape, bool)
-        for label in np.unique(_rim(labels)[_rim(labels) > 0]):
+        for label in np.unique(outer_labels[outer_labels > 0]):
             region = labels == label
             empty = brightest[region].mean() <= EMPTY
             if empty and SMALLEST <= region.mean() <= LARGEST:
@@ -56,20 +59,15 @@ def without_black_borders(
     Returns:
       The mask, None if all pixels are observed, and a note if there are borders.
     """
-    blacked = black_borders(images)
-    if blacked is None:
+    borders = black_borders(images)
+    if borders is None:
         return valid, ()
-    touched = int(blacked.any((1, 2)).sum())
-    notes = (f"{touched} frames have black borders: taken as not filmed",)
-    return ~blacked if valid is None else valid & ~blacked, notes
+    count = int(borders.any((1, 2)).sum())
+    notes = (f"{count} frames have black borders: taken as not observed",)
+    return ~borders if valid is None else valid & ~borders, notes
 
 
-def _rim(pictures):
-    """The outermost pixels of [..., height, width] along one axis."""
-    sides = (
-        pictures[..., 0, :],
-        pictures[..., -1, :],
-        pictures[..., 0],
-        pictures[..., -1],
-    )
-    return np.concatenate(sides, axis=-1)
+def _outermost(image):
+    """The outermost pixels of [height, width] in one array."""
+    sides = (image[0], image[-1], image[:, 0], image[:, -1])
+    return np.concatenate(sides)

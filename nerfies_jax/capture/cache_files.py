@@ -1,9 +1,9 @@
-"""Files that can be made again: caches, and the finished parts of long measurements.
+"""Files that can be recreated: caches, and completed parts of long measurements.
 
-Every one of them is disposable. One that is damaged, cut off, empty, unreadable, of
-another version or of something else is reported in one line that names it, and made
-again. Silent damage would come back as plausible numbers, so a file holds a checksum of
-its content and the identity of what it was made for.
+All of them are disposable. A file that is damaged, truncated, unreadable, of another
+version or of other content is reported in one line and recreated. Undetected damage
+would show up as plausible numbers, so each file holds a checksum of its content and the
+identity of what it was made for.
 """
 
 import contextlib
@@ -22,29 +22,30 @@ from nerfies_jax.capture.json_files import new_folder, replaced_file
 from nerfies_jax.capture.json_files import write_json as write_plain_json
 from nerfies_jax.runtime import console
 
-SEAL = "seal"  # a member of archives and JSON objects, next to the content
-MANIFEST = "manifest.json"  # of a folder
-DAMAGED = ".damaged"  # ends the name of a file that is kept aside
+SEAL = "seal"  # key of the identity and checksum in archives and JSON objects
+MANIFEST = "manifest.json"  # checksums of the files of a folder
+DAMAGED = ".damaged"  # suffix of a damaged file that is kept
 
 Content = TypeVar("Content")
 
-_reported: set[tuple[str, Any]] = set()  # a file may be asked for many times
+# Warnings that were printed, since a file may be requested many times.
+_reported: set[tuple[str, Any]] = set()
 
 
 def read(
     path: pathlib.Path, load: Callable[[pathlib.Path], Content], aside: bool = False
 ) -> Content | None:
-    """Read a file that can be made again.
+    """Read a file that can be recreated.
 
     Args:
       path: The file or folder.
-      load: Reads it. Whatever it raises means that the file is of no use.
-      aside: True to rename a file of no use to NAME.damaged, because it holds more
-        than what is made again now.
+      load: Function that reads it. Any exception means that the file is unusable.
+      aside: True to rename an unusable file to NAME.damaged, for files that hold more
+        than what the caller recreates now.
 
     Returns:
-      What `load` returns, or None where there is no such file, or one of no use. A
-      warning then names it.
+      What `load` returns. None if the file does not exist or, with a warning, if it is
+      unusable.
     """
     try:
         os.lstat(path)
@@ -53,27 +54,27 @@ def read(
         if not os.path.lexists(path):
             return None
         reason: Exception = error
-    # Damaged bytes make readers raise whatever they meet.
+    # Readers of damaged bytes may raise anything.
     except Exception as error:
         reason = error
-    words = " ".join(str(reason).replace(f"{path}: ", "").split())
-    words = f"{path}: of no use ({words or type(reason).__name__}); it is made again"
+    text = " ".join(str(reason).replace(f"{path}: ", "").split())
+    message = f"{path}: unusable ({text or type(reason).__name__}); it is recreated"
     if aside:
-        kept = path.with_name(path.name + DAMAGED)
+        backup = path.with_name(path.name + DAMAGED)
         with contextlib.suppress(OSError):
-            os.replace(path, kept)
-            words += f", and kept as {kept.name}"
-    if (key := (words, _state(path))) not in _reported:
+            os.replace(path, backup)
+            message += f", and kept as {backup.name}"
+    if (key := (message, _state(path))) not in _reported:
         _reported.add(key)
-        console.warn(words)
+        console.warn(message)
     return None
 
 
 def _state(path):
-    """Identify the file at a path, differently for each one that ever had this name."""
+    """Identify the file at a path, to tell it from others that had the same name."""
     with contextlib.suppress(OSError):
-        found = os.lstat(path)
-        return found.st_ino, found.st_mtime_ns, found.st_size
+        status = os.lstat(path)
+        return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def write_arrays(
@@ -86,7 +87,7 @@ def write_arrays(
 
     Args:
       path: The file. Its folder is created if needed.
-      arrays: Arrays by name. None may be named `SEAL`.
+      arrays: Arrays by name. The name `SEAL` is reserved.
       identity: Identity of the content, with the version of the code that made it.
       compressed: True to compress the file.
     """
@@ -174,9 +175,9 @@ def _text_checksum(value):
 
 def _check(seal, identity, crc32):
     if not isinstance(seal, dict) or seal.get("identity") != identity:
-        raise ValueError("it is of another version, or of something else")
+        raise ValueError("it is of another version or for other content")
     if seal.get("crc32") != crc32:
-        raise ValueError("it is not what was written: the checksum differs")
+        raise ValueError("its content changed after it was written (checksum)")
 
 
 @contextlib.contextmanager
@@ -198,7 +199,7 @@ def replaced_entry(path: pathlib.Path, identity: str) -> Iterator[pathlib.Path]:
 
 
 def check_entry(path: pathlib.Path, identity: str) -> None:
-    """Check that a folder is as `replaced_entry` left it.
+    """Check that the files of a folder are unchanged since `replaced_entry` wrote it.
 
     Args:
       path: The folder.
@@ -210,7 +211,7 @@ def check_entry(path: pathlib.Path, identity: str) -> None:
     """
     for name, crc32 in read_json(path / MANIFEST, identity)["files"].items():
         if _file_checksum(path / name) != crc32:
-            raise ValueError(f"{name} is not what was written: the checksum differs")
+            raise ValueError(f"{name} changed after it was written (checksum)")
 
 
 def _files(folder):
@@ -223,7 +224,7 @@ def _file_checksum(path):
 
 
 def _make_way(path, folder=False):
-    """Remove what cannot be replaced by renaming: a folder, or what stands for one."""
+    """Remove what `os.replace` cannot replace: a folder, or a file that blocks one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)

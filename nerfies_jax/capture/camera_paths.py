@@ -1,4 +1,4 @@
-"""Camera paths for videos: cameras, and the times of the scene that they show."""
+"""Camera paths for rendering videos: cameras and scene times."""
 
 from typing import Any, NamedTuple
 
@@ -11,14 +11,14 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.rays import across_ray
 
 KINDS = ("sway", "orbit", "lemniscate", "stabilized", "captured")
-# Standard deviation of the smoothing of a stabilized path, as a share of the capture:
-# half a second of ten, which takes out a hand's shake and keeps its walk.
+# Standard deviation of the Gaussian smoothing of a stabilized path, as a share of the
+# duration: 0.5 s of 10 s, which removes hand shake and preserves the walk.
 SMOOTHED_OVER = 0.05
-SECONDS = 4.0  # that a film plays whose rate is not known
-SHORTEST, LONGEST = 1.0, 60.0
-# Least sine of the angle between the view and what is up. A sway turns the view by some
-# 20 degrees, and across the axis the pictures would turn over; on an orbit all views
-# are at one angle to it.
+SECONDS = 4.0  # duration of a video if the frame rate of the capture is unknown
+SHORTEST, LONGEST = 1.0, 60.0  # seconds
+# Smallest sine of the angle between the viewing direction and the up axis. A sway
+# rotates the view by about 20 degrees, and images would flip where it crosses the axis.
+# On an orbit all views have the same angle to the axis.
 LEAST_TILT, LEAST_ORBIT = 0.35, 0.01
 
 
@@ -26,13 +26,13 @@ class CameraPath(NamedTuple):
     """Cameras of a video and their times, in NumPy."""
 
     cameras: Camera  # [frames], scene units
-    size: tuple[int, int]  # width and height of the pictures, in pixels
-    # [frames] in [0, 1]; None where the path leaves them to whoever renders it.
+    size: tuple[int, int]  # width and height of the images, in pixels
+    # [frames] in [0, 1]. None if the path does not determine them.
     times: np.ndarray | None = None
 
 
 def planned(kind: str, capture: Capture, count: int) -> CameraPath:
-    """Make a path of one of the `KINDS`, with the times that belong to its cameras.
+    """Make a path of one of the `KINDS`, with the times of its cameras.
 
     Args:
       kind: One of `KINDS`.
@@ -47,21 +47,21 @@ def planned(kind: str, capture: Capture, count: int) -> CameraPath:
     """
     times = None
     if kind == "captured":
-        times = capture.times[_replayed(capture, count)]
+        times = capture.times[_rows_in_time(capture, count)]
     elif kind == "stabilized":
-        times = _filmed_span(capture, count)
+        times = _even_times(capture, count)
     return CameraPath(path(kind, capture, count), capture.size, times)
 
 
 def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     """Make cameras that move around the scene.
 
-    "sway" stays in the span of the captured positions, where a monocular reconstruction
-    can be trusted, and so does "lemniscate", a horizontal figure of eight. "orbit" is a
-    full circle around the focus point. "captured" repeats the training cameras in the
-    order of their times, and "stabilized" does the same without camera shake. If the
-    capture looks along the up axis, as a camera overhead does, the middle image defines
-    up.
+    "sway" stays within the range of the captured positions, where a monocular
+    reconstruction is reliable, and so does "lemniscate", a horizontal figure of eight.
+    "orbit" is a full circle around the focus point. "captured" repeats the training
+    cameras in the order of their times, and "stabilized" does the same without camera
+    shake. If the cameras look along the up axis, as an overhead camera does, the
+    vertical of the middle image replaces it.
 
     Args:
       kind: One of `KINDS`.
@@ -78,82 +78,84 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     if kind not in KINDS:
         raise ValueError(f"no camera path {kind!r}; {known_names(kind, KINDS)}")
     if kind == "captured":
-        return cameras.take(capture.cameras, _replayed(capture, count))
+        return cameras.take(capture.cameras, _rows_in_time(capture, count))
     train_cameras = cameras.take(capture.cameras, capture.train)
     if kind == "stabilized":
-        when = capture.times[capture.train].astype(np.float64)
-        return smoothed(train_cameras, when, _filmed_span(capture, count))
+        train_times = capture.times[capture.train].astype(np.float64)
+        return smoothed(train_cameras, train_times, _even_times(capture, count))
     phase = np.linspace(0, 2 * np.pi * turns, count, endpoint=False)
     target = focus_point(train_cameras, capture.near, capture.far)
-    least = LEAST_ORBIT if kind == "orbit" else LEAST_TILT
-    up = _across(up_axis(capture), train_cameras, target, least)
+    min_sine = LEAST_ORBIT if kind == "orbit" else LEAST_TILT
+    up = _usable_up(up_axis(capture), train_cameras, target, min_sine)
     shapes = {"sway": _sway, "orbit": _orbit, "lemniscate": _lemniscate}
     positions = shapes[kind](train_cameras, target, up, phase)
     middle = cameras.take(train_cameras, len(train_cameras.focal_px) // 2)
     size = capture.size
-    looking = cameras.stack(
+    path_cameras = cameras.stack(
         [
             cameras.look_at(position, target, up, float(middle.focal_px), size)
             for position in positions
         ]
     )
     aspect: Any = np.broadcast_to(middle.pixel_aspect, (count,)).copy()
-    return looking._replace(pixel_aspect=aspect)
+    return path_cameras._replace(pixel_aspect=aspect)
 
 
-def _across(up, train_cameras, target, least):
+def _usable_up(up, train_cameras, target, min_sine):
     """Return `up`, or that of the middle image if the view is nearly parallel to it."""
     forward = target - np.median(train_cameras.position.astype(np.float64), axis=0)
-    if np.linalg.norm(np.cross(forward, up)) >= least * np.linalg.norm(forward):
+    if np.linalg.norm(np.cross(forward, up)) >= min_sine * np.linalg.norm(forward):
         return up
     middle = len(train_cameras.focal_px) // 2
     return -train_cameras.camera_from_world[middle, 1].astype(np.float64)
 
 
-def _replayed(capture, count):
-    """Training rows in the order of their times, evenly picked."""
+def _rows_in_time(capture, count):
+    """Indices of evenly spaced training frames in the order of their times."""
     rows = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     return rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
 
 
-def _filmed_span(capture, count):
-    when = capture.times[capture.train]
-    return np.linspace(when.min(), when.max(), count, dtype=np.float32)
+def _even_times(capture, count):
+    """Evenly spaced times from the first to the last training frame."""
+    times = capture.times[capture.train]
+    return np.linspace(times.min(), times.max(), count, dtype=np.float32)
 
 
-def smoothed(filmed: Camera, when: np.ndarray, times: np.ndarray) -> Camera:
-    """Remove the shake of a camera and resample it in time.
+def smoothed(captured: Camera, captured_times: np.ndarray, times: np.ndarray) -> Camera:
+    """Remove camera shake and resample a camera in time.
 
-    Positions and orientations are lines fitted to the frames around each time, weighted
-    by a Gaussian with a standard deviation of `SMOOTHED_OVER`, or 1.5 times the largest
-    gap between frames. A fitted matrix becomes the nearest rotation. A mean in place of
-    a line would stop short of the first and last frame.
+    Positions and rotation matrices are local linear regressions over time, weighted by
+    a Gaussian with a standard deviation of `SMOOTHED_OVER`, or 1.5 times the largest
+    gap between frames. A fitted matrix is projected to the nearest rotation. A local
+    mean would shrink the path at the first and last frame.
 
     Args:
-      filmed: Captured cameras, [frames].
-      when: Their times, [frames].
+      captured: Captured cameras, [frames].
+      captured_times: Their times, [frames].
       times: Times of the result, [count].
 
     Returns:
-      Cameras [count], with the lens of the middle one and without skew.
+      Cameras [count], with the intrinsics of the middle one, without skew and
+      distortion.
     """
-    gaps = np.diff(np.unique(when))
+    gaps = np.diff(np.unique(captured_times))
     width = max(SMOOTHED_OVER, 1.5 * gaps.max(initial=0))
-    count = len(filmed.focal_px)
+    count = len(captured.focal_px)
     poses = np.concatenate(
-        [filmed.position, filmed.camera_from_world.reshape(count, 9)], axis=1
+        [captured.position, captured.camera_from_world.reshape(count, 9)], axis=1
     ).astype(np.float64)
     fitted = np.empty((len(times), 12))
     for row, time in enumerate(np.asarray(times, np.float64)):
-        since = when - time
-        # The root, since least squares squares it.
-        weight = np.exp(-((since / (2 * width)) ** 2))
-        line = np.stack([np.ones(count), since], axis=1) * weight[:, None]
+        offset = captured_times - time
+        # The square root of the Gaussian, since least squares squares the weights.
+        weight = np.exp(-((offset / (2 * width)) ** 2))
+        line = np.stack([np.ones(count), offset], axis=1) * weight[:, None]
         fitted[row] = np.linalg.lstsq(line, poses * weight[:, None], rcond=1e-9)[0][0]
     left, _, right = np.linalg.svd(fitted[:, 3:].reshape(-1, 3, 3))
     flip = np.ones((len(times), 3))
-    flip[:, 2] = np.linalg.det(left @ right)  # a rotation, not a reflection
-    lens = cameras.take(filmed, np.full(len(times), count // 2))
+    flip[:, 2] = np.linalg.det(left @ right)  # excludes reflections
+    lens = cameras.take(captured, np.full(len(times), count // 2))
     leaves: dict[str, Any] = dict(
         camera_from_world=((left * flip[:, None]) @ right).astype(np.float32),
         position=fitted[:, :3].astype(np.float32),
@@ -165,7 +167,7 @@ def smoothed(filmed: Camera, when: np.ndarray, times: np.ndarray) -> Camera:
 
 
 def times(count: int, loops: float = 1.0) -> np.ndarray:
-    """Return times that play the scene forward and back.
+    """Return times that play the scene forward and backward.
 
     Args:
       count: Number of times.
@@ -190,12 +192,12 @@ def playing_seconds(capture: Capture) -> float:
     """
     if capture.frames_per_second is None:
         return SECONDS
-    moments = len(np.unique(capture.times))
-    return float(np.clip(moments / capture.frames_per_second, SHORTEST, LONGEST))
+    count = len(np.unique(capture.times))
+    return float(np.clip(count / capture.frames_per_second, SHORTEST, LONGEST))
 
 
 def up_axis(capture: Capture) -> np.ndarray:
-    """Return the up direction of a capture, or of its training images if it has none.
+    """Return the up direction of a capture, by default the mean of its images.
 
     Args:
       capture: The capture.
@@ -243,7 +245,8 @@ def focus_point(train_cameras: Camera, near: float, far: float) -> np.ndarray:
     mean_axis = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
     mean_center = centers.mean(axis=0)
     halfway = 2 / (1 / near + 1 / far)
-    # Smallest eigenvalue per camera = mean squared sine to the common direction.
+    # The smallest eigenvalue per camera is the mean squared sine of the angles to the
+    # common direction.
     if np.linalg.eigvalsh(system)[0] < 1e-3 * len(axes):
         return mean_center + halfway * mean_axis
     point = np.linalg.solve(system, np.einsum("nij,nj->i", across, centers))
@@ -254,11 +257,11 @@ def focus_point(train_cameras: Camera, near: float, far: float) -> np.ndarray:
 
 
 class _Window(NamedTuple):
-    """Middle of the captured positions, and their extent across the view."""
+    """Median of the captured positions, and their extent across the view."""
 
-    middle: np.ndarray
-    right: np.ndarray  # half of the 70 % span, as a vector
-    upward: np.ndarray
+    middle: np.ndarray  # [3]
+    right: np.ndarray  # [3], half of the range of 70 % of the positions
+    upward: np.ndarray  # [3], likewise
 
 
 def _window(train_cameras, target, up):
@@ -272,19 +275,19 @@ def _window(train_cameras, target, up):
     offset = centers - middle
     wide = np.quantile(np.abs(offset @ right), 0.7)
     high = np.quantile(np.abs(offset @ upward), 0.7)
-    # A camera that hardly moved still sways a little, to show depth.
-    least = 0.03 * np.linalg.norm(target - middle)
-    return _Window(middle, max(wide, least) * right, max(high, least / 2) * upward)
+    # The path of a nearly static camera gets some parallax to show depth.
+    minimum = 0.03 * np.linalg.norm(target - middle)
+    return _Window(middle, max(wide, minimum) * right, max(high, minimum / 2) * upward)
 
 
 def _sway(train_cameras, target, up, phase):
-    """Ellipse through the 70 % span of the captured positions, facing the target."""
+    """Ellipse within the range of 70 % of the captured positions."""
     middle, right, upward = _window(train_cameras, target, up)
     return middle + np.sin(phase)[:, None] * right + np.cos(phase)[:, None] * upward
 
 
 def _lemniscate(train_cameras, target, up, phase):
-    """Gerono's lemniscate through the same span, twice through its middle."""
+    """Lemniscate of Gerono within the same range as the sway."""
     middle, right, upward = _window(train_cameras, target, up)
     return middle + np.sin(phase)[:, None] * right + np.sin(2 * phase)[:, None] * upward
 

@@ -1,4 +1,4 @@
-"""The record of a capture, common to all formats."""
+"""The `Capture` record that all readers return, and its validation."""
 
 import collections
 import dataclasses
@@ -15,10 +15,11 @@ from nerfies_jax.capture.given import Given
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
-# Scene units: positions and depths around 1 are what everything is computed for.
+# In scene units. float32 precision and all defaults assume lengths of order 1.
 MAX_LENGTH = 1e6
-MAX_SCALE = 1e12  # of scene units over world units, or one over that
-MAX_ID = 2**20  # a table of codes longer than this is a broken id, not a capture
+MAX_SCALE = 1e12  # scene units per world unit, or its inverse
+# Tables of latent codes have a row per id, so a larger id is taken for a damaged file.
+MAX_ID = 2**20
 
 
 class PointCloud(NamedTuple):
@@ -43,36 +44,35 @@ class Capture:
     images: np.ndarray  # [frames, height, width, 3] uint8, sRGB, opaque
     cameras: Camera  # NumPy leaves, float32, leading axis frames
     times: np.ndarray  # [frames] float32 in [0, 1] over the whole capture
-    train: np.ndarray  # rows to learn from
-    heldout: np.ndarray  # rows to score on; never learned from
+    train: np.ndarray  # indices of the training frames
+    heldout: np.ndarray  # indices of the frames for evaluation, never trained on
     near: float  # scene units along the viewing axis
     far: float
-    warp_ids: np.ndarray  # [frames] int32, 0..n-1: which moment
-    appearance_ids: np.ndarray  # [frames] int32: which exposure
-    camera_ids: np.ndarray  # [frames] int32: which physical camera
-    valid: np.ndarray | None = None  # [frames, height, width] bool: pixel was filmed
-    moving: np.ndarray | None = None  # [frames, height, width] bool: moves by itself
-    depths: np.ndarray | None = (
-        None  # [frames, height, width] float32 z-depth; 0 unknown
-    )
+    warp_ids: np.ndarray  # [frames] int32, 0..n-1: index of the frame time
+    appearance_ids: np.ndarray  # [frames] int32: index of the exposure
+    camera_ids: np.ndarray  # [frames] int32: index of the physical camera
+    valid: np.ndarray | None = None  # [frames, height, width] bool: observed pixels
+    moving: np.ndarray | None = None  # [frames, height, width] bool: dynamic pixels
+    # [frames, height, width] float32 z-depth, 0 where unknown
+    depths: np.ndarray | None = None
     flow: FrameFlow | None = None  # to the next and previous frame, in pixels
-    given: Given | None = None  # what other tools found, in place of our evidence
+    given: Given | None = None  # external preprocessing that replaces our own
     points: PointCloud | None = None
-    background: tuple[float, float, float] | None = None  # what lies behind, if known
+    background: tuple[float, float, float] | None = None  # sRGB in [0, 1], if known
     scale: float = 1.0
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    up: tuple[float, float, float] | None = None  # unit, scene axes, if known
-    frames_per_second: float | None = None  # of the footage, if known
+    up: tuple[float, float, float] | None = None  # unit vector, scene axes, if known
+    frames_per_second: float | None = None  # of the video, if known
     path: pathlib.Path | None = None
-    notes: tuple[str, ...] = ()  # what the reader found, repaired or left out
-    preprocessing: float = 1.0  # budget of work for flow, tracks and masks; 1: default
+    notes: tuple[str, ...] = ()  # what the reader assumed, repaired or left out
+    preprocessing: float = 1.0  # relative effort for flow, tracks and masks
 
     def __post_init__(self):
         validate(self)
 
     @property
     def centre(self) -> tuple[float, float, float]:
-        """The center under its earlier name, which scripts of users still have."""
+        """Alias of `center`, its name in earlier versions."""
         return self.center
 
     @property
@@ -92,9 +92,9 @@ def point_depths(capture: Capture) -> np.ndarray:
     """
     if capture.points is None:
         return np.zeros(0)
-    turn = capture.cameras.camera_from_world[capture.train, 2]
+    axes = capture.cameras.camera_from_world[capture.train, 2]
     position = capture.cameras.position[capture.train, None]
-    depth = np.einsum("fk,fnk->fn", turn, capture.points.position[None] - position)
+    depth = np.einsum("fk,fnk->fn", axes, capture.points.position[None] - position)
     return depth[depth > capture.near]
 
 
@@ -112,7 +112,7 @@ def validate(capture: Capture):
     if frames < 2:
         raise CaptureError(
             f"{where}: {frames} frame(s); a reconstruction needs at least 2 views, "
-            "so film or select more"
+            "so record or select more"
         )
     name, times = collections.Counter(capture.ids).most_common(1)[0]
     if times > 1:
@@ -135,19 +135,19 @@ def _check_shapes(capture, where, frames):
             f"{where}: images are {images.dtype} of shape {images.shape}; "
             "expected uint8 [frames, height, width, 3]"
         )
-    pictures = images.shape[:3]
-    if pictures[0] != frames or min(pictures) < 1:
+    shape = images.shape[:3]
+    if shape[0] != frames or min(shape) < 1:
         raise CaptureError(
             f"{where}: {frames} ids but images of shape {images.shape}; "
-            "there must be one picture per id"
+            "there must be one image per id"
         )
     for name in ("valid", "moving", "depths"):
         array = getattr(capture, name)
-        kind = np.float32 if name == "depths" else np.bool_
-        if array is not None and (array.shape != pictures or array.dtype != kind):
+        dtype = np.float32 if name == "depths" else np.bool_
+        if array is not None and (array.shape != shape or array.dtype != dtype):
             raise CaptureError(
                 f"{where}: {name} is {array.dtype} of shape {array.shape}; "
-                f"expected {np.dtype(kind)} of shape {pictures}, as the images"
+                f"expected {np.dtype(dtype)} of shape {shape}, as the images"
             )
     for name in ("times", "warp_ids", "appearance_ids", "camera_ids"):
         array = getattr(capture, name)
@@ -195,8 +195,9 @@ def check_cameras(
             try:
                 camera.validate(camera.take(cameras, [row]), size, f"camera {name!r}")
             except ValueError as reason:
-                named = str(reason).replace(" (row 0)", "")  # one camera at a time
-                raise CaptureError(f"{where}: {named}") from None
+                # The row number is that in a batch of this one camera.
+                message = str(reason).replace(" (row 0)", "")
+                raise CaptureError(f"{where}: {message}") from None
         raise CaptureError(str(error)) from None
 
 
@@ -222,8 +223,8 @@ def _check_numbers(capture, where):
     rate = capture.frames_per_second
     if rate is not None and not 0 < rate < np.inf:
         raise CaptureError(
-            f"{where}: {rate:g} frames per second; expected a positive rate, or none "
-            "where it is not known"
+            f"{where}: {rate:g} frames per second; expected a positive rate, or None "
+            "if it is unknown"
         )
     if capture.depths is not None:
         bad = ~(capture.depths >= 0) | np.isinf(capture.depths)
@@ -231,8 +232,8 @@ def _check_numbers(capture, where):
             row = int(np.argmax(bad.any((1, 2))))
             raise CaptureError(
                 f"{where}: the depth of frame {capture.ids[row]!r} has "
-                f"{bad[row].sum()} "
-                "negative, infinite or NaN pixels; write 0 where depth is unknown"
+                f"{bad[row].sum()} negative, infinite or NaN pixels; write 0 where "
+                "depth is unknown"
             )
     if capture.points is not None and not np.isfinite(capture.points.position).all():
         count = (~np.isfinite(capture.points.position).all(1)).sum()
@@ -243,10 +244,10 @@ def _check_numbers(capture, where):
 
 
 def _check_range(capture, where):
-    """Refuse lengths that float32 cannot compute with."""
+    """Refuse lengths beyond the precision of float32."""
     depths = capture.depths
     deepest = 0.0 if depths is None or not depths.size else float(depths.max())
-    for what, value, least, most in (
+    for name, value, least, most in (
         ("near", capture.near, 1 / MAX_LENGTH, MAX_LENGTH),
         ("far", capture.far, 1 / MAX_LENGTH, MAX_LENGTH),
         ("the largest depth", deepest, 0.0, MAX_LENGTH),
@@ -254,7 +255,7 @@ def _check_range(capture, where):
     ):
         if not least <= value <= most:
             raise CaptureError(
-                f"{where}: {what} is {value:.3g}; expected {least:g} to {most:g} "
+                f"{where}: {name} is {value:.3g}; expected {least:g} to {most:g} "
                 "(scene units); check the unit of the files, and write 0 where a depth "
                 "is unknown"
             )
@@ -283,12 +284,12 @@ def _check_rows(capture, where, frames):
         if np.unique(rows).size != rows.size:
             raise CaptureError(f"{where}: {name} names a row twice")
     if not capture.train.size:
-        raise CaptureError(f"{where}: no frame to learn from; hold fewer frames out")
+        raise CaptureError(f"{where}: no training frames; hold out fewer frames")
     shared = np.intersect1d(capture.train, capture.heldout)
     if shared.size:
         raise CaptureError(
-            f"{where}: frame {capture.ids[shared[0]]!r} is both learned from and held "
-            f"out ({shared.size} such); a score on it would mean nothing"
+            f"{where}: frame {capture.ids[shared[0]]!r} is both a training and a "
+            f"held-out frame ({shared.size} such); keep it in one of the splits"
         )
 
 
@@ -300,14 +301,14 @@ def select(capture: Capture, rows: np.ndarray) -> Capture:
       rows: Indices of the frames, in the order of the result.
 
     Returns:
-      The capture of these frames, whose ids keep their meaning.
+      The capture of these frames. Warp, appearance and camera ids are not renumbered.
     """
     rows = np.asarray(rows, np.int64)
-    place = np.full(len(capture.ids), -1)
-    place[rows] = np.arange(rows.size)
+    new_index = np.full(len(capture.ids), -1)
+    new_index[rows] = np.arange(rows.size)
 
-    def moved(old):
-        return np.sort(place[old][place[old] >= 0])
+    def reindex(old):
+        return np.sort(new_index[old][new_index[old] >= 0])
 
     def take(array):
         return None if array is None else array[rows]
@@ -318,8 +319,8 @@ def select(capture: Capture, rows: np.ndarray) -> Capture:
         images=capture.images[rows],
         cameras=camera.take(capture.cameras, rows),
         times=capture.times[rows],
-        train=moved(capture.train),
-        heldout=moved(capture.heldout),
+        train=reindex(capture.train),
+        heldout=reindex(capture.heldout),
         warp_ids=capture.warp_ids[rows],
         appearance_ids=capture.appearance_ids[rows],
         camera_ids=capture.camera_ids[rows],
@@ -334,11 +335,10 @@ def select(capture: Capture, rows: np.ndarray) -> Capture:
 def downscale(capture: Capture, factor: int) -> Capture:
     """Shrink the images of a capture by area averaging.
 
-    Columns and rows that do not fill a block at the right and bottom are removed. A
-    block is observed if all its pixels are, moving if any of them is, and its depth is
-    the mean of the known depths. Its flow is the mean, in pixels of the smaller image.
-    Colors are averaged as stored (sRGB), as in every published evaluation of these
-    captures.
+    Incomplete blocks at the right and bottom are cropped. A block is observed if all
+    its pixels are, moving if any of them is, and its depth is the mean of the known
+    depths. Its flow is the mean, in pixels of the smaller image. Colors are averaged as
+    stored (sRGB), as in every published evaluation of these captures.
 
     Args:
       capture: The capture.
@@ -353,9 +353,8 @@ def downscale(capture: Capture, factor: int) -> Capture:
     width, height = capture.size
     if not 1 <= factor <= min(width, height):
         raise CaptureError(
-            f"{capture.path or capture.name}: cannot make {width}x{height} pictures "
-            f"smaller by {factor}; expected a whole number from 1 to "
-            f"{min(width, height)}"
+            f"{capture.path or capture.name}: cannot downscale {width}x{height} images "
+            f"by {factor}; expected an integer from 1 to {min(width, height)}"
         )
     if factor == 1:
         return capture
@@ -429,24 +428,24 @@ def describe(capture: Capture) -> tuple[str, ...]:
       capture: The capture.
 
     Returns:
-      The lines, the last of which are the notes of its reader.
+      Lines of text. The notes of the reader come last.
     """
     width, height = capture.size
     cameras = np.unique(capture.camera_ids).size
     lines = [
         f"{capture.name}: {capture.source} capture, {len(capture.ids)} frames of "
-        f"{width}x{height}, {capture.train.size} to learn from, "
+        f"{width}x{height}, {capture.train.size} for training, "
         f"{capture.heldout.size} held out",
-        f"{np.unique(capture.warp_ids).size} moments, {cameras} camera(s), focal "
+        f"{np.unique(capture.warp_ids).size} timestamps, {cameras} camera(s), focal "
         f"length {np.median(capture.cameras.focal_px):.4g} px, depth "
         f"{capture.near:.3g} to {capture.far:.3g} scene units (1 unit = "
-        f"{1 / capture.scale:.3g} of the world)",
+        f"{1 / capture.scale:.3g} world units)",
     ]
     extras = []
     if capture.points is not None:
         extras.append(f"{len(capture.points.position)} static points")
     if capture.valid is not None:
-        extras.append(f"{1 - capture.valid.mean():.1%} of pixels not filmed")
+        extras.append(f"{1 - capture.valid.mean():.1%} of pixels not observed")
     if capture.moving is not None:
         extras.append(f"{capture.moving.mean():.1%} of pixels marked moving")
     if capture.depths is not None:

@@ -1,19 +1,20 @@
-"""The one place that imports pycolmap.
+"""Import of pycolmap, which must happen nowhere else.
 
-Its wheel exports a zlib of its own (seen in 4.2.1). A libz loaded after it binds to
-half of that, and the next PNG, .npz or gzip ends the process with "free(): invalid
-pointer". Loaded before it, libz stays whole; hence the first import below.
+The wheel of pycolmap exports the symbols of its own zlib (observed in 4.2.1). If libz
+is loaded afterwards, some of its symbols bind to that copy, and the next PNG, .npz or
+gzip file ends the process with "free(): invalid pointer". Importing `zlib` first
+prevents this.
 """
 
 import zlib  # noqa: F401
 
 from nerfies_jax.capture import extras
 
-MIN_TRACK = 3  # pictures that must show a point that counts: so many are needed
+MIN_TRACK = 3  # smallest number of images that observe a reliable point
 
 
 def library():
-    """Import pycolmap on first use, which takes 0.2 s.
+    """Import pycolmap, which takes 0.2 s, on first use.
 
     Returns:
       The module.

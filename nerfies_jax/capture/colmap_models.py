@@ -10,9 +10,10 @@ FILES = tuple(
     for name in colmap_tables.TEXT_FILES
     for path in (name, name.replace(".txt", ".bin"))
 )
-# Bytes in memory, as pycolmap's objects and then Python's, by those on disk.
+# Bytes in memory per byte on disk, for pycolmap's objects and their Python copies.
 MEMORY_RATIO = 40
-BYTES_PER_SECOND = 1e6  # text is read at 4 MB of them on a slow machine
+# Lower bound of the reading speed. A slow machine reads text at 4 MB per second.
+BYTES_PER_SECOND = 1e6
 
 
 def tables(folder: pathlib.Path) -> decoder.Answer:

@@ -1,4 +1,4 @@
-"""COLMAP models as plain arrays. `decoder_child` runs this, so it imports no JAX."""
+"""COLMAP models as plain arrays. It runs in `decoder_child`, so it imports no JAX."""
 
 import contextlib
 import pathlib
@@ -10,10 +10,10 @@ import numpy as np
 from nerfies_jax.capture import text_files
 from nerfies_jax.capture.colmap_library import MIN_TRACK, library
 
-MAX_ERROR_PX = 2.0  # largest mean reprojection error of a point that is kept
-# pycolmap reads these if there are no binary files of that name.
+MAX_ERROR_PX = 2.0  # largest mean reprojection error of a reliable point
+# pycolmap reads these if there is no binary file of the same stem.
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt")
-# Least bytes of a row of a binary file, behind the number of its rows.
+# Smallest size of a row in bytes. In each file the number of rows comes first.
 _ROW_BYTES = {
     "cameras.bin": 24,
     "images.bin": 73,
@@ -26,51 +26,52 @@ _ROW_BYTES = {
 def read(folder: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read the registered images and reliable points of a sparse model.
 
-    In text files, image names may have spaces, and the encoding may be any Unicode
+    In text files, image names may contain spaces, and the text may be in any Unicode
     encoding with or without a byte order mark.
 
     Args:
       folder: Folder of the model.
 
     Returns:
-      Names, camera ids and cameras of the registered images; and poses, points, their
-      colors and the z-depths of their observations as arrays.
+      Names, camera ids and cameras of the registered images as a dict; and poses,
+      points, their colors and the z-depths of their observations as arrays.
     """
     model = _reconstruction(pathlib.Path(folder))
-    posed = [image for image in model.images.values() if image.has_pose]
-    poses = np.array([image.cam_from_world().matrix() for image in posed])
+    images = [image for image in model.images.values() if image.has_pose]
+    poses = np.array([image.cam_from_world().matrix() for image in images])
     rotations = poses.reshape(-1, 3, 4)[:, :, :3]
-    positions = np.array([image.projection_center() for image in posed]).reshape(-1, 3)
-    row_of = {image.image_id: row for row, image in enumerate(posed)}
-    places, colors, depths = [], [], [np.zeros(0)]
+    positions = np.array([image.projection_center() for image in images])
+    positions = positions.reshape(-1, 3)
+    row_of = {image.image_id: row for row, image in enumerate(images)}
+    points, colors, depths = [], [], [np.zeros(0)]
     for point in model.points3D.values():
         if point.track.length() < MIN_TRACK or not point.error <= MAX_ERROR_PX:
             continue
         rows = [
             row_of[e.image_id] for e in point.track.elements if e.image_id in row_of
         ]
-        places.append(point.xyz)
+        points.append(point.xyz)
         colors.append(point.color)
         depths.append(((point.xyz - positions[rows]) * rotations[rows, 2]).sum(1))
     about = {
-        "names": [image.name for image in posed],
-        "camera_ids": [image.camera_id for image in posed],
+        "names": [image.name for image in images],
+        "camera_ids": [image.camera_id for image in images],
         "cameras": {
-            str(number): _plain(model.cameras[number])
-            for number in {image.camera_id for image in posed}
+            str(number): _camera_fields(model.cameras[number])
+            for number in {image.camera_id for image in images}
         },
     }
     return about, {
         "rotations": rotations,
         "positions": positions,
-        "points": np.array(places, float).reshape(-1, 3),
+        "points": np.array(points, float).reshape(-1, 3),
         "colors": np.array(colors, np.uint8).reshape(-1, 3),
         "depths": np.concatenate(depths),
     }
 
 
-def _plain(camera):
-    """A camera as the constructor of pycolmap's takes it, for JSON."""
+def _camera_fields(camera):
+    """Arguments of `pycolmap.Camera` that reproduce a camera, for JSON."""
     fields = camera.todict()
     fields["params"] = [float(value) for value in fields["params"]]
     fields["model"] = camera.model_name
@@ -90,9 +91,9 @@ def _reconstruction(folder):
 
 
 def _check_counts(folder):
-    """Raise ValueError if a binary file claims more than it holds.
+    """Raise ValueError if a binary file claims more rows than it holds.
 
-    pycolmap believes it, and allocates until it may not.
+    pycolmap does not check the counts and allocates memory for them.
     """
     for name, row in _ROW_BYTES.items():
         path = folder / name
@@ -103,32 +104,33 @@ def _check_counts(folder):
             count = int.from_bytes(file.read(8), "little")
         if 8 + count * row > size:
             raise ValueError(f"{name} claims {count} rows in {size} bytes")
-    for name, fixed, named, each in (
+    for name, fixed_bytes, has_name, item_bytes in (
         ("images.bin", 64, True, 24),
         ("points3D.bin", 43, False, 8),
     ):
         if (folder / name).is_file():
-            _check_lists((folder / name).read_bytes(), name, fixed, named, each)
+            data = (folder / name).read_bytes()
+            _check_lists(data, name, fixed_bytes, has_name, item_bytes)
 
 
-def _check_lists(data, name, fixed, named, each):
-    """Walk over rows of `fixed` bytes, maybe a name, and a list with its length."""
-    at, size = 8, len(data)
+def _check_lists(data, name, fixed_bytes, has_name, item_bytes):
+    """Walk over rows of fixed fields, a name (optional), and a list with its length."""
+    offset, size = 8, len(data)
     for row in range(int.from_bytes(data[:8], "little")):
-        at += fixed
-        if named:
-            end = data.find(b"\0", at)
-            at = size if end < 0 else end + 1
-        length = int.from_bytes(data[at : at + 8], "little")
-        at += 8 + length * each
-        if at > size:
-            raise ValueError(f"{name} ends in its row {row}")
+        offset += fixed_bytes
+        if has_name:
+            end = data.find(b"\0", offset)
+            offset = size if end < 0 else end + 1
+        length = int.from_bytes(data[offset : offset + 8], "little")
+        offset += 8 + length * item_bytes
+        if offset > size:
+            raise ValueError(f"{name} is truncated in row {row}")
 
 
 def _as_utf8(folder, stack):
-    """The folder, or a temporary copy of its text files in UTF-8."""
+    """Return the folder, or a temporary copy of its text files in UTF-8."""
     files = [folder / name for name in TEXT_FILES if (folder / name).is_file()]
-    if all(_is_plain(file) for file in files) or (folder / "images.bin").is_file():
+    if all(_is_utf8(file) for file in files) or (folder / "images.bin").is_file():
         return folder
     copy = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
     for file in files:
@@ -136,13 +138,13 @@ def _as_utf8(folder, stack):
     return copy
 
 
-def _is_plain(file):
+def _is_utf8(file):
     with file.open("rb") as stream:
         return text_files.encoding_of(stream.read(4)) == "utf-8"
 
 
 def _restore_names(model, file):
-    """Give images their whole names: pycolmap ends them at the first space."""
+    """Restore image names with spaces, which pycolmap cuts at the first space."""
     lines = file.read_text(encoding="utf-8", errors="surrogateescape").split("\n")
     lines = [line.strip() for line in lines]
     lines = [line for line in lines if not line.startswith("#")]
@@ -153,9 +155,9 @@ def _restore_names(model, file):
 
 
 def _pose_lines(lines):
-    """Every other line: each image has a line of its observations, maybe empty."""
+    """Lines with poses. Each is followed by a line of observations, maybe empty."""
     rows = iter(lines)
     for line in rows:
-        if line:  # an empty line before the next image is none of its observations
+        if line:  # further empty lines may separate images
             yield line
             next(rows, None)

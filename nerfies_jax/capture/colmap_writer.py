@@ -4,14 +4,14 @@ import numpy as np
 import scipy.spatial.transform
 
 from nerfies_jax.capture import frames
-from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_folder
 from nerfies_jax.capture.transforms_writer import check_names, refuse_skew
 from nerfies_jax.capture.units import Units, places_in
 
-# Frames that a point is listed in, evenly spread over those that show it: a point of a
-# long film would take a line of thousands, and readers use a few.
+# Largest number of observations stored per point, evenly spread over the frames that
+# show it. In a long video a point has thousands, and readers use a few.
 MOST_SEEN = 16
 
 
@@ -20,10 +20,11 @@ def write(
 ) -> None:
     """Write a capture as a COLMAP text model, completely or not at all.
 
-    It writes `sparse/0/*.txt`, `images` and, if they are known, `masks`. Each of the
-    capture's points is listed in some of the frames at its projection. Occlusion is not
-    known. Masks follow COLMAP, black where something moves. Images are transparent
-    where nothing was observed. The format has no times, so readers use the names.
+    It writes `sparse/0/*.txt`, `images` and, if the capture has any, `masks`. The
+    observations of a point are its projections into some of the frames, without a test
+    of occlusion. Masks are black where something moves, as in COLMAP. Images are
+    transparent where nothing was observed. The format has no times, so readers derive
+    them from the names.
 
     Args:
       capture: The capture.
@@ -40,30 +41,29 @@ def write(
     spaced = [name for name in capture.ids if len(name.split()) != 1]
     if spaced:
         raise CaptureError(
-            f"{path}: frame {spaced[0]!r} has a space in its name, which ends a name "
-            "in COLMAP's text; rename it, or export transforms"
+            f"{path}: the name of frame {spaced[0]!r} has a space, which COLMAP's text "
+            "format cannot hold; rename it, or export transforms"
         )
     with replaced_folder(path, overwrite) as folder:
         model = folder / "sparse" / "0"
         model.mkdir(parents=True)
         (folder / "images").mkdir()
         for row, name in enumerate(capture.ids):
-            pictures.write_png(
-                folder / "images" / f"{name}.png", _picture(capture, row)
-            )
+            image = _with_alpha(capture, row)
+            image_files.write_png(folder / "images" / f"{name}.png", image)
         if capture.moving is not None:
             (folder / "masks").mkdir()
             for name, moving in zip(capture.ids, capture.moving, strict=True):
-                pictures.write_png(folder / "masks" / f"{name}.png.png", ~moving)
+                image_files.write_png(folder / "masks" / f"{name}.png.png", ~moving)
         lenses = [_lens(capture, row) for row in range(len(capture.ids))]
         numbers = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), 1)}
         lines = (f"{number} {lens}" for lens, number in numbers.items())
         _write_lines(model / "cameras.txt", lines)
-        seen, pixels = _observations(capture)
-        of_cameras = [numbers[lens] for lens in lenses]
-        lines = _image_lines(capture, units, of_cameras, seen, pixels)
+        observed, pixels = _observations(capture)
+        camera_numbers = [numbers[lens] for lens in lenses]
+        lines = _image_lines(capture, units, camera_numbers, observed, pixels)
         _write_lines(model / "images.txt", lines)
-        _write_lines(model / "points3D.txt", _point_lines(capture, units, seen))
+        _write_lines(model / "points3D.txt", _point_lines(capture, units, observed))
 
 
 def _write_lines(path, lines):
@@ -74,31 +74,32 @@ def _text(values):
     return " ".join(repr(float(value)) for value in values)
 
 
-def _picture(capture, row):
+def _with_alpha(capture, row):
+    """The image of a frame, with the mask of observed pixels as alpha, if any."""
     if capture.valid is None:
         return capture.images[row]
-    filmed = np.where(capture.valid[row], np.uint8(255), np.uint8(0))
-    return np.concatenate([capture.images[row], filmed[..., None]], axis=-1)
+    alpha = np.where(capture.valid[row], np.uint8(255), np.uint8(0))
+    return np.concatenate([capture.images[row], alpha[..., None]], axis=-1)
 
 
 def _lens(capture, row):
-    """MODEL WIDTH HEIGHT PARAMETERS, in pixels."""
+    """Fields MODEL WIDTH HEIGHT PARAMETERS of a camera, in pixels."""
     cameras = capture.cameras
     focal = float(cameras.focal_px[row])
-    across = (focal, focal * float(cameras.pixel_aspect[row]))
-    numbers = [*across, *cameras.principal_point_px[row]]
+    focal_xy = (focal, focal * float(cameras.pixel_aspect[row]))
+    parameters = [*focal_xy, *cameras.principal_point_px[row]]
     k1, k2, k3 = cameras.radial[row]
-    bent = [k1, k2, *cameras.tangential[row]]
+    distortion = [k1, k2, *cameras.tangential[row]]
     model = "PINHOLE"
     if k3 != 0:
-        model, numbers = "FULL_OPENCV", [*numbers, *bent, k3, 0, 0, 0]
-    elif any(bent):
-        model, numbers = "OPENCV", [*numbers, *bent]
-    return f"{model} {capture.size[0]} {capture.size[1]} {_text(numbers)}"
+        model, parameters = "FULL_OPENCV", [*parameters, *distortion, k3, 0, 0, 0]
+    elif any(distortion):
+        model, parameters = "OPENCV", [*parameters, *distortion]
+    return f"{model} {capture.size[0]} {capture.size[1]} {_text(parameters)}"
 
 
 def _observations(capture):
-    """Return the points that each frame lists [frames, points], and all pixels."""
+    """The observations to store [frames, points], and the pixels of all points."""
     count = len(capture.ids)
     if capture.points is None:
         return np.zeros((count, 0), bool), np.zeros((count, 0, 2))
@@ -108,39 +109,44 @@ def _observations(capture):
         for row in range(count)
     ]
     pixels = np.stack([np.asarray(pixel) for pixel, _, _ in rows])
-    seen = np.stack([np.asarray(inside) for _, _, inside in rows])
-    # The n-th of those that show a point is listed where n * MOST_SEEN / all is new.
-    place = np.cumsum(seen, axis=0) - seen
-    all_of_them = np.maximum(seen.sum(axis=0), 1)
-    few = np.minimum(all_of_them, MOST_SEEN)
-    first = (place * few) // all_of_them != ((place - 1) * few) // all_of_them
-    return seen & first, pixels
+    visible = np.stack([np.asarray(inside) for _, _, inside in rows])
+    # Of the frames that show a point, numbered from 0 to count - 1, those are kept in
+    # which number * kept / count reaches the next integer.
+    number = np.cumsum(visible, axis=0) - visible
+    count = np.maximum(visible.sum(axis=0), 1)
+    kept = np.minimum(count, MOST_SEEN)
+    is_kept = (number * kept) // count != ((number - 1) * kept) // count
+    return visible & is_kept, pixels
 
 
-def _image_lines(capture, units, of_cameras, seen, pixels):
-    """Two lines for each frame: its pose, then its points."""
-    turns = scipy.spatial.transform.Rotation.from_matrix(
+def _image_lines(capture, units, camera_numbers, observed, pixels):
+    """Two lines for each frame: its pose, then its observations."""
+    rotations = scipy.spatial.transform.Rotation.from_matrix(
         capture.cameras.camera_from_world.astype(np.float64)
     )
     positions = places_in(units, capture, capture.cameras.position)
-    shifts = -turns.apply(positions)
+    translations = -rotations.apply(positions)
     for row, name in enumerate(capture.ids):
-        x, y, z, w = turns[row].as_quat()
-        pose = _text((w, x, y, z, *shifts[row]))
-        yield f"{row + 1} {pose} {of_cameras[row]} {name}.png"
-        places = zip(*pixels[row][seen[row]].T, np.flatnonzero(seen[row]), strict=True)
-        yield " ".join(f"{x:.3f} {y:.3f} {number + 1}" for x, y, number in places)
+        x, y, z, w = rotations[row].as_quat()
+        pose = _text((w, x, y, z, *translations[row]))
+        yield f"{row + 1} {pose} {camera_numbers[row]} {name}.png"
+        points = np.flatnonzero(observed[row])
+        observations = zip(*pixels[row][points].T, points, strict=True)
+        yield " ".join(f"{x:.3f} {y:.3f} {point + 1}" for x, y, point in observations)
 
 
-def _point_lines(capture, units, seen):
-    """A line for each point: place, color, error, and frame and place of each view."""
+def _point_lines(capture, units, observed):
+    """A line for each point: position, color, error, and its track.
+
+    The track lists the frames and the indices of the observations in their lines.
+    """
     if capture.points is None:
         return
     positions = places_in(units, capture, capture.points.position)
-    place = np.cumsum(seen, axis=1) - 1  # of a point in its frame's line
+    index = np.cumsum(observed, axis=1) - 1
     for number, color in enumerate(capture.points.color):
-        rows = np.flatnonzero(seen[:, number])
-        views = " ".join(f"{row + 1} {place[row, number]}" for row in rows)
-        shade = " ".join(str(int(part)) for part in color)
-        # The error is that of the pixels listed: none but their rounding.
-        yield f"{number + 1} {_text(positions[number])} {shade} 0.0 {views}"
+        rows = np.flatnonzero(observed[:, number])
+        track = " ".join(f"{row + 1} {index[row, number]}" for row in rows)
+        rgb = " ".join(str(int(part)) for part in color)
+        # Observations are exact projections, so the reprojection error is 0.
+        yield f"{number + 1} {_text(positions[number])} {rgb} 0.0 {track}"

@@ -1,4 +1,4 @@
-"""Errors of files that cannot be used. This module imports nothing."""
+"""Errors for files that cannot be used. This module imports nothing."""
 
 
 class FileError(ValueError):

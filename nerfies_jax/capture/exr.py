@@ -11,19 +11,19 @@ from nerfies_jax.capture import decoder, safe_files
 from nerfies_jax.capture.errors import CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
-SECONDS_PER_NUMBER = 1e-6  # of a slow codec on a slow machine
+SECONDS_PER_NUMBER = 1e-6  # decoding time with a slow codec on a slow machine
 _TYPES = (np.float16, np.float32, np.uint32)
 
 
 class ExrPicture(NamedTuple):
-    """One EXR, every array [height, width] first. NaN and infinity are zeroed."""
+    """Channels of an EXR image. NaN and infinity are replaced by 0."""
 
     color: np.ndarray | None  # [height, width, 3] float32, linear light
     alpha: np.ndarray | None  # [height, width] float32
     depth: np.ndarray | None  # [height, width] float32, channel Z
-    extra: dict[str, np.ndarray]  # every other channel, float32 or uint32
-    finite: np.ndarray  # [height, width] bool: no channel was NaN or infinite here
-    color_finite: np.ndarray  # [height, width] bool: neither color nor alpha was
+    extra: dict[str, np.ndarray]  # other channels [height, width], float32 or uint32
+    finite: np.ndarray  # [height, width] bool: all channels were finite
+    color_finite: np.ndarray  # [height, width] bool: color and alpha were finite
     origin: tuple[int, int]  # x, y of the first pixel in the display window
     display_size: tuple[int, int]  # width, height of the display window
 
@@ -31,7 +31,7 @@ class ExrPicture(NamedTuple):
 def read_exr(path: AnyPath) -> ExrPicture:
     """Read the data window of the first part of an EXR file.
 
-    A luminance channel Y without others becomes a gray color.
+    A luminance channel Y is returned as gray color if there are no RGB channels.
 
     Args:
       path: The file.
@@ -44,8 +44,8 @@ def read_exr(path: AnyPath) -> ExrPicture:
     """
     path = _existing(path)
     with decoder.session() as child:
-        about, _ = _decoded(child, path, True)
-        about, channels = _decoded(child, path, False, about["numbers"])
+        about, _ = _decode(child, path, True)
+        about, channels = _decode(child, path, False, about["numbers"])
     return _picture(channels, tuple(about["origin"]), tuple(about["display_size"]))
 
 
@@ -63,14 +63,15 @@ def read_size(path: AnyPath) -> tuple[int, int]:
     """
     path = _existing(path)
     with decoder.session() as child:
-        return tuple(_decoded(child, path, True).about["display_size"])
+        return tuple(_decode(child, path, True).about["display_size"])
 
 
 def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
-    """Place the data window inside the display window, which cameras refer to.
+    """Crop or pad an image to the display window, which cameras refer to.
 
     Renderers store a crop or overscan as a data window of another size. Pixels without
-    data become 0 and count as not finite. Those beyond the display window are dropped.
+    data become 0 and count as not finite. Pixels outside of the display window are
+    dropped.
 
     Args:
       path: The file, for error messages.
@@ -83,34 +84,35 @@ def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
       CaptureError: If the windows do not overlap, so no pixel of the image is stored.
     """
     (left, top), (width, height) = picture.origin, picture.display_size
-    tall, wide = picture.finite.shape
-    if (left, top, wide, tall) == (0, 0, width, height):
+    data_height, data_width = picture.finite.shape
+    if (left, top, data_width, data_height) == (0, 0, width, height):
         return picture
-    rows = slice(max(top, 0), min(top + tall, height))
-    columns = slice(max(left, 0), min(left + wide, width))
+    rows = slice(max(top, 0), min(top + data_height, height))
+    columns = slice(max(left, 0), min(left + data_width, width))
     if rows.start >= rows.stop or columns.start >= columns.stop:
         raise CaptureError(
-            f"{path}: its data window of {wide}x{tall} pixels at ({left}, {top}) lies "
-            f"outside its display window of {width}x{height}; render it again"
+            f"{path}: its data window of {data_width}x{data_height} pixels at "
+            f"({left}, {top}) lies outside its display window of {width}x{height}; "
+            "render it again"
         )
 
-    def placed(array):
+    def fit(array):
         if array is None:
             return None
-        whole = np.zeros((height, width, *array.shape[2:]), array.dtype)
-        whole[rows, columns] = array[
+        fitted = np.zeros((height, width, *array.shape[2:]), array.dtype)
+        fitted[rows, columns] = array[
             rows.start - top : rows.stop - top,
             columns.start - left : columns.stop - left,
         ]
-        return whole
+        return fitted
 
     return ExrPicture(
-        color=placed(picture.color),
-        alpha=placed(picture.alpha),
-        depth=placed(picture.depth),
-        extra={name: placed(array) for name, array in picture.extra.items()},
-        finite=placed(picture.finite),
-        color_finite=placed(picture.color_finite),
+        color=fit(picture.color),
+        alpha=fit(picture.alpha),
+        depth=fit(picture.depth),
+        extra={name: fit(array) for name, array in picture.extra.items()},
+        finite=fit(picture.finite),
+        color_finite=fit(picture.color_finite),
         origin=(0, 0),
         display_size=picture.display_size,
     )
@@ -119,11 +121,11 @@ def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
 def _existing(path):
     path = pathlib.Path(path)
     if not path.is_file():
-        raise CaptureError(f"{path}: no such picture; restore it or drop its frame")
+        raise CaptureError(f"{path}: no such image; restore it or drop its frame")
     return safe_files.check(path)
 
 
-def _decoded(child, path, header_only, numbers=0):
+def _decode(child, path, header_only, numbers=0):
     try:
         return child.request(
             "exr",
@@ -136,7 +138,7 @@ def _decoded(child, path, header_only, numbers=0):
         if error.has_advice:
             raise CaptureError(f"{path}: {error}") from None
         raise CaptureError(
-            f"{path}: not a readable EXR ({error}); it may be cut short, so write it "
+            f"{path}: not a readable EXR ({error}); it may be truncated, so write it "
             "again"
         ) from None
 
@@ -146,11 +148,11 @@ def _picture(channels, origin, display_size):
         name: array if array.dtype == np.uint32 else array.astype(np.float32)
         for name, array in channels.items()
     }
-    known = {name: np.isfinite(array) for name, array in channels.items()}
-    finite = np.logical_and.reduce([*known.values()])
-    # The depth of a background is often infinite where its color is not.
-    seen = [known[name] for name in "RGBYA" if name in known]
-    color_finite = np.logical_and.reduce(seen) if seen else finite
+    is_finite = {name: np.isfinite(array) for name, array in channels.items()}
+    finite = np.logical_and.reduce([*is_finite.values()])
+    # The depth of a background is often infinite, but its color is finite.
+    color_masks = [is_finite[name] for name in "RGBYA" if name in is_finite]
+    color_finite = np.logical_and.reduce(color_masks) if color_masks else finite
     channels = {
         name: np.where(np.isfinite(array), array, array.dtype.type(0))
         for name, array in channels.items()
@@ -184,8 +186,8 @@ def write_exr(
       depth: z-depth, [height, width], as channel Z.
       extra: Other channels [height, width] by name.
       half: True to store color and alpha in 16 bits. Depth and extra channels keep 32,
-        since 11 bits of precision would turn a depth map into steps.
-      header: Further attributes: numbers, texts, and float32 vectors and matrices.
+        since 11 bits of precision would quantize depth visibly.
+      header: Further attributes: numbers, strings, and float32 vectors and matrices.
 
     Raises:
       ValueError: If a value exceeds the range of its type, or shapes differ.
@@ -216,16 +218,19 @@ def write_exr(
             f"{path}: channels of shapes {sorted(shapes)}; expected at least one, all "
             "[height, width]"
         )
-    every = {
+    attributes = {
         **(header or {}),
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
     }
-    # `File` turns the arrays of the dicts it is given into its own objects; these are
-    # ours alone. It also wants them contiguous.
+    # `File` needs contiguous arrays. It also replaces the values of its arguments by
+    # its own objects, so both dicts are copies.
     contiguous = {name: np.ascontiguousarray(array) for name, array in channels.items()}
     try:
-        with replaced_file(path) as partial, OpenEXR.File(every, contiguous) as file:
+        with (
+            replaced_file(path) as partial,
+            OpenEXR.File(attributes, contiguous) as file,
+        ):
             file.write(str(partial))
     except RuntimeError as error:
         reason = " ".join(str(error).split())

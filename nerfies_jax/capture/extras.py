@@ -1,4 +1,4 @@
-"""Optional packages that are installed with an extra, imported on first use."""
+"""Optional dependencies (pip extras), imported on first use."""
 
 import importlib
 import importlib.util
@@ -6,7 +6,7 @@ import types
 
 
 class MissingExtra(ModuleNotFoundError, ValueError):
-    """A package is needed that is installed only with an extra."""
+    """A package of an extra that is not installed."""
 
 
 def library(name: str, extra: str) -> types.ModuleType:

@@ -12,10 +12,10 @@ SIDES = ("forward", "backward")
 class FrameFlow(NamedTuple):
     """Optical flow from each frame to the next and the previous one of the same camera.
 
-    Flow is measured from the center of a pixel to the position of the same surface
-    point in the other frame, in pixels right and down. `seen` is True where both frames
-    show the point. A frame without a neighbor refers to its own row and has no valid
-    flow. Leaves are NumPy arrays in a capture and JAX arrays in training.
+    Flow leads from the center of a pixel to the position of the same surface point in
+    the other frame, in pixels right and down. `seen` is True where both frames show the
+    point. A frame without a neighbor refers to its own row and has no valid flow.
+    Leaves are NumPy arrays in a capture and JAX arrays in training.
     """
 
     forward: Float[Array, "frames height width 2"]
@@ -50,17 +50,17 @@ def validate(
       camera_ids: Physical camera of each frame, [frames].
 
     Raises:
-      ValueError: If it cannot be used, with the frame and the remedy.
+      ValueError: If it is inconsistent, with the name of the frame.
     """
     count = len(ids)
-    pictures = (count, size[1], size[0])
+    full_shape = (count, size[1], size[0])
     for name, shift, seen, rows in sides(flow):
-        expected = ((shift, np.float32, (*pictures, 2)), (seen, np.bool_, pictures))
-        for array, kind, shape in expected:
-            if array.shape != shape or array.dtype != kind:
+        expected = ((shift, np.float32, (*full_shape, 2)), (seen, np.bool_, full_shape))
+        for array, dtype, shape in expected:
+            if array.shape != shape or array.dtype != dtype:
                 raise ValueError(
                     f"{name} flow is {array.dtype} of shape {array.shape}; expected "
-                    f"{np.dtype(kind)} of shape {shape}, as the images"
+                    f"{np.dtype(dtype)} of shape {shape}, as the images"
                 )
         if rows.shape != (count,) or not np.issubdtype(rows.dtype, np.integer):
             raise ValueError(
@@ -72,7 +72,7 @@ def validate(
             row = int(np.argmax(bad))
             raise ValueError(
                 f"{name} flow of frame {ids[row]!r} leads to row {rows[row]} of "
-                f"{count}; write the frame's own row where there is none"
+                f"{count}; write the frame's own row if it has no neighbor"
             )
         other = camera_ids[rows] != camera_ids
         if other.any():
@@ -107,41 +107,42 @@ def take(flow: FrameFlow, rows: np.ndarray) -> FrameFlow:
       flow.
     """
     rows = np.asarray(rows, np.int64)
-    place = np.full(len(flow.next_row), -1)
-    place[rows] = np.arange(len(rows))
-    taken = []
+    new_index = np.full(len(flow.next_row), -1)
+    new_index[rows] = np.arange(len(rows))
+    leaves = []
     for _, shift, seen, neighbor in sides(flow):
-        moved = place[neighbor[rows]]
-        lost = moved < 0
-        there = np.where(lost, np.arange(len(rows)), moved).astype(np.int32)
-        shift, seen = shift[rows], seen[rows]  # copies: rows are a list
+        new_neighbor = new_index[neighbor[rows]]
+        lost = new_neighbor < 0
+        # A frame without a neighbor refers to its own row.
+        new_neighbor = np.where(lost, np.arange(len(rows)), new_neighbor)
+        shift, seen = shift[rows], seen[rows]  # copies, by indexing with an array
         shift[lost], seen[lost] = 0, False
-        taken += [shift, seen, there]
-    return FrameFlow(*taken)
+        leaves += [shift, seen, new_neighbor.astype(np.int32)]
+    return FrameFlow(*leaves)
 
 
 def shrink(flow: FrameFlow, factor: int) -> FrameFlow:
-    """Adapt flow to images smaller by an integer factor.
+    """Downscale flow by an integer factor.
 
     Args:
       flow: The flow, in NumPy.
       factor: Integer factor.
 
     Returns:
-      The mean of each block, in pixels of the smaller images, valid where all of it is.
-      Incomplete blocks are removed as for images.
+      The mean of each block, in pixels of the smaller images, valid where the whole
+      block is. Incomplete blocks are cropped as those of images.
     """
-    shrunk = []
+    leaves = []
     for _, shift, seen, neighbor in sides(flow):
-        both = [shrink_one(*one, factor) for one in zip(shift, seen, strict=True)]
-        shrunk += [np.stack(array) for array in zip(*both, strict=True)] + [neighbor]
-    return FrameFlow(*shrunk)
+        pairs = [shrink_one(*pair, factor) for pair in zip(shift, seen, strict=True)]
+        leaves += [np.stack(array) for array in zip(*pairs, strict=True)] + [neighbor]
+    return FrameFlow(*leaves)
 
 
 def shrink_one(
     shift: np.ndarray, seen: np.ndarray, factor: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Adapt the flow of one frame to an image smaller by an integer factor.
+    """Downscale the flow of one frame by an integer factor.
 
     Args:
       shift: Flow in pixels, [height, width, 2].
@@ -149,15 +150,15 @@ def shrink_one(
       factor: Integer factor.
 
     Returns:
-      The mean of each block in its larger pixels, and True where all of the block is
-      valid.
+      The mean of each block in pixels of the smaller image, and True where the whole
+      block is valid.
     """
-    lines, columns = seen.shape[0] // factor, seen.shape[1] // factor
-    trimmed = np.s_[: lines * factor, : columns * factor]
-    parts = (lines, factor, columns, factor)
-    mean = shift[trimmed].reshape(*parts, 2).mean((1, 3), dtype=np.float64)
-    whole = np.all(seen[trimmed].reshape(parts), axis=(1, 3))
-    return (mean / factor).astype(np.float32), whole
+    rows, columns = seen.shape[0] // factor, seen.shape[1] // factor
+    cropped = np.s_[: rows * factor, : columns * factor]
+    blocks = (rows, factor, columns, factor)
+    mean = shift[cropped].reshape(*blocks, 2).mean((1, 3), dtype=np.float64)
+    valid = np.all(seen[cropped].reshape(blocks), axis=(1, 3))
+    return (mean / factor).astype(np.float32), valid
 
 
 def training_flow(capture) -> FrameFlow | None:

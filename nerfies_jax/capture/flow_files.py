@@ -11,7 +11,7 @@ from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.capture.json_files import read_json, write_json
 
-NEIGHBORS = "neighbors.json"  # {"forward": {id: id of the next frame}, "backward":
+NEIGHBORS = "neighbors.json"  # {"forward": {id: id of the next frame}, "backward": ...}
 
 
 def write(flow: FrameFlow, ids: Sequence[str], folder: pathlib.Path, factor: int):
@@ -33,8 +33,8 @@ def write(flow: FrameFlow, ids: Sequence[str], folder: pathlib.Path, factor: int
         paired = np.flatnonzero(rows != np.arange(len(rows))).tolist()
         neighbors[name] = {ids[row]: ids[rows[row]] for row in paired}
         for row in paired:
-            both = np.concatenate([shift[row], seen[row, ..., None]], axis=-1)
-            array = both.astype(np.float32)
+            array = np.concatenate([shift[row], seen[row, ..., None]], axis=-1)
+            array = array.astype(np.float32)
             np.save(target / f"{ids[row]}.npy", array, allow_pickle=False)
     write_json(folder / NEIGHBORS, neighbors)
 
@@ -69,17 +69,17 @@ def read(
         seen = np.zeros((len(ids), height, width), bool)
         rows = np.arange(len(ids), dtype=np.int32)
         for row, name in enumerate(ids):
-            other = row_of.get(neighbors.get(side, {}).get(name))
+            neighbor = row_of.get(neighbors.get(side, {}).get(name))
             file = folder / f"{source}x" / side / f"{name}.npy"
-            if other is None or not file.is_file():
+            if neighbor is None or not file.is_file():
                 continue
-            shift[row], seen[row] = _one(file, shrink_by, size)
-            rows[row] = other
+            shift[row], seen[row] = _read_frame(file, shrink_by, size)
+            rows[row] = neighbor
         leaves += [shift, seen, rows]
     return FrameFlow._make(leaves)
 
 
-def _one(file, shrink_by, size):
+def _read_frame(file, shrink_by, size):
     array = frames.load_array(file, 3 * images.MAX_PIXELS)
     width, height = size
     fits = array.ndim == 3 and array.shape[2] == 3
@@ -87,8 +87,8 @@ def _one(file, shrink_by, size):
         array.shape[0] // shrink_by != height or array.shape[1] // shrink_by != width
     ):
         raise CaptureError(
-            f"{file}: flow of shape {array.shape}; expected right, down and seen for "
-            f"pictures of {width * shrink_by}x{height * shrink_by}, "
+            f"{file}: flow of shape {array.shape}; expected right, down and validity "
+            f"for images of {width * shrink_by}x{height * shrink_by}, "
             f"[{height * shrink_by}, {width * shrink_by}, 3]"
         )
     shift, seen = array[..., :2].astype(np.float32), array[..., 2] > 0.5

@@ -30,7 +30,7 @@ def _is_blender(path):
     return path.is_file() or any(path.glob("transforms*.json"))
 
 
-# Where COLMAP's models are looked for, each by itself or in folders with numbers.
+# Folders that may hold COLMAP models, either directly or in numbered subfolders.
 MODELS = ("sparse", "colmap/sparse", "distorted/sparse", "colmap", "")
 
 
@@ -45,24 +45,26 @@ def sparse_models(path: pathlib.Path, part: str = "images") -> list[pathlib.Path
       part: File of a model, without suffix, that must exist.
 
     Returns:
-      Folders of the first place that has any, numbered ones in ascending order.
+      Model folders in the first of `MODELS` that has any, in ascending order of their
+      numbers.
     """
-    for place in MODELS:
-        parent = path / place
+    for name in MODELS:
+        parent = path / name
         numbered = [p for p in parent.glob("*") if p.is_dir() and p.name.isdecimal()]
         folders = (*sorted(numbered, key=lambda p: int(p.name)), parent)
-        found = [
+        models = [
             folder
             for folder in folders
-            if any((folder / f"{part}.{ending}").is_file() for ending in ("bin", "txt"))
+            if any((folder / f"{part}.{suffix}").is_file() for suffix in ("bin", "txt"))
         ]
-        if found:
-            return found
+        if models:
+            return models
     return []
 
 
 def _is_colmap(path):
-    # Either alone is half a model, and the reader says what is missing.
+    # Incomplete models are recognized too, so that the reader can report what is
+    # missing.
     return any(sparse_models(path, part) for part in ("images", "cameras"))
 
 
@@ -77,7 +79,7 @@ def videos_in(path: pathlib.Path) -> list[pathlib.Path]:
       path: The folder.
 
     Returns:
-      Paths, sorted character by character.
+      Paths in lexicographic order.
     """
     files = path.glob("*") if path.is_dir() else ()
     return sorted(
@@ -90,24 +92,26 @@ def videos_in(path: pathlib.Path) -> list[pathlib.Path]:
 
 
 def camera_folders(path: pathlib.Path) -> list[pathlib.Path]:
-    """List folders of images of single cameras, sorted letter by letter.
+    """List folders that each hold the images of one camera.
 
     Args:
-      path: Folder of the capture. They lie in it, in `images` or in `frames`.
+      path: Folder of the capture. The folder itself, `images` and `frames` are
+        searched.
 
     Returns:
-      Folders whose names end in a number, with images or with a folder `images`.
+      Folders whose names end in a number, with images or with a folder `images`, in
+      lexicographic order.
     """
-    for place in ("", "images", "frames"):
-        found = [
+    for parent in ("", "images", "frames"):
+        folders = [
             folder
-            for folder in sorted((path / place).glob("*"))
+            for folder in sorted((path / parent).glob("*"))
             if re.fullmatch(r"(?!images).*\d", folder.name)
             and folder.is_dir()
             and (_has_images(folder) or _has_images(folder / "images"))
         ]
-        if len(found) > 1:
-            return found
+        if len(folders) > 1:
+            return folders
     return []
 
 
@@ -148,7 +152,8 @@ FORMATS = (
         _is_colmap,
         "nerfies_jax.capture.colmap",
     ),
-    # After COLMAP: its folders hold the model that the poses came from, with points.
+    # After COLMAP, since LLFF folders often hold the COLMAP model that the poses came
+    # from, which also has points.
     Format(
         "llff",
         "poses_bounds.npy (LLFF, NSFF)",
@@ -158,8 +163,8 @@ FORMATS = (
 )
 
 
-def _pictures_in(path):
-    from nerfies_jax.capture import footage  # loads decoders
+def _count_images(path):
+    from nerfies_jax.capture import footage  # imports decoders, which are slow to load
 
     return len(footage.pictures_in(path)) if path.is_dir() else 0
 
@@ -188,22 +193,22 @@ def recognize(path: AnyPath) -> Format:
     for each in FORMATS:
         if each.recognize(path):
             return each
-    pictures = _pictures_in(path)
-    if pictures >= 2:
+    images = _count_images(path)
+    if images >= 2:
         raise CaptureError(
-            f"{path}: {pictures} pictures without cameras; find those with python -m "
+            f"{path}: {images} images without cameras; estimate those with python -m "
             f"experiments.prepare pictures {shlex.quote(str(path))} OUT"
         )
     videos = videos_in(path)
     if len(videos) > 1:
         raise CaptureError(
-            f"{path}: {len(videos)} videos ({videos[0].name}, ...) without cameras; of "
-            "synchronized cameras, put poses_bounds.npy of Neural 3D Video next to "
-            "them; one video alone can be prepared: python -m experiments.prepare "
+            f"{path}: {len(videos)} videos ({videos[0].name}, ...) without cameras; "
+            "for synchronized cameras, put poses_bounds.npy as in Neural 3D Video next "
+            "to them; prepare a single video with python -m experiments.prepare "
             f"video {shlex.quote(str(videos[0]))} OUT"
         )
-    wanted = "; ".join(each.looks_for for each in FORMATS)
-    raise CaptureError(f"{path}: no capture here; looked for {wanted}")
+    expected = "; ".join(each.looks_for for each in FORMATS)
+    raise CaptureError(f"{path}: no capture here; looked for {expected}")
 
 
 def load(
@@ -222,15 +227,16 @@ def load(
       factor: Read images at 1/`factor` of their full size.
       max_side: Longest side of the images in pixels. At most one of the two can be
         given.
-      heldout: None for the files' own split (every 8th frame if they have none), n for
-        every n-th frame, or the name of a split.
+      heldout: None for the split in the files (every 8th frame if they have none), n
+        for every n-th frame, or the name of a split.
       missing: "refuse" or "skip" frames without an image, a camera file or a pose.
       times: File of frame times (`times_file.with_times`) that replace those of the
         capture.
-      **options: Further arguments of the reader, such as `background` of Blender's.
+      **options: Further arguments of the format's reader, such as `background` of
+        `blender_format.read`.
 
     Returns:
-      The capture. Its `notes` say what was found, repaired or left out.
+      The capture. Its `notes` say what was assumed, repaired or left out.
 
     Raises:
       CaptureError: If the capture cannot be used.

@@ -1,8 +1,8 @@
-"""Memory of the frames of a capture: one copy for the host and for JAX on the CPU.
+"""Memory of the frames of a capture, shared between NumPy and JAX on the CPU.
 
-JAX on the CPU takes a NumPy array as it is if it is aligned, and copies it otherwise.
-Readers therefore decode into aligned arrays, and training indexes all frames of a large
-capture instead of copying those that it learns from.
+JAX on the CPU uses the memory of a NumPy array if it is aligned, and copies it
+otherwise. Readers therefore decode into aligned arrays, and training indexes all frames
+of a large capture instead of copying the training frames.
 """
 
 import math
@@ -13,15 +13,17 @@ import numpy as np
 
 from nerfies_jax.capture.capture import Capture
 
-ALIGNMENT = 64  # bytes, of what XLA takes without a copy
-# Four threads read, and each has an image as a library decodes it and as an array.
+ALIGNMENT = 64  # bytes, of arrays that XLA uses without a copy
+# Images in memory while a capture is read: four threads, each with a decoded image and
+# its array.
 READING_IMAGES = 8
-# Smaller captures are copied: their programs then depend on the training frames alone.
+# Smaller captures are copied, so that their compiled programs depend on the training
+# frames alone.
 LEAST_SHARED_BYTES = 2**26
 
 
 def aligned_empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """Allocate an array that JAX on the CPU takes without copying it.
+    """Allocate an array that JAX on the CPU uses without a copy.
 
     Args:
       shape: Its shape.
@@ -49,16 +51,16 @@ def is_shared(capture: Capture) -> bool:
 
 
 def frame_bytes(capture: Capture, devices: int = 1) -> int:
-    """Estimate the memory of the frames of a capture while it is trained on.
+    """Estimate the peak memory of the frames of a capture in reading and training.
 
     Args:
       capture: The capture.
       devices: Number of devices that train.
 
     Returns:
-      Bytes of the capture on the host; and those of the images that are decoded at a
-      time, or of the copies that training makes of the frames it learns from, on each
-      device and on the host before they go there.
+      Bytes of the capture on the host, plus the larger of two: the images that are
+      decoded at a time, or the copies of the training frames on the host and on each
+      device.
     """
     image = capture.images[:1].nbytes
     copies = 0

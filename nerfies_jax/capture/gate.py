@@ -1,8 +1,8 @@
 """Consistency checks of every capture, independent of its format.
 
-Each check measures one thing in the numbers of a capture and knows what makes it wrong:
-another convention of poses, another unit, intrinsics of other images, masks of other
-values. `checked` is called after every reader.
+Each check measures one property of a capture and names the likely cause of a bad value:
+another pose convention, another unit, intrinsics of images of another size, or inverted
+masks. `checked` is called after every reader.
 """
 
 import dataclasses
@@ -40,15 +40,15 @@ def checked(capture: Capture) -> Capture:
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Measure everything that can be checked in the numbers of a capture.
+    """Run all checks on a capture.
 
     Args:
-      capture: A capture of any format, also one that `checked` refuses.
+      capture: A capture of any format. `checked` may refuse it.
 
     Returns:
       One finding for each check that applies. Those with a `problem` need attention.
     """
-    # Absurd numbers overflow here, and are then found to be wrong.
+    # Absurd values overflow and are then reported by the checks.
     with np.errstate(all="ignore"):
         return [
             *gate_poses.findings(capture),
@@ -59,21 +59,21 @@ def findings(capture: Capture) -> list[Finding]:
 
 
 def table(capture: Capture) -> list[str]:
-    """Format the findings about a capture: each check, its value, and any problem.
+    """Format the findings about a capture as text.
 
     Args:
       capture: The capture.
 
     Returns:
-      Lines of text.
+      Lines of text with the subject and value of each check, and any problem below it.
     """
-    found = findings(capture)
-    wide = max(len(one.subject) for one in found)
+    results = findings(capture)
+    width = max(len(finding.subject) for finding in results)
     lines = []
-    for one in found:
-        lines.append(f"{one.subject:<{wide}}  {one.value}")
-        if one.problem:
-            lines.append(f"{'':<{wide}}  ! {one.problem}")
+    for finding in results:
+        lines.append(f"{finding.subject:<{width}}  {finding.value}")
+        if finding.problem:
+            lines.append(f"{'':<{width}}  ! {finding.problem}")
     return lines
 
 
@@ -91,7 +91,7 @@ def check_observed(capture: Capture) -> None:
     where = str(capture.path or capture.name)
     if capture.valid is not None:
         for rows, use in (
-            (capture.train, "frames to learn from"),
+            (capture.train, "training frames"),
             (capture.heldout, "held-out frames"),
         ):
             if rows.size and not capture.valid[rows].any():
@@ -107,9 +107,9 @@ def check_observed(capture: Capture) -> None:
         static = ~moving[capture.train]
         if not static.any():
             raise CaptureError(
-                f"{where}: every pixel of the {capture.train.size} frames to learn "
-                "from is marked as moving, which leaves no static scene; the masks may "
-                "be inverted"
+                f"{where}: all pixels of the {capture.train.size} training frames are "
+                "marked as moving, which leaves no static scene; the masks may be "
+                "inverted"
             )
         valid = capture.valid
         if valid is None or moving.shape != capture.images.shape[:3]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 class Finding(NamedTuple):
     """Value that a check measured, and the problem that it shows, if any."""
 
-    subject: str  # what was checked, a few words
-    value: str  # what was measured
-    problem: str = ""  # what is wrong, the likely reason and what to do; empty if fine
-    refused: bool = False  # whether nothing can be right
+    subject: str  # property that was checked, in a few words
+    value: str  # measured value
+    problem: str = ""  # the problem, its likely cause and the remedy; empty if none
+    refused: bool = False  # True if the capture cannot be reconstructed

@@ -1,4 +1,4 @@
-"""External preprocessing of a capture (tracks, masks, depth, flow), used as given."""
+"""External preprocessing of a capture: tracks, masks, depth and flow of other tools."""
 
 import dataclasses
 import pathlib
@@ -9,16 +9,17 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class GivenFiles:
-    """Files of other tools (docs/formats.md)."""
+    """Preprocessing files of other tools (docs/formats.md), as absolute paths."""
 
-    tracks: pathlib.Path | str | None = None  # a path, once it is made
-    """Tracks of TAPIR or CoTracker, npz, whose paths in space are taken."""
+    tracks: pathlib.Path | str | None = None
+    """Tracks of TAPIR or CoTracker (npz). Their 3D positions are used if it has any."""
     masks: pathlib.Path | str | None = None
     """Folder of PNGs, white where something moves."""
     depths: pathlib.Path | str | None = None
-    """Depths or inverse depths of any scale: npz, npy, folder of EXR, PNG or npy."""
+    """Depths or inverse depths of any scale: npz, npy, or a folder of EXR, PNG or
+    npy."""
     flow: pathlib.Path | str | None = None
-    """Optical flow: npz of forward and backward, or a folder with .flo of each."""
+    """Optical flow: npz of forward and backward flow, or a folder with .flo of each."""
     times: pathlib.Path | str | None = None
     """Frame times in seconds or on any clock: text with a name and a time in each line,
     or JSON."""
@@ -41,16 +42,17 @@ class Given(NamedTuple):
     track_seen: np.ndarray | None = None  # [frames, tracks] bool
     track_place: np.ndarray | None = None  # [frames, tracks, 3] scene units
     moving: np.ndarray | None = None  # [frames, height, width] bool
-    # [frames, height, width], of any scale and offset, or inverse; NaN unknown
+    # [frames, height, width] depth or inverse depth of any scale and offset, NaN where
+    # unknown
     depth: np.ndarray | None = None
-    # [frames, height, width, 2] from each frame to learn from to the next in time, and
-    # back to the one before
+    # [frames, height, width, 2] from each training frame to the next and the previous
+    # one in time
     forward: np.ndarray | None = None
     backward: np.ndarray | None = None
 
 
 def take(given: Given, rows: np.ndarray) -> Given:
-    """Select frames. Flow is dropped, since its target frames change.
+    """Select frames. Flow is dropped, since its target frames may not be selected.
 
     Args:
       given: External preprocessing results.
@@ -59,9 +61,9 @@ def take(given: Given, rows: np.ndarray) -> Given:
     Returns:
       The results of these frames.
     """
-    parts = given._asdict()
-    del parts["size"], parts["forward"], parts["backward"]
-    kept = {
-        name: None if array is None else array[rows] for name, array in parts.items()
+    arrays = given._asdict()
+    del arrays["size"], arrays["forward"], arrays["backward"]
+    selection = {
+        name: None if array is None else array[rows] for name, array in arrays.items()
     }
-    return Given(given.size, **kept)
+    return Given(given.size, **selection)

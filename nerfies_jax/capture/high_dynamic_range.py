@@ -1,9 +1,9 @@
 """Tone mapping of HDR video (HLG, PQ) to 8-bit sRGB, with one curve for all frames.
 
-Nothing adapts to a frame, so equal brightness in two frames gives equal color. White
-paper is at 203 nits (ITU-R BT.2408), which is where sRGB ends here. Values below half
-of that keep their brightness, and brighter ones are rolled off, up to 1000 nits. The
-filters of ffmpeg that do this (zscale) are not part of PyAV.
+Nothing adapts to single frames, so equal brightness in two frames gives equal color.
+Diffuse white is at 203 nits (ITU-R BT.2408) and maps to white in sRGB. Values below
+half of that keep their brightness, and brighter ones are compressed, up to 1000 nits.
+FFmpeg's filter for this (zscale) is not part of PyAV.
 """
 
 import functools
@@ -14,7 +14,7 @@ import numpy as np
 from nerfies_jax.capture.srgb import srgb_from_linear
 
 Transfer = Literal["HLG", "PQ"]
-# By ffmpeg's number of the transfer characteristics (ITU-T H.273, table 3).
+# Keys are FFmpeg's numbers of the transfer characteristics (ITU-T H.273, table 3).
 TRANSFERS: dict[int, Transfer] = {16: "PQ", 18: "HLG"}
 BRIGHTEST_NITS, WHITE_NITS = 1000.0, 203.0
 CODES = 2**16
@@ -33,7 +33,7 @@ _M1, _M2 = 2610 / 16384, 2523 / 4096 * 128
 _C1, _C2, _C3 = 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
 _A = 0.17883277
 _B, _C = 1 - 4 * _A, 0.5 - _A * np.log(4 * _A)
-HLG_GAMMA = 1.2  # of a display of `BRIGHTEST_NITS`
+HLG_GAMMA = 1.2  # system gamma for a display of `BRIGHTEST_NITS`
 
 
 def tone_mapped(code: np.ndarray, transfer: Transfer) -> np.ndarray:
@@ -53,17 +53,17 @@ def tone_mapped(code: np.ndarray, transfer: Transfer) -> np.ndarray:
         luminance = np.maximum(scene @ _LUMINANCE, np.finfo(np.float32).tiny)
         gain = BRIGHTEST_NITS * luminance ** (HLG_GAMMA - 1)
         nits = scene * gain[..., None].astype(np.float32)
-    # The brightest channel sets the gain of all three, so hues are kept.
-    most = nits.max(axis=-1)
-    rolled = _roll_off()[_place(most, BRIGHTEST_NITS)]
-    shown = nits * (rolled / np.maximum(most, 1e-3))[..., None]
-    linear = shown @ _TO_SRGB.T / WHITE_NITS
-    return _srgb_bytes()[_place(linear, 1.0)]
+    # The brightest channel sets the gain of all three, which preserves the hue.
+    brightest = nits.max(axis=-1)
+    compressed = _roll_off()[_table_index(brightest, BRIGHTEST_NITS)]
+    display = nits * (compressed / np.maximum(brightest, 1e-3))[..., None]
+    linear = display @ _TO_SRGB.T / WHITE_NITS
+    return _srgb_bytes()[_table_index(linear, 1.0)]
 
 
-def _place(values, most):
-    """Rows of tables over 0 to `most`."""
-    share = np.clip(values / np.float32(most), 0, 1)
+def _table_index(values, largest):
+    """Indices into tables of `CODES` entries over 0 to `largest`."""
+    share = np.clip(values / np.float32(largest), 0, 1)
     return (share * (CODES - 1) + 0.5).astype(np.uint16)
 
 
@@ -74,6 +74,7 @@ def _nits_of_pq():
 
 
 def _from_root(root):
+    """Nits of PQ code values to the power of 1 / m2."""
     return 1e4 * (np.maximum(root - _C1, 0) / (_C2 - _C3 * root)) ** (1 / _M1)
 
 
@@ -91,19 +92,19 @@ def _scene_of_hlg():
 
 @functools.cache
 def _roll_off():
-    """Displayed over recorded nits, by the EETF of ITU-R BT.2390-11, section 5.4.1."""
+    """Displayed nits by recorded nits: the EETF of ITU-R BT.2390-11, section 5.4.1."""
     peak = _pq_of_nits(BRIGHTEST_NITS)
-    filmed = _pq_of_nits(np.linspace(0, BRIGHTEST_NITS, CODES)) / peak
+    source = _pq_of_nits(np.linspace(0, BRIGHTEST_NITS, CODES)) / peak
     top = _pq_of_nits(WHITE_NITS) / peak
     knee = 1.5 * top - 0.5
-    t = (filmed - knee) / (1 - knee)
+    t = (source - knee) / (1 - knee)
     spline = (
         (2 * t**3 - 3 * t**2 + 1) * knee
         + (t**3 - 2 * t**2 + t) * (1 - knee)
         + (3 * t**2 - 2 * t**3) * top
     )
-    shown = np.where(filmed < knee, filmed, spline)
-    return _from_root((shown * peak) ** (1 / _M2)).astype(np.float32)
+    target = np.where(source < knee, source, spline)
+    return _from_root((target * peak) ** (1 / _M2)).astype(np.float32)
 
 
 @functools.cache

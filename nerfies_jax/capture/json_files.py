@@ -1,10 +1,10 @@
 """JSON and file names from untrusted sources, and atomic replacement of files.
 
-JSON is limited in size and typed, and names never lead outside their folder. While a
-file or folder is written it has a hidden name next to its final one:
-`.NAME.OWNER.partial`, or `.NAME.OWNER.RANDOM.partial` for folders, where OWNER is the
-process and its machine. `sweep` removes files that killed processes left under such
-names, before anything is written to the folder again.
+JSON is limited in size and typed, and names cannot lead out of their folder. While a
+file or folder is written, it has a hidden name next to its final one:
+`.NAME.OWNER.partial`, or `.NAME.OWNER.RANDOM.partial` for folders. OWNER identifies the
+process and its machine. `sweep` removes such files of killed processes before anything
+else is written to the folder.
 """
 
 import contextlib
@@ -24,10 +24,10 @@ from nerfies_jax.capture.errors import CaptureError
 from nerfies_jax.capture.safe_files import AnyPath as AnyPath
 from nerfies_jax.runtime import processes, stopping
 
-# 20 000 frames of transforms.json are 20 MB. Decoded, a file may take 20 times as much.
+# A transforms.json of 20 000 frames has 20 MB. Decoded, it may take 20 times as much.
 MAX_JSON_BYTES = 64 * 2**20
 
-# Incomplete files of this process, and the folders that `sweep` has visited.
+# Incomplete files of this process, and folders that it has swept.
 _unfinished: set[pathlib.Path] = set()
 _swept: set[pathlib.Path] = set()
 
@@ -87,7 +87,7 @@ def write_json(path: AnyPath, value: Any):
 
 
 def probe(folder: AnyPath) -> None:
-    """Write some data to a folder, to learn why another program failed to.
+    """Write some data to a folder, to find out why another program could not.
 
     Args:
       folder: The folder.
@@ -147,11 +147,11 @@ def named_file(root: pathlib.Path, name: str, named_in: pathlib.Path) -> pathlib
       CaptureError: If the name leads outside the folder.
     """
     target = inside(root, name, named_in)
-    found = text_files.find(root, name)
-    if found is None:
+    file = text_files.find(root, name)
+    if file is None:
         return target
-    inside(root, str(found.relative_to(root)), named_in)
-    return found
+    inside(root, str(file.relative_to(root)), named_in)
+    return file
 
 
 @contextlib.contextmanager
@@ -173,40 +173,40 @@ def replaced_file(path: AnyPath):
     """
     path = pathlib.Path(path)
     _sweep_once(path.parent)
-    # The suffix stays last: image and video writers choose the format by it.
+    # The suffix stays last, since writers of images and videos choose the format by it.
     partial = path.with_name(
         f".{path.stem}.{processes.own_name()}.partial{path.suffix}"
     )
-    _begin(partial)
+    _register(partial)
     try:
         yield partial
         with partial.open("r+b") as file:
             os.fsync(file.fileno())
         os.replace(partial, path)
-        _sync_names(path.parent)
+        _sync_folder(path.parent)
     except OSError as error:
         raise CaptureError(
             f"{path}: cannot be written ({error.strerror or error}); choose another "
             "place"
         ) from None
     finally:
-        with contextlib.suppress(OSError):  # on a disk that became read-only
+        with contextlib.suppress(OSError):  # the disk may have become read-only
             partial.unlink(missing_ok=True)
         _unfinished.discard(partial)
 
 
-def _sync_names(folder):
-    """Put the names in a folder on disk, where the system can: Windows cannot."""
+def _sync_folder(folder):
+    """Flush the names in a folder to disk, if the system supports it (not Windows)."""
     with contextlib.suppress(OSError):
-        opened = os.open(folder, os.O_RDONLY)
+        descriptor = os.open(folder, os.O_RDONLY)
         try:
-            os.fsync(opened)
+            os.fsync(descriptor)
         finally:
-            os.close(opened)
+            os.close(descriptor)
 
 
-def _begin(partial):
-    """Note what a signal that ends the process has to remove."""
+def _register(partial):
+    """Register an incomplete file for removal if a signal ends the process."""
     _unfinished.add(partial)
     stopping.at_end(_remove_unfinished)
 
@@ -225,7 +225,7 @@ def _remove(path):
 
 
 def _sweep_once(folder):
-    """Sweep a folder before the first file that this process writes there."""
+    """Sweep a folder before this process writes its first file there."""
     folder = folder.absolute()
     if folder not in _swept:
         _swept.add(folder)
@@ -233,33 +233,33 @@ def _sweep_once(folder):
 
 
 def sweep(folder: AnyPath) -> list[pathlib.Path]:
-    """Clean up what killed processes of this machine left in a folder.
+    """Clean up hidden files that killed processes of this machine left in a folder.
 
-    Files and folders that were not complete are removed. A folder that was about to be
-    replaced returns to its name where the new one had not taken that name yet.
+    Incomplete files and folders are removed. If a process was killed while it replaced
+    a folder, the earlier folder gets its name back.
 
     Args:
-      folder: Where to look. Folders inside it are not searched.
+      folder: The folder. Its subfolders are not searched.
 
     Returns:
       The hidden paths that were removed or renamed.
     """
-    swept: list[pathlib.Path] = []
+    handled: list[pathlib.Path] = []
     try:
         paths = sorted(pathlib.Path(folder).glob(".*"))
     except OSError:
-        return swept
+        return handled
     for path in paths:
-        left = _LEFT_BEHIND.fullmatch(path.name)
-        if left is None or not processes.has_ended(left["owner"]):
+        match = _LEFT_BEHIND.fullmatch(path.name)
+        if match is None or not processes.has_ended(match["owner"]):
             continue
-        if left["kind"] == "earlier" and not (path.parent / left["name"]).exists():
+        if match["kind"] == "earlier" and not (path.parent / match["name"]).exists():
             with contextlib.suppress(OSError):
-                os.replace(path, path.parent / left["name"])
+                os.replace(path, path.parent / match["name"])
         else:
             _remove(path)
-        swept.append(path)
-    return swept
+        handled.append(path)
+    return handled
 
 
 @contextlib.contextmanager
@@ -302,22 +302,22 @@ def replaced_folder(
 ):
     """Replace a folder once its successor is complete.
 
-    The earlier folder stays as it is until the block ends well. It is never replaced
-    while it holds a file that would be lost.
+    The earlier folder is unchanged until the block ends without an error. It is not
+    replaced if it holds files that would be lost.
 
     Args:
       path: The folder. It may be absent or empty.
       overwrite: True if a folder with files may be replaced.
       replaceable: Files of the earlier folder that may be deleted, by their paths
-        relative to it. Any other is refused before the block begins. By default those
-        that have a like in the new folder, up to the numbers in their names, which is
-        known when the block ends.
+        relative to it. If it holds others, an error is raised before the block begins.
+        By default files may be deleted whose names equal those of files in the new
+        folder up to numbers, which is checked when the block ends.
 
     Yields:
       The temporary folder to write into.
 
     Raises:
-      CaptureError: The folder may not be replaced, or cannot be written.
+      CaptureError: If the folder may not be replaced, or cannot be written.
     """
     path = pathlib.Path(path)
     sweep(path.resolve().parent)
@@ -337,19 +337,19 @@ def replaced_folder(
         _refuse_others(
             path, alike(path, written) if replaceable is None else replaceable
         )
-        _take_place(new, path)
+        _swap_folders(new, path)
 
 
 @contextlib.contextmanager
 def merged_folder(path: AnyPath):
-    """Replace files of a folder once all of their successors are complete.
+    """Replace files of a folder once all their successors are complete.
 
     Args:
-      path: The folder, which is there. What else it holds stays.
+      path: The folder, which must exist. Its other files are unchanged.
 
     Yields:
-      A temporary folder inside it. Its files take their places when the block ends
-      well, each in one step.
+      A temporary folder inside it. When the block ends without an error, its files are
+      renamed to their final paths one by one.
     """
     path = pathlib.Path(path)
     sweep(path)
@@ -360,10 +360,10 @@ def merged_folder(path: AnyPath):
                 target = path / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(partial / name, target)
-        _sync_names(path)
+        _sync_folder(path)
 
 
-def _take_place(new, path):
+def _swap_folders(new, path):
     """Rename the new folder to `path`. `sweep` repairs it after an interruption."""
     earlier = path.with_name(f".{path.name}.{processes.own_name()}.earlier")
     with stopping.protected():
@@ -374,12 +374,12 @@ def _take_place(new, path):
             if not path.exists():
                 os.replace(earlier, path)
             raise
-    _sync_names(path.parent)
+    _sync_folder(path.parent)
     shutil.rmtree(earlier, ignore_errors=True)
 
 
 def _refuse_others(path, replaceable):
-    """Raise where a folder holds a file that is not among those."""
+    """Raise CaptureError if a folder holds a file that is not replaceable."""
     for name in _files(path):
         if name not in replaceable:
             raise CaptureError(
@@ -398,7 +398,7 @@ def _files(folder):
 
 
 def alike(folder: AnyPath, names: Iterable[str]) -> set[str]:
-    """Files of a folder that are named like any of `names`, up to their numbers.
+    """List the files of a folder whose names equal any of `names` up to numbers.
 
     Args:
       folder: The folder. It may be absent.
@@ -420,8 +420,8 @@ def _without_numbers(name):
 def scratch_folder(path: AnyPath):
     """Create a temporary folder next to a new folder, removed when the block ends.
 
-    If it is renamed to `path`, use the real path, since neither "." nor a link can be a
-    target of renaming.
+    To rename it to `path`, use the real path, since neither "." nor a symbolic link can
+    be the target.
 
     Args:
       path: The new folder, which may be absent or empty.
@@ -438,7 +438,7 @@ def scratch_folder(path: AnyPath):
         raise CaptureError(f"{path}: already there; choose another name or remove it")
     if os.path.ismount(path.resolve()):
         raise CaptureError(
-            f"{path}: a whole mounted disk, which no new folder can replace; name a "
+            f"{path}: a mount point, which a new folder cannot replace; choose a "
             "folder in it"
         )
     with _partial_folder(path, path.resolve().parent) as partial:
@@ -446,20 +446,20 @@ def scratch_folder(path: AnyPath):
 
 
 @contextlib.contextmanager
-def _partial_folder(path, place):
-    """Temporary folder in `place` for the contents of `path`, removed at the end."""
+def _partial_folder(path, parent):
+    """Temporary folder in `parent` for the contents of `path`, removed at the end."""
     try:
-        place.mkdir(parents=True, exist_ok=True)
+        parent.mkdir(parents=True, exist_ok=True)
         prefix = f".{path.resolve().name}.{processes.own_name()}."
         partial = pathlib.Path(
-            tempfile.mkdtemp(prefix=prefix, suffix=".partial", dir=place)
+            tempfile.mkdtemp(prefix=prefix, suffix=".partial", dir=parent)
         )
     except OSError as error:
         raise CaptureError(
             f"{path}: cannot be written ({error.strerror or error}); choose another "
             "place"
         ) from None
-    _begin(partial)
+    _register(partial)
     try:
         yield partial
     except OSError as error:

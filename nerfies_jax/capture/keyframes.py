@@ -10,12 +10,12 @@ from nerfies_jax.capture.camera_paths import CameraPath
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 
-MAX_PICTURES = 100_000  # an hour of film, which nobody asks for on purpose
-MOST_KEYFRAMES = 24  # of a path that is to be edited by hand
+MAX_PICTURES = 100_000  # an hour of video; larger requests are mistakes
+MOST_KEYFRAMES = 24  # of a path that is edited by hand
 
 
 class Keyframe(NamedTuple):
-    """A camera and the time of the scene that it shows, in NumPy."""
+    """A camera and a scene time, in NumPy."""
 
     camera: Camera  # pinhole, scene units
     time: float  # in [0, 1]
@@ -24,10 +24,11 @@ class Keyframe(NamedTuple):
 def through(keyframes: list[Keyframe], size: tuple[int, int], count: int) -> CameraPath:
     """Interpolate a camera path through keyframes.
 
-    The path takes equally long between all keyframes. Positions, log focal lengths and
-    times follow monotone cubic curves, which do not overshoot, so time never runs
-    backward between two keyframes, and stays constant between two of the same time.
-    Orientations follow a spline with smooth angular velocity.
+    All segments between keyframes have the same duration. Positions, log focal lengths
+    and times are interpolated with monotone cubic splines (PCHIP), which do not
+    overshoot. Time thus never runs backward between keyframes with ascending times, and
+    is constant between two of equal time. Orientations are interpolated with a spline
+    of continuous angular velocity.
 
     Args:
       keyframes: At least two keyframes.
@@ -42,30 +43,29 @@ def through(keyframes: list[Keyframe], size: tuple[int, int], count: int) -> Cam
     """
     if len(keyframes) < 2:
         raise ValueError(
-            f"{len(keyframes)} keyframe(s) are no path; add at least two, each where "
-            "the camera is to pass"
+            f"{len(keyframes)} keyframe(s); a camera path needs at least two"
         )
     if not len(keyframes) <= count <= MAX_PICTURES:
         raise ValueError(
-            f"{count} pictures through {len(keyframes)} keyframes; choose "
-            f"{len(keyframes)} to {MAX_PICTURES}"
+            f"{count} images through {len(keyframes)} keyframes; expected "
+            f"{len(keyframes)} to {MAX_PICTURES} images"
         )
     knots = np.arange(len(keyframes), dtype=np.float64)
-    at = np.linspace(0, knots[-1], count)
-    chosen = cameras.stack([keyframe.camera for keyframe in keyframes])
-    turns = Rotation.from_matrix(chosen.camera_from_world.astype(np.float64))
+    positions = np.linspace(0, knots[-1], count)
+    key_cameras = cameras.stack([keyframe.camera for keyframe in keyframes])
+    rotations = Rotation.from_matrix(key_cameras.camera_from_world.astype(np.float64))
     curve = np.column_stack(
         [
-            chosen.position,
-            np.log(chosen.focal_px),
+            key_cameras.position,
+            np.log(key_cameras.focal_px),
             [keyframe.time for keyframe in keyframes],
         ]
     )
-    x, y, z, log_focal, time = PchipInterpolator(knots, curve)(at).T
-    lens = cameras.take(chosen, np.zeros(count, int))
-    turned = RotationSpline(knots, turns)(at).as_matrix()
+    x, y, z, log_focal, time = PchipInterpolator(knots, curve)(positions).T
+    lens = cameras.take(key_cameras, np.zeros(count, int))
+    matrices = RotationSpline(knots, rotations)(positions).as_matrix()
     leaves: dict[str, Any] = dict(
-        camera_from_world=turned.astype(np.float32),
+        camera_from_world=matrices.astype(np.float32),
         position=np.stack([x, y, z], axis=1).astype(np.float32),
         focal_px=np.exp(log_focal).astype(np.float32),
     )

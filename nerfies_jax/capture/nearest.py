@@ -1,4 +1,4 @@
-"""Suggestions for errors that refuse an unknown name."""
+"""Suggestions of similar names for error messages about unknown names."""
 
 import difflib
 from collections.abc import Iterable
@@ -18,5 +18,5 @@ def known_names(name: str, known: Iterable[str]) -> str:
     """
     known = list(known)
     listed = f"there are {', '.join(known)}" if known else "there are none"
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {near[0]}? {listed}" if near else listed
+    similar = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {similar[0]}? {listed}" if similar else listed

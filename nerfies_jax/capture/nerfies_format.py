@@ -1,6 +1,6 @@
 """Reader and writer of Nerfies, HyperNeRF, NeRF-DS and DyCheck directories.
 
-All four are the layout of Park et al. 2021 (arXiv:2011.12948) with additions.
+All four use the layout of Park et al. 2021 (arXiv:2011.12948) with additions.
 docs/formats.md lists the files and their meaning.
 """
 
@@ -9,7 +9,7 @@ import pathlib
 import numpy as np
 
 from nerfies_jax.capture import flow_files, frames, nerfies_colmap, text_files
-from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import (
     Capture,
     CaptureError,
@@ -39,9 +39,9 @@ def read(
 
     Args:
       path: The directory.
-      factor: Read images at 1/`factor` of their full size. If `rgb/<factor>x` is not
-        stored, a larger one is averaged. None for the largest stored images, or those
-        that DyCheck's extra.json names.
+      factor: Read images at 1/`factor` of their full size. If there is no folder
+        `rgb/<factor>x`, larger images are downscaled. None for the largest stored
+        images, or those that DyCheck's extra.json names.
       max_side: Longest side of the images in pixels. At most one of the two can be
         given.
       heldout: As in `nerfies_views.read_cameras`.
@@ -55,22 +55,22 @@ def read(
     """
     path = pathlib.Path(path)
     views = read_cameras(path, heldout, missing)
-    folder, source, shrink_by, notes = _stored_pictures(path, views, factor, max_side)
+    folder, source, shrink_by, notes = _stored_images(path, views, factor, max_side)
     paths = [frames.find_picture(folder, name) for name in views.ids]
     rows, lost = frames.keep_found(paths, views.ids, missing, str(folder))
     views = only(views, rows)
     stored = frames.read_frames([paths[row] for row in rows], shrink_by)
     images, alpha = stored.images, stored.alpha
     total = source * shrink_by
-    _check_picture_size(paths[rows[0]], views.size, source)
+    _check_image_size(paths[rows[0]], views.size, source)
     cameras = camera.resize(views.cameras, (total, total), (1, 1))
     size = (images.shape[2], images.shape[1])
     valid, more = _masks(path / "valid", views.ids, size, total, "not observed")
     static, masked = _masks(path / "resized_mask", views.ids, size, total, "moving")
     notes += [*more, *masked]
-    if alpha is not None:  # DyCheck: 255 where the sensor saw something
+    if alpha is not None:  # in DyCheck, 255 marks observed pixels
         valid = (alpha == 255) & (True if valid is None else valid == 1)
-        notes.append("pictures have alpha: pixels below 255 count as not filmed")
+        notes.append("images have alpha: pixels below 255 count as not observed")
     elif valid is not None:
         valid = valid == 1
     valid = frames.both(valid, stored.observed)
@@ -107,8 +107,8 @@ def read(
     )
 
 
-def _stored_pictures(path, views, factor, max_side):
-    """The folder to read, its factor, how much to average on top, and notes."""
+def _stored_images(path, views, factor, max_side):
+    """The folder to read, its reduction, a further reduction to apply, and notes."""
     available = {
         int(folder.name[:-1]): folder
         for folder in (path / "rgb").glob("*x")
@@ -116,13 +116,13 @@ def _stored_pictures(path, views, factor, max_side):
     }
     if not available:
         raise CaptureError(
-            f"{path}: cameras but no pictures (looked for rgb/1x, rgb/2x, ...); fetch "
-            "them, or load the cameras alone with nerfies_format.read_cameras"
+            f"{path}: cameras but no images (looked for rgb/1x, rgb/2x, ...); add "
+            "them, or load the cameras alone with nerfies_views.read_cameras"
         )
     notes = []
     if factor is None and max_side is None and views.extra.factor in available:
         factor = views.extra.factor
-        notes.append(f"read at 1/{factor} of the full size, as extra.json asks")
+        notes.append(f"read at 1/{factor} of the full size, as in extra.json")
     source, shrink_by = frames.choose_source(
         available, views.size, factor, max_side, str(path)
     )
@@ -132,9 +132,9 @@ def _stored_pictures(path, views, factor, max_side):
 def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
     """Write a capture as a Nerfies directory, completely or not at all.
 
-    Images go to `rgb/<factor>x`, averaged for factors above 1. In addition to the
-    layout of Nerfies, exact times, depth (as in DyCheck), moving masks (as in NeRF-DS),
-    masks of observed pixels, optical flow, and colors of the points are stored in files
+    Images go to `rgb/<factor>x`, downscaled by averaging. In addition to the layout of
+    Nerfies, exact times, depth (as in DyCheck), masks of moving pixels (as in NeRF-DS),
+    masks of observed pixels, optical flow and colors of the points are stored in files
     and keys that other readers ignore. External preprocessing (`given`) is not stored.
     When the directory is read again, frames in neither split are missing, and every
     eighth frame is held out if none was.
@@ -152,11 +152,11 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
         _write_tables(capture, folder)
         (folder / "camera").mkdir()
         for row, name in enumerate(capture.ids):
-            one = camera.take(capture.cameras, row)
-            entry = camera_entry(one, capture, capture.size)
+            frame_camera = camera.take(capture.cameras, row)
+            entry = camera_entry(frame_camera, capture, capture.size)
             write_json(folder / "camera" / f"{name}.json", entry)
         for factor in factors:
-            _write_pictures(capture, folder, factor)
+            _write_images(capture, folder, factor)
             if capture.flow is not None:
                 flow_files.write(capture.flow, capture.ids, folder / "flow", factor)
         if capture.points is not None:
@@ -209,48 +209,48 @@ def _write_tables(capture, folder):
         )
 
 
-def _write_pictures(capture, folder, factor):
-    """Colors, masks and depth at one reduction."""
+def _write_images(capture, folder, factor):
+    """Write images, masks and depth at one reduction."""
     depths, moving, valid = capture.depths, capture.moving, capture.valid
 
-    def place(kind):
+    def subfolder(kind):
         target = folder / kind / f"{factor}x"
         target.mkdir(parents=True, exist_ok=True)
         return target
 
     for row, name in enumerate(capture.ids):
         image = shrink(capture.images[row], factor)
-        pictures.write_png(place("rgb") / f"{name}.png", image)
-        if moving is not None:  # NeRF-DS: black moves, and the ending is doubled
-            still = ~blocks(moving[row], factor).any((-3, -1))
-            pictures.write_png(place("resized_mask") / f"{name}.png.png", still)
+        image_files.write_png(subfolder("rgb") / f"{name}.png", image)
+        if moving is not None:  # as in NeRF-DS: black moves, and the suffix is doubled
+            static = ~blocks(moving[row], factor).any((-3, -1))
+            image_files.write_png(subfolder("resized_mask") / f"{name}.png.png", static)
         if valid is not None:
-            filmed = blocks(valid[row], factor).all((-3, -1))
-            pictures.write_png(place("valid") / f"{name}.png", filmed)
+            observed = blocks(valid[row], factor).all((-3, -1))
+            image_files.write_png(subfolder("valid") / f"{name}.png", observed)
         if depths is not None:
             depth = shrink_depth(depths[row], factor) / np.float32(capture.scale)
-            np.save(place("depth") / f"{name}.npy", depth, allow_pickle=False)
+            np.save(subfolder("depth") / f"{name}.npy", depth, allow_pickle=False)
 
 
-def _check_picture_size(file, full_size, source):
-    """Check image sizes. Stored images may be trimmed to whole blocks, by under a
-    pixel.
+def _check_image_size(file, full_size, source):
+    """Compare the size of an image with its camera.
+
+    Sizes may differ by less than a pixel, since incomplete blocks are cropped.
     """
-    width, height = pictures.read_header(file).size
+    width, height = image_files.read_header(file).size
     if (
         abs(width - full_size[0] / source) >= 1
         or abs(height - full_size[1] / source) >= 1
     ):
         raise CaptureError(
-            f"{file}: {width}x{height} pixels, but its camera says "
-            f"{full_size[0]}x{full_size[1]} at full size, so 1/{source} of that "
-            "belongs "
-            "here; mend image_size or move the pictures to the right rgb/<factor>x"
+            f"{file}: {width}x{height} pixels, but 1/{source} of the camera's "
+            f"{full_size[0]}x{full_size[1]} is expected; correct image_size or move "
+            "the images to the right rgb/<factor>x"
         )
 
 
 def _reduced(folder, total):
-    """The stored reduction in `folder` to shrink to `total`, and by how much."""
+    """The smallest stored reduction that divides `total`, and the remaining factor."""
     for source in range(total, 0, -1):
         if total % source == 0 and (folder / f"{source}x").is_dir():
             return folder / f"{source}x", total // source
@@ -258,7 +258,7 @@ def _reduced(folder, total):
 
 
 def _masks(kind, ids, size, total, black):
-    """Share of white per pixel, and notes. NeRF-DS ends its names in .png.png."""
+    """Share of white per pixel, and notes. In NeRF-DS names end in .png.png."""
     folder, shrink_by = _reduced(kind, total)
     if folder is None:
         return None, ()
@@ -284,15 +284,15 @@ def _depths(path, views, size, total):
         file = text_files.find(folder, name, (".npy",))
         if file is None:
             continue  # DyCheck has depth for the moving camera only
-        depth = frames.load_array(file, pictures.MAX_PIXELS)
+        depth = frames.load_array(file, image_files.MAX_PIXELS)
         depth = depth[..., 0] if depth.ndim == 3 else depth
         if depth.ndim != 2 or (
             depth.shape[0] // shrink_by != height
             or depth.shape[1] // shrink_by != width
         ):
             raise CaptureError(
-                f"{file}: depth of shape {depth.shape} for pictures of "
-                f"{width * shrink_by}x{height * shrink_by}; they must agree"
+                f"{file}: depth of shape {depth.shape} for images of "
+                f"{width * shrink_by}x{height * shrink_by}; the sizes must agree"
             )
         known = np.isfinite(depth) & (depth > 0)
         depth = np.where(known, depth * views.scene.scale, 0).astype(np.float32)
@@ -327,7 +327,7 @@ def _points(path, images, cameras, views, moving):
     position = ((world - np.array(scene.center)) * scene.scale).astype(np.float32)[
         finite
     ]
-    # Ours, in the spelling of this version or of earlier ones.
+    # An extension of this library, which earlier versions spelled differently.
     colors = next(iter(sorted(path.glob("points_colo*r.npy"))), None)
     if colors is not None:
         color = frames.load_array(colors, 3 * MAX_POINTS)
@@ -338,4 +338,4 @@ def _points(path, images, cameras, views, moving):
             )
         return PointCloud(position, color[finite]), notes
     cloud = frames.colored_points(position, images, cameras, views.train, moving)
-    return cloud, (*notes, "points.npy has no colors: sampled from the pictures")
+    return cloud, (*notes, "points.npy has no colors: sampled from the images")

@@ -37,19 +37,17 @@ class CameraFile(msgspec.Struct):
     radial_distortion: Triple = (0.0, 0.0, 0.0)
     tangential_distortion: Pair | None = None
     tangential: Pair | None = None  # the name that early files use
-    time: float | None = None  # ours, in [0, 1]: of a camera path
+    time: float | None = None  # our extension for camera paths, in [0, 1]
 
 
 class SceneFile(msgspec.Struct):
-    """`scene.json`, with near and far in scene units, scale and center in world
-    units.
-    """
+    """`scene.json`: near and far in scene units, scale and center in world units."""
 
     scale: float
     center: Triple
     near: float
     far: float
-    background: Triple | None = None  # ours
+    background: Triple | None = None  # our extension
 
 
 class DatasetFile(msgspec.Struct):
@@ -66,16 +64,17 @@ class SplitFile(msgspec.Struct):
     frame_names: list[str]
 
 
-class Moment(msgspec.Struct):
-    """One entry of `metadata.json`."""
+class FrameEntry(msgspec.Struct):
+    """One entry of `metadata.json`.
 
-    warp_id: int | Triple | None = (
-        None  # HyperNeRF's interpolation: left, right, progression
-    )
+    Triples are HyperNeRF's interpolated ids: left id, right id, weight of the right.
+    """
+
+    warp_id: int | Triple | None = None
     appearance_id: int | Triple = 0
     camera_id: int = 0
     time_id: float | None = None
-    time: float | None = None  # ours, in [0, 1]
+    time: float | None = None  # our extension, in [0, 1]
 
 
 class ExtraFile(msgspec.Struct):
@@ -90,8 +89,8 @@ class NerfiesViews(NamedTuple):
     """Cameras and metadata of a directory, without images."""
 
     ids: tuple[str, ...]
-    cameras: Camera  # scene units; pixels of the full-size picture
-    size: tuple[int, int]  # of the full-size picture
+    cameras: Camera  # scene units; pixels of the full-size image
+    size: tuple[int, int]  # width and height of the full-size image
     times: np.ndarray
     train: np.ndarray
     heldout: np.ndarray
@@ -111,9 +110,9 @@ def read_cameras(
 
     Args:
       path: The directory.
-      heldout: None for the files' own split, n for every n-th frame, "interp" for
-        HyperNeRF's interpolation protocol (train on ids[::4], score on ids[2::4]), or
-        the name of one of DyCheck's splits ("val", "val_intl", ...).
+      heldout: None for the split in the files, n for every n-th frame, "interp" for
+        HyperNeRF's interpolation protocol (train on ids[::4], evaluate on ids[2::4]),
+        or the name of one of DyCheck's splits ("val", "val_intl", ...).
       missing: "refuse" or "skip" frames without a camera file, such as those that could
         not be registered.
 
@@ -138,18 +137,18 @@ def read_cameras(
     size = _common_size(path, ids, files)
     cameras = cameras_of(files, scene.scale, scene.center)
     check_cameras(cameras, ids, size, str(path / "camera"))
-    moments, more = _moments(path, ids)
+    entries, more = _frame_entries(path, ids)
     row = {name: number for number, name in enumerate(ids)}
     return NerfiesViews(
         ids=ids,
         cameras=cameras,
         size=size,
-        times=_times(moments, path, ids),
+        times=_times(entries, path, ids),
         train=np.sort([row[name] for name in train if name in row]).astype(int),
         heldout=np.sort([row[name] for name in scored if name in row]).astype(int),
-        warp_ids=frames.dense([_when(m.warp_id) for m in moments]),
-        appearance_ids=frames.dense([_when(m.appearance_id) for m in moments]),
-        camera_ids=frames.dense([m.camera_id for m in moments]),
+        warp_ids=frames.dense([_number(e.warp_id) for e in entries]),
+        appearance_ids=frames.dense([_number(e.appearance_id) for e in entries]),
+        camera_ids=frames.dense([e.camera_id for e in entries]),
         scene=scene,
         extra=extra,
         notes=(*notes, *lost, *more, *_unread(path, ids)),
@@ -157,7 +156,7 @@ def read_cameras(
 
 
 def _unread(path, ids):
-    """Name the keys that are not read, since they may change the scene."""
+    """Notes of unknown keys, which may affect the scene."""
     files = {
         path / "scene.json": {*SceneFile.__struct_fields__},
         path / "dataset.json": {
@@ -178,12 +177,12 @@ def _unread(path, ids):
     ]
     file = path / "metadata.json"
     if file.is_file():
-        notes += unread_keys.notes(file, None, {None: {*Moment.__struct_fields__}})
+        notes += unread_keys.notes(file, None, {None: {*FrameEntry.__struct_fields__}})
     return tuple(notes)
 
 
 def _splits(path, heldout):
-    """Names to learn from, names to score on, notes."""
+    """Names of the training and held-out frames, and notes."""
     file = path / "dataset.json"
     notes = ()
     if file.exists():
@@ -194,29 +193,29 @@ def _splits(path, heldout):
         )
     else:
         ids, train, val = [], [], []
-        notes = ("no dataset.json: every camera file is a frame",)
+        notes = ("no dataset.json: all camera files are frames",)
     if not ids and not train and not val:
         ids = [file.stem for file in (path / "camera").glob("*.json")]
-    every = sorted({*ids, *train, *val}, key=frames.natural)
-    if not every:
-        raise CaptureError(f"{file}: names no frames; list them under ids or train_ids")
+    all_names = sorted({*ids, *train, *val}, key=frames.natural)
+    if not all_names:
+        raise CaptureError(f"{file}: no frames; list them under ids or train_ids")
     if heldout == "interp":
-        ordered = sorted(ids or every, key=frames.natural)
+        ordered = sorted(ids or all_names, key=frames.natural)
         return ordered[::4], ordered[2::4], notes
     if isinstance(heldout, str):
         return *_named_split(path, heldout), notes
     if isinstance(heldout, int) or not val:
         step = frames.HELD_OUT if heldout is None else heldout
-        pool = every if isinstance(heldout, int) or not train else train
+        pool = all_names if isinstance(heldout, int) or not train else train
         pool = sorted(pool, key=frames.natural)
         kept, scored = frames.hold_out_every(len(pool), step, str(path))
         if heldout is None:
             notes += (f"no validation ids: {frames.held_out_note(scored, step)}",)
         return [pool[row] for row in kept], [pool[row] for row in scored], notes
-    left_out = len(every) - len({*train, *val})
+    left_out = len(all_names) - len({*train, *val})
     if train and left_out:
         notes += (f"{left_out} frames in neither split are not read",)
-    return train or [name for name in every if name not in set(val)], val, notes
+    return train or [name for name in all_names if name not in set(val)], val, notes
 
 
 def _named_split(path, heldout):
@@ -233,7 +232,7 @@ def _named_split(path, heldout):
 
 
 def _with_camera_files(path, names, missing):
-    """Names of the frames that have a camera file, and a note of the others."""
+    """Names of the frames with a camera file, and a note about the others."""
     frames.check_missing(missing, str(path))
     kept = tuple(name for name in names if _camera_path(path, name).is_file())
     lost = [name for name in names if name not in set(kept)]
@@ -327,92 +326,90 @@ def camera_entry(one: Camera, capture: Capture, size: tuple[int, int]) -> dict:
     }
 
 
-def _when(number):
-    """A moment between two others, as HyperNeRF's interpolation writes it, or one."""
-    if isinstance(number, tuple):
-        left, right, progress = number
-        return left + (right - left) * progress
-    return number
+def _number(frame_id):
+    """An id as a number, fractional for HyperNeRF's interpolated ids."""
+    if isinstance(frame_id, tuple):
+        left, right, weight = frame_id
+        return left + (right - left) * weight
+    return frame_id
 
 
-def _moments(path, ids):
+def _frame_entries(path, ids):
     file = path / "metadata.json"
     if not file.exists():
-        moments = [Moment(appearance_id=row) for row in range(len(ids))]
-        return _times_of_names(
-            moments, ids, "no metadata.json: each frame is a moment of its own"
-        )
-    table = read_json(file, dict[str, Moment])
+        entries = [FrameEntry(appearance_id=row) for row in range(len(ids))]
+        note = "no metadata.json: each frame has a time of its own"
+        return _times_of_names(entries, ids, note)
+    table = read_json(file, dict[str, FrameEntry])
     absent = [name for name in ids if name not in table]
     if absent:
         raise CaptureError(
-            f"{file}: no entry for frame {absent[0]!r} ({len(absent)} such); add one "
-            "with warp_id, appearance_id and camera_id"
+            f"{file}: no entry for frame {absent[0]!r} ({len(absent)} missing); add "
+            "one with warp_id, appearance_id and camera_id"
         )
-    moments = [table[name] for name in ids]
-    for name, moment in zip(ids, moments, strict=True):
+    entries = [table[name] for name in ids]
+    for name, entry in zip(ids, entries, strict=True):
         for key in ("warp_id", "appearance_id", "camera_id"):
-            value = _when(getattr(moment, key))
+            value = _number(getattr(entry, key))
             if value is not None and not 0 <= value < MAX_ID:
                 raise CaptureError(
                     f"{file}: frame {name!r} has {key} {value}; expected 0 to "
                     f"{MAX_ID - 1}"
                 )
-    moments, notes = _complete(moments, file, ids)
-    between = sum(isinstance(moment.warp_id, tuple) for moment in moments)
-    if between:
-        notes += (f"{between} frames lie between two moments (HyperNeRF)",)
-    return moments, notes
+    entries, notes = _complete_warp_ids(entries, file, ids)
+    interpolated = sum(isinstance(entry.warp_id, tuple) for entry in entries)
+    if interpolated:
+        notes += (f"{interpolated} frames have interpolated warp ids (HyperNeRF)",)
+    return entries, notes
 
 
-def _complete(moments, file, ids):
-    """Moments that all have a warp_id, and notes of where it is from."""
+def _complete_warp_ids(entries, file, ids):
+    """Entries that all have a warp_id, and notes on its source."""
     absent = [
-        name for name, one in zip(ids, moments, strict=True) if one.warp_id is None
+        name for name, entry in zip(ids, entries, strict=True) if entry.warp_id is None
     ]
     if not absent:
-        return moments, ()
+        return entries, ()
     for key in ("time_id", "time"):
-        values = [getattr(one, key) for one in moments]
+        values = [getattr(entry, key) for entry in entries]
         if None not in values:
-            return _with_warp_ids(moments, values), ()
+            return _with_warp_ids(entries, values), ()
     if len(absent) < len(ids):
         raise CaptureError(
             f"{file}: {len(absent)} of {len(ids)} frames have no warp_id "
-            f"({', '.join(absent[:5])}); add it, or remove it from all to take times "
-            "from the names"
+            f"({', '.join(absent[:5])}); add it, or remove it from all so that times "
+            "are taken from the names"
         )
-    return _times_of_names(
-        moments, ids, f"no warp_id, time_id or time in {file.name}: taken from names"
-    )
+    note = f"no warp_id, time_id or time in {file.name}: taken from names"
+    return _times_of_names(entries, ids, note)
 
 
-def _times_of_names(moments, ids, note):
+def _times_of_names(entries, ids, note):
     clock = name_times.clock(ids)
-    moments = _with_warp_ids(moments, clock.times)
-    if clock.cameras is not None and not any(one.camera_id for one in moments):
-        moments = [
-            msgspec.structs.replace(one, camera_id=camera_id)
-            for one, camera_id in zip(moments, clock.cameras.tolist(), strict=True)
+    entries = _with_warp_ids(entries, clock.times)
+    if clock.cameras is not None and not any(entry.camera_id for entry in entries):
+        entries = [
+            msgspec.structs.replace(entry, camera_id=camera_id)
+            for entry, camera_id in zip(entries, clock.cameras.tolist(), strict=True)
         ]
-    spread = frames.spread(clock.times).tolist()
-    moments = [
-        msgspec.structs.replace(one, time=when)
-        for one, when in zip(moments, spread, strict=True)
+    times = frames.spread(clock.times).tolist()
+    entries = [
+        msgspec.structs.replace(entry, time=time)
+        for entry, time in zip(entries, times, strict=True)
     ]
-    return moments, (note, *clock.notes)
+    return entries, (note, *clock.notes)
 
 
-def _with_warp_ids(moments, values):
+def _with_warp_ids(entries, values):
     return [
-        msgspec.structs.replace(one, warp_id=warp_id)
-        for one, warp_id in zip(moments, frames.dense(values).tolist(), strict=True)
+        msgspec.structs.replace(entry, warp_id=warp_id)
+        for entry, warp_id in zip(entries, frames.dense(values).tolist(), strict=True)
     ]
 
 
-def _times(moments, path, ids):
-    if all(moment.time is not None for moment in moments):
-        times = np.array([moment.time for moment in moments], np.float32)
+def _times(entries, path, ids):
+    if all(entry.time is not None for entry in entries):
+        times = np.array([entry.time for entry in entries], np.float32)
         bad = ~((times >= 0) & (times <= 1))
         if bad.any():
             row = int(np.argmax(bad))
@@ -421,9 +418,9 @@ def _times(moments, path, ids):
                 f"{times[row]:g}; expected 0 to 1"
             )
         return times
-    if all(moment.time_id is not None for moment in moments):
-        return frames.spread([moment.time_id for moment in moments])
-    return frames.spread([_when(moment.warp_id) for moment in moments])
+    if all(entry.time_id is not None for entry in entries):
+        return frames.spread([entry.time_id for entry in entries])
+    return frames.spread([_number(entry.warp_id) for entry in entries])
 
 
 def only(views, rows):
@@ -438,13 +435,13 @@ def only(views, rows):
     """
     if len(rows) == len(views.ids):
         return views
-    place = np.full(len(views.ids), -1)
-    place[rows] = np.arange(len(rows))
+    new_index = np.full(len(views.ids), -1)
+    new_index[rows] = np.arange(len(rows))
     columns = ("times", "warp_ids", "appearance_ids", "camera_ids")
     return views._replace(
         ids=tuple(views.ids[row] for row in rows),
         cameras=camera.take(views.cameras, rows),
-        train=place[views.train][place[views.train] >= 0],
-        heldout=place[views.heldout][place[views.heldout] >= 0],
+        train=new_index[views.train][new_index[views.train] >= 0],
+        heldout=new_index[views.heldout][new_index[views.heldout] >= 0],
         **{name: getattr(views, name)[rows] for name in columns},
     )

@@ -11,8 +11,8 @@ from nerfies_jax.capture.frames import HELD_OUT, hold_out_every
 from nerfies_jax.capture.images import write_png
 from nerfies_jax.capture.json_files import AnyPath, new_folder, write_json
 
-SAME_POSE = 1e-6  # of matrix entries; a camera on a tripod repeats its matrix exactly
-TRIPOD_ROWS = 5  # fewer rows of one pose are no validation sweep
+SAME_POSE = 1e-6  # tolerance of matrix entries; a static camera repeats them exactly
+TRIPOD_ROWS = 5  # smallest number of rows with one pose that form a validation sweep
 
 
 def convert(
@@ -21,9 +21,9 @@ def convert(
     """Convert an archive to transforms_train.json and transforms_val.json with images.
 
     The archive holds `images`, `poses` (OpenGL camera to world), `focal` and `times`.
-    If no rows are named and consecutive rows share one pose, those are taken for a
-    validation sweep: they are held out, the rows before them are for training, and the
-    rows after them are left out.
+    If no rows are specified and consecutive rows share one pose, those are taken for a
+    validation sweep over time: they are held out, the rows before them are for
+    training, and the rows after them are left out.
 
     Args:
       file: The archive.
@@ -41,9 +41,9 @@ def convert(
     images, poses, times, focal = read_npz(pathlib.Path(file))
     train, heldout, note = rows_of(poses, heldout, train, str(file))
     common = {"camera_angle_x": 2 * math.atan(images.shape[2] / 2 / focal)}
-    behind = background_of(images)
-    if behind is not None:
-        common["background"] = behind
+    background = background_of(images)
+    if background is not None:
+        common["background"] = background
     with new_folder(out) as folder:
         for name, rows in (("train", train), ("val", heldout)):
             (folder / name).mkdir()
@@ -59,7 +59,7 @@ def convert(
                 entries.append(entry)
             file = folder / f"transforms_{name}.json"
             write_json(file, common | {"frames": entries})
-        formats.load(folder)  # refused now rather than when it is used
+        formats.load(folder)  # reports problems now rather than when it is used
     return [*describe(formats.load(out)), note]
 
 
@@ -83,10 +83,10 @@ def read_npz(path):
         raise CaptureError(
             f"{path}: not a readable .npz ({error}); save it again with numpy.savez"
         ) from None
-    absent = {"images", "poses", "focal"} - set(arrays)
-    if absent:
+    missing = {"images", "poses", "focal"} - set(arrays)
+    if missing:
         raise CaptureError(
-            f"{path}: no array {min(absent)!r}; there are {sorted(arrays)}"
+            f"{path}: no array {min(missing)!r}; there are {sorted(arrays)}"
         )
     for name in {"images", "poses", "focal", "times"} & set(arrays):
         if arrays[name].dtype.kind not in "fiu":
@@ -107,11 +107,14 @@ def read_npz(path):
         )
     if len(poses) != count or (times is not None and times.shape != (count,)):
         raise CaptureError(
-            f"{path}: {count} images but another number of poses or times"
+            f"{path}: {count} images but a different number of poses or times; save "
+            "one of each per image"
         )
     numbers = [images, poses, arrays["focal"], *([] if times is None else [times])]
     if not all(np.isfinite(each).all() for each in numbers):
-        raise CaptureError(f"{path}: holds NaN or infinity; mend or remove those rows")
+        raise CaptureError(
+            f"{path}: holds NaN or infinity; correct or remove those rows"
+        )
     if times is not None and not (times.min() >= 0 and times.max() <= 1):
         raise CaptureError(
             f"{path}: times from {times.min():g} to {times.max():g}; expected 0 to 1"
@@ -148,37 +151,40 @@ def rows_of(poses, heldout, train, where):
     """
     count = len(poses)
     if heldout is not None:
-        scored = _range(heldout, count, "heldout")
-        others = np.setdiff1d(np.arange(count), scored)
-        learned = others if train is None else _range(train, count, "train")
-        both = np.intersect1d(learned, scored)
-        if both.size:
+        heldout_rows = _range(heldout, count, "heldout")
+        others = np.setdiff1d(np.arange(count), heldout_rows)
+        train_rows = others if train is None else _range(train, count, "train")
+        shared = np.intersect1d(train_rows, heldout_rows)
+        if shared.size:
             raise ValueError(
-                f"train={train} and heldout={heldout} share row {both[0]}; held-out "
+                f"train={train} and heldout={heldout} share row {shared[0]}; held-out "
                 "frames must not be trained on"
             )
-        return learned, scored, "rows as asked for"
+        return train_rows, heldout_rows, "rows as specified"
     if train is not None:
-        raise ValueError(
-            f"train={train} needs heldout=FIRST:LAST too, so that both are known"
+        raise ValueError(f"train={train} needs heldout=FIRST:LAST too")
+    length, start = _longest_static_run(poses)
+    if TRIPOD_ROWS <= length < count and start > 0:
+        return (
+            np.arange(start),
+            np.arange(start, start + length),
+            f"rows {start} to {start + length - 1} share one pose: held out; "
+            f"{count - start - length} rows after them left out",
         )
+    train_rows, heldout_rows = hold_out_every(count, HELD_OUT, where)
+    return train_rows, heldout_rows, f"every {HELD_OUT}th row is held out"
+
+
+def _longest_static_run(poses):
+    """Length and start of the longest run of rows that share one pose."""
+    count = len(poses)
     same = np.abs(np.diff(poses, axis=0)).max((1, 2)) < SAME_POSE
     best, first = (0, 0), 0
     for row in range(1, count + 1):
         if row == count or not same[row - 1]:
             best = max(best, (row - first, -first))
             first = row
-    length, start = best[0], -best[1]
-    if TRIPOD_ROWS <= length < count and start > 0:
-        rest = count - start - length
-        return (
-            np.arange(start),
-            np.arange(start, start + length),
-            f"rows {start} to {start + length - 1} share one pose: held out; "
-            f"{rest} rows after them left out",
-        )
-    learned, scored = hold_out_every(count, HELD_OUT, where)
-    return learned, scored, f"every {HELD_OUT}th row is held out"
+    return best[0], -best[1]
 
 
 def _range(text, count, name):
@@ -201,7 +207,7 @@ def background_of(images):
       sRGB color in [0, 1], or None.
     """
     corners = images[:, [0, 0, -1, -1], [0, -1, 0, -1]].reshape(-1, 3)
-    usual = np.median(corners, axis=0)
-    if (corners == usual).all(1).mean() < 0.95:
+    median = np.median(corners, axis=0)
+    if (corners == median).all(1).mean() < 0.95:
         return None
-    return (usual / 255).tolist()
+    return (median / 255).tolist()

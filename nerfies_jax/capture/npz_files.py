@@ -1,6 +1,6 @@
-"""NumPy arrays of untrusted files, which may be damaged or cut short.
+"""NumPy arrays from untrusted files, which may be damaged or truncated.
 
-Headers are trusted only as far as the bytes behind them go, sizes are bounded before
+Sizes in headers are checked against the actual number of bytes and bounded before
 anything is allocated, and Python objects are never loaded.
 """
 
@@ -20,15 +20,16 @@ from nerfies_jax.capture.safe_files import AnyPath
 MAX_BYTES = 16 * 2**30  # of all arrays of an archive, or of one .npy
 MAX_MEMBERS = 10_000
 MAX_AXES = 16
-MAX_HEADER = 2**16  # bytes of what comes before an array
-# Arrays may have so many times the bytes of their archive. Deflate can reach 1032, with
-# zeros alone. Masks that are mostly empty reach 300, but seldom with so many bytes.
+MAX_HEADER = 2**16  # bytes of the header of an array
+# Largest compression ratio of an archive, for arrays of more than `FREE_BYTES`. Deflate
+# can reach 1032, with zeros only. Masks that are mostly empty reach 300, but are rarely
+# that large.
 MAX_EXPANSION = 100
-FREE_BYTES = 256 * 2**20  # of arrays, however small the archive
-_CHUNK = 2**24
+FREE_BYTES = 256 * 2**20
+_CHUNK = 2**24  # bytes to read at a time
 
-# Errors of zipfile, zlib and NumPy for damaged bytes, besides OSError. A RuntimeError
-# is an unknown compression or a password, an AttributeError a .npy.
+# Errors of zipfile, zlib and NumPy for damaged bytes, besides OSError. RuntimeError is
+# raised for unknown compression or a password, AttributeError for a .npy.
 DAMAGED = (
     *(ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError),
     *(zipfile.BadZipFile, zlib.error, RuntimeError, OverflowError, MemoryError),
@@ -46,11 +47,11 @@ class Archive:
         self._members: dict[str, zipfile.ZipInfo] = {}
         for member in members:
             name = member.filename.removesuffix(".npy")
-            # Others unpack without a bound, and NumPy writes none of them.
+            # NumPy writes no others, and their decompression cannot be bounded.
             if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError(f"{name} is compressed in a way that NumPy does not")
+                raise ValueError(f"{name} has a compression that NumPy does not use")
             if name in self._members:
-                raise ValueError(f"{name} is in it twice")
+                raise ValueError(f"{name} is stored twice")
             self._members[name] = member
         total = sum(member.file_size for member in members)
         if total > most:
@@ -58,8 +59,8 @@ class Archive:
         if total > FREE_BYTES and total > MAX_EXPANSION * file_bytes:
             raise ValueError(
                 f"{file_bytes} bytes unpack to {total}, more than {MAX_EXPANSION} "
-                "times as many; if that is meant, save it with numpy.savez, which does "
-                "not compress"
+                "times as many; if that is intended, save it with numpy.savez, which "
+                "does not compress"
             )
 
     @property
@@ -169,22 +170,22 @@ def read_array(stream: io.BufferedIOBase, size: int) -> np.ndarray:
       The array.
 
     Raises:
-      ValueError: If there is no header, or it asks for Python objects or for more or
-        fewer bytes than there are.
+      ValueError: If the header is missing, specifies Python objects, or does not match
+        the number of bytes.
     """
     shape, column_major, dtype, header_bytes = _header(stream)
     count = math.prod(shape)
     if count * dtype.itemsize != size - header_bytes:
         raise ValueError(
-            f"its header claims {dtype} of shape {shape}, which is not what "
-            f"{size - header_bytes} bytes hold"
+            f"its header claims {dtype} of shape {shape}, which does not match "
+            f"{size - header_bytes} bytes"
         )
     array = np.empty(count, dtype)
     left = array.view(np.uint8).data if array.nbytes else memoryview(b"")
     while left:
         part = stream.readinto(left[:_CHUNK])
         if not part:
-            raise ValueError(f"cut short: {len(left)} of {size} bytes are missing")
+            raise ValueError(f"truncated: {len(left)} of {size} bytes are missing")
         left = left[part:]
     return array.reshape(shape, order="F" if column_major else "C")
 
@@ -200,7 +201,7 @@ def _header(stream):
     if head[6] not in (1, 2, 3) or length > MAX_HEADER:
         raise ValueError(f"a header of version {head[6]} and {length} bytes")
     text = stream.read(length)
-    # NumPy parses the header as Python, which raises whatever its parser does.
+    # NumPy parses the header as Python code, so any exception may occur.
     try:
         formats = np.lib.format
         parse = formats.read_array_header_2_0 if wide else formats.read_array_header_1_0
@@ -208,7 +209,7 @@ def _header(stream):
     except Exception as error:
         raise ValueError(f"its header is damaged ({type(error).__name__})") from None
     if dtype.hasobject or not dtype.itemsize:
-        raise ValueError(f"it holds {dtype}, and no Python objects are loaded")
+        raise ValueError(f"it holds {dtype}; Python objects are not loaded")
     if len(shape) > MAX_AXES or any(side < 0 for side in shape):
         raise ValueError(f"an array of shape {shape}"[:200])
     return shape, column_major, dtype, len(head) + len(size) + length

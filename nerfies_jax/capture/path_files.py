@@ -1,7 +1,8 @@
 """Camera path files: nerfstudio's camera_path.json and Nerfies' folder of cameras.
 
-nerfstudio's files are in scene units, with a vertical field of view and only centered
-pinholes with square pixels. Nerfies' are in world units and have complete cameras.
+nerfstudio's files are in scene units and hold pinholes with square pixels, a centered
+principal point and a vertical field of view. Nerfies' are in world units and hold all
+intrinsics.
 """
 
 import math
@@ -29,7 +30,7 @@ from nerfies_jax.capture.nerfies_views import CameraFile, camera_entry, cameras_
 from nerfies_jax.capture.transforms_writer import opengl_pose
 from nerfies_jax.geometry import camera
 
-FRAMES = 96  # of a path that is no file, where nothing is said
+FRAMES = 96  # default length of a path of one of the `KINDS`
 
 
 class PathCamera(msgspec.Struct):
@@ -47,7 +48,7 @@ class PathFile(msgspec.Struct):
     render_width: float
     render_height: float
     camera_type: str = "perspective"
-    # Keyframes of its editor, whose layout differs between versions of nerfstudio.
+    # Keyframes of nerfstudio's editor, whose layout differs between versions.
     keyframes: list[dict[str, Any]] = []
 
 
@@ -57,19 +58,19 @@ def named(name: str, capture: Capture, count: int | None) -> CameraPath:
     Args:
       name: One of the `KINDS`, or a file or folder of a path.
       capture: The capture that it belongs to.
-      count: Number of cameras of a named path. None for the default.
+      count: Number of cameras of a path of one of the `KINDS`. None for `FRAMES`.
 
     Returns:
       The path.
 
     Raises:
-      CaptureError: If there is no such path.
+      CaptureError: If there is no such path or the file cannot be read.
     """
     if name in camera_paths.KINDS:
         return camera_paths.planned(name, capture, count or FRAMES)
     if not pathlib.Path(name).exists():
         raise CaptureError(
-            f"{name}: no such file, and no camera path of that name; "
+            f"{name}: neither a file nor the name of a camera path; "
             + known_names(name, camera_paths.KINDS)
         )
     return read(name, capture)
@@ -93,15 +94,15 @@ def read(path: AnyPath, capture: Capture) -> CameraPath:
         cameras, size, times = _nerfies(path, capture)
     else:
         cameras, size, times = _nerfstudio(path)
-    return _checked(path, cameras, size, times)
+    return _camera_path(path, cameras, size, times)
 
 
-def _checked(path, cameras, size, times):
-    """The path, refused where it is none."""
+def _camera_path(path, cameras, size, times):
+    """Make a `CameraPath` after checking that it can be rendered."""
     if not 1 <= min(size) <= max(size) <= MAX_PIXELS // min(size):
         raise CaptureError(
-            f"{path}: pictures of {size[0]}x{size[1]} pixels; expected 1 to "
-            f"{MAX_PIXELS} in all"
+            f"{path}: images of {size[0]}x{size[1]} pixels; expected 1 to "
+            f"{MAX_PIXELS} pixels in all"
         )
     try:
         camera.validate(cameras, size, str(path))
@@ -111,12 +112,12 @@ def _checked(path, cameras, size, times):
 
 
 def _times(path, times):
-    lacking = sum(time is None for time in times)
-    if lacking == len(times):
+    missing = sum(time is None for time in times)
+    if missing == len(times):
         return None
-    if lacking:
+    if missing:
         raise CaptureError(
-            f"{path}: {lacking} of {len(times)} cameras have no time; give one to all "
+            f"{path}: {missing} of {len(times)} cameras have no time; add it to all "
             "or to none"
         )
     times = np.array(times, np.float32)
@@ -142,8 +143,8 @@ def _nerfstudio(path):
 
 
 def _pinholes(path, entries, size):
-    """Cameras, size and times of entries of a file."""
-    single = []
+    """Cameras, size and times of the entries of a file."""
+    pinholes = []
     for row, each in enumerate(entries):
         if len(each.camera_to_world) != 16 or not 0 < each.fov < 180:
             raise CaptureError(
@@ -154,25 +155,25 @@ def _pinholes(path, entries, size):
         pose = np.reshape(each.camera_to_world, (4, 4))
         rotation = (pose[:3, :3] * [1, -1, -1]).T
         focal = 0.5 * size[1] / math.tan(math.radians(each.fov) / 2)
-        single.append(camera.pinhole(rotation, pose[:3, 3], focal, size))
-    return camera.stack(single), size, [each.render_time for each in entries]
+        pinholes.append(camera.pinhole(rotation, pose[:3, 3], focal, size))
+    return camera.stack(pinholes), size, [each.render_time for each in entries]
 
 
 def _nerfies(path, capture):
-    places = sorted(path.glob("*.json"), key=lambda place: frames.natural(place.name))
-    if not places:
+    files = sorted(path.glob("*.json"), key=lambda file: frames.natural(file.name))
+    if not files:
         raise CaptureError(f"{path}: no camera files (*.json) in it")
-    files = [read_json(place, CameraFile) for place in places]
-    first = files[0].image_size
-    for place, file in zip(places, files, strict=True):
-        if file.image_size != first:
+    entries = [read_json(file, CameraFile) for file in files]
+    first = entries[0].image_size
+    for file, entry in zip(files, entries, strict=True):
+        if entry.image_size != first:
             raise CaptureError(
-                f"{place}: image_size {file.image_size}, but {places[0].name} has "
-                f"{first}; a film has one size"
+                f"{file}: image_size {entry.image_size}, but {files[0].name} has "
+                f"{first}; all images of a video have one size"
             )
     size = round(first[0]), round(first[1])
-    cameras = cameras_of(files, capture.scale, capture.center)
-    return cameras, size, [file.time for file in files]
+    cameras = cameras_of(entries, capture.scale, capture.center)
+    return cameras, size, [entry.time for entry in entries]
 
 
 def read_keyframes(path: AnyPath, capture: Capture) -> list[Keyframe]:
@@ -180,38 +181,37 @@ def read_keyframes(path: AnyPath, capture: Capture) -> list[Keyframe]:
 
     Args:
       path: nerfstudio's `camera_path.json`, or a folder of Nerfies' camera files.
-      capture: The capture it belongs to.
+      capture: The capture that it belongs to.
 
     Returns:
-      The keyframes that the file has. If it has none, `MOST_KEYFRAMES` of its cameras
-      at most, evenly spaced; the path through them is then only close to the file's.
-      Without times they get those of `camera_paths.times`, to 1 and back.
+      The keyframes of the file. If it has none, at most `MOST_KEYFRAMES` evenly spaced
+      cameras of the path, so that the interpolated path only approximates the file's.
+      If it has no times, those of `camera_paths.times`, from 0 to 1 and back.
 
     Raises:
-      CaptureError: If the file cannot be read or is no camera path.
+      CaptureError: If the file cannot be read or is not a camera path.
     """
     path = pathlib.Path(path)
-    planned = read(path, capture)
+    camera_path = read(path, capture)
     if not path.is_dir():
         entries = [_as_camera(each) for each in read_json(path, PathFile).keyframes]
         if len(entries) >= 2 and None not in entries:
-            planned = _checked(path, *_pinholes(path, entries, planned.size))
-    rows = np.arange(len(planned.cameras.focal_px))
+            parts = _pinholes(path, entries, camera_path.size)
+            camera_path = _camera_path(path, *parts)
+    cameras, times = camera_path.cameras, camera_path.times
+    rows = np.arange(len(cameras.focal_px))
     if len(rows) > keyframes.MOST_KEYFRAMES:
         rows = np.linspace(0, rows[-1], keyframes.MOST_KEYFRAMES).round().astype(int)
-    times = planned.times
     if times is None:
-        times = camera_paths.times(len(planned.cameras.focal_px))
-    return [
-        Keyframe(camera.take(planned.cameras, row), float(times[row])) for row in rows
-    ]
+        times = camera_paths.times(len(cameras.focal_px))
+    return [Keyframe(camera.take(cameras, row), float(times[row])) for row in rows]
 
 
 def _as_camera(entry):
     """Convert a keyframe of nerfstudio's editor, or return None for another layout."""
-    renamed = {**entry, "camera_to_world": entry.get("matrix")}
     try:
-        return msgspec.convert(renamed, PathCamera)
+        entry = {**entry, "camera_to_world": entry.get("matrix")}
+        return msgspec.convert(entry, PathCamera)
     except msgspec.ValidationError:
         return None
 
@@ -225,15 +225,15 @@ def write_nerfstudio(
 ) -> None:
     """Write `camera_path.json`, for nerfstudio's renderer and viewer and for ours.
 
-    Poses, times and the vertical field of view are kept, further properties of a lens
-    are not.
+    Poses, times and the vertical field of view are stored. The format holds no other
+    intrinsics.
 
     Args:
       path: The file.
       planned: The cameras.
       rate: Frames per second.
       overwrite: True to replace an existing file.
-      keyframes: Those that the path passes through, to edit it later.
+      keyframes: Keyframes of the path, so that it can be edited later.
     """
     refuse_existing(path, overwrite)
     width, height = planned.size
@@ -245,10 +245,10 @@ def write_nerfstudio(
         if planned.times is not None:
             entry["render_time"] = float(planned.times[row])
         entries.append(entry)
-    edited = []
+    keyframe_entries = []
     for keyframe in keyframes:
         pose, fov = _pose_and_fov(keyframe.camera, height)
-        edited.append(
+        keyframe_entries.append(
             {
                 "matrix": pose,
                 "fov": fov,
@@ -265,14 +265,14 @@ def write_nerfstudio(
         "render_height": height,
         "fps": rate,
         "seconds": count / rate,
-        "keyframes": edited,
+        "keyframes": keyframe_entries,
         "camera_path": entries,
     }
     write_json(path, table)
 
 
 def _pose_and_fov(one, height):
-    """The OpenGL pose row by row, and the vertical field of view in degrees."""
+    """The row-major OpenGL pose, and the vertical field of view in degrees."""
     focal = float(one.focal_px) * float(one.pixel_aspect)
     pose = opengl_pose(one.camera_from_world, one.position).ravel().tolist()
     return pose, math.degrees(2 * math.atan2(height, 2 * focal))

@@ -1,4 +1,4 @@
-"""PLY files of any program, read by plyfile."""
+"""Robust reading of PLY files with plyfile."""
 
 import io
 import pathlib
@@ -19,9 +19,9 @@ _TYPE_BYTES = {
 
 
 class _Binary(io.BufferedReader):
-    """A binary PLY whose header reads as ASCII, byte for byte.
+    """A binary PLY file with non-ASCII bytes of its header replaced by ASCII.
 
-    plyfile refuses other characters, which programs and users write into comments.
+    plyfile refuses them, but programs and users write them into comments.
     """
 
     header_bytes = 0
@@ -44,8 +44,8 @@ def read(path: pathlib.Path) -> plyfile.PlyData:
       The elements.
 
     Raises:
-      ValueError: The file is damaged; one line without the path.
-      CaptureError: It cannot be opened.
+      ValueError: If the file is damaged, with a one-line message without the path.
+      CaptureError: If it cannot be opened.
     """
     with safe_files.open_file(path) as stream:
         head = stream.read(MAX_HEADER)
@@ -56,7 +56,7 @@ def read(path: pathlib.Path) -> plyfile.PlyData:
     if is_text and size > MAX_TEXT:
         raise ValueError(f"{size} bytes of text; save it as a binary PLY")
     try:
-        if encoding != "utf-8":  # only text can be encoded otherwise
+        if encoding != "utf-8":  # only text files can have another encoding
             raw = text_files.utf8(safe_files.read_bytes(path, MAX_TEXT))
             text = raw.decode("ascii", "ignore").replace("\r\n", "\n")
             return plyfile.PlyData.read(io.StringIO(text))
@@ -66,24 +66,24 @@ def read(path: pathlib.Path) -> plyfile.PlyData:
         with _Binary(io.FileIO(path)) as stream:
             stream.header_bytes = len(header)
             return plyfile.PlyData.read(stream, mmap="r")
-    # plyfile parses with eval-like leniency and raises whatever its parts do.
+    # plyfile does not validate its input, so any exception may occur.
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(reason) from error
 
 
 def check_header(head: bytes, size: int) -> bytes:
-    """Check that the counts of a header can be true.
+    """Check that the element counts of a header fit the size of the file.
 
     Args:
       head: The first bytes of the file.
       size: Bytes of the file.
 
     Returns:
-      The header alone, with its last line.
+      The header, including its last line.
 
     Raises:
-      ValueError: It is no header, or claims more than the file can hold.
+      ValueError: If there is no header, or it specifies more than the file can hold.
     """
     if not head.startswith(b"ply"):
         raise ValueError("not a PLY file: it does not start with 'ply'")
@@ -103,7 +103,7 @@ def check_header(head: bytes, size: int) -> bytes:
 
 
 def _elements(header):
-    """Name, count and least bytes of a row of each element."""
+    """Name, count and smallest row size in bytes of each element."""
     is_text = b"format ascii" in header
     elements = []
     for line in header.decode("ascii", "replace").splitlines():
@@ -114,6 +114,6 @@ def _elements(header):
             elements.append([words[1][:20], int(words[2]), 0])
         elif words[:1] == ["property"] and len(words) >= 3 and elements:
             kind = words[2] if words[1] == "list" else words[1]
-            # In text a digit and what separates it from the next.
+            # In text files a digit and a separator.
             elements[-1][2] += 2 if is_text else _TYPE_BYTES.get(kind, 1)
     return elements

@@ -1,4 +1,4 @@
-"""Scene points: placement of the scene, and point cloud files."""
+"""Normalization of a scene's position and scale, and point cloud files."""
 
 import pathlib
 from typing import NamedTuple
@@ -12,15 +12,18 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.rays import across_ray
 
 MAX_POINTS = 50_000_000
-SAME_PLACE = 1e-9  # share of the coordinates within which cameras are at one place
-INLIERS = 0.95  # share of points nearest to their median that the scene must hold
-# Depths beyond these quantiles are outliers; the margins move the planes outwards.
+# Cameras that differ by less than this share of their coordinates share a position.
+SAME_PLACE = 1e-9
+INLIERS = 0.95  # share of the points, nearest to their median, that the box encloses
+# Depths beyond these quantiles are outliers. The margins widen the range between the
+# planes. The near margin is large, since moving objects stand in front of the points of
+# structure from motion.
 QUANTILES, FAR_MARGIN = (0.001, 0.999), 1.2
-NEAR_MARGIN = 0.5  # what moves stands before what structure from motion finds
+NEAR_MARGIN = 0.5
 
 
 class Placement(NamedTuple):
-    """Transform from world to scene units, and depth range in scene units."""
+    """Transform from world to scene units, and near and far planes in scene units."""
 
     center: tuple[float, float, float]
     scale: float
@@ -31,11 +34,11 @@ class Placement(NamedTuple):
 def place_by_points(
     points: np.ndarray, positions: np.ndarray, depths: np.ndarray
 ) -> Placement:
-    """Place the box of points and cameras around the origin with a unit diagonal.
+    """Center the bounding box of points and cameras, and scale it to a unit diagonal.
 
-    Nerfies does the same, since its frequency bands are made for that size. Nerfies
-    moves the near plane outward by 25 % (it divides by 0.8). Here it moves inward, to
-    half.
+    Nerfies does the same, since the frequency bands of its encodings assume that size.
+    Nerfies moves the near plane away from the camera by 25 % (it divides by 0.8). Here
+    it moves toward the camera, to half the depth.
 
     Args:
       points: Scene points in world units, [n, 3].
@@ -46,9 +49,9 @@ def place_by_points(
       The placement.
     """
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    kept = points[distance <= np.quantile(distance, INLIERS)]
-    corners = np.concatenate([kept, positions])
-    low, high = corners.min(0), corners.max(0)
+    inliers = points[distance <= np.quantile(distance, INLIERS)]
+    enclosed = np.concatenate([inliers, positions])
+    low, high = enclosed.min(0), enclosed.max(0)
     scale = 1 / np.linalg.norm(high - low)
     near, far = np.quantile(depths, QUANTILES) * scale
     return Placement(
@@ -60,10 +63,10 @@ def place_by_points(
 
 
 def place_by_cameras(cameras: Camera) -> Placement:
-    """Guess the placement from cameras alone, assuming that they look at the scene.
+    """Estimate the placement from cameras alone, assuming that they look at the scene.
 
-    The scene is centered on the point nearest to all viewing axes. Its size is the
-    cameras' mean distance from it, near is a twentieth of that and far four times.
+    The scene is centered on the point nearest to all viewing axes. The mean distance of
+    the cameras from it becomes 1 scene unit, near is 0.05 and far 4.
 
     Args:
       cameras: Cameras in world units, [frames].
@@ -75,16 +78,16 @@ def place_by_cameras(cameras: Camera) -> Placement:
     positions = np.asarray(cameras.position, np.float64)
     across = across_ray(axes)
     matrix, right = across.sum(0), np.einsum("nij,nj->i", across, positions)
-    # Parallel axes meet nowhere; then the cameras' own spread sets the size.
-    meets = np.linalg.svd(matrix, compute_uv=False)[-1] > 1e-3 * len(axes)
+    # Parallel axes have no nearest point. The spread of the cameras sets the size then.
+    converging = np.linalg.svd(matrix, compute_uv=False)[-1] > 1e-3 * len(axes)
     spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
-    if meets:
+    if converging:
         center = np.linalg.solve(matrix, right)
         distance = np.linalg.norm(positions - center, axis=1).mean()
     else:
         distance = 10 * spread
         center = positions.mean(0) + axes.mean(0) * distance
-    # Every camera at one place, up to rounding: any size is as good.
+    # With all cameras at one position (up to rounding) the scale is arbitrary.
     if not distance > SAME_PLACE * np.abs(positions).max():
         distance, center = 1.0, positions.mean(0) + axes.mean(0)
     return Placement(tuple(center.tolist()), float(1 / distance), 0.05, 4.0)
@@ -125,13 +128,13 @@ def read_ply(path: pathlib.Path) -> PointCloud:
             f"{path}: not a readable point cloud ({reason}); export it again"
         ) from None
     position = position.astype(np.float64)
-    # Most of what is computed from them is float32.
+    # Later computations are in float32.
     finite = (np.abs(position) <= np.finfo(np.float32).max).all(1)
     return PointCloud(position[finite], color[finite])
 
 
 def _check_numbers(vertex):
-    """Raise ValueError where positions or colors are lists."""
+    """Raise ValueError if positions or colors are not scalar properties."""
     names = {"x", "y", "z", "red", "green", "blue"}
     lists = [
         each.name
@@ -139,7 +142,7 @@ def _check_numbers(vertex):
         if each.name in names and vertex.data.dtype[each.name].kind not in "fiu"
     ]
     if lists:
-        raise ValueError(f"properties that are no numbers: {', '.join(lists)}")
+        raise ValueError(f"properties that are not numbers: {', '.join(lists)}")
 
 
 def _bytes(color, path):

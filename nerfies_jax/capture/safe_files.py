@@ -1,8 +1,8 @@
 """Safe opening of untrusted files: regular, inside their folder, bounded in size.
 
-Every reader of a capture opens its files through this module, or checks them here right
-before it gives their path to a library. A link that leads out of the capture is refused
-at that moment, so the target of a name when it was looked up does not count.
+All readers of captures open files through this module, or check them right before they
+pass the path to a library. Links that lead out of the capture are therefore refused
+when the file is opened, even if the link changed after the name was checked.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ AnyPath = str | os.PathLike
 Parameters = ParamSpec("Parameters")
 Content = TypeVar("Content")
 
-# The real path of the folder that the files being read must lie in, if there is one.
+# Real path of the folder that all files must lie in, None for any.
 _folder: contextvars.ContextVar[str | None] = contextvars.ContextVar(
     "folder", default=None
 )
@@ -30,9 +30,10 @@ _folder: contextvars.ContextVar[str | None] = contextvars.ContextVar(
 
 @contextlib.contextmanager
 def confined(folder: AnyPath) -> Iterator[None]:
-    """Refuse files outside a folder while the block reads.
+    """Refuse to open files outside of a folder within the block.
 
-    Functions for the threads of a pool are confined by `carried`.
+    The restriction does not extend to other threads. Wrap their functions with
+    `carried`.
 
     Args:
       folder: The folder.
@@ -50,7 +51,7 @@ def confined(folder: AnyPath) -> Iterator[None]:
 def confines(
     read: Callable[Concatenate[AnyPath, Parameters], Content],
 ) -> Callable[Concatenate[AnyPath, Parameters], Content]:
-    """Decorate a reader of a capture so that it can open files of that capture only.
+    """Decorate a reader of captures so that it can only open files of the capture.
 
     Args:
       read: Reader that takes the path of a folder, or of a file whose folder is the
@@ -72,7 +73,7 @@ def confines(
 
 
 def carried(function: Callable[..., Content]) -> Callable[..., Content]:
-    """Confine a function like its caller now, in whatever thread it runs.
+    """Wrap a function so that the caller's `confined` folder holds in other threads.
 
     Args:
       function: The function.
@@ -130,16 +131,16 @@ def open_file(path: AnyPath) -> io.BufferedReader:
     path = pathlib.Path(path)
     _check_folder(path)
     try:
-        # A pipe in place of the file would block an ordinary open.
+        # Nonblocking, since opening a named pipe would block otherwise.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-        opened = os.open(path, flags)
+        descriptor = os.open(path, flags)
     except (OSError, ValueError) as error:
         raise _missing(path, error) from None
     try:
-        _check_kind(path, os.fstat(opened).st_mode)
-        return os.fdopen(opened, "rb")
+        _check_kind(path, os.fstat(descriptor).st_mode)
+        return os.fdopen(descriptor, "rb")
     except BaseException:
-        os.close(opened)
+        os.close(descriptor)
         raise
 
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from nerfies_jax.capture.capture import Capture, point_depths
 
-MIN_POINTS = 100  # below, the capture's points do not say where the scene is
-# Share of points on either side that are taken for outliers of structure from motion.
+MIN_POINTS = 100  # fewer points do not determine the bounds of the scene
+# Share of points at either end taken for outliers of structure from motion.
 OUTLIERS = 0.02
 
 
@@ -20,11 +20,11 @@ class SceneMetadata:
     far: float
     center: tuple[float, float, float]  # of the captured volume, scene units
     scale: float  # field = (scene - center) * scale
-    background: tuple[float, float, float] | None  # color behind everything, if known
-    times: tuple[float, ...]  # distinct times that are learned from, rising
-    # For each appearance id the rows of the table of codes it lies between, and where:
-    # (left, right, progress). An exposure that is not learned from lies between those
-    # before and after it in time.
+    background: tuple[float, float, float] | None  # sRGB in [0, 1], if known
+    times: tuple[float, ...]  # distinct times of the training frames, ascending
+    # For each appearance id, two rows of the table of codes and the weight between them
+    # (left, right, weight). The code of an appearance that no training frame has is
+    # interpolated between those before and after it in time.
     exposures: tuple[tuple[int, int, float], ...]
     available_data: frozenset[str] = frozenset()  # of "depths", "points", "flow"
 
@@ -67,27 +67,28 @@ def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
 
 
 def _span(capture):
-    """The z-depths to sample: the capture's, tightened to where its points lie.
+    """Near and far planes of the capture, tightened to the depths of its points.
 
-    The near plane of a Nerfies capture is often much nearer than anything filmed (0.05
-    where the first point is at 0.4), and samples there are lost.
+    The near plane of a Nerfies capture is often much nearer than the scene (0.05 where
+    the first point is at 0.4), and samples in the empty space between are wasted.
     """
     depth = point_depths(capture)
-    # Points beyond the far plane are not observed. If all were, near would exceed far.
+    # Points beyond the far plane are ignored, or near could exceed far.
     depth = depth[depth < capture.far]
     if depth.size < MIN_POINTS:
         return float(capture.near), float(capture.far)
     low, high = np.quantile(depth, (OUTLIERS, 1 - OUTLIERS))
-    near = max(capture.near, 0.6 * float(low))  # what moves is nearer than its wall
+    # Moving objects have few points and stand in front of the static background.
+    near = max(capture.near, 0.6 * float(low))
     return float(near), float(min(capture.far, 1.2 * float(high)))
 
 
 def _box(capture, near, far):
-    """Center and longest half side of the captured volume."""
+    """Center and longest half side of the bounding box of the captured volume."""
     if capture.points is not None and len(capture.points.position) >= MIN_POINTS:
         positions = capture.points.position
         low, high = np.quantile(positions, (OUTLIERS, 1 - OUTLIERS), axis=0)
-        # In front of what structure from motion finds there is what moves.
+        # Moving objects stand in front of the points of structure from motion.
         near_points = _frustum_points(capture, near, near)
         low = np.minimum(low, np.quantile(near_points, 0.1, axis=0))
         high = np.maximum(high, np.quantile(near_points, 0.9, axis=0))
@@ -99,14 +100,14 @@ def _box(capture, near, far):
 
 
 def _frustum_points(capture, near, far, depths=8):
-    """Corners and centers of the images at some depths, in scene units.
+    """Corners, edge midpoints and centers of the images at some depths, in scene units.
 
-    Without skew and distortion: they say roughly where the scene is.
+    Skew and distortion are ignored, since the bounds are approximate.
     """
     cameras = capture.cameras
     rows = capture.train
     width, height = capture.size
-    turn = cameras.camera_from_world[rows]
+    rotation = cameras.camera_from_world[rows]
     focal = cameras.focal_px[rows]
     focal = np.stack([focal, focal * cameras.pixel_aspect[rows]], axis=1)
     middle = cameras.principal_point_px[rows]
@@ -114,7 +115,7 @@ def _frustum_points(capture, near, far, depths=8):
     for x, y in itertools.product((0.0, width / 2, width), (0.0, height / 2, height)):
         offset = (np.array([x, y]) - middle) / focal
         ray = np.concatenate([offset, np.ones((len(rows), 1))], axis=1)
-        world = np.einsum("fki,fk->fi", turn, ray)
+        world = np.einsum("fki,fk->fi", rotation, ray)
         for depth in np.linspace(near, far, depths):
             points.append(cameras.position[rows] + depth * world)
     return np.concatenate(points)
@@ -127,31 +128,35 @@ def exposures(capture: Capture) -> tuple[tuple[int, int, float], ...]:
       capture: The capture.
 
     Returns:
-      Two rows of the table of trained ids and the position between them, for each id.
+      For each appearance id, two rows of the table of trained ids and the weight of the
+      second.
     """
     ids = np.asarray(capture.appearance_ids)
-    learned = np.unique(ids[capture.train])
-    row_of = {int(learned_id): row for row, learned_id in enumerate(learned)}
-    when = {
-        int(one): float(np.mean(capture.times[ids == one])) for one in np.unique(ids)
+    trained_ids = np.unique(ids[capture.train])
+    row_of = {int(trained_id): row for row, trained_id in enumerate(trained_ids)}
+    time_of = {
+        int(frame_id): float(np.mean(capture.times[ids == frame_id]))
+        for frame_id in np.unique(ids)
     }
-    by_time = sorted(row_of, key=lambda one: when[one])
-    places = []
-    for one in range(int(ids.max()) + 1):
-        if one in row_of:
-            places.append((row_of[one], row_of[one], 0.0))
-        elif one in when:
-            places.append(_between(when[one], by_time, when, row_of))
+    by_time = sorted(row_of, key=lambda trained_id: time_of[trained_id])
+    trained_times = [time_of[trained_id] for trained_id in by_time]
+    exposures = []
+    for frame_id in range(int(ids.max()) + 1):
+        if frame_id in row_of:
+            exposures.append((row_of[frame_id], row_of[frame_id], 0.0))
+        elif frame_id in time_of:
+            left, right, weight = _interpolate(time_of[frame_id], trained_times)
+            exposures.append((row_of[by_time[left]], row_of[by_time[right]], weight))
         else:
-            places.append((0, 0, 0.0))  # no frame has this id
-    return tuple(places)
+            exposures.append((0, 0, 0.0))  # no frame has this id
+    return tuple(exposures)
 
 
-def _between(time, by_time, when, row_of):
-    times = [when[one] for one in by_time]
+def _interpolate(time, times):
+    """Indices of the sorted times around a time, and the weight of the second."""
     right = int(np.searchsorted(times, time))
     left = max(right - 1, 0)
     right = min(right, len(times) - 1)
     gap = times[right] - times[left]
-    progress = (time - times[left]) / gap if gap > 0 else 0.0
-    return row_of[by_time[left]], row_of[by_time[right]], float(progress)
+    weight = (time - times[left]) / gap if gap > 0 else 0.0
+    return left, right, float(weight)

@@ -22,7 +22,7 @@ def linear_from_srgb(value: ArrayLike | float) -> np.ndarray:
     """Convert sRGB values to linear light.
 
     Args:
-      value: sRGB values in [0, 1]. Values outside continue with the same formulas.
+      value: sRGB values in [0, 1]. The formulas extend to values outside.
 
     Returns:
       Linear light.

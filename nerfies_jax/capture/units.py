@@ -1,4 +1,4 @@
-"""Conversion between scene units and the world units of a capture's own files."""
+"""Conversion between scene units and the world units of a capture's files."""
 
 from typing import Literal
 
@@ -43,13 +43,13 @@ def usual_depth(capture: Capture) -> float:
 
 
 def float32_step(points: np.ndarray) -> float:
-    """Return the largest spacing of float32 numbers at some coordinates.
+    """Return the spacing of float32 numbers at the largest of some coordinates.
 
     Args:
       points: Coordinates of any shape.
 
     Returns:
-      The distance.
+      The spacing, in the unit of the coordinates.
     """
     largest = np.abs(points).max(initial=0.0)
     return float(np.spacing(np.float32(largest)))

@@ -1,4 +1,4 @@
-"""Keys of JSON files that no reader knows, which may change the scene."""
+"""Detection of unknown keys in JSON files, which may affect the scene."""
 
 import pathlib
 from collections.abc import Collection, Mapping
@@ -16,20 +16,20 @@ def notes(
 
     Args:
       file: A file whose top level is an object.
-      known: Its keys that are read, or that change nothing. None for any.
-      inner: The same of the objects in lists or objects under some keys; under the key
-        None of those at the top level.
+      known: Known keys of the top level. None to accept any.
+      inner: Known keys of the entries of a list or object, by its key. The key None
+        stands for the top level itself.
 
     Returns:
-      A note, or none.
+      A note, or an empty tuple if all keys are known.
     """
     table = read_json(file, dict[str, Any])
     keys = set() if known is None else set(table) - set(known)
-    for key, inside in inner.items():
+    for key, known_inner in inner.items():
         entries = table if key is None else table.get(key, ())
         entries = entries.values() if isinstance(entries, dict) else entries
         for entry in entries:
-            keys |= set(entry) - set(inside)
+            keys |= set(entry) - set(known_inner)
     if not keys:
         return ()
     return (f"keys of {file.name} that are not read: {', '.join(sorted(keys))}",)

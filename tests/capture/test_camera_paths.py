@@ -190,7 +190,7 @@ def test_a_path_passes_its_keyframes_and_overshoots_nothing():
     assert path.times.max() <= np.float32(0.8) + 1e-6
     assert (np.diff(path.times[:11]) > 0).all()
     cameras.validate(path.cameras, path.size)
-    with pytest.raises(ValueError, match=r"1 keyframe\(s\) are no path"):
+    with pytest.raises(ValueError, match=r"1 keyframe\(s\); a camera path needs"):
         keyframes.through(frames[:1], (40, 30), 31)
-    with pytest.raises(ValueError, match="choose 4 to"):
+    with pytest.raises(ValueError, match="expected 4 to"):
         keyframes.through(frames, (40, 30), 3)

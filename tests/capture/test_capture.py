@@ -159,7 +159,7 @@ def test_downscale_averages_each_block(size, factor):
 
 def test_describe_says_what_was_found():
     text = "\n".join(capturing.describe(make(notes=("mended a thing",))))
-    for words in ("4 frames of 6x4", "3 to learn from", "1 held out", "mended a thing"):
+    for words in ("4 frames of 6x4", "3 for training", "1 held out", "mended a thing"):
         assert words in text
     bare = dataclasses.replace(
         make(), valid=None, moving=None, depths=None, points=None

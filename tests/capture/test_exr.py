@@ -113,7 +113,7 @@ def test_a_file_cut_short_is_refused(tmp_path, kept):
 
 
 def test_a_bomb_is_refused_before_it_is_decoded(tmp_path):
-    with pytest.raises(CaptureError, match="no such picture"):
+    with pytest.raises(CaptureError, match="no such image"):
         exr.read_exr(tmp_path / "a.exr")
     exr.write_exr(tmp_path / "a.exr", COLOR)
     data = (tmp_path / "a.exr").read_bytes()

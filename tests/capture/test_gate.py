@@ -129,7 +129,7 @@ def test_depths_of_transforms_are_said_not_to_be_read(tmp_path):
 
 def test_nothing_observed_or_nothing_static_is_refused():
     capture = tiny_capture()
-    refused(changed(valid=filled(False)), "no pixel of the .* frames to learn from")
+    refused(changed(valid=filled(False)), "no pixel of the .* training frames")
     valid = filled(True)
     valid[capture.heldout] = False
     refused(changed(valid=valid), "no pixel of the .* held-out frames")

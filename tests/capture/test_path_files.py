@@ -113,9 +113,11 @@ def test_folders_of_no_cameras_or_of_several_sizes_are_refused(tmp_path):
     entry = tmp_path / "path" / "000002.json"
     table = json.loads(entry.read_text()) | {"image_size": [32, 36]}
     entry.write_text(json.dumps(table))
-    with pytest.raises(CaptureError, match="a film has one size"):
+    with pytest.raises(CaptureError, match="all images of a video have one size"):
         path_files.read(tmp_path / "path", capture)
-    with pytest.raises(CaptureError, match="no camera path of that name; there are s"):
+    with pytest.raises(
+        CaptureError, match="nor the name of a camera path; there are s"
+    ):
         path_files.named(str(tmp_path / "nowhere"), capture, None)
 
 

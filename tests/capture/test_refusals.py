@@ -74,7 +74,7 @@ CAPTURES = [
     ({"heldout": np.array([-1])}, "row -1"),
     ({"train": np.array([1, 1])}, "twice"),
     ({"train": np.array([1.0])}, "row numbers"),
-    ({"train": np.array([], int)}, "no frame to learn from"),
+    ({"train": np.array([], int)}, "no training frames"),
     ({"heldout": np.array([2])}, "'f2' is both"),
     (cloud([np.inf] * 3, [np.inf] * 3), "2 scene points"),
     (cloud([0.0] * 3, [0.0] * 3, colors=1), "(1, 3)"),
@@ -126,7 +126,10 @@ def test_a_capture_that_cannot_be_right_is_refused_in_one_line(changes, refusal)
 
 REFUSED = [
     *(
-        (lambda n=n: capturing.downscale(make(), n), "test: cannot make 6x4 pictures")
+        (
+            lambda n=n: capturing.downscale(make(), n),
+            "test: cannot downscale 6x4 images",
+        )
         for n in (0, 5, -1)
     ),
     (lambda: dataclasses.replace(SCENE, frames=1), "frames=1 must be at least 2"),

@@ -99,7 +99,7 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_pictures_without_texture_are_refused_and_leave_nothing(tmp_path):
     film(tmp_path / "pictures", 3, plain=True)
-    with pytest.raises(CaptureError, match="only 0 of 3 pictures"):
+    with pytest.raises(CaptureError, match="only 0 of 3 images"):
         mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["pictures"]
 
@@ -108,7 +108,7 @@ def test_what_cannot_work_is_said_before_it_starts(tmp_path):
     with pytest.raises(CaptureError, match="no such folder"):
         mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
     film(tmp_path / "pictures", 2)
-    with pytest.raises(CaptureError, match="2 pictures"):
+    with pytest.raises(CaptureError, match="2 images"):
         mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
     film(tmp_path / "more", 3)
     (tmp_path / "masks").mkdir()
@@ -120,7 +120,9 @@ def test_doubtful_cameras_say_what_to_do():
     good = mapping.Poses(None, 100, 95, 3000, 0.5, 6.0)
     assert len(good.lines()) == 1
     _, *doubts = good._replace(placed=60, error_px=2.5, angle_deg=0.4).lines()
-    for doubt, words in zip(doubts, ("2.50 px", "0.4 degrees", "40 pict"), strict=True):
+    for doubt, words in zip(
+        doubts, ("2.50 px", "0.4 degrees", "40 image"), strict=True
+    ):
         assert words in doubt
     assert "200 frames" in doubts[2]
 

@@ -262,7 +262,7 @@ def test_the_command_measures_arms_and_goes_on_where_it_stopped(
         monkeypatch.setattr(cache_files, "_reported", set())
         with pytest.raises(AssertionError, match="trained an arm"):
             run(*tiny, "--arms", "static")
-        assert "static-0.json: of no use" in capsys.readouterr().err
+        assert "static-0.json: unusable" in capsys.readouterr().err
     # With no time left nothing is begun, and what is finished is reported.
     monkeypatch.setattr(Job, "is_over", lambda *_: True)
     assert run(*tiny, "--arms", "nerfies", "translation") == 0

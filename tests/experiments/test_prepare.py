@@ -109,7 +109,7 @@ def test_a_film_without_texture_is_refused_and_leaves_nothing(tmp_path, capsys):
     with pytest.raises(SystemExit) as caught:
         prepare.main(["video", str(tmp_path / "a.mp4"), str(tmp_path / "out")])
     assert caught.value.code == 2
-    assert f"{tmp_path / 'a.mp4'}: only 0 of 6 pictures" in capsys.readouterr().err
+    assert f"{tmp_path / 'a.mp4'}: only 0 of 6 images" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
 
 

@@ -124,7 +124,7 @@ def product(name):
 
 def is_at(moment, command, folder):
     """Whether a run that may have been there before has begun and is at a moment."""
-    return "to learn from" in command.said() and moment(folder)
+    return "for training" in command.said() and moment(folder)
 
 
 # In the order of a run: each is waited for where the run was left at the one before.

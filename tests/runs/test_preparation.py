@@ -141,7 +141,7 @@ def test_where_too_few_are_placed_what_moves_is_masked_before(
 
     def too_few_unmasked(pictures, out, masks, spec):
         if masks is None:
-            raise FewPlaced(f"{pictures}: only 1 of 9 pictures found their place")
+            raise FewPlaced(f"{pictures}: only 1 of 9 images could be registered")
         return mapper(pictures, out, masks, spec)
 
     monkeypatch.setattr(preparation, "run_sfm", too_few_unmasked)

@@ -236,7 +236,7 @@ def test_every_button_of_the_camera_path(browser, tmp_path):
         each.tab.get_by_role("button", name="✕", exact=True).nth(0).click()
         each.until(lambda: len(path.keyframes) == 1)
         each.press("render")
-        each.tab.get_by_text("add at least two").wait_for()
+        each.tab.get_by_text("needs at least two").wait_for()
         each.drag(80, -30)
         start = each.still_eye()
         each.press("add keyframe")
