@@ -104,7 +104,7 @@ class Job:
             self.known = protocol.ground_truth(
                 self.capture, truth, args.frames, args.tracks
             )
-            self.told = truths.told(self.capture, truth)
+            self.told = truths.with_truth(self.capture, truth)
             return
         self.told = None
         stored = runs.stored_capture(source)

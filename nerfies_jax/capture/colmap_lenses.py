@@ -1,4 +1,4 @@
-"""Resampling of images with unsupported lens models to a pinhole."""
+"""Undistortion of images with unsupported lens models to a pinhole camera."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,13 +18,13 @@ def undistort(
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray | None], Any]:
     """Resample images to one pinhole camera.
 
-    The pinhole is the one that COLMAP's own undistorter chooses for the first lens.
-    Images are sampled with a Lanczos filter, masks at the nearest pixel. Pixels that
-    look past the outermost pixel centers of the source do not exist and are black.
+    The pinhole is the one that COLMAP's undistorter chooses for the first lens. Images
+    are sampled with a Lanczos filter, masks at the nearest pixel. Pixels outside of the
+    outermost pixel centers of the source image do not exist and are black.
 
     Args:
       images: uint8 images, [frames, height, width, 3].
-      masks: Masks [frames, height, width], or None, all resampled alike.
+      masks: Masks [frames, height, width], or None.
       lenses: One pycolmap.Camera per frame.
       where: Name of the capture in error messages.
 
@@ -46,27 +46,29 @@ def undistort(
     )
     out = np.zeros((len(images), height, width, 3), np.uint8)
     exists = np.zeros(out.shape[:3], bool)
-    bent = [None if mask is None else np.zeros(out.shape[:3], bool) for mask in masks]
+    out_masks = [
+        None if mask is None else np.zeros(out.shape[:3], bool) for mask in masks
+    ]
     maps = {}
     for row, lens in enumerate(lenses):
         key = (lens.model_name, *lens.params)
         if key not in maps:
             maps[key] = _source_pixels(lens, rays, images.shape[1:3], (height, width))
-        place, inside = maps[key]
+        index, inside = maps[key]
         if not inside.any():
             raise CaptureError(
-                f"{where}: the {lens.model_name} lens of frame {row} covers none of "
-                "its undistorted picture; calibrate it again"
+                f"{where}: the {lens.model_name} lens of frame {row} covers no pixel "
+                "of its undistorted image; calibrate it again"
             )
         exists[row] = inside
-        out[row] = resampling.lanczos(images[row], place) * inside[..., None]
-        for target, mask in zip(bent, masks, strict=True):
+        out[row] = resampling.lanczos(images[row], index) * inside[..., None]
+        for target, mask in zip(out_masks, masks, strict=True):
             if target is not None and mask is not None:
-                target[row] = resampling.nearest(mask[row], place) & inside
-    return out, exists, bent, pinhole
+                target[row] = resampling.nearest(mask[row], index) & inside
+    return out, exists, out_masks, pinhole
 
 
 def _source_pixels(lens, rays, source_shape, target_shape):
-    """Array coordinates [2, height, width] in the source, and whether inside it."""
+    """Array coordinates [2, height, width] in the source, and a mask of valid ones."""
     pixel = lens.img_from_cam(rays).reshape(*target_shape, 2)
     return resampling.array_places(pixel, source_shape[::-1])

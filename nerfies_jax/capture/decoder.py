@@ -1,9 +1,9 @@
 """Decoding in a child process with limits of memory and time.
 
-Native decoders (pycolmap, OpenEXR, FFmpeg, Pillow for large images) crash, loop or
-allocate without bound on damaged files. `decoder_child` runs them, and only plain
-arrays and JSON come back. The child ends with this process, however that ends. One
-child serves all requests inside a `session`, because starting one takes 0.3 s.
+Native decoders (pycolmap, OpenEXR, FFmpeg, Pillow for large images) may crash, loop
+forever or allocate without bound on damaged files. They run in `decoder_child`, which
+returns only arrays and JSON. The child ends with this process in any case. One child
+serves all requests within a `session`, because starting one takes 0.3 s.
 """
 
 import contextlib
@@ -20,21 +20,22 @@ import numpy as np
 from nerfies_jax.capture.errors import FileError
 from nerfies_jax.runtime import children
 
-CPU_SECONDS = 5.0  # for a file of any size, besides what `request` adds
-WALL_SECONDS = 120.0  # without an answer: other programs may take the processor
-MEMORY_BYTES = 3 * 2**29  # of address space, on top of the child's libraries
+CPU_SECONDS = 5.0  # for a file of any size, in addition to that of the request
+# Without an answer. Long, since other programs may use the processor.
+WALL_SECONDS = 120.0
+MEMORY_BYTES = 3 * 2**29  # of address space, in addition to the child's libraries
 MAX_HEADER = 2**28  # bytes of the JSON of an answer
 MAX_ANSWER = 2**36  # bytes of its arrays
-# By signal: SIGXCPU, SIGKILL of the timer, SIGABRT of a failed check.
-_ENDINGS = {-24: "took too much processor time", -9: "took too long", -6: "gave up"}
-_KINDS = "biuf"  # of NumPy types that an answer may have
+# By exit code: SIGXCPU, SIGKILL by the timer, SIGABRT of a failed assertion.
+_ENDINGS = {-24: "took too much processor time", -9: "took too long", -6: "aborted"}
+_KINDS = "biuf"  # kinds of NumPy types that an answer may have
 
 
 class DecoderError(FileError):
-    """Defect of a file as the child reported it, or the way in which the child ended.
+    """A defect of a file that the child reported, or an unexpected end of the child.
 
     Attributes:
-      has_advice: True if the message names the remedy, and lacks only the path.
+      has_advice: True if the message includes the remedy, and lacks only the path.
     """
 
     has_advice = False
@@ -48,7 +49,7 @@ class Answer(NamedTuple):
 
 
 class Decoder:
-    """A child process that decodes one file after the other. Threads may share it."""
+    """A child process that decodes one file after the other, for any thread."""
 
     def __init__(self):
         self._child: subprocess.Popen | None = None
@@ -65,17 +66,17 @@ class Decoder:
 
         Args:
           operation: Name of the operation.
-          cpu_seconds: Processor time that the file may take, besides `CPU_SECONDS`.
-          memory_bytes: Memory that it may take, besides `MEMORY_BYTES`.
+          cpu_seconds: Processor time allowed in addition to `CPU_SECONDS`.
+          memory_bytes: Memory allowed in addition to `MEMORY_BYTES`.
           **arguments: Arguments of the operation, as JSON values.
 
         Returns:
           The answer.
 
         Raises:
-          DecoderError: If the file is damaged, or takes too much.
+          DecoderError: If the file is damaged, or exceeds a limit.
         """
-        # To its end: a stream that is given up takes the child with it.
+        # Exhausted, since a stream that is closed early ends the child.
         answers = [*self.stream(operation, cpu_seconds, memory_bytes, **arguments)]
         if not answers:
             raise DecoderError("no answer from its decoder")
@@ -88,7 +89,7 @@ class Decoder:
         memory_bytes: int = 0,
         **arguments: Any,
     ) -> Generator[Answer, None, None]:
-        """Run an operation with any number of answers, as they come.
+        """Run an operation with any number of answers.
 
         Args:
           operation: As for `request`.
@@ -97,7 +98,7 @@ class Decoder:
           **arguments: As for `request`.
 
         Yields:
-          The answers. The limit of time is for one answer.
+          The answers as they arrive. The time limit holds for each answer.
 
         Raises:
           DecoderError: As for `request`.
@@ -118,15 +119,15 @@ class Decoder:
                 ) is not None:
                     yield answer
                 complete = True
-            except _Told as error:
+            except _ReportedError as error:
                 complete = True
-                told = DecoderError(str(error))
-                told.has_advice = error.has_advice
-                raise told from None
+                reported = DecoderError(str(error))
+                reported.has_advice = error.has_advice
+                raise reported from None
             except (OSError, ValueError, EOFError, KeyError, TypeError) as error:
                 raise DecoderError(self._ending(error)) from None
             finally:
-                if not complete:  # what it would say yet is of no use
+                if not complete:  # its remaining answers would confuse the next request
                     self.close()
 
     def _running(self):
@@ -144,18 +145,12 @@ class Decoder:
         return self._child
 
     def _ending(self, error):
-        """Words for how the child ended before it answered."""
-        child = self._child
+        """Describe how the child ended before it answered."""
         try:
-            code = child.wait(1.0)
+            code = self._child.wait(1.0)
         except subprocess.TimeoutExpired:
             return f"no answer from its decoder ({type(error).__name__})"
-        names = {
-            -24: "took too much processor time",
-            -9: "took too long",
-            -6: "aborted",
-        }
-        return f"its decoder {names.get(code, f'ended with code {code}')}"
+        return f"its decoder {_ENDINGS.get(code, f'ended with code {code}')}"
 
     def close(self) -> None:
         """End the child, if there is one."""
@@ -170,8 +165,8 @@ class Decoder:
         child.wait()
 
 
-class _Told(Exception):
-    """The child found out what is wrong."""
+class _ReportedError(Exception):
+    """An error message of the child."""
 
     def __init__(self, message, has_advice):
         super().__init__(message)
@@ -191,7 +186,7 @@ def _next_answer(child, seconds):
         if head.get("end"):
             return None
         if "error" in head:
-            raise _Told(str(head["error"]), bool(head["has_advice"]))
+            raise _ReportedError(str(head["error"]), bool(head["has_advice"]))
         arrays, total = {}, 0
         for name, kind, shape in head["arrays"]:
             dtype = np.dtype(str(kind))
@@ -213,15 +208,15 @@ def _next_answer(child, seconds):
         timer.cancel()
 
 
-_shared: Decoder | None = None  # for requests
-_spare: Decoder | None = None  # for the next stream
+_shared: Decoder | None = None  # serves requests
+_spare: Decoder | None = None  # kept for the next stream
 _sessions = 0
 _sessions_lock = threading.Lock()
 
 
 @contextlib.contextmanager
 def session() -> Iterator[Decoder]:
-    """Keep one child for all requests of the block, and of blocks inside it.
+    """Keep one child for all requests of the block and of nested blocks.
 
     Yields:
       The decoder.
@@ -246,9 +241,9 @@ def session() -> Iterator[Decoder]:
 
 @contextlib.contextmanager
 def streaming() -> Iterator[Decoder]:
-    """Use a child for one stream, while others serve requests in between.
+    """Reserve a child for one stream, while other children serve requests.
 
-    Inside a `session` it is kept for the next stream.
+    Within a `session` the child is kept for the next stream.
 
     Yields:
       The decoder.

@@ -1,4 +1,4 @@
-"""Undistortion of captures for pinhole renderers, and distortion of renders."""
+"""Undistortion of captures for renderers that support only pinhole cameras."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,10 +18,10 @@ from nerfies_jax.runtime import events
 def as_pinholes(capture: Capture) -> Capture:
     """Undistort a capture to pinhole cameras.
 
-    Focal lengths, principal points and image sizes are unchanged. Pixels that the lens
-    did not observe are marked in `valid`. Color is sampled with a Lanczos filter, masks
-    and depth at the nearest pixel. z-depth needs no change, since a ray keeps its
-    points. Flow is dropped, since both of its ends would move.
+    Focal lengths, principal points and image sizes are unchanged. Pixels outside of the
+    distorted image are marked in `valid`. Color is sampled with a Lanczos filter, masks
+    and depth at the nearest pixel. The z-depth of a point does not depend on the lens.
+    Flow is dropped, since both of its ends would have to be resampled.
 
     Args:
       capture: The capture.
@@ -32,7 +32,7 @@ def as_pinholes(capture: Capture) -> Capture:
     if not has_lens(capture.cameras):
         return capture
     images = np.empty_like(capture.images)
-    filmed = np.empty(images.shape[:3], bool)
+    valid = np.empty(images.shape[:3], bool)
     masks: dict[str, Any] = {
         name: None if array is None else np.empty_like(array)
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
@@ -40,24 +40,22 @@ def as_pinholes(capture: Capture) -> Capture:
     maps = Maps(_source_pixels, capture.size)
     with events.stage("undistorting images", len(images)) as stage:
         for row in range(len(images)):
-            place, inside = maps.of(cameras.take(capture.cameras, row))
-            images[row] = resampling.lanczos(capture.images[row], place)
+            index, inside = maps.of(cameras.take(capture.cameras, row))
+            images[row] = resampling.lanczos(capture.images[row], index)
             images[row][~inside] = 0
-            filmed[row] = inside
+            valid[row] = inside
             if capture.valid is not None:
-                filmed[row] &= resampling.nearest(capture.valid[row], place)
+                valid[row] &= resampling.nearest(capture.valid[row], index)
             for name, array in masks.items():
                 if array is not None:
                     source = getattr(capture, name)[row]
-                    array[row] = np.where(inside, resampling.nearest(source, place), 0)
+                    array[row] = np.where(inside, resampling.nearest(source, index), 0)
             stage.advance()
-    note = (
-        f"lens distortion taken out; {1 - filmed.mean():.1%} of the pixels are unseen"
-    )
+    note = f"images undistorted; {1 - valid.mean():.1%} of their pixels are unobserved"
     return dataclasses.replace(
         capture,
         images=images,
-        valid=None if filmed.all() else filmed,
+        valid=None if valid.all() else valid,
         cameras=pinhole(capture.cameras),
         flow=None,
         notes=(*capture.notes, note),
@@ -65,43 +63,43 @@ def as_pinholes(capture: Capture) -> Capture:
     )
 
 
-def scorable(filmed: Capture, traced: bool) -> Capture:
-    """Mark the pixels of a distorted capture that renders can be compared with.
+def scorable(capture: Capture, traced: bool) -> Capture:
+    """Restrict the masks of a distorted capture to pixels that can be evaluated.
 
-    Images stay distorted. Pixels that no renderer can predict are no longer `valid`,
-    and their depth is unknown: those for which the lens model has no ray and, unless
-    rays are traced through the lens, those outside the pinhole image of the same focal
-    length and size that is rendered instead.
+    Images stay distorted. Pixels without a prediction are no longer `valid`, and their
+    depth becomes unknown. These are pixels for which the lens model has no ray and,
+    unless rays are traced through the lens, pixels outside of the rendered pinhole
+    image, which has the same focal length and size.
 
     Args:
-      filmed: The capture with its original images.
+      capture: The capture with its original images.
       traced: True if the renderer traces rays through the lens.
 
     Returns:
       The capture with its masks and depth restricted, or the same one if it has no
       distortion.
     """
-    if not has_lens(filmed.cameras):
-        return filmed
-    maps = Maps(_rays_exist if traced else pinhole_places, filmed.size)
-    drawn = np.stack(
+    if not has_lens(capture.cameras):
+        return capture
+    maps = Maps(_rays_exist if traced else pinhole_places, capture.size)
+    predicted = np.stack(
         [
-            maps.of(cameras.take(filmed.cameras, row))[1]
-            for row in range(len(filmed.ids))
+            maps.of(cameras.take(capture.cameras, row))[1]
+            for row in range(len(capture.ids))
         ]
     )
-    depths = filmed.depths
-    valid = drawn if filmed.valid is None else filmed.valid & drawn
-    before = 1.0 if filmed.valid is None else filmed.valid.mean()
-    if valid.mean() == before:
-        return filmed
-    what = "have no ray" if traced else "lie beyond the pinhole that is drawn"
-    note = f"{before - valid.mean():.2%} of the pixels {what}, and are not scored"
+    depths = capture.depths
+    valid = predicted if capture.valid is None else capture.valid & predicted
+    share_before = 1.0 if capture.valid is None else capture.valid.mean()
+    if valid.mean() == share_before:
+        return capture
+    reason = "have no ray" if traced else "lie outside of the rendered pinhole image"
+    note = f"{share_before - valid.mean():.2%} of the pixels {reason}: not evaluated"
     return dataclasses.replace(
-        filmed,
+        capture,
         valid=valid,
-        notes=(*filmed.notes, note),
-        depths=None if depths is None else np.where(drawn, depths, np.float32(0)),
+        notes=(*capture.notes, note),
+        depths=None if depths is None else np.where(predicted, depths, np.float32(0)),
     )
 
 
@@ -133,11 +131,15 @@ class Maps:
     """Resampling maps for cameras of one image size, cached by intrinsics.
 
     Frames of one physical camera share a map, since it does not depend on the pose.
+
+    Args:
+      places: Function that computes the map of a camera and an image size.
+      size: Width and height of the images in pixels.
     """
 
     def __init__(self, places: Callable, size: tuple[int, int]):
         self._places, self._size = places, size
-        self._kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+        self._cache: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def of(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return the map of a camera.
@@ -150,9 +152,9 @@ class Maps:
           [height, width].
         """
         key = b"".join(np.asarray(leaf).tobytes() for leaf in camera[2:])
-        if key not in self._kept:
-            self._kept[key] = self._places(camera, self._size)
-        return self._kept[key]
+        if key not in self._cache:
+            self._cache[key] = self._places(camera, self._size)
+        return self._cache[key]
 
 
 def pinhole_places(
@@ -170,16 +172,16 @@ def pinhole_places(
       Array coordinates [2, height, width] as in `resampling.array_places`, and booleans
       of the pixels inside the undistorted image [height, width].
     """
-    slopes, single = _straight(*_lens(camera), _slopes(camera, size))
-    slopes = np.where(np.asarray(single)[:, None], np.asarray(slopes), np.nan)
-    return resampling.array_places(_pixels(camera, slopes, size), size)
+    plane, is_unique = _undistort(*_lens(camera), _pixel_grid(camera, size))
+    plane = np.where(np.asarray(is_unique)[:, None], np.asarray(plane), np.nan)
+    return resampling.array_places(_pixels(camera, plane, size), size)
 
 
 def _rays_exist(camera, size):
-    """The pixels themselves, and whether the lens model has a ray for each."""
-    _, single = _straight(*_lens(camera), _slopes(camera, size))
-    place = np.indices(size[::-1], np.float32)
-    return place, np.asarray(single).reshape(size[::-1])
+    """The identity map, and booleans of the pixels for which the lens has a ray."""
+    _, is_unique = _undistort(*_lens(camera), _pixel_grid(camera, size))
+    index = np.indices(size[::-1], np.float32)
+    return index, np.asarray(is_unique).reshape(size[::-1])
 
 
 def _lens(camera):
@@ -187,30 +189,31 @@ def _lens(camera):
 
 
 @jax.jit
-def _straight(radial, tangential, bent):
-    """Slopes of the rays that the lens bends to these, and whether there are any."""
-    return jax.vmap(distortion.undistort, (None, None, 0))(radial, tangential, bent)
+def _undistort(radial, tangential, distorted):
+    """Undistorted image-plane positions, and booleans of those that exist."""
+    each = (None, None, 0)
+    return jax.vmap(distortion.undistort, each)(radial, tangential, distorted)
 
 
 @jax.jit
-def _bent(radial, tangential, slopes):
+def _distort(radial, tangential, plane):
     """Distorted image-plane positions, and booleans where the lens is one-to-one."""
     each = (None, None, 0)
-    bent = jax.vmap(distortion.distort, each)(radial, tangential, slopes)
-    return bent, jax.vmap(distortion.one_to_one, each)(radial, tangential, slopes)
+    distorted = jax.vmap(distortion.distort, each)(radial, tangential, plane)
+    return distorted, jax.vmap(distortion.one_to_one, each)(radial, tangential, plane)
 
 
 def _source_pixels(camera, size):
     """Locate each undistorted pixel in the distorted image, with booleans of success.
 
-    Where the lens model folds back there is no pixel at all.
+    There is no such pixel where the lens model is not one-to-one.
     """
-    bent, single = _bent(*_lens(camera), _slopes(camera, size))
-    bent = np.where(np.asarray(single)[:, None], np.asarray(bent), np.nan)
-    return resampling.array_places(_pixels(camera, bent, size), size)
+    plane, is_unique = _distort(*_lens(camera), _pixel_grid(camera, size))
+    plane = np.where(np.asarray(is_unique)[:, None], np.asarray(plane), np.nan)
+    return resampling.array_places(_pixels(camera, plane, size), size)
 
 
-def _slopes(camera, size):
+def _pixel_grid(camera, size):
     """Image-plane positions [pixels, 2] of the pixel centers, without distortion."""
     focal, skew = float(camera.focal_px), float(camera.skew_px)
     offset = np.asarray(rays.pixel_centers(size)) - np.asarray(
@@ -221,10 +224,10 @@ def _slopes(camera, size):
     return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
 
 
-def _pixels(camera, slopes, size):
+def _pixels(camera, plane, size):
     """Pixel positions [height, width, 2] of image-plane positions [pixels, 2]."""
     focal, skew = float(camera.focal_px), float(camera.skew_px)
-    slopes = slopes.reshape(size[1], size[0], 2)
-    across = focal * slopes[..., 0] + skew * slopes[..., 1]
-    down = focal * float(camera.pixel_aspect) * slopes[..., 1]
-    return np.stack([across, down], axis=-1) + np.asarray(camera.principal_point_px)
+    plane = plane.reshape(size[1], size[0], 2)
+    x = focal * plane[..., 0] + skew * plane[..., 1]
+    y = focal * float(camera.pixel_aspect) * plane[..., 1]
+    return np.stack([x, y], axis=-1) + np.asarray(camera.principal_point_px)

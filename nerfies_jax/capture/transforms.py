@@ -15,8 +15,8 @@ from nerfies_jax.capture.nearest import known_names
 class Lens(msgspec.Struct, kw_only=True):
     """Intrinsics of a whole file or of one frame, in pixels of `w` by `h`."""
 
-    camera_angle_x: float | None = None  # whole horizontal field of view, rad
-    camera_angle_y: float | None = None  # whole vertical field of view, rad
+    camera_angle_x: float | None = None  # horizontal field of view, rad
+    camera_angle_y: float | None = None  # vertical field of view, rad
     x_fov: float | None = None  # the same in degrees, instant-ngp's
     y_fov: float | None = None
     fl_x: float | None = None
@@ -35,7 +35,7 @@ class Lens(msgspec.Struct, kw_only=True):
     camera_model: str | None = None
 
 
-# Keys that belong together: those of a frame replace all of those of its file.
+# Groups of keys. If a frame has any key of a group, none of the file's group is used.
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 CENTER, SIZE, MODEL = ("cx", "cy"), ("w", "h"), ("camera_model", "is_fisheye")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -46,10 +46,10 @@ class Frame(Lens, kw_only=True):
     """One image."""
 
     file_path: str
-    transform_matrix: list[list[float]] | None = None  # None if no pose was found
+    transform_matrix: list[list[float]] | None = None  # None without a pose
     time: float | None = None
-    mask_path: str | None = None  # black: do not learn from
-    depth_file_path: str | None = None  # nerfstudio's; not read, which a note says
+    mask_path: str | None = None  # black pixels are not used
+    depth_file_path: str | None = None  # nerfstudio's; not read, with a note
 
 
 class Transforms(Lens, kw_only=True):
@@ -60,14 +60,14 @@ class Transforms(Lens, kw_only=True):
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
-    # Ours.
-    background: tuple[float, float, float] | None = None  # of opaque pictures
+    # Extensions of this library.
+    background: tuple[float, float, float] | None = None  # of opaque images
     up: tuple[float, float, float] | None = None
     fps: float | None = None
 
 
-# Keys that change nothing here: of the scene boxes and cameras of other programs, and
-# how the poses were found, which are in their final world.
+# Keys that do not affect the result: scene boxes and viewer cameras of other programs,
+# and transforms that the poses already include.
 HARMLESS = {
     *("aabb", "aabb_scale", "scale", "offset", "n_extra_learnable_dims", "n_frames"),
     *("applied_transform", "applied_scale", "colmap_im_id", "sharpness", "rotation"),
@@ -75,7 +75,7 @@ HARMLESS = {
 }
 
 
-ROUNDING = 1e-6  # of times, which may be stored in float32
+ROUNDING = 1e-6  # tolerance of times, which may be stored in float32
 
 
 class Split(msgspec.Struct):
@@ -114,7 +114,7 @@ def read_split(
 
 
 def _with_poses(file, missing):
-    """Read a file; frames without a pose are refused, or left out with a note."""
+    """Read a file. Frames without a pose are refused, or left out with a note."""
     transforms = read_json(file, Transforms)
     frames.check_missing(missing, str(file))
     posed = [each for each in transforms.frames if each.transform_matrix is not None]
@@ -130,11 +130,11 @@ def _with_poses(file, missing):
             f"transform_matrix ({listed}); add their poses, or leave those frames out "
             'with missing="skip"'
         )
-    gone = {text_files.forward_slashes(name) for name in lost}
+    skipped = {text_files.forward_slashes(name) for name in lost}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = getattr(transforms, key)
         if names is not None:
-            kept = [n for n in names if text_files.forward_slashes(n) not in gone]
+            kept = [n for n in names if text_files.forward_slashes(n) not in skipped]
             setattr(transforms, key, kept)
     transforms.frames = posed
     note = f"{len(lost)} frames left out, they have no transform_matrix: {listed}"
@@ -142,9 +142,9 @@ def _with_poses(file, missing):
 
 
 def _fill_times(file, entries):
-    """Give frames without a time one between those of their neighbors in name order.
+    """Interpolate missing times from the neighbors in the order of names, by folder.
 
-    Frames of one folder are neighbors. Where no frame has a time all stay without.
+    If no frame has a time, all stay without.
     """
     lost = [entry for entry in entries if entry.time is None]
     if not lost or len(lost) == len(entries):
@@ -155,7 +155,7 @@ def _fill_times(file, entries):
         folders[pathlib.PurePosixPath(path).parent].append(entry)
     for group in folders.values():
         _fill_folder(file, group)
-    return (f"{len(lost)} frames have no time: filled in between their neighbors",)
+    return (f"{len(lost)} frames have no time: interpolated between neighbors",)
 
 
 def _fill_folder(file, entries):
@@ -164,33 +164,33 @@ def _fill_folder(file, entries):
     if not lost:
         return
     clock = name_times.clock(stems(entries)).times
-    when = dict(zip(map(id, entries), clock, strict=True))
-    places, rows = np.unique([float(when[id(entry)]) for entry in known], True)
+    name_time = dict(zip(map(id, entries), clock, strict=True))
+    knots, rows = np.unique([float(name_time[id(entry)]) for entry in known], True)
     times = np.array([known[row].time for row in rows.tolist()], float)
     for entry in lost:
-        place = when[id(entry)]
+        knot = name_time[id(entry)]
         time = -1.0
-        if len(places) > 1:
-            row = int(np.clip(np.searchsorted(places, place), 1, len(places) - 1))
-            share = (place - places[row - 1]) / (places[row] - places[row - 1])
+        if len(knots) > 1:
+            row = int(np.clip(np.searchsorted(knots, knot), 1, len(knots) - 1))
+            share = (knot - knots[row - 1]) / (knots[row] - knots[row - 1])
             time = float(times[row - 1] + share * (times[row] - times[row - 1]))
         if not -ROUNDING <= time <= 1 + ROUNDING:
             raise CaptureError(
-                f"{file}: frame {entry.file_path!r} has no time, and none follows from "
-                f"those of the {len(known)} other frames of its folder; add it"
+                f"{file}: frame {entry.file_path!r} has no time, and none can be "
+                f"derived from the {len(known)} other frames of its folder; add it"
             )
         entry.time = min(max(time, 0.0), 1.0)
 
 
 def _fill_file(file, entries, others):
-    """Spread times evenly over a split without any, as D-NeRF does, if others have."""
+    """Space times evenly over a split without any, as in D-NeRF, if the other has."""
     if not entries or entries[0].time is not None:
         return ()
     if not others or others[0].time is None:
         return ()
     for entry, time in zip(entries, np.linspace(0, 1, len(entries)), strict=True):
         entry.time = float(time)
-    return (f"no times in {file.name}: spread evenly by the order of its frames",)
+    return (f"no times in {file.name}: spaced evenly in the order of its frames",)
 
 
 def stems(entries: list[Frame]) -> list[str]:
@@ -212,10 +212,10 @@ def stems(entries: list[Frame]) -> list[str]:
 
 
 def _unread(file):
-    """Name the keys that no reader here knows, since they may change the scene."""
+    """Notes of unknown keys, which may affect the scene."""
     known = HARMLESS.union(Transforms.__struct_fields__)
-    of_frames = HARMLESS.union(Frame.__struct_fields__)
-    return unread_keys.notes(file, known, {"frames": of_frames})
+    known_of_frames = HARMLESS.union(Frame.__struct_fields__)
+    return unread_keys.notes(file, known, {"frames": known_of_frames})
 
 
 def _split(file, transforms, heldout, missing):
@@ -226,15 +226,16 @@ def _split(file, transforms, heldout, missing):
             f"{file}: no split {heldout!r}; {known_names(heldout, ('val', 'test'))}, "
             "or a number n holds out every n-th frame"
         )
-    wanted = ("test", "val") if heldout is None else (heldout,)
-    # nerfstudio's lists in one file; of frames to learn from alone, some are held out
+    split_names = ("test", "val") if heldout is None else (heldout,)
+    # nerfstudio's lists in one file. If only the training frames are listed, some of
+    # them are held out below.
     lists = transforms.val_filenames or transforms.test_filenames
-    named = isinstance(heldout, str) or (heldout is None and lists)
-    if transforms.train_filenames is not None and named:
-        return _listed(file, transforms, wanted)
+    has_split = isinstance(heldout, str) or (heldout is None and lists)
+    if transforms.train_filenames is not None and has_split:
+        return _listed_split(file, transforms, split_names)
     empty: tuple[str, ...] = ()
     if not isinstance(heldout, int) and file.name == "transforms_train.json":
-        for name in wanted:
+        for name in split_names:
             other = file.with_name(f"transforms_{name}.json")
             if other.is_file():
                 second, lost = _with_poses(other, missing)
@@ -244,23 +245,22 @@ def _split(file, transforms, heldout, missing):
                 more = lost + _fill_times(other, second.frames)
                 more += _fill_file(file, transforms.frames, second.frames)
                 more += _fill_file(other, second.frames, transforms.frames)
-                scored = _own_lens(second)
                 return Split(
                     file,
                     transforms,
                     transforms.frames,
-                    scored,
+                    _with_intrinsics(second),
                     (f"the {name} split is held out", *empty, *more),
                 )
     if isinstance(heldout, str):
         raise CaptureError(
-            f"{file}: no {heldout} split beside it; pass a number n to hold out every "
+            f"{file}: no {heldout} split next to it; pass a number n to hold out every "
             "n-th frame"
         )
-    # Files list frames in any order; a film is split in the order it was shot.
+    # Files list frames in any order, and a video is split in the order of time.
     pool = transforms.frames
     if transforms.train_filenames is not None and heldout is None:
-        pool = _taken(file, transforms, transforms.train_filenames)
+        pool = _frames_named(file, transforms, transforms.train_filenames)
     times = [0.0 if entry.time is None else entry.time for entry in pool]
     if not any(times):
         times = name_times.clock(stems(pool)).times
@@ -280,8 +280,8 @@ def _split(file, transforms, heldout, missing):
     )
 
 
-def _own_lens(transforms):
-    """Frames that carry the intrinsics of their own file."""
+def _with_intrinsics(transforms):
+    """Frames with the intrinsics of their file."""
     for entry in transforms.frames:
         for unit in UNITS:
             if all(getattr(entry, key) is None for key in unit):
@@ -290,29 +290,30 @@ def _own_lens(transforms):
     return transforms.frames
 
 
-def _listed(file, transforms, wanted):
-    for name in wanted:
-        scored = getattr(transforms, f"{name}_filenames", None)
-        if scored:
+def _listed_split(file, transforms, split_names):
+    """The split of nerfstudio's lists of file names."""
+    for name in split_names:
+        heldout_names = getattr(transforms, f"{name}_filenames", None)
+        if heldout_names:
             break
     else:
         raise CaptureError(
-            f"{file}: lists no {' or '.join(map(str, wanted))}_filenames"
+            f"{file}: lists no {' or '.join(map(str, split_names))}_filenames; add "
+            "them, or pass a number n to hold out every n-th frame"
         )
     return Split(
         file,
         transforms,
-        _taken(file, transforms, transforms.train_filenames),
-        _taken(file, transforms, scored),
+        _frames_named(file, transforms, transforms.train_filenames),
+        _frames_named(file, transforms, heldout_names),
         (f"the {name} split is held out",),
     )
 
 
-def _taken(file, transforms, names):
-    """The frames that a list names."""
-    plain = text_files.forward_slashes
-    table = {plain(entry.file_path): entry for entry in transforms.frames}
-    names = [plain(name) for name in names]
+def _frames_named(file, transforms, names):
+    normalize = text_files.forward_slashes
+    table = {normalize(entry.file_path): entry for entry in transforms.frames}
+    names = [normalize(name) for name in names]
     absent = [name for name in names if name not in table]
     if absent:
         raise CaptureError(

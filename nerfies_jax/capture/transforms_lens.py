@@ -18,10 +18,12 @@ PINHOLES = {
     *("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"),
     "PERSPECTIVE",
 }
-# The principal point of images n times as large is n times as far from the corner, to
-# within this share: of real lenses it lies a few percent off the center.
+# Without a stated size, the ratio n of the sizes of the calibrated images and of these
+# images is that of the principal point to the image center, within this share. The
+# principal point of real lenses lies a few percent off the center.
 CENTERED = 0.1
-ALIKE = 0.03  # of the two ratios, where they are of no whole number
+# Share within which the horizontal and vertical ratio agree if they are not integers.
+ALIKE = 0.03
 
 
 class Intrinsics(NamedTuple):
@@ -31,8 +33,8 @@ class Intrinsics(NamedTuple):
     principal_point_px: tuple[float, float]
     radial: tuple[float, float, float]
     tangential: tuple[float, float]
-    size: tuple[float, float]  # of the images that the file's pixels refer to
-    larger: bool  # whether that size follows from the principal point alone
+    size: tuple[float, float]  # of the images that the file's intrinsics refer to
+    larger: bool  # True if that size was derived from the principal point
 
 
 def resolve(
@@ -40,8 +42,9 @@ def resolve(
 ) -> Intrinsics:
     """Resolve the intrinsics of a frame.
 
-    Size, focal lengths, principal point, camera model and distortion are one unit each.
-    A unit of which the frame has any key is the frame's, else it is the file's.
+    Size, focal lengths, principal point, camera model and distortion are one group
+    each. If the frame has any key of a group, the group is taken from the frame, else
+    from the file.
 
     Args:
       entry: The frame.
@@ -53,22 +56,22 @@ def resolve(
       The intrinsics.
 
     Raises:
-      CaptureError: If a focal length is missing or impossible, the camera is no
-        pinhole, or its size does not match the image.
+      CaptureError: If a focal length is missing or invalid, the camera model is not
+        supported, or its size does not match the image.
     """
     distortion = _distortion(entry, transforms, label)
     stated = _stated_size(entry) or _stated_size(transforms) or (None, None)
     width, height = (
-        own if own is not None else whole
-        for own, whole in zip(stated, size, strict=True)
+        side if side is not None else image_side
+        for side, image_side in zip(stated, size, strict=True)
     )
     if min(width, height) <= 0 or abs(size[0] * height / width - size[1]) > 1:
         raise CaptureError(
             f"{label} is {size[0]}x{size[1]} pixels but its camera says "
-            f"{width:g}x{height:g}; mend w and h or the picture"
+            f"{width:g}x{height:g}; correct w and h or the image"
         )
     level = _level(entry, transforms, CENTER)
-    # A frame and its file may refer to different sizes; each unit has its level's.
+    # A frame and its file may refer to different sizes. Each group has its level's.
     center_size = _size_of(level, (width, height), size)
     center = (
         center_size[0] / 2 if level.cx is None else level.cx,
@@ -93,7 +96,7 @@ def resolve(
 
 
 def _level(entry, transforms, keys) -> Lens:
-    """The frame if it has any of these keys, else the file."""
+    """Return the frame if it has any of these keys, else the file."""
     return transforms if all(getattr(entry, key) is None for key in keys) else entry
 
 
@@ -102,7 +105,7 @@ def _stated_size(level):
 
 
 def _size_of(level, resolved, size):
-    """The size that the pixels of a level refer to."""
+    """The image size that the intrinsics of a level refer to."""
     width, height = _stated_size(level) or (None, None)
     if width is None or height is None or width <= 0:
         return resolved
@@ -111,12 +114,12 @@ def _size_of(level, resolved, size):
 
 
 def _times_as_large(center, size, label):
-    """Factor by which the images of this principal point are larger, usually 1."""
+    """Ratio of the calibrated image size to `size`, by the principal point."""
     ratios = [2 * c / side for c, side in zip(center, size, strict=True)]
     times = round(sum(ratios) / 2)
     if times >= 1 and all(abs(each - times) <= CENTERED * times for each in ratios):
         return times
-    # A crop moves the principal point by another share across than down, mostly.
+    # The ratios of a crop are usually different horizontally and vertically.
     if abs(ratios[0] - ratios[1]) <= ALIKE * max(map(abs, ratios)):
         raise CaptureError(
             f"{label} has its principal point at {center[0]:g}, {center[1]:g} in an "
@@ -129,23 +132,23 @@ def _times_as_large(center, size, label):
 
 def _focal(level, size, label):
     """Horizontal and vertical focal length of one level, in pixels of `size`."""
-    across = _one_focal(level, "x", size[0], label)
-    down = _one_focal(level, "y", size[1], label)
-    if across is None and down is None:
+    focal_x = _axis_focal(level, "x", size[0], label)
+    focal_y = _axis_focal(level, "y", size[1], label)
+    if focal_x is None and focal_y is None:
         raise CaptureError(
             f"{label} has no fl_x and no camera_angle_x; give a focal length in pixels "
             "or a field of view in radians"
         )
-    across = down if across is None else across
-    down = across if down is None else down
-    for name, focal in (("fl_x", across), ("fl_y", down)):
+    focal_x = focal_y if focal_x is None else focal_x
+    focal_y = focal_x if focal_y is None else focal_y
+    for name, focal in (("fl_x", focal_x), ("fl_y", focal_y)):
         if not 0 < focal < math.inf:
             raise CaptureError(f"{label} has {name} = {focal:g}; it must be positive")
-    return across, down
+    return focal_x, focal_y
 
 
-def _one_focal(level, axis, side, label):
-    """The focal length along one axis, by the first key that is there."""
+def _axis_focal(level, axis, side, label):
+    """The focal length along one axis, from the first key that is set."""
     focal, angle = getattr(level, f"fl_{axis}"), getattr(level, f"camera_angle_{axis}")
     degrees = getattr(level, f"{axis}_fov")
     if focal is not None:
@@ -163,15 +166,15 @@ def _one_focal(level, axis, side, label):
 
 
 def _distortion(entry, transforms, label):
-    """k1, k2, k3, p1, p2 of a lens that is a pinhole up to those."""
+    """k1, k2, k3, p1, p2 of a supported camera model."""
     level = _level(entry, transforms, MODEL)
     if (level.camera_model or "").upper() not in PINHOLES:
-        raise _no_pinhole(label, f"camera_model {level.camera_model}")
+        raise _unsupported_model(label, f"camera_model {level.camera_model}")
     if level.is_fisheye:
-        raise _no_pinhole(label, "is_fisheye")
-    other = entry.camera_model not in (None, transforms.camera_model)
-    # Coefficients of another model mean something else.
-    level = entry if other else _level(entry, transforms, DISTORTION)
+        raise _unsupported_model(label, "is_fisheye")
+    has_other_model = entry.camera_model not in (None, transforms.camera_model)
+    # The file's coefficients belong to the file's model.
+    level = entry if has_other_model else _level(entry, transforms, DISTORTION)
     values = {key: getattr(level, key) or 0.0 for key in DISTORTION}
     if values["k4"] != 0:
         raise CaptureError(
@@ -180,32 +183,31 @@ def _distortion(entry, transforms, label):
     return tuple(values[key] for key in ("k1", "k2", "k3", "p1", "p2"))
 
 
-def _no_pinhole(label, lens):
+def _unsupported_model(label, model):
     return CaptureError(
-        f"{label}: {lens}; undistort the pictures to OPENCV or PINHOLE first "
-        "(ns-process-data or COLMAP do it)"
+        f"{label}: {model} is not supported; undistort the images to OPENCV or PINHOLE "
+        "first (ns-process-data or COLMAP do it)"
     )
 
 
-def notes(found: list[Intrinsics], size: tuple[int, int]) -> tuple[str, ...]:
+def notes(intrinsics: list[Intrinsics], size: tuple[int, int]) -> tuple[str, ...]:
     """Describe the assumptions made about intrinsics.
 
     Args:
-      found: Intrinsics of all frames.
+      intrinsics: Intrinsics of all frames.
       size: Width and height of the images in pixels.
 
     Returns:
       Notes.
     """
     lines: tuple[str, ...] = ()
-    sizes = {one.size for one in found if one.size != size and not one.larger}
+    sizes = {one.size for one in intrinsics if one.size != size and not one.larger}
     if sizes:
         width, height = min(sizes)
         lines += (
-            f"cameras for {width:g}x{height:g} scaled to pictures of "
-            f"{size[0]}x{size[1]}",
+            f"cameras for {width:g}x{height:g} scaled to images of {size[0]}x{size[1]}",
         )
-    larger = {one.size for one in found if one.larger}
+    larger = {one.size for one in intrinsics if one.larger}
     if larger:
         width, height = min(larger)
         lines += (

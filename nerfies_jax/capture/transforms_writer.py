@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import plyfile
 
-from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_folder, write_json
 from nerfies_jax.capture.units import Units, places_in
 from nerfies_jax.geometry.camera import Camera
 
 POINTS = "points.ply"
-_OPENGL = np.diag([1.0, -1.0, -1.0])  # right, up, back, from right, down, forward
+_OPENGL = np.diag([1.0, -1.0, -1.0])  # (right, down, forward) to (right, up, back)
 
 
 def write(
@@ -21,10 +21,10 @@ def write(
 ) -> None:
     """Write a capture as transforms.json, `images`, `masks` and points.
 
-    All frames are in it, with their times. `train_filenames` lists the training frames,
-    `val_filenames` and `test_filenames` the held-out ones. Masks are black where
-    nothing was observed. Axes are those of the capture, whichever of them is up. The
-    folder is written completely or not at all.
+    `train_filenames` lists the training frames, `val_filenames` and `test_filenames`
+    the held-out ones. Masks are black where nothing was observed. Axes are those of the
+    capture and are not rotated to a fixed up axis. The folder is written completely or
+    not at all.
 
     Args:
       capture: The capture.
@@ -41,11 +41,11 @@ def write(
     with replaced_folder(path, overwrite) as folder:
         (folder / "images").mkdir()
         for name, image in zip(capture.ids, capture.images, strict=True):
-            pictures.write_png(folder / "images" / f"{name}.png", image)
+            image_files.write_png(folder / "images" / f"{name}.png", image)
         if capture.valid is not None:
             (folder / "masks").mkdir()
-            for name, filmed in zip(capture.ids, capture.valid, strict=True):
-                pictures.write_png(folder / "masks" / f"{name}.png", filmed)
+            for name, valid in zip(capture.ids, capture.valid, strict=True):
+                image_files.write_png(folder / "masks" / f"{name}.png", valid)
         if capture.points is not None:
             write_points(folder / POINTS, capture, units)
         write_json(folder / "transforms.json", _transforms(capture, units))
@@ -82,8 +82,8 @@ def refuse_skew(capture: Capture, path: AnyPath, what: str) -> None:
     """
     if np.any(capture.cameras.skew_px != 0):
         raise CaptureError(
-            f"{path}: a skew of {np.abs(capture.cameras.skew_px).max():g} px has no "
-            f"place in {what}; export nerfies, which has one"
+            f"{path}: {what} cannot hold a skew of "
+            f"{np.abs(capture.cameras.skew_px).max():g} px; export nerfies, which can"
         )
 
 
@@ -97,7 +97,7 @@ def write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
     """
     cloud = capture.points
     assert cloud is not None
-    # World coordinates may be large: meters of a map need more than float32 has.
+    # World coordinates may be large. Those of a map in meters exceed float32 precision.
     kind = "f4" if units == "scene" else "f8"
     fields = [(axis, kind) for axis in "xyz"]
     fields += [(name, "u1") for name in ("red", "green", "blue")]
@@ -130,14 +130,14 @@ def _transforms(capture, units):
     width, height = capture.size
     cameras = capture.cameras
     lenses = [_lens(cameras, row) for row in range(len(capture.ids))]
-    one = all(lens == lenses[0] for lens in lenses)
-    bent = np.any(cameras.radial != 0) or np.any(cameras.tangential != 0)
+    same_lens = all(lens == lenses[0] for lens in lenses)
+    distorted = np.any(cameras.radial != 0) or np.any(cameras.tangential != 0)
     table: dict[str, Any] = {
-        "camera_model": "OPENCV" if bent else "PINHOLE",
+        "camera_model": "OPENCV" if distorted else "PINHOLE",
         "w": width,
         "h": height,
     }
-    if one:
+    if same_lens:
         table |= lenses[0]
     if capture.points is not None:
         table["ply_file_path"] = POINTS
@@ -153,7 +153,7 @@ def _transforms(capture, units):
             "file_path": f"images/{name}.png",
             **({} if capture.valid is None else {"mask_path": f"masks/{name}.png"}),
             "time": float(capture.times[row]),
-            **({} if one else lenses[row]),
+            **({} if same_lens else lenses[row]),
             "transform_matrix": opengl_pose(
                 cameras.camera_from_world[row], positions[row]
             ).tolist(),

@@ -1,4 +1,4 @@
-"""Reading and writing of video with PyAV, which comes with the extra `video`."""
+"""Reading and writing of video with PyAV (extra `video`)."""
 
 import contextlib
 import itertools
@@ -14,9 +14,10 @@ from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.high_dynamic_range import Transfer
 from nerfies_jax.capture.json_files import AnyPath, replaced_file
 
-# Of decoding, for one frame: one of 3840x2160 in high dynamic range takes 2 s.
+# Limits for decoding one frame. A frame of 3840x2160 in HDR takes 2 s.
 CPU_SECONDS, MEMORY_BYTES = 15.0, 4 * 2**30
-LEAST_RATE = 0.001  # frames per second; rates are fractions of up to 1001 seconds
+# Frames per second. Rates are stored as fractions with denominators up to 1001.
+LEAST_RATE = 0.001
 
 
 def library():
@@ -39,8 +40,8 @@ def write_video(
 ):
     """Write frames as H.264 video, atomically.
 
-    An odd width or height grows by one repeated line, since the chroma of `yuv420p`,
-    which every player supports, is subsampled by two.
+    An odd width or height is padded by repeating the last column or row, since the
+    chroma of `yuv420p`, which all players support, is subsampled by two.
 
     Args:
       path: The file, .mp4, .mov or .mkv.
@@ -79,15 +80,15 @@ def _encode(av, partial, path, first, frames, frames_per_second, quality):
     height, width = first.shape[:2]
     with av.open(str(partial), "w") as container:
         rate = Fraction(frames_per_second).limit_denominator(1001)
-        # With its macroblock tree x264 reads what it has not written: equal frames made
-        # another film in every process, and of 14 of them COLMAP once found a path
-        # that was off by 22% of its extent, and not by 3%.
+        # x264 reads uninitialized memory in its macroblock tree. With it, equal frames
+        # gave different videos in different processes, and COLMAP's camera path from 14
+        # such frames once had an error of 22 % of its extent instead of 3 %.
         options = {"crf": str(quality), "x264-params": "mbtree=0"}
         stream = container.add_stream("h264", rate=rate, options=options)
         stream.width, stream.height = width + width % 2, height + height % 2
         stream.pix_fmt = "yuv420p"
-        # Without these tags a player guesses the matrix from the height of the picture
-        # and shifts the colors of small films; BT.709 is what sRGB displays assume.
+        # Without these tags a player guesses the color matrix from the height of the
+        # image and shifts the colors of small videos. sRGB displays assume BT.709.
         stream.codec_context.color_primaries = 1
         stream.codec_context.color_trc = 13
         stream.codec_context.colorspace = 1
@@ -99,10 +100,10 @@ def _encode(av, partial, path, first, frames, frames_per_second, quality):
                     f"expected uint8 of shape {first.shape}, as the first"
                 )
             padded = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
-            picture = av.VideoFrame.from_ndarray(padded, format="rgb24").reformat(
+            encoded = av.VideoFrame.from_ndarray(padded, format="rgb24").reformat(
                 format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG"
             )
-            container.mux(stream.encode(picture))
+            container.mux(stream.encode(encoded))
         container.mux(stream.encode())
 
 
@@ -118,55 +119,55 @@ def transfer_of(path: pathlib.Path) -> Transfer | None:
     """
     extras.check("av", "video")
     try:
-        about = _one(path, "video_transfer").about
+        about = _request(path, "video_transfer").about
     except (decoder.DecoderError, CaptureError):
         return None
     return about["transfer"]
 
 
 def notes_of(path: pathlib.Path, count: int, last: float) -> tuple[str, ...]:
-    """Say what is unusual about a video that was read to its end.
+    """Describe anything unusual about a video that was read to its end.
 
     Args:
       path: The video.
-      count: Frames that could be read.
+      count: Number of frames that could be read.
       last: Time of the last one in seconds.
 
     Returns:
-      Notes: that the file is cut short or damaged, which stream of several was read,
-      that its pixels are not square, that it is interlaced.
+      Notes on truncation, other video streams, pixels that are not square, and
+      interlacing.
 
     Raises:
       CaptureError: If the video cannot be read.
     """
     extras.check("av", "video")
     try:
-        answer = _one(path, "video_notes", count=count, last=last)
+        answer = _request(path, "video_notes", count=count, last=last)
     except decoder.DecoderError as error:
         raise _unreadable(path, error) from None
     return tuple(answer.about["notes"])
 
 
 def stated_frames(path: pathlib.Path) -> int:
-    """Read how many frames a video states to have, or its length and rate tell.
+    """Read the number of frames from the header of a video.
 
     Args:
       path: The video.
 
     Returns:
-      The number, which may be wrong.
+      The number of frames, by default duration times frame rate. It may be wrong.
 
     Raises:
       CaptureError: If the video cannot be read.
     """
     extras.check("av", "video")
     try:
-        return _one(path, "video_length").about["frames"]
+        return _request(path, "video_length").about["frames"]
     except decoder.DecoderError as error:
         raise _unreadable(path, error) from None
 
 
-def _one(path, operation, **arguments):
+def _request(path, operation, **arguments):
     file = str(safe_files.check(path).absolute())
     with decoder.session() as child:
         return child.request(
@@ -178,7 +179,7 @@ def _unreadable(path, error):
     if error.has_advice:
         return CaptureError(f"{path}: {error}")
     return CaptureError(
-        f"{path}: not a readable film ({error}); copy or encode it again"
+        f"{path}: not a readable video ({error}); copy or encode it again"
     )
 
 
@@ -200,10 +201,10 @@ def read_video(
       path: The video.
       stride: Read every `stride`-th frame.
       most: Largest number of frames to read.
-      rows: Numbers of the only frames to return. Nothing after the last of them is
-        decoded. None for all.
-      gray: True for coded luma, uint8 [height, width]. A frame of 3840x2160 HLG takes
-        0.16 s of processor time, compared with 1.8 s in color.
+      rows: Numbers of the frames to return, None for all. Nothing after the last of
+        them is decoded.
+      gray: True for the encoded luma, uint8 [height, width]. A frame of 3840x2160 HLG
+        takes 0.16 s of processor time, compared with 1.8 s in color.
       damaged: "refuse" or "skip" frames that cannot be decoded.
 
     Yields:
@@ -216,7 +217,7 @@ def read_video(
         raise ValueError(f'{path}: damaged={damaged!r}; expected "refuse" or "skip"')
     path = pathlib.Path(path)
     if not path.is_file():
-        raise CaptureError(f"{path}: no such film; check the path")
+        raise CaptureError(f"{path}: no such video; check the path")
     safe_files.check(path)
     extras.check("av", "video")
     with decoder.streaming() as child:

@@ -1,4 +1,4 @@
-"""Decoding of video with PyAV. `decoder_child` runs this, so it imports no JAX."""
+"""Decoding of video with PyAV. It runs in `decoder_child`, so it imports no JAX."""
 
 import contextlib
 import math
@@ -33,7 +33,7 @@ def frames(
       damaged: As for `video.read_video`.
 
     Yields:
-      Nothing for a frame that is passed over, else seconds and the pixels.
+      Seconds and pixels of a frame, or empty dicts for a frame that is skipped.
 
     Raises:
       FileError: If the video cannot be used, with the remedy but without the path.
@@ -53,7 +53,7 @@ def frames(
                 raise FileError(
                     f"the size changes from {size[0]}x{size[1]} to "
                     f"{frame.width}x{frame.height} pixels at frame {number}; cut the "
-                    "film there"
+                    "video there"
                 )
             if number % stride or not (wanted is None or number in wanted):
                 yield {}, {}
@@ -83,12 +83,12 @@ def transfer(path: str) -> Iterator[Reply]:
     av = extras.library("av", "video")
     with _words_of(av), av.open(path) as container:
         frame = next(container.decode(_main_stream(container)), None)
-        found = None if frame is None else TRANSFERS.get(int(frame.color_trc))
-        yield {"transfer": found}, {}
+        name = None if frame is None else TRANSFERS.get(int(frame.color_trc))
+        yield {"transfer": name}, {}
 
 
 def length(path: str) -> Iterator[Reply]:
-    """Find the number of frames that a video states, or that its length and rate imply.
+    """Read the number of frames of a video from its header.
 
     Args:
       path: The video.
@@ -122,7 +122,7 @@ def notes(path: str, count: int, last: float) -> Iterator[Reply]:
 
 @contextlib.contextmanager
 def _words_of(av):
-    """Leave of FFmpeg's errors what they say."""
+    """Reduce FFmpeg's errors to their messages."""
     try:
         yield
     except (av.FFmpegError, OSError) as error:
@@ -137,7 +137,7 @@ def _check_size(width, height):
 
 
 def _main_stream(container):
-    """The largest video of a file: covers and previews are streams of it, too."""
+    """The largest video stream of a file, which may also hold covers and previews."""
     videos = [
         stream
         for stream in container.streams.video
@@ -172,7 +172,7 @@ def _notes(container, count, last):
 
 
 def _shortfall(container, stream, count, last):
-    """A note where the video ends before the time that its file states."""
+    """A note if the video ends before the duration in its header."""
     interval = float(1 / stream.average_rate) if stream.average_rate else 0.0
     slack = SLACK * interval
     if stream.duration is not None and stream.time_base is not None:
@@ -196,7 +196,7 @@ def _shortfall(container, stream, count, last):
 
 
 def _decoded(av, container, stream, damaged):
-    """Decode frames, and skip those that cannot be decoded if damage is allowed."""
+    """Decode frames. Unless damage is refused, skip those that cannot be decoded."""
     if damaged == "refuse":
         yield from container.decode(stream)
         return
@@ -206,7 +206,7 @@ def _decoded(av, container, stream, damaged):
             packet = next(packets, None)
             if packet is None:
                 return
-        except av.FFmpegError:  # the file ends here; what the decoder holds is whole
+        except av.FFmpegError:  # the file ends here; flush the decoder
             with contextlib.suppress(av.FFmpegError):
                 yield from stream.codec_context.decode(None)
             return
@@ -215,7 +215,7 @@ def _decoded(av, container, stream, damaged):
 
 
 def _square(frame, aspect):
-    """The frame with square pixels, none of them lost."""
+    """Resample a frame to square pixels without losing resolution."""
     if not aspect or aspect <= 0 or aspect == 1:
         return frame
     width, height = frame.width, frame.height
@@ -231,12 +231,12 @@ def _pixels(frame):
     """uint8 sRGB [height, width, 3]."""
     transfer = TRANSFERS.get(int(frame.color_trc))
     if transfer is None:
-        told = frame.colorspace != _UNSAID or frame.height < HD_LINES
-        space = None if told else "ITU709"  # ffmpeg would take BT.601
+        has_default = frame.colorspace != _UNSAID or frame.height < HD_LINES
+        space = None if has_default else "ITU709"  # FFmpeg would assume BT.601
         return frame.to_ndarray(
             format="rgb24", src_colorspace=space, dst_colorspace=space
         )
-    # ffmpeg's white is 255/256 of what 16 bits hold.
+    # FFmpeg's white is 255/256 of the largest 16-bit value.
     code = frame.to_ndarray(format="rgb48le").astype(np.uint32) * 257 // 256
     return tone_mapped(np.minimum(code, CODES - 1).astype(np.uint16), transfer)
 
@@ -246,7 +246,7 @@ def _upright(pixels, frame):
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return pixels
-    # x' = a x + c y and y' = b x + d y, of pixels (x, y) as they are stored
+    # x' = a x + c y and y' = b x + d y for stored pixel coordinates (x, y)
     a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
     if abs(a) + abs(d) < abs(b) + abs(c):
         pixels, a, d = pixels.swapaxes(0, 1), c, b

@@ -186,7 +186,7 @@ def test_nerfstudio_lens_scales_with_the_pictures(tmp_path):
     np.testing.assert_allclose(cameras.principal_point_px, [[5.5, 3.5]] * 9)
     np.testing.assert_allclose(cameras.radial[0], [0.1, 0.02, 0], rtol=1e-6)
     np.testing.assert_allclose(cameras.tangential[0], [0.003, 0.004], rtol=1e-6)
-    assert any("scaled to pictures" in note for note in capture.notes)
+    assert any("scaled to images" in note for note in capture.notes)
     # All cameras look at the origin from 4 away; that becomes the unit.
     np.testing.assert_allclose(np.linalg.norm(cameras.position, axis=1), 1, rtol=1e-5)
     assert capture.scale == pytest.approx(0.25)

@@ -74,7 +74,7 @@ def test_pixels_the_lens_did_not_film_are_marked():
     assert flat.valid is not None
     assert not flat.valid[:, 0, 0].any()
     assert flat.valid[:, 15, 20].all()
-    assert "unseen" in flat.notes[-1]
+    assert "unobserved" in flat.notes[-1]
 
 
 def test_masks_and_depth_move_with_the_picture():

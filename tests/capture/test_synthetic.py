@@ -8,7 +8,7 @@ import pytest
 import scipy.ndimage
 
 from nerfies_jax.capture import nerfies_format, synthetic
-from nerfies_jax.capture.synthetic import film, presets, record, truth
+from nerfies_jax.capture.synthetic import presets, record, rendering, truth
 from nerfies_jax.capture.synthetic.spec import Exposure, Specular, Transient
 from nerfies_jax.geometry import camera as cameras
 from tests import scene_oracle
@@ -215,8 +215,8 @@ def test_points_lie_on_static_surfaces_with_little_noise(scene):
 def test_supersampling_is_the_mean_light_of_a_finer_picture(small):
     capture, _ = small
     fine = dataclasses.replace(SMALL, size=(96, 72), supersampling=1)
-    plan = film.schedule(fine, 0)
-    picture = jax.jit(film.picture, static_argnums=0)(
+    plan = rendering.schedule(fine, 0)
+    picture = jax.jit(rendering.render, static_argnums=0)(
         fine, cameras.take(plan.cameras, 2), plan.time[2], plan.light_gain[2], False
     )
     light = linear(np.asarray(picture.image) * 255)
@@ -232,7 +232,7 @@ def test_the_same_seed_repeats_and_another_moves_only_the_hand(small):
         assert np.array_equal(one, two)
     assert np.array_equal(capture.images, again.images)
     assert np.array_equal(capture.points.position, again.points.position)
-    other = film.schedule(SMALL, 1)
+    other = rendering.schedule(SMALL, 1)
     assert np.array_equal(other.time, capture.times)
     shift = np.linalg.norm(other.cameras.position - capture.cameras.position, axis=-1)
     assert 0.001 < shift.mean() < 0.05
@@ -396,7 +396,7 @@ def test_a_failed_write_leaves_nothing_behind(small, tmp_path, monkeypatch):
 
 def test_a_truth_of_another_version_is_refused(tmp_path):
     np.savez(tmp_path / "truth.npz", ids=np.array(["a"]))
-    with pytest.raises(ValueError, match="make the scene again"):
+    with pytest.raises(ValueError, match="create the scene again"):
         truth.load(tmp_path / "truth.npz")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerfies_jax.capture import images
-from nerfies_jax.capture.synthetic import film, presets, texture, trace
+from nerfies_jax.capture.synthetic import presets, rendering, texture, trace
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
 from tests import gradients, scene_oracle
@@ -46,7 +46,7 @@ def cast(spec, origins, directions, time):
 
 
 def rays_of(row, rng, count):
-    plan = film.schedule(SPEC, 0)
+    plan = rendering.schedule(SPEC, 0)
     camera = cameras.take(plan.cameras, row)
     pixels = rng.uniform(0, 1, (count, 2)) * SPEC.size
     along = scene_oracle.directions(camera, pixels)

@@ -43,7 +43,7 @@ def test_a_time_that_cannot_be_known_is_refused(tmp_path):
     make(tmp_path, {"": 9})
     late = [row / 7 for row in range(8)] + [None]
     rewrite(tmp_path, lambda row, entry: entry.update(time=late[row]))
-    with pytest.raises(CaptureError, match="r_8' has no time, and none follows"):
+    with pytest.raises(CaptureError, match="r_8' has no time, and none can be"):
         blender_format.read(tmp_path)
 
 

@@ -175,7 +175,7 @@ def test_of_rows_alone_nothing_behind_the_last_is_decoded(tmp_path):
         where = data.index(b"IHDR", where + 1)
     data[where - 12 : where] = bytes(12)  # its signature
     (tmp_path / "a.mov").write_bytes(data)
-    with pytest.raises(CaptureError, match="not a readable film"):
+    with pytest.raises(CaptureError, match="not a readable video"):
         list(video.read_video(tmp_path / "a.mov"))
     shown = list(video.read_video(tmp_path / "a.mov", rows=(1, 6)))
     for (_, picture), number in zip(shown, (1, 6), strict=True):
@@ -255,10 +255,10 @@ def test_a_film_of_high_dynamic_range_is_told_and_tone_mapped(tmp_path):
 
 
 def test_what_is_no_film_is_refused(tmp_path):
-    with pytest.raises(CaptureError, match="no such film"):
+    with pytest.raises(CaptureError, match="no such video"):
         list(video.read_video(tmp_path / "a.mp4"))
     (tmp_path / "b.mp4").write_bytes(b"hello")
-    with pytest.raises(CaptureError, match=r"b\.mp4: not a readable film"):
+    with pytest.raises(CaptureError, match=r"b\.mp4: not a readable video"):
         list(video.read_video(tmp_path / "b.mp4"))
     video.write_video(tmp_path / "c.mp4", film())
     data = (tmp_path / "c.mp4").read_bytes()
@@ -322,7 +322,7 @@ def test_damaged_frames_are_left_out_with_a_note_and_refused_by_default(tmp_path
     path.write_bytes(data)
     taken = footage.from_film(path, tmp_path / "out", 5)
     assert any("cut short or broken" in note for note in taken.notes)
-    with pytest.raises(CaptureError, match="not a readable film"):
+    with pytest.raises(CaptureError, match="not a readable video"):
         list(video.read_video(path))
 
 

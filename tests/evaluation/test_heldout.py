@@ -344,4 +344,4 @@ def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tm
         run._replace(filmed=broken), state, renderer, scored
     )
     assert set(numbers) == ALWAYS | MASKED | BASELINES | DEPTHS
-    assert "no scene truth" in notes[0]
+    assert "not a readable ground truth" in notes[0]

@@ -1,7 +1,8 @@
 """Rigid motion of the objects of a synthetic scene, in closed form.
 
 World axes are x right, y up, z toward the camera, and lengths are in scene units. Time
-runs from 0 to 1 over the capture. The origin of a body rests at `place` in the world.
+runs from 0 to 1 over the capture. `place` is the world position of a body's origin
+without motion.
 """
 
 import dataclasses
@@ -47,8 +48,8 @@ def unit_axis(axis: Vector) -> Vector:
 class Path:
     """Lissajous path with a rotation about an axis through the body."""
 
-    sway: Vector = (0.0, 0.0, 0.0)  # scene units to either side of the place
-    cycles: Vector = (1.0, 1.0, 1.0)  # per capture, for each direction of sway
+    sway: Vector = (0.0, 0.0, 0.0)  # amplitude about the place, scene units
+    cycles: Vector = (1.0, 1.0, 1.0)  # per capture, for each axis of `sway`
     phase: Vector = (0.0, 0.0, 0.0)  # in cycles
     axis: Vector = (0.0, 1.0, 0.0)
     turns: float = 0.0  # per capture
@@ -60,29 +61,29 @@ class Path:
         """Return the pose at a time.
 
         Args:
-          place: Position of the body at rest, in scene units.
+          place: Position of the body without motion, in scene units.
           time: Time in [0, 1].
 
         Returns:
           The pose.
         """
-        cycles, phase, sway, rest = (
+        cycles, phase, sway, origin = (
             jnp.asarray(value, time.dtype)
             for value in (self.cycles, self.phase, self.sway, place)
         )
         shift = sway * jnp.sin(2 * jnp.pi * (cycles * time + phase))
-        turn = axis_rotation(self.axis, 2 * jnp.pi * self.turns * time)
-        return Pose(turn, rest + shift)
+        rotation = axis_rotation(self.axis, 2 * jnp.pi * self.turns * time)
+        return Pose(rotation, origin + shift)
 
 
 @dataclasses.dataclass(frozen=True)
 class Hinge:
-    """One joint, with pivot and axis in the world at the rest pose."""
+    """One joint, with pivot and axis in world coordinates of the rest pose."""
 
     pivot: Vector
     axis: Vector = (0.0, 0.0, 1.0)
-    rest_rad: float = 0.0
-    swing_rad: float = 0.5  # to either side of the rest angle
+    rest_rad: float = 0.0  # mean angle
+    swing_rad: float = 0.5  # amplitude about the mean angle
     cycles: float = 1.0  # per capture
     phase: float = 0.0  # in cycles
 
@@ -92,10 +93,10 @@ class Hinge:
 
 @dataclasses.dataclass(frozen=True)
 class Arm:
-    """A body at the end of a chain of hinges, the one nearest to the ground first.
+    """A body at the end of a chain of hinges, the base hinge first.
 
     The product of exponentials of Brockett 1984: each joint moves everything after it
-    from its rest pose, so the joints apply last to first.
+    from its rest pose, so the joints are applied last to first.
     """
 
     hinges: tuple[Hinge, ...]
@@ -108,7 +109,7 @@ class Arm:
         """Return the pose at a time.
 
         Args:
-          place: Position of the body at rest, in scene units.
+          place: Position of the body without motion, in scene units.
           time: Time in [0, 1].
 
         Returns:
@@ -118,16 +119,16 @@ class Arm:
         position = jnp.asarray(place, time.dtype)
         for hinge in reversed(self.hinges):
             swing = jnp.sin(2 * jnp.pi * (hinge.cycles * time + hinge.phase))
-            turn = axis_rotation(hinge.axis, hinge.rest_rad + hinge.swing_rad * swing)
+            joint = axis_rotation(hinge.axis, hinge.rest_rad + hinge.swing_rad * swing)
             pivot = jnp.asarray(hinge.pivot, time.dtype)
-            rotation = exact_product(turn, rotation)
-            position = exact_product(turn, position - pivot) + pivot
+            rotation = exact_product(joint, rotation)
+            position = exact_product(joint, position - pivot) + pivot
         return Pose(rotation, position)
 
 
 @dataclasses.dataclass(frozen=True)
 class Glide:
-    """Translation at constant speed between two times, at rest before and after."""
+    """Translation at constant speed between two times, static before and after."""
 
     travel: Vector  # scene units
     start: float = 0.0
@@ -151,8 +152,8 @@ class Glide:
           The pose.
         """
         share = jnp.clip((time - self.start) / (self.stop - self.start), 0, 1)
-        travel, rest = (jnp.asarray(x, time.dtype) for x in (self.travel, place))
-        return Pose(jnp.eye(3, dtype=time.dtype), rest + share * travel)
+        travel, origin = (jnp.asarray(x, time.dtype) for x in (self.travel, place))
+        return Pose(jnp.eye(3, dtype=time.dtype), origin + share * travel)
 
 
 Motion = Path | Arm | Glide
@@ -162,8 +163,8 @@ def pose(motion: Motion | None, place: Vector, time: Float[Array, ""]) -> Pose:
     """Return the pose of a body at a time.
 
     Args:
-      motion: The motion. None for a body at rest.
-      place: Position of the body at rest, in scene units.
+      motion: The motion. None for a static body.
+      place: Position of the body without motion, in scene units.
       time: Time in [0, 1].
 
     Returns:
@@ -201,7 +202,9 @@ def to_body(pose: Pose, point: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def axis_rotation(axis: Vector, angle_rad: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotate about a fixed axis (Rodrigues' formula), smoothly in the angle everywhere.
+    """Return the rotation about a fixed axis (Rodrigues' formula).
+
+    It is a smooth function of the angle everywhere.
 
     Args:
       axis: The axis, of any length.
@@ -214,7 +217,7 @@ def axis_rotation(axis: Vector, angle_rad: Float[Array, ""]) -> Float[Array, "3 
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     first = jnp.asarray(cross, angle_rad.dtype)
     second = jnp.asarray(cross @ cross, angle_rad.dtype)
-    # 2 sin²(a/2) = 1 - cos a, without its cancellation near zero.
+    # 2 sin²(a/2) = 1 - cos a, without cancellation near zero.
     versine = 2 * jnp.sin(angle_rad / 2) ** 2
     eye = jnp.eye(3, dtype=angle_rad.dtype)
     return eye + jnp.sin(angle_rad) * first + versine * second

@@ -1,4 +1,4 @@
-"""Named synthetic scenes. Lengths fit a box with unit diagonal, including cameras."""
+"""Presets of synthetic scenes. Objects and cameras fit a box with unit diagonal."""
 
 import dataclasses
 
@@ -121,8 +121,8 @@ CUBE = Thing(
         turns=0.2,
     ),
 )
-# Twice its own width to either side, and three quarters of a turn: too fast for a short
-# fit, which averages it away.
+# It moves by twice its width to either side and rotates by three quarters of a turn. A
+# short optimization averages this motion away.
 FAST_CUBE = dataclasses.replace(
     CUBE,
     name="fast cube",
@@ -159,8 +159,8 @@ FOREARM = Thing(
     CUBE.texture,
     Arm((_SHOULDER, _ELBOW)),
 )
-# Two balls of dough that swing through each other: one lump for two fifths of the
-# time, and what of one lies inside the other is no surface then.
+# Two lumps that move through each other. They overlap for two fifths of the time, when
+# the parts of each inside the other are not surfaces.
 _APART = Path(sway=(0.035, 0.0, 0.0), cycles=(2.0, 1.0, 1.0))
 LEFT_LUMP = Thing(
     "left lump", Sphere(0.045), (-0.07, -0.05, 0.08), CUBE.texture, _APART
@@ -172,8 +172,8 @@ RIGHT_LUMP = Thing(
     BALL.texture,
     dataclasses.replace(_APART, sway=(-0.035, 0.0, 0.0)),
 )
-# Halves of a shutter: shut at times 0, 1/2 and 1, when nobody can tell that the slit
-# and the inner faces exist; between them it opens by 0.08 onto the wall behind.
+# Two halves of a shutter, which is closed at times 0, 1/2 and 1, when gap and inner
+# faces are not observable. In between it opens by 0.08 and reveals the wall.
 _SLIDE = Path(sway=(0.02, 0.0, 0.0), cycles=(2.0, 1.0, 1.0), phase=(-0.25, 0.0, 0.0))
 LEFT_SHUTTER = Thing(
     "left shutter",

@@ -12,14 +12,14 @@ from nerfies_jax.capture import cache_files, nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.capture.json_files import AnyPath, new_folder
-from nerfies_jax.capture.synthetic import film, trace, truth
+from nerfies_jax.capture.synthetic import rendering, trace, truth
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.capture.synthetic.truth import SceneTruth
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.runtime import data_parallel, events
 
-VERSION = 3  # raise it when the same spec gives other pictures: caches then renew
-TRUTH_FILE = "truth.npz"  # beside the Nerfies files, which other readers pass over
+VERSION = 3  # increase it when images of a spec change, to invalidate caches
+TRUTH_FILE = "truth.npz"  # next to the Nerfies files; other readers ignore it
 
 
 def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
@@ -36,22 +36,22 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
     Returns:
       The capture and its ground truth.
     """
-    plan = film.schedule(spec, seed)
+    plan = rendering.schedule(spec, seed)
     programs = truth.programs(spec, plan)
-    images, depths, hits = _film(spec, plan)
+    images, depths, hits = _render_frames(spec, plan)
     moves = np.array([thing.moves() for thing in spec.all_things()] + [False])
-    moving = moves[hits.thing]  # nothing is id -1: the last row
+    moving = moves[hits.thing]  # id -1, for no object, indexes the last entry
     ids = tuple(
-        f"{camera}_{instant:05d}"  # readers sort names: the rows stay in order
+        f"{camera}_{instant:05d}"  # sorted by name, frames stay in this order
         for instant, camera in zip(plan.instant, plan.camera_id, strict=True)
     )
-    answers = _truth(spec, plan, hits, ids, programs, seed)
+    scene_truth = _truth(spec, plan, hits, ids, programs, seed)
     capture = Capture(
         name=f"synthetic {spec.name}",
         source="synthetic",
         ids=ids,
         images=images,
-        cameras=film.noted_cameras(spec, plan, seed),
+        cameras=rendering.recorded_cameras(spec, plan, seed),
         times=plan.time,
         train=np.flatnonzero(plan.learn),
         heldout=np.flatnonzero(~plan.learn),
@@ -62,12 +62,12 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         camera_ids=plan.camera_id,
         moving=moving,
         depths=depths,
-        flow=_flow(plan, answers),
+        flow=_flow(plan, scene_truth),
         points=_points(spec, plan, images, hits, moving, seed),
         background=spec.background,
         up=(0.0, 1.0, 0.0),
     )
-    return capture, answers
+    return capture, scene_truth
 
 
 def write(spec: SceneSpec, path: AnyPath, seed: int = 0):
@@ -81,20 +81,21 @@ def write(spec: SceneSpec, path: AnyPath, seed: int = 0):
     Raises:
       CaptureError: If the directory cannot be written.
     """
-    with new_folder(path) as folder:  # refuses a path in use before it films
+    with new_folder(path) as folder:  # fails before rendering if the path exists
         _write_into(folder, spec, seed)
 
 
 def _write_into(folder, spec, seed):
-    capture, answers = make(spec, seed)
-    with ThreadPoolExecutor(1) as beside:  # zlib needs no lock of Python
-        saved = beside.submit(truth.save, answers, folder / TRUTH_FILE)
+    capture, scene_truth = make(spec, seed)
+    # In a thread, since zlib releases the GIL.
+    with ThreadPoolExecutor(1) as pool:
+        saving = pool.submit(truth.save, scene_truth, folder / TRUTH_FILE)
         with events.stage("writing the scene"):
             nerfies_format.write(capture, folder / "capture")
         for part in (folder / "capture").iterdir():
             part.rename(folder / part.name)
         (folder / "capture").rmdir()
-        saved.result()
+        saving.result()
 
 
 def cached(
@@ -117,21 +118,21 @@ def cached(
         cache_files.check_entry(path, identity)
         return nerfies_format.read(path), truth.load(path / TRUTH_FILE)
 
-    kept = cache_files.read(path, load)
-    if kept is None:
+    scene = cache_files.read(path, load)
+    if scene is None:
         try:
             with cache_files.replaced_entry(path, identity) as partial:
                 _write_into(partial, spec, seed)
         except CaptureError:
-            # Another process may have been quicker: then its files are as good.
-            kept = cache_files.read(path, load)
-            if kept is None:
+            # Another process may have written the same scene first.
+            scene = cache_files.read(path, load)
+            if scene is None:
                 raise
         else:
-            kept = load(path)
-    capture, answers = kept
+            scene = load(path)
+    capture, scene_truth = scene
     name = f"synthetic {spec.name}"
-    return dataclasses.replace(capture, name=name, source="synthetic"), answers
+    return dataclasses.replace(capture, name=name, source="synthetic"), scene_truth
 
 
 def digest(spec: SceneSpec, seed: int = 0) -> str:
@@ -150,56 +151,57 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def _film(spec, plan):
+def _render_frames(spec, plan):
     rows = plan.cameras, plan.time, plan.light_gain, plan.transient_shown
     images, depths, hits = [], [], []
     with events.stage("rendering the built-in scene", len(plan.time)) as stage:
-        for taken in data_parallel.rows_on_devices(film.picture, spec, rows):
-            images.append(np.round(taken.image * 255).astype(np.uint8))
-            depths.append(taken.depth)
-            hits.append(taken.hit)
+        for frame in data_parallel.rows_on_devices(rendering.render, spec, rows):
+            images.append(np.round(frame.image * 255).astype(np.uint8))
+            depths.append(frame.depth)
+            hits.append(frame.hit)
             stage.advance()
     hits = jax.tree.map(lambda *leaves: np.stack(leaves), *hits)
     return np.stack(images), np.stack(depths), hits
 
 
 def _points(spec, plan, images, hits, moving, seed):
-    """Static points that the first camera sees, as structure from motion finds them.
+    """Static points in the training frames, as from structure from motion.
 
-    A little off, with the color of a pixel, evenly over its pictures.
+    They are uniformly distributed over the pixels, with noise, and have the color of a
+    pixel.
     """
     rng = np.random.default_rng([seed, 4])
-    still = (hits.thing != trace.NOTHING) & ~moving
-    candidates = np.flatnonzero(still & plan.learn[:, None, None])
-    chosen = rng.choice(candidates, min(spec.points, len(candidates)), replace=False)
-    row = chosen // still[0].size
-    directions = jax.vmap(film.view_direction)(
-        cameras.take(plan.cameras, row), _centers_of(chosen, spec.size)
+    static = (hits.thing != trace.NOTHING) & ~moving
+    candidates = np.flatnonzero(static & plan.learn[:, None, None])
+    sample = rng.choice(candidates, min(spec.points, len(candidates)), replace=False)
+    row = sample // static[0].size
+    directions = jax.vmap(rendering.view_direction)(
+        cameras.take(plan.cameras, row), _pixel_centers(sample, spec.size)
     )
-    distance = hits.distance.reshape(-1)[chosen]
+    distance = hits.distance.reshape(-1)[sample]
     exact = plan.cameras.position[row] + distance[:, None] * np.asarray(directions)
     noise = spec.point_noise * rng.normal(size=exact.shape)
     position = (exact + noise).astype(np.float32)
-    return PointCloud(position, images.reshape(-1, 3)[chosen])
+    return PointCloud(position, images.reshape(-1, 3)[sample])
 
 
-def _centers_of(flat, size):
+def _pixel_centers(flat, size):
     """Pixel centers of flat indices into [frames, height, width]."""
     width, height = size
     return np.stack([flat % width, flat // width % height], -1).astype(np.float32) + 0.5
 
 
-def _flow(plan, answers):
-    """The exact flow, row by row as in `truth.flows`."""
+def _flow(plan, scene_truth):
+    """The true flow as the flow of a capture."""
     rows = np.arange(len(plan.time))
     leaves = []
     for step, shift, seen in (
-        (1, answers.flow_forward, answers.forward_seen),
-        (-1, answers.flow_backward, answers.backward_seen),
+        (1, scene_truth.flow_forward, scene_truth.forward_seen),
+        (-1, scene_truth.flow_backward, scene_truth.backward_seen),
     ):
-        other = np.clip(rows + step, 0, len(rows) - 1)
-        same = plan.camera_id[other] == plan.camera_id[rows]
-        leaves += [shift, seen, np.where(same, other, rows).astype(np.int32)]
+        neighbor = np.clip(rows + step, 0, len(rows) - 1)
+        same_camera = plan.camera_id[neighbor] == plan.camera_id[rows]
+        leaves += [shift, seen, np.where(same_camera, neighbor, rows).astype(np.int32)]
     return FrameFlow(*leaves)
 
 

@@ -1,7 +1,7 @@
 """Shapes of a synthetic scene, their ray intersections and non-rigid deformations.
 
 Each shape maps its *material* points (which carry the texture) to *body* points at a
-time, and back. Both maps are exact, and defined off the surface too.
+time, and back. Both maps are exact, and also defined off the surface.
 """
 
 import dataclasses
@@ -14,23 +14,24 @@ from jaxtyping import Array, Bool, Float
 from nerfies_jax.capture.synthetic.motion import Vector
 from nerfies_jax.geometry import rays
 
-# A pair of crossings between two neighboring probes is missed, a fold seen edge-on: of
-# 350 rays at 14 to 34 degrees to the cloth's plane one was, above that none.
+# Samples along a ray. Two intersections between neighboring samples are missed, as at a
+# fold that is viewed edge-on: one of 350 rays at 14 to 34 degrees to the plane of the
+# cloth, and none at larger angles.
 PROBES = 16
-REFINEMENTS = 5  # Newton inside the bracket
+REFINEMENTS = 5  # iterations of Newton's method within the bracket
 
 
 class Crossing(NamedTuple):
     """First intersection of a ray with a shape, at infinity if it misses."""
 
     distance: Float[Array, ""]  # in lengths of the direction
-    material: Float[Array, "3"]  # the point of the material that is met
-    normal: Float[Array, "3"]  # outwards, in the body's axes, unit length
+    material: Float[Array, "3"]  # material point
+    normal: Float[Array, "3"]  # outward unit normal in body coordinates
 
 
 @dataclasses.dataclass(frozen=True)
 class Squash:
-    """Stretches along y and thins across, keeping the volume and the lowest point."""
+    """Stretch along y that preserves the volume and the lowest point."""
 
     amount: float = 0.25  # natural logarithm of the largest stretch
     cycles: float = 2.0  # per capture
@@ -39,7 +40,7 @@ class Squash:
 
 @dataclasses.dataclass(frozen=True)
 class Sphere:
-    """A ball about the body's origin, or an ellipsoid if it squashes."""
+    """A sphere around the body's origin, or an ellipsoid if it is squashed."""
 
     radius: float
     squash: Squash | None = None
@@ -51,7 +52,7 @@ class Sphere:
         """Return whether the material moves within the body.
 
         Returns:
-          True for a sphere that squashes.
+          True for a sphere with `squash`.
         """
         return self.squash is not None
 
@@ -82,7 +83,7 @@ class Sphere:
         return base + (point - base) / scale
 
     def cross(self, origin, direction, time) -> Crossing:
-        """Intersect a ray, in material coordinates, where the shape is a ball.
+        """Intersect a ray in material coordinates, in which the shape is a sphere.
 
         Args:
           origin: Origin of the ray in body coordinates, [3].
@@ -95,17 +96,17 @@ class Sphere:
         scale, _ = self._stretch(time)
         start, along = self.undeform(origin, time), direction / scale
         speed_sq = jnp.sum(along**2)
-        # From the point nearest to the center, not from the origin: b² - ac would
-        # cancel for a small ball far away.
+        # Relative to the point nearest to the center, since b² - ac relative to the
+        # origin of the ray would cancel for a small, distant sphere.
         middle = -jnp.sum(start * along) / speed_sq
         nearest = start + middle * along
         half_chord_sq = (self.radius**2 - jnp.sum(nearest**2)) / speed_sq
-        met = half_chord_sq > 0
-        distance = middle - jnp.sqrt(jnp.where(met, half_chord_sq, 1))
+        hit = half_chord_sq > 0
+        distance = middle - jnp.sqrt(jnp.where(hit, half_chord_sq, 1))
         material = start + distance * along
         normal = material / scale
-        normal = normal / jnp.sqrt(jnp.sum(jnp.where(met, normal, 1) ** 2))
-        return Crossing(_or_infinite(met, distance), material, normal)
+        normal = normal / jnp.sqrt(jnp.sum(jnp.where(hit, normal, 1) ** 2))
+        return Crossing(_or_infinite(hit, distance), material, normal)
 
     def _stretch(self, time):
         if self.squash is None:
@@ -121,7 +122,7 @@ class Sphere:
 
 @dataclasses.dataclass(frozen=True)
 class Box:
-    """A box about the body's origin."""
+    """A box around the body's origin with half sizes `half`."""
 
     half: Vector
 
@@ -161,7 +162,7 @@ class Box:
         return point
 
     def cross(self, origin, direction, time) -> Crossing:
-        """Intersect a ray. A ray that starts inside does not meet the box.
+        """Intersect a ray. Rays that start inside have no intersection.
 
         Args:
           origin: Origin of the ray in body coordinates, [3].
@@ -173,12 +174,12 @@ class Box:
         """
         half = jnp.asarray(self.half, time.dtype)
         distance, leave = rays.intersect_aabb(origin, direction, -half, half)
-        met = (distance > 0) & (distance < leave)
-        material = origin + jnp.where(met, distance, 0) * direction
-        # The face is the one the point lies on, that is farthest out in half sizes.
+        hit = (distance > 0) & (distance < leave)
+        material = origin + jnp.where(hit, distance, 0) * direction
+        # The face is that of the largest coordinate relative to the half size.
         face = jax.nn.one_hot(jnp.argmax(jnp.abs(material) / half), 3, dtype=time.dtype)
         return Crossing(
-            _or_infinite(met, distance), material, face * jnp.sign(material)
+            _or_infinite(hit, distance), material, face * jnp.sign(material)
         )
 
 
@@ -186,17 +187,17 @@ class Box:
 class Sheet:
     """A cloth in the body's xy plane that hangs from its upper edge and billows.
 
-    The material point (u, v, w) goes to (u + sway(v), v, w + billow(u, v)): a shear, so
-    its inverse is exact everywhere and its Jacobian determinant is one. The upper edge
-    stays where it is.
+    The material point (u, v, w) maps to (u + sway(v), v, w + billow(u, v)). This is a
+    shear, so its inverse is exact everywhere and its Jacobian determinant is one. The
+    upper edge is static.
     """
 
     half_width: float
     half_height: float
-    billow: float = 0.03  # scene units to either side at the lower edge
-    wavelength: float = 0.3  # of the wave that runs across, scene units
+    billow: float = 0.03  # amplitude along z at the lower edge, scene units
+    wavelength: float = 0.3  # of the horizontal wave, scene units
     billow_cycles: float = 2.0  # per capture
-    sway: float = 0.04  # sideways, at the lower edge
+    sway: float = 0.04  # amplitude along x at the lower edge, scene units
     sway_cycles: float = 1.0
 
     def __post_init__(self):
@@ -207,7 +208,7 @@ class Sheet:
             wavelength=self.wavelength,
         )
         if self.sway < 0:
-            raise ValueError(f"sway={self.sway} must not be negative; 0 hangs straight")
+            raise ValueError(f"sway={self.sway} must not be negative; 0 disables it")
 
     def bends(self) -> bool:
         """Return whether the material moves within the body.
@@ -246,7 +247,7 @@ class Sheet:
         return jnp.stack([u, y, z - self._billow(u, y, time)])
 
     def cross(self, origin, direction, time) -> Crossing:
-        """Intersect a ray, bracketed by probes and refined by Newton's method.
+        """Intersect a ray by sampling, with Newton's method in the bracket.
 
         Args:
           origin: Origin of the ray in body coordinates, [3].
@@ -256,33 +257,33 @@ class Sheet:
         Returns:
           The first intersection.
         """
-        distance, met = self._root(origin, direction, time)
+        distance, hit = self._root(origin, direction, time)
         material = self.undeform(origin + distance * direction, time)
         normal = jax.grad(lambda point: self.undeform(point, time)[2])(
             origin + distance * direction
         )
-        normal = normal / jnp.sqrt(jnp.sum(normal**2))  # its z is one: never zero
-        return Crossing(_or_infinite(met, distance), material, normal)
+        normal = normal / jnp.sqrt(jnp.sum(normal**2))  # not zero, since its z is one
+        return Crossing(_or_infinite(hit, distance), material, normal)
 
     def _root(self, origin, direction, time):
         def height(distance):
             return self.undeform(origin + distance * direction, time)[2]
 
-        def still(distance):  # the loop must see no derivatives: it has none to give
-            fixed = jax.lax.stop_gradient((origin, direction, time))
-            return self.undeform(fixed[0] + distance * fixed[1], fixed[2])[2]
+        def fixed_height(distance):  # a while loop has no reverse-mode derivative
+            ray = jax.lax.stop_gradient((origin, direction, time))
+            return self.undeform(ray[0] + distance * ray[1], ray[2])[2]
 
-        low, high, found = self._bracket(
+        low, high, bracketed = self._bracket(
             *jax.lax.stop_gradient((origin, direction, time))
         )
-        sign_low = jnp.sign(still(low))
+        sign_low = jnp.sign(fixed_height(low))
 
-        def searching(state):
-            return found & (state[0] < REFINEMENTS)
+        def unfinished(state):
+            return bracketed & (state[0] < REFINEMENTS)
 
         def refine(state):
             index, low, high, at = state
-            value, slope = jax.jvp(still, (at,), (jnp.ones_like(at),))
+            value, slope = jax.jvp(fixed_height, (at,), (jnp.ones_like(at),))
             before = jnp.sign(value) == sign_low
             low, high = jnp.where(before, at, low), jnp.where(before, high, at)
             newton = at - value / jnp.where(slope == 0, 1, slope)
@@ -290,49 +291,50 @@ class Sheet:
             return index + 1, low, high, jnp.where(inside, newton, (low + high) / 2)
 
         start = (jnp.int32(0), low, high, (low + high) / 2)
-        at = jax.lax.stop_gradient(jax.lax.while_loop(searching, refine, start)[3])
-        # One Newton step outside the loop carries the implicit derivative of the root.
+        at = jax.lax.stop_gradient(jax.lax.while_loop(unfinished, refine, start)[3])
+        # One Newton step outside of the loop has the implicit derivative of the root.
         value, slope = jax.jvp(height, (at,), (jnp.ones_like(at),))
         slope = jax.lax.stop_gradient(slope)
         distance = at - value / jnp.where(slope == 0, 1, slope)
         u, v, _ = self.undeform(origin + at * direction, time)
         inside = (jnp.abs(u) <= self.half_width) & (jnp.abs(v) <= self.half_height)
-        return jnp.where(found, distance, 0), found & inside & (at > 0)
+        return jnp.where(bracketed, distance, 0), bracketed & inside & (at > 0)
 
     def _bracket(self, origin, direction, time):
-        """The first interval between probes in which the ray crosses the cloth."""
-        reach = (self.half_width + self.sway, self.half_height, _CREST * self.billow)
-        # A touch beyond the crests: a probe on the border would see no change of sign.
-        high = jnp.asarray(reach, time.dtype) * 1.001
+        """The first interval between samples in which the ray crosses the cloth."""
+        extent = (self.half_width + self.sway, self.half_height, _CREST * self.billow)
+        # Slightly beyond the crests, since a sample on the border has no sign change.
+        high = jnp.asarray(extent, time.dtype) * 1.001
         enter, leave = rays.intersect_aabb(origin, direction, -high, high)
         hit = enter < leave
         enter = jnp.where(hit, enter, 0)
         step = jnp.where(hit, leave - enter, 1) / (PROBES - 1)
 
-        # A while loop: a batch of rays that all miss, or have all crossed, stops here.
-        def searching(state):
-            index, _, found, _, _ = state
-            return hit & ~found & (index < PROBES)
+        # A while loop ends early for a batch of rays that all miss or have all crossed.
+        def unfinished(state):
+            index, _, crossed, _, _ = state
+            return hit & ~crossed & (index < PROBES)
 
         def probe(state):
             index, _, _, u_low, height_low = state
             at = enter + index.astype(time.dtype) * step
             u, _, height = self.undeform(origin + at * direction, time)
-            # Beside the cloth (the sway widens the box) a crossing means nothing; where
-            # on the cloth it is is known to second order in the step from the chord.
+            # The box is wider than the cloth because of the sway, so crossings next to
+            # the cloth are ignored. Linear interpolation locates the crossing to second
+            # order in the step.
             fall = jnp.where(height_low == height, 1, height_low - height)
             crossing = u_low + height_low / fall * (u - u_low)
             on_cloth = jnp.abs(crossing) <= self.half_width
-            found = (height_low * height <= 0) & (height_low != height) & on_cloth
-            return index + 1, at - step, found, u, height
+            crossed = (height_low * height <= 0) & (height_low != height) & on_cloth
+            return index + 1, at - step, crossed, u, height
 
         u, _, height = self.undeform(origin + enter * direction, time)
         start = (jnp.int32(1), enter, jnp.zeros_like(hit), u, height)
-        _, low, found, _, _ = jax.lax.while_loop(searching, probe, start)
-        return low, low + step, found
+        _, low, crossed, _, _ = jax.lax.while_loop(unfinished, probe, start)
+        return low, low + step, crossed
 
     def _hang(self, v):
-        """0 at the upper edge, 1 at the lower."""
+        """0 at the upper edge, 1 at the lower edge."""
         return (self.half_height - v) / (2 * self.half_height)
 
     def _sway(self, v, time):
@@ -347,14 +349,14 @@ class Sheet:
         return self.billow * self._hang(v) * (wave + ripple)
 
 
-_RIPPLE = 0.35  # of the main wave
-_CREST = 1 + _RIPPLE  # no crest of both waves is higher
+_RIPPLE = 0.35  # amplitude relative to the main wave
+_CREST = 1 + _RIPPLE  # upper bound of the sum of both waves
 
 Shape = Sphere | Box | Sheet
 
 
-def _or_infinite(met: Bool[Array, ""], distance: Float[Array, ""]):
-    return jnp.where(met & (distance > 0), distance, jnp.inf)
+def _or_infinite(hit: Bool[Array, ""], distance: Float[Array, ""]):
+    return jnp.where(hit & (distance > 0), distance, jnp.inf)
 
 
 def _positive(**values):

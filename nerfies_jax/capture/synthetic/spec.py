@@ -9,13 +9,13 @@ from nerfies_jax.capture.synthetic.texture import Texture
 
 @dataclasses.dataclass(frozen=True)
 class Thing:
-    """One object: its shape, texture, rest position and motion."""
+    """One object: its shape, texture, initial position and motion."""
 
     name: str
     shape: Shape
-    place: Vector  # of the body's origin at rest, world
+    place: Vector  # world position of the body's origin without motion
     texture: Texture = Texture()
-    motion: Motion | None = None  # None stays in its place
+    motion: Motion | None = None  # None for a static position
 
     def moves(self) -> bool:
         """Return whether any point of the object ever moves.
@@ -28,23 +28,24 @@ class Thing:
 
 @dataclasses.dataclass(frozen=True)
 class Cameras:
-    """A casual hand-held arc, and a second camera next to the first.
+    """A hand-held camera that moves along an arc, and a second camera next to it.
 
-    The hand sweeps to and fro about the target and leans forward, with smooth shake.
-    Its period differs from those of the objects, since one camera cannot tell the depth
-    of an object that swings in step with it. The second camera looks at the same
-    target, and its images are never used for training.
+    The first camera sweeps back and forth around the target and moves closer, with
+    smooth shake. Its period differs from those of the objects, since a single camera
+    cannot determine the depth of an object that moves in phase with it. The second
+    camera looks at the same target, and its images are never used for training.
     """
 
-    distance: float = 0.66  # from the target at rest, scene units
+    distance: float = 0.66  # largest distance from the target, scene units
     target: Vector = (0.0, -0.02, 0.0)
-    height: float = 0.07  # above the target
+    height: float = 0.07  # above the target, scene units
     arc_rad: float = 0.38  # to either side
-    sweeps: float = 2.5  # to and fro, per capture
-    forward: float = 0.05  # how far the hand comes closer, scene units
-    shake: float = 0.005  # root mean square, of position and of aim, scene units
-    field_of_view_rad: float = 0.85  # across the width
-    beside: Vector = (0.09, 0.05, 0.0)  # second camera: right, up, back; scene units
+    sweeps: float = 2.5  # periods per capture
+    forward: float = 0.05  # amplitude of the movement toward the target, scene units
+    shake: float = 0.005  # root mean square of position and target, scene units
+    field_of_view_rad: float = 0.85  # horizontal
+    # Offset of the second camera to the right, up and back, scene units.
+    beside: Vector = (0.09, 0.05, 0.0)
 
     def __post_init__(self):
         if not self.distance - self.forward > 0:
@@ -57,12 +58,12 @@ class Cameras:
                 f"field_of_view_rad={self.field_of_view_rad} must lie between 0 and 3"
             )
         if self.shake < 0:
-            raise ValueError(f"shake={self.shake} must not be negative; 0 holds still")
+            raise ValueError(f"shake={self.shake} must not be negative; 0 is steady")
 
 
 @dataclasses.dataclass(frozen=True)
 class Exposure:
-    """Brightness and tint that drift from instant to instant, in linear light."""
+    """Exposure and white balance that drift smoothly over time, in linear light."""
 
     stops: float = 0.5  # root mean square; one stop doubles the light
     tint: float = 0.06  # root mean square share, for red and blue
@@ -72,12 +73,12 @@ class Exposure:
 class PoseError:
     """Pose error of the first camera's frames, independent for each frame.
 
-    It stands for errors of structure from motion. The second camera, which is for
+    It simulates errors of structure from motion. The second camera, which is used for
     evaluation, has its true pose.
     """
 
-    turn_px: float = 0.6  # root mean square about each axis, seen in the picture
-    shift_px: float = 0.6  # along each axis, of what is as far as the target
+    turn_px: float = 0.6  # root mean square of the rotation about each axis
+    shift_px: float = 0.6  # of the translation along each axis, at the target distance
 
     def __post_init__(self):
         if not (self.turn_px >= 0 and self.shift_px >= 0):
@@ -89,13 +90,13 @@ class PoseError:
 
 @dataclasses.dataclass(frozen=True)
 class Transient:
-    """An object that passes in front of the first camera and is not in the scene.
+    """An object that passes in front of the first camera and is not part of the scene.
 
-    It is in none of the second camera's frames, which evaluate the scene without it.
+    It is absent from the second camera's frames, which evaluate the scene without it.
     """
 
     thing: Thing
-    windows: tuple[tuple[float, float], ...]  # when it is there: (start, stop) times
+    windows: tuple[tuple[float, float], ...]  # (start, stop) times of its presence
 
     def __post_init__(self):
         for start, stop in self.windows:
@@ -108,44 +109,45 @@ class Transient:
 
 @dataclasses.dataclass(frozen=True)
 class Specular:
-    """A polished surface: a highlight that moves with the eye (Blinn 1977)."""
+    """A specular highlight, which depends on the viewpoint (Blinn 1977)."""
 
-    thing: str  # name of the thing that shines
+    thing: str  # name of the specular object
     strength: float = 0.5  # added to all channels, linear light
     sharpness: float = 40.0  # exponent of the half-angle cosine
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneSpec:
-    """An analytic dynamic scene and its recording. An effect of None is absent."""
+    """An analytic dynamic scene and its cameras. An effect of None is absent."""
 
     name: str
     things: tuple[Thing, ...]
     cameras: Cameras = Cameras()
     size: tuple[int, int] = (176, 132)  # width, height in pixels
-    frames: int = 60  # instants over the capture, all seen by the first camera
-    heldout_every: int = 4  # the second camera looks at every so-manieth instant
-    skip_every: int | None = None  # the first camera's frames kept from training, too
-    supersampling: int = 2  # n x n rays for each pixel's color
+    frames: int = 60  # timestamps, all observed by the first camera
+    heldout_every: int = 4  # the second camera observes every n-th timestamp
+    skip_every: int | None = None  # every n-th frame of the first camera is held out
+    supersampling: int = 2  # n x n rays per pixel for color
     points: int = 2500  # static surface points, as from structure from motion
     point_noise: float = 0.0005  # root mean square of each coordinate, scene units
     tracks: int = 384  # true tracks of moving surface points
     light: Vector = (0.45, 0.75, 0.6)  # toward the light
-    ambient: float = 0.45  # share of the light that comes from everywhere
+    ambient: float = 0.45  # share of ambient light
     background: Vector = (0.5, 0.6, 0.7)  # sRGB, behind everything
     exposure: Exposure | None = None
     transient: Transient | None = None
     specular: Specular | None = None
-    # Not in the representation, which names films: those without are as they were.
+    # Not in `repr`, which identifies cached scenes, so that scenes without it keep
+    # their identity.
     pose_error: PoseError | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self):
         unit_axis(self.light)
         self._check_counts()
         names = [thing.name for thing in self.all_things()]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise ValueError(f"two things are called {twice!r}; rename one")
+        duplicate = next((name for name in names if names.count(name) > 1), None)
+        if duplicate is not None:
+            raise ValueError(f"two things are called {duplicate!r}; rename one")
         if self.specular is not None and self.specular.thing not in names:
             raise ValueError(
                 f"specular thing {self.specular.thing!r} is not in the scene; "
@@ -167,7 +169,8 @@ class SceneSpec:
                 )
         if self.skip_every is not None and self.skip_every < 2:
             raise ValueError(
-                f"skip_every={self.skip_every} leaves nothing to learn from; at least 2"
+                f"skip_every={self.skip_every} leaves no training frames; use at least "
+                "2"
             )
         if min(self.size) < 8:
             raise ValueError(f"size={self.size} must be at least 8x8 pixels")
@@ -205,5 +208,5 @@ class SceneSpec:
 
     @property
     def transient_id(self) -> int:
-        """Id of the transient, or -2, which no pixel has, if there is none."""
+        """Id of the transient object, or -2, which no pixel has, if there is none."""
         return -2 if self.transient is None else len(self.things)

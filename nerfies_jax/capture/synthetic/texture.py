@@ -1,8 +1,8 @@
 """Procedural solid textures with detail at several scales, fixed to the material.
 
-A texture is a function of the material point alone, so it moves with the object and
-needs no unwrapping. All objects share one formula, so that a ray evaluates it once,
-whatever it hits.
+A texture is a function of the material point, so it moves with the object and needs no
+UV map. All objects share one formula with different coefficients, so that it is
+evaluated once per ray.
 """
 
 import dataclasses
@@ -17,15 +17,16 @@ from nerfies_jax.capture.images import linear_from_srgb
 from nerfies_jax.capture.synthetic.motion import Vector
 
 OCTAVES = 3
-LATTICE_FACTORS = (0x8DA6B343, 0xD8163841, 0xCB1AB31F)  # odd, far apart
-EDGE = 6.0  # steepness of a checker edge: it takes about a tenth of a square
+LATTICE_FACTORS = (0x8DA6B343, 0xD8163841, 0xCB1AB31F)  # odd, for hashing
+EDGE = 6.0  # steepness of a checker edge, which spans about a tenth of a square
 
 
 @dataclasses.dataclass(frozen=True)
 class Texture:
-    """Two colors mixed by checker, stripes and noise, with spots of a third.
+    """Two colors mixed by a checkerboard, stripes and noise, with blots of a third.
 
-    Colors are sRGB in [0, 1]. The shares set the strength of each pattern.
+    Colors are sRGB in [0, 1]. `checker`, `stripes`, `noise` and `blots` are the
+    strengths of the patterns.
     """
 
     dark: Vector = (0.2, 0.2, 0.25)
@@ -44,8 +45,8 @@ class Texture:
         for name in ("checker_size", "noise_size", "blot_size"):
             if not getattr(self, name) > 0:
                 raise ValueError(
-                    f"{name}={getattr(self, name)} must be positive; to switch a "
-                    "pattern off, set its share to 0"
+                    f"{name}={getattr(self, name)} must be positive; to disable a "
+                    "pattern, set its strength to 0"
                 )
         for name in ("dark", "light", "blot"):
             if min(getattr(self, name)) < 0 or max(getattr(self, name)) > 1:
@@ -68,43 +69,47 @@ def albedo(
     Returns:
       Linear albedo for each channel, [3].
     """
-    # Scalars, not arrays of three, so that a batch of rays fills the vector registers:
-    # six times faster on a CPU. Choosing among numbers is cheaper than a gather, too.
+    # Scalars instead of arrays of three let a batch of rays fill the vector registers,
+    # which is six times faster on a CPU. `where` is faster than a gather, too.
     x, y, z = material
 
-    def pick(number):
-        values = [number(one) for one in textures]
-        chosen = jnp.full_like(x, values[0])
+    def select(coefficient):
+        values = [coefficient(each) for each in textures]
+        selected = jnp.full_like(x, values[0])
         for index, value in enumerate(values[1:], 1):
-            chosen = jnp.where(thing == index, jnp.asarray(value, x.dtype), chosen)
-        return chosen
+            selected = jnp.where(thing == index, jnp.asarray(value, x.dtype), selected)
+        return selected
 
-    # Cosines, so that a face through the body's origin lies inside a square, not on an
-    # edge.
-    turn = jnp.pi / pick(lambda t: t.checker_size)
-    squares = jnp.tanh(EDGE * jnp.cos(turn * x) * jnp.cos(turn * y) * jnp.cos(turn * z))
-    along_x, along_y, along_z = (
-        pick(lambda t, i=axis: 2 * math.pi * t.stripes_per_unit[i]) for axis in range(3)
+    # With cosines, faces through the body's origin lie inside squares and not on edges.
+    scale = jnp.pi / select(lambda t: t.checker_size)
+    squares = jnp.tanh(
+        EDGE * jnp.cos(scale * x) * jnp.cos(scale * y) * jnp.cos(scale * z)
     )
-    bands = jnp.sin(along_x * x + along_y * y + along_z * z)
-    lumps = 1 / pick(lambda t: t.noise_size)
+    wave_x, wave_y, wave_z = (
+        select(lambda t, i=axis: 2 * math.pi * t.stripes_per_unit[i])
+        for axis in range(3)
+    )
+    bands = jnp.sin(wave_x * x + wave_y * y + wave_z * z)
+    frequency = 1 / select(lambda t: t.noise_size)
     grain = sum(
-        value_noise(material * (lumps * 2**octave), 7 * octave + thing) / 2**octave
+        value_noise(material * (frequency * 2**octave), 7 * octave + thing) / 2**octave
         for octave in range(OCTAVES)
     )
     mix = 0.5 + 0.5 * (
-        pick(lambda t: t.checker) * squares
-        + pick(lambda t: t.stripes) * bands
-        + pick(lambda t: t.noise) * grain
+        select(lambda t: t.checker) * squares
+        + select(lambda t: t.stripes) * bands
+        + select(lambda t: t.noise) * grain
     )
     mix = jnp.clip(mix, 0, 1)
-    spot = value_noise(material / pick(lambda t: t.blot_size), 101 + thing)
-    # Blots with soft rims.
-    spot = pick(lambda t: t.blots) / (1 + jnp.exp(-12 * (spot - 0.2)))
+    spot = value_noise(material / select(lambda t: t.blot_size), 101 + thing)
+    # Blots have soft edges.
+    spot = select(lambda t: t.blots) / (1 + jnp.exp(-12 * (spot - 0.2)))
     channels = []
     for channel in range(3):
         dark, light, blot = (
-            pick(lambda t, n=name, i=channel: float(linear_from_srgb(getattr(t, n)[i])))
+            select(
+                lambda t, n=name, i=channel: float(linear_from_srgb(getattr(t, n)[i]))
+            )
             for name in ("dark", "light", "blot")
         )
         ground = dark + mix * (light - dark)
@@ -163,6 +168,6 @@ def srgb(light: Float[Array, "*any"]) -> Float[Array, "*any"]:
       sRGB values in [0, 1].
     """
     low = light <= 0.0031308
-    # The power's slope is infinite at zero, where the other branch is taken.
-    above = jnp.where(low, 1, light)
-    return jnp.where(low, 12.92 * light, 1.055 * above ** (1 / 2.4) - 0.055)
+    # The gradient of the power is infinite at zero, also in the unselected branch.
+    positive = jnp.where(low, 1, light)
+    return jnp.where(low, 12.92 * light, 1.055 * positive ** (1 / 2.4) - 0.055)

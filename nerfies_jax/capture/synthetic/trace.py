@@ -1,6 +1,6 @@
-"""Ray tracing of a synthetic scene: first hits, true motion, shading.
+"""Ray tracing of a synthetic scene: first hits, true motion and shading.
 
-Functions take one ray or one point, and callers vmap them. `spec` is static under jit.
+Functions take a single ray or point, and callers vmap them. `spec` is static under jit.
 """
 
 from typing import NamedTuple
@@ -18,18 +18,19 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.precision import exact_product
 
 NOTHING = -1  # thing id of a ray that leaves the scene
-# Distance in front of a point from which on a surface occludes it, scene units: float32
-# hits surfaces to 1e-6 at grazing incidence, and a pixel at distance 0.7 is 4e-3 wide.
-HIDES = 2e-4
+# A surface occludes a point if it is nearer to the camera by more than this, in scene
+# units. The error of float32 intersections is 1e-6 at grazing incidence, and a pixel at
+# distance 0.7 is 4e-3 wide.
+OCCLUSION_DISTANCE = 2e-4
 
 
 class Hit(NamedTuple):
     """First hit of a ray."""
 
-    distance: Float[Array, ""]  # in lengths of the direction; infinite for nothing
+    distance: Float[Array, ""]  # in lengths of the direction; infinite without a hit
     thing: Int[Array, ""]  # id, or NOTHING
-    material: Float[Array, "3"]  # point of the thing's material
-    normal: Float[Array, "3"]  # in the world, on the viewer's side, unit length
+    material: Float[Array, "3"]  # material point of the object
+    normal: Float[Array, "3"]  # world unit normal that faces the viewer
 
 
 def cast(
@@ -66,11 +67,11 @@ def cast(
         if index == spec.transient_id:
             nearer = nearer & transient_shown
         normal = exact_product(pose.rotation, crossing.normal)
-        here = Hit(
+        hit = Hit(
             crossing.distance, jnp.asarray(index, jnp.int32), crossing.material, normal
         )
         best = jax.tree.map(
-            lambda new, old, take=nearer: jnp.where(take, new, old), here, best
+            lambda new, old, take=nearer: jnp.where(take, new, old), hit, best
         )
     facing = jnp.sum(best.normal * direction) <= 0
     return best._replace(normal=jnp.where(facing, best.normal, -best.normal))
@@ -87,7 +88,7 @@ def observe(
     Args:
       spec: The scene.
       thing: Id of the object.
-      canonical_point: World point on the object's surface, or fixed to it, at time 0,
+      canonical_point: World point at time 0 on the object, or rigidly attached to it,
         [3].
       time: Time in [0, 1].
 
@@ -104,8 +105,9 @@ def canonical(
     observed_point: Float[Array, "3"],
     time: Float[Array, ""],
 ) -> Float[Array, "3"]:
-    """Map a point observed at a time to its position at time 0. Inverts `observe`
-    exactly.
+    """Map a point observed at a time to its position at time 0.
+
+    This is the exact inverse of `observe`.
 
     Args:
       spec: The scene.
@@ -164,17 +166,17 @@ def shade(
     toward_light = jnp.asarray(motion.unit_axis(spec.light), dtype)
     base = surface_color(spec, jnp.maximum(hit.thing, 0), hit.material)
     lambert = jnp.maximum(jnp.sum(hit.normal * toward_light), 0)
-    # More of the ambient light comes from above: it models the shaded side.
+    # Ambient light is stronger from above, which gives shaded surfaces some shading.
     sky = 0.75 + 0.25 * hit.normal[1]
     color = base * (spec.ambient * sky + (1 - spec.ambient) * lambert)
     if spec.specular is not None:
-        shines = hit.thing == spec.id_of(spec.specular.thing)
+        is_specular = hit.thing == spec.id_of(spec.specular.thing)
         half = toward_light - direction / jnp.sqrt(jnp.sum(direction**2))
         cosine = jnp.sum(hit.normal * half) / jnp.sqrt(jnp.sum(half**2))
         lobe = jnp.maximum(cosine, 0) ** spec.specular.sharpness
-        color = color + jnp.where(shines, spec.specular.strength * lobe, 0)
-    behind = jnp.asarray(linear_from_srgb(np.asarray(spec.background)), dtype)
-    return light_gain * jnp.where(hit.thing == NOTHING, behind, color)
+        color = color + jnp.where(is_specular, spec.specular.strength * lobe, 0)
+    background = jnp.asarray(linear_from_srgb(np.asarray(spec.background)), dtype)
+    return light_gain * jnp.where(hit.thing == NOTHING, background, color)
 
 
 def surface_color(
@@ -204,8 +206,7 @@ def visible(
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
     """Project a point of an object and test if the camera sees it.
 
-    The test is exact: a ray is cast at the point itself, and no depth image is
-    interpolated.
+    The test is exact: it casts a ray at the point instead of comparing depth images.
 
     Args:
       spec: The scene.
@@ -225,7 +226,7 @@ def visible(
     width, height = spec.size
     bounds = jnp.asarray((width, height), pixel.dtype)
     inside = jnp.all((pixel >= 0) & (pixel <= bounds)) & (depth > 0)
-    return pixel, inside & (hit.thing == thing) & (jnp.abs(gap) < HIDES)
+    return pixel, inside & (hit.thing == thing) & (jnp.abs(gap) < OCCLUSION_DISTANCE)
 
 
 def _thing(spec: SceneSpec, index: int) -> Thing:

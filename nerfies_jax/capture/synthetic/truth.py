@@ -15,7 +15,7 @@ from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.given import Given
 from nerfies_jax.capture.synthetic import trace
-from nerfies_jax.capture.synthetic.film import Schedule
+from nerfies_jax.capture.synthetic.rendering import Schedule
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import rays
@@ -27,19 +27,20 @@ class SceneTruth(NamedTuple):
 
     Flow leads from the center of a pixel to the position of its point in the next
     (previous) frame of the same camera, in pixels. It is also defined where that point
-    is occluded or outside of the image. `seen` marks where it can be compared with
-    images. The last (first) frame of a camera has none: zero, and nowhere seen.
+    is occluded or outside of the image. `forward_seen` and `backward_seen` are True
+    where the point is visible in both frames. The last (first) frame of a camera has
+    zero flow that is nowhere visible.
     """
 
     ids: tuple[str, ...]  # of the capture's frames, one for each row
-    things: np.ndarray  # [frames, height, width] int8; -1 for nothing
+    things: np.ndarray  # [frames, height, width] int8 ids of objects; -1 for none
     thing_names: tuple[str, ...]  # by id
     transient: np.ndarray  # [frames, height, width] bool
     flow_forward: np.ndarray  # [frames, height, width, 2] float32, right and down
     forward_seen: np.ndarray  # [frames, height, width] bool
     flow_backward: np.ndarray
     backward_seen: np.ndarray
-    light_gain: np.ndarray  # [frames, 3] float32: the exposure, of linear light
+    light_gain: np.ndarray  # [frames, 3] float32: exposure as a gain of linear light
     track_thing: np.ndarray  # [tracks] int32
     track_canonical: np.ndarray  # [tracks, 3] float32: the point at time 0, world
     track_world: np.ndarray  # [tracks, instants, 3] float32
@@ -63,21 +64,21 @@ def track_places(capture: Capture, truth: SceneTruth, rows: np.ndarray) -> np.nd
     """
     if truth.ids != capture.ids:
         raise ValueError(
-            f"{capture.name}: the truth has other frames than the capture; make the "
-            "scene again"
+            f"{capture.name}: the ground truth has other frames than the capture; "
+            "create the scene again"
         )
     last = truth.track_world.shape[1] - 1
     instants = np.round(capture.times[rows] * last).astype(int)
     if np.abs(instants - capture.times[rows] * last).max() > 1e-3:
         raise ValueError(
-            f"{capture.name}: its frames lie between the {last + 1} instants of the "
-            "truth; make the scene again"
+            f"{capture.name}: its frames lie between the {last + 1} timestamps of the "
+            "ground truth; create the scene again"
         )
     world = truth.track_world[:, instants] - np.array(capture.center, np.float32)
     return (world * capture.scale).astype(np.float32)
 
 
-def told(capture: Capture, truth: SceneTruth) -> Capture:
+def with_truth(capture: Capture, truth: SceneTruth) -> Capture:
     """Attach the true tracks, positions and masks as external preprocessing.
 
     Args:
@@ -90,15 +91,15 @@ def told(capture: Capture, truth: SceneTruth) -> Capture:
     Raises:
       ValueError: If the truth is not that of the capture.
     """
-    place = track_places(capture, truth, np.arange(len(capture.ids)))
-    found = Given(
+    positions = track_places(capture, truth, np.arange(len(capture.ids)))
+    given = Given(
         capture.size,
         track_pixel=np.moveaxis(truth.track_pixel, 0, 1),
         track_seen=np.moveaxis(truth.track_seen, 0, 1),
-        track_place=np.moveaxis(place, 0, 1),
+        track_place=np.moveaxis(positions, 0, 1),
         moving=capture.moving,
     )
-    return dataclasses.replace(capture, given=found)
+    return dataclasses.replace(capture, given=given)
 
 
 class Flow(NamedTuple):
@@ -121,7 +122,7 @@ def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flo
       transient_shown: True if the other frame shows the transient object.
 
     Returns:
-      The flow, zero where nothing was hit.
+      The flow, zero for the background.
     """
 
     def one(thing, material):
@@ -139,15 +140,15 @@ class Programs(NamedTuple):
     """Programs of `flows` and `tracks`, compiled in the background."""
 
     flow: Future[jax.stages.Compiled]
-    follow: Future[jax.stages.Compiled] | None = None  # where nothing moves
+    follow: Future[jax.stages.Compiled] | None = None  # None for a static scene
     watch: Future[jax.stages.Compiled] | None = None
 
 
 def programs(spec: SceneSpec, plan: Schedule) -> Programs:
-    """Begin to compile the programs of the ground truth, while images are rendered.
+    """Compile the programs of the ground truth in the background.
 
-    For the built-in scene this takes 6 s of one core, and the program of the images 5
-    s.
+    For the default scene this takes 6 s of one core, and the program that renders
+    images 5 s.
 
     Args:
       spec: The scene.
@@ -193,20 +194,20 @@ def flows(
     width, height = spec.size
     row = np.tile(np.arange(count), 2)
     other = row + np.repeat([1, -1], count)
-    known = (other >= 0) & (other < count)
-    known[known] = plan.camera_id[other[known]] == plan.camera_id[row[known]]
-    here, there = row[known], other[known]
+    exists = (other >= 0) & (other < count)
+    exists[exists] = plan.camera_id[other[exists]] == plan.camera_id[row[exists]]
+    source, target = row[exists], other[exists]
     pairs = (
-        hits.thing[here],
-        hits.material[here],
-        cameras.take(plan.cameras, there),
-        plan.time[there],
-        plan.transient_shown[there],
+        hits.thing[source],
+        hits.material[source],
+        cameras.take(plan.cameras, target),
+        plan.time[target],
+        plan.transient_shown[target],
     )
     shift = np.zeros((2 * count, height, width, 2), np.float32)
     seen = np.zeros((2 * count, height, width), bool)
-    led = data_parallel.rows_on_devices(flow, spec, pairs, programs.flow.result())
-    for index, result in zip(np.flatnonzero(known), led, strict=True):
+    results = data_parallel.rows_on_devices(flow, spec, pairs, programs.flow.result())
+    for index, result in zip(np.flatnonzero(exists), results, strict=True):
         shift[index], seen[index] = result
     forward = Flow._make((shift[:count], seen[:count]))
     return forward, Flow._make((shift[count:], seen[count:]))
@@ -215,7 +216,7 @@ def flows(
 def tracks(
     spec: SceneSpec, plan: Schedule, hits: trace.Hit, programs: Programs, seed: int
 ):
-    """Track random points of moving objects where the first camera sees them.
+    """Track random points of moving objects that training frames show.
 
     The transient object is not tracked.
 
@@ -234,13 +235,13 @@ def tracks(
     moving = np.array([thing.moves() for thing in spec.things])
     eligible = np.isin(hits.thing, np.flatnonzero(moving)) & plan.learn[:, None, None]
     candidates = np.flatnonzero(eligible)
-    # Few moving pixels give few tracks, never the same one twice.
-    chosen = rng.choice(candidates, min(spec.tracks, len(candidates)), replace=False)
-    thing = hits.thing.reshape(-1)[chosen].astype(np.int32)
-    material = hits.material.reshape(-1, 3)[chosen]
+    # Tracks are distinct, so there may be fewer than `spec.tracks`.
+    sample = rng.choice(candidates, min(spec.tracks, len(candidates)), replace=False)
+    thing = hits.thing.reshape(-1)[sample].astype(np.int32)
+    material = hits.material.reshape(-1, 3)[sample]
     times = np.linspace(0, 1, spec.frames).astype(np.float32)
-    # A static scene. An empty batch would not divide into rows.
-    if not len(chosen) or programs.follow is None or programs.watch is None:
+    # Programs for an empty batch cannot be compiled.
+    if not len(sample) or programs.follow is None or programs.watch is None:
         frames = len(plan.time)
         return (
             thing,
@@ -249,12 +250,12 @@ def tracks(
             np.zeros((0, frames, 2), np.float32),
             np.zeros((0, frames), bool),
         )
-    # Where fewer points move than were asked for, the last again and again.
-    filled = np.minimum(np.arange(spec.tracks), len(chosen) - 1)
-    world = np.asarray(programs.follow.result()(thing[filled], material[filled], times))
-    places = world[:, plan.instant]
-    pixel, seen = programs.watch.result()(thing[filled], places, plan)
-    world, pixel, seen = (np.asarray(x)[: len(chosen)] for x in (world, pixel, seen))
+    # The programs expect `spec.tracks` points, so the last one is repeated.
+    padded = np.minimum(np.arange(spec.tracks), len(sample) - 1)
+    world = np.asarray(programs.follow.result()(thing[padded], material[padded], times))
+    positions = world[:, plan.instant]
+    pixel, seen = programs.watch.result()(thing[padded], positions, plan)
+    world, pixel, seen = (np.asarray(x)[: len(sample)] for x in (world, pixel, seen))
     return thing, world[:, 0], world, pixel, seen
 
 
@@ -310,13 +311,14 @@ def load(path: pathlib.Path) -> SceneTruth:
         stored = npz_files.read_arrays(path)
     except (OSError, ValueError) as error:
         raise ValueError(
-            f"{path}: no scene truth ({error}); delete it and make the scene again"
+            f"{path}: not a readable ground truth ({error}); delete it and create the "
+            "scene again"
         ) from error
     missing = set(SceneTruth._fields) - set(stored)
     if missing:
         raise ValueError(
-            f"{path} holds no {sorted(missing)[0]!r}, so it is no scene truth of "
-            "this version; delete it and make the scene again"
+            f"{path} holds no {sorted(missing)[0]!r}, so it is not a ground truth of "
+            "this version; delete it and create the scene again"
         )
     fields: dict[str, Any] = {name: stored[name] for name in SceneTruth._fields}
     for name in ("ids", "thing_names"):

@@ -1,4 +1,4 @@
-"""Cameras, schedule and images of a synthetic scene."""
+"""Cameras, schedule and rendering of a synthetic scene."""
 
 from typing import NamedTuple
 
@@ -15,31 +15,33 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.precision import exact_product
 
 TILE = 16  # pixels
-SHAKE_HARMONICS = 6  # the fastest tremor takes a sixth of the capture
+SHAKE_HARMONICS = 6  # the fastest component has six periods per capture
 
 
 class Schedule(NamedTuple):
     """Times, cameras and exposure of all frames, in NumPy."""
 
-    instant: np.ndarray  # int32
-    camera_id: np.ndarray  # int32: 0 in the hand, 1 beside it
+    instant: np.ndarray  # int32 index of the timestamp
+    camera_id: np.ndarray  # int32: 0 for the hand-held camera, 1 for the second
     time: np.ndarray  # float32 in [0, 1]
-    learn: np.ndarray  # bool: may be learned from
+    learn: np.ndarray  # bool: True for training frames
     cameras: Camera
-    light_gain: np.ndarray  # [frames, 3] float32, of linear light
+    light_gain: np.ndarray  # [frames, 3] float32 gain of linear light
     transient_shown: np.ndarray  # bool
 
 
-class Picture(NamedTuple):
-    """One frame. Depth and hits belong to the center of each pixel."""
+class Frame(NamedTuple):
+    """One rendered frame. Depth and hits are those of the pixel centers."""
 
-    image: Float[Array, "height width 3"]  # sRGB-coded in [0, 1], not rounded
-    depth: Float[Array, "height width"]  # z-depth, scene units; 0 for nothing
-    hit: trace.Hit  # [height, width], of rays of z-depth one
+    image: Float[Array, "height width 3"]  # sRGB in [0, 1], not rounded
+    depth: Float[Array, "height width"]  # z-depth, scene units; 0 for the background
+    hit: trace.Hit  # [height, width], along directions of z-depth one
 
 
 def schedule(spec: SceneSpec, seed: int) -> Schedule:
-    """Plan all frames: those of the first camera in order of time, then the second's.
+    """Plan all frames: first those of the hand-held camera, then those of the second.
+
+    The frames of each camera are in order of time.
 
     Args:
       spec: The scene.
@@ -49,41 +51,42 @@ def schedule(spec: SceneSpec, seed: int) -> Schedule:
       The schedule.
     """
     instants = np.arange(spec.frames)
-    looks = instants[spec.heldout_every // 2 :: spec.heldout_every]
-    instant = np.concatenate([instants, looks])
-    camera_id = np.repeat([0, 1], [len(instants), len(looks)])
+    second_instants = instants[spec.heldout_every // 2 :: spec.heldout_every]
+    instant = np.concatenate([instants, second_instants])
+    camera_id = np.repeat([0, 1], [len(instants), len(second_instants)])
     times = instants / (spec.frames - 1)
     learn = camera_id == 0
     if spec.skip_every is not None:
         learn &= instant % spec.skip_every != spec.skip_every // 2
-    both = [_arc(spec, times, seed, beside) for beside in (False, True)]
-    views = cameras.stack([both[c][i] for c, i in zip(camera_id, instant, strict=True)])
-    shown = np.zeros(len(instant), bool)
+    arcs = [_arc(spec, times, seed, is_second) for is_second in (False, True)]
+    views = cameras.stack([arcs[c][i] for c, i in zip(camera_id, instant, strict=True)])
+    frame_times = times[instant]
+    transient_shown = np.zeros(len(instant), bool)
     if spec.transient is not None:
         for start, stop in spec.transient.windows:
-            here = times[instant]
-            shown |= (camera_id == 0) & (start <= here) & (here <= stop)
+            in_window = (start <= frame_times) & (frame_times <= stop)
+            transient_shown |= (camera_id == 0) & in_window
     return Schedule(
         instant.astype(np.int32),
         camera_id.astype(np.int32),
-        times[instant].astype(np.float32),
+        frame_times.astype(np.float32),
         learn,
         views,
         _light_gain(spec, times, seed)[instant],
-        shown,
+        transient_shown,
     )
 
 
-def picture(
+def render(
     spec: SceneSpec,
     camera: Camera,
     time: Float[Array, ""],
     light_gain: Float[Array, "3"],
     transient_shown: Bool[Array, ""],
-) -> Picture:
-    """Render one frame, in square tiles.
+) -> Frame:
+    """Render one frame in square tiles.
 
-    The sheet costs only in tiles that may show it.
+    The iterative intersection with sheets then runs only in tiles that may show one.
 
     Args:
       spec: The scene.
@@ -100,32 +103,32 @@ def picture(
         return trace.cast(spec, camera.position, direction, time, transient_shown)
 
     def color(hit, direction):
-        # The sensor clips each sample: a highlight must not spill beyond its rim.
+        # Clipping each sample keeps saturated highlights from bleeding over edges.
         return jnp.clip(trace.shade(spec, hit, direction, light_gain), 0, 1)
 
-    # The center goes along as a last sample: one program, not two to compile.
+    # The center is the last sample, so that a single program suffices.
     offsets = _sub_pixels(spec.supersampling, time.dtype)
 
     def tile(pixels):
         samples = pixels[:, None, :] + offsets
         directions = jax.vmap(jax.vmap(lambda p: view_direction(camera, p)))(samples)
         hits = jax.vmap(jax.vmap(hit))(directions)
-        lit = jax.tree.map(lambda leaf: leaf[:, :-1], hits)
-        light = jax.vmap(jax.vmap(color))(lit, directions[:, :-1])
+        color_hits = jax.tree.map(lambda leaf: leaf[:, :-1], hits)
+        light = jax.vmap(jax.vmap(color))(color_hits, directions[:, :-1])
         center = jax.tree.map(lambda leaf: leaf[:, -1], hits)
         return texture.srgb(jnp.mean(light, axis=1)), center
 
     tiles = jax.lax.map(tile, _tiles(spec.size, time.dtype))
     image, center = _untiled(tiles, spec.size)
-    # Directions have z-depth one, so the distance along one is the z-depth.
+    # Directions have z-depth one, so the distance is the z-depth.
     depth = jnp.where(center.thing == trace.NOTHING, 0, center.distance)
-    return Picture(image, depth, center)
+    return Frame(image, depth, center)
 
 
 def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
     """Return the world direction of a pixel, scaled to z-depth one.
 
-    The cameras here have no distortion, which saves an iteration for each ray.
+    Cameras have no distortion here, so no iterative undistortion is needed.
 
     Args:
       camera: The camera, without distortion.
@@ -134,12 +137,12 @@ def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"
     Returns:
       The direction, [3].
     """
-    slopes = (pixel - camera.principal_point_px) / camera.focal_px
-    in_camera = jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
+    plane = (pixel - camera.principal_point_px) / camera.focal_px
+    in_camera = jnp.concatenate([plane, jnp.ones_like(plane[:1])])
     return exact_product(in_camera, camera.camera_from_world)
 
 
-def noted_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:
+def recorded_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:
     """Return the cameras of the capture, with the pose error of the first camera.
 
     Args:
@@ -153,56 +156,58 @@ def noted_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:
     if spec.pose_error is None:
         return plan.cameras
     rng = np.random.default_rng([seed, 5])
-    turn, shift = rng.normal(size=(2, len(plan.time), 3)).astype(np.float32)
+    rotation, shift = rng.normal(size=(2, len(plan.time), 3)).astype(np.float32)
     focal_px = plan.cameras.focal_px[:, None]
-    first = (plan.camera_id == 0)[:, None]
-    turn = first * spec.pose_error.turn_px / focal_px * turn
+    is_first = (plan.camera_id == 0)[:, None]
+    rotation = is_first * spec.pose_error.turn_px / focal_px * rotation
     depth = spec.cameras.distance
-    shift = first * depth * spec.pose_error.shift_px / focal_px * shift
+    shift = is_first * depth * spec.pose_error.shift_px / focal_px * shift
 
-    moved = jax.jit(jax.vmap(cameras.move))(plan.cameras, turn, shift)
+    perturbed = jax.jit(jax.vmap(cameras.move))(plan.cameras, rotation, shift)
     return jax.tree.map(
-        lambda old, new: np.where(
-            first.reshape(-1, *(1,) * (old.ndim - 1)), np.asarray(new, old.dtype), old
+        lambda true, new: np.where(
+            is_first.reshape(-1, *(1,) * (true.ndim - 1)),
+            np.asarray(new, true.dtype),
+            true,
         ),
         plan.cameras,
-        moved,
+        perturbed,
     )
 
 
 def _sub_pixels(count, dtype):
-    """Offsets of count x count equal cells from the pixel's center, and zero."""
+    """Offsets of count x count equal cells from the pixel center, and a zero offset."""
     offsets = (np.arange(count) + 0.5) / count - 0.5
     grid = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
     return jnp.asarray(np.concatenate([grid, np.zeros((1, 2))]), dtype)
 
 
 def _tiles(size, dtype):
-    """Pixel centers [tiles, TILE², 2] that cover an image, and a margin beyond it."""
-    down, across = (-(-length // TILE) for length in size[::-1])
-    centers = rays.pixel_centers((across * TILE, down * TILE), dtype)
-    tiles = centers.reshape(down, TILE, across, TILE, 2).swapaxes(1, 2)
-    return tiles.reshape(down * across, TILE**2, 2)
+    """Pixel centers [tiles, TILE², 2] that cover an image, padded to whole tiles."""
+    rows, columns = (-(-length // TILE) for length in size[::-1])
+    centers = rays.pixel_centers((columns * TILE, rows * TILE), dtype)
+    tiles = centers.reshape(rows, TILE, columns, TILE, 2).swapaxes(1, 2)
+    return tiles.reshape(rows * columns, TILE**2, 2)
 
 
 def _untiled(tree, size):
-    """Arrays [tiles, TILE², ...] as [height, width, ...], without the margin."""
+    """Arrays [tiles, TILE², ...] as [height, width, ...], without the padding."""
     width, height = size
-    down, across = (-(-length // TILE) for length in (height, width))
+    rows, columns = (-(-length // TILE) for length in (height, width))
 
-    def whole(leaf):
-        rest = leaf.shape[2:]
-        leaf = leaf.reshape(down, across, TILE, TILE, *rest).swapaxes(1, 2)
-        return leaf.reshape(down * TILE, across * TILE, *rest)[:height, :width]
+    def untile(leaf):
+        channels = leaf.shape[2:]
+        leaf = leaf.reshape(rows, columns, TILE, TILE, *channels).swapaxes(1, 2)
+        return leaf.reshape(rows * TILE, columns * TILE, *channels)[:height, :width]
 
-    return jax.tree.map(whole, tree)
+    return jax.tree.map(untile, tree)
 
 
-def _arc(spec, times, seed, beside):
-    """One camera for each time: `beside` shifts the second from the first."""
+def _arc(spec, times, seed, is_second):
+    """The first or second camera at each time."""
     setting = spec.cameras
-    shaking = np.random.default_rng([seed, 1])
-    shake = setting.shake * _smooth_noise(shaking, times, 6)
+    rng = np.random.default_rng([seed, 1])
+    shake = setting.shake * _smooth_noise(rng, times, 6)
     sweep = 2 * np.pi * setting.sweeps * times
     angle = setting.arc_rad * np.sin(sweep)
     distance = setting.distance - setting.forward * np.sin(sweep / 2) ** 2
@@ -212,9 +217,9 @@ def _arc(spec, times, seed, beside):
     up = np.array([0.0, 1.0, 0.0])
     rise = (setting.height + 0.2 * setting.height * np.cos(sweep))[:, None] * up
     position = setting.target + distance[:, None] * back + rise + shake[:, :3]
-    if beside:
-        across, above, behind = setting.beside
-        position = position + across * right + above * up + behind * back
+    if is_second:
+        offset_right, offset_up, offset_back = setting.beside
+        position = position + offset_right * right + offset_up * up + offset_back * back
     focal_px = spec.size[0] / 2 / np.tan(setting.field_of_view_rad / 2)
     return [
         cameras.look_at(eye, aim, up, focal_px, spec.size)
