@@ -72,7 +72,7 @@ def read_header(path: AnyPath) -> Header:
 def _existing(path):
     """Raise unless there is an image file that may be read."""
     if not path.is_file():
-        raise CaptureError(f"{path}: no such picture; restore it or drop its frame")
+        raise CaptureError(f"{path}: no such image; restore it or drop its frame")
     safe_files.check(path)
 
 

@@ -143,7 +143,7 @@ def test_a_picture_cut_short_is_refused(tmp_path, ending, kept):
 
 
 def test_what_is_no_picture_is_refused(tmp_path):
-    with pytest.raises(CaptureError, match="no such picture"):
+    with pytest.raises(CaptureError, match="no such image"):
         images.read_image(tmp_path / "a.png")
     (tmp_path / "b.png").write_text("hello")
     with pytest.raises(CaptureError, match="not a readable picture"):
@@ -208,5 +208,5 @@ def test_linear_light_is_read_as_the_colors_it_is_seen_as(tmp_path):
     exr.write_exr(tmp_path / "c.exr", depth=light[..., 0])
     with pytest.raises(CaptureError, match="no color"):
         images.read_image(tmp_path / "c.exr")
-    with pytest.raises(CaptureError, match="no such picture"):
+    with pytest.raises(CaptureError, match="no such image"):
         images.read_header(tmp_path / "d.exr")

@@ -52,7 +52,7 @@ def test_a_split_without_times_is_spread_evenly(tmp_path):
     rewrite(tmp_path, lambda _, entry: entry.pop("time"), "transforms_test.json")
     capture = blender_format.read(tmp_path)
     np.testing.assert_allclose(capture.times[-3:], [0, 0.5, 1])
-    assert any("transforms_test.json: spread evenly" in note for note in capture.notes)
+    assert any("transforms_test.json: spaced evenly" in note for note in capture.notes)
 
 
 def test_times_come_from_names_where_no_frame_has_one(tmp_path):

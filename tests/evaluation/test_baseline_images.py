@@ -163,7 +163,7 @@ def test_a_pinhole_s_render_is_bent_as_the_lens_films(bulge):
     np.testing.assert_array_equal(judged.images, bent.images)
     if bulge < 0:
         lost = 1 - judged.valid.mean()
-        assert f"{lost:.2%} of the pixels lie beyond" in judged.notes[-1]
+        assert f"{lost:.2%} of the pixels lie outside" in judged.notes[-1]
 
 
 def test_rays_through_a_lens_are_scored_but_where_it_has_none():
