@@ -2,7 +2,7 @@
 
     python -m experiments.results                  # every page whose numbers are there
     python -m experiments.results effect_cost      # one
-    python -m experiments.results ablate_moba --measured runs/ablation/ablation.json
+    python -m experiments.results benchmark --measured runs/benchmark/benchmark.json
 
 Nothing is measured here. A page is what its study says of itself, and tables of the
 kept file: `--measured FILE` keeps a new one first. A test holds every page against what
@@ -99,51 +99,35 @@ def _package(name, words="", page="page", of=None, measured=None):
     return _study(name, words, f"{folder}.__main__", f"{folder}.{page}", measured)
 
 
-_BOOKSHELF = "--capture CAPTURE --max-side 256 --heldout 8"
+def _suite(name, words):
+    return _package(name, f"{words} --jobs 2", of="benchmark")
+
+
+_BOOKSHELF = "CAPTURE --max-side 256 --heldout 8"
 STUDIES = {
-    "benchmark": _package("benchmark", "--seeds 3"),
+    "benchmark": _package("benchmark"),
     "effect_cost": _package(
         "effect_cost", measured="nerfies_jax/runs/effect_cost.json"
     ),
     "evidence": _package("evidence", "--scenes"),
-    "ablate_fields": _package(
-        "ablate_fields",
-        "--suite fields --steps 600 --seeds 3 --jobs 2",
-        of="ablate",
+    "ablate_fields": _suite("ablate_fields", "--suite fields --steps 600"),
+    "ablate_fields_bookshelf": _suite(
+        "ablate_fields_bookshelf", f"{_BOOKSHELF} --suite fields --steps 600"
     ),
-    "ablate_fields_bookshelf": _package(
-        "ablate_fields_bookshelf",
-        f"--suite fields {_BOOKSHELF} --steps 600 --seeds 3 --jobs 2",
-        of="ablate",
+    "ablate_tracked": _suite("ablate_tracked", "--suite tracked --steps 900"),
+    "ablate_poses": _suite(
+        "ablate_poses", "--scene pose-error --suite poses --steps 900"
     ),
-    "ablate_tracked": _package(
-        "ablate_tracked", "--suite tracked --steps 900 --jobs 2", of="ablate"
+    "ablate_poses_bookshelf": _suite(
+        "ablate_poses_bookshelf", f"{_BOOKSHELF} --suite poses --steps 900"
     ),
-    "ablate_poses": _package(
-        "ablate_poses",
-        "--suite poses --scene pose-error --steps 900 --jobs 2",
-        of="ablate",
+    "ablate_sonata": _suite("ablate_sonata", "--suite sonata --steps 900"),
+    "ablate_sonata_bookshelf": _suite(
+        "ablate_sonata_bookshelf", f"{_BOOKSHELF} --suite sonata --steps 600"
     ),
-    "ablate_poses_bookshelf": _package(
-        "ablate_poses_bookshelf",
-        f"--suite poses {_BOOKSHELF} --steps 900 --jobs 2",
-        of="ablate",
-    ),
-    "ablate_sonata": _package(
-        "ablate_sonata", "--suite sonata --steps 900 --jobs 2", of="ablate"
-    ),
-    "ablate_sonata_bookshelf": _package(
-        "ablate_sonata_bookshelf",
-        f"--suite sonata {_BOOKSHELF} --steps 600 --seeds 3 --jobs 2",
-        of="ablate",
-    ),
-    "ablate_moba": _package(
-        "ablate_moba", "--suite moba --steps 900 --jobs 2", of="ablate"
-    ),
-    "ablate_moba_bookshelf": _package(
-        "ablate_moba_bookshelf",
-        f"--suite moba {_BOOKSHELF} --steps 600 --seeds 3 --jobs 2",
-        of="ablate",
+    "ablate_moba": _suite("ablate_moba", "--suite moba --steps 900"),
+    "ablate_moba_bookshelf": _suite(
+        "ablate_moba_bookshelf", f"{_BOOKSHELF} --suite moba --steps 600"
     ),
     "speed": _package(
         "speed", "--job --beside CHECKOUT --yardstick PATH/run.py --out speed"
@@ -241,19 +225,18 @@ def keep(name: str, measured: pathlib.Path) -> None:
 
 
 def _check_of(name, stored, measured):
-    """ValueError where a file holds nothing, or what another page's command wrote."""
-    if not isinstance(stored, dict) or [] in stored.values():
-        raise ValueError(f"--measured {measured}: holds no rows; measure again")
+    """Raise ValueError if a file holds nothing, or results of another page."""
+    if not isinstance(stored, dict) or not all(stored.values()):
+        raise ValueError(f"--measured {measured}: holds no results; measure again")
     words = STUDIES[name].command.split()
-    about = stored.get("about", {})
-    told = stored | about | about.get("settings", {})
-    for option in ("suite", "scene"):
-        if f"--{option}" in words and option in told:
-            wanted = words[words.index(f"--{option}") + 1]
-            if told[option] != wanted:
+    for option in ("--suite", "--scene"):
+        if option in words:
+            wanted = " ".join(words[words.index(option) :][:2])
+            others = [x for x in stored.get("benchmarks", ()) if wanted not in x]
+            if others:
                 raise ValueError(
-                    f"--measured {measured}: of {option} {told[option]}, and the page "
-                    f"{name} is of {wanted}"
+                    f"--measured {measured}: of {others[0]}, and the page {name} is of "
+                    f"{wanted}"
                 )
 
 

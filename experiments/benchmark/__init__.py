@@ -1,1 +1,1 @@
-"""Quality of the main job over several seeds."""
+"""Quality of methods over seeds."""

@@ -1,46 +1,67 @@
-"""Quality of the main job over several seeds, compared with two baselines.
+"""Quality of methods over seeds: the default command, presets, ablations.
 
-    python -m experiments.benchmark --out runs/benchmark
-    python -m experiments.benchmark --scene fast --out runs/benchmark
-    python -m experiments.benchmark CAPTURE --max-side 256 --out runs/benchmark
+    python -m experiments.benchmark                            # the default command
+    python -m experiments.benchmark CAPTURE --max-side 256
+    python -m experiments.benchmark --preset nerfies-small --set elastic=none
+    python -m experiments.benchmark --suite sonata --steps 900 --jobs 2
+    python -m experiments.benchmark --suite presets --seconds 90
 
-Each seed is one run of `experiments.reconstruct` in its own process. One run at a time
-uses the cores that its preset wants. The seed determines the initial Gaussians and the
-order of the frames, and the camera path of a built-in scene. Complete runs are not
-repeated, and the numbers of other captures in OUT/benchmark.json stay.
+Every run is one of `experiments.reconstruct`, in its own process and folder. The
+methods of a suite train on the same frames with the same seeds, for the same number of
+steps (`--steps`) or the same time (`--seconds`), and the final state is evaluated. The
+seed determines the initial model and the order of the frames, and the camera path of a
+built-in scene. A claim of a suite is judged by the difference between two methods and
+its spread over the seeds. Two baselines are reported: the mean of the two neighboring
+training images, and the run's own renders averaged over time.
+
+The same command continues interrupted runs, and other results in OUT/benchmark.json
+stay. `experiments.compare` draws curves and images of the run folders.
 """
 
-import concurrent.futures
 import dataclasses
-import multiprocessing
-import os
 import pathlib
 import re
+import shlex
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
-from experiments import cli, kept
-from experiments.benchmark import job
+from experiments import cli, records
+from experiments.benchmark import jobs, suites
 from nerfies_jax.runs import representations
-from nerfies_jax.runs.config import RunConfig
-from nerfies_jax.runtime import children, console
+from nerfies_jax.runtime import console
 
 STORED = "benchmark.json"
 
 
 @dataclasses.dataclass(frozen=True)
 class Benchmark:
-    """Run the main job on one capture with several seeds."""
+    """Compare the quality, time and size of methods on one capture."""
+
+    GROUPS: ClassVar = {
+        "methods": ("suite", "methods", "preset", "set"),
+        "training": ("steps", "seconds", "seeds"),
+    }
 
     source: cli.Source = cli.NamedSource()
+    suite: Literal["fields", "tracked", "poses", "sonata", "moba", "presets"] | None = (
+        None
+    )
+    """Methods to compare: radiance fields, the parts of splats-tracked-small, pose
+    refinement, the ablations of Sonata or MoBa-GS, or every small preset (default:
+    one method, the preset)."""
+    methods: tuple[str, ...] = ()
+    """Methods of the suite (default: all)."""
     preset: cli.Preset = None
-    """Preset (default: chosen by the tracks of the capture)."""
-    steps: int | None = None
-    """Steps of training (default: the preset's own)."""
-    seconds: float | None = None
-    """Train for so many seconds, without compiling, instead."""
+    """Preset, without a suite (default: chosen by the tracks of the capture)."""
     set: cli.Overrides = ()
-    """Fields of the preset, as for experiments.reconstruct."""
+    """Fields changed in every method, as for experiments.reconstruct."""
+    steps: int | None = None
+    """Steps of training of every method (default: the presets' own)."""
+    seconds: float | None = None
+    """Seconds of training of every method, without compilation, instead. Schedules
+    stretch with the steps that fit."""
     seeds: int = 3
-    """So many, from 0 on."""
+    """Number of seeds, from 0 on. One seed has no spread and supports no claim."""
     jobs: int = 1
     """Runs at a time. Two or more get one core each, and a single one uses all
     cores."""
@@ -48,107 +69,156 @@ class Benchmark:
     """Folder for the runs and benchmark.json."""
 
     def __post_init__(self):
-        for name in ("seeds", "jobs"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}={getattr(self, name)}: at least 1")
+        for name in ("seeds", "jobs", "steps"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"--{name} {value}: at least 1")
+        if self.seconds is not None and not self.seconds > 0:
+            raise ValueError(f"--seconds {self.seconds:g}: must be above 0")
+        if self.suite is None and self.methods:
+            raise ValueError("--methods: methods of a suite; name one with --suite")
+        if self.suite is not None and self.preset is not None:
+            raise ValueError("--preset and --suite: a suite has presets of its own")
+        for name in self.methods:
+            if name not in self.known:
+                raise ValueError(
+                    f"--methods {name}: in --suite {self.suite} there are "
+                    + ", ".join(self.known)
+                )
+
+    @property
+    def known(self) -> dict[str, str]:
+        """Preset and changes of each method that can be chosen."""
+        if self.suite is None:
+            return {self.preset or "default": self.preset or ""}
+        return suites.SUITES[self.suite].methods
+
+    @property
+    def chosen(self) -> dict[str, str]:
+        """Preset and changes of the methods to compare, with those of --set."""
+        names = self.methods or self.known
+        return {
+            name: shlex.join([*shlex.split(self.known[name]), *self.set])
+            for name in names
+        }
+
+    @property
+    def label(self) -> str:
+        """Options of the benchmark, without the location of its files."""
+        source = cli.plain(self.source)
+        words = list(source.arguments)
+        if source.capture is not None:
+            words[0] = pathlib.Path(source.capture).name
+        for name in ("preset", "suite", "steps", "seconds"):
+            if getattr(self, name) is not None:
+                words += [f"--{name}", f"{getattr(self, name)}"]
+        return " ".join([*words, *(["--set", *self.set] if self.set else ())])
 
 
 @cli.command(Benchmark)
 def main(args):
-    """Run all seeds and store their metrics. Wrong input ends with exit code 2."""
+    """Run what is missing and store all results. Failed runs end with exit code 1."""
     with cli.user_errors():
-        filmed = args.source.capture
-        if filmed is not None and not filmed.exists():
-            raise ValueError(f"{filmed}: no such file or folder; check the path")
-        representations.cores(args.preset, args.set)  # refuses wrong settings
+        folder = args.source.capture
+        if folder is not None and not folder.exists():
+            raise ValueError(f"{folder}: no such file or folder; check the path")
+        for settings in args.chosen.values():
+            representations.cores(*suites.parsed(settings))  # refuses wrong settings
         args.out.mkdir(parents=True, exist_ok=True)
-        label = _label(args)
-        configs = {seed: _config(args, seed) for seed in range(args.seeds)}
-    from nerfies_jax.runs.reconstruction import Refused
-
-    with cli.user_errors((Refused,)):
-        _run_all(args, label, configs)
-    console.say(f"kept in {args.out / STORED}")
-    return cli.stored(args.out / STORED)
-
-
-def _run_all(args, label, configs):
-    # Not forked: JAX has threads, and each run chooses its platform anew.
-    spawned = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(
-        args.jobs,
-        spawned,
-        children.end_with_parent,
-        (os.getpid(),),
-        max_tasks_per_child=1,
-    ) as pool:
-        runs = {
-            pool.submit(
-                job.score,
-                config,
-                args.out / f"{_stem(args)}-{seed}",
-                args.seconds,
-                alone=args.jobs == 1,
-            ): seed
-            for seed, config in configs.items()
-        }
-        try:
-            for run in concurrent.futures.as_completed(runs):
-                keep(args.out / STORED, label, runs[run], run.result())
-                console.say(f"{label}, seed {runs[run]}: {_line(run.result())}")
-        except BaseException:  # what refuses one seed refuses the others
-            pool.shutdown(cancel_futures=True)
-            raise
+        runs = planned(args)
+        failures = _execute(args, runs)
+    results = {run: jobs.result(run) for run in runs}
+    finished = {run: result for run, result in results.items() if result is not None}
+    if finished:
+        keep(args, finished)
+    return cli.Ended(cli.stored(args.out / STORED), 1 if failures else 0)
 
 
-def keep(path: pathlib.Path, label: str, seed: int, scored: dict) -> None:
-    """Add one run to the kept numbers, in the place of an older one."""
-    from nerfies_jax.capture.json_files import write_json
-    from nerfies_jax.metrics import clock
+def planned(args: Benchmark) -> list[jobs.Run]:
+    """List all runs, those of the first seed first.
 
-    stored = kept.rows(path, runs=dict) or {"runs": {}}
-    scored = dict(scored)
-    machine = scored.pop("machine")
-    stored["machine"] = clock.beside(machine, stored.get("machine", {}))
-    stored["runs"].setdefault(label, {})[str(seed)] = scored
-    write_json(path, stored)
+    Args:
+      args: Options.
 
-
-def _config(args, seed):
-    return RunConfig(
-        preset=args.preset,
-        source=cli.plain(args.source),
-        steps=args.steps,
-        overrides=args.set,
-        seed=seed,
-    )
-
-
-def _label(args):
-    """Describe the run without the location of its files."""
-    source = cli.plain(args.source)
-    words = list(source.arguments)
-    if source.capture is not None:
-        words[0] = source.capture.name
-    for name in ("preset", "steps", "seconds"):
-        if getattr(args, name) is not None:
-            words += [f"--{name}", f"{getattr(args, name)}"]
-    if args.set:
-        words += ["--set", *args.set]
-    return " ".join(words)
+    Returns:
+      The runs.
+    """
+    stem = re.sub(r"[^\w.=]+", "-", args.label).strip("-")
+    source = cli.plain(args.source).arguments
+    return [
+        jobs.Run(
+            method,
+            seed,
+            args.out / stem / f"{method}-{seed}",
+            jobs.words(source, settings, seed, args.steps),
+            args.seconds,
+        )
+        for seed in range(args.seeds)
+        for method, settings in args.chosen.items()
+    ]
 
 
-def _stem(args):
-    return re.sub(r"[^\w.=]+", "-", _label(args)).strip("-")
+def _execute(args, runs):
+    """Execute the missing runs and return those that failed.
+
+    Wrong input, which is that of all runs, raises ValueError.
+    """
+    failures = []
+    missing = [run for run in runs if jobs.result(run) is None]
+    for run, code in jobs.execute(missing, args.jobs):
+        result = jobs.result(run)
+        if result is not None:
+            console.say(f"{run.name}: {_line(result.metrics)}")
+            continue
+        reason = jobs.last_line(run)
+        if code == 2:
+            raise ValueError(reason.removeprefix("error: "))
+        console.say(f"{run.name}: failed with exit code {code}: {reason} ({run.log})")
+        failures.append(run)
+    return failures
 
 
-def _line(scored):
-    metrics = scored["metrics"]
-    return (
-        f"{scored['preset']}, {metrics['heldout.psnr']:.2f} dB, "
-        f"{metrics.get('heldout.moving_psnr', float('nan')):.2f} dB moving, "
-        f"{metrics['train.seconds']:.0f} s"
-    )
+def _line(metrics):
+    moving = metrics.get("heldout.moving_psnr")
+    words = [f"{metrics['heldout.psnr']:.2f} dB"]
+    words += [f"{moving:.2f} dB in dynamic regions"] if moving is not None else []
+    return ", ".join([*words, f"{metrics['train.seconds']:.0f} s"])
+
+
+def keep(args: Benchmark, results: Mapping[jobs.Run, jobs.Result]) -> None:
+    """Add the results of a benchmark to OUT/benchmark.json and print its page.
+
+    Args:
+      args: Options.
+      results: Results of finished runs.
+    """
+    from experiments.benchmark import page, verdicts  # load JAX
+
+    path = args.out / STORED
+    stored = records.rows(path, benchmarks=dict) or {"benchmarks": {}}
+    numbers = {(run.method, run.seed): one.metrics for run, one in results.items()}
+    methods = {}
+    for method, settings in args.chosen.items():
+        of_method = [run for run in results if run.method == method]
+        presets = dict.fromkeys(results[run].preset for run in of_method)
+        seeds = [results[run].metrics for run in of_method]
+        if seeds:
+            settings = settings if suites.parsed(settings)[0] else " / ".join(presets)
+            methods[method] = {"settings": settings, **verdicts.summary(seeds)}
+    claims = () if args.suite is None else suites.SUITES[args.suite].claims
+    benchmark = {
+        "suite": args.suite,
+        "methods": methods,
+        "claims": [one._asdict() for one in verdicts.judge(numbers, claims)],
+    }
+    stored["benchmarks"][args.label] = benchmark
+    records.write(path, stored, *(result.machine for result in results.values()))
+    console.say(page.page({"benchmarks": {args.label: benchmark}}))
+    folders = [run.folder for run in results if run.seed == 0]
+    if len(folders) > 1:
+        words = shlex.join(map(str, folders))
+        console.say(f"images: python -m experiments.compare {words}")
+    console.say(f"stored in {path}")
 
 
 if __name__ == "__main__":

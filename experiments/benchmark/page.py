@@ -1,41 +1,56 @@
-"""The page of `experiments.benchmark` in docs/results."""
+"""Pages of `experiments.benchmark` in docs/results."""
 
-import math
-import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from experiments import markdown
+from experiments.benchmark import suites
+from nerfies_jax.metrics.metric_table import METRICS
 
-COLUMNS = (
-    ("PSNR", "heldout.psnr", 2),
-    ("SSIM", "heldout.ssim", 3),
-    ("moving", "heldout.moving_psnr", 2),
-    ("static", "heldout.static_psnr", 2),
-    ("neighbors", "baseline.neighbor_mean", 2),
-    ("time average", "baseline.static", 2),
-    ("EPE", "tracks.epe", 4),
-    ("static EPE", "tracks.static_epe", 4),
-    ("flow px", "flow.epe", 2),
-    ("moving flow px", "flow.moving_epe", 2),
-    ("training s", "train.seconds", 0),
-    ("all s", "total.seconds", 0),
+# Columns: key of metrics.json, heading, digits behind the point, divisor.
+Column = tuple[str, str, int, float]
+GROUPS: tuple[tuple[Column, ...], ...] = (
+    (
+        ("heldout.psnr", "PSNR", 2, 1),
+        ("heldout.ssim", "SSIM", 3, 1),
+        ("heldout.moving_psnr", "moving PSNR", 2, 1),
+        ("heldout.moving_ssim", "moving SSIM", 3, 1),
+        ("heldout.static_psnr", "static PSNR", 2, 1),
+        ("baseline.neighbor_mean", "neighbors", 2, 1),
+        ("baseline.static", "time average", 2, 1),
+    ),
+    (
+        ("tracks.epe", "EPE", 4, 1),
+        ("tracks.static_epe", "static EPE", 4, 1),
+        ("tracks.correct", "<0.01", 2, 1),
+        ("tracks.lost", "lost", 3, 1),
+        ("tracks.drift", "drift", 4, 1),
+        ("tracks.strain", "strain", 2, 1),
+        ("flow.epe", "flow", 2, 1),
+        ("flow.moving_epe", "moving flow", 2, 1),
+        ("heldout.depth_median", "depth", 4, 1),
+        ("heldout.moving_depth_median", "moving depth", 4, 1),
+    ),
+    (
+        ("train.steps", "steps", 0, 1),
+        ("train.seconds", "training s", 0, 1),
+        ("train.compile_seconds", "compilation s", 0, 1),
+        ("total.seconds", "all s", 0, 1),
+        ("render.ms_per_frame", "frame ms", 0, 1),
+        ("gaussians", "Gaussians", 0, 1),
+        ("parameters", "parameters", 0, 1),
+        ("file.bytes", "file MB", 2, 1e6),
+        ("memory.peak_bytes", "peak MB", 0, 1e6),
+    ),
 )
 READING = """\
-PSNR (dB) and SSIM are of the original, distorted held-out images. *moving* and *static*
-are the PSNR of moving objects and of the static background. *neighbors* is the PSNR of
-the mean of the two neighboring training images, and *time average* that of the run's
-own renders averaged over time. A run must exceed both of these baselines. *EPE* is the
-mean distance of tracked points from their true positions in scene units, and *static
-EPE* that of a prediction without motion. *flow* is the end-point error of optical flow
-to the camera's next frame in pixels, over all pixels and over moving objects. Each
-number is the median over seeds, with minimum and maximum in brackets. Seconds are wall
-clock, on a machine that may do other work: *training* excludes compilation, and *all*
-is from the command to the report, including preprocessing that was not cached."""
+Numbers are means over the seeds, ± their standard deviation. Scores are of the
+original, distorted held-out images. A run must exceed both baselines (*neighbors*,
+*time average*). Seconds are wall clock, on a machine that may have been busy."""
 
 
 def page(stored: Mapping[str, Any]) -> str:
-    """Format one row for each capture, over its seeds.
+    """Format the tables below the docstring.
 
     Args:
       stored: The stored results.
@@ -43,27 +58,79 @@ def page(stored: Mapping[str, Any]) -> str:
     Returns:
       Markdown.
     """
-    heads = ("run", "preset", "seeds", *(head for head, _, _ in COLUMNS))
-    runs = stored["runs"].items()
-    rows = [_row(label, list(seeds.values())) for label, seeds in runs]
-    return f"{READING}\n\n{markdown.table(heads, rows, words=2)}"
+    single, parts = {}, [READING]
+    for label, benchmark in stored["benchmarks"].items():
+        if benchmark["suite"] is None:
+            (method,) = benchmark["methods"].values()
+            single[label] = method
+        else:
+            parts += _suite(label, benchmark)
+    if single:
+        parts += _tables("run", single)
+    methods = [
+        method
+        for benchmark in stored["benchmarks"].values()
+        for method in benchmark["methods"].values()
+    ]
+    return "\n\n".join([*parts, markdown.bullets(_legend(methods))])
 
 
-def _row(label: str, scored: Sequence[Mapping[str, Any]]) -> list[str]:
-    presets = " / ".join(sorted({one["preset"] for one in scored}))
-    cells = [f"`{label}`", presets, str(len(scored))]
-    for _, key, digits in COLUMNS:
-        values = sorted(one["metrics"][key] for one in scored if key in one["metrics"])
-        cells.append(_spread([v for v in values if math.isfinite(v)], digits))
-    return cells
+def _suite(label, benchmark):
+    parts = [f"## `{label}`", *_tables("method", benchmark["methods"])]
+    if benchmark["claims"]:
+        parts += ["### Claims", _claims(benchmark["claims"])]
+    context = suites.SUITES[benchmark["suite"]].context
+    return [*parts, context] if context else parts
 
 
-def _spread(values, digits):
-    """Format the median, and minimum and maximum if there are several."""
-    if not values:
+def _tables(kind, methods):
+    """Format the settings of each row, and one table for each group of columns."""
+    rows = [
+        [f"`{name}`", one["settings"], str(one["seeds"])]
+        for name, one in methods.items()
+    ]
+    tables = [markdown.table((kind, "preset and changes", "seeds"), rows, words=2)]
+    for group in GROUPS:
+        columns = _known(group, methods.values())
+        heads = (kind, *(column[1] for column in columns))
+        rows = [
+            [f"`{name}`", *(_cell(one, column) for column in columns)]
+            for name, one in methods.items()
+        ]
+        if columns:
+            tables.append(markdown.table(heads, rows))
+    return tables
+
+
+def _known(group: Iterable[Column], methods) -> list[Column]:
+    return [column for column in group if any(column[0] in m["mean"] for m in methods)]
+
+
+def _cell(method, column):
+    key, _, digits, divisor = column
+    if key not in method["mean"]:
         return ""
-    middle = markdown.number(statistics.median(values), digits)
-    if len(values) == 1:
-        return middle
-    ends = " to ".join(markdown.number(values[k], digits) for k in (0, -1))
-    return f"{middle} ({ends})"
+    spread = method["spread"].get(key, float("nan")) / divisor
+    return markdown.with_spread(method["mean"][key] / divisor, spread, digits)
+
+
+def _claims(verdicts):
+    rows = []
+    for one in verdicts:
+        gain = markdown.short(one["gain"])
+        if one["half_width"] is not None:
+            gain += f" ± {markdown.short(one['half_width'])}"
+        claim = f"{one['claim']}: `{one['better']}` compared with `{one['worse']}`"
+        rows.append([claim, f"`{one['metric']}`", gain, one["verdict"]])
+    return markdown.table(("claim", "metric", "gain", "verdict"), rows, words=4) + (
+        "\n\nA positive gain supports the claim, and ± is its 95 % confidence interval "
+        "(Student, seeds paired)."
+    )
+
+
+def _legend(methods):
+    for group in GROUPS:
+        for key, heading, *_ in _known(group, methods):
+            entry = METRICS[key]
+            unit = "" if heading.endswith(("MB", " s", " ms")) else entry.unit
+            yield f"{heading}{f' ({unit})' if unit else ''}: {entry.explanation}"

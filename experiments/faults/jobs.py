@@ -6,7 +6,6 @@ import os
 import pathlib
 import subprocess
 import sys
-import zipfile
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -25,9 +24,9 @@ FIELD = (
     "template.color_width=8",
 )
 SWEEP = (
-    *("--suite", "presets", "--arms", "splats-static-small", "splats-mcmc-small"),
-    *("--steps", "20", "--seeds", "1", "--frames", "1", "--tracks", "4"),
-    *("--jobs", "2", "--set", "sh_degree=0", "init.extra_random=0"),
+    *("--suite", "presets", "--methods", "splats-static-small", "splats-mcmc-small"),
+    *("--steps", "20", "--seeds", "1", "--jobs", "2"),
+    *("--set", "sh_degree=0", "init.extra_random=0"),
 )
 LITTER = ("*.partial*", "*.earlier", "*.unfinished*")
 
@@ -103,8 +102,11 @@ def _files(folder):
 
 
 def _state(work):
+    return _state_of(work / "out")
+
+
+def _state_of(run):
     """The bits of the last checkpoint, the score and the names of the products."""
-    run = work / "out"
     last = max((run / "checkpoints").iterdir(), key=lambda path: int(path.name))
     about = json.loads((last / "about.json").read_text())
     bits = {name: str(note["crc32"]) for name, note in about["leaves"].items()}
@@ -176,20 +178,14 @@ def _whole_folder(work):
 
 
 def _sweep(bench, work):
-    words = (*SWEEP, "--capture", bench.filmed, "--out", work / "out")
-    return bench.command("ablate", *words)
+    words = (bench.filmed, *SWEEP, "--out", work / "out")
+    return bench.command("benchmark", *words)
 
 
-def _cells(work):
-    """The arrays of each finished cell, which other cells must not touch."""
-    cells = {}
-    for path in sorted((work / "out").rglob("*-0.json")):
-        arrays = path.with_suffix(".npz")
-        if path.parent.name != "logs" and arrays.exists():
-            with zipfile.ZipFile(arrays) as archive:
-                sums = [str(item.CRC) for item in archive.infolist()]
-            cells[path.stem] = " ".join(sums)
-    return cells
+def _finished_runs(work):
+    """The state of each finished run, which other runs must not touch."""
+    runs = {path.parent for path in (work / "out").rglob("metrics.json")}
+    return {run.name: json.dumps(_state_of(run)) for run in sorted(runs)}
 
 
 def _everything(work):
@@ -203,7 +199,7 @@ JOBS = {
     "prepare": Job(_prepare, _everything, _everything),
     "export": Job(_export, _everything, _whole_folder, _earlier(_export), "moving"),
     "render": Job(_render, _everything, _whole_folder, _earlier(_render), "moving"),
-    "sweep": Job(_sweep, _cells, _cells),
+    "sweep": Job(_sweep, _finished_runs, _finished_runs),
 }
 # A sweep takes six times as long as an export.
 ORDER = (

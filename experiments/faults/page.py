@@ -12,7 +12,7 @@ ABOUT = {
     "prepare": "`prepare`: cameras of a clip by COLMAP",
     "export": "`export`, over an earlier sequence of files",
     "render": "`render`, over an earlier video and its images",
-    "sweep": "`ablate` with two processes",
+    "sweep": "`benchmark` with two processes",
 }
 
 

@@ -429,7 +429,7 @@ def _read_metrics(folder):
 def _cache(folder):
     from nerfies_jax.capture import cache_files
 
-    cache_files.write_arrays(folder / "a.npz", {"a": np.arange(9)}, "fuzz", True)
+    cache_files.write_arrays(folder / "a.npz", {"a": np.arange(9)}, "fuzz")
     cache_files.write_json(folder / "b.json", {"a": [1, 2]}, "fuzz")
 
 

@@ -18,7 +18,7 @@ import queue
 import subprocess
 import tempfile
 
-from experiments import cli, kept
+from experiments import cli, records
 from experiments.mutants.faults import ROOT, drawn
 from experiments.mutants.page import page
 from experiments.mutants.witnesses import default_tests, reached_by, tried
@@ -100,7 +100,7 @@ def _reached(out, workers, with_copy):
     digest = hashlib.blake2b(
         b"".join(sorted(map(_name_and_bytes, _files())))
     ).hexdigest()
-    stored = kept.rows(path, reached=dict)
+    stored = records.rows(path, reached=dict)
     entered = stored["reached"] if stored.get("digest") == digest else {}
 
     def run(test):
@@ -137,7 +137,7 @@ def _is_row_of(fault, row):
 
 
 def _stored(path, seed):
-    stored = kept.rows(path, rows=list)
+    stored = records.rows(path, rows=list)
     return stored["rows"] if stored.get("seed") == seed else []
 
 

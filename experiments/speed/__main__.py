@@ -28,7 +28,7 @@ import sys
 import tempfile
 import time
 
-from experiments import cli, kept
+from experiments import cli, records
 from experiments.speed import job, raster
 from nerfies_jax.runs import representations
 from nerfies_jax.runtime import children, console
@@ -108,7 +108,7 @@ def keep(path: pathlib.Path, machine: dict, keys: tuple[str, ...], record) -> No
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.metrics import clock
 
-    stored = kept.rows(path)
+    stored = records.rows(path)
     stored["machine"] = clock.beside(machine, stored.get("machine", {}))
     inner = stored
     for key in keys[:-1]:

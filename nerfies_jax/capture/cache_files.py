@@ -78,10 +78,7 @@ def _state(path):
 
 
 def write_arrays(
-    path: pathlib.Path,
-    arrays: Mapping[str, np.ndarray],
-    identity: str,
-    compressed: bool = False,
+    path: pathlib.Path, arrays: Mapping[str, np.ndarray], identity: str
 ) -> None:
     """Write a .npz with its checksum, completely or not at all.
 
@@ -89,14 +86,12 @@ def write_arrays(
       path: The file. Its folder is created if needed.
       arrays: Arrays by name. The name `SEAL` is reserved.
       identity: Identity of the content, with the version of the code that made it.
-      compressed: True to compress the file.
     """
     seal = json.dumps({"identity": identity, "crc32": checksum(arrays)})
     _make_way(path)
-    save = np.savez_compressed if compressed else np.savez
     contents: dict[str, Any] = {**arrays, SEAL: np.array(seal)}
     with replaced_file(path) as partial:
-        save(partial, **contents)
+        np.savez(partial, **contents)
 
 
 def read_arrays(path: pathlib.Path, identity: str) -> dict[str, np.ndarray]:

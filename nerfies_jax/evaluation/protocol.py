@@ -21,7 +21,7 @@ STATIC_POINTS = 500  # of the capture's static points, to see whether they drift
 
 
 class GroundTruth(NamedTuple):
-    """Ground truth of all variants, in NumPy. A real capture has no tracks."""
+    """Ground truth of a built-in scene, in NumPy."""
 
     rows: np.ndarray  # held-out frames of the capture that are rendered
     moments: np.ndarray  # frames learned from, in time: when points are looked for
@@ -32,7 +32,6 @@ class GroundTruth(NamedTuple):
     # The moment from which points are followed: the middle one. D-NeRF's template is
     # what it sees at time 0, and its warp jumps there.
     start: int
-    exact: bool = True  # whether depth and what moves are known, not estimated
 
     @property
     def start_points(self) -> np.ndarray:
@@ -99,38 +98,6 @@ def ground_truth(
         path=path[chosen],
         seen=truth.track_seen[chosen][:, moments],
         start=start,
-    )
-
-
-def held_out_only(capture: Capture, frames: int) -> GroundTruth:
-    """Select held-out frames of a real capture, which has no ground truth for points.
-
-    Depths and masks, if any, are estimates. Depths are not evaluated, and masks only
-    select the pixels of images.
-
-    Args:
-      capture: The capture.
-      frames: Largest number of frames.
-
-    Returns:
-      The selected ground truth, without tracks.
-
-    Raises:
-      ValueError: If the capture has no held-out frames.
-    """
-    if not len(capture.heldout):
-        raise ValueError(
-            f"{capture.name}: no held-out frames to evaluate; choose some with "
-            "heldout=8 for every eighth"
-        )
-    moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-    return GroundTruth(
-        rows=evaluation.spread(capture.heldout, frames),
-        moments=moments,
-        path=np.zeros((0, len(moments), 3), np.float32),
-        seen=np.zeros((0, len(moments)), bool),
-        start=len(moments) // 2,
-        exact=False,
     )
 
 

@@ -68,18 +68,3 @@ def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start():
     assert away.mean() > 1e-3
     nothing = protocol.score_tracks(known, None)
     assert np.isnan(list(nothing.values())).all()
-
-
-def test_a_real_capture_is_judged_by_its_pictures_alone():
-    capture, _, known = scenes.tiny_tracks()
-    halved = protocol.held_out_only(capture, 2)
-    np.testing.assert_array_equal(halved.rows, known.rows)
-    np.testing.assert_array_equal(halved.moments, known.moments)
-
-    assert np.isnan(list(protocol.score_tracks(halved, None).values())).all()
-    assert np.isnan(protocol.static_error(halved))
-    blind = dataclasses.replace(
-        capture, train=np.arange(len(capture.ids)), heldout=np.zeros(0, int)
-    )
-    with pytest.raises(ValueError, match="no held-out frames to evaluate"):
-        protocol.held_out_only(blind, 2)

@@ -1,120 +1,230 @@
-"""The benchmark keeps every run under what was run, and shows medians and ends."""
+"""The benchmark runs `reconstruct`, stores means and spreads, and judges claims."""
 
-import concurrent.futures
 import json
+import math
+import signal
+import sys
+import threading
 import time
-from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import scipy.stats
 
 from experiments import cli
 from experiments.benchmark import __main__ as benchmark
-from experiments.benchmark import job, page
-from nerfies_jax import runs
+from experiments.benchmark import jobs, page, suites, verdicts
+from experiments.benchmark.suites import SUITES, Claim
+from nerfies_jax.metrics.metric_table import METRICS
 from nerfies_jax.runs import representations
-from nerfies_jax.runs.config import CaptureSource, RunConfig
-from nerfies_jax.runs.reconstruction import Refused
 from nerfies_jax.training import specs
 
 MACHINE = {"cpu": "one", "backend": "cpu", "jax": "0"}
+# Stands for `reconstruct`: a process that writes what a run writes.
+RUN = """
+import json, pathlib, sys, time
+words = sys.argv[1:]
+out = pathlib.Path(words[words.index("--out") + 1])
+log = out.with_suffix(".calls")
+log.write_text((log.read_text() if log.exists() else "") + " ".join(words) + "\\n")
+out.mkdir(exist_ok=True)
+preset = words[words.index("--preset") + 1] if "--preset" in words else "nerf-small"
+config = {"preset": preset}
+(out / "config.json").write_text(json.dumps({"config": config}))
+print("at work", flush=True)
+time.sleep(float(WAIT))
+if "rays=-1" in words:
+    sys.exit(print("error: rays=-1") or 2)
+if out.name.startswith("sonata"):
+    sys.exit("no such luck")
+seed = int(words[words.index("--seed") + 1])
+metrics = {"heldout.psnr": 20.0 + seed, "train.seconds": 1.0, "tracks.epe": None}
+(out / "metrics.json").write_text(json.dumps(metrics))
+curve = {"evaluations": [], "frames": [], "compile_seconds": 1, "machine": MACHINE}
+(out / "curve.json").write_text(json.dumps(curve))
+"""
 
 
-def scored(psnr, **more):
-    metrics = {"heldout.psnr": psnr, "train.seconds": 1.0, **more}
-    return {"preset": "splats-tracked-small", "machine": MACHINE, "metrics": metrics}
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """Let processes run `RUN` instead of `reconstruct`."""
+
+    def use(wait=0.0):
+        path = tmp_path / "run.py"
+        text = RUN.replace("WAIT", str(wait)).replace("MACHINE", json.dumps(MACHINE))
+        path.write_text(text)
+        start = jobs.children.start
+        monkeypatch.setattr(
+            jobs.children,
+            "start",
+            lambda command, **more: start(
+                [sys.executable, str(path), *command[3:]], **more
+            ),
+        )
+
+    return use
 
 
-def test_runs_are_kept_by_what_was_run_and_their_seed(tmp_path):
-    path = tmp_path / "benchmark.json"
-    benchmark.keep(path, "--scene fast", 0, scored(20.0))
-    benchmark.keep(path, "--scene default", 0, scored(30.0))
-    benchmark.keep(path, "--scene fast", 1, scored(22.0))
-    benchmark.keep(path, "--scene fast", 0, scored(21.0))  # made again
-    stored = json.loads(path.read_text())
-    assert stored["machine"] == MACHINE
-    fast = stored["runs"]["--scene fast"]
-    assert [fast[seed]["metrics"]["heldout.psnr"] for seed in "01"] == [21.0, 22.0]
-    assert "machine" not in fast["0"]
+def run(*words):
+    """Run the command and return its exit code."""
+    with pytest.raises(SystemExit) as stop:
+        benchmark.main(list(map(str, words)))
+    return stop.value.code
 
 
-def test_the_page_has_the_median_and_the_ends():
-    runs = {str(seed): scored(psnr) for seed, psnr in enumerate([31.0, 33.5, 32.0])}
-    written = page.page({"machine": MACHINE, "runs": {"--scene default": runs}})
-    assert "| `--scene default` | splats-tracked-small | 3 |" in written
-    assert "32.00 (31.00 to 33.50)" in written
-    del runs["2"]
-    written = page.page({"machine": MACHINE, "runs": {"--scene default": runs}})
-    assert "32.25 (31.00 to 33.50)" in written
-    assert "EPE at rest |" not in written  # no truth: the column is left out
-
-
-def test_a_run_is_named_without_where_it_lies(tmp_path):
+def test_a_benchmark_is_named_without_where_it_lies(tmp_path):
     words = [str(tmp_path / "film"), "--max-side", "256", "--steps", "20"]
     args = cli.parse(benchmark.Benchmark, words)
-    assert benchmark._label(args) == "film --max-side 256 --steps 20"
-    assert benchmark._stem(args) == "film-max-side-256-steps-20"
+    assert args.label == "film --max-side 256 --steps 20"
+    planned = benchmark.planned(args)
+    assert [run.folder.name for run in planned] == [f"default-{k}" for k in range(3)]
+    assert planned[0].folder.parent.name == "film-max-side-256-steps-20"
 
 
-def test_a_run_goes_on_where_it_was_cut_and_belongs_to_one_capture(
-    tmp_path, monkeypatch
+def test_a_run_is_one_of_reconstruct():
+    words = "--scene fast --suite sonata --methods no-depth --set sh_degree=0"
+    args = cli.parse(benchmark.Benchmark, [*words.split(), "--seconds", "9"])
+    first = benchmark.planned(args)[0]
+    changes = ("depth=none", suites.TRACKS, "sh_degree=0")
+    assert first.words == (
+        *("--scene", "fast", "--seed", "0", "--preset", "sonata-small"),
+        *("--set", *changes),
+    )
+    assert first.seconds == 9
+
+
+def test_interrupted_runs_continue_and_finished_ones_are_not_repeated(
+    tmp_path, stand_in, capsys
 ):
-    """Nothing is trained: what stands in for it writes what a run writes."""
-    done = []
-    spec = representations.of_preset("nerf-small").presets["nerf-small"]
-
-    def config_of(folder):
-        source = CaptureSource(capture=str(tmp_path / folder / "dog"))
-        return RunConfig(preset="nerf-small", source=source)
-
-    def begin(config, folder, seconds):
-        done.append("begun")
-        folder.mkdir()
-        stored = {"config": specs.as_json(config), "spec": specs.as_json(spec)}
-        stored["representation"] = "radiance"
-        (folder / "config.json").write_text(json.dumps(stored))
-        result = SimpleNamespace(stopped_by="SIGINT")
-        return SimpleNamespace(errors=(), result=result)
-
-    def go_on(folder):
-        done.append("resumed")
-        (folder / "metrics.json").write_text(json.dumps({"heldout.psnr": 30.0}))
-        run = SimpleNamespace(config=SimpleNamespace(preset="nerf-small"))
-        return SimpleNamespace(errors=(), run=run)
-
-    monkeypatch.setattr(job.platform, "start_jax", lambda *_: None)
-    monkeypatch.setattr(runs, "reconstruct", begin)
-    monkeypatch.setattr(runs, "resume", go_on)
-    out, first = tmp_path / "dog-0", config_of("a")
-    with pytest.raises(RuntimeError, match="the same command goes on"):
-        job.score(first, out, None, alone=True)
-    for _ in range(2):
-        assert job.score(first, out, None, True)["metrics"] == {"heldout.psnr": 30.0}
-    assert done == ["begun", "resumed"]
-    with pytest.raises(ValueError, match=r"holds a run of .*dog, and .*dog is asked"):
-        job.score(config_of("b"), out, None, alone=True)
+    stand_in()
+    words = ("--scene", "fast", "--preset", "nerf-small", "--seconds", "9")
+    out = ("--jobs", "2", "--out", tmp_path / "out")
+    args = cli.parse(benchmark.Benchmark, [*words, "--out", str(tmp_path / "out")])
+    first, second, _ = benchmark.planned(args)
+    first.folder.mkdir(parents=True)
+    (first.folder / "config.json").write_text("{}")
+    assert run(*words, *out) == 0
+    assert "--resume" in first.folder.with_suffix(".calls").read_text()
+    calls = second.folder.with_suffix(".calls").read_text()
+    assert "--seconds 9" in calls
+    assert run(*words, *out) == 0
+    assert second.folder.with_suffix(".calls").read_text() == calls
+    stored = json.loads((tmp_path / "out" / "benchmark.json").read_text())
+    assert stored["machine"] == MACHINE
+    (method,) = stored["benchmarks"][args.label]["methods"].values()
+    assert method["settings"] == "nerf-small"
+    assert method["mean"] == {"heldout.psnr": 21.0, "train.seconds": 1.0}
+    assert method["spread"]["heldout.psnr"] == 1.0
+    shown = "| 21.00 ± 1.00 |"
+    assert shown in capsys.readouterr().out
+    assert shown in page.page(stored)
+    # The results of another benchmark stay.
+    assert run("--scene", "topology", "--seeds", "1", *out) == 0
+    stored = json.loads((tmp_path / "out" / "benchmark.json").read_text())
+    assert len(stored["benchmarks"]) == 2
 
 
-def test_what_refuses_one_seed_ends_all_in_a_line(tmp_path, monkeypatch, capsys):
-    tried = []
+def test_a_run_that_fails_is_named_and_the_others_go_on(tmp_path, stand_in, capsys):
+    stand_in()
+    methods = ("--suite", "presets", "--methods", "sonata-small", "nerf-small")
+    assert run(*methods, "--seeds", "2", "--out", tmp_path / "out") == 1
+    printed = capsys.readouterr().out
+    assert "sonata-small, seed 1: failed with exit code 1: no such luck" in printed
+    assert "| `nerf-small` | nerf-small | 2 |" in printed
+    assert "| `sonata-small`" not in printed
 
-    def refused(config, *_, **__):
-        tried.append(config.seed)
-        time.sleep(0.02)
-        raise Refused("no width; move the scene")
 
-    def threads(jobs, *_, **__):
-        return concurrent.futures.ThreadPoolExecutor(jobs)
+def test_wrong_input_of_one_run_ends_all(tmp_path, stand_in, capsys, monkeypatch):
+    stand_in()
+    words = ("--preset", "nerf-small", "--set", "rays=-1", "--out", tmp_path / "out")
+    assert run(*words) == 2
+    assert "rays=-1" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()  # refused before any run
+    monkeypatch.setattr(representations, "cores", lambda *_: None)
+    assert run(*words) == 2
+    assert capsys.readouterr().err.endswith("error: rays=-1\n")
+    assert len(list((tmp_path / "out").rglob("*.calls"))) == 1
 
-    monkeypatch.setattr(job, "score", refused)
-    monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", threads)
-    words = ["--scene", "static", "--seeds", "99", "--out", str(tmp_path)]
-    for more, message in [
-        ((), "no width"),
-        (("--preset", "nerf-small", "--set", "rays=-1"), "rays=-1"),
-    ]:
-        with pytest.raises(SystemExit) as ended:
-            benchmark.main([*words, *more])
-        assert ended.value.code == 2
-        assert message in capsys.readouterr().err
-    assert len(tried) < 99
-    assert not list(tmp_path.iterdir())
+
+@pytest.mark.full
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (15, 143)])
+def test_a_signal_ends_every_run(tmp_path, stand_in, number, code, monkeypatch):
+    stand_in(wait=60.0)
+    started = []
+    start = jobs._start
+
+    def noted(*arguments, **more):
+        started.append(start(*arguments, **more))
+        return started[-1]
+
+    monkeypatch.setattr(jobs, "_start", noted)
+
+    def interrupt():
+        while len(list(tmp_path.rglob("config.json"))) < 2:
+            time.sleep(0.02)
+        signal.raise_signal(number)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    assert run("--jobs", "2", "--out", tmp_path / "out") == code
+    thread.join()
+    assert len(started) == 2
+    assert all(one.poll() is not None for one in started)
+
+
+CLAIM = Claim("A warp helps", "warp", "static", ("tracks.epe", "heldout.psnr"))
+
+
+@pytest.mark.parametrize(
+    ("warp", "static", "verdict"),
+    [
+        ([0.010, 0.012, 0.011], [0.020, 0.023, 0.020], "supported"),
+        ([0.020, 0.023, 0.020], [0.010, 0.012, 0.011], "contradicted"),
+        ([0.010, 0.030, 0.011], [0.020, 0.013, 0.020], "not significant"),
+        ([0.010], [0.020], "one seed, not significant"),
+        # Only seeds that both methods have are compared.
+        ([0.010, 0.012, 0.011, 9.0], [0.020, 0.023, 0.020], "supported"),
+    ],
+)
+def test_a_claim_is_judged_by_the_spread_over_seeds(warp, static, verdict):
+    numbers = {
+        (method, seed): {"tracks.epe": x, "heldout.psnr": -x}
+        for method, values in (("warp", warp), ("static", static))
+        for seed, x in enumerate(values)
+    }
+    first, second = verdicts.judge(numbers, [CLAIM])
+    # A lower error and a higher PSNR are both a gain.
+    assert first.verdict == second.verdict == verdict
+    count = min(len(warp), len(static))
+    gains = np.subtract(static[:count], warp[:count])
+    np.testing.assert_allclose(first.gain, gains.mean(), rtol=1e-12)
+    if count > 1:
+        interval = scipy.stats.ttest_1samp(gains, 0).confidence_interval(0.95)
+        width = (interval.high - interval.low) / 2
+        assert first.half_width == pytest.approx(width, rel=1e-9)
+    benchmark = {"suite": "fields", "claims": [first._asdict()], "methods": {}}
+    assert f"| {verdict} |" in page.page({"benchmarks": {"--scene fast": benchmark}})
+
+
+def test_a_claim_without_both_numbers_is_not_judged():
+    numbers = {("warp", 0): {"heldout.psnr": 9.0}, ("static", 0): {}}
+    assert verdicts.judge(numbers, [CLAIM]) == []
+    numbers["static", 0] = {"heldout.psnr": math.nan}
+    assert verdicts.judge(numbers, [CLAIM]) == []
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_suites_are_consistent(name):
+    suite = SUITES[name]
+    for settings in suite.methods.values():
+        preset, changes = suites.parsed(settings)
+        specs.override(representations.of_preset(preset).presets[preset], changes)
+    for claim in suite.claims:
+        assert {claim.better, claim.worse} <= set(suite.methods)
+        assert set(claim.metrics) <= set(METRICS)
+    judged = {method for claim in suite.claims for method in claim[1:3]}
+    assert judged == (set(suite.methods) if suite.claims else set())
+
+
+def test_every_column_has_an_explanation():
+    assert {column[0] for group in page.GROUPS for column in group} <= set(METRICS)

@@ -172,7 +172,7 @@ def test_json_alone_is_on_standard_output(capfd):
 def test_every_command_is_listed_with_a_line(capsys):
     every.main([])
     printed = capsys.readouterr().out
-    for name in ("reconstruct", "render", "prepare", "ablate", "hard_cases"):
+    for name in ("reconstruct", "render", "prepare", "benchmark", "hard_cases"):
         assert f"\n{name} " in printed
     assert all(line.endswith((".", "?")) for line in every.commands().values())
 
@@ -228,7 +228,7 @@ def test_an_unknown_command_names_those_there_are(capsys):
     with pytest.raises(SystemExit) as stop:
         every.main(["reconstrct"])
     assert stop.value.code == 2
-    assert "did you mean reconstruct? there are ablate, " in capsys.readouterr().err
+    assert "did you mean reconstruct? there are benchmark, " in capsys.readouterr().err
 
 
 @pytest.mark.full

@@ -1,4 +1,4 @@
-"""Every cache and every kept part of a sweep is disposable, however it is damaged."""
+"""Every cache and every stored part of a benchmark may be damaged and is made again."""
 
 import dataclasses
 import functools
@@ -13,19 +13,14 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import kept
-from experiments.ablate import results
-from experiments.ablate.measures import MEASURES
-from experiments.ablate.results import ArmResult
-from experiments.benchmark.job import SCORED
+from experiments import records
+from experiments.benchmark.jobs import COMPLETE
 from nerfies_jax.capture import cache_files, synthetic
 from nerfies_jax.capture.synthetic import record as scenes_record
 from nerfies_jax.preprocessing import record
 from tests import scenes
 
 pytestmark = pytest.mark.slow
-
-SPEC = {"steps": 3, "arm": "static", "seed": 0, "spec": {"rate": 0.1}}
 
 
 class Kind(NamedTuple):
@@ -49,31 +44,20 @@ def scene(folder):
     return synthetic.cached(scenes.TINY_FILM, folder)
 
 
-def cell(folder):
-    path = folder / "static-0.json"
-    found = results.read(path, SPEC)
-    if found is None:
-        numbers = {name: 0.25 for name in MEASURES}
-        arrays = {"color": np.arange(999.0), "depth": np.ones((3, 4), np.float32)}
-        results.write(path, SPEC, ArmResult(numbers, arrays, {"steps": 3}))
-        found = results.read(path, SPEC)
-    return found
-
-
 def rows(folder):
     path = folder / "rows.json"
-    found = kept.rows(path, rows=list)
+    found = records.rows(path, rows=list)
     if not found:
         path.write_text(json.dumps({"machine": {}, "rows": [{"psnr": 20.5}] * 9}))
-        found = kept.rows(path, rows=list)
+        found = records.rows(path, rows=list)
     return found
 
 
 def finished(folder):
     path = folder / "metrics.json"
-    if kept.one(path, SCORED) is None:
+    if records.one(path, COMPLETE) is None:
         path.write_text(json.dumps({"heldout.psnr": 20.5, "train.seconds": 3.25}))
-    return kept.one(path, SCORED)
+    return records.one(path, COMPLETE)
 
 
 KINDS = {
@@ -82,8 +66,6 @@ KINDS = {
     "depth of a scene": Kind(scene, "*/depth/**/*.npy", "*"),
     "camera of a scene": Kind(scene, "*/camera/*.json", "*"),
     "manifest of a scene": Kind(scene, "*/manifest.json", "*"),
-    "numbers of a cell": Kind(cell, "static-0.json", "static-0.json"),
-    "arrays of a cell": Kind(cell, "static-0.npz", "static-0.json"),
     "a finished run": Kind(finished, "metrics.json", "metrics.json", sealed=False),
     "rows of a study": Kind(rows, "rows.json", "rows.json", True, False),
 }
@@ -221,9 +203,7 @@ def test_damaged_files_are_reported_and_made_again(kind, tmp_path, capsys):
             shutil.rmtree(beside) if beside.is_dir() else beside.unlink()
 
 
-@pytest.mark.parametrize(
-    "kind", ["evidence", "truth of a scene", "numbers of a cell", "arrays of a cell"]
-)
+@pytest.mark.parametrize("kind", ["evidence", "truth of a scene"])
 def test_no_flipped_bit_becomes_a_plausible_number(kind, tmp_path):
     """Wherever it is: in a number, a header, or where nothing is read."""
     fetch, file, *_ = KINDS[kind]
@@ -237,22 +217,7 @@ def test_no_flipped_bit_becomes_a_plausible_number(kind, tmp_path):
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
 def test_a_file_that_may_not_be_read_is_made_again(tmp_path, capsys):
-    whole = cell(tmp_path)
-    (tmp_path / "static-0.json").chmod(0)
-    same(cell(tmp_path), whole)
+    whole = rows(tmp_path)
+    (tmp_path / "rows.json").chmod(0)
+    same(rows(tmp_path), whole)
     assert "Permission denied" in capsys.readouterr().err
-
-
-def test_steps_are_known_from_other_seeds_if_the_first_is_damaged(tmp_path, capsys):
-    cell(tmp_path)
-    for seed in (1, 2):
-        identity = SPEC | {"seed": seed}
-        kept_cell = ArmResult({}, {}, {})
-        results.write(tmp_path / f"static-{seed}.json", identity, kept_cell)
-    (tmp_path / "static-0.json").write_text("{")
-    (tmp_path / "static-1.json").write_text("")
-    assert results.steps_of(tmp_path, "static") == 3
-    said = capsys.readouterr().err
-    assert "static-0.json" in said
-    assert "static-1.json" in said
-    assert results.steps_of(tmp_path, "stat") is None

@@ -12,17 +12,13 @@ from tests import scenes
 
 # OUT is a folder that is not there.
 TABLE = [
-    ("ablate", "--arms nerfy", "in --suite fields there are nerfies, no-elastic"),
-    ("ablate", "--suite moba --arms nerfies", "there are full, no-basis"),
-    ("ablate", "--seeds 0", "positive"),
-    ("ablate", "--budget -1", "positive"),
-    ("ablate", "--seconds 0", "positive"),
-    ("ablate", "--seed 1 --jobs 2", "one seed from 0 on"),
-    ("ablate", "--scene moon", "no such built-in scene"),
-    ("ablate", "--scene tiny --arms static --set color=red", "no field 'color'"),
-    ("ablate", "--heldout 8", "is for captures"),
-    ("ablate", "--scene tiny --arms static --seconds 9 --seed 1", "train it first"),
     ("benchmark", "OUT --out OUT", "OUT: no such file or folder"),
+    ("benchmark", "--suite moba --methods nerfies", "there are full, no-basis"),
+    ("benchmark", "--methods nerfies", "name one with --suite"),
+    ("benchmark", "--suite moba --preset nerfies", "has presets of its own"),
+    ("benchmark", "--seeds 0", "at least 1"),
+    ("benchmark", "--seconds 0", "above 0"),
+    ("benchmark", "--suite fields --set color=red --out OUT", "no field 'color'"),
     ("compare", "OUT", "two or more"),
     ("effect_cost", "--presets nerf", "no effect to be priced"),
     ("effect_cost", "--presets", "--presets"),

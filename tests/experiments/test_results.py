@@ -39,34 +39,40 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
         STUDIES, "benchmark", STUDIES["benchmark"]._replace(measured="kept.json")
     )
     new = tmp_path / "new.json"
-    runs = {"default": {"0": {"preset": "nerf", "metrics": {"heldout.psnr": 21.5}}}}
+    method = {"settings": "nerf", "seeds": 1, "spread": {}}
+    method["mean"] = {"heldout.psnr": 21.5}
+    default = {"suite": None, "claims": [], "methods": {"nerf": method}}
+    benchmarks = {"--scene default": default}
     machine = {"cpu": "a core", "backend": "cpu", "jax": "0"}
-    new.write_text(json.dumps({"machine": machine, "runs": runs}))
+    new.write_text(json.dumps({"machine": machine, "benchmarks": benchmarks}))
     results.main(["benchmark", "--measured", str(new)])
-    assert "| `default` | nerf | 1 | 21.50 |" in (tmp_path / "benchmark.md").read_text()
+    written = (tmp_path / "benchmark.md").read_text()
+    assert "| `--scene default` | 21.50 |" in written
     assert "[benchmark.md]" in (tmp_path / "README.md").read_text()
-    new.write_text(json.dumps({"machine": machine, "runs": {"default": {"0": {}}}}))
+    broken = {"machine": machine, "benchmarks": {"--scene default": {"suite": None}}}
+    new.write_text(json.dumps(broken))
     with pytest.raises(SystemExit) as stop:
         results.main(["benchmark", "--measured", str(new)])
     assert stop.value.code == 2
     assert "not what python -m experiments.benchmark" in capsys.readouterr().err
-    assert json.loads((tmp_path / "kept.json").read_text())["runs"] == runs
+    stored = json.loads((tmp_path / "kept.json").read_text())
+    assert stored["benchmarks"] == benchmarks
 
 
 @pytest.mark.parametrize(
     ("page", "text", "words"),
     [
         ("benchmark", "words", "not JSON"),
-        ("benchmark", '{"machine": {}, "rows": []}', "holds no rows"),
+        ("benchmark", '{"machine": {}, "rows": []}', "holds no results"),
         (
             "ablate_poses",
-            '{"about": {"settings": {"scene": "fast"}}}',
-            "of scene fast, and the",
+            '{"benchmarks": {"--scene fast --suite poses": {}}}',
+            "of --scene fast --suite poses, and the",
         ),
         (
             "ablate_moba",
-            '{"about": {"settings": {"suite": "sonata"}}}',
-            "the page ablate_moba is of moba",
+            '{"benchmarks": {"--scene default --suite sonata": {}}}',
+            "the page ablate_moba is of --suite moba",
         ),
     ],
 )

@@ -1,6 +1,5 @@
 """Ground truth of a synthetic scene beyond its images: ids, flow, point tracks."""
 
-import dataclasses
 import functools
 import pathlib
 from concurrent.futures import Future
@@ -13,7 +12,6 @@ from jaxtyping import Array, Bool, Float
 
 from nerfies_jax.capture import npz_files
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.capture.given import Given
 from nerfies_jax.capture.synthetic import trace
 from nerfies_jax.capture.synthetic.rendering import Schedule
 from nerfies_jax.capture.synthetic.spec import SceneSpec
@@ -76,30 +74,6 @@ def track_places(capture: Capture, truth: SceneTruth, rows: np.ndarray) -> np.nd
         )
     world = truth.track_world[:, instants] - np.array(capture.center, np.float32)
     return (world * capture.scale).astype(np.float32)
-
-
-def with_truth(capture: Capture, truth: SceneTruth) -> Capture:
-    """Attach the true tracks, positions and masks as external preprocessing.
-
-    Args:
-      capture: The capture.
-      truth: Its ground truth.
-
-    Returns:
-      The capture with `given` set.
-
-    Raises:
-      ValueError: If the truth is not that of the capture.
-    """
-    positions = track_places(capture, truth, np.arange(len(capture.ids)))
-    given = Given(
-        capture.size,
-        track_pixel=np.moveaxis(truth.track_pixel, 0, 1),
-        track_seen=np.moveaxis(truth.track_seen, 0, 1),
-        track_place=np.moveaxis(positions, 0, 1),
-        moving=capture.moving,
-    )
-    return dataclasses.replace(capture, given=given)
 
 
 class Flow(NamedTuple):

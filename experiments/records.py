@@ -1,4 +1,4 @@
-"""Files of finished parts of a study, so that the same command goes on."""
+"""Files of measured numbers, to which the same command adds until it is done."""
 
 import json
 import pathlib
@@ -7,30 +7,48 @@ from typing import Any
 
 
 def rows(path: pathlib.Path, **kinds: type) -> dict[str, Any]:
-    """Read the file to which a study adds row after row.
+    """Read the file that a command extends row by row.
 
     Args:
       path: The file.
       **kinds: The entries that it must have, with their types.
 
     Returns:
-      Its content. It is empty where there is no file or a damaged one, which is
-      reported and kept under another name.
+      Its content. It is empty if there is no file or a damaged one, which is reported
+      and kept under another name.
     """
     return _read(path, kinds, aside=True) or {}
 
 
 def one(path: pathlib.Path, kinds: Mapping[str, type]) -> dict[str, Any] | None:
-    """Read what one part of a study left.
+    """Read the result of one part of a measurement.
 
     Args:
       path: The file.
       kinds: The entries that it must have, with their types.
 
     Returns:
-      Its content, or None where there is no file or a damaged one, which is reported.
+      Its content, or None if there is no file or a damaged one, which is reported.
     """
     return _read(path, kinds)
+
+
+def write(path: pathlib.Path, stored: dict[str, Any], *machines: dict) -> None:
+    """Write the file of a measurement, with the machines and revision that made it.
+
+    Args:
+      path: The file.
+      stored: Its content. Processors of earlier parts are kept.
+      *machines: Descriptions of the machines of the parts that were added.
+    """
+    from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.metrics import clock
+    from nerfies_jax.training.provenance import revision
+
+    for machine in machines:
+        stored["machine"] = clock.beside(machine, stored.get("machine", {}))
+    stored["revision"] = revision()
+    write_json(path, stored)
 
 
 def _read(path, kinds, aside=False):
