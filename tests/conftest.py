@@ -62,6 +62,7 @@ LONGEST = {
     "test_splat_cases.py": (),
     "test_elastic_cases.py": (),
     "test_presets.py": ("name",),
+    "test_values_and_slopes.py": ("topic",),
     "test_contracts.py": (),
     "test_effect_cost.py": (),
     "test_inspection_truth.py": ("name",),

@@ -158,8 +158,14 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("command", OPENING)
-@pytest.mark.parametrize("kind", HOSTILE)
+@pytest.mark.parametrize(
+    ("kind", "command"),
+    [
+        *((kind, "render") for kind in HOSTILE),
+        # All open a folder in the same way.
+        *(("a motion beside it", one) for one in OPENING if one != "render"),
+    ],
+)
 def test_no_command_runs_what_a_folder_names(
     kind, command, stranger, finished, capsys, monkeypatch
 ):

@@ -16,8 +16,6 @@ from tests.hard_cases import hostile
 from tests.training import toy
 from tests.training.toy import MODEL, fit, start
 
-pytestmark = pytest.mark.hard_cases
-
 STEPS = 20  # of which the toy grows after the seventh
 NAMES = {
     "metric": "metric loss",

@@ -77,7 +77,6 @@ def test_a_bent_slice_is_the_loop_over_its_layers(dtype, rng):
     np.testing.assert_allclose(lifted, features, atol=tolerance)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize("spec", [BENT, PLANE], ids=["bent", "plane"])
 def test_while_shut_the_template_reads_zeros_and_nothing_learns(spec, dtype, rng):
     effect = spec.bind(1, None)

@@ -117,7 +117,6 @@ def test_a_flow_with_a_trunk_of_its_own_reads_nothing_of_the_medium_s(dtype):
 # --- edges of time
 
 
-@pytest.mark.hard_cases
 def test_a_medium_on_planes_is_finite_where_there_is_no_moment(dtype):
     """As neighbors of the first and the last are, at any distance."""
     network = dataclasses.replace(
@@ -161,7 +160,6 @@ def slopes_of(params, frames, batch, arrays, times):
     return jax.grad(total, (0, 1), has_aux=True)(params, shift)
 
 
-@pytest.mark.hard_cases
 def test_the_first_and_the_last_moment_have_one_neighbor(float64):
     (_, grad), _ = slopes_of(*scenario("float64"), TIMES)
     strength = {name: np.abs(np.asarray(x)).sum((1, -1)) for name, x in grad.items()}
@@ -175,7 +173,6 @@ def test_the_first_and_the_last_moment_have_one_neighbor(float64):
 
 
 @pytest.mark.full
-@pytest.mark.hard_cases
 def test_a_single_moment_has_no_neighbors_and_no_flow_to_learn(dtype):
     params, frames, batch, arrays = scenario(dtype)
     still = frames._replace(times=np.zeros(MOMENTS, dtype))

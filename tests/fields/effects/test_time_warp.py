@@ -50,7 +50,6 @@ def test_shift_and_features_are_those_of_the_layers(time, dtype, rng):
         np.testing.assert_allclose(features, expected[1], rtol=bound, atol=bound)
 
 
-@pytest.mark.hard_cases
 def test_it_starts_as_the_identity_and_does_not_stay_there(dtype, rng):
     spec = TimeWarpSpec()
     points = rng.uniform(-1, 1, (300, 3)).astype(dtype)

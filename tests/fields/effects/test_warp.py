@@ -105,7 +105,6 @@ def test_a_warp_without_hidden_layers_reads_point_and_condition(condition, dtype
     np.testing.assert_allclose(moved, truth, rtol=0, atol=bound)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize(
     ("kind", "anneal_steps"),
     [
@@ -163,7 +162,6 @@ def test_weights_of_bands_that_open_late_start_at_zero():
         assert np.all(np.asarray(head.weight)[:3] != 0)
 
 
-@pytest.mark.hard_cases
 @pytest.mark.parametrize(
     "kind", ["se3", pytest.param("translation", marks=pytest.mark.full)]
 )
