@@ -87,7 +87,7 @@ def main(args):
     save(folder, compared, goals)
     if args.frames:
         kinds = [representations.of_run(each.folder) for each in compared]
-        threads = {kind.threads for kind in kinds if kind is not None}
+        threads = {kind.resources.threads for kind in kinds if kind is not None}
         with cli.user_errors():
             cli.find_code(args.trust)
             platform.start_jax(args.device, "all" if "all" in threads else "one")

@@ -191,7 +191,7 @@ def _splatv(args: Export, run: Any) -> str:
     model = run.model
     if spec.exposure is not None:  # of which the file has none
         neutral = ("exposure",)
-        model = run.representation.variant(spec, run.metadata, neutral, False)
+        model = run.representation.products.variant(spec, run.metadata, neutral, False)
     draw = evaluation.Renderer(model, capture.size)
     fit = splatv.measured(curves, learned, draw, state, raster, capture)
     said = (
@@ -238,7 +238,7 @@ def _planned(args: Export, run: Any) -> Any:
     from nerfies_jax.capture import camera_paths, path_files, pinholes
 
     planned = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)
-    if not run.representation.traces_lenses:
+    if not run.representation.scoring.traces_lenses:
         planned = planned._replace(cameras=pinholes.pinhole(planned.cameras))
     if planned.times is None:
         count = len(planned.cameras.focal_px)
@@ -273,7 +273,7 @@ def _tracks(args: Export, run: Any) -> str:
 
 
 def _mover(run: Any):
-    return run.representation.mover(run.spec, run.metadata)
+    return run.representation.scoring.mover(run.spec, run.metadata)
 
 
 def _exr(args: Export, run: Any) -> str:

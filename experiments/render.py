@@ -180,14 +180,16 @@ def _model(args, run):
     blended = args.appearance is not None
     if not args.without and not blended:
         return run.model
-    return run.representation.variant(run.spec, run.metadata, args.without, blended)
+    return run.representation.products.variant(
+        run.spec, run.metadata, args.without, blended
+    )
 
 
 def _mover(args, run):
     """Return the function that moves points between images, if flow is shown."""
     if args.show != "flow":
         return None
-    move = run.representation.mover(run.spec, run.metadata)
+    move = run.representation.scoring.mover(run.spec, run.metadata)
     if move is None:
         raise ValueError(
             "--show flow: nothing in this run moves points; it needs a warp or motion"
@@ -259,7 +261,7 @@ def _views(args, run):
             views = [view._replace(time=time) for view in views]
         return names, views, run.capture.size
     path = path_files.named(args.path, run.capture, args.frames)
-    if not run.representation.traces_lenses:
+    if not run.representation.scoring.traces_lenses:
         path = path._replace(cameras=pinholes.pinhole(path.cameras))
     count = len(path.cameras.focal_px)
     if args.freeze is not None:

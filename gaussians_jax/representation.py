@@ -28,8 +28,12 @@ from nerfies_jax.evaluation.representation import (
     Choice,
     Pair,
     Player,
+    Products,
+    Recommendation,
     Representation,
+    Resources,
     Saved,
+    Scoring,
 )
 from nerfies_jax.preprocessing import record, rigid_groups, usable_paths
 from nerfies_jax.preprocessing.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
@@ -235,35 +239,42 @@ def capacity(
 
 GAUSSIANS = Representation(
     name="gaussians",
-    # Splats are tight loops. XLA splits their bodies over all cores it sees and gains
-    # nothing: 87 to 94 ms a training step with one, 94 to 109 with four (10,000
-    # Gaussians, 176x132). With one, the bits do not depend on the core count either.
-    threads="one",
-    shares=lambda spec: spec.batch_size,
-    traces_lenses=False,
     spec_type=scene.SplatScene,
     presets=presets.PRESETS,
     with_steps=presets.with_steps,
-    growth=growth,
     metadata_of=lambda capture, spec: scene.metadata_of(capture),
     build=scene.build,
-    estimate_memory_bytes=first_state.estimate_memory_bytes,
-    memory_hint="lower init.points, init.random or raster.capacity",
-    step_parts=step_time.parts,
-    variant=variants.without_effects,
-    parts=variants.parts,
-    score_halves=held_out_exposure.score,
-    fitted_rays=0,
-    save=save,
-    player=player,
-    follow=point_tracks.follow,
-    mover=point_tracks.mover,
-    advise=advise,
-    default_preset=default_preset,
-    prices={
-        MOTION: Pair("splats-deformable-small", "only_motion"),
-        DEPTH: Pair("sonata-small", "only_depth"),
-        LIGHT: Pair("splats-static-small", "only_exposure"),
-    },
-    splatting=browser_splats.splatting,
+    resources=Resources(
+        # Splats are tight loops. XLA splits their bodies over all cores it sees and
+        # gains nothing: 87 to 94 ms a training step with one, 94 to 109 with four
+        # (10,000 Gaussians, 176x132). With one, the bits do not depend on the core
+        # count either.
+        threads="one",
+        shares=lambda spec: spec.batch_size,
+        estimate_memory_bytes=first_state.estimate_memory_bytes,
+        memory_hint="lower init.points, init.random or raster.capacity",
+        growth=growth,
+        step_parts=step_time.parts,
+    ),
+    scoring=Scoring(
+        score_halves=held_out_exposure.score,
+        follow=point_tracks.follow,
+        mover=point_tracks.mover,
+    ),
+    products=Products(
+        save=save,
+        player=player,
+        splatting=browser_splats.splatting,
+        parts=variants.parts,
+        variant=variants.without_effects,
+    ),
+    recommendation=Recommendation(
+        advise,
+        default_preset,
+        prices={
+            MOTION: Pair("splats-deformable-small", "only_motion"),
+            DEPTH: Pair("sonata-small", "only_depth"),
+            LIGHT: Pair("splats-static-small", "only_exposure"),
+        },
+    ),
 )

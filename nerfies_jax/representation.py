@@ -3,8 +3,11 @@
 from nerfies_jax.evaluation.representation import (
     Choice,
     Pair,
+    Products,
+    Recommendation,
     Representation,
-    Saved,
+    Resources,
+    Scoring,
 )
 from nerfies_jax.preprocessing.findings import BACKGROUND, LIGHT, MOTION, TRANSIENT
 from nerfies_jax.scene import (
@@ -86,33 +89,34 @@ def _parts(spec, names):
 
 RADIANCE = Representation(
     name="radiance",
-    threads="all",  # matrix products, which every core makes faster
-    shares=lambda spec: spec.micro_batches,
-    traces_lenses=True,
     spec_type=scene.RadianceScene,
     presets=presets.PRESETS,
     with_steps=presets.with_steps,
-    growth=lambda spec, state: 1.0,
     metadata_of=scene.metadata_of,
     build=scene.build,
-    estimate_memory_bytes=scene.estimate_memory_bytes,
-    memory_hint="lower rays, sampling.coarse or sampling.fine",
-    step_parts=step_time.parts,
-    variant=variants.without_effects,
-    parts=variants.parts,
-    score_halves=held_out_codes.score,
-    fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
-    save=lambda *_, **__: Saved(),  # the checkpoint holds all there is
-    player=None,  # an image takes seconds
-    follow=point_tracks.follow,
-    mover=point_tracks.mover,
-    default_preset=None,
-    advise=advise,
-    # Motion brings the elastic penalty along.
-    prices={
-        MOTION: Pair("nerfies-small", "warp_and_elastic"),
-        LIGHT: Pair("nerf-w-small", "only_appearance"),
-        TRANSIENT: Pair("nerf-w-small", "only_transient"),
-        BACKGROUND: Pair("nerfies-small", "warp_and_background", "only_warp"),
-    },
+    resources=Resources(
+        threads="all",  # matrix products, which every core makes faster
+        shares=lambda spec: spec.micro_batches,
+        estimate_memory_bytes=scene.estimate_memory_bytes,
+        memory_hint="lower rays, sampling.coarse or sampling.fine",
+        step_parts=step_time.parts,
+    ),
+    scoring=Scoring(
+        traces_lenses=True,
+        score_halves=held_out_codes.score,
+        fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
+        follow=point_tracks.follow,
+        mover=point_tracks.mover,
+    ),
+    products=Products(parts=variants.parts, variant=variants.without_effects),
+    recommendation=Recommendation(
+        advise,
+        # Motion brings the elastic penalty along.
+        prices={
+            MOTION: Pair("nerfies-small", "warp_and_elastic"),
+            LIGHT: Pair("nerf-w-small", "only_appearance"),
+            TRANSIENT: Pair("nerf-w-small", "only_transient"),
+            BACKGROUND: Pair("nerfies-small", "warp_and_background", "only_warp"),
+        },
+    ),
 )

@@ -59,8 +59,9 @@ def measure(preset: str, all_cores: bool) -> dict[str, Any]:
         "compile_seconds": step.compile_seconds,
         "devices": model.devices,
     }
-    if not all_cores:
-        parts = representation.step_parts(spec, metadata, model, state, frames).ms()
+    step_parts = representation.resources.step_parts
+    if not all_cores and step_parts is not None:
+        parts = step_parts(spec, metadata, model, state, frames).ms()
         renderer = Renderer(model, capture.size)
         for row in capture.heldout[: FRAMES + 1]:
             renderer(state, evaluation.view_of(capture, row))

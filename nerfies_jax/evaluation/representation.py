@@ -5,7 +5,8 @@
 """
 
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -82,54 +83,84 @@ class SplatCloud(NamedTuple):
 Splatting = Callable[[TrainState, float, int, np.ndarray], SplatCloud]
 
 
-class Representation(NamedTuple):
-    """Constructors and functions of a representation's scenes."""
+class Resources(NamedTuple):
+    """Cores, memory and time that training needs."""
 
-    name: str
     # Cores that XLA:CPU should see: "one" if its own threading slows the loops down.
-    threads: Literal["one", "all"]
+    threads: Literal["one", "all"] = "all"
     # Number of equal shares of a spec's step, for as many devices.
-    shares: Callable[[Spec], int]
+    shares: Callable[[Spec], int] = lambda spec: 1
+    # (spec, capture) -> bytes of frames, first state and step; None: not checked
+    estimate_memory_bytes: Callable[[Spec, Capture], int] | None = None
+    memory_hint: str = ""  # which settings make the first state smaller
+    # Mean time of a step over a run, relative to one with the first state.
+    growth: Callable[[Spec, TrainState], float] = lambda spec, state: 1.0
+    # (spec, metadata, model, state, frames) -> the parts of a step
+    step_parts: Callable[..., StepParts] | None = None
+
+
+class Scoring(NamedTuple):
+    """Evaluation of a trained scene beyond its renders."""
+
     # True if rays are traced through the lens. Otherwise pinhole images are rendered,
     # and distorted before held-out frames are evaluated.
-    traces_lenses: bool
+    traces_lenses: bool = False
+    # (spec, metadata, state, capture, rows) -> scores with codes fitted to half of each
+    # frame, None if the scene has no codes of its own for each frame
+    score_halves: Callable[..., Halves | None] = lambda *args: None
+    fitted_rays: int = 0  # rendered to fit the codes of one frame
+    follow: Follow = lambda *args: None
+    mover: Mover = lambda spec, metadata: None
+
+
+def _no_variants(spec, metadata, without, blended):
+    raise ValueError("this representation defines no variants of a trained scene")
+
+
+class Products(NamedTuple):
+    """Files and variants of a trained scene."""
+
+    # (folder, spec, metadata, state) -> files beside the checkpoint
+    save: Callable[..., Saved] = lambda *args: Saved()
+    # (path, title, spec, model, state, capture, poster) -> a page that shows the scene
+    # from anywhere at any time
+    player: Callable[..., Player] | None = None
+    # (spec, metadata, names left out) -> the Gaussians of a trained scene, for other
+    # rasterizers
+    splatting: Callable[..., Splatting] | None = None
+    # (spec, metadata) -> the effects that can be left out
+    parts: Callable[..., Parts] = lambda spec, metadata: Parts((), False)
+    # (spec, metadata, names left out, whether appearances are blended) -> model. With
+    # blended appearances it renders a `nerfies_jax.scene.variants.Between` in place of
+    # a view.
+    variant: Callable[..., Model] = _no_variants
+
+
+class Recommendation(NamedTuple):
+    """Presets and settings for a capture."""
+
+    # ({effect: True, False, or None if undecided}, whether in the sizes of the papers,
+    # preset of the user without "-small", or None) -> the choice
+    advise: Callable[[dict[str, bool | None], bool, str | None], Choice]
+    # Preset of a capture if the user names none.
+    default_preset: Callable[[Capture], Choice] | None = None
+    # By effect, as in `nerfies_jax.preprocessing.findings`.
+    prices: Mapping[str, Pair] = MappingProxyType({})
+
+
+class Representation(NamedTuple):
+    """A kind of scenes that runs can train. The last four fields are optional."""
+
+    name: str
     spec_type: type
     presets: dict[str, Spec]
     with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
-    # Mean time of a step over a run, relative to one with the first state.
-    growth: Callable[[Spec, TrainState], float]
     metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[..., Model]  # (spec, metadata) -> model
-    estimate_memory_bytes: Callable[
-        [Spec, Capture], int
-    ]  # frames, first state and step
-    memory_hint: str  # which settings make the first state smaller
-    # (spec, metadata, model, state, frames) -> the parts of a step
-    step_parts: Callable[..., StepParts]
-    # (spec, metadata, names left out, whether appearances are blended) -> model; it
-    # draws a `nerfies_jax.scene.variants.Between` instead of a view where they are.
-    variant: Callable[..., Model]
-    parts: Callable[..., Parts]  # (spec, metadata)
-    # (spec, metadata, state, capture, rows), codes fitted to half a frame;
-    # None where the scene has no codes of its own for each frame.
-    score_halves: Callable[..., Halves | None]
-    fitted_rays: int  # rendered to fit the codes of one frame
-    # (folder, spec, metadata, state) -> what it wrote beside the checkpoint
-    save: Callable[..., Saved]
-    # (path, title, spec, model, state, capture, poster) -> a page that shows the scene
-    # from anywhere at any time; None where nothing plays it in a browser.
-    player: Callable[..., Player] | None
-    follow: Follow
-    mover: Mover
-    # ({effect: whether it is called for, None unknown}, papers' sizes, the preset that
-    # the user names, without "-small", or None) -> what to take
-    advise: Callable[[dict[str, bool | None], bool, str | None], Choice]
-    # Preset of a capture if the user names none.
-    default_preset: Callable[[Capture], Choice] | None
-    prices: dict[str, Pair]  # by effect, as in `nerfies_jax.preprocessing.findings`
-    # (spec, metadata, names left out) -> the Gaussians of a trained scene
-    # for a rasterizer elsewhere; None where a scene has none.
-    splatting: Callable[..., Splatting] | None = None
+    resources: Resources = Resources()
+    scoring: Scoring = Scoring()
+    products: Products = Products()
+    recommendation: Recommendation | None = None
 
 
 def check_there(without: tuple[str, ...], there: tuple[str, ...]) -> None:

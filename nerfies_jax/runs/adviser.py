@@ -48,6 +48,9 @@ def advise(
 
     Returns:
       The recommendation.
+
+    Raises:
+      ValueError: If the representation recommends no presets.
     """
     wanted = {one.effect: one.wanted for one in findings}
     notes = [
@@ -55,7 +58,11 @@ def advise(
         for effect, choice in wanted.items()
         if choice is None
     ]
-    choice = representation.advise(wanted, full, family)
+    if representation.recommendation is None:
+        raise ValueError(
+            f"the {representation.name} representation recommends no presets"
+        )
+    choice = representation.recommendation.advise(wanted, full, family)
     return Advice(
         representation.name,
         choice.preset if full else f"{choice.preset}-small",
@@ -75,7 +82,9 @@ def advise_all(findings: tuple[Finding, ...], full: bool = False) -> list[Advice
       One recommendation for each representation.
     """
     return [
-        advise(findings, each, full) for each in representations.installed().values()
+        advise(findings, each, full)
+        for each in representations.installed().values()
+        if each.recommendation is not None
     ]
 
 
@@ -107,14 +116,10 @@ def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]
     Raises:
       ValueError: If no installed representation chooses presets.
     """
-    chooses = [
-        each.default_preset
-        for each in representations.installed().values()
-        if each.default_preset is not None
-    ]
-    if not chooses:
+    choosing = representations.choosing()
+    if not choosing:
         raise ValueError("name a preset: nothing that is installed has a default one")
-    choice = chooses[0](capture)
+    choice = choosing[0].recommendation.default_preset(capture)
     words = [choice.preset, *(["--set"] if choice.overrides else []), *choice.overrides]
     lines = [f"preset: {' '.join(words)}" + "".join(f" ({n})" for n in choice.notes)]
     overrides = (*choice.overrides, *config.overrides)

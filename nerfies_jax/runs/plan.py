@@ -33,7 +33,7 @@ def with_seconds(run: Run, state: TrainState, seconds: float | int) -> tuple[Run
     """
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     step = rate.step_time(run.model, state, frames, run.spec.steps)
-    growth = run.representation.growth(run.spec, state)
+    growth = run.representation.resources.growth(run.spec, state)
     steps = rounded(seconds / (step.seconds * growth))
     grown = f", {growth:.2g} times that as it grows" if growth > 1 else ""
     line = (

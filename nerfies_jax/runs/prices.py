@@ -51,8 +51,9 @@ def price(effect: str, measured: Mapping[str, Metric]) -> Price:
       Factors by representation, NaN if the effect adds nothing to a step.
     """
     return {
-        name: _factor(each.prices.get(effect), measured)
+        name: _factor(each.recommendation.prices.get(effect), measured)
         for name, each in representations.installed().items()
+        if each.recommendation is not None
     }
 
 

@@ -116,7 +116,8 @@ def make(
                 None, with_extra, save_film, path, run, renderer, state, seconds
             )
             attempt(None, save_depth, place / "depth", run.capture, scored)
-            save, model = run.representation.save, (run.spec, run.metadata, state)
+            save = run.representation.products.save
+            model = run.spec, run.metadata, state
             with events.stage("saving the model"):
                 saved = attempt(Saved(), save, place, *model)
             fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
@@ -293,10 +294,10 @@ def score_halves(
     width, height = run.capture.size
     if width // 2 < len(losses.WINDOW):
         return [], ()  # too narrow for the window of the SSIM
-    share = run.representation.fitted_rays / (width * height)
+    share = run.representation.scoring.fitted_rays / (width * height)
     count = budget.halves(frame_seconds, share, len(scored.rows))
     few = evaluation.spread(np.arange(len(scored.rows)), count)
-    halves = run.representation.score_halves(
+    halves = run.representation.scoring.score_halves(
         run.spec,
         run.metadata,
         state,
@@ -411,7 +412,7 @@ def save_player(
     Returns:
       A figure that links to the page, or none and a note with the reason.
     """
-    write = run.representation.player
+    write = run.representation.products.player
     if write is None:
         return [], [
             f"The {run.representation.name} representation has no player; scene.mp4 "

@@ -109,8 +109,8 @@ def measure(
         notes.append(f"No points were followed: {error}")
     if known is not None:
         kind, scene = run.representation, (run.spec, run.metadata)
-        followed = kind.follow(*scene, state, capture, known)
-        move = kind.mover(*scene)
+        followed = kind.scoring.follow(*scene, state, capture, known)
+        move = kind.scoring.mover(*scene)
         if move is not None:
             flow = model_flow.heldout_flow(move, state, capture, scored)
     if extra.camera_fits:

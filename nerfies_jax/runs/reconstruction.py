@@ -207,9 +207,7 @@ def _check_spec(config):
     """
     names = [config.preset]
     if config.preset is None:
-        kinds = representations.installed().values()
-        choosing = [kind.presets for kind in kinds if kind.default_preset is not None]
-        names = [name for presets in choosing for name in presets]
+        names = [n for each in representations.choosing() for n in each.presets]
     refused = []
     for name in names:
         try:

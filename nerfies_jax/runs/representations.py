@@ -74,6 +74,16 @@ def named(name: str) -> "Representation":
     return installed()[name]
 
 
+def choosing() -> list["Representation"]:
+    """Return the installed representations that choose a preset for a capture."""
+    return [
+        each
+        for each in installed().values()
+        if each.recommendation is not None
+        and each.recommendation.default_preset is not None
+    ]
+
+
 def of_preset(preset: str) -> "Representation":
     """Return the representation that has a preset.
 
@@ -157,7 +167,8 @@ def cores(preset: str | None, overrides: tuple[str, ...] = ()) -> Cores:
         preset, overrides = USUAL, ()
     representation = of_preset(preset)
     spec = specs.override(representation.presets[preset], overrides)
-    return Cores(representation.threads, representation.shares(spec))
+    resources = representation.resources
+    return Cores(resources.threads, resources.shares(spec))
 
 
 def cores_of_run(folder: pathlib.Path) -> Cores:
@@ -174,7 +185,7 @@ def cores_of_run(folder: pathlib.Path) -> Cores:
         return Cores("all", 1)
     try:
         stored = json.loads((folder / CONFIG).read_text())["spec"]
-        shares = representation.shares(stored_spec(representation, stored))
+        shares = representation.resources.shares(stored_spec(representation, stored))
     except (OSError, ValueError, KeyError, TypeError):
         shares = 1
-    return Cores(representation.threads, shares)
+    return Cores(representation.resources.threads, shares)

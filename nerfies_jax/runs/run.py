@@ -99,8 +99,9 @@ def open_run(
       The run.
     """
     stored = stored or stored_capture(config.source, config.seed)
-    filmed = pinholes.scorable(stored, representation.traces_lenses)
-    capture = filmed if representation.traces_lenses else pinholes.as_pinholes(stored)
+    traces_lenses = representation.scoring.traces_lenses
+    filmed = pinholes.scorable(stored, traces_lenses)
+    capture = filmed if traces_lenses else pinholes.as_pinholes(stored)
     run = _built(config, representation, spec, capture, filmed)
     capture = _completed(capture, run.model.required_data)
     if capture is run.capture:
@@ -172,7 +173,7 @@ def drawer(run: Run, renderer: Renderer) -> Draw:
     Returns:
       A renderer of `run.filmed`, with lens distortion if needed.
     """
-    if run.representation.traces_lenses or run.filmed is run.capture:
+    if run.representation.scoring.traces_lenses or run.filmed is run.capture:
         return renderer
     return ThroughLens(renderer, run.filmed.size)
 
@@ -478,15 +479,17 @@ def first_state(run: Run) -> TrainState:
     Raises:
       ValueError: If it would not fit in memory.
     """
-    needed = run.representation.estimate_memory_bytes(run.spec, run.capture)
-    needed -= frame_memory.capture_bytes(run.capture)  # it is there already
-    free = free_memory()
-    if needed > free:
-        raise ValueError(
-            f"the first state needs about {needed / 2**30:.1f} GiB and "
-            f"{free / 2**30:.1f} GiB are free; {run.representation.memory_hint}, or "
-            "read smaller images with max_side=..."
-        )
+    resources = run.representation.resources
+    if resources.estimate_memory_bytes is not None:
+        needed = resources.estimate_memory_bytes(run.spec, run.capture)
+        needed -= frame_memory.capture_bytes(run.capture)  # it is there already
+        free = free_memory()
+        if needed > free:
+            raise ValueError(
+                f"the first state needs about {needed / 2**30:.1f} GiB and "
+                f"{free / 2**30:.1f} GiB are free; {resources.memory_hint}, or "
+                "read smaller images with max_side=..."
+            )
     return run.model.init(run.capture, jax.random.key(run.config.seed))
 
 

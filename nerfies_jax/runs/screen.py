@@ -35,8 +35,8 @@ class Screen:
         pixels = TRACED_PIXELS if traced else RASTERIZED_PIXELS
         self.pyramid = interactive.pyramid(full, pixels)
         settings = run.spec, run.metadata
-        self.parts = run.representation.parts(*settings)
-        self._move = run.representation.mover(*settings)
+        self.parts = run.representation.products.parts(*settings)
+        self._move = run.representation.scoring.mover(*settings)
         self._models: dict[tuple[str, ...], Model] = {}
         self._renderers: dict[tuple[str, ...], Renderer] = {}
         self._splatting: dict[tuple[str, ...], Splatting] = {}
@@ -54,7 +54,7 @@ class Screen:
     @property
     def in_browser(self) -> bool:
         """True if a browser can render the colors of this run itself."""
-        return self.run.representation.splatting is not None
+        return self.run.representation.products.splatting is not None
 
     def is_compiled(self, look: Look) -> bool:
         """Return whether the program for a look was used before.
@@ -80,7 +80,7 @@ class Screen:
           The Gaussians.
         """
         if look.without not in self._splatting:
-            run, splatting = self.run, self.run.representation.splatting
+            run, splatting = self.run, self.run.representation.products.splatting
             assert splatting is not None  # `in_browser`
             self._splatting[look.without] = splatting(
                 run.spec, run.metadata, look.without
@@ -157,7 +157,7 @@ class Screen:
         if without not in self._models:
             run, model = self.run, self.run.model
             if without:
-                model = run.representation.variant(
+                model = run.representation.products.variant(
                     run.spec, run.metadata, without, False
                 )
             self._models[without] = model

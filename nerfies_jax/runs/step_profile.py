@@ -41,11 +41,13 @@ def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
         except Exception as error:
             return refused(error)
 
+    step_parts = run.representation.resources.step_parts
+    if step_parts is None:
+        yield lambda: Profile({}, [])
+        return
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     try:
-        parts = run.representation.step_parts(
-            run.spec, run.metadata, run.model, state, frames
-        )
+        parts = step_parts(run.spec, run.metadata, run.model, state, frames)
     except Exception as error:
         profile = refused(error)
         yield lambda: profile

@@ -289,7 +289,9 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
 
     truth = protocol.stored_truth(capture)
     known = protocol.ground_truth(capture, truth, 2, quality.TRACKS)
-    followed = run.representation.follow(run.spec, run.metadata, state, capture, known)
+    followed = run.representation.scoring.follow(
+        run.spec, run.metadata, state, capture, known
+    )
     assert np.abs(followed.path - known.start_points[:, None]).max() > 1e-3
     seen = known.seen.copy()
     seen[:, known.start] = False
@@ -300,7 +302,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
         away = np.linalg.norm(path - known.path, axis=-1)[seen]
         assert numbers[key] == pytest.approx(away.mean(), rel=1e-4)
     # The flow is that of the same motion: points of the start at the last moment.
-    move = run.representation.mover(run.spec, run.metadata)
+    move = run.representation.scoring.mover(run.spec, run.metadata)
     here, there = (
         evaluation.view_of(capture, int(known.moments[place]))
         for place in (known.start, -1)
@@ -321,10 +323,10 @@ def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tm
     run, state = started("gaussians", filmed)
     static = dataclasses.replace(KINDS["gaussians"], motion=None)
     kind = run.representation
-    assert kind.mover(static, splat_scene.metadata_of(run.capture)) is None
+    assert kind.scoring.mover(static, splat_scene.metadata_of(run.capture)) is None
     field = dataclasses.replace(FIELD, warp=None)
     assert (
-        representations.named("radiance").mover(
+        representations.named("radiance").scoring.mover(
             field, scene.metadata_of(run.capture, field)
         )
         is None

@@ -16,11 +16,18 @@ from experiments import compare, export, reconstruct, render
 from gaussians_jax.scene import step_time
 from nerfies_jax import runs
 from nerfies_jax.capture import exr, images, nerfies_format, video
-from nerfies_jax.evaluation import baseline_images
+from nerfies_jax.evaluation import baseline_images, representation
 from nerfies_jax.metrics import part_time
-from nerfies_jax.runs import products, quality, reconstruction, run_folder, train
+from nerfies_jax.runs import (
+    products,
+    quality,
+    reconstruction,
+    representations,
+    run_folder,
+    train,
+)
 from nerfies_jax.runs.run_folder import CHECKPOINTS
-from nerfies_jax.training import rate
+from nerfies_jax.training import rate, specs
 from nerfies_jax.visualization import panels
 from tests import event_checks, scenes
 
@@ -130,6 +137,32 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     scores = [one["metrics"] for one in told if one["kind"] == "evaluation"]
     assert [row["psnr"] for row in curve["evaluations"]] == [x["psnr"] for x in scores]
     assert curve["training"][-1]["step"] == 2
+
+
+@pytest.mark.full
+def test_a_representation_needs_six_fields_only(tmp_path, monkeypatch, capsys):
+    ours = representations.named("gaussians")
+    spec = specs.override(
+        ours.presets["splats-static-small"],
+        ("strategy=none", "sh_degree=0", "init.extra_random=0"),
+    )
+    other = representation.Representation(
+        "other",
+        ours.spec_type,
+        {"other-small": spec},
+        ours.with_steps,
+        ours.metadata_of,
+        ours.build,
+    )
+    monkeypatch.setattr(representations, "installed", lambda: {"other": other})
+    monkeypatch.setattr(quality, "CACHE", tmp_path / "cache")
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "input")
+    words = (tmp_path / "input", "--preset", "other-small", "--steps", 2)
+    assert ended(*words, "--out", tmp_path / "run", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["metrics"]["train.steps"] == 2
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names >= {"metrics.json", "scene.mp4", "report.html"}
+    assert not names & {"model.npz", "gaussians.ply", "player.html"}
 
 
 @pytest.mark.slow

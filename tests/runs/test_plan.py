@@ -77,9 +77,9 @@ def test_growth_is_expected_within_bounds():
     at_first = model.counts(state)["gaussians"]
     for cap, growth in ((at_first // 2, 1), (2 * at_first, 2**0.5), (10**6, 2)):
         density = dataclasses.replace(spec.strategy, cap_max=cap)
-        growth_of_scene = kind.growth(
+        growth_of_scene = kind.resources.growth(
             dataclasses.replace(spec, strategy=density), state
         )
         assert growth_of_scene == pytest.approx(growth)
-    assert kind.growth(dataclasses.replace(spec, strategy=None), state) == 1
-    assert representations.named("radiance").growth(None, state) == 1
+    assert kind.resources.growth(dataclasses.replace(spec, strategy=None), state) == 1
+    assert representations.named("radiance").resources.growth(None, state) == 1

@@ -74,7 +74,7 @@ def test_a_price_is_what_an_effect_adds_in_bare_steps(effect, gaussians, radianc
 
 def test_the_kept_baseline_prices_every_decision():
     for kind in representations.installed().values():
-        for pair in kind.prices.values():
+        for pair in kind.recommendation.prices.values():
             for arm in (pair.with_it, pair.without):
                 ratio = prices.baseline()[f"{pair.preset}.{arm}.step.over_bare"]
                 assert 0.8 < ratio.value < 20
@@ -89,7 +89,7 @@ def test_what_a_decision_switches_on_has_a_price(name, effect):
     """An effect that changes the compiled step is priced, whatever it is called."""
     kind = representations.named(name)
     switched_on, left_out = (_effects(kind, effect, wanted) for wanted in (True, False))
-    assert (switched_on != left_out) == (effect in kind.prices)
+    assert (switched_on != left_out) == (effect in kind.recommendation.prices)
 
 
 def _effects(kind, effect, wanted):

@@ -74,7 +74,8 @@ def test_a_player_that_fails_loses_nothing_but_itself(tmp_path):
         raise KeyError("mean")
 
     capture = scenes.tiny_capture()
-    kind = representations.named("gaussians")._replace(player=write)
+    gaussians = representations.named("gaussians")
+    kind = gaussians._replace(products=gaussians.products._replace(player=write))
     config = RunConfig("splats-static-small")
     run = Run(config, capture, capture, kind, None, None, None)
     black = Rendering(np.zeros((30, 40, 3), np.float32), None, None)
@@ -84,7 +85,8 @@ def test_a_player_that_fails_loses_nothing_but_itself(tmp_path):
         [],
         ["There is no player: KeyError: 'mean'"],
     )
-    run = run._replace(representation=kind._replace(player=None))
+    without = gaussians._replace(products=gaussians.products._replace(player=None))
+    run = run._replace(representation=without)
     figures, (note,) = products.save_player(tmp_path, run, trained)
     assert (figures, "has no player" in note) == ([], True)
     assert not list(tmp_path.iterdir())
@@ -100,7 +102,8 @@ def test_a_profile_that_fails_loses_nothing_but_itself():
     state = TrainState(None, None, None, jnp.int32(0), jax.random.key(0))
     unready = types.SimpleNamespace(ms=refuses)
     for step_parts in (refuses, lambda *_, **__: unready):
-        failing = kind._replace(step_parts=step_parts)
+        resources = kind.resources._replace(step_parts=step_parts)
+        failing = kind._replace(resources=resources)
         run = Run(config, capture, capture, failing, None, None, model)
         with step_profile.profiling(run, state) as profile:
             step_ms, (note,) = profile()

@@ -22,7 +22,7 @@ THREADS = {"gaussians": "one", "radiance": "all"}
 @pytest.mark.parametrize("name", THREADS)
 def test_every_preset_finds_its_representation(name):
     kind = representations.named(name)
-    assert (kind.name, kind.threads) == (name, THREADS[name])
+    assert (kind.name, kind.resources.threads) == (name, THREADS[name])
     assert kind.presets
     for preset, spec in kind.presets.items():
         assert representations.of_preset(preset) is kind
@@ -72,7 +72,7 @@ def test_a_scene_of_gaussians_is_saved_as_a_model_and_for_viewers(moving, tmp_pa
     capture = scenes.tiny_capture()
     metadata = kind.metadata_of(capture, spec)
     state = kind.build(spec, metadata).init(capture, jax.random.key(0))
-    saved = kind.save(tmp_path, spec, metadata, state)
+    saved = kind.products.save(tmp_path, spec, metadata, state)
     assert saved.model_bytes == (tmp_path / MODEL).stat().st_size
     assert [note.split()[0] for note in saved.notes] == ["gaussians.ply"] * moving
     params, about = model_file.load(tmp_path / MODEL)

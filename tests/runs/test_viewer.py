@@ -298,7 +298,7 @@ def test_images_of_a_field_reach_full_size_however_slow_they_are(tmp_path, monke
     monkeypatch.setattr(viewer_window, "SENT_SECONDS", 0.0)
     row = int(CAPTURE.train[0])
     with opened(tmp_path, "radiance") as (page, browser, until, run, state):
-        assert run.representation.splatting is None
+        assert run.representation.products.splatting is None
         browser.look(eye_of(row))
         until(lambda: browser.picture is not None)
         assert browser.picture.shape[1] < 160
