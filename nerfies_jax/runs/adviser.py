@@ -119,7 +119,8 @@ def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]
     choosing = representations.choosing()
     if not choosing:
         raise ValueError("name a preset: nothing that is installed has a default one")
-    choice = choosing[0].recommendation.default_preset(capture)
+    _, choose = choosing[0]
+    choice = choose(capture)
     words = [choice.preset, *(["--set"] if choice.overrides else []), *choice.overrides]
     lines = [f"preset: {' '.join(words)}" + "".join(f" ({n})" for n in choice.notes)]
     overrides = (*choice.overrides, *config.overrides)

@@ -207,7 +207,7 @@ def _check_spec(config):
     """
     names = [config.preset]
     if config.preset is None:
-        names = [n for each in representations.choosing() for n in each.presets]
+        names = [n for each, _ in representations.choosing() for n in each.presets]
     refused = []
     for name in names:
         try:

@@ -7,7 +7,10 @@ import pathlib
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:  # a record is loaded when it is asked for, not with this module
-    from nerfies_jax.evaluation.representation import Representation
+    from collections.abc import Callable
+
+    from nerfies_jax.capture.capture import Capture
+    from nerfies_jax.evaluation.representation import Choice, Representation
 
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs.platform import Threads
@@ -74,14 +77,14 @@ def named(name: str) -> "Representation":
     return installed()[name]
 
 
-def choosing() -> list["Representation"]:
-    """Return the installed representations that choose a preset for a capture."""
-    return [
-        each
-        for each in installed().values()
-        if each.recommendation is not None
-        and each.recommendation.default_preset is not None
-    ]
+def choosing() -> "list[tuple[Representation, Callable[[Capture], Choice]]]":
+    """Return the representations that choose presets, with their functions."""
+    chosen = []
+    for each in installed().values():
+        recommendation = each.recommendation
+        if recommendation is not None and recommendation.default_preset is not None:
+            chosen.append((each, recommendation.default_preset))
+    return chosen
 
 
 def of_preset(preset: str) -> "Representation":

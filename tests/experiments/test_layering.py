@@ -21,7 +21,7 @@ LAYERS = (
     "nerfies_jax.evaluation",
     "nerfies_jax.runs",
     "nerfies_jax.fields",
-    "nerfies_jax.scene.scene",
+    "nerfies_jax.scene",
     "nerfies_jax",
     "gaussians_jax.core",
     "gaussians_jax.splatting",
@@ -30,7 +30,7 @@ LAYERS = (
     "gaussians_jax.motion",
     "gaussians_jax.losses",
     "gaussians_jax.per_frame",
-    "gaussians_jax.scene.scene",
+    "gaussians_jax.scene",
     "gaussians_jax.io",
     "gaussians_jax.player",
     "gaussians_jax",
@@ -48,7 +48,7 @@ TESTED = {
     "training": "nerfies_jax.training",
     "metrics": "nerfies_jax.metrics",
     "visualization": "nerfies_jax.visualization",
-    "fields": "nerfies_jax.scene.scene",
+    "fields": "nerfies_jax.scene",
     "gaussians": "gaussians_jax",
 }
 
