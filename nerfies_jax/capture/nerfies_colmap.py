@@ -49,9 +49,9 @@ def points_beside(
     scene, rows = views.scene, np.array(pairs, int).reshape(-1, 2)
     expected = views.cameras.position[rows[:, 1]].astype(np.float64)
     centers = (model.positions[rows[:, 0]] - np.array(scene.center)) * scene.scale
-    error = np.linalg.norm(centers - expected, axis=1)
+    distance = np.linalg.norm(centers - expected, axis=1)
     spread = np.linalg.norm(np.ptp(expected, axis=0))
-    if not len(rows) or error.max() > SAME_PLACE * spread:
+    if not len(rows) or distance.max() > SAME_PLACE * spread:
         note = f"{folders[0]} has other cameras: its points are not used"
         return None, (note,)
     position = (model.points - np.array(scene.center)) * scene.scale
