@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.capture.capture import select
 from nerfies_jax.fields.effects import scene_flow_losses as flow_losses
 from nerfies_jax.scene import scene
 from tests import scenes
@@ -52,7 +51,7 @@ RUNS += [marked(name, start) for name in tiny_fields.SYSTEMS for start in FEW_ST
 # --- whole runs ----------------------------------------------------------------------
 
 
-def trained(name, start, folder=None, steps=tiny_fields.STEPS):
+def trained(name, start, folder=None):
     """A run that ended as every run must, and what it would show then."""
     run = tiny_fields.started(name)
     film = start.film(run.capture)
@@ -62,7 +61,7 @@ def trained(name, start, folder=None, steps=tiny_fields.STEPS):
     frames = start.frames(tiny_fields.frames_of(film, run.model.required_data))
     params = start.params(jax.tree.map(np.asarray, run.state.params))
     state = run.state._replace(params=params, aux_state=place)
-    ended = hostile.train(run.model, state, frames, folder, steps=steps)
+    ended = hostile.train(run.model, state, frames, folder, steps=tiny_fields.STEPS)
     return ended, picture_of(run, ended.result.state, frames, 0)
 
 
@@ -82,6 +81,8 @@ def test_a_field_stays_finite_from(name, start, tmp_path):
     assert np.all((picture.color > -1e-5) & (picture.color < 2 + 1e-5))
     assert np.all((picture.alpha > -1e-5) & (picture.alpha < 1 + 1e-5))
     assert np.all(picture.depth >= 0)
+    if start == "as filmed":
+        assert ended.last["mse"] < 0.9 * ended.first["mse"]
 
 
 # One size a field of these widths does not survive: products of five layers pass 3e38.
@@ -108,8 +109,9 @@ def test_a_field_that_overflows_stops_where_it_started_and_says_so(name, tmp_pat
 @pytest.mark.parametrize("unit", ["box of 1e-5 units", "box of 1e5 units"])
 @pytest.mark.parametrize("name", FIELDS)
 def test_a_step_is_the_same_in_any_unit(name, unit):
-    usual, _ = trained(name, Start(), steps=1)
-    other, _ = trained(name, STARTS[unit], steps=1)
+    # Without learning, which would make more and more of the rounding.
+    usual, _ = trained(name, Start(speed=0.0))
+    other, _ = trained(name, STARTS[unit]._replace(speed=0.0))
     # Positions are rounded before they are scaled: by 1e-7 of the box
     for metric, value in usual.first.items():
         if metric not in ("step", "seconds"):
@@ -125,41 +127,20 @@ def test_a_step_with_the_elastic_penalty_is_finite_from(displacement, name):
     def bent(params):
         return params | {"warp": linear_warps.linear_warp(params["warp"], strain)}
 
-    ended, picture = trained(name, Start(params=bent), steps=50)
+    # Its gradients are taken and not followed: every step has the same strain.
+    ended, picture = trained(name, Start(params=bent, speed=0.0))
     assert ended.result.stopped_by == "steps", ended.result.message
     assert not hostile.not_finite(picture)
     expected = linear_warps.cost(tiny_fields.tiny(name).elastic, strain)
     measured = ended.first["elastic/elastic"]
     if displacement == "huge":
-        # Asked 1e4 units out, the template leaves some rays empty.
+        # Asked 1e4 units out, the template leaves some rays empty in some steps.
         assert 0 < measured < (1 + 1e-4) * expected
     else:  # every ray ends somewhere, for behind it is an interval of 1e10
         np.testing.assert_allclose(measured, expected, rtol=1e-4, atol=1e-12)
     folded = np.linalg.det(np.eye(3) + strain) < 0
-    np.testing.assert_allclose(ended.first["elastic/folded"], float(folded), atol=1e-6)
-
-
-def bare(capture):
-    """One frame, and nothing but its picture."""
-    capture = dataclasses.replace(
-        capture, depths=None, flow=None, points=None, moving=None
-    )
-    one = select(capture, np.arange(2))
-    return dataclasses.replace(one, train=np.asarray([0]), heldout=np.asarray([1]))
-
-
-@pytest.mark.slow  # a program of its own: one frame, no depth and no flow
-def test_scene_flow_of_a_single_bare_frame_stays_finite():
-    spec = tiny_fields.tiny("nsff")
-    run = tiny_fields.start(spec, bare(scenes.tiny_capture()))
-    frames = tiny_fields.frames_of(run.capture, run.model.required_data)
-    assert frames.flow is None
-    assert frames.depths is None
-    ended = hostile.train(run.model, run.state, frames, steps=tiny_fields.STEPS)
-    assert ended.result.stopped_by == "steps", ended.result.message
-    assert ended.last["mse"] < ended.first["mse"]
-    for name in ("warped", "disocclusion", "cycle", "magnitude", "kinetic"):
-        assert ended.last[f"scene_flow/{name}"] == 0  # there is no neighbor
+    empty = 0.2 if displacement == "huge" else 1e-6
+    np.testing.assert_allclose(ended.first["elastic/folded"], folded, atol=empty)
 
 
 # --- what the field knows of a hostile capture ---------------------------------------
