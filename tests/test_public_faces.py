@@ -287,7 +287,9 @@ def test_float32_stays_float32_where_x64_is_on(name):
 def test_integers_are_refused_by_name_or_converted_as_images(name):
     case = CASES[name]
     for argument in case.shapes:
-        for kind in INTEGERS:
+        # All kinds of the first argument and of images; the others are read alike.
+        first = argument in (next(iter(case.shapes)), *case.images)
+        for kind in INTEGERS if first else INTEGERS[:1]:
             if argument in case.images and kind.startswith("uint"):
                 assert floats(traced(case, {argument: kind})) == {"float32"}
                 continue

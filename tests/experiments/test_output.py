@@ -26,9 +26,6 @@ pytestmark = [
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 RECONSTRUCT = ("--preset", "splats-static-small", "--steps", "12")
 RECONSTRUCT += ("--set", "strategy=none", "sh_degree=0", "init.extra_random=0")
-# Two ends of an output that are no failure; a full one, which is, is that of a resumed
-# run below.
-BROKEN = {"2>&1 | head -1": 0, "2>&-": 0}
 
 
 def command(name, *words, output=""):
@@ -128,11 +125,11 @@ def test_a_terminal_shows_each_stage_that_lasts_by_name(undisturbed):
     assert "report:" in shown
 
 
-@pytest.mark.parametrize("output", BROKEN)
-def test_a_reconstruction_completes_whatever_reads_it(output, undisturbed, tmp_path):
+def test_a_reconstruction_completes_whatever_reads_it(undisturbed, tmp_path):
+    """A reader that goes away is no failure; a full disk, below, is one."""
     whole, _ = undisturbed
     words = (whole.parent / "filmed", *RECONSTRUCT, "--out", tmp_path / "run")
-    assert command("reconstruct", *words, output=output) == BROKEN[output]
+    assert command("reconstruct", *words, output="2>&1 | head -1") == 0
     check_whole(tmp_path / "run", whole)
 
 

@@ -1,6 +1,7 @@
 """Signals end a command soon, whatever it is doing, and it can be continued."""
 
 import functools
+import importlib.util
 import itertools
 import json
 import os
@@ -81,20 +82,10 @@ class Command:
         assert not left, said
 
 
-# In the order in which the main job imports them. `experiments.faults` tries others.
-MODULES = (
-    "tyro",
-    "experiments.cli",
-    "numpy",
-    "jaxlib",
-    "jax._src.core",
-    "jax.numpy",
-    "jax.random",
-    "jax",
-    "optax",
-    "orbax.checkpoint",
-)
-CORE = ("tyro", "jaxlib", "jax._src.core")
+# In the order in which the main job imports them: pure Python before and after JAX, a
+# library of C++, and in the middle of JAX. `experiments.faults` tries others.
+MODULES = ("tyro", "jaxlib", "jax._src.core", "orbax.checkpoint")
+CORE = ("jaxlib", "jax._src.core")
 
 
 @pytest.mark.parametrize(
@@ -130,19 +121,17 @@ def is_at(moment, command, folder):
 # In the order of a run: each is waited for where the run was left at the one before.
 MOMENTS = (
     product("config.json"),
-    checkpoint_after(0),
     checkpoint_after(STEPS // 2),
     product("player.html"),
-    product("metrics.json"),
 )
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_after_a_signal_at_any_moment(tmp_path):
+def test_a_run_goes_on_after_a_signal_at_any_moment_and_is_viewed(tmp_path):
     nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
     words = ("reconstruct", tmp_path / "filmed", *QUICK, "--out", tmp_path / "run")
     goes_on = ("reconstruct", "--out", tmp_path / "run", "--resume")
-    for moment, number in zip(MOMENTS, itertools.cycle(SIGNALS)):
+    for moment, number in zip(MOMENTS, SIGNALS, strict=True):
         command = Command(tmp_path, *words)
         assert command.wait_until(functools.partial(is_at, moment, command, tmp_path))
         command.check_ends(number)
@@ -152,15 +141,7 @@ def test_a_run_goes_on_after_a_signal_at_any_moment(tmp_path):
     assert command.process.wait(600) == 0, command.said()
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert metrics["train.steps"] == STEPS
-
-
-@pytest.mark.slow
-def test_a_viewer_ends_by_a_signal(tmp_path):
-    pytest.importorskip("viser")
-    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
-    words = ("reconstruct", tmp_path / "filmed", *QUICK, "--out", tmp_path / "run")
-    command = Command(tmp_path, *words)
-    assert command.process.wait(600) == 0, command.said()
-    command = Command(tmp_path, "view", tmp_path / "run")
-    assert command.wait_until(lambda: "look around at" in command.said())
-    command.check_ends(signal.SIGINT)
+    if importlib.util.find_spec("viser"):  # the viewer ends by a signal as well
+        command = Command(tmp_path, "view", tmp_path / "run")
+        assert command.wait_until(lambda: "look around at" in command.said())
+        command.check_ends(signal.SIGINT)

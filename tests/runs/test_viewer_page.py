@@ -1,11 +1,10 @@
-"""The viewer in a real browser: what it renders, and every control of its page."""
+"""The viewer in a real browser: what it renders, and the controls of the scene."""
 
 import contextlib
 import re
 import threading
 import time
 
-import jax
 import numpy as np
 import pytest
 
@@ -14,7 +13,7 @@ from nerfies_jax.evaluation import interactive
 from nerfies_jax.runs import viewer, viewer_window
 from nerfies_jax.training.model import View, in_default_precision
 from tests.gaussians import browser as browsers
-from tests.runs.test_viewer import CAPTURE, a_run, label_of
+from tests.runs.test_viewer import a_run
 
 pytest.importorskip("viser")
 pytestmark = pytest.mark.slow
@@ -33,15 +32,13 @@ class Served:
 
     def __init__(self, page, state, tab):
         self.page, self.state, self.tab = page, state, tab
-        self.serving = threading.Lock()  # held, the server does nothing
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
     def _serve(self):
         while not self._ended.is_set():
-            with self.serving:
-                self.page.serve(self.state, 25, 0.2)
+            self.page.serve(self.state, 25, 0.2)
             time.sleep(0.02)
 
     def end(self):
@@ -74,25 +71,10 @@ class Served:
                 return image
         raise TimeoutError
 
-    def press(self, name, exact=True):
-        self.tab.get_by_role("button", name=name, exact=exact).first.click()
-
-    def drag(self, right, down):
-        """Orbit with the mouse."""
-        mouse = self.tab.mouse
-        mouse.move(300, 300)
-        mouse.down()
-        mouse.move(300 + right, 300 + down, steps=4)
-        mouse.up()
-
     def eye(self):
         """The browser's camera, as far as the server was told."""
         (client,) = self.page._server.get_clients().values()
         return viewer_window.eye_of(client.camera)
-
-    def at(self, eye):
-        """Whether the browser looks from there."""
-        return np.allclose(self.eye().position, eye.position, atol=1e-3)
 
     def still_eye(self):
         """The camera once it has come to rest: the browser damps its motion."""
@@ -105,10 +87,10 @@ class Served:
 
 
 @contextlib.contextmanager
-def served(browser, tmp_path, kind="gaussians", **options):
+def served(browser, tmp_path):
     # Little enough that what moves stays in the window.
-    run, state = a_run(kind, 0.03)
-    page = viewer.Viewer(run, (160, 120), 8380, tmp_path, **options)
+    run, state = a_run("gaussians", 0.03)
+    page = viewer.Viewer(run, (160, 120), 8380, tmp_path)
     tab = browser.new_page(viewport=WINDOW)
     tab.set_default_timeout(WAIT_MS)
     each = Served(page, state, tab)
@@ -179,113 +161,3 @@ def test_the_browser_renders_the_gaussians_at_every_time_and_without_effects(
         each.tab.get_by_label("play", exact=True).check()
         times = set()
         each.until(lambda: times.add(each.page._time.value) or len(times) > 3)
-
-
-def test_every_button_of_the_camera_path(browser, tmp_path):
-    with served(browser, tmp_path) as each:
-        path = each.page.path
-        first = each.still_eye()
-        each.press("add keyframe")
-        each.until(lambda: len(path.keyframes) == 1)
-        each.drag(60, 10)
-        clicked = each.still_eye()
-        assert clicked != first
-        # The server is busy while the camera moves on.
-        with each.serving:
-            each.press("add keyframe")
-            each.drag(-120, 30)
-            later = each.still_eye()
-        assert np.abs(np.subtract(later.position, clicked.position)).max() > 0.01
-        each.until(lambda: len(path.keyframes) == 2)
-        for keyframe, eye in zip(path.keyframes, (first, clicked), strict=True):
-            np.testing.assert_allclose(
-                keyframe.camera.position, eye.position, atol=1e-5
-            )
-            size = CAPTURE.size
-            expected = interactive.camera_of(
-                eye._replace(aspect=size[0] / size[1]), size
-            )
-            jax.tree.map(
-                lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4),
-                keyframe.camera,
-                expected,
-            )
-        # In the list: of two keyframes, each with the same buttons.
-        each.tab.get_by_role("button", name="go", exact=True).nth(1).click()
-        each.until(
-            lambda: np.allclose(each.eye().position, clicked.position, atol=1e-3)
-        )
-        each.tab.get_by_role("button", name="↑", exact=True).nth(1).click()
-        each.until(
-            lambda: np.allclose(path.keyframes[0].camera.position, clicked.position)
-        )
-        each.tab.get_by_role("button", name="↓", exact=True).nth(0).click()
-        each.until(
-            lambda: np.allclose(path.keyframes[0].camera.position, first.position)
-        )
-        each.drag(0, 40)
-        third = each.still_eye()
-        each.press("add keyframe")
-        each.until(lambda: len(path.keyframes) == 3)
-        each.tab.get_by_role("button", name="✕", exact=True).nth(1).click()
-        each.until(lambda: len(path.keyframes) == 2)
-        each.tab.get_by_role("button", name="set", exact=True).nth(0).click()
-        each.until(
-            lambda: np.allclose(path.keyframes[0].camera.position, third.position)
-        )
-        each.tab.get_by_role("button", name="✕", exact=True).nth(0).click()
-        each.until(lambda: len(path.keyframes) == 1)
-        each.press("render")
-        each.tab.get_by_text("needs at least two").wait_for()
-        each.drag(80, -30)
-        start = each.still_eye()
-        each.press("add keyframe")
-        each.until(lambda: len(path.keyframes) == 2)
-        shown = len(path._drawn)
-        each.tab.get_by_label("show path", exact=True).uncheck()
-        each.until(lambda: len(path._drawn) == 0 < shown)
-        seconds = each.tab.get_by_label("seconds", exact=True)
-        seconds.fill("0.5")
-        seconds.press("Enter")
-        each.until(lambda: path._length.value == 0.5)
-        each.press("preview")
-        passed = set()
-        each.until(lambda: passed.add(each.eye().position) or path._preview is None)
-        each.until(lambda: each.at(start))
-        each.press("save")
-        saved = tmp_path / "exports" / "path-1.json"
-        each.until(saved.exists)
-        kept = [keyframe.camera.position for keyframe in path.keyframes]
-        for count in (1, 0):
-            each.tab.get_by_role("button", name="✕", exact=True).first.click()
-            each.until(lambda count=count: len(path.keyframes) == count)
-        with each.tab.expect_file_chooser() as chooser:
-            each.press("load")
-        chooser.value.set_files(saved)
-        each.until(lambda: len(path.keyframes) == 2)
-        loaded = [keyframe.camera.position for keyframe in path.keyframes]
-        np.testing.assert_allclose(loaded, kept, atol=1e-5)
-        each.press("render")
-        out = tmp_path / "renders" / "path-1"
-        each.until(out.exists)
-        assert len(list(out.glob("*.png"))) == 12  # of half a second
-        each.tab.get_by_text("12 images").wait_for()
-        (out / "film.mp4").rename(out / "whole.mp4")
-
-
-def test_a_field_sharpens_and_training_is_paused_and_plotted(browser, tmp_path):
-    with served(browser, tmp_path, "radiance", in_training=True) as each:
-        each.tab.get_by_text("160x120, step 25").wait_for()
-        expected = rendered(each, float(each.page._time.value))[:, : SCENE_PX // 2]
-        shown = each.settled()[::2, ::2]
-        assert np.abs(shown[: len(expected)] - expected).mean() < 0.02
-        assert not each.page.holds_training
-        each.press("pause training")
-        each.until(lambda: each.page.holds_training)
-        each.press("resume training")
-        each.until(lambda: not each.page.holds_training)
-        assert not each.tab.get_by_text("training loss").is_visible()
-        for step in range(1, 200):
-            each.page.add_metrics(step, {"loss": 1 / step})
-        each.tab.get_by_text("training loss").wait_for()
-        assert label_of(each.page, "pause training")
