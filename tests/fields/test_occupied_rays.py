@@ -33,6 +33,7 @@ SPEC = dataclasses.replace(
     learning_rate=5e-4,
 )
 CELLS = 16
+meets = jax.jit(occupied_rays.meets, static_argnums=2)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
@@ -61,7 +62,7 @@ def test_a_ray_meets_what_it_goes_through(rng, dtype):
         origin, toward = rng.uniform(-0.4, 0.4, (2, 3))
         direction = (toward - origin) / np.linalg.norm(toward - origin)
         ray = Ray(*(jnp.asarray(x, dtype) for x in (origin, direction, 0.0, 0.5)))
-        met = bool(occupied_rays.meets(jnp.asarray(occupied), ray, half_side))
+        met = bool(meets(jnp.asarray(occupied), ray, half_side))
         along = np.linspace(0, 0.5, 20_001)[:, None] * direction + origin
         gap = np.abs(along - middle).max(axis=1).min()  # to the middle, by the cube
         if abs(gap - size) > 0.02 * size:  # but for a corner that is only just cut
@@ -74,7 +75,7 @@ def test_a_ray_that_leaves_the_cells_may_meet_anything(dtype):
     origin, direction = jnp.zeros(3, dtype), jnp.asarray([0, 0, 1], dtype)
     for far, met in ((0.99, False), (1.01, True), (1e30, True)):
         ray = Ray(origin, direction, jnp.zeros((), dtype), jnp.asarray(far, dtype))
-        assert bool(occupied_rays.meets(nothing, ray, 0.5)) is met
+        assert bool(meets(nothing, ray, 0.5)) is met
 
 
 def test_a_run_surveys_and_learns_from_what_is_left():
@@ -93,7 +94,7 @@ def test_a_run_surveys_and_learns_from_what_is_left():
     assert 0 < ended.aux_state.sum() < left.sum()
     assert not (ended.aux_state & ~left).any()
     field = scene.field(SPEC, scene.metadata_of(capture, SPEC))
-    seen = field.survey(ended.params, ended.step)[skipping.GUIDE]
+    seen = jax.jit(field.survey)(ended.params, ended.step)[skipping.GUIDE]
     assert (seen & ~left).any()  # by itself it would
 
 
@@ -102,14 +103,16 @@ def test_valid_rays_that_meet_something_are_learned_from():
     metadata = scene.metadata_of(capture, SPEC)
     field = scene.field(SPEC, metadata)
     frames = evaluation.frames_of(capture, frozenset())
-    every = scene.draw_batch(frames, 160, jax.random.key(1))
-    every = every._replace(valid=every.valid.at[::3].set(False))
-    cells = jnp.zeros((CELLS,) * 3, bool).at[:, : CELLS // 2].set(True)
-    batch = occupied_rays.learned_from(field, cells, every)
+    draw = jax.jit(scene.draw_batch, static_argnums=1)
+    every = jax.tree.map(np.asarray, draw(frames, 160, jax.random.key(1)))
+    every = every._replace(valid=every.valid & (np.arange(160) % 3 > 0))
+    cells = np.zeros((CELLS,) * 3, bool)
+    cells[:, : CELLS // 2] = True
+    choose = jax.jit(lambda *given: occupied_rays.learned_from(field, *given))
+    batch = choose(cells, every)
     assert len(batch.row) == SPEC.rays
     by_itself = [
-        bool(every.valid[n])
-        and bool(occupied_rays.meets(cells, ray_of(metadata, every, n), 1.0))
+        bool(every.valid[n]) and bool(meets(cells, ray_of(metadata, every, n), 1.0))
         for n in range(160)
     ]
     assert 20 < sum(by_itself[8:]) < 140

@@ -87,6 +87,7 @@ def full_of_holes(spec, background):
 
 
 ORANGE = (1.0, 0.5, 0.0)
+occupied_at = jax.jit(occupancy.at, static_argnums=2)
 
 
 @pytest.mark.parametrize(
@@ -193,23 +194,24 @@ def test_a_frame_does_not_depend_on_how_it_is_cut(pixels, monkeypatch):
 def test_a_survey_finds_a_small_thing_whichever_cell_it_is_in():
     """Points of a cell lie in it, and what touches it is occupied as well."""
     cells = 12
-    index = jnp.arange(cells**3, dtype=jnp.int32)
+    index = np.arange(cells**3, dtype=np.int32)
+    draw = jax.jit(occupancy.random_points, static_argnums=(2, 3, 4))
+    dilated = jax.jit(occupancy.dilated)
     for number in range(3):
-        key = jax.random.key(number)
-        point = occupancy.random_points(key, index, cells, 0.3, jnp.float32)
+        point = draw(jax.random.key(number), index, cells, 0.3, jnp.float32)
         assert np.abs(point).max() > 0.5  # up to twice the half-side
         for one in (0, 777, cells**3 - 1):
-            only = jnp.zeros(cells**3, bool).at[one].set(True)
+            only = index == one
             grid = only.reshape((cells,) * 3)
-            np.testing.assert_array_equal(occupancy.at(grid, point, 0.3), only)
-            around = occupancy.dilated(grid)
+            np.testing.assert_array_equal(occupied_at(grid, point, 0.3), only)
+            around = np.asarray(dilated(grid))
             near = np.abs(
                 np.stack(np.unravel_index(index, (cells,) * 3))
                 - np.stack(np.unravel_index(one, (cells,) * 3))[:, None]
             )
             np.testing.assert_array_equal(around.ravel(), near.max(axis=0) <= 1)
-    far = jnp.asarray([[0.61, 0.0, 0.0], [0.0, -9.0, 0.1]])
-    assert occupancy.at(jnp.zeros((cells,) * 3, bool), far, 0.3).all()
+    far = np.float32([[0.61, 0.0, 0.0], [0.0, -9.0, 0.1]])
+    assert occupied_at(np.zeros((cells,) * 3, bool), far, 0.3).all()
 
 
 @pytest.mark.parametrize("bend", [0.0, -0.2])
@@ -226,13 +228,16 @@ def test_a_survey_of_what_is_shown_is_that_of_everything_there(bend):
     )
     assert 0.02 < shown.mean() < 0.4
     # Every sample of every ray is in a cell that is shown.
-    ray, _ = jax.vmap(lambda pixel: field_ray_through(metadata, camera, pixel))(
-        rays.pixel_centers(capture.size).reshape(-1, 2)
+    through = jax.jit(
+        jax.vmap(lambda pixel: field_ray_through(metadata, camera, pixel))
+    )
+    ray, _ = jax.tree.map(
+        np.asarray, through(rays.pixel_centers(capture.size).reshape(-1, 2))
     )
     share = np.linspace(0, 1, 41, dtype=np.float32)[:, None]
     distance = ray.near + share * (ray.far - ray.near)
     point = ray.origin + distance[..., None] * ray.direction
-    assert occupancy.at(shown, point, spec.extent).mean() > 0.999
+    assert occupied_at(shown, point, spec.extent).mean() > 0.999
 
     time = jnp.float32(0.4)
     codes = field.codes_at(params, evaluation.view_of(capture, 2))
@@ -241,9 +246,12 @@ def test_a_survey_of_what_is_shown_is_that_of_everything_there(bend):
         jax.jit(lambda which: skipping.survey(bound, condition, which))(which)
         for which in (None, shown)
     )
+    around = np.asarray(jax.jit(occupancy.dilated)(shown))
+    shown = np.asarray(shown)
     for name, cells in whole.items():
-        np.testing.assert_array_equal(part[name] & shown, cells & shown)
-        assert part[name][~occupancy.dilated(shown)].all()
+        found = np.asarray(part[name])
+        np.testing.assert_array_equal(found & shown, np.asarray(cells) & shown)
+        assert found[~around].all()
 
 
 @pytest.mark.parametrize(
