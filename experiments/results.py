@@ -1,12 +1,12 @@
-"""The pages of docs/results, written from the numbers that are kept beside the code.
+"""Write the pages of docs/results from the stored measurements.
 
-    python -m experiments.results                  # every page whose numbers are there
+    python -m experiments.results                  # every page with stored numbers
     python -m experiments.results effect_cost      # one
     python -m experiments.results benchmark --measured runs/benchmark/benchmark.json
 
-Nothing is measured here. A page is what its study says of itself, and tables of the
-kept file: `--measured FILE` keeps a new one first. A test holds every page against what
-this writes.
+Nothing is measured here. A page consists of the docstring of its command and of tables
+of the stored file, which `--measured FILE` replaces first. A test compares every page
+with its file.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import importlib
 import json
 import pathlib
 import shutil
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from experiments import cli, markdown
 from nerfies_jax.runtime import console
@@ -24,45 +24,22 @@ PAGES = ROOT / "docs" / "results"
 INDEX = """\
 # Results
 
-Every page is written from a file of this repository by `python -m experiments.results`,
-and a test compares each page with its file. The command next to a page measures again.
-If a page has rows of several captures or presets, the command was run once for each.
-Its `--out` names the result, and `python -m experiments.results benchmark --measured
-benchmark.json`, for example, stores that file and rewrites the page.
+`python -m experiments.results` writes every page from a file of this repository, and a
+test compares each page with its file. The command next to a page measures again. If a
+page has rows of several captures or presets, the command was run once for each.
+`python -m experiments.results benchmark --measured benchmark.json`, for example, stores
+the result of a command and rewrites its page.
 
 {pages}
 
 {missing}Errors and costs of single formulas are in [numerics.md](../numerics.md), which
 `python -m experiments.hard_cases --document docs/numerics.md` rewrites.
 
-## Where to find what
-
-- Comparison of all small presets, and the margins that the papers print:
-  [league.md](league.md).
-- Initialization from tracks, for four motions of splats:
-[ablate_start.md](ablate_start.md).
-- Parts of the default preset: [ablate_tracked.md](ablate_tracked.md).
-- Parts of Sonata, MoBa-GS and Nerfies: [ablate_sonata.md](ablate_sonata.md),
-  [ablate_moba.md](ablate_moba.md), [ablate_fields.md](ablate_fields.md), and on a real
-  video [ablate_sonata_bookshelf.md](ablate_sonata_bookshelf.md),
-  [ablate_moba_bookshelf.md](ablate_moba_bookshelf.md),
-  [ablate_fields_bookshelf.md](ablate_fields_bookshelf.md).
-- Pose refinement: [ablate_poses.md](ablate_poses.md), and on a real video
-  [ablate_poses_bookshelf.md](ablate_poses_bookshelf.md).
-- Choices that the papers leave open: [ablate_open.md](ablate_open.md).
-- Discontinuous camera motion: [ablate_jumps.md](ablate_jumps.md).
-- Entropy coding of ADC-GS' features: [ablate_rate.md](ablate_rate.md).
-- Views per step on two cores: [ablate_views.md](ablate_views.md).
-- Lazy elastic regularization: [ablate_lazy.md](ablate_lazy.md).
-- Cost of deformation, solvers and local kernels:
-  [deformation_cost.md](deformation_cost.md), [solver_table.md](solver_table.md),
-  [kan_local.md](kan_local.md).
-- Motion bases at equal rank: [motion_rank.md](motion_rank.md).
-
 ## Finished studies
 
 These studies answered their question. Their pages and numbers stay, and their code is
-in revision {revision} of this repository, which can run the command on each page.
+in revision {revision} of this repository, which can run the command on each page. The
+numbers of a page NAME.md are in NAME.json.
 
 {finished}
 """
@@ -76,84 +53,105 @@ These commands have no stored numbers yet:
 
 
 class Study(NamedTuple):
-    """Measurement of the numbers of one page, and the function that formats them."""
+    """A page: the command that measures, and the functions that format the result."""
 
-    module: str  # whose docstring opens the page
-    page: str  # module with `page(stored)`, the rest of it, and `draw(stored, path)`
-    measured: str  # the kept file
-    command: str  # that measures
+    about: str  # subject of the page
+    command: str  # words after `python -m experiments.`
+    module: str  # of experiments, whose docstring opens the page
+    page: str  # of experiments, with `page(stored)`
+    measured: str = ""  # the stored file, if it is not in experiments/measured
 
-
-def _study(name, words="", module=None, page=None, measured=None):
-    study = name if module is None else module
-    return Study(
-        f"experiments.{study}",
-        f"experiments.{page or study}",
-        measured or f"experiments/measured/{name}.json",
-        f"python -m experiments.{study.removesuffix('.__main__')} {words}".strip(),
-    )
+    @property
+    def line(self) -> str:
+        """The whole command."""
+        return f"python -m experiments.{self.command}"
 
 
-def _package(name, words="", page="page", of=None, measured=None):
-    folder = of or name
-    return _study(name, words, f"{folder}.__main__", f"{folder}.{page}", measured)
+def _suite(about, words):
+    command = f"benchmark {words} --jobs 2"
+    return Study(about, command, "benchmark.__main__", "benchmark.page")
 
 
-def _suite(name, words):
-    return _package(name, f"{words} --jobs 2", of="benchmark")
+def _package(about, command):
+    name = command.split()[0]
+    return Study(about, command, f"{name}.__main__", f"{name}.page")
 
 
-_BOOKSHELF = "CAPTURE --max-side 256 --heldout 8"
+_REAL = "CAPTURE --max-side 256 --heldout 8 --suite"
 STUDIES = {
-    "benchmark": _package("benchmark"),
-    "effect_cost": _package(
-        "effect_cost", measured="nerfies_jax/runs/effect_cost.json"
+    "benchmark": _package("quality of the default command", "benchmark"),
+    "ablate_tracked": _suite(
+        "parts of the default preset", "--suite tracked --steps 900"
     ),
-    "evidence": _package("evidence", "--scenes"),
-    "ablate_fields": _suite("ablate_fields", "--suite fields --steps 600"),
+    "ablate_sonata": _suite("parts of Sonata", "--suite sonata --steps 900"),
+    "ablate_sonata_bookshelf": _suite(
+        "the same on a real video", f"{_REAL} sonata --steps 600"
+    ),
+    "ablate_moba": _suite("parts of MoBa-GS", "--suite moba --steps 900"),
+    "ablate_moba_bookshelf": _suite(
+        "the same on a real video", f"{_REAL} moba --steps 600"
+    ),
+    "ablate_fields": _suite("parts of Nerfies", "--suite fields --steps 600"),
     "ablate_fields_bookshelf": _suite(
-        "ablate_fields_bookshelf", f"{_BOOKSHELF} --suite fields --steps 600"
+        "the same on a real video", f"{_REAL} fields --steps 600"
     ),
-    "ablate_tracked": _suite("ablate_tracked", "--suite tracked --steps 900"),
     "ablate_poses": _suite(
-        "ablate_poses", "--scene pose-error --suite poses --steps 900"
+        "pose refinement", "--scene pose-error --suite poses --steps 900"
     ),
     "ablate_poses_bookshelf": _suite(
-        "ablate_poses_bookshelf", f"{_BOOKSHELF} --suite poses --steps 900"
+        "the same on a real video", f"{_REAL} poses --steps 900"
     ),
-    "ablate_sonata": _suite("ablate_sonata", "--suite sonata --steps 900"),
-    "ablate_sonata_bookshelf": _suite(
-        "ablate_sonata_bookshelf", f"{_BOOKSHELF} --suite sonata --steps 600"
+    "speed": _package("steps, frames, the rasterizer", "speed steps"),
+    "effect_cost": Study(
+        "cost of each effect",
+        "speed effects",
+        "speed.effects",
+        "speed.effects_page",
+        "nerfies_jax/runs/effect_cost.json",
     ),
-    "ablate_moba": _suite("ablate_moba", "--suite moba --steps 900"),
-    "ablate_moba_bookshelf": _suite(
-        "ablate_moba_bookshelf", f"{_BOOKSHELF} --suite moba --steps 600"
+    "player_speed": Study(
+        "frames of the browser player",
+        "speed player PLAYER.html --gsplat INDEX.es.js",
+        "speed.player",
+        "speed.player",
     ),
-    "speed": _package(
-        "speed", "--job --beside CHECKOUT --yardstick PATH/run.py --out speed"
-    ),
-    "player_speed": _study(
-        "player_speed", "PLAYER.html --gsplat INDEX.es.js --out player_speed.json"
-    ),
-    "faults": _package("faults", "--trials 200 --jobs 2"),
-    "fuzz": _package("fuzz", "--mutations 1000000"),
-    "mutants": _package("mutants", "--count 44"),
-    "mutants_unseen": _package("mutants_unseen", "--count 24 --seed 1", of="mutants"),
+    "faults": _package("signals, full disks, closed pipes", "faults --trials 200"),
+    "fuzz": _package("damaged files", "fuzz --mutations 1000000"),
+    "mutants": _package("faults that the tests detect", "mutants --count 44"),
+    "mutants_unseen": _package("the same, other faults", "mutants --count 24 --seed 1"),
 }
 # Studies that answered their question: the page and its numbers stay, without the code.
 REVISION = "99f3f69"  # the last revision with all of them
-FINISHED = (
-    *("ablate_jumps", "ablate_lazy", "ablate_open", "ablate_rate", "ablate_start"),
-    *("ablate_views", "accuracy_time", "appearance_codes", "camera_masks"),
-    *("deformation_cost", "elastic_points", "field_speed", "frequency_gates"),
-    *("kan_local", "league", "motion_rank", "nerf_speed", "raster_speed"),
-    *("solver_table", "solver_table_poses", "spectral_bias", "transient_medium"),
-)
+FINISHED = {
+    "league": "comparison of all small presets, and margins that the papers print",
+    "accuracy_time": "quality against training time",
+    "evidence": "preprocessing of the built-in scenes, and optical flow methods",
+    "ablate_start": "initialization from tracks, for four motions of splats",
+    "ablate_open": "choices that the papers leave open",
+    "ablate_jumps": "discontinuous camera motion",
+    "ablate_rate": "entropy coding of ADC-GS' features",
+    "ablate_views": "views per step on two cores",
+    "ablate_lazy": "lazy elastic regularization",
+    "appearance_codes": "appearance codes",
+    "camera_masks": "masks for structure from motion",
+    "deformation_cost": "cost of deformation, and of tables of it",
+    "elastic_points": "samples of the elastic penalty",
+    "field_speed": "speed of radiance fields",
+    "frequency_gates": "frequency gates",
+    "kan_local": "local kernels of KANs",
+    "motion_rank": "motion bases at equal rank",
+    "nerf_speed": "speed of NeRF",
+    "raster_speed": "speed of the rasterizer",
+    "solver_table": "solvers of bundle adjustment",
+    "solver_table_poses": "solvers of poses",
+    "spectral_bias": "spectral bias",
+    "transient_medium": "transient media",
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """Write pages of docs/results from the files of numbers that are kept."""
+    """Write pages of docs/results from stored measurements."""
 
     pages: cli.Positional[tuple[str, ...]] = ()
     """Pages to write (default: every one with stored numbers)."""
@@ -176,7 +174,6 @@ def main(args):
             keep(args.pages[0], args.measured)
         written = {name: PAGES / f"{name}.md" for name in args.pages or kept()}
         for name, path in written.items():
-            draw(name)
             _write(path, page(name))
             console.say(path)
         _write(PAGES / "README.md", index())
@@ -197,15 +194,36 @@ def _copy(source, path):
         shutil.copyfile(source, partial)
 
 
+def path_of(name: str) -> pathlib.Path:
+    """Return the path of the stored numbers of a page.
+
+    Args:
+      name: Name of the page.
+
+    Returns:
+      The path.
+    """
+    return ROOT / (STUDIES[name].measured or f"experiments/measured/{name}.json")
+
+
 def kept() -> list[str]:
-    """The pages whose numbers are there."""
-    return [name for name, study in STUDIES.items() if (ROOT / study.measured).exists()]
+    """List the pages with stored numbers.
+
+    Returns:
+      Their names.
+    """
+    return [name for name in STUDIES if path_of(name).exists()]
 
 
 def keep(name: str, measured: pathlib.Path) -> None:
-    """Take what a study wrote as the numbers of a page, and its picture with it.
+    """Store a result as the numbers of a page.
 
-    ValueError where no page can be written from the file.
+    Args:
+      name: Name of the page.
+      measured: File of the result.
+
+    Raises:
+      ValueError: If no page can be written from the file.
     """
     try:
         stored = json.loads(measured.read_text())
@@ -214,14 +232,11 @@ def keep(name: str, measured: pathlib.Path) -> None:
     _check_of(name, stored, measured)
     try:
         _page_of(name, stored)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"--measured {measured}: not what {STUDIES[name].command} writes ({error})"
+            f"--measured {measured}: not what {STUDIES[name].line} writes ({error!r})"
         ) from error
-    _copy(measured, ROOT / STUDIES[name].measured)
-    picture = measured.with_suffix(".png")
-    if picture.exists():
-        _copy(picture, PAGES / f"{name}.png")
+    _copy(measured, path_of(name))
 
 
 def _check_of(name, stored, measured):
@@ -241,61 +256,62 @@ def _check_of(name, stored, measured):
 
 
 def page(name: str) -> str:
-    """The page, from the kept numbers alone."""
-    return _page_of(name, _stored(name))
+    """Write a page from its stored numbers.
 
+    Args:
+      name: Name of the page.
 
-def draw(name: str) -> None:
-    """The page's picture, where it can be drawn from the kept numbers."""
-    module = importlib.import_module(STUDIES[name].page)
-    if hasattr(module, "draw"):
-        module.draw(_stored(name), PAGES / f"{name}.png")
+    Returns:
+      Markdown.
+    """
+    path = path_of(name)
+    if not path.exists():
+        raise ValueError(
+            f"{path}: not there; measure with {STUDIES[name].line}, and name its "
+            "result with --measured"
+        )
+    return _page_of(name, json.loads(path.read_text()))
 
 
 def index() -> str:
-    """The list of pages."""
-    there = kept()
+    """Write the list of pages.
+
+    Returns:
+      Markdown.
+    """
     rows = [
-        [f"[{name}.md]({name}.md)", f"`{study.command}`", f"`{study.measured}`"]
+        [f"[{name}.md]({name}.md)", study.about, f"`{study.line}`"]
         for name, study in STUDIES.items()
-        if name in there
+        if path_of(name).exists()
     ]
-    heads = ("page", "measured by", "kept in")
-    missing = [f"`{s.command}`" for name, s in STUDIES.items() if name not in there]
+    missing = [
+        f"`{study.line}`" for name, study in STUDIES.items() if name not in kept()
+    ]
     return INDEX.format(
-        pages=markdown.table(heads, rows, words=3),
+        pages=markdown.table(("page", "subject", "measured by"), rows, words=3),
         missing=MISSING.format(commands=markdown.bullets(missing)) if missing else "",
         revision=REVISION,
         finished=markdown.bullets(
-            f"[{name}.md]({name}.md), numbers in `docs/results/{name}.json`"
-            for name in FINISHED
+            f"[{name}.md]({name}.md): {about}" for name, about in FINISHED.items()
         ),
     )
 
 
-def _stored(name) -> dict[str, Any]:
-    path = ROOT / STUDIES[name].measured
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError:
-        raise ValueError(
-            f"{path}: not there; measure with {STUDIES[name].command}, and name what "
-            "it writes with --measured"
-        ) from None
-
-
 def _page_of(name, stored):
     study = STUDIES[name]
-    title, text = markdown.title_and_text(importlib.import_module(study.module).__doc__)
-    about = stored.get("machine") or stored["about"].get("machine") or stored["about"]
+    module = importlib.import_module(f"experiments.{study.module}")
+    title, text = markdown.title_and_text(module.__doc__)
+    about = stored.get("machine") or stored["about"]
     parts = [title, text]
     if (PAGES / f"{name}.png").exists():
         parts.append(f"![{title.removeprefix('# ')}]({name}.png)")
-    parts.append(importlib.import_module(study.page).page(stored))
+    parts.append(importlib.import_module(f"experiments.{study.page}").page(stored))
+    revision = stored.get("revision")
+    origin = markdown.machine(about) + (f", revision {revision}" if revision else "")
+    stored_in = path_of(name).relative_to(ROOT)
     parts.append(
-        f"Measured by `{study.command}` ({markdown.machine(about)}); the numbers are "
-        f"in `{study.measured}`, and `python -m experiments.results {name}` wrote this "
-        "page from them."
+        f"Measured by `{study.line}` ({origin}); the numbers are in `{stored_in}`, and "
+        f"`python -m experiments.results {name}` wrote this page from them."
     )
     return "\n\n".join(parts) + "\n"
 

@@ -1,125 +1,198 @@
-"""Time of a step, a frame, a compilation and the main job on this machine.
+"""Time of training steps, effects, the rasterizer, the default command and the player.
 
-    python -m experiments.speed --out speed
-    python -m experiments.speed --presets splats-tracked-small --out speed
-    python -m experiments.speed --job --yardstick PATH/run.py --out speed
-    python -m experiments.speed --no-steps --beside CHECKOUT --out speed
-    python -m experiments.speed --presets splats-tracked-small --check BEFORE/speed.json
+    python -m experiments.speed steps                       # every small preset
+    python -m experiments.speed effects --presets sonata-small
+    python -m experiments.speed raster 10000@256x256 --reference PATH/run.py
+    python -m experiments.speed job --compare CHECKOUT
+    python -m experiments.speed player PLAYER.html --gsplat INDEX.es.js
+    python -m experiments.speed steps --check BEFORE/speed.json
 
-Every preset is timed in two fresh processes, one that sees one core and one that has
-the cores its steps are made for. `--job` also times the README's first command with
-empty caches, and `--beside` that of another checkout, an earlier revision, between two
-of ours. `--raster` times the rasterizer on cases such as 10000@256x256, and
-`--yardstick` compares it with another (`experiments.speed.raster`). Times are wall
-clock, so leave the machine idle. Earlier measurements stay in OUT/speed.json where they
-are not repeated. `--check` compares with an earlier file. The tolerances are a quarter
-of a time, half of a compilation, a tenth of memory, 0.15 of a ratio to the other
-rasterizer, and half a decibel.
+`steps` times every preset in two fresh processes, one that sees one core and one with
+the cores that its step is made for. `job` times the README's first command with empty
+caches, and `--compare` that of another checkout between two of this one. `raster` times
+the rasterizer, and `--reference` another one on the same scene. Times of these three
+are wall clock, so leave the machine idle. `effects` and `player` are described on their
+own pages.
+
+Earlier results in --out stay where they are not repeated. `--check` compares with an
+earlier file and ends with exit code 1 if a number is worse than its tolerance: a
+quarter of a time, half of a compilation, a tenth of memory, 0.15 of a ratio to the
+other rasterizer, and half a decibel.
 """
 
 import concurrent.futures
 import dataclasses
-import json
 import multiprocessing
 import os
 import pathlib
-import subprocess
-import sys
-import tempfile
-import time
+from typing import Any, Literal
 
 from experiments import cli, records
-from experiments.speed import job, raster
+from experiments.speed import raster
 from nerfies_jax.runs import representations
 from nerfies_jax.runtime import children, console
 
-STORED = "speed.json"
+STORED, EFFECTS, PLAYER = "speed.json", "effect_cost.json", "player_speed.json"
 
 
 @dataclasses.dataclass(frozen=True)
-class Speed:
-    """Time presets, the main job, and the rasterizer beside another."""
+class _Stored:
+    out: pathlib.Path = pathlib.Path("runs/speed")
+    """Folder of the results."""
+    check: pathlib.Path | None = None
+    """An earlier file of results to compare with."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Steps(_Stored):
+    """Time training steps, compilation and rendering of presets."""
 
     presets: tuple[str, ...] = ()
     """Presets to time (default: all small ones)."""
-    steps: bool = True
-    """Time their steps. Otherwise only measure what the other options ask for."""
-    job: bool = False
-    """Also the main job, from the command to its report."""
-    beside: pathlib.Path | None = None
-    """Also the main job of this checkout of the library, between two of ours."""
-    raster: tuple[str, ...] = ()
-    """Cases of the rasterizer to time as well (default: three with --yardstick)."""
-    yardstick: pathlib.Path | None = None
-    """Also the rasterizer, next to the one that this script times."""
-    out: pathlib.Path = pathlib.Path("runs/speed")
-    """Folder for speed.json."""
-    check: pathlib.Path | None = None
-    """An earlier speed.json: exit code 1 where a number is worse than its tolerance."""
 
     def __post_init__(self):
         cli.check_presets(self.presets)
-        if self.presets and not self.steps:
-            raise ValueError("--no-steps times no preset: leave --presets out")
-        for case in self.raster:
+
+
+@dataclasses.dataclass(frozen=True)
+class Effects(_Stored):
+    """Measure the cost of each effect of presets."""
+
+    presets: tuple[str, ...] = ()
+    """Presets to measure (default: all small ones with effects of their own)."""
+    at: float = 0.4
+    """Share of a run's steps before the step that is measured."""
+    rows: int | None = None
+    """Initial Gaussians of a scene of splats (default: the preset's)."""
+    rays: int | None = None
+    """Rays of a step of a radiance field (default: the preset's)."""
+    repeats: int = 5
+    """Timed calls of every program. The table has the medians."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """Device to compute on."""
+
+    def __post_init__(self):
+        cli.check_presets(self.presets)
+        if not 0 <= self.at < 1:
+            raise ValueError(f"--at {self.at}: a share of the steps, from 0 to below 1")
+        for name in ("rows", "rays", "repeats"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"--{name} {value} must be at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class Raster(_Stored):
+    """Time the rasterizer and its gradient on one core."""
+
+    cases: cli.Positional[tuple[str, ...]] = raster.CASES
+    """Gaussians and image sizes, as 10000@256x256."""
+    reference: pathlib.Path | None = None
+    """Script of another rasterizer to time on the same scenes."""
+
+    def __post_init__(self):
+        for case in self.cases:
             raster.parsed(case)
 
 
-@cli.command(Speed)
+@dataclasses.dataclass(frozen=True)
+class Job(_Stored):
+    """Time the README's first command, from empty caches to its report."""
+
+    compare: pathlib.Path | None = None
+    """Checkout of another revision of the library to compare with."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Player:
+    """Time frames of the browser player, and of gsplat.js on the same Gaussians."""
+
+    pages: cli.Positional[tuple[pathlib.Path, ...]]
+    """Pages that runs of splats have written (player.html)."""
+    gsplat: pathlib.Path | None = None
+    """Its module, node_modules/gsplat/dist/index.es.js after `npm install gsplat`."""
+    size: int = 600
+    """Width and height of the canvases, in pixels."""
+    time: float = 0.5
+    """Time of the scene to render, from 0 to 1."""
+    frames: int = 4
+    """Frames in a row of one player."""
+    rounds: int = 9
+    """Rounds of measurements, in which the players take turns."""
+    out: pathlib.Path = pathlib.Path("runs/speed")
+    """Folder of the results."""
+
+    def __post_init__(self):
+        if min(self.size, self.frames, self.rounds) < 1 or not 0 <= self.time <= 1:
+            raise ValueError(
+                "--size, --frames and --rounds are at least 1, --time is from 0 to 1"
+            )
+
+
+@cli.command(Steps | Effects | Raster | Job | Player)
 def main(args):
     """Measure and store. Wrong input ends with exit code 2."""
-    from experiments.speed import tolerances
     from nerfies_jax.metrics import baselines
 
     before = None
     with cli.user_errors():
-        if args.check is not None:
-            before = baselines.read(args.check, STORED)
-        if args.beside is not None and not (args.beside / "experiments").is_dir():
-            raise ValueError(f"--beside {args.beside}: no checkout of this library")
-        if args.yardstick is not None and not args.yardstick.is_file():
-            raise ValueError(f"--yardstick {args.yardstick}: no such file")
+        check = getattr(args, "check", None)
+        if check is not None:
+            before = baselines.read(check, check.name)
+        _check_files(args)
         args.out.mkdir(parents=True, exist_ok=True)
-    path = args.out / STORED
-    small = tuple(n for n in representations.PRESETS if n.endswith("-small"))
-    if args.steps:
-        _keep_steps(path, args.presets or small)
-    if args.job:
-        _keep_job(path, ("job",), None)
-    if args.beside is not None:
-        jobs = {"first": None, "beside": args.beside, "again": None}
-        for name, checkout in jobs.items():
-            _keep_job(path, ("jobs", name), checkout)
-    if args.raster or args.yardstick is not None:
-        record = _apart(raster.measure, args.raster or raster.CASES, args.yardstick)
-        keep(path, record["machine"], ("raster",), {"rows": record["rows"]})
-    console.say(f"kept in {path}")
-    stored = cli.stored(path)
-    worse = []
+        path = MEASURES[type(args)](args)
+    console.say(f"stored in {path}")
+    stored, worse = cli.stored(path), []
     if before is not None:
-        worse = baselines.changes(tolerances.metrics(stored or {}), before)
-        console.say("\n".join(worse) or f"nothing is worse than in {args.check}")
+        from nerfies_jax.metrics import clock
+
+        worse = baselines.changes([*clock.read_metrics(path).values()], before)
+        console.say("\n".join(worse) or f"nothing is worse than in {check}")
     return cli.Ended(stored, 1 if worse else 0)
 
 
-def keep(path: pathlib.Path, machine: dict, keys: tuple[str, ...], record) -> None:
-    """Put a record in its place in the file, which keeps all others."""
+def _check_files(args):
+    """Raise ValueError if a file or folder that options name does not exist."""
+    files = [*getattr(args, "pages", ())]
+    files += [getattr(args, "gsplat", None), getattr(args, "reference", None)]
+    for path in filter(None, files):
+        if not path.is_file():
+            raise ValueError(f"{path}: no such file")
+    checkout = getattr(args, "compare", None)
+    if checkout is not None and not (checkout / "experiments").is_dir():
+        raise ValueError(f"--compare {checkout}: no checkout of this library")
+
+
+def keep(
+    path: pathlib.Path, machine: dict, keys: tuple[str, ...], record: Any
+) -> pathlib.Path:
+    """Put a record in its place in speed.json, which keeps all others.
+
+    Args:
+      path: The file.
+      machine: Description of the machine.
+      keys: Place of the record.
+      record: The record.
+
+    Returns:
+      The file.
+    """
     from experiments.speed import tolerances
-    from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.metrics import clock
 
     stored = records.rows(path)
-    stored["machine"] = clock.beside(machine, stored.get("machine", {}))
-    inner = stored
+    place = stored
     for key in keys[:-1]:
-        inner = inner.setdefault(key, {})
-    inner[keys[-1]] = record
+        place = place.setdefault(key, {})
+    place[keys[-1]] = record
     stored["metrics"] = clock.metric_rows(tolerances.metrics(stored))
-    write_json(path, stored)
+    records.write(path, stored, machine)
+    return path
 
 
 def _apart(work, *arguments):
-    """The work's result, from a fresh process."""
+    """Return the work's result from a fresh process."""
     spawned = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(
         1, spawned, children.end_with_parent, (os.getpid(),)
@@ -127,53 +200,63 @@ def _apart(work, *arguments):
         return pool.submit(work, *arguments).result()
 
 
-def _keep_steps(path, presets):
-    _apart(job.prepare)
-    for preset in presets:
+def _steps(args):
+    from experiments.speed import steps
+
+    small = tuple(n for n in representations.PRESETS if n.endswith("-small"))
+    _apart(steps.prepare)
+    for preset in args.presets or small:
         for cores in ("one", "all"):
-            record = _apart(job.measure, preset, cores == "all")
-            keep(path, record.pop("machine"), ("presets", preset, cores), record)
-            console.say(f"{preset}, {cores}: {record['step_ms']:.1f} ms a step")
+            record = _apart(steps.measure, preset, cores == "all")
+            machine, keys = record.pop("machine"), ("presets", preset, cores)
+            keep(args.out / STORED, machine, keys, record)
+            console.say(f"{preset}, {cores}: {record['step_ms']:.1f} ms per step")
+    return args.out / STORED
 
 
-def _keep_job(path, keys, checkout):
-    record = main_job(checkout)
-    machine = record.pop("machine")
-    keep(path, machine, keys, record | {"cpu": machine["cpu"]})
-    whose = "main job" if checkout is None else f"main job of {checkout}"
-    console.say(f"{whose}: {record['seconds']:.0f} s")
+def _job(args):
+    from experiments.speed import steps
+
+    commands = {("job",): None}
+    if args.compare is not None:
+        places = {"first": None, "beside": args.compare, "again": None}
+        commands |= {("jobs", name): checkout for name, checkout in places.items()}
+    for keys, checkout in commands.items():
+        record = steps.default_command(checkout)
+        machine = record.pop("machine")
+        keep(args.out / STORED, machine, keys, record | {"cpu": machine["cpu"]})
+        console.say(f"{record['revision']}: {record['seconds']:.0f} s")
+    return args.out / STORED
 
 
-def main_job(checkout: pathlib.Path | None = None) -> dict:
-    """Seconds of the README's first command, with nothing kept from before.
+def _raster(args):
+    record = _apart(raster.measure, args.cases, args.reference)
+    rows = {"rows": record["rows"]}
+    return keep(args.out / STORED, record["machine"], ("raster",), rows)
 
-    Of another checkout by its own code, and with its revision.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        run = pathlib.Path(folder) / "run"
-        environment = dict(children.environment(), XDG_CACHE_HOME=f"{folder}/cache")
-        for name in ("JAX_COMPILATION_CACHE_DIR", "PJRT_NPROC", "NPROC"):
-            environment.pop(name, None)
-        if checkout is not None:
-            environment["PYTHONPATH"] = str(checkout.resolve())
-        command = [sys.executable, "-m", "experiments.reconstruct", "--out", str(run)]
-        began = time.perf_counter()
-        subprocess.run(
-            command, check=True, env=environment, cwd=checkout, capture_output=True
-        )
-        seconds = time.perf_counter() - began
-        metrics = json.loads((run / "metrics.json").read_text())
-    from nerfies_jax.metrics import clock
-    from nerfies_jax.training.provenance import revision
 
-    wanted = ("train.seconds", "train.compile_seconds", "heldout.psnr")
-    return {
-        "seconds": seconds,
-        "revision": revision(checkout),
-        **{name: metrics.get(name) for name in (*wanted, "heldout.moving_psnr")},
-        "machine": clock.machine(),
-    }
+def _effects(args):
+    from experiments.speed import effects
 
+    return effects.measure_all(args, args.out / EFFECTS)
+
+
+def _player(args):
+    from experiments.speed import player
+
+    path = args.out / PLAYER
+    rows, machine = player.measure(args)
+    records.write(path, {"rows": rows}, machine)
+    return path
+
+
+MEASURES = {
+    Steps: _steps,
+    Effects: _effects,
+    Raster: _raster,
+    Job: _job,
+    Player: _player,
+}
 
 if __name__ == "__main__":
     main()

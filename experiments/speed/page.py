@@ -24,12 +24,19 @@ once."""
 
 
 def page(stored: Mapping[str, Any]) -> str:
-    """The tables: presets, where their time goes, the main job, the rasterizer."""
+    """Format the tables of presets, the default command and the rasterizer.
+
+    Args:
+      stored: The stored results.
+
+    Returns:
+      Markdown.
+    """
     parts = [READING, _presets(stored["presets"]), "## Where a step's time goes"]
     parts.append(PARTS)
     parts.append(_parts(stored["presets"]))
     if "job" in stored:
-        parts += ["## The main job", _job(stored["job"])]
+        parts += ["## The default command", _job(stored["job"])]
         if "jobs" in stored:
             parts.append(_beside(**stored["jobs"]))
     if "raster" in stored:
@@ -108,7 +115,7 @@ before and after ours, the mean of both."""
 
 def _raster(rows):
     heads = ("case", "ours", "theirs", "times as long")
-    names = ("forward_backward_ms", "yardstick_forward_backward_ms")
+    names = ("forward_backward_ms", "reference_forward_backward_ms")
     return markdown.table(
         heads,
         [

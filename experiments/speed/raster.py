@@ -1,9 +1,9 @@
 """The rasterizer's time, alone or next to another rasterizer on the same scene.
 
-Times are medians of process CPU time in one process that sees one core, because the
+Times are medians of processor time in one process that sees one core, because the
 machine may be shared. The other rasterizer is a script that is called as
 `PYTHON SCRIPT --gaussians N --size WxH --scene FILE --json`. It writes the scene that
-it draws to FILE and answers with `forward_ms` and `forward_backward_ms`.
+it renders to FILE and answers with `forward_ms` and `forward_backward_ms`.
 """
 
 import dataclasses
@@ -22,12 +22,12 @@ CASES = ("10000@256x256", "50000@480x270", "200000@800x800")
 REPEATS = 7
 
 
-def measure(cases: tuple[str, ...], yardstick: pathlib.Path | None) -> dict:
+def measure(cases: tuple[str, ...], reference: pathlib.Path | None) -> dict:
     """Time all cases in this process.
 
     Args:
       cases: Numbers of Gaussians and image sizes, as `CASES`.
-      yardstick: Script of the other rasterizer, or None.
+      reference: Script of the other rasterizer, or None.
 
     Returns:
       The machine and one row for each case.
@@ -35,7 +35,7 @@ def measure(cases: tuple[str, ...], yardstick: pathlib.Path | None) -> dict:
     platform.start_jax("cpu", "one")
     from nerfies_jax.metrics import clock
 
-    rows = [time_case(text, yardstick) for text in cases]
+    rows = [time_case(text, reference) for text in cases]
     return {"machine": clock.machine(), "rows": rows}
 
 
@@ -160,7 +160,7 @@ def median_ms(call) -> float:
     return float(np.median(times))
 
 
-def yardstick_times(script: pathlib.Path, text: str, scene_file: str) -> dict:
+def reference_times(script: pathlib.Path, text: str, scene_file: str) -> dict:
     """Time the other rasterizer on a scene.
 
     Args:
@@ -180,15 +180,15 @@ def yardstick_times(script: pathlib.Path, text: str, scene_file: str) -> dict:
     return json.loads(answer.stdout.strip().splitlines()[-1])
 
 
-def time_case(text: str, yardstick: pathlib.Path | None) -> dict:
+def time_case(text: str, reference: pathlib.Path | None) -> dict:
     """Time one case, between two runs of the other rasterizer where there is one."""
     import numpy as np
 
     theirs, scene = [], make_scene(*parsed(text))
-    if yardstick is not None:
+    if reference is not None:
         with tempfile.TemporaryDirectory() as folder:
             file = str(pathlib.Path(folder) / "scene.npz")
-            theirs.append(yardstick_times(yardstick, text, file))
+            theirs.append(reference_times(reference, text, file))
             with np.load(file) as stored:
                 scene = {name: stored[name] for name in stored.files}
     forward, both = compiled(text, scene)
@@ -197,11 +197,11 @@ def time_case(text: str, yardstick: pathlib.Path | None) -> dict:
         "forward_ms": median_ms(forward),
         "forward_backward_ms": median_ms(both),
     }
-    if yardstick is not None:
+    if reference is not None:
         with tempfile.TemporaryDirectory() as folder:
             file = str(pathlib.Path(folder) / "scene.npz")
-            theirs.append(yardstick_times(yardstick, text, file))
+            theirs.append(reference_times(reference, text, file))
         for name in ("forward_ms", "forward_backward_ms"):
-            row[f"yardstick_{name}"] = sum(times[name] for times in theirs) / 2
-        row["ratio"] = row["forward_backward_ms"] / row["yardstick_forward_backward_ms"]
+            row[f"reference_{name}"] = sum(times[name] for times in theirs) / 2
+        row["ratio"] = row["forward_backward_ms"] / row["reference_forward_backward_ms"]
     return row

@@ -53,7 +53,7 @@ class Choice(NamedTuple):
 class Pair(NamedTuple):
     """Two scenes of a preset that differ in one decision.
 
-    The names are those of the keys of `experiments.effect_cost`.
+    The names are those of the keys of `experiments.speed effects`.
     """
 
     preset: str

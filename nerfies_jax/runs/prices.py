@@ -1,4 +1,4 @@
-"""Cost of an effect per training step, as measured by `experiments.effect_cost`."""
+"""Cost of an effect per training step, as measured by `experiments.speed effects`."""
 
 import functools
 import importlib.resources
@@ -36,7 +36,7 @@ def legend() -> str:
     names = " / ".join(representations.installed())
     return (
         "cost per step: a training step with the effect over one without any, of "
-        f"{names};\n- where no step takes longer. From experiments.effect_cost."
+        f"{names};\n- where no step takes longer. From experiments.speed effects."
     )
 
 

@@ -18,7 +18,7 @@ def test_the_index_lists_every_page_there_is():
     there = {path.stem for path in PAGES.glob("*.md")} - {"README"}
     assert there == {*results.kept(), *FINISHED}
     measured = {path.name for path in (ROOT / "experiments/measured").iterdir()}
-    known = {study.measured.rpartition("/")[2] for study in STUDIES.values()}
+    known = {results.path_of(name).name for name in STUDIES}
     assert measured <= known
 
 

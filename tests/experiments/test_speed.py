@@ -1,4 +1,4 @@
-"""What `experiments.speed` keeps of its numbers, and what it holds them against."""
+"""Results of `experiments.speed` are stored, and compared with earlier ones."""
 
 import copy
 import json
@@ -28,10 +28,16 @@ def kept(tmp_path):
     return path
 
 
+@pytest.fixture(autouse=True)
+def nothing_measured(monkeypatch):
+    nothing = {speed.Raster: lambda args: args.out / speed.STORED}
+    monkeypatch.setattr(speed, "MEASURES", nothing)
+
+
 def checked(out, before):
-    """The exit code of a command that measures nothing anew."""
+    """Return the exit code of a command that measures nothing anew."""
     with pytest.raises(SystemExit) as stop:
-        speed.main(["--no-steps", "--out", str(out), "--check", str(before)])
+        speed.main(["raster", "--out", str(out), "--check", str(before)])
     return stop.value.code
 
 
@@ -67,6 +73,7 @@ def test_only_what_is_worse_than_its_tolerance_fails(
         inner = inner[key]
     inner[last] = value
     (tmp_path / "now").mkdir()
+    now["metrics"] = clock.metric_rows(tolerances.metrics(now))
     (tmp_path / "now" / "speed.json").write_text(json.dumps(now))
     assert checked(tmp_path / "now", kept) == (0 if says is None else 1)
     printed = capsys.readouterr().out
@@ -109,5 +116,5 @@ def test_the_rasterizer_is_timed_next_to_another_on_its_scene(tmp_path, monkeypa
     row = raster.time_case("150@40x24", script)
     assert row["forward_ms"] > 0
     assert row["forward_backward_ms"] > 0
-    assert row["yardstick_forward_backward_ms"] == 60_000
+    assert row["reference_forward_backward_ms"] == 60_000
     assert row["ratio"] == row["forward_backward_ms"] / 60_000

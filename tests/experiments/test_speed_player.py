@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from experiments import player_speed
+from experiments.speed import player
+from experiments.speed.__main__ import Player
 from tests.gaussians.browser import launched, write_blobs
 
 
@@ -17,8 +18,8 @@ def browser():
 def test_frames_are_timed_and_their_fragments_counted(browser, tmp_path):
     path = tmp_path / "player.html"
     write_blobs(path)
-    args = player_speed.PlayerSpeed((path,), size=64, frames=2, rounds=3, time=0.0)
-    row = player_speed.measured(browser, path, args)
+    args = Player((path,), size=64, frames=2, rounds=3, time=0.0)
+    row = player.measure_page(browser, path, args)
     assert (row["gaussians"], row["moving"], row["size"]) == (4, 1, 64)
     assert len(row["ours_ms"]) == 3
     assert min(row["ours_ms"]) > 0
@@ -34,7 +35,7 @@ def test_frames_are_timed_and_their_fragments_counted(browser, tmp_path):
     expected = math.pi * 2 * math.log(0.95 * 255) * area
     assert work["blended"] == pytest.approx(expected, rel=0.03)
     stored = {"machine": {"cpu": "one", "cores": 2, "browser": "B"}, "rows": [row]}
-    assert "| 16 |" in player_speed.page(stored)
+    assert "| 16 |" in player.page(stored)
 
 
 def test_a_ratio_is_of_the_same_round():
@@ -44,5 +45,5 @@ def test_a_ratio_is_of_the_same_round():
     row |= {"ours_cpu_ms": [80.0] * 3, "gsplat_cpu_ms": [60.0] * 3}
     row |= {"alike_db": 33.0, "work": work | {"large_sort_ms": 90.0}}
     stored = {"machine": {"cpu": "one", "cores": 2, "browser": "B"}, "rows": [row]}
-    page = player_speed.page(stored)
+    page = player.page(stored)
     assert "| 200 | 400 | 1.50 (1.00 to 2.00) | 80 | 60 | 0.75 (0.75 to 0.75) |" in page
