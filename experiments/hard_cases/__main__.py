@@ -1,14 +1,14 @@
-"""Where textbook formulas lose their digits, what ours keep, and what that costs.
+"""Errors and costs of formulas at their hard points, and of their textbook forms.
 
     python -m experiments.hard_cases
     python -m experiments.hard_cases --topics rotations splats --repeats 30
-    python -m experiments.hard_cases --document docs/numerics.md   # renew its table
+    python -m experiments.hard_cases --document docs/numerics.md   # rewrite its table
 
-Every case sweeps a function to its singular point. The table shows the worst errors of
-value, slope and curvature of the textbook's form and of ours against 60-digit
-arithmetic, in float32 and float64, and the time of ours over the textbook's for values
-and for gradients, from interleaved calls over many inputs away from the singular
-point. Saves hard_cases.json and a figure of each case.
+Every case sweeps a function to its singular point. The table shows the largest errors
+of value, gradient and curvature of the textbook form and of the stable one compared
+with 60-digit arithmetic, in float32 and float64, and the ratio of their times for
+values and for gradients, from interleaved calls over many inputs away from the singular
+point. Writes hard_cases.json.
 """
 
 import dataclasses
@@ -70,7 +70,7 @@ class HardCases:
     repeats: int = 15
     """Timed calls of each form, in turn. The table has the medians."""
     out: pathlib.Path | None = None
-    """Folder for the figures and hard_cases.json (default: runs/hard_cases)."""
+    """Folder for hard_cases.json (default: runs/hard_cases)."""
     document: pathlib.Path | None = None
     """Write the table into this Markdown file, between its two markers."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "cpu"
@@ -98,28 +98,27 @@ class CaseResult(NamedTuple):
     """Measurements of one case."""
 
     case: Case
-    test: str  # file and test that hold it
+    test: str  # file and name of its test
     outcomes: dict[str, Outcome]  # by precision
-    # Time of ours over the textbook's in float32, medians of processor time; NaN where
-    # the two do not do the same work.
+    # Ratio of the times of the stable and the textbook form in float32, medians of
+    # processor time; NaN if the two do not do the same work.
     value_cost: float
-    slope_cost: float
+    gradient_cost: float
 
 
 @cli.command(HardCases)
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        chosen = choose(args.topics, args.cases)
+        selection = select(args.topics, args.cases)
         folder = run_folder.new_run_folder(args.out, "hard_cases")
         if args.document is not None:
             report.parts(args.document)  # before the work
         platform.start_jax(args.device)
     rows = []
-    for case, test in chosen:
+    for case, test in selection:
         rows.append(measure(case, test, args.numbers, args.repeats))
         console.say(report.block(rows[-1]))
-        report.save_figure(folder, rows[-1])
     report.save_numbers(folder, rows, args)
     console.say(f"\n{report.summary(rows)}\nsaved in {folder}")
     if args.document is not None:
@@ -128,26 +127,26 @@ def main(args):
     return cli.stored(folder / "hard_cases.json")
 
 
-def choose(topics, names) -> list[tuple[Case, str]]:
+def select(topics, names) -> list[tuple[Case, str]]:
     """Select cases of topics whose name contains one of `names`, with their tests."""
-    chosen = []
+    selection = []
     for topic in topics:
         cases, test = TOPICS[topic]
-        chosen += [
+        selection += [
             (case, f"hard_cases/{test}::test_held")
             for case in cases
             if not names or any(name in case.name for name in names)
         ]
-    if not chosen:
+    if not selection:
         known = [case.name for topic in topics for case in TOPICS[topic][0]]
         raise ValueError(
             f"--cases {' '.join(names)}: no such case; there are {', '.join(known)}"
         )
-    return chosen
+    return selection
 
 
 def measure(case: Case, test: str, numbers: int, repeats: int) -> CaseResult:
-    """Errors in every precision that is held, and what the stable form costs."""
+    """Measure the errors in every precision, and the cost of the stable form."""
     outcomes = {}
     for dtype, bounds in case.bounds.items():
         inputs = hard_case.rounded(case.inputs, dtype)
@@ -180,9 +179,10 @@ def _costs(case, numbers, repeats):
     calls = {}
     for form in ("stable", "textbook"):
         function = getattr(case, form)
-        value, slope = jax.jit(jax.vmap(function)), jax.jit(jax.grad(total(function)))
+        value = jax.jit(jax.vmap(function))
+        gradient = jax.jit(jax.grad(total(function)))
         calls[f"{form} value"] = lambda program=value: program(inputs)
-        calls[f"{form} slope"] = lambda program=slope: program(inputs)
+        calls[f"{form} gradient"] = lambda program=gradient: program(inputs)
     times = clock.compare(calls, repeats=repeats)
     return tuple(
         times[f"stable {name}"].median_cpu / times[f"textbook {name}"].median_cpu

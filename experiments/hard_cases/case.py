@@ -1,7 +1,7 @@
 """Hard cases, and the error of a formula on them.
 
-A case sweeps a function to where its textbook form loses digits, and compares both
-forms with 60-digit arithmetic: value, gradient and, where something differentiates
+A case sweeps a function to the point where its textbook form loses digits, and compares
+both forms with 60-digit arithmetic: value, gradient and, if anything differentiates
 twice, curvature. `hard_cases` prints the table, and tests check the bounds.
 """
 
@@ -15,7 +15,7 @@ import mpmath
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 
-ORDERS = ("value", "slope", "curvature")
+ORDERS = ("value", "gradient", "curvature")
 ROWS = 16  # a program is compiled for a multiple of so many inputs
 
 
@@ -29,31 +29,46 @@ class Case(NamedTuple):
     """
 
     name: str  # "screw near zero"
-    breaks: str  # what breaks in the textbook form
+    breaks: str  # the failure of the textbook form
     formula: str  # the one used
-    axis: str  # what is swept, with its unit: "θ / rad"
-    at: (
-        np.ndarray
-    )  # [points] the sweep, ascending, float64; from both sides of switches
-    inputs: np.ndarray  # [points, n] float64
+    axis: str  # the swept quantity, with its unit: "θ / rad"
+    # [points] the sweep, ascending, float64; from both sides of switches
+    at: np.ndarray
     stable: Callable
     textbook: Callable
     exact: Callable
-    # By precision: largest error of value, slope (and curvature). See `errors`.
+    # By precision: largest error of value, gradient (and curvature). See `errors`.
     bounds: Mapping[str, tuple[float, ...]]
+    along: ArrayLike = 1.0  # [n] inputs are multiples of it, by `at`
+    points: np.ndarray | None = None  # [points, n] float64 instead
     # Errors are relative to the largest entry of the truth, which counts as at least
     # this: by order, for the points where the truth itself is or nears zero.
     floors: tuple[float, ...] = (0.0, 0.0, 0.0)
     switch: str = "none"  # where the formula changes
-    # The precisions and orders that the textbook form fails, by a factor of ten.
-    caught: tuple[tuple[str, str], ...] = (("float32", "slope"),)
     timed: np.ndarray | None = None  # [n] a usual input, to time (default: the middle)
     alike: bool = True  # both forms do the same work, so that their times compare
+
+    @property
+    def inputs(self) -> np.ndarray:
+        """Inputs of the sweep, [points, n]."""
+        if self.points is not None:
+            return self.points
+        return self.at[:, None] * np.atleast_1d(np.asarray(self.along))
 
     @property
     def orders(self) -> int:
         """Number of tested derivatives, including the value."""
         return max(len(bounds) for bounds in self.bounds.values())
+
+
+def sides(edge: float) -> list[float]:
+    """Return an edge and its neighbors in both precisions, ascending."""
+    places = [edge]
+    for kind in (np.float32, np.float64):
+        places += [
+            float(np.nextafter(kind(edge), kind(to))) for to in (-np.inf, np.inf)
+        ]
+    return sorted(places)
 
 
 def constant(values: ArrayLike, dtype: DTypeLike) -> jax.Array:
@@ -62,27 +77,35 @@ def constant(values: ArrayLike, dtype: DTypeLike) -> jax.Array:
 
 
 def derivatives(function: Callable, count: int) -> Callable:
-    """[n] -> the first `count` of value [m], slope [m, n] and curvature [m, n, n].
+    """Differentiate a function of [n].
 
-    The curvature is forward over reverse mode. All of them come of one trace: traced
+    The curvature is forward over reverse mode. One trace gives all derivatives: traced
     one by one they take 1.2 times as long to compile.
+
+    Args:
+      function: The function, with values [m].
+      count: Number of derivatives, including the value.
+
+    Returns:
+      A function with the first `count` of value [m], gradient [m, n] and curvature
+      [m, n, n].
     """
 
     def value(x):
         result = function(x)
         return result, (result,)
 
-    def slope(x):
+    def gradient(x):
         result, pull = jax.vjp(function, x)
         unit = np.eye(result.shape[0], dtype=result.dtype)
-        slopes = jax.vmap(lambda cotangent: pull(cotangent)[0])(unit)
-        return slopes, (result, slopes)
+        gradients = jax.vmap(lambda cotangent: pull(cotangent)[0])(unit)
+        return gradients, (result, gradients)
 
     def curvature(x):
-        bends, lower = jax.jacfwd(slope, has_aux=True)(x)
-        return bends, (*lower, bends)
+        second, lower = jax.jacfwd(gradient, has_aux=True)(x)
+        return second, (*lower, second)
 
-    highest = (value, slope, curvature)[count - 1]
+    highest = (value, gradient, curvature)[count - 1]
     return lambda x: highest(x)[1]
 
 
@@ -102,33 +125,33 @@ def _differences(function, row, order):
     axes = range(len(center))
 
     @functools.cache
-    def after(moves):
-        moved = [x + count * step for x, count in zip(center, moves, strict=True)]
-        return mpmath.matrix(function(moved))
+    def after(steps):
+        place = [x + count * step for x, count in zip(center, steps, strict=True)]
+        return mpmath.matrix(function(place))
 
-    def at(*moves):
-        """There, after so many steps along each of some axes: moves that undo or
-        repeat each other meet."""
-        return after(tuple(sum(sign for i, sign in moves if i == j) for j in axes))
+    def at(*steps):
+        """Evaluate after steps (axis, sign), which may repeat or undo each other."""
+        return after(tuple(sum(sign for i, sign in steps if i == j) for j in axes))
 
     if order == 0:
         return [float(x) for x in at()]
     if order == 1:
-        slopes = [(at((i, 1)) - at((i, -1))) / (2 * step) for i in axes]
-        return [[float(slope[m]) for slope in slopes] for m in range(len(slopes[0]))]
-    bends = {
-        (i, j): _bend(at, i, j) / (4 * step**2) for i in axes for j in axes if i <= j
+        columns = [(at((i, 1)) - at((i, -1))) / (2 * step) for i in axes]
+        return [[float(each[m]) for each in columns] for m in range(len(columns[0]))]
+    second = {
+        (i, j): (_mixed(at, i, j, 1) - _mixed(at, i, j, -1)) / (4 * step**2)
+        for i in axes
+        for j in axes
+        if i <= j
     }
     return [
-        [[float(bends[min(i, j), max(i, j)][m]) for j in axes] for i in axes]
-        for m in range(len(bends[0, 0]))
+        [[float(second[min(i, j), max(i, j)][m]) for j in axes] for i in axes]
+        for m in range(len(second[0, 0]))
     ]
 
 
-def _bend(at, i, j):
-    return (
-        at((i, 1), (j, 1)) - at((i, 1), (j, -1)) - at((i, -1), (j, 1))
-    ) + at((i, -1), (j, -1))  # fmt: skip
+def _mixed(at, i, j, sign):
+    return at((i, sign), (j, 1)) - at((i, sign), (j, -1))
 
 
 def rounded(inputs: np.ndarray, dtype: str) -> np.ndarray:
@@ -159,16 +182,24 @@ def evaluate(
     count: int,
     options: tuple[tuple[str, int | bool], ...] = (),
 ) -> tuple[np.ndarray, ...]:
-    """The first `count` of value, slope and curvature, [points, m, ...] each.
+    """Evaluate a function and its derivatives, jitted over all inputs.
 
-    In that precision, jitted over all inputs, with these options of the compiler.
+    Args:
+      function: The function.
+      inputs: Inputs, [points, n].
+      dtype: Name of the precision.
+      count: Number of derivatives, including the value.
+      options: Options of the compiler.
+
+    Returns:
+      The first `count` of value, gradient and curvature, [points, m, ...] each.
     """
-    given = np.asarray(inputs).astype(jnp.dtype(dtype))
+    rows = np.asarray(inputs).astype(jnp.dtype(dtype))
     # Cases of one function share a program: as many rows, the last one repeated.
-    more = -len(given) % ROWS
-    padded = np.concatenate([given, np.repeat(given[-1:], more, axis=0)])
+    more = -len(rows) % ROWS
+    padded = np.concatenate([rows, np.repeat(rows[-1:], more, axis=0)])
     results = _program(function, count, options)(padded)
-    return tuple(np.asarray(one)[: len(given)] for one in results)
+    return tuple(np.asarray(one)[: len(rows)] for one in results)
 
 
 @functools.cache

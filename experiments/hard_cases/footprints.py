@@ -103,13 +103,12 @@ NEEDLE = Case(
     formula="u = p dx, v = r (dy - k dx); c - b²/a as a sum of squares",
     axis="length / px",
     at=_LENGTHS,
-    inputs=np.array([[*_needle(length), *_OFFSET] for length in _LENGTHS]),
+    points=np.array([[*_needle(length), *_OFFSET] for length in _LENGTHS]),
     stable=_gaussian,
     textbook=_gaussian_textbook,
     exact=_exact_gaussian,
     bounds={"float32": (1e-5, 1e-4), "float64": (1e-14, 1e-13)},
     floors=(1e-3, 1e-3, 0.0),
-    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
     timed=np.array([*_needle(10.0), 3.0, 1.0]),
 )
 
@@ -136,12 +135,11 @@ ANTIALIASED = Case(
     formula="|cross(t1, t2)|² of the rows of T = J W R diag(s); no Σ",
     axis="length over width",
     at=_RATIOS,
-    inputs=np.array([_needle(0.25 * ratio, 0.25) for ratio in _RATIOS]),
+    points=np.array([_needle(0.25 * ratio, 0.25) for ratio in _RATIOS]),
     stable=lambda x: _footprint(x, SHARP).opacity,
     textbook=_antialiased_textbook,
     exact=_exact_antialiased,
     bounds={"float32": (1e-6, 1e-6, 9e-7), "float64": (1e-15, 1e-15, 2e-15)},
-    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
     timed=np.array(_needle(2.5, 0.25)),
 )
 
@@ -189,14 +187,13 @@ FAR_MEAN = Case(
     formula="R (x - c)",
     axis="distance / scene units",
     at=_DISTANCES,
-    inputs=np.array(
+    points=np.array(
         [[*(d * _PLACE), *(d * _PLACE + _BESIDE @ np.eye(3))] for d in _DISTANCES]
     ),
     stable=_mean_px,
     textbook=_mean_px_textbook,
     exact=_exact_mean_px,
     bounds={"float32": (1e-6, 1e-6, 6e-7), "float64": (1e-15, 1e-15, 1e-15)},
-    caught=(("float32", "value"),),
     alike=False,  # a whole footprint against its center
 )
 
@@ -210,12 +207,11 @@ DIRECTION = Case(
     formula="divided by the largest component first",
     axis="|v| / scene units",
     at=_REACHES,
-    inputs=_REACHES[:, None] * _TOWARD,
+    along=_TOWARD,
     stable=harmonics.unit_direction,
     textbook=lambda v: v / jnp.sqrt(jnp.sum(v**2)),
     exact=lambda v: [c / mpmath.sqrt(mpmath.fdot(v, v)) for c in v],
     bounds={"float32": (4e-7, 1e-6), "float64": (1e-15, 2e-15)},
-    caught=(("float32", "value"), ("float32", "slope")),
     timed=_TOWARD,
 )
 

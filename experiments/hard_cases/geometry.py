@@ -63,12 +63,11 @@ FAR_CAMERA = Case(
     formula="R (x - c)",
     axis="distance / scene units",
     at=_DISTANCES,
-    inputs=np.concatenate([_POSITIONS + np.array([0.5, 0.25, 4]), _POSITIONS], axis=1),
+    points=np.concatenate([_POSITIONS + np.array([0.5, 0.25, 4]), _POSITIONS], axis=1),
     stable=_far_pixel,
     textbook=_textbook_far_pixel,
     exact=_exact_far_pixel,
     bounds={"float32": (1e-6, 1e-6, 3e-7), "float64": (2e-15, 2e-15, 1e-15)},
-    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
 )
 
 
@@ -94,12 +93,11 @@ NEAR_PLANE = Case(
     switch=f"slope = {cameras.MAX_SLOPE:g}",
     axis="z / scene units",
     at=_DEPTHS,
-    inputs=np.stack([np.ones(10), np.full(10, -0.5), _DEPTHS], axis=1),
+    points=np.stack([np.ones(10), np.full(10, -0.5), _DEPTHS], axis=1),
     stable=_near_pixel,
     textbook=lambda point: _on_plane(point[:2], point[2]),
     exact=_exact_near_pixel,
     bounds={"float32": (1e-6, 1e-6, 4e-7), "float64": (2e-15, 2e-15, 1e-15)},
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=np.array([1, -0.5, 2]),
 )
 
@@ -136,12 +134,11 @@ LENS_FOLD = Case(
     formula="bracketed Newton, derivative of the implicit function",
     axis="distorted radius",
     at=_BENT,
-    inputs=_BENT[:, None] * np.array([0.6, -0.8]),
+    along=np.array([0.6, -0.8]),
     stable=_undistorted,
     textbook=_fixed_point,
     exact=_exact_undistorted,
     bounds={"float32": (4e-6, 2e-4, 3e-4), "float64": (4e-15, 1e-13, 2e-13)},
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=0.3 * np.array([0.6, -0.8]),
 )
 
@@ -177,12 +174,11 @@ BOX = Case(
     switch=f"component = {rays.PARALLEL:g}",
     axis="component across",
     at=_SLANTS,
-    inputs=np.stack([np.ones(7), -_SLANTS, 0.5 * _SLANTS], axis=1),
+    points=np.stack([np.ones(7), -_SLANTS, 0.5 * _SLANTS], axis=1),
     stable=_span,
     textbook=_slabs,
     exact=_exact_span,
     bounds={"float32": (1e-6, 1e-6), "float64": (2e-15, 2e-15)},
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
 )
 
 CASES = (FAR_CAMERA, NEAR_PLANE, LENS_FOLD, BOX)

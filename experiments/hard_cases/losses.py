@@ -21,8 +21,7 @@ def _sides(switch):
 
 
 def _along(lengths):
-    lengths = np.array(lengths)
-    return {"axis": "|r|", "at": lengths, "inputs": lengths[:, None] * AXIS}
+    return {"axis": "|r|", "at": np.array(lengths), "along": AXIS}
 
 
 def _geman_by_power(r):
@@ -46,12 +45,6 @@ GEMAN = Case(
     exact=lambda r: [2 * _exact_sq(r) / (_exact_sq(r) + 4 * mpmath.mpf(WIDTH) ** 2)],
     bounds=PENALTY | {"bfloat16": (2e-2, 3e-2)},
     floors=(0, 1e-30, 1e-20),
-    caught=(
-        ("float32", "value"),
-        ("float64", "value"),
-        ("float32", "slope"),
-        ("float64", "curvature"),
-    ),
     timed=0.01 * AXIS,
 )
 
@@ -75,7 +68,6 @@ CHARBONNIER = Case(
     textbook=_charbonnier_by_difference,
     exact=_exact_charbonnier,
     bounds=PENALTY,
-    caught=(("float32", "value"), ("float64", "value")),
     timed=0.01 * AXIS,
 )
 
@@ -103,7 +95,6 @@ HUBER = Case(
     textbook=_huber_of_length,
     exact=_exact_huber,
     bounds=PENALTY,
-    caught=(("float32", "slope"), ("float64", "slope")),
     timed=0.01 * AXIS,
 )
 
@@ -117,18 +108,11 @@ PSNR = Case(
     switch="mse = 1e-10",
     axis="mean squared error",
     at=_ERRORS,
-    inputs=_ERRORS[:, None],
     stable=losses.psnr,
     textbook=lambda mse: -10 * jnp.log10(mse + 1e-10),
     exact=lambda mse: [-10 * mpmath.log10(max(mse[0], mpmath.mpf(losses.LEAST_MSE)))],
     bounds={"float32": (1e-6, 1e-6, 6e-7), "float64": (1e-15, 1e-15, 1e-15)},
     floors=(10.0, 0.0, 0.0),
-    caught=(
-        ("float32", "value"),
-        ("float64", "value"),
-        ("float32", "slope"),
-        ("float64", "slope"),
-    ),
     timed=np.array([1e-3]),
 )
 
@@ -164,13 +148,12 @@ NERF_W = Case(
     formula="softplus by logaddexp, β_min added, r / β squared",
     axis="raw β",
     at=_RAW,
-    inputs=np.concatenate([np.tile(_RESIDUAL, (len(_RAW), 1)), _RAW[:, None]], 1),
+    points=np.concatenate([np.tile(_RESIDUAL, (len(_RAW), 1)), _RAW[:, None]], 1),
     stable=_uncertain,
     textbook=_uncertain_textbook,
     exact=_exact_uncertain,
     bounds={"float32": (1e-6, 2e-6, 7e-7), "float64": (2e-15, 5e-15, 2e-13)},
     floors=(1.0, 0.0, 0.0),
-    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
 )
 
 _LIGHT = np.array([0, 1e-30, 1e-6, *_sides(0.0031308), 0.2, 1, 100])
@@ -194,12 +177,10 @@ SRGB = Case(
     switch="light = 0.0031308",
     axis="linear light",
     at=_LIGHT,
-    inputs=_LIGHT[:, None],
     stable=texture.srgb,
     textbook=_srgb_textbook,
     exact=_exact_srgb,
     bounds={"float32": (1e-6, 1e-6, 2e-6), "float64": (2e-15, 2e-15, 2e-15)},
-    caught=(("float32", "slope"), ("float64", "slope")),
     timed=np.array([0.2]),
 )
 

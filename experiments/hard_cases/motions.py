@@ -34,13 +34,12 @@ SPARSITY = Case(
     formula="1e-3, which moves nothing, added to the denominator",
     axis="largest coefficient",
     at=_SIZES,
-    inputs=_SIZES[:, None] * _SHARES,
+    along=_SHARES,
     stable=_sparsity,
     textbook=_quotient,
     exact=_exact_sparsity,
     bounds={"float32": (1e-6, 2e-6), "float64": (2e-15, 4e-15)},
     floors=(1.0, 1.0, 0.0),
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
 )
 
 _LOW, _HIGH = temporal_opacity.LOG_WIDTH_RANGE
@@ -70,13 +69,12 @@ VISIBLE = Case(
     switch="-9 and 9",
     axis="logarithm of the width, films",
     at=_WIDTHS[:, 1],
-    inputs=_WIDTHS,
+    points=_WIDTHS,
     stable=_visible,
     textbook=lambda x: jnp.exp(-jnp.square(x[0] / jnp.exp(x[1])))[None],
     exact=_exact_visible,
     bounds={"float32": (2e-6, 4e-6), "float64": (2e-15, 4e-15)},
     floors=(1.0, 1.0, 0.0),
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=np.array([0.4, 0.0]),
 )
 
@@ -88,13 +86,11 @@ UNREST = Case(
     switch="1",
     axis="feature",
     at=_PLACES,
-    inputs=_PLACES[:, None],
     stable=lambda x: planes.l1_time_planes(x[None, None])[None],
     textbook=lambda x: jnp.mean(jnp.abs(1 - x))[None],
     exact=lambda x: [abs(x[0] - 1)],
     bounds={"float32": (1e-6, 1e-6), "float64": (1e-15, 1e-15)},
     floors=(0.0, 1.0, 0.0),
-    caught=(("float32", "slope"), ("float64", "slope")),
 )
 
 _ROW, _SLANT = np.array([0.0, 1.0, 2.0]), np.array([0.0, 0.125, -0.25])
@@ -130,13 +126,12 @@ SHARES = Case(
     switch="-20 and 15",
     axis="distance, in distances of nodes",
     at=np.repeat(_AWAY, len(_RADII)),
-    inputs=np.array([[away, radius] for away in _AWAY for radius in _RADII]),
+    points=np.array([[away, radius] for away in _AWAY for radius in _RADII]),
     stable=_shares,
     textbook=_quotients,
     exact=_exact_shares,
     bounds={"float32": (1e-4, 1e-4), "float64": (1e-12, 1e-12)},
     floors=(1.0, 1.0, 0.0),
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=np.array([0.4, 0.0]),
 )
 
@@ -168,13 +163,12 @@ BITS = Case(
     axis="distance, deviations",
     at=np.repeat(_FAR, len(_STEPS)),
     # Where a step is wide, from its end on.
-    inputs=np.array([[away + step // 2, step] for away in _FAR for step in _STEPS]),
+    points=np.array([[away + step // 2, step] for away in _FAR for step in _STEPS]),
     stable=_bits,
     textbook=_log_of_difference,
     exact=_exact_bits,
     bounds={"float32": (2e-5, 2e-3), "float64": (1e-6, 1e-5)},
     floors=(1.0, 1.0, 0.0),
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=np.array([0.4, 1.0]),
 )
 

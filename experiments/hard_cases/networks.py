@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
-from experiments.hard_cases.case import Case, constant
+from experiments.hard_cases.case import Case, constant, sides
 from gaussians_jax.optim import optimizer
 from nerfies_jax.nn import bsplines, kan
 from nerfies_jax.nn.kan import KAN, KANLayer, KANSpec, Kernels
@@ -48,16 +48,8 @@ def _exact_edge(x, first=0):
     ]
 
 
-def _sides(edge):
-    """The neighbors of an edge in both precisions, and itself."""
-    places = [edge]
-    for kind in (np.float32, np.float64):
-        places += [float(np.nextafter(kind(edge), kind(to))) for to in (-9e9, 9e9)]
-    return sorted(places)
-
-
 _PLACES = np.array(
-    [-1e4, -50, -5, -1, *_sides(0.0), 0.3, 3.5, *_sides(7.0), 8, 12, 57, 1e4]
+    [-1e4, -50, -5, -1, *sides(0.0), 0.3, 3.5, *sides(7.0), 8, 12, 57, 1e4]
 )
 OUTSIDE = Case(
     name="KAN input outside its grid",
@@ -66,7 +58,6 @@ OUTSIDE = Case(
     switch="the ends of the grid",
     axis="x, grid 0 to 7",
     at=_PLACES,
-    inputs=_PLACES[:, None],
     stable=lambda x: _edge(EDGE, x),
     textbook=_gaussians,
     exact=lambda x: _exact_edge(x[0]),
@@ -75,13 +66,6 @@ OUTSIDE = Case(
         "float32": (1e-6, 2e-6, 6e-5),
         "float64": (2e-15, 4e-15, 1e-13),
     },
-    caught=(
-        ("bfloat16", "value"),
-        ("float32", "value"),
-        ("float64", "value"),
-        ("float32", "slope"),
-        ("float64", "slope"),
-    ),
     timed=np.array([3.3]),
 )
 
@@ -100,13 +84,11 @@ FAR_AWAY = Case(
     formula="the square of the difference",
     axis="x",
     at=_OFFSETS,
-    inputs=_OFFSETS[:, None],
     stable=lambda x: _edge(FAR_EDGE, x),
     textbook=_expanded,
     exact=lambda x: _exact_edge(x[0], 1024),
     bounds={"float32": (4e-7, 1e-6, 2e-6), "float64": (1e-15, 2e-15, 4e-15)},
     floors=(0, 0.3, 1),
-    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
     timed=np.array([1027.3]),
 )
 
@@ -149,7 +131,7 @@ WIDTH = Case(
     switch="s = ±10",
     axis="s, the width's logarithm",
     at=_WIDTHS[:, 1],
-    inputs=_WIDTHS,
+    points=_WIDTHS,
     stable=_trained,
     textbook=_by_variance,
     exact=_exact_trained,
@@ -159,12 +141,6 @@ WIDTH = Case(
         "float64": (2e-15, 4e-15, 3e-15),
     },
     floors=(1, 1, 0),
-    caught=(
-        ("bfloat16", "value"),
-        ("float32", "value"),
-        ("float32", "slope"),
-        ("float64", "slope"),
-    ),
     timed=np.array([3.3, 0.1]),
 )
 
@@ -200,13 +176,11 @@ NORM = Case(
     formula="mean square of what is centered, + 1e-6",
     axis="spread about 64",
     at=_SPREADS,
-    inputs=_SPREADS[:, None],
     stable=_standardized,
     textbook=_by_moments,
     exact=_exact_standardized,
     bounds={"float32": (1e-6, 1e-5), "float64": (1e-15, 1e-14)},
     floors=(1e-30, 1),
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),
     timed=np.array([1.0]),
 )
 
@@ -227,7 +201,7 @@ def _exact_spline(x):
 
 
 _FROM_KNOT = np.array(
-    [-1.999, -1.5, -1, -0.25, 0.5, *_sides(1.0), 1.25, 1.9, 1.99, 1.999]
+    [-1.999, -1.5, -1, -0.25, 0.5, *sides(1.0), 1.25, 1.9, 1.99, 1.999]
 )
 SPLINE = Case(
     name="cubic B-spline where it ends",
@@ -236,17 +210,10 @@ SPLINE = Case(
     switch="|x| = 1",
     axis="x in intervals",
     at=_FROM_KNOT,
-    inputs=_FROM_KNOT[:, None],
     stable=bsplines.cubic,
     textbook=_truncated_cubes,
     exact=_exact_spline,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 2e-15)},
-    caught=(
-        ("float32", "value"),
-        ("float32", "slope"),
-        ("float64", "value"),
-        ("float64", "slope"),
-    ),
     timed=np.array([1.3]),
 )
 
@@ -277,12 +244,10 @@ LENGTH = Case(
     switch="t = 999.5",
     axis="updates",
     at=_UPDATES,
-    inputs=_UPDATES[:, None],
     stable=lambda x: optimizer.moment_length(x, B2),
     textbook=_length_as_printed,
     exact=_exact_length,
     bounds={"float32": (4e-7,), "float64": (2e-15,)},
-    caught=(("float32", "value"), ("float64", "value")),
     timed=np.array([40.0]),
 )
 
@@ -320,12 +285,11 @@ NEWBORN = Case(
     formula="a count for each row",
     axis="updates since birth",
     at=_AGES[:, 0],
-    inputs=_AGES,
+    points=_AGES,
     stable=_nth_update,
     textbook=lambda x: _update_at(1000 + x[:1], x),
     exact=_exact_update,
     bounds={"float32": (1e-6,), "float64": (2e-15,)},
-    caught=(("float32", "value"), ("float64", "value")),
     timed=np.array([10, 1e-3]),
 )
 
@@ -346,7 +310,7 @@ SIZE = NEWBORN._replace(
     formula="eps 1e-15",
     axis="slope",
     at=_SLOPES[:, 1],
-    inputs=_SLOPES,
+    points=_SLOPES,
     textbook=lambda x: _update_at(x[:1], x),
     bounds={"float32": (3e-6,), "float64": (2e-15,)},
     floors=(1,),  # of a full step; squares below 1e-38 are 0 in float32

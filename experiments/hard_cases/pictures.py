@@ -43,15 +43,14 @@ def _exact_amplitudes(pixels):
 AMPLITUDE = Case(
     name="Fourier amplitudes of an almost black picture",
     breaks="√(re² + im²) is 0 below 1e-19 (f32), its slope 0/0",
-    formula="abs of the complex number; slope 0 where it vanishes",
+    formula="abs of the complex number; gradient 0 where it vanishes",
     axis="contrast",
     at=_CONTRAST,
-    inputs=_CONTRAST[:, None] * _PATTERN,
+    along=_PATTERN,
     stable=lambda x: spectral.amplitudes(x.reshape(2, 3, 1)).reshape(-1),
     textbook=_amplitudes_textbook,
     exact=_exact_amplitudes,
     bounds={"float32": (1e-6, 2e-6), "float64": (2e-15, 5e-15)},
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),
     timed=_PATTERN,
 )
 
@@ -118,13 +117,12 @@ DSSIM = Case(
     formula="a + b - ab from the window of image - target, about the target's mean",
     axis="row of level, offset, contrast",
     at=np.arange(len(_LEVELS), dtype=float),
-    inputs=np.array(_LEVELS),
+    points=np.array(_LEVELS),
     stable=lambda x: losses.dssim_map(*_pair(x), padding="valid").reshape(1),
     textbook=_dssim_textbook,
     exact=_exact_dssim,
     bounds={"float32": (1e-6, 5e-4), "float64": (2e-15, 5e-13)},
     floors=(1e-3, 1e-3, 0.0),
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),
 )
 
 
@@ -149,7 +147,7 @@ HAAR = Case(
     formula="differences of neighbors first",
     axis="contrast at level 1000.3",
     at=_SOFT,
-    inputs=1000.3 + _SOFT[:, None] * _QUAD,
+    points=1000.3 + _SOFT[:, None] * _QUAD,
     stable=_bands,
     textbook=_bands_textbook,
     exact=lambda p: [
@@ -158,7 +156,6 @@ HAAR = Case(
         (p[0] + p[3] - p[1] - p[2]) / 2,
     ],
     bounds={"float32": (2e-7, 2e-7), "float64": (4e-16, 4e-16)},
-    caught=(("float32", "value"),),
 )
 
 
@@ -192,14 +189,13 @@ CORRELATION = Case(
     formula="half the mean square of the difference of standardized depths",
     axis="departure from the truth",
     at=_OFF,
-    inputs=_DEPTHS + _OFF[:, None] * _WRONG,
+    points=_DEPTHS + _OFF[:, None] * _WRONG,
     stable=lambda x: depth.correlation(x, _truth_like(x), constant(np.ones(6), bool))[
         None
     ],
     textbook=_pearson_textbook,
     exact=_exact_pearson,
     bounds={"float32": (1e-3, 1e-3, 8e-7), "float64": (1e-11, 1e-11, 2e-15)},
-    caught=(("float32", "value"),),
 )
 
 CASES = (AMPLITUDE, DSSIM, HAAR, CORRELATION)

@@ -46,12 +46,11 @@ LOGARITHM = Case(
     switch=f"tan²(θ/2) = {quaternion.SERIES_BELOW:g}; sign of w at π",
     axis="θ / rad",
     at=_BOTH,
-    inputs=_half_turns(_BOTH),
+    points=_half_turns(_BOTH),
     stable=quaternion.log,
     textbook=_textbook_log,
     exact=_exact_log,
     bounds={"float32": (1e-6, 1e-6, 3e-6), "float64": (2e-15, 2e-15, 3e-15)},
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),
     timed=_half_turns([1.0])[0],
 )
 
@@ -85,13 +84,12 @@ MATRIX_LOGARITHM = Case(
     switch="largest pivot",
     axis="θ / rad",
     at=_ROUND,
-    inputs=_ROUND[:, None] * AXIS,
+    along=AXIS,
     stable=lambda w: lie.log_so3(_turned(w)),
     textbook=_textbook_matrix_log,
     exact=_exact_wrapped,
     bounds={"float32": (1e-6, 1e-6, 2e-6), "float64": (2e-15, 2e-15, 2e-15)},
     floors=(0, 0, 1),
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=AXIS,
 )
 
@@ -127,13 +125,12 @@ LENGTH = Case(
     switch="largest component 1.2e-38",
     axis="|q|",
     at=_LENGTHS,
-    inputs=_LENGTHS[:, None] * _half_turns([2.0]),
+    along=_half_turns([2.0]),
     stable=lambda q: quaternion.to_matrix(q).reshape(9),
     textbook=_textbook_matrix,
     exact=_exact_matrix,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 2e-15)},
     floors=(0, 1e-31, 1e-37),  # 1 / 2e38 and 1 / 1e60 are zero in float32
-    caught=(("float32", "value"), ("float32", "curvature"), ("float64", "slope")),
     timed=_half_turns([2.0])[0],
 )
 
@@ -180,12 +177,11 @@ SLERP = Case(
     switch=f"tan²(θ/2) = {quaternion.SERIES_BELOW:g}; shorter way from π on",
     axis="θ between / rad",
     at=_APART,
-    inputs=_APART[:, None] * AXIS,
+    along=AXIS,
     stable=_slerp,
     textbook=_textbook_slerp,
     exact=_exact_slerp,
     bounds={"float32": (1e-6, 1e-6, 4e-5), "float64": (2e-15, 2e-15, 3e-14)},
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),
     timed=AXIS,
 )
 

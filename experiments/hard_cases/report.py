@@ -1,4 +1,4 @@
-"""Tables, figures and the page of `experiments.hard_cases`."""
+"""Tables and the page of `experiments.hard_cases`."""
 
 import re
 
@@ -8,18 +8,9 @@ from experiments.hard_cases.case import ORDERS
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.metrics import clock
 from nerfies_jax.metrics.clock import Metric
-from nerfies_jax.visualization import figures
 
 BEGIN = "<!-- begin: python -m experiments.hard_cases -->"
 END = "<!-- end: python -m experiments.hard_cases -->"
-LEAST, MOST = 1e-18, 1e6  # errors outside are drawn at the edge of a figure
-COLORS = {"stable": "#0a5fb4", "textbook": "#c4501b"}
-LINES = {"float32": "-", "float64": "--", "bfloat16": ":"}
-
-
-def worst(values) -> float:
-    """Return the largest error of a sweep, infinite if any is not finite."""
-    return float(np.max(values))
 
 
 def number(values) -> str:
@@ -50,13 +41,13 @@ def costs(row) -> str:
     """Format costs, as in "0.21, 0.47"."""
     if not row.case.alike:
         return "not comparable"
-    return f"{row.value_cost:.2f}, {row.slope_cost:.2f}"
+    return f"{row.value_cost:.2f}, {row.gradient_cost:.2f}"
 
 
 def summary(rows) -> str:
     """Summarize the table in two sentences."""
     broken = sum(
-        any(worst(x) > 1e-2 for o in row.outcomes.values() for x in o.textbook)
+        any(np.max(x) > 1e-2 for o in row.outcomes.values() for x in o.textbook)
         for row in rows
     )
     verdict = (
@@ -67,12 +58,12 @@ def summary(rows) -> str:
     if not timed:
         return verdict
     value = np.median([row.value_cost for row in timed])
-    slope = np.median([row.slope_cost for row in timed])
-    dear = max(timed, key=lambda row: row.slope_cost)
+    gradient = np.median([row.gradient_cost for row in timed])
+    costly = max(timed, key=lambda row: row.gradient_cost)
     return (
         f"{verdict}\nMedian time of ours over the textbook's: value {value:.2f}, "
-        f"gradient {slope:.2f}; dearest gradient {dear.slope_cost:.2f} "
-        f"({dear.case.name})."
+        f"gradient {gradient:.2f}; most expensive gradient {costly.gradient_cost:.2f} "
+        f"({costly.case.name})."
     )
 
 
@@ -145,46 +136,12 @@ def save_numbers(folder, rows, args) -> None:
         for dtype, outcome in row.outcomes.items():
             for name, ours, theirs in zip(ORDERS, *outcome, strict=False):
                 stem = f"{key}.{dtype}.{name}"
-                metrics.append(Metric(f"{stem}.ours", worst(ours), "", "lower"))
-                metrics.append(Metric(f"{stem}.textbook", worst(theirs), "", "lower"))
-        measured = {"value": row.value_cost, "gradient": row.slope_cost}
+                metrics.append(Metric(f"{stem}.ours", float(np.max(ours)), "", "lower"))
+                metrics.append(
+                    Metric(f"{stem}.textbook", float(np.max(theirs)), "", "lower")
+                )
+        measured = {"value": row.value_cost, "gradient": row.gradient_cost}
         for name, cost in measured.items() if row.case.alike else ():
             metrics.append(Metric(f"{key}.{name}_cost", cost, "", "lower", 0.25))
     about = {"numbers": args.numbers, "repeats": args.repeats, **clock.machine()}
     clock.write_metrics(folder / "hard_cases.json", metrics, about)
-
-
-def save_figure(folder, row) -> None:
-    """Errors over the sweep, one panel for value, slope and curvature."""
-    orders = row.case.orders
-    figure = figures.new_figure(figsize=(4.2 * orders, 3.4), layout="constrained")
-    panels = figure.subplots(1, orders, squeeze=False)[0]
-    places = np.arange(len(row.case.at))
-    for order, panel in enumerate(panels):
-        for dtype, outcome in row.outcomes.items():
-            for form, errors in zip(("stable", "textbook"), outcome, strict=True):
-                if order < len(errors):
-                    shown = np.clip(errors[order], LEAST, MOST)
-                    panel.semilogy(
-                        places,
-                        shown,
-                        LINES[dtype],
-                        color=COLORS[form],
-                        marker=".",
-                        label=f"{'ours' if form == 'stable' else form}, {dtype}",
-                    )
-        panel.set_title(ORDERS[order], loc="left", fontsize=10)
-        panel.set_xlabel(row.case.axis)
-        every = max(1, len(places) // 7)
-        panel.set_xticks(places[::every])
-        panel.set_xticklabels(
-            [f"{x:.3g}" for x in row.case.at[::every]], rotation=40, fontsize=8
-        )
-        panel.set_ylim(LEAST / 3, MOST * 3)
-        panel.grid(alpha=0.3)
-    panels[0].set_ylabel("error / largest entry of the truth")
-    panels[-1].legend(fontsize=7)
-    figure.suptitle(f"{row.case.name} (top edge: not finite)", fontsize=11)
-    name = re.sub(r"[^a-z0-9]+", "-", row.case.name.lower()).strip("-")
-    with replaced_file(folder / f"{name}.png") as file:
-        figure.savefig(file, dpi=110, format="png")

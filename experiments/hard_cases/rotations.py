@@ -55,12 +55,11 @@ SCREW = Case(
     switch=f"|w|² = {SERIES_BELOW:g}",
     axis="θ / rad",
     at=_ANGLES,
-    inputs=_ANGLES[:, None] * AXIS,
+    along=AXIS,
     stable=_screw,
     textbook=_rodrigues,
     exact=_exact_screw,
     bounds={"float32": (1e-6, 2e-6, 4e-6), "float64": (2e-15, 5e-15, 1e-14)},
-    caught=(("float32", "slope"), ("float32", "curvature"), ("float64", "curvature")),
     timed=0.3 * AXIS,
 )
 
@@ -137,12 +136,11 @@ TURN = Case(
     switch=f"|w|² = {SERIES_BELOW:g}",
     axis="θ / rad",
     at=_TURNS,
-    inputs=_screws(_TURNS, 0.0),
+    points=_screws(_TURNS, 0.0),
     stable=_displaced,
     textbook=_displaced_textbook,
     exact=_exact_displaced,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 3e-15)},
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=np.array([*(0.3 * AXIS), 0.0]),
 )
 
@@ -153,12 +151,11 @@ SHIFT = Case(
     formula="Stumpff functions of |w|²; v enters linearly",
     axis="speed / scene units",
     at=_SPEEDS,
-    inputs=_screws(1e-4, _SPEEDS),
+    points=_screws(1e-4, _SPEEDS),
     stable=_displaced,
     textbook=_displaced_textbook,
     exact=_exact_displaced,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 2e-15)},
-    caught=(("float32", "slope"), ("float32", "curvature"), ("float64", "slope")),
     timed=np.array([*(0.3 * AXIS), 1.0]),
 )
 
@@ -190,12 +187,11 @@ INVERSE_JACOBIAN = Case(
     switch=f"|w|² = {SERIES_BELOW:g}",
     axis="θ / rad",
     at=_TO_TURN,
-    inputs=_TO_TURN[:, None] * AXIS,
+    along=AXIS,
     stable=_inverse_jacobian,
     textbook=_textbook_inverse_jacobian,
     exact=_exact_inverse_jacobian,
     bounds={"float32": (1e-6, 2e-6, 3e-6), "float64": (6e-15, 1e-14, 3e-14)},
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "slope")),
     timed=0.3 * AXIS,
 )
 
@@ -254,12 +250,11 @@ COUPLING = Case(
     switch=f"|w|² = {SERIES_BELOW:g}",
     axis="θ / rad",
     at=_TO_HALF,
-    inputs=_TO_HALF[:, None] * AXIS,
+    along=AXIS,
     stable=_coupling,
     textbook=_textbook_coupling,
     exact=_exact_coupling,
     bounds={"float32": (2e-6, 2e-6, 3e-6), "float64": (5e-15, 5e-15, 4e-15)},
-    caught=(("float32", "value"), ("float32", "slope"), ("float64", "value")),
     timed=0.3 * AXIS,
 )
 

@@ -105,12 +105,11 @@ LONG_LIST = Case(
     switch="alpha = 1/255 (cut) and 0.99 (clamp)",
     axis="alpha",
     at=_ALPHAS,
-    inputs=np.stack([np.full(len(_ALPHAS), 0.25), _ALPHAS], axis=1),
+    points=np.stack([np.full(len(_ALPHAS), 0.25), _ALPHAS], axis=1),
     stable=_pixel,
     textbook=_pixel_textbook,
     exact=_exact_pixel,
     bounds={"float32": (2e-6, 2e-4), "float64": (5e-15, 1e-12)},
-    caught=(("float32", "slope"), ("float64", "slope")),
     alike=False,  # a whole rasterizer against one product
 )
 
@@ -139,13 +138,11 @@ HALVED = Case(
     switch="logit -20",
     axis="logit",
     at=_LOGITS,
-    inputs=_LOGITS[:, None],
     stable=densification.halve_opacity,
     textbook=_halved_textbook,
     exact=_exact_halved,
     bounds={"float32": (1e-6, 1e-6), "float64": (1e-14, 1e-14)},
     floors=(1.0, 0.0, 0.0),
-    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
 )
 
 
@@ -180,12 +177,10 @@ LOG_SCALE = Case(
     switch="-20 and 15",
     axis="log-scale",
     at=_LOGS,
-    inputs=_LOGS[:, None],
     stable=_variance,
     textbook=lambda s: jnp.exp(s) ** 2,
     exact=_exact_variance,
     bounds={"float32": (3e-6, 3e-6, 4e-7), "float64": (1e-14, 1e-14, 2e-15)},
-    caught=(("float32", "value"), ("float64", "value"), ("float32", "slope")),
     alike=False,  # all of a row is activated, not one scale
 )
 
@@ -235,12 +230,10 @@ RELOCATION = Case(
     formula="integral of what n copies cover, all terms positive; expm1, log1p",
     axis="opacity",
     at=_OPACITIES,
-    inputs=_OPACITIES[:, None],
     stable=_spread,
     textbook=_spread_textbook,
     exact=_exact_spread,
     bounds={"float32": (2e-6,), "float64": (1e-13,)},
-    caught=(("float32", "value"), ("float64", "value")),
     timed=np.array([0.5]),
 )
 
@@ -271,14 +264,13 @@ ACCELERATION = Case(
     formula="(p₊ - p) - (p - p₋), each exact for close places",
     axis="scene units per interval",
     at=_SPEEDS,
-    inputs=np.concatenate(
+    points=np.concatenate(
         [_FROM + _SPEEDS[:, None] * share * _MOVE for share in (-1.0, 0.0, 1.25)], 1
     ),
     stable=_bend,
     textbook=_bend_textbook,
     exact=_exact_bend,
     bounds={"float32": (1e-6, 1e-6), "float64": (1e-15, 1e-15)},
-    caught=(("float32", "value"),),
 )
 
 CASES = (LONG_LIST, HALVED, LOG_SCALE, RELOCATION, ACCELERATION)

@@ -1,4 +1,4 @@
-"""The table of hard cases: a cheap room from the command line to the page."""
+"""The table of hard cases, from the command line to the page."""
 
 import json
 import pathlib
@@ -38,21 +38,21 @@ def test_the_page_has_a_row_of_every_case_and_no_other():
     assert rows == [[cell.replace("|", r"\|") for cell in row] for row in told]
 
 
-def test_textbook_forms_miss_the_bounds_by_far():
-    """The test of each case can fail: the page has what its textbook form is off by."""
+def test_textbook_forms_miss_a_bound_by_far():
+    """The test of each case can fail: the page has the errors of its textbook form."""
     cases = [case for cases, _ in TOPICS.values() for case in cases]
     for case, row in zip(cases, rows_of_the_page(), strict=True):
-        measured = dict(zip(("float32", "float64"), row[3:5], strict=True))
-        for dtype, order in (pair for pair in case.caught if pair[0] in measured):
-            textbook = re.search(rf"{order} (.*?) →", measured[dtype])[1]
-            if not textbook.startswith("not finite"):
-                bound = case.bounds[dtype][hard_case.ORDERS.index(order)]
-                # The page rounds to one digit.
-                assert float(textbook) > 9 * bound, (case.name, dtype, order)
+        factors = []
+        for dtype, cell in zip(("float32", "float64"), row[3:5], strict=True):
+            for name, bound in zip(hard_case.ORDERS, case.bounds[dtype], strict=False):
+                error = re.search(rf"{name} (.*?) →", cell)[1]
+                finite = not error.startswith("not finite")
+                factors.append(float(error) / bound if finite else np.inf)
+        assert max(factors) > 9, case.name  # the page rounds to one digit
 
 
 @pytest.mark.full
-def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys):
+def test_the_command_measures_prints_and_renews_the_page(tmp_path, capsys):
     page, out = tmp_path / "page.md", tmp_path / "out"
     page.write_text(PAGE)
     words = ["--topics", "encodings", "--cases", "window", "--numbers", "10"]
@@ -67,9 +67,8 @@ def test_the_command_measures_prints_draws_and_renews_the_page(tmp_path, capsys)
     assert "old" not in text
     assert "test_encoding_cases.py::test_held[window of a band that opens-…]" in text
     stored = json.loads((out / "hard_cases.json").read_text())["metrics"]
-    key = "window_of_a_band_that_opens.float32.slope"
+    key = "window_of_a_band_that_opens.float32.gradient"
     assert stored[f"{key}.ours"]["value"] < 1e-5 < stored[f"{key}.textbook"]["value"]
-    assert (out / "window-of-a-band-that-opens.png").stat().st_size > 5000
 
 
 def test_errors_are_of_the_largest_entry_and_never_forgiving():

@@ -1,4 +1,4 @@
-"""What every hard case is held to, however it came by its numbers."""
+"""Checks that every hard case passes."""
 
 import functools
 
@@ -56,7 +56,7 @@ class _Key:
 
 
 def hold(case: Case, dtype: str) -> None:
-    """Value and derivatives within their bounds."""
+    """Check that value and derivatives are within their bounds."""
     count = len(case.bounds[dtype])
     with jax.enable_x64(dtype == "float64"):
         every = hard_case.evaluate(case.stable, case.inputs, dtype, count)
