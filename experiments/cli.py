@@ -53,8 +53,8 @@ Scene = Literal[
 SCENES: tuple[str, ...] = typing.get_args(Scene)
 # Arguments of the library that have an option of the same name; "..." is any value.
 ARGUMENTS = (
-    *("device", "heldout", "max_side", "missing", "out", "overwrite"),
-    *("scene", "train"),
+    *("checkpoint_every", "device", "evaluate_every", "factor", "heldout", "max_side"),
+    *("missing", "out", "overwrite", "scene", "seconds", "train"),
 )
 _ARGUMENT = re.compile(
     rf"\b(?P<name>{'|'.join(ARGUMENTS)})=(?P<value>\"[^\"]*\"|\.\.\.|[^\s;,)]*[^\s;:,.)])"

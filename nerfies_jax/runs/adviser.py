@@ -1,4 +1,4 @@
-"""Presets and overrides recommended for a capture, one for each representation."""
+"""Recommended preset and overrides for a capture, for each representation."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from nerfies_jax.runs.config import RunConfig
 
 @dataclasses.dataclass(frozen=True)
 class Advice:
-    """A preset with overrides, and notes on undecided or impossible requests."""
+    """A preset with overrides, and notes on undecided or unsupported effects."""
 
     representation: str
     preset: str
@@ -22,7 +22,7 @@ class Advice:
         """Return the arguments of `experiments.reconstruct` for this advice.
 
         Returns:
-          Words of a command line.
+          Part of a command line.
         """
         words = f"--preset {self.preset}"
         return f"{words} --set {' '.join(self.overrides)}" if self.overrides else words
@@ -43,8 +43,10 @@ def advise(
     Args:
       findings: Findings about the capture.
       representation: The representation.
-      full: True for the sizes of the papers, False for sizes that a CPU can train.
-      family: A preset without "-small", kept if it supports the required effects.
+      full: True for models of the size in the papers, False for models that a CPU can
+        train.
+      family: Name of a preset without "-small", which is kept if it supports the
+        required effects.
 
     Returns:
       The recommendation.
@@ -54,7 +56,7 @@ def advise(
     """
     wanted = {one.effect: one.wanted for one in findings}
     notes = [
-        f"{effect}: cannot tell, the preset's own setting stays"
+        f"{effect}: undecided, the setting of the preset is kept"
         for effect, choice in wanted.items()
         if choice is None
     ]
@@ -76,7 +78,7 @@ def advise_all(findings: tuple[Finding, ...], full: bool = False) -> list[Advice
 
     Args:
       findings: Findings about the capture.
-      full: True for the sizes of the papers.
+      full: True for models of the size in the papers.
 
     Returns:
       One recommendation for each representation.
@@ -104,7 +106,7 @@ def advise_for(findings: tuple[Finding, ...], preset: str) -> Advice:
 
 
 def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]]:
-    """Choose the preset of a config that names none, by tracks in the capture.
+    """Choose a preset from the point tracks of a capture.
 
     Args:
       config: Config without a preset.
@@ -114,11 +116,13 @@ def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]
       The config with preset and overrides, and lines of text with the reasons.
 
     Raises:
-      ValueError: If no installed representation chooses presets.
+      ValueError: If no installed representation can choose a preset.
     """
     choosing = representations.choosing()
     if not choosing:
-        raise ValueError("name a preset: nothing that is installed has a default one")
+        raise ValueError(
+            "preset=None: no installed representation can choose a preset; set one"
+        )
     _, choose = choosing[0]
     choice = choose(capture)
     words = [choice.preset, *(["--set"] if choice.overrides else []), *choice.overrides]
@@ -129,16 +133,17 @@ def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]
 
 
 def follow(
-    config: RunConfig, own: tuple[str, ...], findings: tuple[Finding, ...]
+    config: RunConfig, user_overrides: tuple[str, ...], findings: tuple[Finding, ...]
 ) -> tuple[RunConfig, list[str]]:
     """Apply the recommendation to a config.
 
-    The requested preset determines the representation, the family and the size. Other
-    overrides of the config belong to that preset, and stay only with it.
+    The requested preset determines the representation, the family and the size. The
+    other overrides of the config were chosen for that preset and are dropped if another
+    preset is recommended.
 
     Args:
       config: The config.
-      own: The user's own overrides, which come last.
+      user_overrides: Overrides set by the user, which take precedence.
       findings: Findings about the capture.
 
     Returns:
@@ -150,8 +155,9 @@ def follow(
         f"effects: {advice.arguments()}",
     ]
     lines += [f"note: {note}" for note in advice.notes]
-    kept = config.overrides if advice.preset == config.preset else own
+    same_preset = advice.preset == config.preset
+    overrides = config.overrides if same_preset else user_overrides
     changed = dataclasses.replace(
-        config, preset=advice.preset, overrides=(*advice.overrides, *kept)
+        config, preset=advice.preset, overrides=(*advice.overrides, *overrides)
     )
     return changed, lines

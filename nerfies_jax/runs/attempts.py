@@ -1,4 +1,4 @@
-"""Independent writing of products, so that a full disk loses as few as possible."""
+"""Independent writing of products, so that a full disk affects as few as possible."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -9,26 +9,29 @@ Result = TypeVar("Result")
 
 
 class Attempts:
-    """Calls functions that write products, and remembers failures.
+    """Calls functions that write products, and collects their failures.
+
+    Args:
+      all_or_none: True to raise the first failure instead, because the products must
+        replace earlier ones together.
 
     Attributes:
       failures: One line for each product that was not written, with its path and the
         reason.
     """
 
-    def __init__(self, together: bool):
-        """`together` raises the first failure: the products replace earlier ones."""
-        self._together = together
+    def __init__(self, all_or_none: bool):
+        self._all_or_none = all_or_none
         self.failures: list[str] = []
 
     def __call__(
-        self, otherwise: Result, save: Callable[..., Result], *arguments, **named
+        self, fallback: Result, save: Callable[..., Result], *arguments
     ) -> Result:
-        """Return what `save` returns, or `otherwise` where it could not write."""
+        """Return the result of `save`, or `fallback` if it could not write."""
         try:
-            return save(*arguments, **named)
+            return save(*arguments)
         except (OSError, CaptureError) as error:
-            if self._together:
+            if self._all_or_none:
                 raise
             self.failures.append(str(error))
             return otherwise

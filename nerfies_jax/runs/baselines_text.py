@@ -1,10 +1,8 @@
-"""Text about the baselines of a run, with advice if it is below them."""
+"""Text about the baselines of a run, with a warning if it scores below them."""
 
 from collections.abc import Mapping
 
-LONGER = "train for more steps or use another preset"
-
-# Rounding alone can cost a static model a little: -0.0017 dB was measured.
+# A static model loses a little to rounding: -0.0017 dB was measured.
 _WORSE_DB = -0.05
 
 
@@ -20,47 +18,53 @@ def lines(numbers: Mapping[str, float]) -> list[str]:
     parts = []
     if "baseline.neighbor_mean" in numbers:
         parts.append(
-            f"{numbers['baseline.neighbor_mean']:.2f} dB mean of two neighbors"
+            f"{numbers['baseline.neighbor_mean']:.2f} dB for the mean of the two "
+            "neighboring frames"
         )
     if "baseline.static" in numbers:
         parts.append(
-            f"{numbers['baseline.static']:.2f} dB static (renders averaged over time)"
+            f"{numbers['baseline.static']:.2f} dB for static renders (averaged over "
+            "time)"
         )
-    text = [f"baselines: {', '.join(parts)}"] if parts else []
+    text = [f"baselines:  {', '.join(parts)}"] if parts else []
     if "motion.gain" in numbers:
-        where = ""
+        region = ""
         if "motion.moving_gain" in numbers:
-            where = f", {_signed(numbers['motion.moving_gain'])} in dynamic regions"
-        text.append(f"motion:    gains {_signed(numbers['motion.gain'])}{where}")
+            region = f", {_signed(numbers['motion.moving_gain'])} in dynamic regions"
+        text.append(
+            f"motion:     {_signed(numbers['motion.gain'])} compared with static "
+            f"renders{region}"
+        )
     return text
 
 
 def warnings(numbers: Mapping[str, float]) -> list[str]:
-    """Warn of each baseline that the run is below.
+    """Warn of each baseline that the run scores below.
 
     Args:
       numbers: Metrics by key.
 
     Returns:
-      One line for each.
+      One line for each of these baselines.
     """
     psnr, sentences = numbers["heldout.psnr"], []
     if psnr < numbers.get("baseline.neighbor_mean", psnr):
         sentences.append(
             f"warning: {psnr:.2f} dB is below the "
             f"{numbers['baseline.neighbor_mean']:.2f} dB of the mean of two "
-            f"neighboring frames: {LONGER} "
-            "(python -m experiments.inspect_scene says which)"
+            "neighboring frames; train for more steps, or use the preset that "
+            "python -m experiments.inspect_scene recommends"
         )
     if numbers.get("motion.gain", 0.0) < _WORSE_DB:
         sentences.append(
-            f"warning: held-out frames are {-numbers['motion.gain']:.2f} dB worse "
-            "than the model's own renders averaged over time, so its motion is wrong: "
-            f"{LONGER}, a static one (splats-static, nerf) if nothing moves"
+            f"warning: held-out frames score {-numbers['motion.gain']:.2f} dB less "
+            "than renders of the model averaged over time, so its motion is wrong; "
+            "train for more steps, or use another preset, such as a static one "
+            "(splats-static, nerf) if nothing moves"
         )
     return sentences
 
 
 def _signed(decibels):
-    """Format with two decimals, without a minus sign before zero."""
+    """Format with a sign and two decimals. Zero is never negative."""
     return f"{round(decibels, 2) + 0.0:+.2f} dB"

@@ -1,33 +1,35 @@
-"""Number of images that a run can afford, from the time of one.
+"""Numbers of images to render for the evaluations and products of a run.
 
-Gaussians render in milliseconds, and a radiance field takes seconds for a frame on a
-CPU. Products of a run are reduced so that they do not take longer than training.
+They follow from the time of one render. Gaussians render in milliseconds, but a frame
+of a radiance field takes seconds on a CPU. Rendering must not take longer than
+training.
 """
 
 from typing import NamedTuple
 
-EVALUATION_SHARE = 0.1  # of the training time, for the evaluations beside it
+EVALUATION_SHARE = 0.1  # of the training time, for evaluations during training
 SCORE_SECONDS = 240.0  # for the held-out frames at the end
-LEAST_SCORED = 8
-FIT_SECONDS = 60.0  # for fitting codes to held-out frames and drawing them again
-LEAST_FITTED = 2
-STILL_SECONDS = 30.0  # for what scored frames show at other moments
-STILL_PIXELS = 10_000_000  # of these frames together, 24 bytes each
-LEAST_STILL, LEAST_MOMENTS, MOST_MOMENTS = 2, 4, 16
-FILM_SECONDS = 45.0  # of rendering
-FILM_LENGTH = 4.0  # seconds that the video plays
-MOST_FILMED, LEAST_FILMED = 96, 24
-LEAST_SIDE = 32  # pixels: a video is not made smaller than this
+MIN_SCORED_FRAMES = 8
+FIT_SECONDS = 60.0  # for fitting codes to held-out frames and rendering them again
+MIN_FITTED_FRAMES = 2
+STATIC_SECONDS = 30.0  # for averaging renders of scored frames over time
+STATIC_PIXELS = 10_000_000  # of these frames together, at 24 bytes each
+MIN_STATIC_FRAMES = 2
+MIN_TIMESTAMPS, MAX_TIMESTAMPS = 4, 16
+VIDEO_SECONDS = 45.0  # of rendering
+VIDEO_DURATION = 4.0  # seconds
+MIN_VIDEO_FRAMES, MAX_VIDEO_FRAMES = 24, 96
+MIN_VIDEO_SIDE = 32  # pixels
 
 
 class Evaluations(NamedTuple):
-    """Number of frames of an evaluation, and the time between two of them."""
+    """Number of frames of an evaluation, and the time between two evaluations."""
 
     frames: int
     every_seconds: float  # of training
 
 
-class FilmPlan(NamedTuple):
+class VideoPlan(NamedTuple):
     """Number of frames of a video, their size and rate."""
 
     frames: int
@@ -38,7 +40,8 @@ class FilmPlan(NamedTuple):
 def evaluations(frame_seconds: float, every_seconds: float, most: int) -> Evaluations:
     """Limit evaluations to a tenth of the training time.
 
-    A slow renderer first gets fewer frames, down to one, and then longer intervals.
+    For a slow renderer, first the number of frames is reduced, down to one, and then
+    the interval is extended.
 
     Args:
       frame_seconds: Seconds to render one frame.
@@ -48,12 +51,13 @@ def evaluations(frame_seconds: float, every_seconds: float, most: int) -> Evalua
     Returns:
       Number of frames and interval.
     """
-    frames = _clamped(EVALUATION_SHARE * every_seconds, frame_seconds, 1, most)
-    least = frames * frame_seconds / EVALUATION_SHARE
-    return Evaluations(frames, max(every_seconds, least))
+    budget = EVALUATION_SHARE * every_seconds
+    frames = _affordable(budget, frame_seconds, 1, most)
+    min_interval = frames * frame_seconds / EVALUATION_SHARE
+    return Evaluations(frames, max(every_seconds, min_interval))
 
 
-def scored(frame_seconds: float, heldout: int) -> int:
+def scored_frames(frame_seconds: float, heldout: int) -> int:
     """Return the number of held-out frames to evaluate at the end.
 
     Args:
@@ -63,28 +67,32 @@ def scored(frame_seconds: float, heldout: int) -> int:
     Returns:
       All of them, or as many as time allows.
     """
-    return _clamped(SCORE_SECONDS, frame_seconds, min(LEAST_SCORED, heldout), heldout)
+    least = min(MIN_SCORED_FRAMES, heldout)
+    return _affordable(SCORE_SECONDS, frame_seconds, least, heldout)
 
 
-def halves(frame_seconds: float, share: float, heldout: int) -> int:
+def fitted_frames(frame_seconds: float, share: float, heldout: int) -> int:
     """Return the number of held-out frames to fit codes to.
 
     Args:
       frame_seconds: Seconds to render one frame.
-      share: Cost of a fit in rendered frames.
+      share: Time of a fit as a multiple of the time of a render.
       heldout: Number of held-out frames.
 
     Returns:
       The number of frames.
     """
-    least = min(LEAST_FITTED, heldout)
-    return _clamped(FIT_SECONDS, frame_seconds * (1 + share), least, heldout)
+    least = min(MIN_FITTED_FRAMES, heldout)
+    return _affordable(FIT_SECONDS, frame_seconds * (1 + share), least, heldout)
 
 
-def still(frame_seconds: float, scored: int, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the number of held-out frames to average over time, and of timestamps.
+def static_renders(
+    frame_seconds: float, scored: int, size: tuple[int, int]
+) -> tuple[int, int]:
+    """Return the numbers of held-out frames and timestamps for static renders.
 
-    Time and memory limit the timestamps first, and then the frames.
+    Time and memory first limit the timestamps that a render is averaged over, and then
+    the frames.
 
     Args:
       frame_seconds: Seconds to render one frame.
@@ -94,18 +102,19 @@ def still(frame_seconds: float, scored: int, size: tuple[int, int]) -> tuple[int
     Returns:
       Number of frames and number of timestamps.
     """
-    scored = min(scored, max(LEAST_STILL, STILL_PIXELS // (size[0] * size[1])))
-    renders = STILL_SECONDS / frame_seconds if frame_seconds > 0 else float("inf")
-    moments = min(max(renders / scored, LEAST_MOMENTS), MOST_MOMENTS)
-    frames = min(max(renders / moments, min(LEAST_STILL, scored)), scored)
-    return int(frames), int(moments)
+    in_memory = max(MIN_STATIC_FRAMES, STATIC_PIXELS // (size[0] * size[1]))
+    most = min(scored, in_memory)
+    renders = STATIC_SECONDS / frame_seconds if frame_seconds > 0 else float("inf")
+    timestamps = min(max(renders / most, MIN_TIMESTAMPS), MAX_TIMESTAMPS)
+    frames = min(max(renders / timestamps, min(MIN_STATIC_FRAMES, most)), most)
+    return int(frames), int(timestamps)
 
 
-def film(frame_seconds: float, size: tuple[int, int]) -> FilmPlan:
-    """Plan a video that renders within `FILM_SECONDS`.
+def video(frame_seconds: float, size: tuple[int, int]) -> VideoPlan:
+    """Plan a video that renders within `VIDEO_SECONDS`.
 
-    It first gets fewer frames at a lower rate, and then images of half the size, which
-    take a quarter of the time each, and so on.
+    First the number and rate of frames is reduced, and then their size is halved until
+    they can be rendered in time. Halving the size divides the time by four.
 
     Args:
       frame_seconds: Seconds to render one frame of `size`.
@@ -114,13 +123,19 @@ def film(frame_seconds: float, size: tuple[int, int]) -> FilmPlan:
     Returns:
       The plan.
     """
-    while LEAST_FILMED * frame_seconds > FILM_SECONDS and min(size) // 2 >= LEAST_SIDE:
+    while (
+        MIN_VIDEO_FRAMES * frame_seconds > VIDEO_SECONDS
+        and min(size) // 2 >= MIN_VIDEO_SIDE
+    ):
         size, frame_seconds = (size[0] // 2, size[1] // 2), frame_seconds / 4
-    frames = _clamped(FILM_SECONDS, frame_seconds, LEAST_FILMED, MOST_FILMED)
-    return FilmPlan(frames, size, frames / FILM_LENGTH)
+    frames = _affordable(
+        VIDEO_SECONDS, frame_seconds, MIN_VIDEO_FRAMES, MAX_VIDEO_FRAMES
+    )
+    return VideoPlan(frames, size, frames / VIDEO_DURATION)
 
 
-def _clamped(seconds, frame_seconds, least, most):
+def _affordable(seconds, frame_seconds, least, most):
+    """Number of frames that can be rendered in a time, between `least` and `most`."""
     if frame_seconds * most <= seconds:
         return most
     return max(least, int(seconds / frame_seconds))

@@ -1,6 +1,7 @@
 """Shell commands that start, continue or render a run.
 
-With a `base`, absolute paths become relative to it, for a page that is read elsewhere.
+With a `base`, absolute paths become relative to it, so that a report can be read on
+another machine.
 """
 
 import os
@@ -22,13 +23,13 @@ def resume(
 
     Args:
       folder: Folder of the run, which holds its settings.
-      code: Names MODULE:NAME of code from other packages, which must be repeated.
+      code: Names MODULE:NAME of code from other packages that the run needs.
       base: Folder that paths are relative to, or None.
 
     Returns:
       The command line.
     """
-    words = [*_RECONSTRUCT, "--out", str(folder), "--resume", *_trusting(code)]
+    words = [*_RECONSTRUCT, "--out", str(folder), "--resume", *_trust(code)]
     return _line(words, base)
 
 
@@ -61,18 +62,18 @@ def render(
 
     Args:
       folder: Folder of the run.
-      code: Names MODULE:NAME of code from other packages, which must be repeated.
+      code: Names MODULE:NAME of code from other packages that the run needs.
       base: Folder that paths are relative to, or None.
 
     Returns:
       The command line.
     """
     words = ["python", "-m", "experiments.render", str(folder), "--path", "orbit"]
-    return _line([*words, *_trusting(code)], base)
+    return _line([*words, *_trust(code)], base)
 
 
-def _trusting(code):
-    """Return the option that names code of other packages: no folder may do so."""
+def _trust(code):
+    """Return the option that allows code of other packages to be loaded."""
     return ["--trust", *code] if code else []
 
 

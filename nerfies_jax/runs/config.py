@@ -1,4 +1,7 @@
-"""Settings of a run: its capture, preset and steps. Imports no JAX."""
+"""Settings of a run: its capture, preset and steps.
+
+This module does not import JAX, so that command lines parse quickly.
+"""
 
 import dataclasses
 import math
@@ -9,7 +12,7 @@ from nerfies_jax.capture.given import GivenFiles
 
 
 class CaptureNotFound(ValueError):
-    """The capture of a run is not where it was when the run was started.
+    """The capture of a run is no longer at its path.
 
     Attributes:
       folder: Folder of the run.
@@ -17,8 +20,8 @@ class CaptureNotFound(ValueError):
 
     def __init__(self, folder: pathlib.Path, capture: pathlib.Path | str):
         super().__init__(
-            f"{folder}: its capture {capture} is not there; if it was moved, name its "
-            "new path"
+            f"{folder}: its capture {capture} does not exist; if it was moved, pass "
+            "its new path"
         )
         self.folder = folder
 
@@ -34,22 +37,24 @@ def check_budget(preprocessing: float | None) -> None:
     """
     if preprocessing is not None and not 0 < preprocessing < math.inf:
         raise ValueError(
-            f"preprocessing={preprocessing}: a positive multiple of the default budget"
+            f"preprocessing={preprocessing} must be a positive, finite multiple of the "
+            "default budget"
         )
 
 
 @dataclasses.dataclass(frozen=True)
 class CaptureSource:
-    """Images to read: those of a folder, or of a built-in scene."""
+    """Images to read, from a folder or from a built-in scene."""
 
-    capture: pathlib.Path | str | None = None  # a path, once it is made
+    capture: pathlib.Path | str | None = None  # converted to an absolute path
     """Folder in Nerfies, HyperNeRF, Blender, D-NeRF, COLMAP or LLFF layout."""
     scene: str = "default"
     """Built-in scene to use if no capture is given."""
     factor: int | None = None
     """Read images at 1/FACTOR of their size."""
     max_side: int | None = None
-    """Read images with no side longer than this, in pixels."""
+    """Longest side of the images in pixels. Larger images are read at lower
+    resolution."""
     heldout: str | None = None
     """Frames to hold out: n for every n-th, or the name of a split."""
     missing: Literal["refuse", "skip"] = "refuse"
@@ -62,19 +67,20 @@ class CaptureSource:
 
     def __post_init__(self):
         check_budget(self.preprocessing)
-        if self.capture is not None:  # one folder has one name, wherever it is opened
+        # Absolute, so that a run can be continued from any working directory.
+        if self.capture is not None:
             folder = pathlib.Path(self.capture).absolute()
             object.__setattr__(self, "capture", folder)
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Arguments of a command line that name these images, not quoted."""
+        """Command-line arguments that select these images, not quoted for a shell."""
         words = ["--scene", self.scene]
         if self.capture is not None:
             words = [str(self.capture)]
         fields = {**vars(self), **vars(self.files)}
-        own = ("factor", "max_side", "heldout", "preprocessing")
-        for name in (*own, *vars(self.files)):
+        names = ("factor", "max_side", "heldout", "preprocessing", *vars(self.files))
+        for name in names:
             value = fields[name]
             if value is not None:
                 words += [f"--{name.replace('_', '-')}", str(value)]
@@ -85,13 +91,14 @@ class CaptureSource:
 
 @dataclasses.dataclass(frozen=True)
 class RunConfig:
-    """Settings that determine a run, kept in its `config.json`."""
+    """Settings that determine a run, stored in its `config.json`."""
 
-    # None: what the capture calls for, by its tracks; a saved run names it.
+    # None: chosen from the tracks of the capture. A stored run always has a preset.
     preset: str | None = None
     source: CaptureSource = CaptureSource()
-    steps: int | None = None  # the preset's own; schedules stretch with them
-    overrides: tuple[str, ...] = ()  # of the preset's fields, as PATH=VALUE
+    # None for the number of the preset. Schedules are rescaled to the number of steps.
+    steps: int | None = None
+    overrides: tuple[str, ...] = ()  # of fields of the preset, as PATH=VALUE
     seed: int = 0
 
     @property
@@ -99,57 +106,57 @@ class RunConfig:
         """Name of the preset.
 
         Raises:
-          ValueError: If none is chosen yet.
+          ValueError: If none has been chosen yet.
         """
         if self.preset is None:
             raise ValueError(
-                "these settings name no preset yet; choose one, or let "
-                "`adviser.by_tracks` choose it by the tracks of the capture"
+                "preset=None: no preset has been chosen yet; set one, or let "
+                "`adviser.by_tracks` choose it from the tracks of the capture"
             )
         return self.preset
 
 
 @dataclasses.dataclass(frozen=True)
 class Preparation:
-    """Settings of the conversion of a video or of plain images to a capture."""
+    """Settings of the conversion of a video, or of images, to a capture."""
 
     frames: int | None = None
-    """Frames of a video to keep, evenly spaced (default: 100)."""
+    """Number of frames of a video to keep, evenly spaced (default: 100)."""
     fps: float | None = None
-    """Frames to keep per second of a video, instead of a number."""
+    """Frames to keep per second of a video, instead of their total number."""
     max_side: int = 960
     """Longest side of the images in pixels."""
     masks: pathlib.Path | None = None
-    """Masks of moving objects, which are black: NAME.png for every image NAME, or one
-    for every frame of a video, in order. Without them moving objects are detected."""
+    """Masks in which moving objects are black: NAME.png for every image NAME, or one
+    for every frame of a video, in order. Without masks, moving objects are detected."""
     passes: Literal[1, 2] = 2
-    """2: detect moving objects with the first cameras, and estimate the cameras again
-    without them, or detect them without cameras if too few images are registered. 1:
-    use the first cameras."""
+    """2: estimate the cameras, detect moving objects, and estimate the cameras again
+    with these masked. If the first pass registers too few images, moving objects are
+    detected without cameras. 1: estimate the cameras once, without masks."""
     camera_model: Literal[
         "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
     ] = "OPENCV"
-    """COLMAP's name of the lens model, the same for all images."""
+    """COLMAP camera model, the same for all images."""
     matcher: Literal["auto", "sequential", "exhaustive"] = "auto"
-    """Image pairs to match: neighbors, or all (auto: neighbors of more than 40
-    images)."""
+    """Image pairs to match: neighboring images (sequential) or all (exhaustive). auto
+    is sequential for more than 40 images."""
     threads: int | None = None
     """Number of cores (default: all)."""
 
     def __post_init__(self):
         if None not in (self.frames, self.fps):
             raise ValueError(
-                f"frames={self.frames} and fps={self.fps}: give the frames of a film "
-                "or so many a second, not both"
+                f"frames={self.frames} and fps={self.fps} are mutually exclusive; set "
+                "the number of frames of the video or the frames per second"
             )
         if self.frames is not None and self.frames < 3:
-            raise ValueError(f"frames={self.frames}: keep at least 3")
+            raise ValueError(f"frames={self.frames} must be at least 3")
         if self.fps is not None and not 0 < self.fps < math.inf:
-            raise ValueError(f"fps={self.fps}: a positive number of frames a second")
+            raise ValueError(f"fps={self.fps} must be positive and finite")
         if self.max_side < 16:
-            raise ValueError(f"max_side={self.max_side}: expected at least 16 pixels")
+            raise ValueError(f"max_side={self.max_side} must be at least 16 pixels")
         if self.threads is not None and self.threads < 1:
-            raise ValueError(f"threads={self.threads}: use at least 1")
+            raise ValueError(f"threads={self.threads} must be at least 1")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,21 +164,21 @@ class MoreMetrics:
     """Metrics of held-out frames that are computed only on request."""
 
     lpips_weights: tuple[pathlib.Path | str, ...] = ()
-    """Also measure LPIPS: files (.pth, .safetensors, .npz) with the trained classifier
-    and the LPIPS heads."""
+    """Also compute LPIPS, with the weights of the network and of its linear heads in
+    these files (.pth, .safetensors, .npz)."""
     lpips_network: Literal["alex", "vgg"] = "alex"
-    """Whose weights these are."""
+    """Network that the LPIPS weights belong to."""
     fit_heldout_cameras: int = 0
-    """Fit the cameras of this many held-out frames to their images, with the trained
-    scene fixed, and evaluate them again."""
+    """Optimize the cameras of this many held-out frames with the trained scene fixed,
+    and evaluate these frames again."""
 
     def __post_init__(self):
         if self.lpips_network not in ("alex", "vgg"):
             raise ValueError(
-                f"lpips_network={self.lpips_network!r}: there are alex and vgg"
+                f"lpips_network={self.lpips_network!r} must be 'alex' or 'vgg'"
             )
         if self.fit_heldout_cameras < 0:
             raise ValueError(
-                f"fit_heldout_cameras={self.fit_heldout_cameras}: a number of frames, "
-                "not negative"
+                f"fit_heldout_cameras={self.fit_heldout_cameras} must be a number of "
+                "frames, at least 0"
             )

@@ -15,7 +15,8 @@ from nerfies_jax.visualization import panels
 def save(path: pathlib.Path, run: Run, trained: Trained, scored: Scored):
     """Plot PSNR against seconds of training.
 
-    If the curve covers fewer frames than the final metrics, those are marked too.
+    If the curve covers fewer frames than the final metrics, the final PSNR is marked
+    separately.
 
     Args:
       path: The image file.
@@ -24,7 +25,7 @@ def save(path: pathlib.Path, run: Run, trained: Trained, scored: Scored):
       scored: Its evaluated frames.
 
     Returns:
-      The path, or None if the run ended before it was evaluated.
+      The path, or None if the run ended before its first evaluation.
     """
     history = trained.result.history
     if not history.evaluations:
@@ -47,7 +48,7 @@ def _is_partial(trained, scored):
     return len(trained.watched) < len(scored.rows)
 
 
-def caption(run, trained, scored):
+def caption(run: Run, trained: Trained, scored: Scored) -> str:
     """Describe the frames of the curve and of the final metrics, and their values.
 
     Args:
@@ -58,19 +59,20 @@ def caption(run, trained, scored):
     Returns:
       The caption.
     """
-    score = f"{evaluation.known_mean(scored.psnr):.2f} dB"
-    count = len(trained.watched)
-    which = "all of the held-out frames"
-    if _is_partial(trained, scored):
+    partial = _is_partial(trained, scored)
+    frames = "all held-out frames"
+    if partial:
         names = ", ".join(run.capture.ids[row] for row in trained.watched)
-        which = f"{count} of the {len(scored.rows)} scored held-out frames ({names})"
+        count = len(trained.watched)
+        frames = f"{count} of the {len(scored.rows)} scored held-out frames ({names})"
     last = trained.result.history.evaluations[-1]["psnr"]
-    text = f"PSNR during training. The line is the mean over {which}"
+    text = f"PSNR during training. The line is the mean over {frames}"
     if math.isfinite(last):
-        text += f", and ends at {last:.2f} dB"
-    if not _is_partial(trained, scored):
+        text += f" and ends at {last:.2f} dB"
+    if not partial:
         return f"{text}."
     return (
         f"{text}. The mean over all {len(scored.rows)} frames, which is the score of "
-        f"the run, is {score} and is marked with a diamond."
+        f"the run, is {evaluation.known_mean(scored.psnr):.2f} dB and is marked with a "
+        "diamond."
     )

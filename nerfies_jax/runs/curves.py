@@ -1,7 +1,6 @@
 """Losses and metrics of a run over time, from its events.
 
-`events.jsonl` has them while the run goes on, and `curve.json` holds a summary once it
-has ended.
+They are in `events.jsonl` during the run. `curve.json` holds a summary after its end.
 """
 
 import math
@@ -22,9 +21,9 @@ CURVE = "curve.json"
 class Curve(NamedTuple):
     """Quality over the time of training, with one entry for each evaluation."""
 
-    seconds: tuple[float, ...]  # of training, without compiling
+    seconds: tuple[float, ...]  # of training, without compilation
     steps: tuple[int, ...]
-    psnr: tuple[float, ...]  # dB, mean of a few held-out frames
+    psnr: tuple[float, ...]  # dB, mean over the frames below
     ssim: tuple[float, ...]
     frames: tuple[str, ...]  # names of those frames
     compile_seconds: float
@@ -35,17 +34,17 @@ class Course(NamedTuple):
     """Training of a run so far, from its events.
 
     Rows are dictionaries with `step`, `seconds` of training and the metrics, in the
-    order of steps. If a resumed run repeated steps, the last ones count.
+    order of steps. If a resumed run repeated steps, only the last repetition is kept.
     """
 
-    training: tuple[dict[str, Any], ...] = ()  # mean metrics of chunks, thinned out
-    evaluations: tuple[dict[str, Any], ...] = ()  # with `hook` as well
-    frames: tuple[str, ...] = ()  # held-out frames that evaluations are of
+    training: tuple[dict[str, Any], ...] = ()  # subsampled mean metrics of chunks
+    evaluations: tuple[dict[str, Any], ...] = ()  # also with `hook`
+    frames: tuple[str, ...] = ()  # evaluated held-out frames
     step: int = 0  # completed
-    steps: int | None = None  # asked for
+    steps: int | None = None  # requested
     seconds: float = 0.0  # of training
     compile_seconds: float = 0.0
-    stopped_by: str | None = None  # None while it runs, and where it was killed
+    stopped_by: str | None = None  # None while it runs, or if it was killed
     machine: dict[str, Any] = {}  # noqa: RUF012  (never changed)
 
     @property
@@ -59,14 +58,13 @@ class Course(NamedTuple):
         Returns:
           The text.
         """
-        words = f"step {self.step:,}"
+        text = f"step {self.step:,}"
         if self.steps is not None:
-            words += f" of {self.steps:,}"
+            text += f" of {self.steps:,}"
         scores = [row["psnr"] for row in self.evaluations if row.get("psnr")]
         if scores:
-            words += f", {scores[-1]:.2f} dB over the {len(self.frames)} frames of its "
-            words += "curve"
-        return words
+            text += f", {scores[-1]:.2f} dB over {len(self.frames)} held-out frames"
+        return text
 
 
 def course(events: Iterable[Event]) -> Course:
@@ -93,7 +91,7 @@ def course(events: Iterable[Event]) -> Course:
                 numbers["frames"] = tuple(map(str, event["frames"]))
             elif kind == "run":
                 if event["status"] == "resume":
-                    # Everything after the checkpoint is repeated.
+                    # Steps after the checkpoint are repeated.
                     training = _until(training, event["step"])
                     evaluations = _until(evaluations, event["step"])
                 numbers["stopped_by"] = event.get("stopped_by")
@@ -135,19 +133,19 @@ def write(
     folder: pathlib.Path,
     history: History,
     frames: Sequence[str],
-    told: Course | None = None,
+    logged: Course | None = None,
 ) -> None:
     """Write `curve.json`: evaluations, mean metrics of chunks, and the machine.
 
     Args:
       folder: Folder to write it to.
-      history: History of the run, which replaces events that were lost.
+      history: History of the run, which is written if events were lost.
       frames: Names of the held-out frames of the evaluations.
-      told: Summary of the events of the run, which is written if it is complete.
+      logged: Summary of the events of the run, which is written if it is complete.
     """
-    told = told or Course()
-    evaluations, training = told.evaluations, told.training
-    if [_at(row) for row in evaluations] != [_at(row) for row in history.evaluations]:
+    logged = logged or Course()
+    evaluations, training = logged.evaluations, logged.training
+    if list(map(_key, evaluations)) != list(map(_key, history.evaluations)):
         evaluations, training = history.evaluations, history.rows
     write_json(
         folder / CURVE,
@@ -161,49 +159,50 @@ def write(
     )
 
 
-def _at(row):
+def _key(row):
     return row["hook"], row["step"]
 
 
 def read(folder: pathlib.Path) -> Curve:
-    """Read the curve of a run, also of one that is running or was killed.
+    """Read the curve of a run, which may still be running or may have been killed.
 
     Args:
       folder: The run folder.
 
     Returns:
-      The curve, by `events.jsonl` as long as the run has not ended, by `curve.json`
+      The curve, from `events.jsonl` until the run has ended, and from `curve.json`
       afterwards.
 
     Raises:
       ValueError: The folder has neither file, or it is damaged.
     """
     folder = pathlib.Path(folder)
-    told = course_of(folder)
+    logged = course_of(folder)
     if not (folder / CURVE).is_file():
-        if told is None:
+        if logged is None:
             raise ValueError(
-                f"{folder}: neither {CURVE} nor {event_log.EVENTS} here; name the "
-                "folder of a run. One from before there were these files can be "
-                "resumed for no further steps to get them"
+                f"{folder}: neither {CURVE} nor {event_log.EVENTS} exists; pass a run "
+                "folder. To create them for a run of an earlier version, resume it "
+                "without further steps"
             )
-        return _curve_of(told)
+        return _curve_of(logged)
     stored = _stored(folder / CURVE)
-    if told is not None and not told.ended and told.step > max(stored.steps, default=0):
-        return _curve_of(told)
+    last_step = max(stored.steps, default=0)
+    if logged is not None and not logged.ended and logged.step > last_step:
+        return _curve_of(logged)
     return stored
 
 
-def _curve_of(told):
-    rows = [row for row in told.evaluations if "psnr" in row]
+def _curve_of(logged):
+    rows = [row for row in logged.evaluations if "psnr" in row]
     return Curve(
         seconds=tuple(row["seconds"] for row in rows),
         steps=tuple(row["step"] for row in rows),
         psnr=tuple(_number(row["psnr"]) for row in rows),
         ssim=tuple(_number(row.get("ssim")) for row in rows),
-        frames=told.frames,
-        compile_seconds=told.compile_seconds,
-        machine=told.machine,
+        frames=logged.frames,
+        compile_seconds=logged.compile_seconds,
+        machine=logged.machine,
     )
 
 
@@ -229,7 +228,7 @@ def _stored(path):
         ValueError,
         ArithmeticError,
     ) as error:
-        raise FileError(f"{path}: not the curve of a run ({error!r})") from error
+        raise FileError(f"{path}: not a valid curve of a run ({error!r})") from error
 
 
 def _number(value):
@@ -258,5 +257,5 @@ def seconds_to(curve: Curve, psnr: float | int) -> float | None:
     if not math.isfinite(below):
         return curve.seconds[last]
     share = (psnr - below) / (above - below)
-    began, ended = curve.seconds[last - 1], curve.seconds[last]
-    return began + share * (ended - began)
+    start, end = curve.seconds[last - 1], curve.seconds[last]
+    return start + share * (end - start)

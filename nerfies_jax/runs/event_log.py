@@ -1,7 +1,7 @@
 """Writer and reader of `events.jsonl`, the event stream in a run folder.
 
-It has one JSON object per line. A run that is resumed appends to it. It can be read
-while the run goes on. docs/events.md lists the kinds of events and their fields.
+It has one JSON object per line. A resumed run appends to it. It can be read during the
+run. docs/events.md lists the kinds of events and their fields.
 """
 
 import contextlib
@@ -18,48 +18,49 @@ from nerfies_jax.runtime import console
 from nerfies_jax.runtime.events import Event
 
 EVENTS = "events.jsonl"
-TRAIN_SECONDS = 0.5  # between two rows of training, and of the progress of a stage
-# And at least this share of the time since the log began: a day has some 17,000 rows of
-# training, not 170,000.
-TRAIN_SHARE = 1 / 2000
-MOST_WAITING_BYTES = 2**20  # of lines that the disk did not take yet
-LONGEST_LINE = 2**20  # bytes; a longer one is none of ours
+MIN_INTERVAL_S = 0.5  # between two train events, or progress events of a stage
+# The interval is also at least this share of the time since the log was opened, so that
+# a day has some 17,000 train events instead of 170,000.
+INTERVAL_SHARE = 1 / 2000
+MAX_PENDING_BYTES = 2**20  # of lines that could not be written yet
+MAX_LINE_BYTES = 2**20  # longer lines were not written by this module
 READ_BYTES = 2**20  # at a time
 
 
 class EventLog:
     """A sink that appends events to `events.jsonl`.
 
-    Events that come before the run folder is known wait until `open` names it. A disk
-    that is full keeps later events waiting, and ends nothing: they are written as soon
-    as there is room again.
+    Events are buffered until `open` names the run folder, and while the disk is full.
+    Failing to write them never ends a run.
     """
 
     name = EVENTS
 
     def __init__(self):
-        self._waiting = bytearray()
-        self._began = time.monotonic()
-        self._written: dict[Any, float] = {}  # when, by what is thinned out
-        self._thinned: dict[Any, Event] = {}  # the newest that was left out
+        self._pending = bytearray()
+        self._start_time = time.monotonic()
+        # For each group of subsampled events, the time of the last one that was kept
+        # and the newest one that was skipped.
+        self._kept_time: dict[Any, float] = {}
+        self._skipped: dict[Any, Event] = {}
         self._descriptor: int | None = None
         self._path: pathlib.Path | None = None
         self._problem: OSError | None = None
-        self._lost = 0  # events
+        self._lost_count = 0
         self._lock = threading.RLock()
 
     def open(self, folder: pathlib.Path) -> None:
         """Open the file in a run folder for appending.
 
         Args:
-          folder: The run folder, which exists. An incomplete last line of a killed
-            process is removed.
+          folder: The run folder, which exists. An incomplete last line that a killed
+            process left there is removed.
         """
         self._path = folder / EVENTS
         try:
             flags = os.O_RDWR | os.O_CREAT | os.O_APPEND
             self._descriptor = os.open(self._path, flags, 0o666)
-            _drop_torn_line(self._descriptor)
+            _drop_incomplete_line(self._descriptor)
         except OSError as problem:
             self._problem = problem
         self._write()
@@ -67,36 +68,41 @@ class EventLog:
     def __call__(self, event: Event) -> None:
         """Receive an event."""
         with self._lock:
-            key = _thinned_by(event)
-            if key is not None:
-                now = time.monotonic()
-                wait = max(TRAIN_SECONDS, TRAIN_SHARE * (now - self._began))
-                if now - self._written.get(key, -math.inf) < wait:
-                    self._thinned[key] = event
-                    return
-                self._written[key] = now
-                self._thinned.pop(key, None)
+            group = _subsampled_group(event)
+            if group is None:
+                self._append_skipped()
             else:
-                # In order, and with the last of what was thinned out before it.
-                for each in self._thinned.values():
-                    self._append(each)
-                self._thinned.clear()
+                now = time.monotonic()
+                interval = max(
+                    MIN_INTERVAL_S, INTERVAL_SHARE * (now - self._start_time)
+                )
+                if now - self._kept_time.get(group, -math.inf) < interval:
+                    self._skipped[group] = event
+                    return
+                self._kept_time[group] = now
+                self._skipped.pop(group, None)
             self._append(event)
             self._write()
 
+    def _append_skipped(self):
+        """Append the newest skipped event of each group, to preserve the last state."""
+        for event in self._skipped.values():
+            self._append(event)
+        self._skipped.clear()
+
     def _append(self, event):
         line = json.dumps(json_values(event), allow_nan=False, default=str) + "\n"
-        if len(self._waiting) + len(line) > MOST_WAITING_BYTES:
-            self._lost += 1
+        if len(self._pending) + len(line) > MAX_PENDING_BYTES:
+            self._lost_count += 1
         else:
-            self._waiting += line.encode()
+            self._pending += line.encode()
 
     def _write(self):
         if self._descriptor is None:
             return
         try:
-            while self._waiting:  # a disk that fills up takes a part of a line
-                del self._waiting[: os.write(self._descriptor, self._waiting)]
+            while self._pending:  # a write to a nearly full disk may be partial
+                del self._pending[: os.write(self._descriptor, self._pending)]
             self._problem = None
         except OSError as problem:
             self._problem = problem
@@ -104,24 +110,22 @@ class EventLog:
     def close(self) -> None:
         """Write the remaining events, and warn if any were lost."""
         with self._lock:
-            for each in self._thinned.values():
-                self._append(each)
-            self._thinned.clear()
+            self._append_skipped()
             self._write()
             if self._descriptor is not None:
                 with contextlib.suppress(OSError):
                     os.close(self._descriptor)
                 self._descriptor = None
-            if self._path is not None and (self._problem or self._lost):
-                reason = getattr(self._problem, "strerror", None) or "no space in time"
+            if self._path is not None and (self._problem or self._lost_count):
+                reason = getattr(self._problem, "strerror", None) or "disk was full"
                 console.warn(
-                    f"{self._path}: not all events of the run are in it ({reason}); "
-                    "curves that are drawn from it have gaps"
+                    f"{self._path}: some events could not be written ({reason}); "
+                    "curves plotted from this file have gaps"
                 )
 
 
-def _thinned_by(event):
-    """Group of events that is thinned out, or None for events that are all kept."""
+def _subsampled_group(event):
+    """Group in which an event is subsampled, or None if it is always kept."""
     if event["kind"] == "train":
         return "train"
     if event["kind"] == "stage" and event["status"] == "progress":
@@ -129,17 +133,17 @@ def _thinned_by(event):
     return None
 
 
-def _drop_torn_line(descriptor):
+def _drop_incomplete_line(descriptor):
     size = os.fstat(descriptor).st_size
     end = size
     while end:
-        begin = max(0, end - READ_BYTES)
-        os.lseek(descriptor, begin, os.SEEK_SET)
-        newline = os.read(descriptor, end - begin).rfind(b"\n")
+        start = max(0, end - READ_BYTES)
+        os.lseek(descriptor, start, os.SEEK_SET)
+        newline = os.read(descriptor, end - start).rfind(b"\n")
         if newline >= 0:
-            end = begin + newline + 1
+            end = start + newline + 1
             break
-        end = begin
+        end = start
     if end < size:
         os.ftruncate(descriptor, end)
 
@@ -172,8 +176,7 @@ class EventReader:
     def new(self) -> list[Event]:
         """Return the events that were written since the last call.
 
-        A line that is not complete yet is left for the next call, and a damaged one is
-        skipped.
+        An incomplete last line is left for the next call. Damaged lines are skipped.
 
         Returns:
           The events.
@@ -185,22 +188,22 @@ class EventReader:
         try:
             with self._path.open("rb") as file:
                 if os.fstat(file.fileno()).st_size < self._offset:
-                    self._offset = 0  # it was replaced
+                    self._offset = 0  # the file was replaced
                 file.seek(self._offset)
-                while line := file.readline(LONGEST_LINE):
-                    if not line.endswith(b"\n") and len(line) < LONGEST_LINE:
+                while line := file.readline(MAX_LINE_BYTES):
+                    if not line.endswith(b"\n") and len(line) < MAX_LINE_BYTES:
                         break
                     self._offset += len(line)
-                    received += _parsed(line)
+                    received += _parse(line)
         except OSError as problem:
             raise ValueError(
-                f"{self._path}: no events can be read ({problem.strerror}); name the "
-                "folder of a run, one that is still running as well"
+                f"{self._path}: events cannot be read ({problem.strerror}); pass the "
+                "folder of a run, which may still be running"
             ) from problem
         return received
 
 
-def _parsed(line):
+def _parse(line):
     try:
         event = json.loads(line)
     except (ValueError, RecursionError):
@@ -209,7 +212,7 @@ def _parsed(line):
 
 
 def read_events(folder: str | os.PathLike) -> list[Event]:
-    """Read the events of a run, also of one that is running or was killed.
+    """Read the events of a run, which may still be running or may have been killed.
 
     Args:
       folder: The run folder.

@@ -1,4 +1,4 @@
-"""Routing of a run's events to its folder and to experiment trackers."""
+"""Forwarding of the events of a run to its folder and to experiment trackers."""
 
 import contextlib
 import pathlib
@@ -15,13 +15,15 @@ from nerfies_jax.training.loop import FitResult
 
 
 class Following:
-    """Event sinks of a run, which are opened once its folder exists."""
+    """Event sinks of a run, which are opened as soon as its folder exists."""
 
-    def __init__(self, held: contextlib.ExitStack, log: EventLog, names: Sequence[str]):
-        self._held, self._log, self._names = held, log, names
+    def __init__(
+        self, stack: contextlib.ExitStack, log: EventLog, names: Sequence[str]
+    ):
+        self._stack, self._log, self._names = stack, log, names
 
     def begin(self, folder: pathlib.Path, run: Run, after: int | None) -> None:
-        """Write events to the folder and to the trackers from now on.
+        """Begin to write events to the folder and to the trackers.
 
         Args:
           folder: Folder of the run.
@@ -38,8 +40,8 @@ class Following:
             folder, identity, folder.name, specs.as_json(run.config), after or 0
         )
         for name in self._names:
-            sink = self._held.enter_context(trackers.opened(name, tracked))
-            self._held.enter_context(events.subscribe(sink))
+            sink = self._stack.enter_context(trackers.opened(name, tracked))
+            self._stack.enter_context(events.subscribe(sink))
         events.emit(
             "run",
             status="begin" if after is None else "resume",
@@ -52,7 +54,7 @@ class Following:
         )
 
     def end(self, result: FitResult, errors: Sequence[str]) -> None:
-        """Record the end of the run, once all products are written.
+        """Record the end of the run, after all products have been written.
 
         Args:
           result: Result of the training.
@@ -70,7 +72,7 @@ class Following:
 
 
 def _identity(folder):
-    """Identity by which trackers know the run, or None if no event has one."""
+    """Return the identity of a run in trackers, or None if no event contains it."""
     with contextlib.suppress(ValueError):
         for event in read_events(folder):
             if event["kind"] == "run" and isinstance(event.get("identity"), str):
@@ -80,20 +82,20 @@ def _identity(folder):
 
 @contextlib.contextmanager
 def following(names: Sequence[str] = ()) -> Iterator[Following]:
-    """Collect the events of a run, even before it has a folder.
+    """Collect the events of a run, including those before its folder exists.
 
     Args:
       names: Names of trackers, keys of `trackers.TRACKERS`.
 
     Yields:
-      An object whose `begin` and `end` are to be called.
+      The sinks. Call `begin` when the folder exists, and `end` after the run.
 
     Raises:
       ValueError: If a tracker is unknown or not installed.
     """
     trackers.check(names)
     log = EventLog()
-    with contextlib.ExitStack() as held:
-        held.callback(log.close)
-        held.enter_context(events.subscribe(log))
-        yield Following(held, log, names)
+    with contextlib.ExitStack() as stack:
+        stack.callback(log.close)
+        stack.enter_context(events.subscribe(log))
+        yield Following(stack, log, names)

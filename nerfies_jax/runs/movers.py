@@ -1,4 +1,4 @@
-"""Masks of moving objects in images whose cameras may not be known yet."""
+"""Masks of moving objects in images whose cameras may be inaccurate."""
 
 import dataclasses
 
@@ -7,24 +7,24 @@ import numpy as np
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.preprocessing import frame_masks, record
 
-LEAST_SHARE = 0.005  # of the pixels: cameras hardly notice less
+MIN_MOVING_SHARE = 0.005  # of the pixels. Fewer hardly affect the cameras.
 
 
-def masks_of(pictures: Capture) -> np.ndarray | None:
-    """Segment moving objects from tracks that the static points do not explain.
+def masks_of(capture: Capture) -> np.ndarray | None:
+    """Segment moving objects, from tracks that no static point explains.
 
     Args:
-      pictures: The images as a capture, whose cameras may be wrong.
+      capture: The images. The cameras may be inaccurate.
 
     Returns:
       Booleans [frames, height, width], or None if nothing moves.
     """
-    rows = np.arange(len(pictures.ids))
-    every = dataclasses.replace(pictures, train=rows, heldout=rows[:0])
-    evidence = record.gather(every)
-    if evidence.unusable or evidence.moving.mean() < LEAST_SHARE:
+    rows = np.arange(len(capture.ids))
+    all_frames = dataclasses.replace(capture, train=rows, heldout=rows[:0])
+    evidence = record.gather(all_frames)
+    if evidence.unusable or evidence.moving.mean() < MIN_MOVING_SHARE:
         return None
-    masks = np.zeros((len(rows), *pictures.images.shape[1:3]), bool)
+    masks = np.zeros((len(rows), *capture.images.shape[1:3]), bool)
     for row, mask in zip(evidence.row, evidence.moving, strict=True):
-        masks[row] = frame_masks.enlarged(mask, evidence.factor, pictures.size)
+        masks[row] = frame_masks.enlarged(mask, evidence.factor, capture.size)
     return masks

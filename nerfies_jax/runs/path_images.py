@@ -1,4 +1,4 @@
-"""A camera path of a run as numbered images and a video, an image at a time."""
+"""Rendering of a camera path to numbered images and a video, one image at a time."""
 
 import pathlib
 from collections.abc import Iterator, Sequence
@@ -23,27 +23,27 @@ def render(
 ) -> Iterator[int]:
     """Render views into a new folder, yielding after each image.
 
-    The folder takes its name when everything is in it. If the iteration is abandoned,
-    nothing is left. Without the extra `video` there is no video.
+    The folder is written completely or not at all. No video is written if the extra
+    `video` is not installed.
 
     Args:
       out: The folder.
       renderer: Renderer of the model, at the size of the images.
       state: The trained state.
-      views: One for each image.
+      views: The view of each image.
       rate: Frames per second of the video.
 
     Yields:
       The number of images written.
     """
     with replaced_folder(out) as folder:
-        places = [folder / f"{number:04d}.png" for number in range(len(views))]
-        for number, (place, view) in enumerate(zip(places, views, strict=True), 1):
-            images.write_png(place, as_picture(np.asarray(renderer(state, view).color)))
+        paths = [folder / f"{number:04d}.png" for number in range(len(views))]
+        for number, (path, view) in enumerate(zip(paths, views, strict=True), 1):
+            images.write_png(path, as_picture(np.asarray(renderer(state, view).color)))
             yield number
         try:
             video.library()
         except MissingExtra:
             return
-        frames = (images.read_pixels(place) for place in places)
+        frames = (images.read_pixels(path) for path in paths)
         video.write_video(folder / VIDEO, frames, rate)

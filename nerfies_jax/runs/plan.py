@@ -8,24 +8,23 @@ from nerfies_jax.runtime import events
 from nerfies_jax.training import rate
 from nerfies_jax.training.model import TrainState
 
-# A run is cut where it takes so many times the seconds it was planned for. A schedule
-# that is cut has not come to its low rates, which costs more than the time.
+# Training ends early only after this multiple of the planned time: ending before the
+# schedule has reached its low learning rates costs more quality than the time saves.
 OVERRUN = 1.5
 
 
 @events.stage("measuring the time of a step")
 def with_seconds(run: Run, state: TrainState, seconds: float | int) -> tuple[Run, str]:
-    """Plan a run for a number of seconds of training.
+    """Set the number of steps of a run to fit a number of seconds of training.
 
-    Its schedules are stretched to the number of steps. The step time is measured with
-    the first state (`rate.step_time`), which does not depend on the number of steps,
-    and the representation estimates how it grows. The number of steps is rounded to two
-    digits, so that another run of the same length finds its program in the compilation
-    cache.
+    Schedules are rescaled to the number of steps. The step time is measured with the
+    initial state (`rate.step_time`), and the representation estimates how much it grows
+    during training. The number of steps is rounded to two digits, so that another run
+    of the same length finds its program in the compilation cache.
 
     Args:
       run: The run.
-      state: Its first state.
+      state: Its initial state.
       seconds: Seconds of training.
 
     Returns:
@@ -35,11 +34,12 @@ def with_seconds(run: Run, state: TrainState, seconds: float | int) -> tuple[Run
     step = rate.step_time(run.model, state, frames, run.spec.steps)
     growth = run.representation.resources.growth(run.spec, state)
     steps = rounded(seconds / (step.seconds * growth))
-    grown = f", {growth:.2g} times that as it grows" if growth > 1 else ""
+    growing = f", expected to grow {growth:.2g} times" if growth > 1 else ""
     line = (
-        f"plan: {steps:,} steps for {seconds:g} s of training "
-        f"({1e3 * step.seconds:.3g} ms a step now{grown}; measured after compiling for "
-        f"{step.compile_seconds:.0f} s); compiling, scores and pictures come on top"
+        f"plan: {steps:,} steps in {seconds:g} s of training "
+        f"({1e3 * step.seconds:.3g} ms per step{growing}; compiling the measurement "
+        f"took {step.compile_seconds:.0f} s); compilation, evaluation and rendering "
+        "take additional time"
     )
     return with_steps(run, steps), line
 

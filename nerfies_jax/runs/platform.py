@@ -1,7 +1,7 @@
 """Device, number of cores and caches of a process.
 
-JAX is imported only when it is started, because the platform and the number of cores
-that XLA:CPU sees must be set before the first array.
+JAX is imported only in `start_jax`, because the platform and the number of cores that
+XLA:CPU sees must be set before the first array is created.
 """
 
 import contextlib
@@ -15,10 +15,10 @@ from nerfies_jax.runtime import events
 from nerfies_jax.runtime.compiler import UNDIVIDED
 
 Device = Literal["auto", "cpu", "gpu", "tpu"]
-# Number of cores that XLA:CPU sees, which each representation chooses.
+# Number of cores that XLA:CPU sees. Each representation chooses it.
 Threads = Literal["one", "all"]
 _AFFINITY = hasattr(psutil.Process, "cpu_affinity")  # not on macOS
-VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # XLA:CPU's own is 256 bits
+VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # 256 bits by default
 
 
 @events.stage("starting JAX")
@@ -27,49 +27,51 @@ def start_jax(
 ) -> None:
     """Choose the platform, the number of cores that XLA:CPU sees, and the cache.
 
-    Call it before the first array is made. `PJRT_NPROC` and `JAX_NUM_CPU_DEVICES` in
-    the environment take precedence. So does `XLA_FLAGS` for the width of vectors, 512
-    bits if the processor supports them, and for disabled passes: if each device sees
-    one core, the pass that divides loops is disabled.
+    Call it before the first array is created. If each CPU device sees one core, the
+    compiler pass that parallelizes loops is disabled. The vector width is 512 bits if
+    the processor supports it. The environment variables `PJRT_NPROC`,
+    `JAX_NUM_CPU_DEVICES` and `XLA_FLAGS` take precedence over these choices.
 
     Args:
-      device: Platform, or "auto" for JAX's own choice.
+      device: Platform, or "auto" for the default of JAX.
       threads: "one" or "all" cores for XLA:CPU.
-      shares: Number of equal parts of a step, which get a CPU device each if there are
-        enough cores (`data_parallel`).
+      shares: Number of equal parts that a step is divided into, each with a CPU device
+        of its own if there are enough cores (`data_parallel`).
 
     Raises:
       ValueError: If the device is not available.
     """
     if threads == "one" and os.environ.setdefault("PJRT_NPROC", "1") == "1":
-        # XLA sees a thread for each device, and would divide the loops of each among
-        # all: a step of `splats-tracked-small` on two takes 21 ms for 24.
+        # XLA has a thread for each device and would divide the loops of every device
+        # among all threads. Without that, a step of `splats-tracked-small` on two
+        # devices takes 21 ms instead of 24 ms.
         for name, value in UNDIVIDED.items():
             _set_flag(f"--{name}", value)
     if "avx512f" in _processor_flags():
-        # Splats train in 0.88 of the time (10,000 Gaussians, 256x192, side by side).
+        # Training takes 0.88 of the time (10,000 Gaussians, 256x192).
         _set_flag(VECTOR_WIDTH, "512")
     import jax
 
     if shares > 1 and "JAX_NUM_CPU_DEVICES" not in os.environ:
-        with contextlib.suppress(RuntimeError):  # where JAX has begun, as it is
+        # The number of devices cannot change if JAX has already been initialized.
+        with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", min(shares, cores()))
     if device != "auto":
         name = {"gpu": "cuda"}.get(device, device)
-        os.environ["JAX_PLATFORMS"] = name  # of the processes that this one starts
+        os.environ["JAX_PLATFORMS"] = name  # for child processes
         jax.config.update("jax_platforms", name)
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:
-        reason = (str(error).splitlines() or ["JAX finds none"])[0]
+        reason = (str(error).splitlines() or ["JAX finds no such device"])[0]
         raise ValueError(
-            f"device={device} cannot be used here ({reason}); choose device=cpu, or "
-            "install a JAX built for that device"
+            f"device={device} is not available ({reason}); choose device=cpu, or "
+            "install a version of JAX for that device"
         ) from error
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         folder = CACHE / "compiled"
-        with contextlib.suppress(OSError):  # a cache that cannot be kept is no error
+        with contextlib.suppress(OSError):  # JAX also works without a cache
             folder.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(folder))
 

@@ -1,11 +1,15 @@
 """Conversion of a video, or of images without cameras, to a capture that is kept.
 
-Cameras are estimated in two passes, the second of which masks what moves, as found by
-the first, and uses finer features. On two real clips with known cameras, the second
-pass alone and after the first gave: for 87 frames of 184x240, reprojection errors of
-static points of 0.31 and 0.26 px and position errors of 0.86 and 0.67 % of the extent
-after the best similarity (medians), and for 86 frames of 512x384, 0.42 and 0.35 px,
-0.34 and 0.34 %. They took some 30 to 60 s each on two busy cores.
+Cameras are estimated in two passes. The second pass masks moving objects, which are
+detected with the cameras of the first, and uses finer features. It was compared with
+a single pass of fine features without masks on two real videos with known cameras
+(medians, positions after the best similarity transform, relative to the extent):
+
+- 87 frames of 184x240: reprojection error of static points 0.26 px instead of 0.31 px,
+  position error 0.67 % instead of 0.86 %.
+- 86 frames of 512x384: 0.35 px instead of 0.42 px, 0.34 % for both.
+
+Each took some 30 to 60 s on two busy cores.
 """
 
 import contextlib
@@ -40,21 +44,22 @@ from nerfies_jax.runs.run_folder import PREPARED as RECORD
 from nerfies_jax.runtime import console, events
 from nerfies_jax.training import specs
 
-# Masks are of a pinhole and features lie beside edges: this share of the longer side
-# is masked around what moves as well.
-RIM = 0.01
-# Cameras of the second pass are kept where they place so many of the first's images.
-AS_MANY = 0.9
+# Margin that is masked around moving objects, as a share of the longer side: features
+# lie near edges, and the masks ignore lens distortion.
+MARGIN = 0.01
+# Cameras of the second pass are used if they register at least this share of the images
+# that the first pass registered.
+MIN_REGISTERED_SHARE = 0.9
 
 Tell = Callable[[str], None]
 
 
 class Solved(NamedTuple):
-    """Cameras, and the masks that they were estimated with."""
+    """Estimated cameras."""
 
     poses: Poses
-    masked: bool
-    lines: tuple[str, ...]  # what to say of how they were found
+    masked: bool  # whether moving objects were masked
+    lines: tuple[str, ...]  # text about the result
 
 
 def prepare(
@@ -65,9 +70,9 @@ def prepare(
 ) -> Capture:
     """Convert a video or a folder of images to a Nerfies directory with cameras.
 
-    The directory is written completely or not at all. Its `colmap` is the COLMAP model,
-    `masks_found` the masks of what was found to move, in white, and `prepared.json` a
-    record of the conversion.
+    The directory is written completely or not at all. It also contains the COLMAP model
+    in `colmap`, the masks of detected moving objects (white) in `masks_found`, and a
+    record of the conversion in `prepared.json`.
 
     Args:
       source: The video or folder.
@@ -79,24 +84,27 @@ def prepare(
       The capture.
 
     Raises:
-      ValueError: If the cameras cannot be estimated, with the remedy.
+      ValueError: If the cameras cannot be estimated, with advice.
     """
     source, out = pathlib.Path(source), pathlib.Path(out)
     if not source.exists():
-        raise CaptureError(f"{source}: no such film or folder; check the path")
+        raise CaptureError(f"{source}: no such video or folder; check the path")
     run_folder.refuse_run(source)
     kind = footage.kind_of(source)
     if kind is None:
         raise CaptureError(
-            f"{source}: neither a film ({', '.join(formats.VIDEOS)}) nor a folder with "
-            f"two or more pictures ({', '.join((*footage.PLAIN, *footage.HEIC))})"
+            f"{source}: neither a video ({', '.join(formats.VIDEOS)}) nor a folder "
+            f"with two or more images ({', '.join((*footage.PLAIN, *footage.HEIC))})"
         )
     if kind == "pictures" and (how.frames or how.fps):
-        raise ValueError("frames and fps choose from a film; a folder is taken whole")
+        raise ValueError(
+            f"frames={how.frames}, fps={how.fps}: these select frames of a video, but "
+            f"{source} is a folder, whose images are all used; remove them"
+        )
     _check_masks(how)
-    with scratch_folder(out) as scratch, _named(scratch, source, out):
+    with scratch_folder(out) as scratch, _renaming_paths(scratch, source, out):
         if kind == "film":
-            tell(f"looking for sharp frames in {source}")
+            tell(f"selecting sharp frames of {source}")
         taken = _taken(kind, source, scratch, how)
         for line in taken.notes:
             tell(line)
@@ -107,7 +115,7 @@ def prepare(
         rate = None
         if taken.seconds:
             rate = (len(taken.names) - 1) / taken.seconds
-        if how.masks is None:  # what was found is no truth to be scored by
+        if how.masks is None:  # detected masks are not ground truth for metrics
             capture = dataclasses.replace(capture, moving=None)
         capture = dataclasses.replace(
             capture, name=out.resolve().name, path=None, frames_per_second=rate
@@ -117,7 +125,7 @@ def prepare(
             nerfies_format.write(capture, written)
         shutil.copytree(solved.poses.folder / "sparse", written / "colmap" / "sparse")
         if solved.masked and how.masks is None:
-            (scratch / "found").rename(written / "masks_found")
+            (scratch / "detected").rename(written / "masks_found")
         write_json(written / RECORD, _record(source, how, solved))
         os.replace(written, out.resolve())
     for line in describe(capture):
@@ -131,17 +139,17 @@ def _check_masks(how):
 
 
 @contextlib.contextmanager
-def _named(scratch, source, out):
-    """Errors about the scratch folder, which goes, name the source or the result."""
+def _renaming_paths(scratch, source, out):
+    """In error messages, replace paths in the temporary folder by the user's paths."""
     try:
         yield
     except CaptureError as error:
-        hidden = re.escape(str(scratch.resolve()))
-        # Its images by name, whatever else as the whole.
-        inside = f"{hidden}{re.escape(os.sep)}(images|[^:]*)"
-        named = out if "cannot be written" in str(error) else source
-        said = re.sub(inside, lambda _: str(named), str(error))
-        raise CaptureError(said) from error
+        root = re.escape(str(scratch.resolve()))
+        # File names of images are kept, those of other files mean nothing to the user.
+        inside = f"{root}{re.escape(os.sep)}(images|[^:]*)"
+        replacement = out if "cannot be written" in str(error) else source
+        message = re.sub(inside, lambda _: str(replacement), str(error))
+        raise CaptureError(message) from error
 
 
 def _taken(kind, source, scratch, how) -> Taken:
@@ -159,72 +167,81 @@ def _solve(scratch, taken, how, tell) -> Solved:
     )
     if taken.focal is not None:
         spec = dataclasses.replace(spec, focal=taken.focal)
-    pictures, given = scratch / "images", scratch / "masks"
+    images = scratch / "images"
     if how.masks is not None:
-        poses = run_sfm(pictures, scratch / "only", given, spec)
+        poses = run_sfm(images, scratch / "only", scratch / "masks", spec)
         return Solved(poses, True, tuple(poses.lines()))
-    # Coarse first: what moves has most of the fine features of some images.
+    # The first pass uses coarse features, because most fine features of some images lie
+    # on moving objects.
     coarse = spec if how.passes == 1 else dataclasses.replace(spec, first_octave=0)
     try:
-        first = run_sfm(pictures, scratch / "first", None, coarse)
+        first = run_sfm(images, scratch / "first", None, coarse)
     except FewPlaced as error:
         if how.passes == 1:
             raise
-        return _solve_without_movers(scratch, spec, error, tell)
+        return _solve_masked(scratch, spec, error, tell)
     if how.passes == 1:
         return Solved(first, False, tuple(first.lines()))
-    tell(f"{first.lines()[0]}; looking for what moves")
+    tell(f"{first.lines()[0]}; detecting moving objects")
     capture = colmap.read(first.folder)
     moving = movers.masks_of(capture)
     masks = None
     if moving is None:
-        tell("nothing was found to move; the cameras again from finer features")
+        tell("no moving objects detected; estimating the cameras from finer features")
     else:
         row_of = {f"{name}.png": row for row, name in enumerate(capture.ids)}
-        still = np.zeros(moving.shape[1:], bool)  # of what found no place
-        moves = {n: moving[row_of[n]] if n in row_of else still for n in taken.names}
-        masks = _write_masks(scratch, moves)
-        share = f"{moving.mean():.1%} of the pixels move"
-        tell(f"{share}; the cameras again without them")
+        empty = np.zeros(moving.shape[1:], bool)  # for images that were not registered
+        by_name = {n: moving[row_of[n]] if n in row_of else empty for n in taken.names}
+        masks = _write_masks(scratch, by_name)
+        tell(
+            f"{moving.mean():.1%} of the pixels show moving objects; estimating the "
+            "cameras again with these masked"
+        )
     try:
-        second = run_sfm(pictures, scratch / "second", masks, spec)
+        second = run_sfm(images, scratch / "second", masks, spec)
     except CaptureError as error:
         reason = str(error).partition(": ")[2]
-        kept = f"once more, {reason}; the first cameras are kept"
-        return Solved(first, False, (kept, *first.lines()))
-    if second.placed < AS_MANY * first.placed:
-        kept = f"once more only {second.placed} are placed; the first are kept"
-        return Solved(first, False, (kept, *first.lines()))
+        note = f"the second pass failed ({reason}); using the cameras of the first"
+        return Solved(first, False, (note, *first.lines()))
+    if second.placed < MIN_REGISTERED_SHARE * first.placed:
+        note = (
+            f"the second pass registered only {second.placed} of the {first.placed} "
+            "images of the first; using the cameras of the first"
+        )
+        return Solved(first, False, (note, *first.lines()))
     return Solved(second, masks is not None, tuple(second.lines()))
 
 
-def _solve_without_movers(scratch, spec, error, tell):
-    """The cameras without what seems to move, where with it too few were placed."""
-    tell(f"{str(error).partition(': ')[2]}; looking for what moves")
+def _solve_masked(scratch, spec, error, tell):
+    """Retry structure from motion with moving objects masked, detected from flow."""
+    tell(f"{str(error).partition(': ')[2]}; detecting moving objects")
     try:
-        moves = masks_without_cameras.moving_in(scratch / "images")
+        moving = masks_without_cameras.moving_in(scratch / "images")
     except ValueError as reason:
         raise error from reason
-    share = np.mean([one.mean() for one in moves.values()])
+    share = np.mean([mask.mean() for mask in moving.values()])
     if share == 0:
         raise error
-    masks = _write_masks(scratch, moves)
-    tell(f"{share:.1%} of the pixels seem to move; the cameras again without them")
+    masks = _write_masks(scratch, moving)
+    tell(
+        f"{share:.1%} of the pixels seem to show moving objects; estimating the "
+        "cameras again with these masked"
+    )
     poses = run_sfm(scratch / "images", scratch / "second", masks, spec)
     return Solved(poses, True, tuple(poses.lines()))
 
 
 def _write_masks(scratch, moving):
-    """Write masks: white for users, and black with a margin for COLMAP.
+    """Write masks of moving objects, and return the folder of those for COLMAP.
 
-    Returns the folder of the latter.
+    They are white for the user, and black with a margin for COLMAP.
     """
-    (scratch / "found").mkdir()
+    (scratch / "detected").mkdir()
     (scratch / "black").mkdir()
-    for name, moves in moving.items():
-        rim = 2 * round(RIM * max(moves.shape)) + 1
-        wide = cv2.dilate(moves.astype(np.uint8), np.ones((rim, rim), np.uint8)) > 0
-        write_png(scratch / "found" / name, moves)
+    for name, mask in moving.items():
+        side = 2 * round(MARGIN * max(mask.shape)) + 1
+        wide = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        write_png(scratch / "detected" / name, mask)
         write_png(scratch / "black" / f"{name}.png", ~wide)
     return scratch / "black"
 
@@ -236,10 +253,10 @@ def _record(source, how, solved):
 
 
 def _made_of(source, how):
-    """Identity of a capture: its source, its contents, masks and settings."""
+    """Identity of a capture: its source with its contents, masks and settings."""
     _check_masks(how)
     masks = None if how.masks is None else _checksum(pathlib.Path(how.masks))
-    # Threads change how long it takes.
+    # The number of threads changes only the duration.
     how = {name: one for name, one in specs.as_json(how).items() if name != "threads"}
     return {
         "source": str(source.resolve()),
@@ -252,7 +269,7 @@ def _made_of(source, how):
 def _checksum(path):
     """Checksum of the names and contents of a video or of the images of a folder.
 
-    Files that file managers leave there (.DS_Store, Thumbs.db) do not count.
+    Files of file managers (.DS_Store, Thumbs.db) are ignored.
     """
     files = [path] if path.is_file() else sorted(footage.pictures_in(path))
     checksum = hashlib.blake2b(digest_size=12)
@@ -264,13 +281,13 @@ def _checksum(path):
 
 
 def needed(path: AnyPath) -> bool:
-    """Test if a path names a video or images without cameras, and no capture.
+    """Test if a path is a video or a folder of images without cameras.
 
     Args:
       path: File or folder.
 
     Returns:
-      True if it must be converted with `prepare`.
+      True if it must be converted with `prepare`. False for a capture.
     """
     path = pathlib.Path(path)
     if footage.kind_of(path) is None:
@@ -300,23 +317,24 @@ def prepared(
     """
     source, out = pathlib.Path(source), pathlib.Path(out)
     if not (out / RECORD).is_file():
-        tell(f"preparing {source} as {out}, which is kept")
+        tell(f"converting {source} to a capture: {out} (kept for later runs)")
         prepare(source, out, how, tell)
         return out
     try:
         made_of = dict(json.loads((out / RECORD).read_bytes()))
     except (OSError, ValueError, TypeError, RecursionError) as error:
-        # The folder may hold the user's own work by now: it is not made again unasked.
+        # It is not replaced automatically, because the user may have edited the folder.
         raise ValueError(
-            f"{out / RECORD}: damaged, so nothing tells what {out} was made of "
-            f"({error}); remove the folder, or choose another one with out=..."
+            f"{out / RECORD}: damaged ({error}), so the source of {out} is unknown; "
+            "remove the folder, or choose another one with out=..."
         ) from error
-    wanted = json.loads(json.dumps(_made_of(source, how)))
-    differ = [name for name, value in wanted.items() if made_of.get(name) != value]
-    if differ:
+    requested = json.loads(json.dumps(_made_of(source, how)))
+    changed = [name for name, value in requested.items() if made_of.get(name) != value]
+    if changed:
         raise ValueError(
-            f"{out}: a capture prepared otherwise ({', '.join(differ)} differ); remove "
-            "it, or choose another folder with out=..."
+            f"{out}: a capture converted from another source or with other settings "
+            f"({', '.join(changed)} differ); remove it, or choose another folder with "
+            "out=..."
         )
-    tell(f"{source} was prepared before: {out}")
+    tell(f"{source} has already been converted: {out}")
     return out

@@ -11,8 +11,8 @@ from nerfies_jax.metrics.clock import Metric
 from nerfies_jax.preprocessing.findings import Finding
 from nerfies_jax.runs import representations
 
-EFFECT_COST = "effect_cost.json"  # beside this file; the study writes it
-Price = dict[str, float]  # by representation; NaN where an effect costs no step
+EFFECT_COST = "effect_cost.json"  # next to this file, written by the study
+Price = dict[str, float]  # by representation, NaN if a step takes no longer
 
 
 @functools.cache
@@ -35,23 +35,24 @@ def legend() -> str:
     """
     names = " / ".join(representations.installed())
     return (
-        "cost per step: a training step with the effect over one without any, of "
-        f"{names};\n- where no step takes longer. From experiments.speed effects."
+        "cost per step: time of a training step with the effect, divided by that of a "
+        f"step without\neffects, for {names} (- if the effect adds nothing). Measured "
+        "by experiments.speed effects."
     )
 
 
-def price(effect: str, measured: Mapping[str, Metric]) -> Price:
+def price(effect: str, metrics: Mapping[str, Metric]) -> Price:
     """Return the cost of an effect as a factor of a step without effects.
 
     Args:
       effect: Name of the effect.
-      measured: Metrics by key.
+      metrics: Measured metrics by key.
 
     Returns:
       Factors by representation, NaN if the effect adds nothing to a step.
     """
     return {
-        name: _factor(each.recommendation.prices.get(effect), measured)
+        name: _factor(each.recommendation.prices.get(effect), metrics)
         for name, each in representations.installed().items()
         if each.recommendation is not None
     }
@@ -91,12 +92,12 @@ def as_json(findings: tuple[Finding, ...]) -> dict[str, dict[str, float | None]]
     }
 
 
-def _factor(pair: Pair | None, measured):
-    """One plus what the effect adds, in bare steps."""
+def _factor(pair: Pair | None, metrics):
+    """One plus the time that an effect adds, relative to a step without effects."""
     if pair is None:
         return math.nan
-    dearer, cheaper = (
-        measured[f"{pair.preset}.{arm}.step.over_bare"].value
-        for arm in (pair.with_it, pair.without)
+    with_effect, without_effect = (
+        metrics[f"{pair.preset}.{variant}.step.over_bare"].value
+        for variant in (pair.with_it, pair.without)
     )
-    return 1 + dearer - cheaper
+    return 1 + with_effect - without_effect

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from nerfies_jax import evaluation
-from nerfies_jax.capture import camera_paths, exr, video
+from nerfies_jax.capture import camera_paths, exr
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.json_files import merged_folder, write_json
+from nerfies_jax.capture.video import write_video
 from nerfies_jax.evaluation import Renderer, Scored, heldout
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.metrics import clock
@@ -35,7 +36,7 @@ from nerfies_jax.runs import (
 )
 from nerfies_jax.runs.attempts import Attempts
 from nerfies_jax.runs.run import Run, with_found_cameras
-from nerfies_jax.runs.run_folder import CONFIG, LEFT_OUT
+from nerfies_jax.runs.run_folder import CONFIG, PREPROCESSING_NOTES
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.runtime import console, events
 from nerfies_jax.training import losses
@@ -43,12 +44,12 @@ from nerfies_jax.training.model import TrainState
 from nerfies_jax.visualization import panels
 
 METRICS = "metrics.json"
-SHOWN = 4  # held-out frames in the comparison
-COMPARED = (
+COMPARISON_FRAMES = 4
+COMPARISON_CAPTION = (
     "Held-out frames, which the model was not trained on. Each row shows the observed "
     "image, the rendered image, the error between them, and the rendered depth."
 )
-FILMED = (
+VIDEO_CAPTION = (
     "The reconstructed scene over time, from a camera that sways around the captured "
     "viewpoints."
 )
@@ -58,83 +59,83 @@ def make(
     folder: pathlib.Path,
     run: Run,
     trained: Trained,
-    began: float,
+    start_time: float,
     extra: quality.Extra = quality.NOTHING,
 ) -> None:
-    """Write all products into the run folder and print where they are.
+    """Write all products into the run folder and print their paths.
 
     Args:
       folder: The run folder.
       run: The run.
       trained: Its training.
-      began: `time.perf_counter()` at the beginning of the run.
+      start_time: `time.perf_counter()` at the beginning of the run.
       extra: Additional metrics.
 
     Raises:
-      FloatingPointError: If rendered images are not finite, in which case nothing is
-        written. Parameters may be finite and yet unusable.
+      FloatingPointError: If rendered images are not finite, which finite parameters do
+        not exclude. In that case nothing is written.
       OSError: If products could not be written, after all others have been.
     """
     state, renderer = trained.result.state, trained.renderer
     run = with_found_cameras(run, state)
-    rows, left_out = frames_to_score(run, trained)
+    rows, skipped_frames = frames_to_score(run, trained)
     scored = evaluation.score(trained.draw, state, run.filmed, rows)
     if not np.isfinite(scored.color).all():
         raise FloatingPointError(
-            f"no report: what the state of step {trained.result.steps:,} draws is not "
+            f"no report: the images rendered at step {trained.result.steps:,} are not "
             "finite"
         )
     quality.check_learned(trained.result.history, scored)
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
-    # Products that replace earlier ones stay together.
-    attempt = Attempts(together=(folder / METRICS).exists())
-    with _staged(folder) as place:
-        nothing: tuple[list[report.Figure], list[str]] = ([], [])
-        player, unplayed = attempt(nothing, save_player, place, run, trained)
-        # Compiles while all else is written, but for the player, whose own compiling
-        # fills both cores.
+    # Products of an earlier call are replaced together or not at all.
+    attempt = Attempts(all_or_none=(folder / METRICS).exists())
+    with _staged(folder) as target:
+        no_player: tuple[list[report.Figure], list[str]] = ([], [])
+        player, player_notes = attempt(no_player, save_player, target, run, trained)
+        # The parts of a step are compiled in the background while other products are
+        # written. The player comes first, because its compilation uses all cores.
         with step_profile.profiling(run, state) as profile:
             figures = [*player]
             comparison = attempt(
-                None, save_comparison, place / "comparison.png", run.filmed, scored
+                None, save_comparison, target / "comparison.png", run.filmed, scored
             )
             if comparison is not None:
-                figures.append(report.Figure(comparison, COMPARED))
+                figures.append(report.Figure(comparison, COMPARISON_CAPTION))
             watched = [run.capture.ids[row] for row in trained.watched]
             course = curves.course_of(folder)
             history = trained.result.history
-            attempt(None, curves.write, place, history, watched, course)
-            path = place / "psnr_over_time.png"
+            attempt(None, curves.write, target, history, watched, course)
+            path = target / "psnr_over_time.png"
             curve = attempt(
                 None, with_extra, curve_figure.save, path, run, trained, scored
             )
             if curve is not None:
                 caption = curve_figure.caption(run, trained, scored)
                 figures.append(report.Figure(curve, caption))
-            seconds, path = ms_per_frame / 1e3, place / "scene.mp4"
-            film = attempt(
-                None, with_extra, save_film, path, run, renderer, state, seconds
+            seconds, path = ms_per_frame / 1e3, target / "scene.mp4"
+            video = attempt(
+                None, with_extra, save_video, path, run, renderer, state, seconds
             )
-            attempt(None, save_depth, place / "depth", run.capture, scored)
+            attempt(None, save_depth, target / "depth", run.capture, scored)
             save = run.representation.products.save
             model = run.spec, run.metadata, state
             with events.stage("saving the model"):
-                saved = attempt(Saved(), save, place, *model)
-            fitted, gain = score_halves(run, state, scored, ms_per_frame / 1e3)
-            numbers, remarks = quality.measure(
-                run, state, trained.draw, scored, extra, ms_per_frame / 1e3
+                saved = attempt(Saved(), save, target, *model)
+            fitted, fit_notes = score_halves(run, state, scored, seconds)
+            numbers, quality_notes = quality.measure(
+                run, state, trained.draw, scored, extra, seconds
             )
             metrics = heldout.metrics(numbers)
-            metrics += [*measured(run, trained, scored, ms_per_frame, began), *fitted]
-            metrics += model_size(saved)
-            attempt(None, save_metrics, place / METRICS, metrics)
+            metrics += measured(run, trained, scored, ms_per_frame, start_time)
+            metrics += [*fitted, *model_size(saved)]
+            attempt(None, save_metrics, target / METRICS, metrics)
             warnings = baselines_text.warnings(numbers)
-            notes = [*warnings, trained.result.message, *left_out]
+            notes = [*warnings, trained.result.message, *skipped_frames]
             notes += _capture_notes(run, folder)
-            notes += [*remarks, *gain, *saved.notes, *unplayed]
+            notes += [*quality_notes, *fit_notes, *saved.notes, *player_notes]
             with events.stage("timing the parts of a step"):
-                step_ms, unknown = profile()
-        notes += unknown
+                step_ms, profile_notes = profile()
+        notes += profile_notes
     page = attempt(
         None,
         report.write,
@@ -143,22 +144,23 @@ def make(
         metrics,
         json.loads((folder / CONFIG).read_text()),
         [each._replace(path=folder / each.path.name) for each in figures],
-        film if film is None else film._replace(path=folder / film.path.name),
+        video if video is None else video._replace(path=folder / video.path.name),
         step_ms,
         notes,
         _next(folder.absolute(), run, trained, relative_paths.base_of(folder)),
     )
-    following = _next(folder, run, trained)
     for figure in player:
         console.say(f"player:     {folder / figure.link}")
-    _log(folder, page, metrics, [*baselines_text.lines(numbers), *warnings], following)
+    baselines = [*baselines_text.lines(numbers), *warnings]
+    _log(folder, page, metrics, baselines, _next(folder, run, trained))
     attempt.finish()
 
 
 def _staged(folder):
-    """Yield a folder to write to, next to earlier products until all new ones exist.
+    """Yield the folder to write products to.
 
-    A run without any keeps what it could write, whatever fails.
+    If the run has earlier products, it is a temporary folder, whose contents replace
+    them when the block ends without an error.
     """
     if (folder / METRICS).exists():
         return merged_folder(folder)
@@ -174,7 +176,7 @@ def with_extra(save: Callable[..., Any], path: pathlib.Path, *arguments):
       *arguments: Further arguments.
 
     Returns:
-      Its result, or None, after a line of text, if the extra is not installed.
+      Its result. None if the extra is not installed, which is printed.
     """
     try:
         return save(path, *arguments)
@@ -197,8 +199,9 @@ def save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
 
 def _capture_notes(run, folder):
     """Notes on the training images, their preprocessing, and the evaluated images."""
-    unpreprocessed = json.loads((folder / CONFIG).read_text()).get(LEFT_OUT, [])
-    return dict.fromkeys([*run.capture.notes, *unpreprocessed, *run.filmed.notes])
+    config = json.loads((folder / CONFIG).read_text())
+    preprocessing = config.get(PREPROCESSING_NOTES, [])
+    return dict.fromkeys([*run.capture.notes, *preprocessing, *run.filmed.notes])
 
 
 def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -213,18 +216,18 @@ def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, 
     """
     heldout = run.capture.heldout
     seconds = trained.renderer.ms_per_frame(1) / 1e3
-    count = budget.scored(seconds, len(heldout))
+    count = budget.scored_frames(seconds, len(heldout))
     if count == len(heldout):
         return heldout, ()
     note = (
-        f"Scores are of {count} of the {len(heldout)} held-out frames, evenly spread: "
-        f"one takes {seconds:.1f} s to render."
+        f"Metrics are computed on {count} of the {len(heldout)} held-out frames, "
+        f"evenly spaced, because each takes {seconds:.1f} s to render."
     )
     return evaluation.spread(heldout, count), (note,)
 
 
 def measured(
-    run: Run, trained: Trained, scored: Scored, ms_per_frame: float, began: float
+    run: Run, trained: Trained, scored: Scored, ms_per_frame: float, start_time: float
 ) -> list[Metric]:
     """Collect the metrics of time, memory and size of a run.
 
@@ -233,14 +236,14 @@ def measured(
       trained: Its training.
       scored: Its evaluated frames.
       ms_per_frame: Milliseconds to render a frame.
-      began: `time.perf_counter()` at the beginning of the run.
+      start_time: `time.perf_counter()` at the beginning of the run.
 
     Returns:
       The metrics.
     """
     result = trained.result
     counts = run.model.counts(result.state)
-    seconds, fps = time.perf_counter() - began, 1e3 / ms_per_frame
+    seconds, fps = time.perf_counter() - start_time, 1e3 / ms_per_frame
     return [
         metric("heldout.frames", len(scored.rows)),
         metric("train.seconds", result.seconds, 0.2 * result.seconds),
@@ -256,7 +259,7 @@ def measured(
 
 
 def _device_memory():
-    """Peak of device memory, if the backend reports it. That of a CPU does not."""
+    """Return the peak of device memory, which the CPU backend does not report."""
     peak = clock.device_peak_bytes()
     if peak is None:
         return []
@@ -289,32 +292,27 @@ def score_halves(
       frame_seconds: Seconds to render a frame.
 
     Returns:
-      Metrics and notes, both empty if frames have no codes of their own.
+      Metrics and notes, both empty if the model has no per-frame codes.
     """
     width, height = run.capture.size
     if width // 2 < len(losses.WINDOW):
         return [], ()  # too narrow for the window of the SSIM
     share = run.representation.scoring.fitted_rays / (width * height)
-    count = budget.halves(frame_seconds, share, len(scored.rows))
-    few = evaluation.spread(np.arange(len(scored.rows)), count)
+    count = budget.fitted_frames(frame_seconds, share, len(scored.rows))
+    places = evaluation.spread(np.arange(len(scored.rows)), count)
+    rows = scored.rows[places]
     halves = run.representation.scoring.score_halves(
-        run.spec,
-        run.metadata,
-        state,
-        run.capture,
-        scored.rows[few],
+        run.spec, run.metadata, state, run.capture, rows
     )
     if halves is None:
         return [], ()
-    before = evaluation.score_right_halves(
-        run.capture, scored.rows[few], scored.color[few]
-    )
+    before = evaluation.score_right_halves(run.capture, rows, scored.color[places])
     psnr, ssim = (evaluation.known_mean(each) for each in (halves.psnr, halves.ssim))
     unfitted = evaluation.known_mean(before.psnr)
     note = (
-        f"Right halves of {count} held-out frames: {unfitted:.2f} dB with "
+        f"PSNR of the right halves of {count} held-out frames: {unfitted:.2f} dB with "
         f"codes interpolated in time, {psnr:.2f} dB with codes fitted to the left "
-        "halves and without a transient medium."
+        "halves, without the transient field."
     )
     metrics = [
         metric("heldout.fitted_psnr", psnr, 0.2),
@@ -324,7 +322,9 @@ def score_halves(
 
 
 @events.stage("drawing the comparison")
-def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
+def save_comparison(
+    path: pathlib.Path, capture: Capture, scored: Scored
+) -> pathlib.Path:
     """Save an image of ground truth, render, error and depth of a few held-out frames.
 
     Args:
@@ -335,28 +335,29 @@ def save_comparison(path: pathlib.Path, capture: Capture, scored: Scored):
     Returns:
       The path.
     """
-    shown = evaluation.spread(np.arange(len(scored.rows)), SHOWN)
+    places = evaluation.spread(np.arange(len(scored.rows)), COMPARISON_FRAMES)
     captions = [
         f"frame {capture.ids[scored.rows[i]]}   {scored.psnr[i]:.2f} dB   "
         f"SSIM {scored.ssim[i]:.3f}"
-        for i in shown
+        for i in places
     ]
-    truth, color = capture.images[scored.rows[shown]], scored.color[shown]
-    if capture.valid is not None:  # what was not filmed is black in both: no error
-        filmed = capture.valid[scored.rows[shown]][..., None]
-        truth, color = np.where(filmed, truth, 0), np.where(filmed, color, 0)
-    picture = panels.comparison(
+    truth, color = capture.images[scored.rows[places]], scored.color[places]
+    # Pixels that were not observed are black in both, so that they show no error.
+    if capture.valid is not None:
+        valid = capture.valid[scored.rows[places]][..., None]
+        truth, color = np.where(valid, truth, 0), np.where(valid, color, 0)
+    image = panels.comparison(
         truth,
         color,
-        scored.depth[shown],
+        scored.depth[places],
         captions,
-        known_depth=scored.alpha[shown] > 0.5,
+        known_depth=scored.alpha[places] > 0.5,
     )
-    panels.save(picture, path)
+    panels.save(image, path)
     return path
 
 
-def save_film(
+def save_video(
     path: pathlib.Path,
     run: Run,
     renderer: Renderer,
@@ -376,26 +377,26 @@ def save_film(
       The video for the report.
     """
     size = run.capture.size
-    film = budget.film(frame_seconds, size)
-    if film.size != size:
-        renderer = Renderer(run.model, film.size)
+    plan = budget.video(frame_seconds, size)
+    if plan.size != size:
+        renderer = Renderer(run.model, plan.size)
     views = evaluation.path_views(
-        camera_paths.path("sway", run.capture, film.frames),
-        camera_paths.times(film.frames),
+        camera_paths.path("sway", run.capture, plan.frames),
+        camera_paths.times(plan.frames),
         evaluation.view_of(run.capture, int(run.capture.train[0])),
     )
 
     def frames(stage):
         for view in views:
-            rendering = renderer(state, evaluation.resized(view, size, film.size))
+            rendering = renderer(state, evaluation.resized(view, size, plan.size))
             yield evaluation.as_picture(rendering.color)
             stage.advance()
 
-    with events.stage("rendering the video", film.frames) as stage:
-        rendered = frames(stage)
-        poster = next(rendered)
-        video.write_video(path, itertools.chain([poster], rendered), film.rate)
-    return report.Video(path, FILMED, poster)
+    with events.stage("rendering the video", plan.frames) as stage:
+        images = frames(stage)
+        poster = next(images)
+        write_video(path, itertools.chain([poster], images), plan.rate)
+    return report.Video(path, VIDEO_CAPTION, poster)
 
 
 @events.stage("making the player")
@@ -415,8 +416,8 @@ def save_player(
     write = run.representation.products.player
     if write is None:
         return [], [
-            f"The {run.representation.name} representation has no player; scene.mp4 "
-            "shows it from a moving camera."
+            f"The {run.representation.name} representation has no interactive player; "
+            "scene.mp4 shows the scene from a moving camera."
         ]
     first = evaluation.view_of(run.capture, int(run.capture.train[0]))
     try:
@@ -431,17 +432,18 @@ def save_player(
             run.capture,
             poster,
         )
-        picture = folder / "player.png"
-        panels.save(poster, picture)
-    except (OSError, CaptureError):  # a full disk is told with all that is not written
+        image = folder / "player.png"
+        panels.save(poster, image)
+    except (OSError, CaptureError):  # `Attempts` reports files that are not written
         raise
-    except Exception as error:  # whatever it is, the run keeps all its other products
-        return [], [f"There is no player: {type(error).__name__}: {error}"]
+    except Exception as error:  # no failure of the player may affect other products
+        message = f"{type(error).__name__}: {error}"
+        return [], [f"The interactive player could not be created: {message}"]
     caption = (
         f"The interactive player, {player.path.name}, shows the scene from any "
         f"viewpoint at any time in a web browser. It contains {player.about}"
     )
-    return [report.Figure(picture, caption, player.path.name)], []
+    return [report.Figure(image, caption, player.path.name)], []
 
 
 @events.stage("writing depth")
@@ -460,34 +462,35 @@ def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
 
 
 def _next(folder, run, trained, base=None):
-    """Suggested next commands, with absolute paths relative to a `base`."""
-    own = run.code
-    line = commands.render(folder, own, base)
-    looked = report.Command("Render it from other viewpoints and times:", line)
+    """Suggest the next commands, with absolute paths relative to a `base`."""
+    line = commands.render(folder, run.code, base)
+    render = report.Command("Render the scene from other viewpoints and times:", line)
     if trained.result.stopped_by == "non-finite":
-        return [looked]  # resumed, it would stop at the same step
+        return [render]  # a resumed run would stop at the same step
     if trained.result.steps < run.spec.steps:
-        line = commands.resume(folder, own, base)
-        return [looked, report.Command("Train it to the end:", line)]
+        line = commands.resume(folder, run.code, base)
+        return [render, report.Command("Continue training to the last step:", line)]
     others = tuple(o for o in run.config.overrides if not o.startswith("steps="))
     longer = dataclasses.replace(run.config, steps=2 * run.spec.steps, overrides=others)
     line = commands.reconstruct(longer, base)
-    return [looked, report.Command("Train it twice as long:", line)]
+    return [render, report.Command("Train for twice as many steps:", line)]
 
 
-def _log(folder, page, metrics, baselines, following):
+def _log(folder, page, metrics, baselines, suggestions):
+    """Print the main metrics, the paths of the products, and suggested commands."""
     value = {metric.key: metric.value for metric in metrics}
     console.say(
-        f"held out: {value['heldout.psnr']:.2f} dB, SSIM {value['heldout.ssim']:.3f} "
-        f"over {value['heldout.frames']} frames{_parts(value)}; "
-        f"{value['train.seconds']:.0f} s of "
-        f"training, {value['train.compile_seconds']:.0f} s of compilation; "
-        f"{value['render.ms_per_frame']:.0f} ms per frame"
+        f"held-out:   {value['heldout.psnr']:.2f} dB PSNR, "
+        f"{value['heldout.ssim']:.3f} SSIM over {value['heldout.frames']} frames"
+        f"{_parts(value)}; "
+        f"{value['train.seconds']:.0f} s of training, "
+        f"{value['train.compile_seconds']:.0f} s of compilation; "
+        f"{value['render.ms_per_frame']:.0f} ms per rendered frame"
     )
     if "tracks.epe" in value:
         console.say(
-            f"tracks:    end-point error {value['tracks.epe']:.4f} scene units, "
-            f"{value['tracks.static_epe']:.4f} for a static prediction"
+            f"tracks:     end-point error {value['tracks.epe']:.4f} scene units "
+            f"({value['tracks.static_epe']:.4f} for a static prediction)"
         )
     for line in baselines:
         console.say(line)
@@ -496,12 +499,12 @@ def _log(folder, page, metrics, baselines, following):
     for kind, name in (("comparison:", "comparison.png"), ("video:", "scene.mp4")):
         if (folder / name).exists():
             console.say(f"{kind:11} {folder / name}")
-    for command in following:
+    for command in suggestions:
         console.say(f"{command.purpose}\n  {command.line}")
 
 
 def _parts(value):
-    """Format the PSNR of moving and static regions, where masks separate them."""
+    """Format the PSNR of moving and static regions, if masks separate them."""
     names = {"moving": "heldout.moving_psnr", "static": "heldout.static_psnr"}
     parts = [
         f"{value[key]:.2f} dB {name}" for name, key in names.items() if key in value

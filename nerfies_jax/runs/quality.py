@@ -1,4 +1,4 @@
-"""Quality of the held-out frames of a finished run."""
+"""Quality metrics of the held-out frames of a finished run."""
 
 from typing import NamedTuple
 
@@ -26,22 +26,22 @@ from nerfies_jax.runtime import events
 from nerfies_jax.training.loop import History
 from nerfies_jax.training.model import TrainState
 
-TRACKS = 200  # points of a built-in scene that are followed
+TRACKS = 200  # points of a built-in scene to track
 NETWORKS = {"alex": perceptual.ALEX, "vgg": perceptual.VGG}
 
 
 class Extra(NamedTuple):
-    """Additional metrics that were requested."""
+    """Additional metrics requested by the user."""
 
     lpips: Lpips | None
-    camera_fits: int  # frames that are scored with cameras fitted to them
+    camera_fits: int  # frames to score also with optimized cameras
 
 
 NOTHING = Extra(None, 0)
 
 
 def prepared(more: MoreMetrics) -> Extra:
-    """Read the weights of additional metrics, before anything is trained.
+    """Read the weights of additional metrics, so that errors occur before training.
 
     Args:
       more: Requested metrics.
@@ -84,7 +84,7 @@ def measure(
 ) -> tuple[dict[str, float], list[str]]:
     """Measure the quality of a run.
 
-    Points and flow are compared with the ground truth of a built-in scene.
+    For a built-in scene, tracks and optical flow are compared with the ground truth.
 
     Args:
       run: The run.
@@ -98,7 +98,7 @@ def measure(
     Returns:
       Values by the keys of `heldout.TOLERANCES`, and notes.
     """
-    known = followed = flow = fitted = None
+    known = tracked = flow = fitted = None
     capture, note = moving_masks.with_masks(run.filmed, CACHE / "evidence")
     notes = [note] if note else []
     try:
@@ -106,10 +106,10 @@ def measure(
         if truth is not None:
             known = protocol.ground_truth(capture, truth, len(scored.rows), TRACKS)
     except ValueError as error:
-        notes.append(f"No points were followed: {error}")
+        notes.append(f"Tracks were not evaluated: {error}")
     if known is not None:
         kind, scene = run.representation, (run.spec, run.metadata)
-        followed = kind.scoring.follow(*scene, state, capture, known)
+        tracked = kind.scoring.follow(*scene, state, capture, known)
         move = kind.scoring.mover(*scene)
         if move is not None:
             flow = model_flow.heldout_flow(move, state, capture, scored)
@@ -123,22 +123,22 @@ def measure(
             scored.rows[places],
             filmed=run.filmed,
         )
-        given, found = map(
+        before, after = map(
             evaluation.known_mean, (scored.psnr[places], fitted.scored.psnr)
         )
         notes.append(
-            f"Cameras fitted to {len(places)} held-out frames: {given:.2f} dB with "
-            f"those of the capture, {found:.2f} dB with the fitted ones, of which "
-            f"{fitted.converged.sum()} converged."
+            f"PSNR of {len(places)} held-out frames: {before:.2f} dB with the cameras "
+            f"of the capture, {after:.2f} dB with cameras optimized for these frames "
+            f"({fitted.converged.sum()} of {len(places)} converged)."
         )
     if extra.lpips is not None:
-        notes.append(f"LPIPS is that of {extra.lpips.network.name}, version 0.1.")
+        notes.append(f"LPIPS uses {extra.lpips.network.name}, version 0.1.")
     numbers = heldout.heldout_metrics(
         scored,
         capture,
         lpips=extra.lpips,
         known=known,
-        followed=followed,
+        followed=tracked,
         flow=flow,
         fitted=fitted,
         baselines=_baselines(run, state, draw, scored.rows, frame_seconds),
@@ -147,15 +147,15 @@ def measure(
 
 
 def _baselines(run, state, draw, rows, frame_seconds):
-    frames, moments = budget.still(frame_seconds, len(rows), run.filmed.size)
+    counts = budget.static_renders(frame_seconds, len(rows), run.filmed.size)
     return Baselines(
         baseline_images.neighbor_means(run.filmed, rows),
-        baseline_images.time_averages(draw, state, run.filmed, rows, frames, moments),
+        baseline_images.time_averages(draw, state, run.filmed, rows, *counts),
     )
 
 
 def check_learned(history: History, scored: Scored) -> None:
-    """Refuse a report of a run that learned nothing or cannot be evaluated.
+    """Refuse to report a run that learned nothing or cannot be evaluated.
 
     Args:
       history: History of the run.
@@ -169,10 +169,10 @@ def check_learned(history: History, scored: Scored) -> None:
     if losses and not any(losses):
         raise FloatingPointError(
             "no report: the loss was 0 in all steps, so nothing was learned; check "
-            "which pixels of the capture are observed and static"
+            "the masks of valid and of moving pixels of the capture"
         )
     if len(scored.psnr) and np.isnan(scored.psnr).all():
         raise FloatingPointError(
-            f"no report: none of the {len(scored.psnr)} held-out frames that were "
-            "scored has a PSNR; check which of their pixels are observed"
+            f"no report: none of the {len(scored.psnr)} scored held-out frames has a "
+            "PSNR; check the masks of their valid pixels"
         )

@@ -1,4 +1,4 @@
-"""Reconstruction in one call, from a capture or on from a checkpoint."""
+"""Reconstruction in one call, from a capture or from the last checkpoint of a run."""
 
 import contextlib
 import dataclasses
@@ -41,7 +41,7 @@ from nerfies_jax.runtime import console, stopping
 from nerfies_jax.training import checkpoint
 from nerfies_jax.training.loop import FitResult, Hook
 
-# (run, its folder) -> what is called between chunks of steps while the run is trained
+# From the run and its folder to a context that yields a hook of the training loop.
 Watched = Callable[[Run, pathlib.Path], contextlib.AbstractContextManager[Hook]]
 
 
@@ -50,12 +50,12 @@ class Refused(ValueError):
 
 
 class Outcome(NamedTuple):
-    """Result of a run with its folder, and errors."""
+    """Result of training a run, and the errors that occurred while writing products."""
 
     folder: pathlib.Path
     run: Run
     result: FitResult
-    errors: tuple[str, ...]  # one line each; empty where all went well
+    errors: tuple[str, ...]  # one line each, empty if there were none
 
 
 def reconstruct(
@@ -73,16 +73,17 @@ def reconstruct(
 ) -> Outcome:
     """Train a run from its first step and write its products.
 
-    A video or images without cameras are converted first into a folder `OUT-capture`,
-    which is kept. From the first moment on, `resume` can continue the run in `out`. Its
-    events are in `events.jsonl` from the beginning on (`runs.read_events`).
+    A video or images without cameras are first converted to a capture in the folder
+    `OUT-capture`, which is kept. `resume` can continue the run in `out` as soon as the
+    folder exists. Events are written to its `events.jsonl` from the beginning
+    (`runs.read_events` reads them).
 
     Args:
       config: Settings of the run.
       out: A new folder for everything. None for `runs/CAPTURE-PRESET`.
       effects: "preset", or "auto" to enable the effects that the capture needs.
-      seconds: Seconds of training, which determine the number of steps or, if that is
-        set, end training early.
+      seconds: Time budget in seconds of training. It determines the number of steps. If
+        `config` sets that number, training ends early when the budget is spent.
       evaluate_every: Seconds of training between two evaluations.
       checkpoint_every: Seconds of training between two checkpoints.
       more: Additional metrics, computed at the end.
@@ -91,16 +92,16 @@ def reconstruct(
       log: Trackers that receive the events: "tensorboard", "wandb", "rerun".
 
     Returns:
-      The result.
+      The run with its result and its folder.
 
     Raises:
       Refused: If training cannot begin.
     """
-    began = time.perf_counter()
-    with contextlib.ExitStack() as held:
+    start_time = time.perf_counter()
+    with contextlib.ExitStack() as stack:
         with _refusing():
             pace = Pace(seconds, evaluate_every, checkpoint_every)
-            follow = held.enter_context(following(log))
+            follow = stack.enter_context(following(log))
             if out is not None:
                 out = pathlib.Path(out).absolute()
                 run_folder.check_free(out)
@@ -111,21 +112,21 @@ def reconstruct(
             _describe(run)
             quality.check(extra, run.capture.size)
             state = first_state(run)
-            if seconds is not None and not _steps_given(run.config):
+            if seconds is not None and not _sets_steps(run.config):
                 run, line = plan.with_seconds(run, state, seconds)
                 console.say(line)
                 pace = dataclasses.replace(pace, seconds=plan.OVERRUN * seconds)
             stem = "-".join(run.capture.name.split()) + "-" + run.config.preset
             folder = run_folder.new_run_folder(out, stem)
-            held.enter_context(run_folder.owned(folder))
-            left_out = record.notes_on(run.capture, CACHE / "evidence")
-            save_config(folder, run, left_out)
+            stack.enter_context(run_folder.owned(folder))
+            notes = record.notes_on(run.capture, CACHE / "evidence")
+            save_config(folder, run, notes)
             same_capture.record(folder, run.capture)
             follow.begin(folder, run, None)
-            checkpoints = _opened(held, folder, run, state, None)
-            hooks = _watching(held, watched, run, folder)
+            checkpoints = _open_checkpoints(stack, folder, run, state, None)
+            hooks = _hooks(stack, watched, run, folder)
         start = state, None, checkpoints
-        outcome = _finished(folder, run, start, pace, hooks, began, extra)
+        outcome = _train(folder, run, start, pace, hooks, start_time, extra)
         follow.end(outcome.result, outcome.errors)
         return outcome
 
@@ -145,17 +146,16 @@ def resume(
 ) -> Outcome:
     """Continue a run from its last checkpoint, bit for bit.
 
-    A complete run gets its products written again.
+    If the run has completed its training, only its products are written again.
 
     Args:
       folder: The run folder.
       expected: Settings that the run must have been started with: fields of its config
-        and of its source by name. A capture that was moved since is named at its new
-        place.
+        and of its source by name. If the capture has been moved, its new path.
       overrides: Fields of its spec that it must have been started with, as PATH=VALUE.
       trusted: Names MODULE:NAME of code from other packages that may be loaded if the
         run was started with it. The folder alone cannot cause code to run.
-      seconds: Seconds of training of this call.
+      seconds: Time budget of this call in seconds of training.
       evaluate_every: Seconds of training between two evaluations.
       checkpoint_every: Seconds of training between two checkpoints.
       more: Additional metrics, computed at the end.
@@ -163,37 +163,37 @@ def resume(
       log: Trackers that receive the events: "tensorboard", "wandb", "rerun".
 
     Returns:
-      The result.
+      The run with its result and its folder.
 
     Raises:
       Refused: If settings, images or cameras differ from those at the start of the run,
         or another process is working in the folder.
     """
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     folder = pathlib.Path(folder)
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as stack:
         with _refusing():
             pace = Pace(seconds, evaluate_every, checkpoint_every)
-            follow = held.enter_context(following(log))
-            moved = _check_expected(folder, expected)
-            held.enter_context(run_folder.owned(folder))
+            follow = stack.enter_context(following(log))
+            new_paths = _check_expected(folder, expected)
+            stack.enter_context(run_folder.owned(folder))
             extra = quality.prepared(more)
-            run = saved_run(folder, overrides, moved, trusted)
+            run = saved_run(folder, overrides, new_paths, trusted)
             _describe(run)
             quality.check(extra, run.capture.size)
-            state, record, after = _restored(folder, run)
+            state, history, after = _restore(folder, run)
             follow.begin(folder, run, after or 0)
-            checkpoints = _opened(held, folder, run, state, after)
-            hooks = _watching(held, watched, run, folder)
-        start = state, record, checkpoints
-        outcome = _finished(folder, run, start, pace, hooks, began, extra)
+            checkpoints = _open_checkpoints(stack, folder, run, state, after)
+            hooks = _hooks(stack, watched, run, folder)
+        start = state, history, checkpoints
+        outcome = _train(folder, run, start, pace, hooks, start_time, extra)
         follow.end(outcome.result, outcome.errors)
         return outcome
 
 
 @contextlib.contextmanager
 def _refusing() -> Iterator[None]:
-    """Raise errors of readers of settings, captures and folders as Refused."""
+    """Convert errors in settings, captures and folders to `Refused`."""
     try:
         yield
     except (ValueError, OSError) as error:
@@ -201,33 +201,35 @@ def _refusing() -> Iterator[None]:
 
 
 def _check_spec(config):
-    """Refuse wrong settings before minutes of looking for cameras and motion.
+    """Refuse wrong settings before the minutes that cameras and tracks may take.
 
-    Of a preset that tracks will choose, what none of those allows.
+    If the preset is yet to be chosen from the tracks, overrides are refused only if no
+    candidate accepts them.
     """
     names = [config.preset]
     if config.preset is None:
         names = [n for each, _ in representations.choosing() for n in each.presets]
-    refused = []
+    errors = []
     for name in names:
         try:
             scene_spec(dataclasses.replace(config, preset=name))
         except ValueError as error:
-            refused.append(error)
-    if refused and len(refused) == len(names):
-        raise refused[0]
+            errors.append(error)
+    if errors and len(errors) == len(names):
+        raise errors[0]
 
 
 def _with_cameras(config, out, how):
-    """The config, its source a capture: prepared now, or before, if it was none."""
+    """Return the config with a capture as its source, converted first if needed."""
     source = config.source.capture
     if source is not None:
         run_folder.refuse_run(source)
     if source is None or not preparation.needed(source):
         if how != Preparation():
             raise ValueError(
-                "prepare is for videos and images without cameras, and "
-                f"{source or 'a built-in scene'} has its own; leave it out"
+                "settings of the conversion (prepare) apply to videos and images "
+                f"without cameras, but {source or 'a built-in scene'} has cameras; "
+                "remove them"
             )
         return config
     out = out or pathlib.Path("runs") / source.stem
@@ -236,10 +238,10 @@ def _with_cameras(config, out, how):
     return dataclasses.replace(config, source=named)
 
 
-def _steps_given(config):
-    """Test if the user has set the number of steps."""
-    given = any(words.startswith("steps=") for words in config.overrides)
-    return given or config.steps is not None
+def _sets_steps(config):
+    """Test if a config sets the number of steps."""
+    overridden = any(text.startswith("steps=") for text in config.overrides)
+    return overridden or config.steps is not None
 
 
 def _new_run(config, effects):
@@ -250,9 +252,8 @@ def _new_run(config, effects):
     if config.preset is None:
         chosen, lines = adviser.by_tracks(config, stored)
     if effects == "auto":
-        inspected = inspection.inspect(stored, CACHE / "evidence")
-        found = inspected.findings
-        chosen, more = adviser.follow(chosen, config.overrides, found)
+        findings = inspection.inspect(stored, CACHE / "evidence").findings
+        chosen, more = adviser.follow(chosen, config.overrides, findings)
         lines += more
     console.say("\n".join(lines))
     return new_run(chosen, stored)
@@ -264,44 +265,46 @@ def _describe(run):
 
 
 def _check_expected(folder, expected):
-    """Raise ValueError naming both values where a run was started with others.
+    """Check that a run was started with the expected settings.
 
-    Returns what of its source has been moved since, by name.
+    Returns the new paths of files of its source that have been moved, by field name.
+    Raises ValueError with the saved and the expected value of each difference.
     """
     config = read_config(folder)
     stored = {**vars(config), **vars(config.source)}
-    there, source = stored["capture"], expected.get("capture")
-    if there is not None and source is not None and run_folder.is_of(there, source):
-        expected = {**expected, "capture": there}  # or a film that it was made of
-    moved = {k: x for k, x in expected.items() if _has_moved(stored[k], x)}
-    stored = stored | moved
-    unlike = [
+    capture, source = stored["capture"], expected.get("capture")
+    if capture is not None and source is not None and run_folder.is_of(capture, source):
+        expected = {**expected, "capture": capture}  # also if `source` is its video
+    new_paths = {k: x for k, x in expected.items() if _has_moved(stored[k], x)}
+    stored = stored | new_paths
+    differences = [
         f"{name.replace('_', '-')}: saved {stored[name]}, now {value}"
         for name, value in expected.items()
         if value != stored[name]
     ]
-    if unlike:
+    if differences:
         raise ValueError(
-            f"{folder}: the run was started with other settings: {'; '.join(unlike)}; "
-            "leave them out to continue it, or start anew in another folder, out=..."
+            f"{folder}: the run was started with other settings: "
+            f"{'; '.join(differences)}; leave them out to continue it, or start a new "
+            "run in another folder, out=..."
         )
-    return moved
+    return new_paths
 
 
 def _has_moved(old, new):
-    """Test if a missing file or folder may be the one that is named now."""
+    """Test if a file that is missing may be the one at a new path."""
     if isinstance(old, GivenFiles):
         pairs = [(x, getattr(new, name)) for name, x in vars(old).items()]
-        unlike = [(x, y) for x, y in pairs if x != y]
-        return bool(unlike) and all(_has_moved(x, y) for x, y in unlike)
-    paths = isinstance(old, pathlib.Path) and isinstance(new, pathlib.Path)
-    return paths and not old.exists() and new.exists()
+        different = [(x, y) for x, y in pairs if x != y]
+        return bool(different) and all(_has_moved(x, y) for x, y in different)
+    are_paths = isinstance(old, pathlib.Path) and isinstance(new, pathlib.Path)
+    return are_paths and not old.exists() and new.exists()
 
 
-def _restored(folder, run):
-    """The newest state saved, its record and step.
+def _restore(folder, run):
+    """Return the newest saved state, the history and the step of a run.
 
-    The first one, without them, where the run was killed before it saved that.
+    If it was killed before it saved any, the initial state without the other two.
     """
     if checkpoint.latest(folder / run_folder.CHECKPOINTS) is None:
         return first_state(run), None, None
@@ -309,40 +312,40 @@ def _restored(folder, run):
     return restored.state, restored.record, restored.step
 
 
-def _opened(held, folder, run, state, after):
-    """Open the checkpoints of a run, and save the state of a new one."""
+def _open_checkpoints(stack, folder, run, state, after):
+    """Open the checkpoints of a run, and save the initial state of a new run."""
     line = commands.resume(folder, run.code)
     stopping.advise(f"continue with: {line}")
-    checkpoints = held.enter_context(train.open_checkpoints(folder, run, after))
+    checkpoints = stack.enter_context(train.open_checkpoints(folder, run, after))
     if after is None:
         checkpoints.save(state, 0)
         checkpoints.wait()
     return checkpoints
 
 
-def _watching(held, watched, run, folder):
-    """The hooks of who looks on, for as long as `held` is."""
-    return () if watched is None else (held.enter_context(watched(run, folder)),)
+def _hooks(stack, watched, run, folder):
+    """Return the hooks of observers, which stay active until `stack` is closed."""
+    return () if watched is None else (stack.enter_context(watched(run, folder)),)
 
 
-def _finished(folder, run, start, pace, hooks, began, extra):
-    """The outcome of training to the end, with what is to be seen of it written."""
+def _train(folder, run, start, pace, hooks, start_time, extra):
+    """Train a run to its end and write its products."""
     trained = train.train(run, *start, pace, hooks)
     result = trained.result
     errors = [result.unsaved] if result.unsaved else []
     if result.stopped_by in ("steps", "seconds", "non-finite"):
         try:
-            products.make(folder, run, trained, began, extra)
+            products.make(folder, run, trained, start_time, extra)
         except FloatingPointError as error:
             errors.append(str(error))
         except (OSError, CaptureError) as error:
             errors.append(
-                f"not all of what came of the run is written: {error}; resume the run "
-                "once there is room"
+                f"some products of the run could not be written: {error}; free disk "
+                "space and resume the run to write them"
             )
     if result.stopped_by == "non-finite":
         errors.append(
-            f"{result.message}; start anew with lower learning rates "
+            f"{result.message}; start a new run with lower learning rates "
             f"(their names are in {folder / run_folder.CONFIG})"
         )
     return Outcome(folder, run, result, tuple(errors))

@@ -1,7 +1,7 @@
-"""Report of a run as one HTML page. Programs read `metrics.json` instead.
+"""Report of a run as an HTML page. Programs should read `metrics.json` instead.
 
-The page is one file that loads nothing and runs no script: images and short videos are
-embedded. It shows no path of the machine that it was made on.
+The page is one file without scripts or external resources: images and short videos are
+embedded. It contains no absolute paths of the machine that it was written on.
 """
 
 import base64
@@ -25,7 +25,7 @@ from nerfies_jax.runs import relative_paths
 from nerfies_jax.runs.report_style import STYLE
 from nerfies_jax.runtime import events
 
-# A larger video stays beside the page: base64 adds a third, and mail stops near 10 MB.
+# Larger videos are linked: base64 adds a third, and mail servers reject about 10 MB.
 EMBEDDED_VIDEO_BYTES = 6 * 2**20
 HEADLINES = (
     "heldout.psnr",
@@ -40,10 +40,10 @@ HEADLINES = (
     "gaussians",
     "parameters",
 )
-# Broader images scroll sideways on a phone instead of shrinking to stamps.
-BROAD_PX = 1100
+# Wider images scroll horizontally on a phone instead of becoming illegible.
+WIDE_PX = 1100
 _BETTER = {"higher": "\u2191 higher", "lower": "\u2193 lower", "equal": ""}
-_OTHER = "Other"  # group of metrics that the table does not have
+_OTHER = "Other"  # group of metrics that `metric_table` does not contain
 
 
 class Figure(NamedTuple):
@@ -51,11 +51,11 @@ class Figure(NamedTuple):
 
     path: pathlib.Path  # PNG or JPEG
     caption: str  # full sentences
-    link: str = ""  # a file beside the page that the image leads to
+    link: str = ""  # file next to the page that the image links to
 
 
 class Video(NamedTuple):
-    """A video file, a caption for it, and the image that stands for it in print."""
+    """A video file, a caption for it, and the image that replaces it in print."""
 
     path: pathlib.Path  # mp4
     caption: str  # full sentences
@@ -63,7 +63,7 @@ class Video(NamedTuple):
 
 
 class Command(NamedTuple):
-    """Something to run next."""
+    """A suggested command."""
 
     purpose: str
     line: str
@@ -90,10 +90,10 @@ def write(
       metrics: Metrics of the run. `metric_table` names and explains them.
       config: The settings of the run, in nested mappings.
       figures: Images to show, in order.
-      video: A video to show after them.
+      video: A video to show after the images.
       step_ms: Milliseconds of a training step by part.
-      notes: Sentences that the reader should know, such as what was not computed.
-      commands: Commands to run next, with their paths relative as above.
+      notes: Sentences for the reader, such as metrics that could not be computed.
+      commands: Suggested next commands, with relative paths as described above.
 
     Returns:
       The path of the page.
@@ -103,13 +103,14 @@ def write(
     """
     folder = pathlib.Path(folder)
 
-    def shown(text):
+    def without_paths(text):
         return relative_paths.in_text(text, folder)
 
-    figures = [each._replace(caption=shown(each.caption)) for each in figures]
+    figures = [each._replace(caption=without_paths(each.caption)) for each in figures]
+    heading = _safe(without_paths(title))
     sections = [
         _headlines(metrics),
-        _notes(map(shown, notes)),
+        _notes(map(without_paths, notes)),
         *(_figure(figure) for figure in figures),
         _video(video, folder),
         _metrics(metrics),
@@ -125,12 +126,12 @@ def write(
             '<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             '<meta name="color-scheme" content="light dark">',
-            f"<title>{_safe(shown(title))}</title>",
+            f"<title>{heading}</title>",
             f"<style>\n{STYLE}</style>",
             "</head>",
             "<body>",
             "<main>",
-            f"<h1>{_safe(shown(title))}</h1>",
+            f"<h1>{heading}</h1>",
             *filter(None, sections),
             "</main>",
             "</body>",
@@ -155,7 +156,7 @@ def readable(value: float | int, unit: str) -> str:
       The text.
     """
     if not math.isfinite(value):
-        return "not a number"
+        return "not available"
     if unit in ("bytes", "B"):
         for name, size in (("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
             if abs(value) >= size:
@@ -166,7 +167,7 @@ def readable(value: float | int, unit: str) -> str:
 
 
 def _rounded(value):
-    """Four digits, but never fewer than the whole part has."""
+    """Format with four digits, or more if the integer part has more."""
     places = max(0, 3 - math.floor(math.log10(abs(value))))
     return f"{value:,.{places}f}" if places <= 6 else f"{value:.3e}"
 
@@ -198,29 +199,33 @@ def _figure(figure):
     path = pathlib.Path(figure.path)
     kind = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}.get(path.suffix.lower())
     if kind is None:
-        raise ValueError(f"{path}: a report shows PNG and JPEG; convert it first")
-    width, height = images.read_header(path).size  # an error here names the file
+        raise ValueError(
+            f"{path}: images of a report must be PNG or JPEG; convert it first"
+        )
+    width, height = images.read_header(path).size  # errors name the file
     source = f"data:image/{kind};base64,{_encoded(path)}"
     caption = _safe(figure.caption)
     shape = f'width="{width}" height="{height}"'
-    if width > BROAD_PX:
-        # Focusable, so that the keyboard can scroll it too.
-        before = f'<div class="wide" tabindex="0" role="group" aria-label="{caption}">'
-        picture = (
-            f'{before}<img class="broad" {shape} alt="{caption}" src="{source}"></div>'
+    if width > WIDE_PX:
+        # Focusable, so that it can also be scrolled with the keyboard.
+        start = f'<div class="wide" tabindex="0" role="group" aria-label="{caption}">'
+        image = (
+            f'{start}<img class="broad" {shape} alt="{caption}" src="{source}"></div>'
         )
     else:
-        picture = f'<img {shape} alt="{caption}" src="{source}">'
+        image = f'<img {shape} alt="{caption}" src="{source}">'
     if figure.link:
-        before, name = f'<a href="{_safe(figure.link)}">', _safe(figure.link)
-        picture, words = f"{before}{picture}</a>", f"{before}{name}</a>"
-        named = name in caption
-        caption = caption.replace(name, words, 1) if named else f"{caption} {words}"
-    return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
+        name = _safe(figure.link)
+        image, link = f'<a href="{name}">{image}</a>', f'<a href="{name}">{name}</a>'
+        if name in caption:
+            caption = caption.replace(name, link, 1)
+        else:
+            caption = f"{caption} {link}"
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 
 def _video(video, folder):
-    """The video on a screen, and a still with the file's name on paper."""
+    """Show the video on screen, and its first frame with the file name in print."""
     if video is None:
         return ""
     path = pathlib.Path(video.path)
@@ -241,24 +246,24 @@ def _video(video, folder):
     )
 
 
-def _jpeg(picture):
+def _jpeg(image):
     content = io.BytesIO()
-    PIL.Image.fromarray(picture).save(content, "JPEG", quality=85)
+    PIL.Image.fromarray(image).save(content, "JPEG", quality=85)
     return base64.b64encode(content.getvalue()).decode("ascii")
 
 
 def _metrics(metrics):
-    """One table with a heading for each group, so that its columns align."""
+    """Show all groups in one table, so that their columns are aligned."""
     rows = []
     for group in (*GROUPS, _OTHER):
-        inside = [metric for metric in metrics if _entry(metric).group == group]
-        if inside:
+        members = [metric for metric in metrics if _entry(metric).group == group]
+        if members:
             rows.append(
                 f'<tr class="group"><th colspan="3" scope="rowgroup">{group}</th></tr>'
             )
-        rows += map(_metric_row, inside)
-    heads = ("metric", "value", "better")
-    return _table("Metrics", heads, "".join(rows), kind="metrics")
+        rows += map(_metric_row, members)
+    columns = ("metric", "value", "better")
+    return _table("Metrics", columns, "".join(rows), kind="metrics")
 
 
 def _metric_row(metric):
@@ -297,7 +302,7 @@ def _settings(config, base):
 
 
 def _flat(config, base, prefix=""):
-    """Dotted names and values. An empty group is shown as such."""
+    """Yield dotted names and values. An empty group has a row of its own."""
     for name, value in config.items():
         if isinstance(value, Mapping) and value:
             yield from _flat(value, base, f"{prefix}{name}.")
@@ -308,7 +313,7 @@ def _flat(config, base, prefix=""):
 
 
 def _relative(value, base):
-    """A setting, with absolute paths relative to the base."""
+    """Return the value of a setting with absolute paths made relative to the base."""
     if isinstance(value, list | tuple):
         return [_relative(each, base) for each in value]
     if isinstance(value, str | os.PathLike) and os.path.isabs(value):
@@ -323,14 +328,14 @@ def _commands(commands, folder):
     )
     if not items:
         return ""
-    inside = relative_paths.relative(folder, relative_paths.base_of(folder))
-    where = (
+    path = relative_paths.relative(folder, relative_paths.base_of(folder))
+    base = (
         "the folder of this page"
-        if inside == "."
-        else f"the folder that contains <code>{_safe(inside)}</code>"
+        if path == "."
+        else f"the folder that contains <code>{_safe(path)}</code>"
     )
-    note = f"<p>Paths on this page are relative to {where}.</p>"
-    return f"<section><h2>What to run next</h2>{items}{note}</section>"
+    note = f"<p>Paths on this page are relative to {base}.</p>"
+    return f"<section><h2>Next steps</h2>{items}{note}</section>"
 
 
 def _table(title, columns, rows, kind=""):

@@ -1,4 +1,4 @@
-"""Installed representations, found by their entry points."""
+"""Installed representations, discovered through their entry points."""
 
 import functools
 import importlib.metadata
@@ -6,7 +6,7 @@ import json
 import pathlib
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-if TYPE_CHECKING:  # a record is loaded when it is asked for, not with this module
+if TYPE_CHECKING:  # not at run time, so that importing this module imports no JAX
     from collections.abc import Callable
 
     from nerfies_jax.capture.capture import Capture
@@ -18,8 +18,9 @@ from nerfies_jax.runs.run_folder import CONFIG
 from nerfies_jax.training import extensions, specs
 
 GROUP = "nerfies_jax.representations"
-USUAL = "splats-tracked-small"  # where none is named, and tracks tell a motion
-# Presets of both packages, for command lines, which are parsed without JAX.
+# Preset of a run without a preset whose capture has usable tracks of moving points.
+USUAL = "splats-tracked-small"
+# Presets of both packages, because command lines are parsed without importing JAX.
 PRESETS = (
     *("splats-static", "splats-mcmc", "splats-tracked", "splats-deformable"),
     *("sonata", "moba", "dynmf", "spacetime", "spline", "4dgs", "sc-gs", "edgs"),
@@ -49,12 +50,12 @@ def installed() -> dict[str, "Representation"]:
       ValueError: If there are none.
     """
     points = importlib.metadata.entry_points(group=GROUP)
-    # A checkout that is installed and also stands on the path is found twice.
+    # A checkout that is both installed and on the path has two entry points.
     by_name = {point.name: point for point in points}
     if not by_name:
         raise ValueError(
-            f"no entry point of the group {GROUP}: install this project, as with "
-            "pip install -e ."
+            f"no entry points in the group {GROUP}: install this package, for example "
+            "with pip install -e ."
         )
     return {name: by_name[name].load() for name in sorted(by_name)}
 
@@ -69,7 +70,7 @@ def named(name: str) -> "Representation":
       The representation.
 
     Raises:
-      ValueError: If there is none of that name.
+      ValueError: If there is none with that name.
     """
     if name not in installed():
         known = known_names(name, installed())
@@ -79,16 +80,16 @@ def named(name: str) -> "Representation":
 
 def choosing() -> "list[tuple[Representation, Callable[[Capture], Choice]]]":
     """Return the representations that choose presets, with their functions."""
-    chosen = []
+    pairs = []
     for each in installed().values():
         recommendation = each.recommendation
         if recommendation is not None and recommendation.default_preset is not None:
-            chosen.append((each, recommendation.default_preset))
-    return chosen
+            pairs.append((each, recommendation.default_preset))
+    return pairs
 
 
 def of_preset(preset: str) -> "Representation":
-    """Return the representation that has a preset.
+    """Return the representation that a preset belongs to.
 
     Args:
       preset: Name of the preset.
@@ -97,7 +98,7 @@ def of_preset(preset: str) -> "Representation":
       The representation.
 
     Raises:
-      ValueError: If there is no such preset, with the names of all.
+      ValueError: If there is no such preset.
     """
     for representation in installed().values():
         if preset in representation.presets:
@@ -113,8 +114,8 @@ def of_run(folder: pathlib.Path) -> "Representation | None":
       folder: The run folder.
 
     Returns:
-      The representation, or None if it cannot be read. Reading the run itself reports
-      the reason.
+      The representation, or None if it cannot be read. `run.read_settings` reports the
+      reason.
     """
     try:
         stored = json.loads((folder / CONFIG).read_text())
@@ -126,19 +127,19 @@ def of_run(folder: pathlib.Path) -> "Representation | None":
 def stored_spec(
     representation: "Representation", stored: Any, *, load: bool = False
 ) -> Any:
-    """Read a spec as a run folder holds it.
+    """Parse the spec that is stored in a run folder.
 
     Args:
       representation: The representation of the run.
       stored: JSON values.
-      load: Whether classes of other packages that are named in it are imported, which
-        runs their code.
+      load: True to import classes of other packages that it names, which runs their
+        code.
 
     Returns:
       The spec.
 
     Raises:
-      ValueError, TypeError: If it is no spec of that representation.
+      ValueError, TypeError: If it is not a spec of that representation.
     """
     known = representation.spec_type
     names = extensions.names_in(stored, specs.TYPE) if load else ()
@@ -154,11 +155,11 @@ class Cores(NamedTuple):
 
 
 def cores(preset: str | None, overrides: tuple[str, ...] = ()) -> Cores:
-    """Return the cores that training of a preset should use.
+    """Return the number of cores for training a preset.
 
     Args:
-      preset: Name of the preset. None for the default one.
-      overrides: Changed fields, as PATH=VALUE.
+      preset: Name of the preset. None for the default preset.
+      overrides: Overrides of its fields, as PATH=VALUE.
 
     Returns:
       The arguments of `platform.start_jax`.
@@ -175,13 +176,13 @@ def cores(preset: str | None, overrides: tuple[str, ...] = ()) -> Cores:
 
 
 def cores_of_run(folder: pathlib.Path) -> Cores:
-    """Return the cores that the run in a folder should use.
+    """Return the number of cores for the run in a folder.
 
     Args:
       folder: The run folder.
 
     Returns:
-      The arguments of `platform.start_jax`, default ones if the run cannot be read.
+      The arguments of `platform.start_jax`, or the defaults if the run cannot be read.
     """
     representation = of_run(folder)
     if representation is None:

@@ -25,7 +25,7 @@ from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.preprocessing import frame_flow, frame_masks, given_files
 from nerfies_jax.runs import representations, same_capture, trust
 from nerfies_jax.runs.config import CaptureNotFound, CaptureSource, RunConfig
-from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG, LEFT_OUT
+from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG, PREPROCESSING_NOTES
 from nerfies_jax.runtime import events
 from nerfies_jax.training import checkpoint, specs
 from nerfies_jax.training.model import Model, TrainState
@@ -41,14 +41,16 @@ class Settings(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Everything that a run consists of before its first step."""
+    """Capture, scene and model of a run."""
 
     config: RunConfig
-    capture: Capture  # what is learned from: with pinholes where only they are drawn
-    filmed: Capture  # what held-out frames are scored against (`pinholes.scorable`)
+    # Training images. Undistorted if the representation renders only pinhole cameras.
+    capture: Capture
+    # Images that held-out frames are scored against (`pinholes.scorable`).
+    filmed: Capture
     representation: Representation
     spec: Any  # of the representation's `spec_type`
-    metadata: Any  # what the scene must know of the capture
+    metadata: Any  # scene metadata computed from the capture
     model: Model
 
     @property
@@ -59,24 +61,25 @@ class Run(NamedTuple):
 
 
 def new_run(config: RunConfig, stored: Capture | None = None) -> Run:
-    """Open a run for its settings.
+    """Create a run from its settings.
 
     Args:
       config: Settings of the run.
-      stored: Its `stored_capture`, if that has already been read.
+      stored: Result of `stored_capture`, if it has already been read.
 
     Returns:
       The run.
 
     Raises:
-      ValueError: If it cannot be opened, or has no held-out frames.
+      ValueError: If settings or capture are invalid, or no frames are held out.
     """
     representation = representations.of_preset(config.preset_name)
     run = open_run(config, representation, scene_spec(config), stored)
-    if not len(run.capture.heldout):  # before a training that ends without a score
+    # Otherwise the error would occur after training.
+    if not len(run.capture.heldout):
         raise ValueError(
             f"{run.capture.path or run.capture.name}: no held-out frames to evaluate; "
-            "use three images or more, or choose some with heldout=8"
+            "use three images or more, or hold out every 8th with heldout=8"
         )
     return run
 
@@ -93,7 +96,7 @@ def open_run(
       config: Settings of the run.
       representation: Representation of its preset.
       spec: Spec of the representation.
-      stored: Its `stored_capture`, if that has already been read.
+      stored: Result of `stored_capture`, if it has already been read.
 
     Returns:
       The run.
@@ -102,24 +105,27 @@ def open_run(
     traces_lenses = representation.scoring.traces_lenses
     filmed = pinholes.scorable(stored, traces_lenses)
     capture = filmed if traces_lenses else pinholes.as_pinholes(stored)
-    run = _built(config, representation, spec, capture, filmed)
-    capture = _completed(capture, run.model.required_data)
+    run = _build(config, representation, spec, capture, filmed)
+    capture = _add_required(capture, run.model.required_data)
     if capture is run.capture:
         return run
-    return _built(config, representation, spec, capture, filmed)
+    return _build(config, representation, spec, capture, filmed)
 
 
-def _completed(capture, wanted):
-    """Add flow and masks computed from the images if they are required.
+def _add_required(capture, required):
+    """Add optical flow and masks computed from the images if the model needs them.
 
-    Other missing data is noted.
+    Missing depth cannot be computed and becomes a note.
     """
-    if "flow" in wanted and capture.flow is None:
+    if "flow" in required and capture.flow is None:
         capture = frame_flow.with_flow(capture)
-    if "moving" in wanted and capture.moving is None:
+    if "moving" in required and capture.moving is None:
         capture = frame_masks.with_masks(capture)
-    if "depths" in wanted and capture.depths is None:
-        note = "this preset learns from depth as well, and the capture has none"
+    if "depths" in required and capture.depths is None:
+        note = (
+            "this preset can also use depth maps, but the capture has none: its depth "
+            "loss is disabled"
+        )
         capture = dataclasses.replace(capture, notes=(*capture.notes, note))
     return capture
 
@@ -132,22 +138,22 @@ def with_steps(run: Run, steps: int) -> Run:
       steps: Number of steps.
 
     Returns:
-      The run with its schedules stretched.
+      The run, with its schedules rescaled to that number.
     """
     config = dataclasses.replace(run.config, steps=steps)
     spec = scene_spec(config)
-    return _built(config, run.representation, spec, run.capture, run.filmed)
+    return _build(config, run.representation, spec, run.capture, run.filmed)
 
 
 @events.stage("building the model")
-def _built(config, representation, spec, capture, filmed):
+def _build(config, representation, spec, capture, filmed):
     metadata = representation.metadata_of(capture, spec)
     model = representation.build(spec, metadata)
     return Run(config, capture, filmed, representation, spec, metadata, model)
 
 
 def with_found_cameras(run: Run, state: TrainState) -> Run:
-    """Replace the cameras of a run by those that training has refined.
+    """Replace the cameras of a run by its refined cameras.
 
     Args:
       run: The run.
@@ -164,14 +170,15 @@ def with_found_cameras(run: Run, state: TrainState) -> Run:
 
 
 def drawer(run: Run, renderer: Renderer) -> Draw:
-    """Return the renderer of the frames as they were captured.
+    """Return a renderer of the original, possibly distorted frames.
 
     Args:
       run: The run.
       renderer: Renderer of the model.
 
     Returns:
-      A renderer of `run.filmed`, with lens distortion if needed.
+      A renderer of the views of `run.filmed`. It adds lens distortion if the model
+      renders only pinhole cameras.
     """
     if run.representation.scoring.traces_lenses or run.filmed is run.capture:
         return renderer
@@ -185,14 +192,14 @@ def scene_spec(config: RunConfig) -> Any:
       config: Settings of the run.
 
     Returns:
-      The spec, with schedules stretched to the number of steps.
+      The spec, with schedules rescaled to the number of steps.
     """
     representation = representations.of_preset(config.preset_name)
     spec = representation.presets[config.preset_name]
     steps = config.steps
-    for words in config.overrides:
-        if words.startswith("steps="):
-            steps = specs.override(spec, (words,)).steps
+    for override in config.overrides:
+        if override.startswith("steps="):
+            steps = specs.override(spec, (override,)).steps
     if steps is not None:
         spec = representation.with_steps(spec, steps)
     return specs.override(spec, config.overrides)
@@ -210,10 +217,9 @@ def load_capture(
     Args:
       folder: Folder of the capture.
       factor: Read images at 1/`factor` of their full size.
-      max_side: Longest side of the images in pixels. At most one of the two can be
-        given.
+      max_side: Longest side of the images in pixels. Mutually exclusive with `factor`.
       heldout: Frames to evaluate: n for every n-th, or the name of a split. None for
-        the files' own split.
+        the split stored with the capture.
 
     Returns:
       The capture, on the host.
@@ -221,13 +227,12 @@ def load_capture(
     Raises:
       ValueError: If it cannot be read.
     """
-    chosen = None if heldout is None else str(heldout)
     return read_capture(
         CaptureSource(
             capture=pathlib.Path(folder),
             factor=factor,
             max_side=max_side,
-            heldout=chosen,
+            heldout=None if heldout is None else str(heldout),
         )
     )
 
@@ -243,7 +248,7 @@ def built_in_scene(name: str = "default", seed: int = 0) -> Capture:
       The capture.
 
     Raises:
-      ValueError: If there is no scene of that name.
+      ValueError: If there is no scene with that name.
     """
     return read_capture(CaptureSource(scene=name), seed)
 
@@ -274,14 +279,14 @@ def stored_capture(source: CaptureSource, seed: int = 0) -> Capture:
     Raises:
       ValueError: If it cannot be read as requested.
     """
-    capture = given_files.attached(_filmed(source, seed), source.files)
+    capture = given_files.attached(_load(source, seed), source.files)
     gate.check_observed(capture)
     if source.preprocessing is None:
         return capture
     return dataclasses.replace(capture, preprocessing=source.preprocessing)
 
 
-def _filmed(source, seed):
+def _load(source, seed):
     if source.capture is None:
         return _built_in(source, seed)
     heldout = source.heldout
@@ -305,27 +310,26 @@ def _built_in(source, seed):
         )
     if source.files.times is not None:
         raise ValueError(
-            f"times={source.files.times}: a built-in scene has its own times; they are "
-            "for captures"
+            f"times={source.files.times}: timestamps can only be set for a capture; "
+            "a built-in scene defines its own"
         )
     for name in ("factor", "max_side", "heldout"):
-        if getattr(source, name) is not None:
+        value = getattr(source, name)
+        if value is not None:
             raise ValueError(
-                f"--{name.replace('_', '-')} is for captures; film the built-in "
-                "scene as you want it with experiments.make_scene and name its "
-                "folder"
+                f"{name}={value} applies to captures only; render the built-in scene "
+                "to a folder with experiments.make_scene, and use that as the capture"
             )
-    film = synthetic.PRESETS[source.scene]
-    return synthetic.cached(film, CACHE / "scenes", seed)[0]
+    return synthetic.cached(synthetic.PRESETS[source.scene], CACHE / "scenes", seed)[0]
 
 
-def save_config(folder: pathlib.Path, run: Run, left_out: Sequence[str] = ()) -> None:
+def save_config(folder: pathlib.Path, run: Run, notes: Sequence[str] = ()) -> None:
     """Write `config.json`: the settings, the complete spec, and the environment.
 
     Args:
       folder: The run folder.
       run: The run.
-      left_out: Notes on parts of preprocessing that were left out.
+      notes: Notes on steps of preprocessing that were skipped.
     """
     stored = {
         "config": specs.as_json(run.config),
@@ -333,8 +337,8 @@ def save_config(folder: pathlib.Path, run: Run, left_out: Sequence[str] = ()) ->
         "spec": specs.as_json(run.spec),
         "made by": provenance(),
     }
-    if left_out:
-        stored[LEFT_OUT] = [*left_out]
+    if notes:
+        stored[PREPROCESSING_NOTES] = [*notes]
     write_json(folder / CONFIG, stored)
 
 
@@ -344,15 +348,17 @@ def saved_run(
     moved: Mapping[str, Any] = {},
     trusted: Collection[str] = (),
 ) -> Run:
-    """Open the run in a folder, with the settings and the capture it was made with.
+    """Open the run in a folder with the settings and the capture it was started with.
 
-    Opening a folder runs no code of it: it may come from a stranger.
+    Opening a run folder never executes code that it names, because it may come from an
+    untrusted source.
 
     Args:
       folder: The run folder. Settings come from its `config.json`, not from the preset,
         which may have changed since.
       overrides: Settings that the run must have, as PATH=VALUE.
-      moved: The parts of its source that have another path today, which is kept.
+      moved: New values of fields of its source whose files have been moved. They are
+        stored in the run.
       trusted: Names MODULE:NAME of code from other packages that the caller trusts. It
         is loaded if the run needs it.
 
@@ -362,18 +368,19 @@ def saved_run(
     Raises:
       UntrustedCode: The run needs code that is not in `trusted`. It is a ValueError,
         and nothing has been imported.
-      CaptureNotFound: The capture is not where it was. It is a ValueError.
+      CaptureNotFound: The capture is no longer at its path. It is a ValueError.
       ValueError: `overrides` would change settings, or the capture is not the one that
         the run was started with.
     """
     folder = pathlib.Path(folder)
     config, kind, spec = read_settings(folder, trusted)
-    wanted = specs.override(spec, overrides)
-    changed = specs.differences(specs.as_json(spec), specs.as_json(wanted))
-    if changed:
+    requested = specs.override(spec, overrides)
+    changes = specs.differences(specs.as_json(spec), specs.as_json(requested))
+    if changes:
         raise ValueError(
-            f"{folder}: the run was started with other settings: {'; '.join(changed)}; "
-            "leave them out to continue it, or start anew in another folder, out=..."
+            f"{folder}: the run was started with other settings: {'; '.join(changes)}; "
+            "leave them out to continue it, or start a new run in another folder, "
+            "out=..."
         )
     source = dataclasses.replace(config.source, **moved)
     if source.capture is not None and not pathlib.Path(source.capture).exists():
@@ -408,20 +415,24 @@ def read_settings(folder: pathlib.Path, trusted: Collection[str] = ()) -> Settin
     trust.check(folder, stored, kind.spec_type, trusted)
     with _readable(folder):
         spec = representations.stored_spec(kind, stored["spec"], load=True)
-        for value, wanted in ((config, RunConfig), (spec, kind.spec_type)):
-            if not isinstance(value, wanted):
-                raise ValueError(f"a {type(value).__name__} for a {wanted.__name__}")
+        _check_type(config, RunConfig)
+        _check_type(spec, kind.spec_type)
     return Settings(config, kind, spec)
 
 
+def _check_type(value, expected):
+    if not isinstance(value, expected):
+        raise ValueError(f"expected {expected.__name__}, got {type(value).__name__}")
+
+
 def read_config(folder: pathlib.Path) -> RunConfig:
-    """Read the request that a run in a folder was started with, and no code.
+    """Read the config that a run was started with, without loading any code.
 
     Args:
       folder: The run folder.
 
     Returns:
-      The request.
+      The config.
 
     Raises:
       ValueError: If it cannot be read.
@@ -429,8 +440,7 @@ def read_config(folder: pathlib.Path) -> RunConfig:
     stored = _stored(folder)
     with _readable(folder):
         config = specs.from_json(stored["config"], RunConfig)
-        if not isinstance(config, RunConfig):
-            raise ValueError(f"a {type(config).__name__} for a RunConfig")
+        _check_type(config, RunConfig)
     return config
 
 
@@ -438,9 +448,9 @@ def _stored(folder):
     path = folder / CONFIG
     if not path.is_file():
         raise ValueError(
-            f"{folder}: no run here (there is no {CONFIG}); name the folder that "
-            "experiments.reconstruct printed; a run that was killed before it had one "
-            "must be started again"
+            f"{folder}: not a run folder (there is no {CONFIG}); pass the folder that "
+            "experiments.reconstruct printed; a run that was killed before it wrote "
+            "that file must be started again"
         )
     with _readable(folder):
         return read_json(path, dict[str, Any])
@@ -448,7 +458,7 @@ def _stored(folder):
 
 @contextlib.contextmanager
 def _readable(folder):
-    """Say of which file it is that what is read in the block is no settings."""
+    """Add the path of the settings to errors raised in the block."""
     try:
         yield
     except FileError:  # it names the path already
@@ -462,7 +472,7 @@ def _readable(folder):
     ) as error:
         reason = " ".join(str(error).split())
         raise FileError(
-            f"{folder / CONFIG}: not the settings of a run ({reason})"
+            f"{folder / CONFIG}: not valid settings of a run ({reason})"
         ) from error
 
 
@@ -482,13 +492,13 @@ def first_state(run: Run) -> TrainState:
     resources = run.representation.resources
     if resources.estimate_memory_bytes is not None:
         needed = resources.estimate_memory_bytes(run.spec, run.capture)
-        needed -= frame_memory.capture_bytes(run.capture)  # it is there already
+        needed -= frame_memory.capture_bytes(run.capture)  # already allocated
         free = free_memory()
         if needed > free:
             raise ValueError(
-                f"the first state needs about {needed / 2**30:.1f} GiB and "
-                f"{free / 2**30:.1f} GiB are free; {resources.memory_hint}, or "
-                "read smaller images with max_side=..."
+                f"the initial training state needs about {needed / 2**30:.1f} GiB of "
+                f"memory, but {free / 2**30:.1f} GiB are free; "
+                f"{resources.memory_hint}, or read smaller images with max_side=..."
             )
     return run.model.init(run.capture, jax.random.key(run.config.seed))
 

@@ -11,22 +11,22 @@ from collections.abc import Iterator
 
 import filelock
 
-CONFIG = "config.json"  # which capture and which scene, and the whole of its spec
-LEFT_OUT = "preprocessing"  # in it: notes on what that left out, if it did
+CONFIG = "config.json"  # settings of the run and its complete spec
+PREPROCESSING_NOTES = "preprocessing"  # key in CONFIG: notes on skipped preprocessing
 CHECKPOINTS = "checkpoints"
-EXPORTS = "exports"  # files for other programs, where no other place is named
+EXPORTS = "exports"  # default folder of files for other programs
 RENDERS = "renders"  # images and videos of camera paths
-PREPARED = "prepared.json"  # in a capture: of what it was made, and how
+PREPARED = "prepared.json"  # in a capture: its source and the conversion settings
 LOCK = ".lock"
-OWNER = ".owner.json"  # beside the lock: Windows lets nobody read a locked file
+OWNER = ".owner.json"  # not in LOCK, because Windows does not let locked files be read
 
 
 def new_run_folder(out: pathlib.Path | None, stem: str) -> pathlib.Path:
     """Create an empty writable folder for a run.
 
     Args:
-      out: The folder. None for `runs/STEM[-n]`.
-      stem: Beginning of the name of a default folder.
+      out: The folder. None for `runs/STEM`, or `runs/STEM-2` and so on if it exists.
+      stem: Name of the default folder.
 
     Returns:
       The folder.
@@ -37,7 +37,7 @@ def new_run_folder(out: pathlib.Path | None, stem: str) -> pathlib.Path:
     if out is None:
         return _numbered(pathlib.Path("runs"), stem)
     check_free(out)
-    with _named_if_not_writable(out):
+    with _write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out):
             pass
@@ -59,18 +59,18 @@ def newest_of(source: pathlib.Path, above: pathlib.Path | None = None) -> pathli
     """
     refuse_run(source)
     above = pathlib.Path("runs") if above is None else above
-    found = []
+    candidates = []
     for path in above.glob(f"*/{CONFIG}"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             capture = json.loads(path.read_text())["config"]["source"]["capture"]
             if capture is not None and is_of(pathlib.Path(capture), source):
-                found.append((path.stat().st_mtime_ns, path.parent))
-    if not found:
+                candidates.append((path.stat().st_mtime_ns, path.parent))
+    if not candidates:
         raise ValueError(
-            f"{source}: no run of it in {above}; name the run's folder with out=..., "
-            "or start a new one"
+            f"{source}: {above} contains no run of it; pass the run folder with "
+            "out=..., or start a new run"
         )
-    return max(found)[1]
+    return max(candidates)[1]
 
 
 def is_of(capture: pathlib.Path, source: pathlib.Path) -> bool:
@@ -102,7 +102,7 @@ def refuse_run(source: pathlib.Path) -> None:
     """
     if (source / CONFIG).is_file() and (source / CHECKPOINTS).is_dir():
         raise ValueError(
-            f"{source}: the folder of a run, not of a capture; continue the run with "
+            f"{source}: a run folder, not a capture; continue the run with "
             f"runs.resume({str(source)!r})"
         )
 
@@ -118,20 +118,21 @@ def check_free(out: pathlib.Path) -> None:
     """
     if out.exists() and not out.is_dir():
         raise ValueError(
-            f"{out}: the run folder is a file; choose another one with out=..."
+            f"{out}: a run needs a folder, but this is a file; choose another path "
+            "with out=..."
         )
     if not out.is_dir():
         above = next(path for path in out.absolute().parents if path.exists())
         if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)):
             raise ValueError(
-                f"{out}: the run folder cannot be written, since {above} cannot be; "
-                "choose another one with out=..."
+                f"{out}: the run folder cannot be created, because {above} is not a "
+                "writable folder; choose another one with out=..."
             )
         return
     if (out / LOCK).exists():
         with owned(out):
             pass
-    # A run that was killed before its first file leaves these.
+    # A run that was killed before it wrote anything else leaves these two files.
     if any(path.name not in (LOCK, OWNER) for path in out.iterdir()):
         raise ValueError(
             f"{out}: the run folder is not empty; choose another one with out=..., or "
@@ -159,19 +160,19 @@ def owned(folder: pathlib.Path) -> Iterator[None]:
         lock.acquire(blocking=False)
     except filelock.Timeout:
         raise ValueError(
-            f"{folder}: {_owner(folder)} is at work in this run folder; wait for it, "
-            "or stop it (Ctrl-C, kill), which saves"
+            f"{folder}: {_owner(folder)} is using this run folder; wait until it ends, "
+            "or stop it (Ctrl-C or kill), which saves a checkpoint"
         ) from None
     try:
-        me = {
+        owner = {
             "pid": os.getpid(),
             "host": platform.node(),
             "since": datetime.datetime.now().astimezone().isoformat(" ", "seconds"),
         }
-        (folder / OWNER).write_text(json.dumps(me))
+        (folder / OWNER).write_text(json.dumps(owner))
         yield
     finally:
-        with contextlib.suppress(OSError):  # gone, or no longer to be written
+        with contextlib.suppress(OSError):  # removed, or not writable any more
             (folder / OWNER).unlink()
         lock.release()
 
@@ -180,14 +181,14 @@ def _owner(folder):
     try:
         owner = json.loads((folder / OWNER).read_text())
         return f"process {owner['pid']} on {owner['host']} (since {owner['since']})"
-    except (OSError, ValueError, KeyError, TypeError):  # it is just writing it
+    except (OSError, ValueError, KeyError, TypeError):  # not completely written yet
         return "another process"
 
 
 def _numbered(above, stem):
-    """The first of STEM, STEM-2, ... that is not there, made by this process."""
+    """Create the first of STEM, STEM-2, ... that does not exist."""
     number, folder = 1, above / stem
-    with _named_if_not_writable(folder):
+    with _write_errors(folder):
         above.mkdir(parents=True, exist_ok=True)
         while True:
             try:
@@ -199,7 +200,8 @@ def _numbered(above, stem):
 
 
 @contextlib.contextmanager
-def _named_if_not_writable(folder):
+def _write_errors(folder):
+    """Report write errors in the block with the path and advice."""
     try:
         yield
     except OSError as error:

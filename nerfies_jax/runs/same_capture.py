@@ -1,7 +1,7 @@
 """Test that a capture is still the one that a run was started with.
 
-It compares numbers with tolerances instead of a digest, because other decoders or
-processors change images by a level and cameras by rounding.
+Values are compared with tolerances, not by a checksum, because another decoder or
+processor may change images by one 8-bit level and cameras by rounding errors.
 """
 
 import pathlib
@@ -12,62 +12,69 @@ from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.capture.npz_files import read_arrays
 
-KEPT = "capture.npz"
-BLOCKS = 8  # an image is kept as the means of so many blocks a side
-LEVELS = 3.0  # of 255, between the means of a block
-TOLERANCE = 1e-3  # of cameras, times and bounds: relative, and in their own units
+FILE = "capture.npz"
+BLOCKS = 8  # along each side of an image, whose mean colors are stored
+LEVEL_TOLERANCE = 3.0  # of 255, of the mean colors
+TOLERANCE = 1e-3  # of cameras, times and bounds, absolute plus relative
+# Names of arrays in the file that differ from those in messages.
+_LABELS = {
+    "frames": "the names of frames",
+    "size": "the dimensions of the images",
+    "frames to learn from": "the training frames",
+    "held-out frames": "the held-out frames",
+    "pictures": "images",
+}
 
 
 def record(folder: pathlib.Path, capture: Capture) -> None:
-    """Store in a run folder the numbers that identify its capture.
+    """Store the values that identify a capture in a run folder.
 
     Args:
       folder: The run folder.
       capture: The capture.
     """
-    with replaced_file(folder / KEPT) as partial, open(partial, "wb") as file:
-        np.savez_compressed(file, **_told(capture))
+    with replaced_file(folder / FILE) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **_signature(capture))
 
 
 def check(folder: pathlib.Path, capture: Capture) -> None:
     """Check that a capture is the one that a run was started with.
 
-    Runs of former versions, which stored nothing, are not checked.
+    Runs of earlier versions, which stored no values, are not checked.
 
     Args:
       folder: The run folder.
       capture: The capture.
 
     Raises:
-      CaptureError: If it differs, with the first frame that does.
+      CaptureError: If it differs, with the name of the first frame that does.
     """
-    path = folder / KEPT
+    path = folder / FILE
     if not path.is_file():
         return
     try:
-        before = read_arrays(path)
-        unlike = _unlike(before, _told(capture))
+        difference = _difference(read_arrays(path), _signature(capture))
     except (ValueError, KeyError) as error:
         raise CaptureError(
-            f"{path}: not what a run keeps of its capture ({error}); remove the file "
-            "if the capture is as it was"
+            f"{path}: not a valid description of the capture of a run ({error}); "
+            "remove the file if the capture has not changed"
         ) from error
-    if unlike is not None:
+    if difference is not None:
         raise CaptureError(
-            f"{capture.path or capture.name}: {unlike} than when {folder} was begun; "
-            "undo the change, or start anew in another folder, out=..."
+            f"{capture.path or capture.name}: {difference} since {folder} was started; "
+            "undo the change, or start a new run in another folder, out=..."
         )
 
 
-def _told(capture):
-    """All by name, a row for each frame where it is of frames."""
+def _signature(capture):
+    """Return arrays by name. Those that belong to frames have one row per frame."""
     ids = np.array(capture.ids)
     cameras = {f"camera {k}": v for k, v in capture.cameras._asdict().items()}
     bounds = np.array([capture.near, capture.far, capture.scale, *capture.center])
     return {
         "frames": ids,
         "size": np.array(capture.size),
-        "frames to learn from": np.sort(ids[capture.train]),
+        "frames to learn from": np.sort(ids[capture.train]),  # keys of stored files
         "held-out frames": np.sort(ids[capture.heldout]),
         "bounds, scale or center": bounds,
         "times": capture.times,
@@ -77,7 +84,7 @@ def _told(capture):
 
 
 def _means(image):
-    """Means over the blocks of an image [height, width, 3]: [blocks, blocks, 3]."""
+    """Mean colors of the blocks of an image [height, width, 3]: [blocks, blocks, 3]."""
     rows, columns = (
         np.linspace(0, side, min(BLOCKS, side), endpoint=False, dtype=int)
         for side in image.shape[:2]
@@ -89,19 +96,20 @@ def _means(image):
     return (sums / np.outer(height, width)[..., None]).astype(np.float32)
 
 
-def _unlike(before, now):
+def _difference(before, now):
     """Describe the first difference, or return None if there is none."""
     for name, new in now.items():
-        old = before[name]
+        old, label = before[name], _LABELS.get(name, name)
         if old.dtype.kind == "U" or old.shape != new.shape:
             if not np.array_equal(old, new):
-                return f"other {name}"
+                return f"{label} have changed"
             continue
-        bound = LEVELS if name == "pictures" else TOLERANCE * (1 + np.abs(old))
-        far = ~(np.abs(new.astype(np.float64) - old) <= bound)
-        if far.any():
+        images = name == "pictures"
+        bound = LEVEL_TOLERANCE if images else TOLERANCE * (1 + np.abs(old))
+        outside = ~(np.abs(new.astype(np.float64) - old) <= bound)
+        if outside.any():
             if name in ("size", "bounds, scale or center"):
-                return f"other {name}"
-            row = int(np.argmax(far.reshape(len(far), -1).any(axis=1)))
-            return f"other {name} ({now['frames'][row]} first)"
+                return f"{label} have changed"
+            row = int(np.argmax(outside.reshape(len(outside), -1).any(axis=1)))
+            return f"{label} have changed (first at frame {now['frames'][row]})"
     return None

@@ -1,4 +1,4 @@
-"""Images of a run for an interactive viewer: any view, with effects on or off."""
+"""Images of a run for an interactive viewer, with effects enabled or disabled."""
 
 import collections
 import statistics
@@ -17,16 +17,21 @@ from nerfies_jax.runs.run import Run
 from nerfies_jax.training.model import Model, TrainState, View, in_default_precision
 from nerfies_jax.visualization.panels import Colored
 
-# Pixels of a tile. A change of the view waits until a tile is rendered: rays are traced
-# one by one, while a rasterizer goes through all Gaussians for every tile.
+# Pixels of a tile. A tile must be rendered before a new view can be shown. The time of
+# ray tracing is proportional to the pixels, while a rasterizer processes all Gaussians
+# for every tile.
 TRACED_PIXELS, RASTERIZED_PIXELS = 2048, 65536
-TIMED = 5  # tiles whose median says how long the next one takes
+TIMED_TILES = 5  # whose median time predicts the time of the next one
 
 
 class Screen:
-    """Renders a run's trained state in tiles, level by level of `pyramid`.
+    """Renders the trained state of a run in tiles, level by level of an image pyramid.
 
-    Each combination of effects is compiled when it is first viewed.
+    Each combination of effects is compiled when it is viewed for the first time.
+
+    Args:
+      run: The run.
+      full: Width and height in pixels of the finest level.
     """
 
     def __init__(self, run: Run, full: tuple[int, int]):
@@ -41,23 +46,23 @@ class Screen:
         self._renderers: dict[tuple[str, ...], Renderer] = {}
         self._splatting: dict[tuple[str, ...], Splatting] = {}
         self._seconds: dict[Any, collections.deque] = {}
-        # Rounding must not be drawn as motion: what moves by less than a pixel does not
-        # reach full color.
+        # Initially the color range of motion ends at the length of one pixel, so that
+        # rounding errors are not shown as motion.
         self._limits = {"motion": (0.0, _pixel_length(run.capture))}
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Channels of this run. "motion" exists only if the model moves points."""
+        """Channels that can be shown: "motion" only if the model moves points."""
         static = self._move is None
         return tuple(c for c in interactive.CHANNELS if not (static and c == "motion"))
 
     @property
     def in_browser(self) -> bool:
-        """True if a browser can render the colors of this run itself."""
+        """True if browsers can render the colors of this run themselves."""
         return self.run.representation.products.splatting is not None
 
     def is_compiled(self, look: Look) -> bool:
-        """Return whether the program for a look was used before.
+        """Test if the program for a channel and variant has been used before.
 
         Args:
           look: The requested channel and variant.
@@ -69,7 +74,9 @@ class Screen:
         return look.without in (self._splatting if in_browser else self._renderers)
 
     def splats(self, state: TrainState, eye: Eye, look: Look) -> SplatCloud:
-        """Return the Gaussians of a run that is `in_browser`, for its rasterizer.
+        """Return the Gaussians of a run, for the rasterizer of a browser.
+
+        The run must be `in_browser`.
 
         Args:
           state: Trained state.
@@ -85,11 +92,11 @@ class Screen:
             self._splatting[look.without] = splatting(
                 run.spec, run.metadata, look.without
             )
-        draw = self._splatting[look.without]
-        return draw(state, look.time, look.appearance, np.asarray(eye.position))
+        evaluate = self._splatting[look.without]
+        return evaluate(state, look.time, look.appearance, np.asarray(eye.position))
 
     def tile_seconds(self, look: Look) -> float | None:
-        """Return the time of a tile, without compilation.
+        """Return the time to render a tile, without compilation.
 
         Args:
           look: The requested channel and variant.
@@ -97,16 +104,17 @@ class Screen:
         Returns:
           Median seconds, or None before the first tile.
         """
-        known = self._seconds.get((look.without, look.channel))
-        return None if known is None else statistics.median(known)
+        seconds = self._seconds.get((look.without, look.channel))
+        return None if seconds is None else statistics.median(seconds)
 
     def draw(
         self, state: TrainState, eye: Eye, look: Look, level: int, cell: tuple[int, int]
     ) -> np.ndarray:
         """Render one tile of a level.
 
-        Depth is colored over the range of the first coarse image that has any, motion
-        over the largest distance in any coarse image so far.
+        The color range of depth is that of the first coarsest image with more than one
+        depth. The color range of motion ends at the largest distance in all coarsest
+        images so far.
 
         Args:
           state: Trained state.
@@ -118,7 +126,7 @@ class Screen:
         Returns:
           uint8 image, [height, width, 3].
         """
-        began, key = time.perf_counter(), (look.without, look.channel)
+        start_time, key = time.perf_counter(), (look.without, look.channel)
         renderer = self._renderer(look.without)
         camera = interactive.camera_of(eye, self.pyramid.size(level))
         camera = interactive.tile_camera(camera, self.pyramid, cell)
@@ -133,23 +141,23 @@ class Screen:
                 self._move, state, view, start, rendering
             )
             if level and limits is not None:
-                # A tile of its own range would differ in color from its neighbors.
+                # All tiles need the same color range.
                 distance = np.minimum(distance, limits[1])
         image = interactive.as_channel(look.channel, rendering, distance, limits)
         if not level:
             self._keep_limits(look.channel, image)
-        # The first may have been compiled, which the renderer leaves out.
+        # The first call may include compilation, which `renderer.seconds` excludes.
         first = key not in self._seconds
-        elapsed = renderer.seconds[-1] if first else time.perf_counter() - began
-        recent = self._seconds.setdefault(key, collections.deque(maxlen=TIMED))
+        elapsed = renderer.seconds[-1] if first else time.perf_counter() - start_time
+        recent = self._seconds.setdefault(key, collections.deque(maxlen=TIMED_TILES))
         recent.append(elapsed)
         return image.picture
 
     def model(self, without: tuple[str, ...]) -> Model:
-        """Return the model with some effects left out.
+        """Return the model with some effects disabled.
 
         Args:
-          without: Names of the effects.
+          without: Names of the disabled effects.
 
         Returns:
           The model.
@@ -164,7 +172,7 @@ class Screen:
         return self._models[without]
 
     def has_range(self, channel: str) -> bool:
-        """Return whether the colors of a channel span a range that images determine.
+        """Test if the color range of a channel depends on the images.
 
         Args:
           channel: Name of the channel.
@@ -185,13 +193,13 @@ class Screen:
         """
         low, high = self._limits.get(channel, (0.0, 0.0))
         if channel == "depth":
-            return f"bright {low:.3g}, dark {high:.3g} scene units away"
+            return f"depth: bright {low:.3g}, dark {high:.3g} scene units"
         if channel == "motion":
-            return f"since time 0: black none, light yellow {high:.3g} scene units"
+            return f"motion since time 0: black 0, light yellow {high:.3g} scene units"
         return ""
 
     def _keep_limits(self, channel: str, image: Colored) -> None:
-        # Motion since time 0 grows with the time, depth is much the same everywhere.
+        # The range of motion since time 0 grows with time, that of depth hardly does.
         if channel == "motion":
             self._limits[channel] = image.low, image.high
         elif channel == "depth" and image.high > image.low:
@@ -208,5 +216,5 @@ def _pixel_length(capture: Capture) -> float:
     """Length of a pixel at the focus point of the cameras, in scene units."""
     train = cameras.take(capture.cameras, capture.train)
     focus = camera_paths.focus_point(train, capture.near, capture.far)
-    away = np.linalg.norm(train.position - focus, axis=-1)
-    return float(np.median(away / train.focal_px))
+    distance = np.linalg.norm(train.position - focus, axis=-1)
+    return float(np.median(distance / train.focal_px))

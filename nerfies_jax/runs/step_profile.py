@@ -1,4 +1,4 @@
-"""Time of the parts of a training step, measured after a run for its report."""
+"""Time of the parts of a training step, measured after training for the report."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -13,15 +13,15 @@ class Profile(NamedTuple):
     """Time of a training step by part."""
 
     step_ms: dict[str, float]  # by part
-    notes: list[str]  # why it is not known
+    notes: list[str]  # reasons why it could not be measured
 
 
 @contextlib.contextmanager
 def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
     """Compile the parts of a step in the background, to time them later.
 
-    A failure becomes a note, so the run keeps all its other products. If the block ends
-    with an error, pending compilations are dropped.
+    A failure becomes a note and does not affect other products of the run. If the block
+    ends with an error, pending compilations are dropped.
 
     Args:
       run: The run.
@@ -31,15 +31,16 @@ def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
       A function that measures the times.
     """
 
-    def refused(error):
-        words = f"{type(error).__name__}: {error}"
-        return Profile({}, [f"Where the time of a step goes is not known: {words}"])
+    def failure(error):
+        reason = f"{type(error).__name__}: {error}"
+        note = f"The time of the parts of a step could not be measured: {reason}"
+        return Profile({}, [note])
 
-    def timed():
+    def measure():
         try:
             return Profile(parts.ms(), [])
         except Exception as error:
-            return refused(error)
+            return failure(error)
 
     step_parts = run.representation.resources.step_parts
     if step_parts is None:
@@ -49,11 +50,11 @@ def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
     try:
         parts = step_parts(run.spec, run.metadata, run.model, state, frames)
     except Exception as error:
-        profile = refused(error)
+        profile = failure(error)
         yield lambda: profile
         return
     try:
-        yield timed
+        yield measure
     except BaseException:
         parts.drop()
         raise

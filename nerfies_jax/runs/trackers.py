@@ -1,6 +1,6 @@
 """Experiment trackers: scalars of a run for TensorBoard, Weights & Biases and rerun.
 
-Each is a sink of events that writes through the tracker's own library (extra `log`).
+Each is a sink of events that uses the library of the tracker (extra `log`).
 """
 
 import contextlib
@@ -19,14 +19,14 @@ class TrackedRun(NamedTuple):
     """Description of a run for a tracker."""
 
     folder: pathlib.Path
-    identity: str  # the same whenever the run is resumed
+    identity: str  # stays the same when the run is resumed
     name: str
     config: dict[str, Any]  # JSON values
-    step: int  # that it begins after, or is resumed after
+    step: int  # after which it begins or is resumed
 
 
 class Tracker(Protocol):
-    """A sink of events that is closed at the end."""
+    """A sink of events that is closed at the end of a run."""
 
     name: str
 
@@ -35,7 +35,7 @@ class Tracker(Protocol):
         ...
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write pending data."""
         ...
 
 
@@ -65,13 +65,13 @@ def scalars(event: Event) -> dict[str, float]:
 
 
 class TensorBoard:
-    """Writes event files into `tensorboard` in the run folder."""
+    """Writes event files to `tensorboard` in the run folder."""
 
     name = "tensorboard"
 
     def __init__(self, run: TrackedRun):
         library = extras.library("tensorboardX", "log")
-        # Steps that a resumed run repeats are shown once.
+        # Hides the first version of steps that a resumed run repeats.
         self._writer = library.SummaryWriter(
             str(run.folder / "tensorboard"), purge_step=run.step + 1
         )
@@ -82,12 +82,12 @@ class TensorBoard:
             self._writer.add_scalar(name, value, event["step"], event["time"])
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write pending data."""
         self._writer.close()
 
 
 class WeightsAndBiases:
-    """Logs to Weights & Biases, by the settings that `wandb login` and WANDB_* made."""
+    """Logs to Weights & Biases, configured by `wandb login` and WANDB_* variables."""
 
     name = "wandb"
 
@@ -102,26 +102,27 @@ class WeightsAndBiases:
                 dir=str(run.folder),
                 resume="allow",
             )
-        except Exception as error:  # without a login, without a network
+        except Exception as error:  # such as a missing login or network
             raise ValueError(
-                f"Weights & Biases cannot start ({error}); log in with `wandb login`, "
-                "or set WANDB_MODE=offline and upload later with `wandb sync`"
+                f"Weights & Biases could not start ({error}); log in with `wandb "
+                "login`, or set WANDB_MODE=offline and upload later with `wandb sync`"
             ) from error
 
     def __call__(self, event: Event) -> None:
         """Receive an event."""
         numbers = scalars(event)
         if numbers:
-            # Their own step may not go back, as ours does after a crash.
+            # A metric, because the step of W&B cannot decrease as ours does when a
+            # killed run is resumed.
             self._run.log({**numbers, "step": event["step"]})
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write pending data."""
         self._run.finish()
 
 
 class Rerun:
-    """Writes recordings for the viewer of rerun, `rerun/STEP.rrd` in the run folder."""
+    """Writes recordings for the rerun viewer to `rerun/STEP.rrd` in the run folder."""
 
     name = "rerun"
 
@@ -130,7 +131,7 @@ class Rerun:
         folder = run.folder / "rerun"
         folder.mkdir(exist_ok=True)
         self._stream = self._library.RecordingStream(PROJECT, recording_id=run.identity)
-        # Files of one recording: the viewer lays them over each other.
+        # Each resumption writes another file, which the viewer merges by recording id.
         self._stream.save(folder / f"{run.step}.rrd")
         self._stream.send_recording_name(run.name)
 
@@ -142,7 +143,7 @@ class Rerun:
             self._stream.log(name, self._library.Scalars(value))
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write pending data."""
         self._stream.flush()
         self._stream.disconnect()
 
@@ -162,15 +163,13 @@ def check(names: Sequence[str]) -> None:
     """
     for name in names:
         if name not in TRACKERS:
-            raise ValueError(
-                f"no tracker {name!r} to log to; {known_names(name, TRACKERS)}"
-            )
+            raise ValueError(f"no tracker {name!r}; {known_names(name, TRACKERS)}")
         extras.check(PACKAGES[name], "log")
 
 
 @contextlib.contextmanager
 def opened(name: str, run: TrackedRun) -> Iterator[Tracker]:
-    """Open a tracker for as long as the block runs.
+    """Open a tracker for the duration of the block.
 
     Args:
       name: A key of `TRACKERS`.
@@ -183,6 +182,6 @@ def opened(name: str, run: TrackedRun) -> Iterator[Tracker]:
     try:
         yield tracker
     finally:
-        # Whatever its library raises, the run is there.
+        # An error of a tracker must not fail the run.
         with contextlib.suppress(Exception):
             tracker.close()

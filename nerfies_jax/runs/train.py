@@ -1,4 +1,4 @@
-"""Training of a run, with held-out metrics along the way."""
+"""Training of a run, with evaluations on held-out frames."""
 
 import dataclasses
 import pathlib
@@ -16,14 +16,14 @@ from nerfies_jax.training import chunk, loop
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult, History, Hook
 
-EVALUATED = 4  # held-out frames in the curve; all of them are scored at the end
+EVALUATED = 4  # held-out frames during training. All of them are scored at the end.
 
 
 @dataclasses.dataclass(frozen=True)
 class Pace:
     """Duration of training and intervals of evaluations and checkpoints, in seconds."""
 
-    seconds: float | int | None = None  # no bound but the steps
+    seconds: float | int | None = None  # None for no limit
     evaluate_every: float | int = 20.0
     checkpoint_every: float | int = 60.0
 
@@ -32,17 +32,17 @@ class Pace:
             value = getattr(self, name)
             if value is not None and not value >= 0:
                 raise ValueError(
-                    f"--{name.replace('_', '-')} {value}: seconds, not negative"
+                    f"{name}={value} must be a number of seconds, at least 0"
                 )
 
 
 class Trained(NamedTuple):
-    """A finished training, and the renderer that is compiled for it."""
+    """Result of training, and the compiled renderer."""
 
     result: FitResult
     renderer: Renderer
-    draw: Draw  # the same, of the frames as they were captured
-    watched: np.ndarray  # rows of the held-out frames that its curve is of
+    draw: Draw  # renderer of the original, possibly distorted frames
+    watched: np.ndarray  # rows of the held-out frames evaluated during training
 
 
 def open_checkpoints(folder: pathlib.Path, run: Run, after: int | None) -> Checkpoints:
@@ -79,7 +79,7 @@ def train(
 
     Args:
       run: The run.
-      state: First or restored state.
+      state: Initial or restored state.
       record: Stored history of a restored run, or None.
       checkpoints: Writer of checkpoints.
       pace: Duration and intervals.
@@ -90,29 +90,29 @@ def train(
     """
     renderer = Renderer(run.model, run.capture.size)
     draw = drawer(run, renderer)
-    few, evaluate_every = run.capture.heldout, pace.evaluate_every
+    rows, evaluate_every = run.capture.heldout, pace.evaluate_every
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     history = History() if record is None else History(**record)
-    first = evaluation.view_of(run.capture, int(few[0])) if len(few) else None
-    spent = history.compile_seconds + _compiled(run, state, frames, renderer, first)
-    history = history._replace(compile_seconds=spent)
+    first = evaluation.view_of(run.capture, int(rows[0])) if len(rows) else None
+    seconds = history.compile_seconds + _compile(run, state, frames, renderer, first)
+    history = history._replace(compile_seconds=seconds)
     if first is not None:
-        renderer(state, first)  # how long it takes
-        share = budget.evaluations(renderer.seconds[-1], evaluate_every, EVALUATED)
-        few = evaluation.spread(run.capture.heldout, share.frames)
-        evaluate_every = share.every_seconds
+        renderer(state, first)  # measures the time of a frame
+        plan = budget.evaluations(renderer.seconds[-1], evaluate_every, EVALUATED)
+        rows = evaluation.spread(run.capture.heldout, plan.frames)
+        evaluate_every = plan.every_seconds
 
     def held_out(state, step, metrics):
         del step, metrics
-        filmed = evaluation.as_found(run.model, state, run.filmed)
-        scored = evaluation.score(draw, state, filmed, few)
+        capture = evaluation.as_found(run.model, state, run.filmed)
+        scored = evaluation.score(draw, state, capture, rows)
         return {
             "psnr": evaluation.known_mean(scored.psnr),
             "ssim": evaluation.known_mean(scored.ssim),
         }
 
-    if len(few):
-        names = [run.capture.ids[row] for row in few]
+    if len(rows):
+        names = [run.capture.ids[row] for row in rows]
         events.emit("evaluation_frames", frames=names)
         hooks = (Hook("held out", held_out, every_seconds=evaluate_every), *hooks)
     result = loop.fit(
@@ -126,11 +126,11 @@ def train(
         checkpoint_seconds=pace.checkpoint_every,
         history=history,
     )
-    return Trained(result, renderer, draw, few)
+    return Trained(result, renderer, draw, rows)
 
 
-def _compiled(run, state, frames, renderer, view) -> float:
-    """Seconds of compiling the scan of a run, with the renderer compiled meanwhile."""
+def _compile(run, state, frames, renderer, view) -> float:
+    """Compile training and renderer concurrently, and return the time of the former."""
     scan = None
     if run.spec.steps - int(state.step) >= chunk.LENGTH:
         scan = chunk.compiling(run.model, state, frames, run.spec.steps)

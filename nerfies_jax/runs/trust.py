@@ -1,4 +1,4 @@
-"""Trust in run folders: nothing is imported just because a file names it."""
+"""Protection from code that untrusted run folders name."""
 
 import pathlib
 from collections.abc import Collection
@@ -8,7 +8,7 @@ from nerfies_jax.training import extensions, specs
 
 
 class UntrustedCode(ValueError):
-    """A run folder needs code that the caller did not name.
+    """A run folder needs code that the caller did not declare as trusted.
 
     Attributes:
       names: Names of that code, as MODULE:NAME.
@@ -16,9 +16,8 @@ class UntrustedCode(ValueError):
 
     def __init__(self, folder: pathlib.Path, names: tuple[str, ...]):
         super().__init__(
-            f"{folder}: the run uses parts from outside of this package "
-            f"({', '.join(names)}), which run code when they are loaded; name each of "
-            "them if you trust it"
+            f"{folder}: the run uses code from other packages ({', '.join(names)}), "
+            "which is executed when it is loaded; name each part if you trust it"
         )
         self.names = names
 
@@ -26,53 +25,52 @@ class UntrustedCode(ValueError):
 def check(
     folder: pathlib.Path, stored: Any, spec_type: type, trusted: Collection[str]
 ) -> None:
-    """Refuse code that a run folder asks for and its reader did not name.
+    """Refuse a run folder that needs code which the caller does not trust.
 
     Args:
       folder: The run folder.
-      stored: Its settings, as `config.json` holds them.
-      spec_type: Settings of a scene of its representation.
-      trusted: The names MODULE:NAME that the caller trusts. They are compared as text.
+      stored: Its settings, as stored in `config.json`.
+      spec_type: Type of the specs of its representation.
+      trusted: Names MODULE:NAME that the caller trusts. They are compared as text.
 
     Raises:
       UntrustedCode: If some names are not in `trusted`.
-      ValueError: If the overrides are no texts.
+      ValueError: If the overrides are not strings.
     """
     try:
-        wanted = outside_names(stored, spec_type)
+        names = outside_names(stored, spec_type)
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
-    unnamed = tuple(name for name in wanted if name not in trusted)
-    if unnamed:
-        raise UntrustedCode(folder, unnamed)
+    untrusted = tuple(name for name in names if name not in trusted)
+    if untrusted:
+        raise UntrustedCode(folder, untrusted)
 
 
 def outside_names(stored: Any, spec_type: type) -> tuple[str, ...]:
     """Return the names of code from other packages that settings need.
 
     Args:
-      stored: The settings of a run as JSON values, as `config.json` holds them.
-      spec_type: Settings of a scene. It and all that its annotated fields can hold are
-        known without importing anything.
+      stored: The settings of a run as JSON values, as stored in `config.json`.
+      spec_type: Type of the specs of a representation. It and all types in the
+        annotations of its fields are known without importing anything.
 
     Returns:
-      The names, each MODULE:NAME once: values of overrides, and the classes of the
-      scene's parts.
+      The unique names MODULE:NAME in values of overrides and in types of the spec.
 
     Raises:
-      ValueError: If the overrides are no texts.
+      ValueError: If the overrides are not strings.
     """
     config = stored["config"]
     overrides = config.get("overrides", ())
     if not isinstance(overrides, tuple | list) or not all(
         isinstance(each, str) for each in overrides
     ):
-        raise ValueError(f"its overrides are {overrides!r}, which are no texts")
+        raise ValueError(f"overrides must be strings, got {overrides!r}")
     known = specs.allowed_names(spec_type)
-    parts = [
+    in_spec = [
         name
         for name in extensions.names_in(stored.get("spec"), specs.TYPE)
         if name not in known
     ]
-    named = extensions.names_in_assignments(overrides)
-    return tuple(dict.fromkeys((*named, *parts)))
+    in_overrides = extensions.names_in_assignments(overrides)
+    return tuple(dict.fromkeys((*in_overrides, *in_spec)))

@@ -1,7 +1,7 @@
 """Interactive viewer of a run in the browser, served by viser.
 
-Callbacks of viser only record clicks, with the camera and the controls at that time.
-Everything else happens in `Viewer.serve`, in the thread of its caller, so that nothing
+Callbacks of viser only record events, with the camera and the controls at that time.
+All other work happens in `Viewer.serve`, in the thread of its caller, so that nothing
 is computed concurrently with a training step.
 """
 
@@ -31,11 +31,11 @@ from nerfies_jax.training.loop import Hook
 from nerfies_jax.training.model import TrainState
 
 HOST = viewer_access.HOST
-LIVE_SECONDS = 0.5  # training waits so long at a time for who looks around
-PLOT_SECONDS = 1.0  # between two updates of the curve
+LIVE_SECONDS = 0.5  # maximum time between two chunks of steps for serving the viewer
+PLOT_SECONDS = 1.0  # between two updates of the loss curve
 IDLE_SECONDS = 0.02
-FRUSTA = 48  # training cameras shown
-FRUSTUM_SHARE = 0.02  # of the way from the cameras to what they look at
+MAX_FRUSTA = 48  # training cameras shown
+FRUSTUM_SHARE = 0.02  # size relative to the distance from the first camera to the focus
 FRUSTUM_PX = 2.0
 
 
@@ -49,12 +49,12 @@ def check_installed() -> None:
 
 
 class Viewer:
-    """The page of one run.
+    """The web page of one run.
 
     Args:
       run: The run.
-      full: Width and height in pixels of images of a static view.
-      port: Port on `HOST`, or the next free one.
+      full: Width and height in pixels of the completely refined image of a view.
+      port: Port on `HOST`. If it is in use, the next free one.
       folder: The run's folder. Camera paths are saved and rendered into it.
       in_training: True if the run is being trained, so that it can be paused.
     """
@@ -71,28 +71,28 @@ class Viewer:
         import viser
 
         self.screen = Screen(run, full)
-        self._orders: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._tasks: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._windows: dict[int, Window] = {}
         self._clock = time.monotonic()
-        self._plotted = 0.0
+        self._plot_time = 0.0
         with viewer_access.guarded(), _quiet():
             self._server = viser.ViserServer(
                 HOST, port, label=run.capture.name, verbose=False
             )
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._about = self._server.gui.add_markdown(COMPILING)
-        away = self._place_cameras(run)
+        distance = self._place_cameras(run)
         self._make_controls(run)
         self.path = PathPanel(
             self._server,
             self.screen,
             folder,
             self._seconds,
-            FRUSTUM_SHARE * away,
-            self._ordered,
+            FRUSTUM_SHARE * distance,
+            self._deferred,
             self._show_time,
         )
-        self.training = TrainingPanel(self._server, self._ordered, in_training)
+        self.training = TrainingPanel(self._server, self._deferred, in_training)
 
     @property
     def address(self) -> str:
@@ -102,8 +102,8 @@ class Viewer:
     @property
     def holds_training(self) -> bool:
         """True if training must wait: it is paused, or a path is being rendered."""
-        held = self.training.held(len(self._server.get_clients()))
-        return held or self.path.rendering is not None
+        paused = self.training.is_paused(len(self._server.get_clients()))
+        return paused or self.path.rendering is not None
 
     def close(self) -> None:
         """Disconnect every browser and stop listening."""
@@ -112,17 +112,15 @@ class Viewer:
             self._server.stop()
 
     def serve(self, state: TrainState, step: int, seconds: float) -> None:
-        """Update every browser for some time, at least once.
-
-        Returns early if nothing is left to do.
+        """Update every browser repeatedly, at least once.
 
         Args:
           state: Training state to show.
           step: Its step.
-          seconds: Time limit.
+          seconds: Time limit. The method returns earlier if nothing is left to do.
         """
         until = time.monotonic() + seconds
-        while self._round(state, step) and time.monotonic() < until:
+        while self._update(state, step) and time.monotonic() < until:
             pass
 
     def add_metrics(self, step: int, metrics: Mapping[str, float]) -> None:
@@ -135,7 +133,7 @@ class Viewer:
         self.training.add(step, metrics)
 
     def add_history(self, rows: Sequence[Mapping[str, float]]) -> None:
-        """Add the metrics of an earlier training to the curve.
+        """Add the metrics of earlier training to the curve.
 
         Args:
           rows: Metrics by name, with "step".
@@ -143,15 +141,15 @@ class Viewer:
         for row in rows:
             self.training.add(int(row["step"]), row)
 
-    def _round(self, state, step) -> bool:
+    def _update(self, state, step) -> bool:
         """Update each browser by a bounded amount of work. True if more is left."""
         with contextlib.suppress(queue.Empty):
             while True:
-                self._orders.get_nowait()()
+                self._tasks.get_nowait()()
         self._advance_time()
         clients = self._server.get_clients()
-        if clients and time.monotonic() - self._plotted > PLOT_SECONDS:
-            self._plotted = time.monotonic()
+        if clients and time.monotonic() - self._plot_time > PLOT_SECONDS:
+            self._plot_time = time.monotonic()
             self.training.show()
         busy = self.path.advance(state, clients)
         for key in self._windows.keys() - clients.keys():
@@ -159,11 +157,11 @@ class Viewer:
         look = self._look()
         for key, client in clients.items():
             if key not in self._windows:
-                self._windows[key] = Window(client, self.screen, self._tell)
+                self._windows[key] = Window(client, self.screen, self._show_text)
             busy |= self._windows[key].update(state, step, look)
         return busy
 
-    def _tell(self, text):
+    def _show_text(self, text):
         if self._about.content != text:
             self._about.content = text
 
@@ -182,85 +180,87 @@ class Viewer:
         now, before = time.monotonic(), self._clock
         self._clock = now
         if self._play.value:
-            passed = (now - before) * self._speed.value / self._seconds
-            self._show_time((self._time.value + passed) % 1)
+            elapsed = (now - before) * self._speed.value / self._seconds
+            self._show_time((self._time.value + elapsed) % 1)
 
     def _show_time(self, time):
         self._time.value = round(float(time), 3)
 
-    def _ordered(self, action: Callable, argument: Callable | None = None):
-        """Return a callback of viser that has `action` run in the next round.
+    def _deferred(self, action: Callable, argument: Callable | None = None):
+        """Return a callback of viser that lets the next `_update` call `action`.
 
-        The action gets the client, its camera as an `Eye` or None, the `Look`, and what
-        `argument` returns, all as of the click: viser awaits a coroutine before it
-        reads the browser's next message, so a camera that moves right after the click
-        is not taken for that of the click.
+        Arguments of the action are the client, its camera as an `Eye` or None, the
+        `Look`, and the result of `argument`, all as of the click. The callback is a
+        coroutine, which viser awaits before it reads the next message of the browser,
+        so that camera movements after the click have no effect.
         """
 
-        async def note(event):
+        async def record(event):
             eye = None if event.client is None else eye_of(event.client.camera)
             inputs: list[Any] = [event.client, eye, self._look()]
             if argument is not None:
                 inputs.append(argument())
-            self._orders.put(lambda: action(*inputs))
+            self._tasks.put(lambda: action(*inputs))
 
-        return note
+        return record
 
     def _place_cameras(self, run) -> float:
-        """Up axis, the first training camera as the start, and frusta of the others.
+        """Set the up axis and the initial camera, and add frusta of the others.
 
-        Returns how far that camera is from what the cameras look at, scene units.
+        Returns the distance of the first training camera from the focus point of all
+        training cameras, in scene units.
         """
         server, capture = self._server, run.capture
         train = cameras.take(capture.cameras, capture.train)
         focus = camera_paths.focus_point(train, capture.near, capture.far)
         first = cameras.take(train, 0)
-        away = float(np.linalg.norm(focus - first.position))
+        distance = float(np.linalg.norm(focus - first.position))
         server.scene.set_up_direction(tuple(camera_paths.up_axis(capture)))
         start = server.initial_camera
         position, rows = map(np.asarray, (first.position, first.camera_from_world))
         start.position = position
         # On the viewing axis, so that the page opens with the first training view.
-        start.look_at = position + away * rows[2]
+        start.look_at = position + distance * rows[2]
         start.up = -rows[1]
         start.fov = vertical_fov(first, capture.size)
-        # At the start one stands among them: their lines would hide the scene.
+        # Hidden at first: the initial camera is between them, and their lines would
+        # cover the scene.
         self._frusta = server.scene.add_frame(
             "/cameras", show_axes=False, visible=False
         )
-        # Not that of the start itself, whose frame would fill the window.
-        for row in evaluation.spread(capture.train[1:], FRUSTA):
-            one = cameras.take(capture.cameras, row)
-            turn = Rotation.from_matrix(one.camera_from_world.T)
+        # Without the initial camera, whose frustum would fill the window.
+        for row in evaluation.spread(capture.train[1:], MAX_FRUSTA):
+            camera = cameras.take(capture.cameras, row)
+            rotation = Rotation.from_matrix(camera.camera_from_world.T)
             server.scene.add_camera_frustum(
                 f"/cameras/{row}",
-                vertical_fov(one, capture.size),
-                capture.size[0] / capture.size[1] / float(one.pixel_aspect),
-                scale=FRUSTUM_SHARE * away,
+                vertical_fov(camera, capture.size),
+                capture.size[0] / capture.size[1] / float(camera.pixel_aspect),
+                scale=FRUSTUM_SHARE * distance,
                 thickness=FRUSTUM_PX,
                 thickness_units="screen",
                 color=(255, 150, 40),
-                wxyz=turn.as_quat(scalar_first=True),
-                position=np.asarray(one.position),
+                wxyz=rotation.as_quat(scalar_first=True),
+                position=np.asarray(camera.position),
             )
-        return away
+        return distance
 
     def _make_controls(self, run):
         gui, capture = self._server.gui, run.capture
         self._seconds = camera_paths.playing_seconds(capture)
-        known = np.unique(capture.appearance_ids[capture.train]).tolist()
+        ids = np.unique(capture.appearance_ids[capture.train]).tolist()
         first = int(capture.appearance_ids[capture.train[0]])
-        varied = self.screen.parts.appearance and len(known) > 1
-        self._appearances = known if varied else [first]
+        selectable = self.screen.parts.appearance and len(ids) > 1
+        self._appearances = ids if selectable else [first]
         start = float(np.round(capture.times[capture.train[0]], 3))
         self._time = gui.add_slider("time", 0.0, 1.0, 0.001, start)
         self._play = gui.add_checkbox("play", False)
         self._speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0)
         self._channel = gui.add_dropdown("show", self.screen.channels)
         self._appearance = None
-        if varied:
+        if selectable:
             self._appearance = gui.add_slider(
-                "appearance", 0, len(known) - 1, 1, known.index(first)
+                "appearance", 0, len(ids) - 1, 1, ids.index(first)
             )
         frusta = gui.add_checkbox("cameras", False)
         frusta.on_update(lambda _: setattr(self._frusta, "visible", frusta.value))
@@ -272,20 +272,21 @@ class Viewer:
 
 
 def _quiet():
-    """Drop what viser prints when it starts and stops.
+    """Suppress the output of viser when it starts and stops.
 
-    Commands say where the page is, and may print one JSON document and nothing else.
+    Commands print the address of the page themselves, and with --json nothing but the
+    document may be printed.
     """
     return contextlib.redirect_stdout(io.StringIO())
 
 
 @contextlib.contextmanager
 def live(run: Run, folder: pathlib.Path, port: int) -> Iterator[Hook]:
-    """Serve the page while the run is trained.
+    """Serve the page during training.
 
-    Training waits at most `LIVE_SECONDS` between two chunks of steps for a user who
-    looks around, and as long as someone pauses it or renders a camera path. It
-    continues when every browser has left, and ends at a signal as always.
+    Between two chunks of steps, the viewer is served for at most `LIVE_SECONDS`, or as
+    long as training is paused or a camera path is rendered. Training continues when all
+    browsers have disconnected. Signals end it as usual.
 
     Args:
       run: The run.
@@ -296,7 +297,7 @@ def live(run: Run, folder: pathlib.Path, port: int) -> Iterator[Hook]:
       The training hook that serves the page.
     """
     viewer = Viewer(run, run.capture.size, port, folder, in_training=True)
-    console.say(f"look around while it trains: {viewer.address}")
+    console.say(f"live view during training: {viewer.address}")
 
     def show(state: TrainState, step: int, metrics: Mapping[str, float]) -> None:
         viewer.add_metrics(step, metrics)

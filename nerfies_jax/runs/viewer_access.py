@@ -1,7 +1,7 @@
-"""Access control of the viewer: only pages that it served itself, from this machine.
+"""Access control of the viewer: only pages that it has served itself may connect.
 
-viser listens on the loopback address and checks nothing else. A page of any web site
-that is open in the same browser could then connect to it, directly or under a name that
+viser listens on the loopback address but performs no other checks. Any web site that is
+open in the same browser could connect to it, directly or through a domain name that
 resolves to 127.0.0.1 (DNS rebinding), and operate the viewer.
 """
 
@@ -14,8 +14,8 @@ import urllib.parse
 from collections.abc import Callable, Iterator
 from typing import Any
 
-HOST = "127.0.0.1"  # where the viewer listens
-NAMES = (HOST, "localhost")  # by which its own page may call it
+HOST = "127.0.0.1"  # address that the viewer listens on
+NAMES = (HOST, "localhost")  # host names that its own page may use
 _LOGGER = "nerfies_jax.viewer"
 _patching = threading.Lock()
 
@@ -26,26 +26,27 @@ def refusal(host: str | None, origin: str | None, port: int) -> str | None:
     Args:
       host: The Host header.
       origin: The Origin header. Browsers send it with every websocket and with requests
-        of other sites. Programs that are not browsers may leave it out.
+        of other sites. Other programs may omit it.
       port: Port of the viewer.
 
     Returns:
       The reason, or None for a request of the viewer's own page.
     """
-    own = [f"{name}:{port}" for name in NAMES]
+    allowed = [f"{name}:{port}" for name in NAMES]
     if port == 80:
-        own += NAMES
-    if host is None or host.lower() not in own:
+        allowed += NAMES
+    if host is None or host.lower() not in allowed:
         return (
-            f"Host {host!r} is not {' or '.join(own)}. To view from another machine, "
-            f"forward this port under the same number: ssh -L {port}:{HOST}:{port}"
+            f"Host {host!r} is not {' or '.join(allowed)}. To view from another "
+            "machine, forward this port with the same number: "
+            f"ssh -L {port}:{HOST}:{port}"
         )
     if origin is not None:
         try:
             parts = urllib.parse.urlsplit(origin)
         except ValueError:
             parts = urllib.parse.urlsplit("")
-        if parts.scheme != "http" or parts.netloc.lower() not in own:
+        if parts.scheme != "http" or parts.netloc.lower() not in allowed:
             return f"Origin {origin!r} is another site."
     return None
 
@@ -54,9 +55,9 @@ def refusal(host: str | None, origin: str | None, port: int) -> str | None:
 def guarded() -> Iterator[None]:
     """Check the requests of every viser server that is started in this block.
 
-    viser passes its request handler to `websockets` in its own thread and cannot be
-    configured with another one, so the function that it calls is replaced until the
-    server listens.
+    viser has no option for a request handler. It passes its own one to
+    `websockets.asyncio.server.serve`, so that function is replaced until the server
+    listens.
 
     Yields:
       None.
@@ -82,12 +83,12 @@ def guarded() -> Iterator[None]:
 
 
 def _checked(process_request):
-    """The handler of requests, which answers 403 where `refusal` has a reason."""
+    """Wrap a request handler to answer 403 if `refusal` returns a reason."""
 
     def process(connection, request):
         headers = request.headers
         port = connection.local_address[1]
-        # A repeated header counts as a wrong one.
+        # A repeated header is never valid.
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         host = hosts[0] if len(hosts) == 1 else None
         origin = ", ".join(origins) if origins else None
@@ -99,26 +100,26 @@ def _checked(process_request):
     return process
 
 
-class _Departures(logging.Filter):
-    """Drops the record of a connection that was closed before its first request.
+class _DisconnectFilter(logging.Filter):
+    """Drops log records about connections that were closed before their first request.
 
-    Browsers open connections in advance and close tabs in the middle of a request.
-    Neither is an error of the server.
+    Browsers open connections in advance and close tabs during requests. Neither is an
+    error of the server.
     """
 
     def filter(self, record):
         error = record.exc_info[1] if record.exc_info else None
-        seen = []
-        while error is not None and error not in seen:
+        visited = []
+        while error is not None and error not in visited:
             if isinstance(error, EOFError | ConnectionError):
                 return False
-            seen.append(error)
+            visited.append(error)
             error = error.__cause__ or error.__context__
         return True
 
 
 def _logger():
     logger = logging.getLogger(_LOGGER)
-    if not any(isinstance(each, _Departures) for each in logger.filters):
-        logger.addFilter(_Departures())
+    if not any(isinstance(each, _DisconnectFilter) for each in logger.filters):
+        logger.addFilter(_DisconnectFilter())
     return logger

@@ -26,25 +26,34 @@ from nerfies_jax.runtime import console
 from nerfies_jax.training.model import TrainState, View, in_default_precision
 
 RATE = 24.0  # images per second of a path
-LINE_POINTS = 200  # of the curve in the scene
+CURVE_POINTS = 200  # of the path shown in the scene
 FRUSTUM_PX = 2.0
 COLOR = (60, 170, 255)
 GO, SET, UP, DOWN, DELETE = "go", "set", "↑", "↓", "✕"
-ACTIONS = (GO, SET, UP, DOWN, DELETE)  # of a keyframe; five fit into a line
+ACTIONS = (GO, SET, UP, DOWN, DELETE)  # of a keyframe. Five buttons fit into a line.
 _HINT = (
-    f"{GO}: look through it. {SET}: replace it by the view and the time of now. "
-    f"{UP} {DOWN}: move it. {DELETE}: delete it."
+    f"{GO}: view it. {SET}: replace it by the current view and time. "
+    f"{UP} {DOWN}: move it in the list. {DELETE}: delete it."
 )
-_EMPTY = "Look from where the path begins, at the time it shows there; add it."
+_EMPTY = "Move to the first view and time of the path, and add it as a keyframe."
 _NAME = "/path"
 
 
 class PathPanel:
-    """Keyframes, and the controls of the path through them.
+    """Keyframes, and the controls of the camera path through them.
 
-    viser's threads call nothing here. `ordered` makes a callback of an action `(client,
-    eye, look)` that runs in the thread that serves the viewer, with the camera and the
-    controls as they were when the browser's click arrived.
+    The threads of viser execute nothing here. `deferred` turns an action `(client, eye,
+    look)` into a callback that lets the thread of the viewer run the action, with the
+    camera and the controls as of the click.
+
+    Args:
+      server: The server of viser.
+      screen: Renderer of the run.
+      run_folder: The folder of the run, for paths and their images.
+      seconds: Initial duration of a path.
+      frustum_scale: Size of the frusta of keyframes in scene units.
+      deferred: Makes a callback of an action, as above.
+      show_time: Sets the time of the scene in all browsers.
     """
 
     def __init__(
@@ -54,20 +63,19 @@ class PathPanel:
         run_folder: pathlib.Path,
         seconds: float,
         frustum_scale: float,
-        ordered: Callable[..., Callable],
+        deferred: Callable[..., Callable],
         show_time: Callable[[float], None],
     ):
         self.keyframes: list[Keyframe] = []
         self.rendering: Generator[int, TrainState, None] | None = None
         self._server, self._screen, self._folder = server, screen, run_folder
-        self._scale, self._ordered, self._show_time = frustum_scale, ordered, show_time
-        self._preview: tuple[Any, CameraPath, float] | None = (
-            None  # client, path, start
-        )
-        self._count = 0  # images of the path being rendered
-        self._total = 0
-        self._rows: list[Any] = []  # viser's handles of the list of keyframes
-        self._drawn: list[Any] = []  # and of what is drawn in the scene
+        self._scale, self._deferred = frustum_scale, deferred
+        self._show_time = show_time
+        # Client, path and start time of the preview.
+        self._preview: tuple[Any, CameraPath, float] | None = None
+        self._total = 0  # images of the path that is rendered
+        self._rows: list[Any] = []  # handles of viser for the list of keyframes
+        self._handles: list[Any] = []  # and for the objects in the scene
         gui = server.gui
         with gui.add_folder("camera path") as self._panel:
             self._message = gui.add_markdown(_EMPTY)
@@ -76,24 +84,24 @@ class PathPanel:
             self._button("add keyframe", self._add, color=None)
             self._length = gui.add_number("seconds", seconds, min=0.1, step=0.1)
             self._visible = gui.add_checkbox("show path", True)
-            self._visible.on_update(ordered(lambda *_: self._draw()))
+            self._visible.on_update(deferred(lambda *_: self._draw()))
             self._play = self._button("preview", self._toggle_preview)
             self._button("save", self._save)
             loading = gui.add_upload_button(
                 "load", mime_type="application/json,.json", color="gray"
             )
-            # Value of this click: the next one replaces it in the handle.
-            loading.on_upload(ordered(self._load, lambda: loading.value.content))
+            # The content is read at once, because the next upload replaces it.
+            loading.on_upload(deferred(self._load, lambda: loading.value.content))
             self._render = self._button("render", self._toggle_render)
             self._progress = gui.add_progress_bar(0.0, visible=False)
 
     def _button(self, label, action, color="gray"):
         button = self._server.gui.add_button(label, color=color)
-        button.on_click(self._ordered(action))
+        button.on_click(self._deferred(action))
         return button
 
     def close(self) -> None:
-        """Stop rendering, and remove its incomplete result."""
+        """Stop rendering and remove its incomplete result."""
         if self.rendering is not None:
             self.rendering.close()
             self.rendering = None
@@ -120,87 +128,87 @@ class PathPanel:
         del client
         if eye is not None:
             self.keyframes.append(self._keyframe(eye, look))
-            self._changed()
+            self._update()
 
     def _keyframe(self, eye: Eye, look: Look) -> Keyframe:
         size = self._screen.run.capture.size
         square = eye._replace(aspect=size[0] / size[1])
         return Keyframe(interactive.camera_of(square, size), look.time)
 
-    def _edit(self, place, action, client, eye, look):
-        """One button of the keyframe at `place` of the list."""
+    def _edit(self, index, action, client, eye, look):
+        """Perform the action of a button of a keyframe."""
         frames = self.keyframes
-        if place >= len(frames):
+        if index >= len(frames):
             return
         if action == GO:
             self._stop_preview()
-            self._go(client, frames[place])
+            self._go(client, frames[index])
             return
         if action == SET:
             if eye is not None:
-                frames[place] = self._keyframe(eye, look)
+                frames[index] = self._keyframe(eye, look)
         elif action == DELETE:
-            del frames[place]
+            del frames[index]
         else:
-            other = place + (1 if action == DOWN else -1)
+            other = index + (1 if action == DOWN else -1)
             if 0 <= other < len(frames):
-                frames[place], frames[other] = frames[other], frames[place]
-        self._changed()
+                frames[index], frames[other] = frames[other], frames[index]
+        self._update()
 
-    def _changed(self):
-        """List the keyframes and draw the path anew."""
+    def _update(self):
+        """Update the list of keyframes and the path in the scene."""
         self._stop_preview()
         for row in self._rows:
             row.remove()
         self._rows = []
         with self._list:
-            for place, keyframe in enumerate(self.keyframes):
-                label = f"{place + 1}: t {keyframe.time:.3f}"
+            for index, keyframe in enumerate(self.keyframes):
+                label = f"{index + 1}: t {keyframe.time:.3f}"
                 row = self._server.gui.add_button_group(label, ACTIONS, hint=_HINT)
-                row.on_click(self._edited(place, row))
+                row.on_click(self._edit_callback(index, row))
                 self._rows.append(row)
         self._list.visible = bool(self.keyframes)
         self._message.content = "" if self.keyframes else _EMPTY
         self._draw()
 
-    def _edited(self, place, row):
+    def _edit_callback(self, index, row):
         def edit(client, eye, look, action):
-            self._edit(place, action, client, eye, look)
+            self._edit(index, action, client, eye, look)
 
-        return self._ordered(edit, lambda: row.value)
+        return self._deferred(edit, lambda: row.value)
 
     # In the scene
 
     def _draw(self):
-        for handle in self._drawn:
+        for handle in self._handles:
             handle.remove()
-        self._drawn = []
+        self._handles = []
         if not self._visible.value:
             return
         scene, size = self._server.scene, self._screen.run.capture.size
-        for place, keyframe in enumerate(self.keyframes):
-            one = keyframe.camera
-            turn = Rotation.from_matrix(one.camera_from_world.T)
-            self._drawn.append(
+        for index, keyframe in enumerate(self.keyframes):
+            camera = keyframe.camera
+            rotation = Rotation.from_matrix(camera.camera_from_world.T)
+            self._handles.append(
                 scene.add_camera_frustum(
-                    f"{_NAME}/keyframe {place + 1}",
-                    vertical_fov(one, size),
-                    size[0] / size[1] / float(one.pixel_aspect),
+                    f"{_NAME}/keyframe {index + 1}",
+                    vertical_fov(camera, size),
+                    size[0] / size[1] / float(camera.pixel_aspect),
                     scale=self._scale,
                     thickness=FRUSTUM_PX,
                     thickness_units="screen",
                     color=COLOR,
-                    wxyz=turn.as_quat(scalar_first=True),
-                    position=one.position,
+                    wxyz=rotation.as_quat(scalar_first=True),
+                    position=camera.position,
                 )
             )
         if len(self.keyframes) >= 2:
-            count = max(LINE_POINTS, len(self.keyframes))
-            at = keyframes.through(self.keyframes, size, count).cameras.position
-            self._drawn.append(
+            count = max(CURVE_POINTS, len(self.keyframes))
+            points = keyframes.through(self.keyframes, size, count).cameras.position
+            self._handles.append(
                 scene.add_line_segments(
                     f"{_NAME}/curve",
-                    np.stack([at[:-1], at[1:]], axis=1),
+                    np.stack([points[:-1], points[1:]], axis=1),
                     COLOR,
                     thickness=FRUSTUM_PX,
                     thickness_units="screen",
@@ -220,15 +228,14 @@ class PathPanel:
             self._play.label = "stop the preview"
 
     def _advance_preview(self, clients):
-        client, path, began = self._preview
-        count = len(path.times)
-        place = (time.monotonic() - began) * RATE
-        if client.client_id not in clients or place > count - 1:
+        client, path, start_time = self._preview
+        last = len(path.times) - 1
+        row = round((time.monotonic() - start_time) * RATE)
+        if client.client_id not in clients or row > last:
             self._stop_preview()
-            place = count - 1
-        row = round(place)
-        one = cameras.take(path.cameras, row)
-        self._go(client, Keyframe(one, float(path.times[row])))
+            row = last
+        camera = cameras.take(path.cameras, row)
+        self._go(client, Keyframe(camera, float(path.times[row])))
 
     def _stop_preview(self):
         if self._preview is not None:
@@ -236,13 +243,13 @@ class PathPanel:
             self._play.label = "preview"
 
     def _go(self, client, keyframe: Keyframe):
-        """Show a browser what a keyframe does."""
+        """Move the camera of a browser to a keyframe, and show its time."""
         if client is None:
             return
-        turn = Rotation.from_matrix(keyframe.camera.camera_from_world.T)
+        rotation = Rotation.from_matrix(keyframe.camera.camera_from_world.T)
         with departing(client), client.atomic():
             client.camera.position = keyframe.camera.position
-            client.camera.wxyz = turn.as_quat(scalar_first=True)
+            client.camera.wxyz = rotation.as_quat(scalar_first=True)
             client.camera.fov = vertical_fov(
                 keyframe.camera, self._screen.run.capture.size
             )
@@ -251,7 +258,7 @@ class PathPanel:
     # Files
 
     def _path(self) -> CameraPath | None:
-        """The path, or None after telling in the page why there is none."""
+        """Return the path, or None after showing the reason in the page."""
         count = max(round(RATE * self._length.value), len(self.keyframes))
         try:
             size = self._screen.run.capture.size
@@ -264,31 +271,31 @@ class PathPanel:
         path = self._path()
         if path is None:
             return
-        place = _numbered(self._folder / EXPORTS, "path-", ".json")
+        file = _numbered(self._folder / EXPORTS, "path-", ".json")
         try:
-            place.parent.mkdir(parents=True, exist_ok=True)
-            path_files.write_nerfstudio(place, path, RATE, keyframes=self.keyframes)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            path_files.write_nerfstudio(file, path, RATE, keyframes=self.keyframes)
         except (ValueError, OSError) as error:
-            self._message.content = f"Not saved: {error}"
+            self._message.content = f"Could not be saved: {error}"
             return
-        words = "experiments.render", str(self._folder), "--path", str(place)
-        render = shlex.join(("python", "-m", *words))
+        arguments = "experiments.render", str(self._folder), "--path", str(file)
+        render = shlex.join(("python", "-m", *arguments))
         self._message.content = f"Saved. To render it later:\n\n`{render}`"
-        console.say(f"{len(path.times)} cameras: {place}; {render}")
+        console.say(f"{len(path.times)} cameras: {file}; {render}")
 
     def _load(self, client, eye, look, content: bytes):
         del client, eye, look
         with tempfile.TemporaryDirectory() as folder:
-            place = pathlib.Path(folder) / "camera path"
-            place.write_bytes(content)
+            file = pathlib.Path(folder) / "camera path"
+            file.write_bytes(content)
             try:
-                loaded = path_files.read_keyframes(place, self._screen.run.capture)
+                loaded = path_files.read_keyframes(file, self._screen.run.capture)
             except CaptureError as error:
-                reason = str(error).replace(f"{place}: ", "")
-                self._message.content = f"Not loaded: {reason}"
+                reason = str(error).replace(f"{file}: ", "")
+                self._message.content = f"Could not be loaded: {reason}"
                 return
         self.keyframes = loaded
-        self._changed()
+        self._update()
         self._message.content = f"{len(loaded)} keyframes loaded."
 
     # Rendering
@@ -296,7 +303,7 @@ class PathPanel:
     def _toggle_render(self, client, eye, look):
         del client, eye
         if self.rendering is not None:
-            self._end_rendering("The rendering is canceled, nothing of it is kept.")
+            self._end_rendering("Rendering was canceled. No images were kept.")
             return
         path = self._path()
         if path is None:
@@ -305,7 +312,7 @@ class PathPanel:
         screen, total = self._screen, len(path.times)
 
         def images():
-            # The state of the first call: training waits until the last image.
+            # One state for all images: training waits until the last one.
             state = yield 0
             out.parent.mkdir(parents=True, exist_ok=True)
             first = View(
@@ -320,7 +327,7 @@ class PathPanel:
         self.rendering, self._out, self._total = images(), out, total
         next(self.rendering)
         self._progress.value, self._progress.visible = 0.0, True
-        self._render.label = "cancel the rendering"
+        self._render.label = "cancel rendering"
         self._message.content = f"Rendering {total} images of {_text(path.size)}."
 
     def _advance_rendering(self, state):
@@ -330,7 +337,7 @@ class PathPanel:
             self._end_rendering(f"{self._total} images: `{self._out}`")
             console.say(f"{self._total} images: {self._out}")
         except (CaptureError, OSError, ValueError) as error:
-            self._end_rendering(f"Not rendered: {error}")
+            self._end_rendering(f"Could not be rendered: {error}")
         else:
             self._progress.value = 100.0 * done / self._total
             self._message.content = f"{done} of {self._total} images rendered."
@@ -357,11 +364,11 @@ def vertical_fov(camera: Camera, size: tuple[int, int]) -> float:
 
 
 def _numbered(folder: pathlib.Path, stem: str, suffix: str) -> pathlib.Path:
-    """The first of STEM1, STEM2, ... that is not there."""
+    """Return the first of STEM1, STEM2, ... that does not exist."""
     number = 1
-    while (place := folder / f"{stem}{number}{suffix}").exists():
+    while (path := folder / f"{stem}{number}{suffix}").exists():
         number += 1
-    return place
+    return path
 
 
 def _text(size):

@@ -1,4 +1,4 @@
-"""Panel of the viewer for a run in training: its loss, and a button that pauses it."""
+"""Panel of the viewer for a run in training: loss curve and pause button."""
 
 import math
 import time
@@ -7,34 +7,34 @@ from typing import Any
 
 import numpy as np
 
-MOST_POINTS = 1000  # of the curve; beyond, every second one is left out
-ABSENT_SECONDS = 10.0  # without a browser until training goes on by itself
+MAX_POINTS = 1000  # of the curve. If there are more, every second one is removed.
+ABSENT_SECONDS = 10.0  # without a browser until paused training continues
 PLOT_PX = 180
 _LOSS = "loss"
 
 
 class TrainingPanel:
-    """The loss curve, and the pause button of training.
+    """The loss curve and the pause button of training.
 
     Args:
-      server: viser's server.
-      ordered: As in `viewer_path.PathPanel`.
+      server: The server of viser.
+      deferred: As for `viewer_path.PathPanel`.
       pausable: True if training is in progress, so that it can be paused.
     """
 
-    def __init__(self, server: Any, ordered: Callable, pausable: bool):
+    def __init__(self, server: Any, deferred: Callable, pausable: bool):
         self.paused = False
         self._server = server
         self._steps: list[float] = []
         self._losses: list[float] = []
         self._stride, self._skipped = 1, 0
         self._plot = self._button = None
-        self._seen = time.monotonic()  # when a browser was there last
+        self._connected_time = time.monotonic()  # when a browser was last connected
         self._folder = server.gui.add_folder("training", visible=pausable)
         if pausable:
             with self._folder:
                 self._button = server.gui.add_button("pause training", color="gray")
-                self._button.on_click(ordered(lambda *_: self._pause(not self.paused)))
+                self._button.on_click(deferred(lambda *_: self._pause(not self.paused)))
 
     def add(self, step: int, metrics: Mapping[str, float]) -> None:
         """Add a point to the curve.
@@ -53,7 +53,7 @@ class TrainingPanel:
         self._skipped = 0
         self._steps.append(float(step))
         self._losses.append(loss)
-        if len(self._steps) > MOST_POINTS:
+        if len(self._steps) > MAX_POINTS:
             del self._steps[1::2], self._losses[1::2]
             self._stride *= 2
 
@@ -75,10 +75,10 @@ class TrainingPanel:
                 height=PLOT_PX,
             )
 
-    def held(self, browsers: int) -> bool:
-        """Return whether training must wait.
+    def is_paused(self, browsers: int) -> bool:
+        """Test if training must wait.
 
-        A pause ends by itself when no browser is left that could end it.
+        A pause ends automatically if no browser is connected for `ABSENT_SECONDS`.
 
         Args:
           browsers: Number of connected browsers.
@@ -88,13 +88,13 @@ class TrainingPanel:
         """
         now = time.monotonic()
         if browsers:
-            self._seen = now
-        if self.paused and now - self._seen > ABSENT_SECONDS:
+            self._connected_time = now
+        if self.paused and now - self._connected_time > ABSENT_SECONDS:
             self._pause(False)
         return self.paused
 
     def _pause(self, paused):
         self.paused = paused
-        self._seen = time.monotonic()
+        self._connected_time = time.monotonic()
         if self._button is not None:
             self._button.label = "resume training" if paused else "pause training"

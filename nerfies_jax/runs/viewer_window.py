@@ -1,4 +1,4 @@
-"""Contents of one browser: Gaussians that it renders itself, or rendered images."""
+"""Scene in one browser: Gaussians that the browser renders, or images rendered here."""
 
 import contextlib
 import time
@@ -13,16 +13,16 @@ from nerfies_jax.runs.screen import Screen
 from nerfies_jax.training.model import TrainState
 
 IDLE_SECONDS = 0.01
-REST_SECONDS = 0.2  # without a change until a view counts as resting
-REFRESH_SECONDS = 2.0  # between two updates of a resting view while training goes on
-SENT_SECONDS = 0.15  # between two images of a level that is not complete
+STATIC_SECONDS = 0.2  # without a change until a view is considered static
+REFRESH_SECONDS = 2.0  # between two updates of a static view during training
+PARTIAL_SECONDS = 0.15  # between two images of an incomplete level
 SPLATS_SECONDS = 1 / 30  # between two updates of the Gaussians
-TURNED_SECONDS = 0.2  # the same, where only the camera moved
-BYTES_PER_SECOND = 40e6  # of Gaussians, which a browser unpacks and sorts
+CAMERA_SECONDS = 0.2  # the same, if only the camera has moved
+BYTES_PER_SECOND = 40e6  # of Gaussians that a browser can unpack and sort
 BYTES_PER_SPLAT = 32
 JPEG_QUALITY = 90
 LARGEST_HALF = 6e4  # below the largest float16
-COMPILING = "Compiling the program that renders this, once ..."
+COMPILING = "Compiling the renderer for the first image ..."
 _NAME = "/splats"
 
 
@@ -47,10 +47,9 @@ def eye_of(camera) -> Eye | None:
 
 @contextlib.contextmanager
 def departing(client):
-    """Tolerate that the browser leaves while something is sent to it.
+    """Suppress warnings of viser about messages to a browser that has disconnected.
 
-    It may do so at any time, and viser warns of messages that nobody receives. Only
-    messages sent in this block are affected.
+    Browsers may disconnect at any time. Only messages sent in this block are affected.
 
     Args:
       client: The browser.
@@ -66,23 +65,27 @@ def departing(client):
 class Window:
     """The scene in one browser, kept up to date by calls of `update`.
 
-    `tell` shows a line of text in the page.
+    Args:
+      client: The browser.
+      screen: Renderer of the run.
+      show_text: Shows a line of text in the page.
     """
 
-    def __init__(self, client, screen: Screen, tell: Callable[[str], None]):
-        self._client, self._screen, self._tell = client, screen, tell
-        self._splats = None  # viser's handle
+    def __init__(self, client, screen: Screen, show_text: Callable[[str], None]):
+        self._client, self._screen, self._show_text = client, screen, show_text
+        self._splats = None  # handle of viser
         self._splat_unit = 1.0
         self._splat_count = 0
-        self._background: tuple[int, ...] | None = None  # of one color; None: an image
-        self._shown: tuple | None = None  # by what the last Gaussians were evaluated
-        self._sent = 0.0  # when the last update was, by the monotonic clock
+        self._background: tuple[int, ...] | None = None  # color, None for an image
+        # Look, step, eye position, and the position that the last Gaussians depend on.
+        self._splat_key: tuple | None = None
+        self._send_time = 0.0  # of the last update, monotonic
         self._image = _Image()
 
     def update(self, state: TrainState, step: int, look: Look) -> bool:
-        """Bring the browser closer to the state by a bounded amount of work.
+        """Update the browser by a bounded amount of work.
 
-        It renders at most one tile, so that the viewer stays responsive.
+        At most one tile is rendered, so that the viewer stays responsive.
 
         Args:
           state: Trained state.
@@ -102,39 +105,40 @@ class Window:
 
     def _update_splats(self, state, step, eye, look):
         self._image = _Image()
-        now, shown = time.monotonic(), self._shown
-        if shown is None or shown[:3] != (look, step, eye.position):
-            wait = self._splats_wait(shown, look, step)
-            if now - self._sent < wait:
-                time.sleep(IDLE_SECONDS)
-                return wait < REFRESH_SECONDS
-            if not self._screen.is_compiled(look):
-                self._tell(COMPILING)
-            cloud = self._screen.splats(state, eye, look)
-            self._send_splats(cloud)
-            position = eye.position if cloud.view_dependent else None
-            self._shown = look, step, eye.position, position
-            self._sent = time.monotonic()
-            self._splat_count = len(cloud.centers)
+        now, key = time.monotonic(), self._splat_key
+        if key is not None and key[:3] == (look, step, eye.position):
             self._show_splats(True)
-            self._tell(f"{len(cloud.centers):,} Gaussians, step {step:,}")
-            return True
+            return False
+        wait = self._splats_wait(look, step)
+        if now - self._send_time < wait:
+            time.sleep(IDLE_SECONDS)
+            return wait < REFRESH_SECONDS
+        if not self._screen.is_compiled(look):
+            self._show_text(COMPILING)
+        cloud = self._screen.splats(state, eye, look)
+        self._send_splats(cloud)
+        position = eye.position if cloud.view_dependent else None
+        self._splat_key = look, step, eye.position, position
+        self._send_time = time.monotonic()
+        self._splat_count = len(cloud.centers)
         self._show_splats(True)
-        return False
+        self._show_text(f"{len(cloud.centers):,} Gaussians, step {step:,}")
+        return True
 
-    def _splats_wait(self, shown, look, step):
-        """Seconds from the last update of the Gaussians to the next."""
-        if shown is None:
+    def _splats_wait(self, look, step):
+        """Return the seconds from the last update of the Gaussians to the next."""
+        if self._splat_key is None:
             return 0.0
+        last_look, last_step, _, position = self._splat_key
         wait = max(
             SPLATS_SECONDS, BYTES_PER_SPLAT * self._splat_count / BYTES_PER_SECOND
         )
-        if shown[0] != look:
+        if last_look != look:
             return wait
-        if shown[1] != step:
+        if last_step != step:
             return max(wait, REFRESH_SECONDS)
-        # Only the camera moved, which matters where colors depend on it.
-        return float("inf") if shown[3] is None else max(wait, TURNED_SECONDS)
+        # Only the camera moved. No update is needed unless colors depend on the view.
+        return float("inf") if position is None else max(wait, CAMERA_SECONDS)
 
     def _send_splats(self, cloud: SplatCloud):
         color = _bytes(cloud.background)
@@ -148,12 +152,12 @@ class Window:
                     _NAME, *arrays, scale=self._splat_unit
                 )
             else:
-                # One message with one buffer. The browser keeps its textures as long as
-                # the number of Gaussians stays the same.
+                # One message with one buffer. The browser reuses its textures if the
+                # number of Gaussians has not changed.
                 self._splats.set_gaussians(*arrays)
 
     def _half_range(self, cloud: SplatCloud):
-        """Arrays for viser, in units in which covariances fit into its float16."""
+        """Convert to arrays for viser, scaled so that covariances fit into float16."""
         covariances = np.asarray(cloud.covariances, np.float32)
         if self._splats is None:
             variance = np.trace(covariances, axis1=1, axis2=2) / 3
@@ -172,17 +176,17 @@ class Window:
             with departing(self._client):
                 self._splats.visible = visible
         if not visible:
-            self._shown = None
+            self._splat_key = None
 
     def _update_image(self, state, step, eye, look):
         image, pyramid, now = self._image, self._screen.pyramid, time.monotonic()
-        # The first level of a view is finished even if the view has changed since, or
-        # nothing would be seen of one that changes all the time.
+        # The first level of a view is completed even if the view has changed since.
+        # Otherwise nothing would be shown while the camera moves.
         finished = image.complete is not None or not image.cells
-        if image.seen != (eye, look) and finished:
-            self._image = image = _Image(seen=(eye, look), changed=now)
-        eye, look = image.seen
-        moving = now - image.changed < REST_SECONDS
+        if image.view != (eye, look) and finished:
+            self._image = image = _Image(view=(eye, look), start_time=now)
+        eye, look = image.view
+        moving = now - image.start_time < STATIC_SECONDS
         if not image.cells:
             seconds = self._screen.tile_seconds(look)
             if image.complete is None and self._screen.has_range(look.channel):
@@ -193,7 +197,7 @@ class Window:
             if (
                 level is None
                 and step != image.step
-                and now - self._sent > REFRESH_SECONDS
+                and now - self._send_time > REFRESH_SECONDS
             ):
                 level = image.complete
             if level is None:
@@ -201,16 +205,18 @@ class Window:
                 return moving
             image.begin(pyramid, level, step)
         if not self._screen.is_compiled(look):
-            self._tell(COMPILING)
+            self._show_text(COMPILING)
         cell = image.cells.pop(0)
         tile = self._screen.draw(state, eye, look, image.level, cell)
         image.paste(tile, cell, pyramid.tile)
         done, now = not image.cells, time.monotonic()
         if done:
             image.complete = image.level
-        # While the first level is incomplete there is nothing to show beside its tiles.
-        if done or (image.complete is not None and now - self._sent > SENT_SECONDS):
-            self._background, self._sent = None, now
+        # The first level is not sent before it is complete, because the rest of its
+        # canvas is black.
+        due = now - self._send_time > PARTIAL_SECONDS
+        if done or (image.complete is not None and due):
+            self._background, self._send_time = None, now
             self._send_image(image.canvas, format="jpeg")
         self._describe(image, look, step)
         return True
@@ -225,7 +231,7 @@ class Window:
         elif image.level + 1 < pyramid.levels:
             text += ", refining"
         legend = self._screen.legend(look.channel)
-        self._tell(f"{text}\n\n{legend}" if legend else text)
+        self._show_text(f"{text}\n\n{legend}" if legend else text)
 
     def _send_image(self, image, format):
         with departing(self._client):
@@ -235,18 +241,18 @@ class Window:
 
 
 class _Image:
-    """An image of one view in the making."""
+    """A partially rendered image of one view."""
 
-    def __init__(self, seen: tuple[Eye, Look] | None = None, changed: float = 0.0):
-        self.seen, self.changed = seen, changed
+    def __init__(self, view: tuple[Eye, Look] | None = None, start_time: float = 0.0):
+        self.view, self.start_time = view, start_time
         self.level = 0
-        self.complete: int | None = None  # the finest level that is
-        self.cells: list[tuple[int, int]] = []  # left to render of `level`
+        self.complete: int | None = None  # the finest complete level
+        self.cells: list[tuple[int, int]] = []  # tiles of `level` yet to be rendered
         self.step = -1  # of training, when `level` was begun
         self.canvas: np.ndarray | None = None
 
     def begin(self, pyramid, level, step):
-        """Start a level over what is known of the coarser one."""
+        """Begin a level with the enlarged image of the coarser one."""
         width, height = pyramid.size(level)
         if self.canvas is None:
             self.canvas = np.zeros((height, width, 3), np.uint8)
@@ -255,12 +261,12 @@ class _Image:
         self.level, self.step, self.cells = level, step, pyramid.tiles(level)
 
     def paste(self, tile, cell, size):
-        """Put a tile into its place."""
+        """Copy a tile into the canvas."""
         (column, row), (width, height) = cell, size
         top, left = row * height, column * width
         self.canvas[top : top + height, left : left + width] = tile
 
 
 def _bytes(values):
-    """Values in [0, 1] as 8 bits."""
+    """Convert values in [0, 1] to 8 bits."""
     return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)

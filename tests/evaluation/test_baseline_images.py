@@ -110,16 +110,16 @@ def test_a_run_below_a_baseline_is_told_what_to_do():
     }
     numbers |= {"motion.gain": 0.5}
     assert baselines_text.warnings(numbers) == []
-    assert "19.00 dB mean of two" in baselines_text.lines(numbers)[0]
+    assert "19.00 dB for the mean of the two" in baselines_text.lines(numbers)[0]
     assert "+0.50 dB" in baselines_text.lines(numbers)[1]
     assert baselines_text.warnings(numbers | {"motion.gain": -0.04}) == []
     (worse,) = baselines_text.warnings(numbers | {"motion.gain": -0.06})
-    assert "0.06 dB worse" in worse
+    assert "0.06 dB less" in worse
     below, worse = baselines_text.warnings(
         numbers | {"baseline.neighbor_mean": 22.7, "motion.gain": -0.25}
     )
     assert "20.00 dB is below the 22.70 dB" in below
-    assert "0.25 dB worse" in worse
+    assert "0.25 dB less" in worse
     assert "more steps" in below
     assert "splats-static" in worse
     assert baselines_text.lines({"heldout.psnr": 20.0}) == []

@@ -49,7 +49,7 @@ def test_splats_that_blow_up_say_where_and_are_reported(tmp_path, capsys):
     last = printed.err.splitlines()[-1]
     assert last.startswith("error: stopped at step ")
     assert "is not finite: params.rows.splats.opacity_logit (" in last
-    assert "start anew with lower learning rates" in last
+    assert "start a new run with lower learning rates" in last
     assert "--resume" not in printed.out  # it would stop at the same step
     assert json.loads((folder / "metrics.json").read_text())["train.steps"] == step
     assert (folder / "report.html").is_file()
@@ -60,6 +60,6 @@ def test_a_field_that_draws_no_numbers_leaves_no_report(tmp_path, capsys):
     folder, step = reconstruct_at(tmp_path, "nerf-small", rate, *FIELD)
     assert step == 1
     *_, drawn, last = capsys.readouterr().err.splitlines()
-    assert drawn.startswith("error: no report: what the state of step 1 draws is not")
+    assert drawn.startswith("error: no report: the images rendered at step 1 are not")
     assert last.startswith("error: stopped at step 1 of 6: step 2 is not finite: ")
     assert not (folder / "report.html").exists()

@@ -107,7 +107,7 @@ def test_other_machines_and_frames_are_remarked(tmp_path):
             lambda folder: (folder / "curve.json").unlink(),
             "neither curve.json",
         ),
-        (lambda folder: (folder / "curve.json").write_text("{}"), "not the curve"),
+        (lambda folder: (folder / "curve.json").write_text("{}"), "not a valid curve"),
         (lambda folder: (folder / "metrics.json").unlink(), "not a run"),
         (lambda folder: (folder / "config.json").write_text("{}"), "not a run"),
         (

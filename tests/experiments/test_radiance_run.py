@@ -49,7 +49,7 @@ def run(filmed):
     out = filmed.parent / "run"
     common = ("--preset", "nerfies", "--steps", "12", "--out", out)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(budget, "MOST_FILMED", budget.LEAST_FILMED)
+        patch.setattr(budget, "MAX_VIDEO_FRAMES", budget.MIN_VIDEO_FRAMES)
         assert main(reconstruct, filmed, *common, "--set", *TINY) == 0
     return out
 

@@ -122,9 +122,9 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     for words in ("is below the", f"{exact:.2f} dB", "player.html"):
         assert words in page
         assert words in printed
-    assert "There is no player" not in page
+    assert "player could not be created" not in page
     assert "plan: 2 steps for 250 s of training" in printed
-    assert "motion:    gains +0.00 dB" in printed
+    assert "motion:     +0.00 dB compared with" in printed
     told = runs.read_events(out)
     names = event_checks.ended_stages(told)
     order = ["reading images", "initializing the scene", "training"]
@@ -343,7 +343,7 @@ def test_a_run_that_is_alive_is_not_resumed(run, tmp_path, capsys):
     shutil.copytree(run, folder)
     with run_folder.owned(folder):
         assert ended("--out", folder, "--resume") == 2
-    refusal = f"process {os.getpid()} on .* is at work in this run folder"
+    refusal = f"process {os.getpid()} on .* is using this run folder"
     assert re.search(refusal, capsys.readouterr().err)
 
 
@@ -359,7 +359,7 @@ def test_a_run_that_cannot_be_drawn_or_kept_says_so_and_ends(
     shutil.rmtree(folder / CHECKPOINTS / "12")
     before = {name: (folder / name).read_bytes() for name in PRODUCTS}
     with monkeypatch.context() as patch:
-        patch.setattr(products, "save_film", full)
+        patch.setattr(products, "save_video", full)
         assert ended("--out", folder, "--resume") == 1
     words = f"is written: {folder}: cannot be written (No space left on device)"
     assert words in capsys.readouterr().err
@@ -371,7 +371,7 @@ def test_a_run_that_cannot_be_drawn_or_kept_says_so_and_ends(
     for name in set(PRODUCTS) - {"config.json", "capture.npz"}:
         (folder / name).unlink()
     with monkeypatch.context() as patch:
-        patch.setattr(products, "save_film", full)
+        patch.setattr(products, "save_video", full)
         assert ended("--out", folder, "--resume") == 1
     assert "is written: [Errno 28] No space left" in capsys.readouterr().err
     assert {n for n in PRODUCTS if not (folder / n).exists()} == {"scene.mp4"}

@@ -69,7 +69,7 @@ def test_frames_without_their_picture_are_left_out_where_asked(
         (("--preset", "splats-magic"), "splats-deformable-small"),
         (("--steps", "0"), "at least one step"),
         (("--heldout", "1"), "held"),
-        (("--prepare.frames", "9"), "has its own"),
+        (("--prepare.frames", "9"), "has cameras"),
         (("--checkpoint-every", "-1"), "--checkpoint-every -1"),
         (("--lpips-weights", "a.npz"), "a.npz: No such file"),
         (("--lpips-weights", "a.npz", "--lpips-network", "vgg"), "a.npz: No such file"),
@@ -143,7 +143,7 @@ def test_a_run_is_found_by_what_was_filmed(tmp_path, monkeypatch, capsys):
     assert "runs/clip-capture: the run was started" in line
     assert "seed: saved 0, now 7;" in line
     assert "capture" not in line.partition("settings: ")[2]
-    assert "no run of it in runs" in refused(capsys, tmp_path / "new", "--resume")
+    assert "runs contains no run of it" in refused(capsys, tmp_path / "new", "--resume")
 
 
 @pytest.mark.parametrize(

@@ -150,6 +150,6 @@ def test_pieces_begin_while_their_share_of_the_budget_is_left():
 
 @pytest.mark.parametrize("budget", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_budget_that_is_none_is_refused(budget):
-    with pytest.raises(ValueError, match="a positive multiple of the default budget"):
+    with pytest.raises(ValueError, match="positive, finite multiple of the"):
         CaptureSource(preprocessing=budget)
     assert CaptureSource(preprocessing=2.0).arguments[-2:] == ("--preprocessing", "2.0")

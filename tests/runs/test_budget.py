@@ -21,20 +21,20 @@ def test_evaluations_stay_a_tenth_of_the_training(frame_seconds):
 
 def test_a_zero_of_the_clock_is_no_division():
     assert budget.evaluations(0.0, 20.0, 4) == (4, 20.0)
-    assert budget.scored(0.0, 7) == 7
-    assert budget.film(0.0, (176, 132)).frames == 96
+    assert budget.scored_frames(0.0, 7) == 7
+    assert budget.video(0.0, (176, 132)).frames == 96
 
 
 def test_all_frames_are_scored_where_time_allows_and_eight_otherwise():
-    assert budget.scored(0.5, 40) == 40
-    assert budget.scored(12.0, 40) == 20
-    assert budget.scored(1000.0, 40) == 8
-    assert budget.scored(1000.0, 5) == 5
+    assert budget.scored_frames(0.5, 40) == 40
+    assert budget.scored_frames(12.0, 40) == 20
+    assert budget.scored_frames(1000.0, 40) == 8
+    assert budget.scored_frames(1000.0, 5) == 5
 
 
 @pytest.mark.parametrize("frame_seconds", [0.01, 0.47, 1.0, 1.8, 1.9, 5.0, 20.0])
 def test_a_film_fits_its_time_and_plays_four_seconds(frame_seconds):
-    film = budget.film(frame_seconds, (176, 132))
+    film = budget.video(frame_seconds, (176, 132))
     assert 24 <= film.frames <= 96
     smaller = 176 // film.size[0]
     assert film.size == (176 // smaller, 132 // smaller)
@@ -45,7 +45,7 @@ def test_a_film_fits_its_time_and_plays_four_seconds(frame_seconds):
 
 
 def test_a_film_is_not_made_too_small_to_see():
-    film = budget.film(1e4, (100, 80))
+    film = budget.video(1e4, (100, 80))
     assert film.size == (50, 40)
     assert film.frames == 24
 
@@ -53,7 +53,7 @@ def test_a_film_is_not_made_too_small_to_see():
 @pytest.mark.parametrize("frame_seconds", [0.0, 0.01, 0.1, 0.5, 1.0, 30.0])
 @pytest.mark.parametrize("size", [(176, 132), (4000, 3000)])
 def test_averages_over_time_keep_to_their_time_and_memory(frame_seconds, size):
-    frames, moments = budget.still(frame_seconds, 15, size)
+    frames, moments = budget.static_renders(frame_seconds, 15, size)
     assert 2 <= frames <= 15
     assert 4 <= moments <= 16
     assert frames * size[0] * size[1] <= max(10_000_000, 2 * size[0] * size[1])
@@ -61,4 +61,4 @@ def test_averages_over_time_keep_to_their_time_and_memory(frame_seconds, size):
     assert frames * moments * frame_seconds <= max(30.0, 8 * frame_seconds)
     if frame_seconds <= 0.1 and size == (176, 132):
         assert (frames, moments) == (15, 16)
-    assert budget.still(frame_seconds, 1, size)[0] == 1
+    assert budget.static_renders(frame_seconds, 1, size)[0] == 1

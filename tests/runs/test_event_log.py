@@ -78,7 +78,7 @@ def test_damaged_lines_are_skipped(tmp_path):
 
 
 def test_a_reader_follows_what_is_written(tmp_path):
-    with pytest.raises(ValueError, match="no events can be read"):
+    with pytest.raises(ValueError, match="events cannot be read"):
         EventReader(tmp_path).new()
     logged(tmp_path, run("begin", 0))
     reader = EventReader(tmp_path)
@@ -125,9 +125,9 @@ def test_a_full_disk_keeps_events_waiting(tmp_path, monkeypatch, capsys):
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
 def test_events_that_are_lost_are_told_at_the_end(tmp_path, monkeypatch, capsys):
     (tmp_path / EVENTS).symlink_to(FULL)
-    monkeypatch.setattr(event_log, "MOST_WAITING_BYTES", 100)
+    monkeypatch.setattr(event_log, "MAX_PENDING_BYTES", 100)
     logged(tmp_path, *(run("begin", step) for step in range(9)))
-    assert "not all events of the run are in it (No space left" in (
+    assert "some events could not be written (No space left" in (
         capsys.readouterr().err
     )
 

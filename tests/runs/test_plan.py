@@ -61,9 +61,9 @@ def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     assert planned.capture is run.capture
     assert planned.filmed is run.filmed
     assert line.startswith(
-        f"plan: {planned.spec.steps:,} steps for 10 s of training (10"
+        f"plan: {planned.spec.steps:,} steps in 10 s of training (10"
     )
-    assert ("1.4 times that" in line) == growing
+    assert ("grow 1.4 times" in line) == growing
     if growing:
         stop = planned.spec.strategy.refine_stop_iter
         assert stop == 10 * round(200 * planned.spec.steps / 3000)

@@ -128,7 +128,7 @@ def test_a_second_pass_that_loses_pictures_is_not_taken(
     del moving
     mapper.fails, log = True, []
     preparation.prepare(pictures, tmp_path / "out", tell=log.append)
-    assert any("only 6 are placed; the first are kept" in line for line in log)
+    assert any("registered only 6 of the 9 images" in line for line in log)
     assert not (tmp_path / "out/masks_found").exists()
 
 
@@ -185,7 +185,7 @@ def test_other_masks_make_another_capture_and_what_is_no_picture_does_not(
             (folder / name).write_bytes(b"of a file manager")
     log = []
     preparation.prepared(pictures, tmp_path / "out", how, log.append)
-    assert "was prepared before" in log[0]
+    assert "has already been converted" in log[0]
     assert len(mapper.calls) == 1
     mask[3:5] = False
     images.write_png(tmp_path / "masks/p4.png", mask)
@@ -232,11 +232,11 @@ def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monke
 
 
 def test_what_cannot_be_prepared_is_refused_and_leaves_nothing(pictures, tmp_path):
-    with pytest.raises(CaptureError, match=r"nothing\.mp4: no such film"):
+    with pytest.raises(CaptureError, match=r"nothing\.mp4: no such video"):
         preparation.prepare(tmp_path / "nothing.mp4", tmp_path / "out")
-    with pytest.raises(CaptureError, match="neither a film"):
+    with pytest.raises(CaptureError, match="neither a video"):
         preparation.prepare(pictures / "p0.png", tmp_path / "out")
-    with pytest.raises(ValueError, match="choose from a film"):
+    with pytest.raises(ValueError, match="select frames of a video"):
         preparation.prepare(pictures, tmp_path / "out", Preparation(frames=5))
     with pytest.raises(CaptureError, match="maskz: no such folder of masks"):
         preparation.prepare(
@@ -250,7 +250,7 @@ def test_what_cannot_be_prepared_is_refused_and_leaves_nothing(pictures, tmp_pat
     [
         ({"threads": 0}, "threads=0"),
         ({"max_side": 8}, "max_side=8"),
-        ({"frames": 9, "fps": 2.0}, "not both"),
+        ({"frames": 9, "fps": 2.0}, "mutually exclusive"),
     ],
 )
 def test_wrong_settings_are_refused_before_a_film_is_read(wrong, words):

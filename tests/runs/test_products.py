@@ -83,12 +83,12 @@ def test_a_player_that_fails_loses_nothing_but_itself(tmp_path):
     trained = Trained(result, lambda *_: black, None, None)
     assert products.save_player(tmp_path, run, trained) == (
         [],
-        ["There is no player: KeyError: 'mean'"],
+        ["The interactive player could not be created: KeyError: 'mean'"],
     )
     without = gaussians._replace(products=gaussians.products._replace(player=None))
     run = run._replace(representation=without)
     figures, (note,) = products.save_player(tmp_path, run, trained)
-    assert (figures, "has no player" in note) == ([], True)
+    assert (figures, "has no interactive player" in note) == ([], True)
     assert not list(tmp_path.iterdir())
 
 

@@ -23,7 +23,7 @@ def address(tmp_path_factory):
     """The page of a run with every metric, a broad image and a video."""
     folder = tmp_path_factory.mktemp("run")
     (folder / "scene.mp4").write_bytes(b"not really a video")
-    broad = np.zeros((90, report.BROAD_PX + 1, 3), np.uint8)
+    broad = np.zeros((90, report.WIDE_PX + 1, 3), np.uint8)
     for name, picture in (("broad", broad), ("small", broad[:, :100])):
         panels.save(picture, folder / f"{name}.png")
     path = report.write(

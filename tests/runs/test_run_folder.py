@@ -35,9 +35,9 @@ def test_a_run_is_no_capture(tmp_path):
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.json").write_text("{}")
     for look in (run_folder.newest_of, preparation.prepare):
-        with pytest.raises(ValueError, match=r"folder of a run, .* runs\.resume\("):
+        with pytest.raises(ValueError, match=r"a run folder, .* runs\.resume\("):
             look(run, tmp_path / "out")
-    with pytest.raises(reconstruction.Refused, match="folder of a run"):
+    with pytest.raises(reconstruction.Refused, match="a run folder, not a capture"):
         reconstruction.reconstruct(RunConfig(None, CaptureSource(run)))
 
 
@@ -61,9 +61,7 @@ def test_a_folder_has_one_owner_for_the_life_of_its_process(end, tmp_path):
     )
     try:
         assert owner.stdout.readline() == b"mine\n"
-        refusal = (
-            rf"process {owner.pid} on .* \(since 20.*\) is at work in this run folder"
-        )
+        refusal = rf"process {owner.pid} on .* \(since 20.*\) is using this run folder"
         with pytest.raises(ValueError, match=refusal):
             run_folder.new_run_folder(tmp_path, "x")
         with pytest.raises(ValueError, match=refusal), run_folder.owned(tmp_path):

@@ -51,23 +51,27 @@ def _retouched(images):
 FOURTH = CAPTURE.ids[3]
 FOCAL = CAPTURE.cameras.focal_px * np.where(np.arange(len(CAPTURE.ids)) == 3, 1.01, 1)
 OTHERS = {
-    f"other pictures ({FOURTH} first)": [
+    f"images have changed (first at frame {FOURTH})": [
         with_pictures(_of_another_frame),
         with_pictures(_retouched),
     ],
-    f"other camera focal_px ({FOURTH} first)": [
+    f"camera focal_px have changed (first at frame {FOURTH})": [
         with_cameras(focal_px=FOCAL.astype(np.float32))
     ],
-    "other frames than": [captures.select(CAPTURE, np.arange(1, len(CAPTURE.ids)))],
-    "other size": [captures.downscale(CAPTURE, 2)],
-    "other frames to learn from": [
+    "the names of frames have changed": [
+        captures.select(CAPTURE, np.arange(1, len(CAPTURE.ids)))
+    ],
+    "the dimensions of the images have changed": [captures.downscale(CAPTURE, 2)],
+    "the training frames have changed": [
         dataclasses.replace(CAPTURE, train=CAPTURE.train[1:])
     ],
-    "other held-out frames": [
+    "the held-out frames have changed": [
         dataclasses.replace(CAPTURE, heldout=CAPTURE.heldout[:0])
     ],
-    "other times": [dataclasses.replace(CAPTURE, times=1 - CAPTURE.times)],
-    "other bounds": [dataclasses.replace(CAPTURE, far=1.01 * CAPTURE.far)],
+    "times have changed": [dataclasses.replace(CAPTURE, times=1 - CAPTURE.times)],
+    "bounds, scale or center have changed": [
+        dataclasses.replace(CAPTURE, far=1.01 * CAPTURE.far)
+    ],
 }
 
 
@@ -88,12 +92,12 @@ def test_a_run_of_a_former_version_is_taken_at_its_word(tmp_path):
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 and no more", None])
 def test_a_damaged_record_is_named(content, tmp_path):
-    path = tmp_path / same_capture.KEPT
+    path = tmp_path / same_capture.FILE
     if content is None:
         np.savez(path, times=np.zeros(3))
     else:
         path.write_bytes(content)
-    with pytest.raises(CaptureError, match=r"capture\.npz: not what a run keeps"):
+    with pytest.raises(CaptureError, match=r"capture\.npz: not a valid description"):
         same_capture.check(tmp_path, CAPTURE)
 
 
@@ -114,7 +118,7 @@ def test_a_capture_may_be_moved(begun):
     path = folder / run_folder.CONFIG
     before = json.loads(path.read_text())
     there = source.rename(source.with_name("elsewhere"))
-    with pytest.raises(ValueError, match="was moved, name its new path"):
+    with pytest.raises(ValueError, match="was moved, pass its new path"):
         runs.saved_run(folder)
     runs.saved_run(folder, moved={"capture": there})
     assert runs.saved_run(folder).capture.path == there
@@ -130,7 +134,7 @@ def test_another_capture_is_not_taken_for_a_moved_one(begun):
     with pytest.raises(runs.Refused, match="capture: saved"):  # the old one is there
         runs.resume(folder, expected={"capture": there})
     source.rename(source.with_name("lost"))
-    words = re.escape(f"other pictures ({FOURTH} first)")
+    words = re.escape(f"images have changed (first at frame {FOURTH})")
     with pytest.raises(runs.Refused, match=words):
         runs.resume(folder, expected={"capture": there})
     assert (folder / run_folder.CONFIG).read_bytes() == before
@@ -162,5 +166,5 @@ def test_times_of_a_file_are_of_captures_and_of_no_built_in_scene(tmp_path):
     read = runs.stored_capture(source)
     np.testing.assert_allclose(read.times, CAPTURE.times**2, atol=1e-6)
     assert read.given is None
-    with pytest.raises(ValueError, match="a built-in scene has its own times"):
+    with pytest.raises(ValueError, match="a built-in scene defines its own"):
         runs.stored_capture(CaptureSource(files=GivenFiles(times=file)))

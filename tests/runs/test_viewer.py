@@ -248,11 +248,11 @@ def test_a_browser_gets_gaussians_that_follow_time_effects_and_the_channel(tmp_p
         browser.press(page, "time", 0.1)
         time.sleep(0.2)
         until(lambda: page._time.value == 0.1)
-        until(lambda: not page._round(state, 0))
+        until(lambda: not page._update(state, 0))
         np.testing.assert_array_equal(browser.positions(), frozen)
         # Depth is rendered here, by another program, and sharpens by itself.
-        told, tell = [], page._windows[0]._tell
-        page._windows[0]._tell = lambda text: told.append(text) or tell(text)
+        told, tell = [], page._windows[0]._show_text
+        page._windows[0]._show_text = lambda text: told.append(text) or tell(text)
         browser.press(page, "show", "depth")
         until(lambda: browser.picture is not None and browser.picture.shape[1] == 160)
         assert told[0].startswith("Compiling")
@@ -295,7 +295,7 @@ def test_images_of_a_field_reach_full_size_however_slow_they_are(tmp_path, monke
 
     monkeypatch.setattr(screen, "TRACED_PIXELS", 400)
     monkeypatch.setattr(screen.Screen, "tile_seconds", lambda *_: 30.0)
-    monkeypatch.setattr(viewer_window, "SENT_SECONDS", 0.0)
+    monkeypatch.setattr(viewer_window, "PARTIAL_SECONDS", 0.0)
     row = int(CAPTURE.train[0])
     with opened(tmp_path, "radiance") as (page, browser, until, run, state):
         assert run.representation.products.splatting is None
@@ -303,7 +303,7 @@ def test_images_of_a_field_reach_full_size_however_slow_they_are(tmp_path, monke
         until(lambda: browser.picture is not None)
         assert browser.picture.shape[1] < 160
         until(lambda: browser.picture.shape[1] == 160)
-        until(lambda: not page._round(state, 0))
+        until(lambda: not page._update(state, 0))
         browser.receive(0.2)
         view = evaluation.resized(
             evaluation.view_of(CAPTURE, row), CAPTURE.size, (160, 120)
@@ -354,7 +354,7 @@ def test_a_path_is_edited_saved_loaded_and_rendered(tmp_path, capsys):
         np.testing.assert_allclose(path.times[ends], [0.25, 0.5], atol=1e-3)
         expected = CAPTURE.cameras.position[[rows[2], rows[1]]]
         np.testing.assert_allclose(path.cameras.position[ends], expected, atol=1e-5)
-        page._orders.put(lambda: page.path._load(None, None, None, saved.read_bytes()))
+        page._tasks.put(lambda: page.path._load(None, None, None, saved.read_bytes()))
         until(lambda: page.path.keyframes[0].time == 0.25)
         browser.press(page, "render")
         out = tmp_path / "renders" / "path-1"
@@ -363,7 +363,7 @@ def test_a_path_is_edited_saved_loaded_and_rendered(tmp_path, capsys):
         assert page.path.rendering is None
         browser.press(page, "render")
         until(lambda: page.path.rendering is not None)
-        browser.press(page, "cancel the rendering")
+        browser.press(page, "cancel rendering")
         until(lambda: page.path.rendering is None)
         assert [each.name for each in out.parent.iterdir()] == ["path-1"]
     assert f"--path {saved}" in capsys.readouterr().out
