@@ -67,7 +67,7 @@ REFUSED = {
     ),
     "a raw key": (
         lambda: pair(jnp.ones(5), jnp.ones((5, 3)), key=jax.random.PRNGKey(0)),
-        r"`key` must be a key, got uint32\[2\]; make it with jax.random.key",
+        r"`key` must be a key, got uint32\[2\]; create it with jax.random.key",
     ),
     "a list": (
         lambda: pair([1.0, 2.0], jnp.ones((2, 3))),
@@ -99,7 +99,7 @@ REFUSED = {
     ),
     "an image of int32": (
         lambda: difference(jnp.ones((4, 4, 3), int), jnp.ones((4, 4, 3))),
-        r"`image` is int32\[4, 4, 3\]; images are floating-point in \[0, 1\], uint8 or",
+        r"`image` is int32\[4, 4, 3\]; images must be floating-point in",
     ),
 }
 

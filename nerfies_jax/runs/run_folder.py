@@ -118,8 +118,8 @@ def check_free(out: pathlib.Path) -> None:
     """
     if out.exists() and not out.is_dir():
         raise ValueError(
-            f"{out}: a run needs a folder, but this is a file; choose another path "
-            "with out=..."
+            f"{out}: the run folder is an existing file; choose another path with "
+            "out=..."
         )
     if not out.is_dir():
         above = next(path for path in out.absolute().parents if path.exists())

@@ -1,8 +1,9 @@
-"""Child processes that end when their parent does, however that ends.
+"""Child processes that end when their parent ends, for whatever reason.
 
 The parent starts a Python program with `start`, or a pool of processes with
 `end_with_parent` as its initializer. The child calls `end_with_parent`. Linux then
-kills it together with its parent. Elsewhere a thread of the child looks for the parent.
+kills it together with its parent. On other systems a thread of the child checks whether
+the parent is still running.
 """
 
 import os
@@ -17,7 +18,7 @@ from typing import Any
 
 from nerfies_jax.runtime import stopping
 
-PARENT = "NERFIES_JAX_PARENT"  # variable of the child's environment: a process id
+PARENT = "NERFIES_JAX_PARENT"  # environment variable with the process id of the parent
 POLL_SECONDS = 0.5
 _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of linux/prctl.h
 
@@ -55,7 +56,7 @@ def start(command: Sequence[str | os.PathLike], **options: Any) -> subprocess.Po
 
 
 def _kill():
-    """Kill the children before what they write is removed."""
+    """Kill the children, so that their incomplete files can be removed."""
     for child in list(_started):
         if child.returncode is None:
             child.kill()
@@ -65,15 +66,15 @@ def end_with_parent(parent: int | None = None) -> None:
     """Make this process end when its parent does. Call it early in a child.
 
     Args:
-      parent: Process id of the parent. By default the one that `start` left in the
-        environment; nothing happens where there is none.
+      parent: Process id of the parent. None for the one that `start` has passed in the
+        environment. Without any, the function does nothing.
     """
     parent = parent or int(os.environ.pop(PARENT, "0"))
     if not parent:
         return
     if sys.platform != "linux" or not _ask_kernel():
-        threading.Thread(target=_follow, args=(parent,), daemon=True).start()
-    if not _is_there(parent):  # it ended before
+        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+    if not _is_running(parent):  # it ended before the call
         os._exit(128 + signal.SIGTERM)
 
 
@@ -87,14 +88,14 @@ def _ask_kernel() -> bool:
     return prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL) == 0
 
 
-def _follow(parent):
-    while _is_there(parent):
+def _watch(parent):
+    while _is_running(parent):
         time.sleep(POLL_SECONDS)
     os._exit(128 + signal.SIGTERM)
 
 
-def _is_there(parent):
-    if os.name == "posix":  # an orphan gets another parent
+def _is_running(parent):
+    if os.name == "posix":  # an orphan is adopted by another process
         return os.getppid() == parent
     import psutil
 

@@ -1,10 +1,10 @@
-"""Messages to the user, which never end or skip the work that they report.
+"""Messages to the user. Failing to write them never ends the work.
 
-Every message of the packages goes through `say`, `note`, `warn` and `error`. A reader
-that went away (`reconstruct ... | head`), a full disk under a log file and a closed
-stream lose the message and nothing else: the first error is remembered, the descriptor
-is pointed at the null device, and the work goes on. A `session` does the same for what
-other libraries write, and decides the exit code of a command.
+Every message of the packages goes through `say`, `note`, `warn` and `error`. If the
+reader of a pipe has ended (`reconstruct ... | head`), the disk of a log file is full or
+a stream is closed, only messages are lost: the first error is stored, the descriptor is
+redirected to the null device, and the work continues. A `session` does the same for the
+output of other libraries, and determines the exit code of a command.
 """
 
 import contextlib
@@ -59,7 +59,7 @@ def _write_line(name, text):
     if _above is not None and stream.isatty():
         _above(text)
     else:
-        # One write: lines of several processes in one log stay whole.
+        # A single write, so that lines of several processes in one log are not mixed.
         stream.write(text + "\n")
 
 
@@ -68,7 +68,7 @@ def display(above: Callable[[str], None]) -> Iterator[None]:
     """Send lines for a terminal to `above` while the block runs.
 
     Args:
-      above: Writes a line above the progress display that occupies the last lines.
+      above: Writes a line above a progress display at the bottom of the terminal.
 
     Yields:
       None.
@@ -82,10 +82,10 @@ def display(above: Callable[[str], None]) -> Iterator[None]:
 
 
 class SafeStream:
-    """A text stream whose `write` and `flush` never raise an error of its file.
+    """A text stream whose `write` and `flush` never raise errors of its file.
 
     Attributes:
-      failure: The first error, or None while everything has been written.
+      failure: The first error, or None if there was none.
     """
 
     def __init__(self, stream: Any):
@@ -93,7 +93,9 @@ class SafeStream:
         self.failure: OSError | None = None
 
     def write(self, text: str) -> int:
-        """Write and flush at the end of a line, since a pipe must not hold lines back.
+        """Write text, and flush it if it contains the end of a line.
+
+        Otherwise the buffer of a pipe would delay lines.
 
         Args:
           text: The text.
@@ -110,12 +112,12 @@ class SafeStream:
         try:
             self._stream.write(text)
         except UnicodeEncodeError:
-            coding = self._stream.encoding
-            plain = text.encode(coding, "backslashreplace").decode(coding)
-            self._stream.write(plain)
+            encoding = self._stream.encoding
+            escaped = text.encode(encoding, "backslashreplace").decode(encoding)
+            self._stream.write(escaped)
 
     def writelines(self, lines) -> None:
-        """Write every line.
+        """Write several lines.
 
         Args:
           lines: The lines.
@@ -124,11 +126,11 @@ class SafeStream:
             self.write(line)
 
     def flush(self) -> None:
-        """Flush what was written."""
+        """Flush the buffer."""
         self._attempt(lambda: self._stream.flush())
 
     def isatty(self) -> bool:
-        """Return whether this is a terminal.
+        """Test if this is a terminal.
 
         Returns:
           True for a terminal.
@@ -139,22 +141,22 @@ class SafeStream:
             return False
 
     def _attempt(self, action, *arguments):
-        if self._stream is None:  # Python opens none for a closed descriptor
+        if self._stream is None:  # the descriptor was closed when Python started
             return
         try:
             action(*arguments)
         except BlockingIOError:
-            pass  # a slow reader: it is still in the buffer, for the next flush
+            pass  # slow reader: the text stays in the buffer until the next flush
         except RuntimeError:
-            pass  # a signal handler that writes in the middle of a write
+            pass  # reentrant call from a signal handler during a write
         except (OSError, ValueError) as problem:
-            lost = problem if isinstance(problem, OSError) else OSError(str(problem))
-            self._give_up(lost)
+            is_os_error = isinstance(problem, OSError)
+            self._give_up(problem if is_os_error else OSError(str(problem)))
 
     def _give_up(self, problem):
         self.failure = self.failure or problem
-        # The rest of the buffer goes there too: otherwise Python would fail on it again
-        # when it exits, with code 120.
+        # The rest of the buffer is written to the null device, too. Otherwise Python
+        # would fail to flush it at exit, with code 120.
         with contextlib.suppress(OSError, ValueError):
             _point_at_null(self._stream.fileno())
             self._stream.flush()
@@ -164,7 +166,7 @@ class SafeStream:
 
 
 def safe(name: str) -> SafeStream:
-    """Return `sys.stdout` or `sys.stderr`, by its name, as a stream that never raises.
+    """Wrap `sys.stdout` or `sys.stderr` in a stream that never raises.
 
     Args:
       name: `"stdout"` or `"stderr"`.
@@ -187,14 +189,14 @@ def _point_at_null(descriptor):
 def open_descriptors() -> None:
     """Open the null device in place of standard streams that are closed.
 
-    Otherwise the next file that is opened gets the number of the stream, and native
-    libraries write their standard error into the middle of it.
+    Otherwise the next file to be opened gets the descriptor of the stream, and native
+    libraries would write their error messages into it.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            # The lowest free number, which is this one.
+            # `os.open` returns the lowest free descriptor, which is this one.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
             if getattr(sys, name) is None:
                 mode = "w" if number else "r"
@@ -210,7 +212,7 @@ class Session:
         self._undelivered: OSError | None = None
 
     def deliver(self, document: str) -> None:
-        """Write the result of the command to stdout. If it is lost, the command fails.
+        """Write the result of the command to stdout. The command fails if it is lost.
 
         Args:
           document: The result.
@@ -219,17 +221,17 @@ class Session:
         self._undelivered = safe("stdout").failure
 
     def lost(self) -> OSError | None:
-        """Return why output was lost.
+        """Return the error due to which output was lost.
 
-        A reader of messages that has read enough, such as `head`, is no loss. A reader
-        of a document that went away before its end is one.
+        A closed pipe counts only for the result of the command, not for messages, whose
+        reader may need only a part of them (`head`).
 
         Returns:
           The error, or None.
         """
         failures = (stream.failure for stream in self._streams)
-        unread = [x for x in failures if x is not None and x.errno != errno.EPIPE]
-        return self._undelivered or (unread[0] if unread else None)
+        errors = [x for x in failures if x is not None and x.errno != errno.EPIPE]
+        return self._undelivered or (errors[0] if errors else None)
 
 
 _session: Session | None = None
@@ -237,17 +239,17 @@ _session: Session | None = None
 
 @contextlib.contextmanager
 def session() -> Iterator[Session]:
-    """Run a command whose output cannot end it.
+    """Run a command that does not fail because of its messages.
 
-    While the block runs, writing to `sys.stdout` and `sys.stderr` never raises,
-    whichever library writes. If the block succeeds although output was lost (a full
-    disk, a document whose reader went away), the command exits with code 1.
+    While the block runs, writing to `sys.stdout` and `sys.stderr` never raises, also in
+    other libraries. If the block succeeds although output was lost (because of a full
+    disk, or because the reader of the result has ended), the command exits with code 1.
 
     Yields:
       The session.
     """
     global _session
-    if _session is not None:  # of the command that called this one
+    if _session is not None:  # another command has called this one
         yield _session
         return
     names = ("stdout", "stderr")

@@ -1,14 +1,14 @@
 """Trace-time checks of the arguments of public functions.
 
 The jaxtyping annotations of a function are its contract. `checked` checks shapes, ranks
-and types of the arguments against them on every call, in Python. Under `jax.jit` that
-is once, while tracing, and the compiled program is that of the undecorated function.
-With `broadcast=True` a function that is written for one item also takes any number of
+and dtypes of the arguments against them on every call, in Python. Under `jax.jit` this
+happens only during tracing, and the compiled program is that of the undecorated
+function. With `broadcast=True` a function of one item also accepts any number of
 leading axes, which broadcast against each other as in NumPy.
 
-NumPy arrays become JAX arrays, and Python numbers are taken for scalars. Everything
-else is refused with a `ValueError` that names the function, the argument, its value and
-the expected shape and type.
+NumPy arrays are converted to JAX arrays, and Python numbers are accepted as scalars.
+Other arguments are refused with a `ValueError` that names the function, the argument,
+its value and the expected shape and dtype.
 """
 
 import functools
@@ -24,7 +24,7 @@ import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-REMEMBERED = 1000  # shapes of arguments of one function that are not checked again
+CACHE_SIZE = 1000  # combinations of shapes per function that are not checked again
 ANY = "_"  # an axis of any length
 # Full scale of the integer images that are converted.
 FULL_SCALE = {"uint8": 255.0, "uint16": 65535.0}
@@ -34,13 +34,13 @@ class _Leaf(NamedTuple):
     """One array argument, or one array field of a NamedTuple argument."""
 
     name: str
-    kinds: frozenset[str]  # names of the types it may have
-    before: tuple[int | str, ...]  # axes in front of the variadic ones, or all
-    variadic: str | None  # None where there are none
-    after: tuple[int | str, ...]  # axes behind the variadic ones
+    kinds: frozenset[str]  # names of the allowed dtypes
+    before: tuple[int | str, ...]  # axes before the variadic ones, or all axes
+    variadic: str | None  # name of the variadic axes, None if there are none
+    after: tuple[int | str, ...]  # axes after the variadic ones
     optional: bool
     host: bool  # stays a NumPy array
-    number: bool  # Python numbers are annotated, and stay as they are
+    number: bool  # the annotation allows Python numbers, which are not converted
 
     @property
     def core(self) -> tuple[int | str, ...]:
@@ -52,14 +52,14 @@ class _Record(NamedTuple):
 
     name: str
     kind: type
-    fields: tuple["_Leaf | _Record | None", ...]  # None is not checked
+    fields: tuple["_Leaf | _Record | None", ...]  # None for unchecked fields
     optional: bool
 
 
 class _Plan(NamedTuple):
     title: str  # "so3.exp"
     names: tuple[str, ...]  # of all parameters, in order
-    checks: tuple[tuple[str, _Leaf | _Record], ...]  # of those that are checked
+    checks: tuple[tuple[str, _Leaf | _Record], ...]  # of the checked parameters
 
 
 @typing.overload
@@ -74,44 +74,44 @@ def checked(
     """Check the array arguments of a function against its annotations.
 
     Args:
-      function: The function. Its arrays are annotated with jaxtyping types; arguments
-        with other annotations pass unchecked. NamedTuples are checked field by field.
-      broadcast: True if the function is written for one item and shall map over leading
-        axes. Each array argument may then have any number of them, and those of all
-        arguments broadcast. Without any the function is called as it is.
+      function: The function. Its arrays are annotated with jaxtyping types. Arguments
+        with other annotations are not checked. NamedTuples are checked field by field.
+      broadcast: True if the function takes one item and is to be mapped over leading
+        axes with `jax.vmap`. Each array argument may have any number of them, and those
+        of all arguments broadcast. Without any the function is called directly.
       images: Names of arguments that are images. uint8 and uint16 images are divided by
-        255 and 65535. A gray image [height, width] gets a channel axis where
-        the annotation has one.
+        255 and 65535. A gray image [height, width] gets a channel axis if the
+        annotation has one.
 
     Returns:
-      The function with the checks in front. It costs nothing under `jax.jit`.
+      The function with checks of its arguments. They cost nothing under `jax.jit`.
 
     Raises:
-      ValueError: At a call, where an argument has another rank, another length of an
-        axis or another type than its annotation says, or where one name of an axis
-        stands for two lengths.
+      ValueError: When the function is called, if the rank, an axis or the dtype of an
+        argument differs from its annotation, or if two axes of the same name differ in
+        length.
     """
     if function is None:
         return functools.partial(checked, broadcast=broadcast, images=tuple(images))
     plan: _Plan | None = None
-    passed: set[Any] = set()  # arguments that go to the function as they are
+    valid: set[Any] = set()  # shapes and dtypes that need no check or conversion
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         nonlocal plan
-        if plan is None:  # at the first call: importing costs nothing
+        if plan is None:  # at the first call, so that importing stays fast
             plan = _plan(function)
         positional = plan.names[: len(args)]
         if len(args) > len(positional) or not kwargs.keys().isdisjoint(positional):
             return function(*args, **kwargs)  # raises Python's own TypeError
         values = dict(zip(positional, args, strict=True)) | kwargs
         key = _key(plan, values)
-        if key in passed:
+        if key in valid:
             return function(*args, **kwargs)
-        given = values
+        original = values
         if images:
             values = _with_float_images(plan, values, images)
-        as_given = values is given
+        unchanged = values is original
         sizes: dict[str, tuple[Any, str]] = {}
         batches: list[tuple[tuple[int, ...], str]] | None = [] if broadcast else None
         for name, check in plan.checks:
@@ -119,15 +119,15 @@ def checked(
                 values[name] = _check(plan.title, check, values[name], sizes, batches)
         if batches and any(shape for shape, _ in batches):
             return _mapped(plan, function, batches, values, positional)
-        if key is not None and as_given and len(passed) < REMEMBERED:
-            passed.add(key)
+        if key is not None and unchanged and len(valid) < CACHE_SIZE:
+            valid.add(key)
         return _call(function, values, positional)
 
     return call
 
 
 def _key(plan, values):
-    """Types and shapes of the arguments, None unless all are JAX arrays or None."""
+    """Shapes and dtypes of the arguments, or None if some are not JAX arrays."""
     key = []
     for name, _ in plan.checks:
         value = values.get(name)
@@ -154,7 +154,7 @@ def _plan(function: Callable[..., Any]) -> _Plan:
 
 @functools.cache
 def _read(name: str, annotation: Any) -> _Leaf | _Record | None:
-    """Return the check that an annotation asks for, or None if it is not of arrays."""
+    """Return the check for an annotation, or None if it does not contain arrays."""
     options, optional = [annotation], False
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         options = list(typing.get_args(annotation))
@@ -191,25 +191,23 @@ def _leaf(
     for axis in axes.split():
         if axis == "..." or axis.lstrip("#").startswith("*"):
             variadic = axis.lstrip("#*.")
-        else:
-            known = (
-                int(axis) if axis.isdigit() else axis if axis.isidentifier() else ANY
-            )
-            (before if variadic is None else after).append(known)
+            continue
+        length = int(axis) if axis.isdigit() else axis if axis.isidentifier() else ANY
+        (before if variadic is None else after).append(length)
     return _Leaf(
         name, kinds, tuple(before), variadic, tuple(after), optional, host, number
     )
 
 
 def _check(title, check, value, sizes, batches):
-    """Return the value as the function gets it, or raise ValueError."""
+    """Return the converted value, or raise ValueError."""
     if value is None and check.optional:
         return None
     if isinstance(check, _Record):
         if not isinstance(value, check.kind):
             raise ValueError(
                 f"{title}: `{check.name}` must be a {check.kind.__name__}, got "
-                f"{_described(value)}"
+                f"{_description(value)}"
             )
         return check.kind(
             *(
@@ -238,7 +236,7 @@ def _as_array(title, check, value):
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return value
     raise ValueError(
-        f"{title}: `{check.name}` must be an array, got {_described(value)}; convert "
+        f"{title}: `{check.name}` must be an array, got {_description(value)}; convert "
         "it with jnp.asarray"
     )
 
@@ -250,41 +248,43 @@ def _check_kind(title, check, array):
     ):
         return
     if "prng_key" in check.kinds:
-        wanted, remedy = "a key", "make it with jax.random.key(seed)"
+        expected, remedy = "a key", "create it with jax.random.key(seed)"
     elif "float32" in check.kinds:
-        wanted, remedy = "floating-point", "cast it with .astype(jnp.float32)"
+        expected, remedy = "floating-point", "cast it with .astype(jnp.float32)"
     elif "bool" in check.kinds:
-        wanted, remedy = "boolean", "compare it, as in mask != 0"
+        expected, remedy = "boolean", "convert it with a comparison such as mask != 0"
     else:
-        wanted, remedy = "integer", "cast it with .astype(jnp.int32)"
+        expected, remedy = "integer", "cast it with .astype(jnp.int32)"
     raise ValueError(
-        f"{title}: `{check.name}` must be {wanted}, got {kind}{list(array.shape)}; "
+        f"{title}: `{check.name}` must be {expected}, got {kind}{list(array.shape)}; "
         f"{remedy}"
     )
 
 
 def _check_shape(title, check, shape, sizes, batches):
-    spare = len(shape) - len(check.core)
+    """Check a shape, and record named axes in `sizes` and leading axes in `batches`."""
+    extra = len(shape) - len(check.core)
     front = len(check.before)
     if batches is None:
-        fits = spare == 0 if check.variadic is None else spare >= 0
+        fits = extra == 0 if check.variadic is None else extra >= 0
         lengths = shape[:front] + shape[len(shape) - len(check.after) :]
         if fits and check.variadic:
-            middle = shape[front : front + spare]
+            middle = shape[front : front + extra]
             fits = sizes.setdefault(f"*{check.variadic}", (middle, check.name))[0] == (
                 middle
             )
     else:
-        fits = spare >= 0
-        lengths = shape[max(spare, 0) :]
-        batches.append((shape[: max(spare, 0)], check.name))
+        fits = extra >= 0
+        lengths = shape[max(extra, 0) :]
+        batches.append((shape[: max(extra, 0)], check.name))
     if fits:
         for axis, length in zip(check.core, lengths, strict=True):
             if isinstance(axis, int):
                 fits = fits and axis == length
             elif axis != ANY:
-                known = sizes.setdefault(axis, (length, check.name))[0]
-                fits = fits and known == length
+                fits = fits and sizes.setdefault(axis, (length, check.name))[0] == (
+                    length
+                )
     if not fits:
         raise ValueError(_shape_message(title, check, shape, sizes, batches))
 
@@ -302,13 +302,13 @@ def _shape_message(title, check, shape, sizes, batches):
         f"{title}: `{check.name}` has shape {list(shape)}, expected "
         f"[{', '.join(map(str, axes))}]"
     )
-    known = [
+    named_axes = [
         f"{axis} = {_length(sizes[str(axis)][0])} from `{sizes[str(axis)][1]}`"
         for axis in axes
         if str(axis) in sizes and sizes[str(axis)][1] != check.name
     ]
-    if known:
-        message += f" with {' and '.join(known)}"
+    if named_axes:
+        message += f" with {' and '.join(named_axes)}"
     if batches is None and len(shape) > len(check.core) and check.variadic is None:
         message += "; map over its leading axes with jax.vmap"
     return message
@@ -318,38 +318,38 @@ def _length(size):
     return list(size) if isinstance(size, tuple) else size
 
 
-def _described(value):
+def _description(value):
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{value.dtype}{list(value.shape)}"
     return f"a {type(value).__name__}"
 
 
 def _with_float_images(plan, values, images):
-    """The arguments with integer images in [0, 1] and a channel axis on gray ones."""
+    """Convert integer images to [0, 1], and add a channel axis to gray images."""
     checks = dict(plan.checks)
     shapes = {
         name: np.shape(value)
         for name, value in values.items()
         if name in checks and hasattr(value, "dtype")
     }
-    given = [name for name in images if name in shapes]
-    wide = any(values[name].dtype == np.float64 for name in given)
+    names = [name for name in images if name in shapes]
+    wide = any(values[name].dtype == np.float64 for name in names)
     wide = wide and jax.config.jax_enable_x64
     masks = [shape for name, shape in shapes.items() if name not in images]
     converted = {}
-    for name in given:
+    for name in names:
         image, kind = values[name], np.dtype(values[name].dtype).name
         if kind in FULL_SCALE:
             image = jnp.asarray(image, jnp.float64 if wide else jnp.float32)
             image = image / FULL_SCALE[kind]
         elif kind not in checks[name].kinds:
             raise ValueError(
-                f"{plan.title}: `{name}` is {kind}{list(shapes[name])}; images are "
+                f"{plan.title}: `{name}` is {kind}{list(shapes[name])}; images must be "
                 "floating-point in [0, 1], uint8 or uint16"
             )
         if checks[name].variadic is None:
             gray = len(shapes[name]) == len(checks[name].core) - 1
-        else:  # any shape and channels: gray where the mask has the same axes
+        else:  # with any number of axes, an image of the shape of the mask is gray
             gray = shapes[name] in masks
         if gray:
             image = image[..., None]
@@ -359,7 +359,7 @@ def _with_float_images(plan, values, images):
 
 
 def _mapped(plan, function, batches, values, positional):
-    """The function mapped over the broadcast leading axes of its arrays."""
+    """Map a function over the broadcast leading axes of its arrays."""
     try:
         batch = np.broadcast_shapes(*(shape for shape, _ in batches))
     except ValueError:
@@ -376,21 +376,24 @@ def _mapped(plan, function, batches, values, positional):
     squeezed, axes = [], []
     for leaf, (shape, _) in zip(leaves, batches, strict=True):
         missing = len(batch) - len(shape)
-        # An axis of length one is not mapped where the batch is longer there.
+        # Axes that are missing or broadcast from length one are not mapped.
         mapped = [
-            place >= missing and shape[place - missing] == batch[place]
-            for place in range(len(batch))
+            axis >= missing and shape[axis - missing] == batch[axis]
+            for axis in range(len(batch))
         ]
-        dropped = [
-            place - missing for place in range(missing, len(batch)) if not mapped[place]
+        broadcast = [
+            axis - missing for axis in range(missing, len(batch)) if not mapped[axis]
         ]
-        squeezed.append(jnp.squeeze(leaf, dropped) if dropped else leaf)
-        axes.append([0 if use else None for use in mapped])
+        squeezed.append(jnp.squeeze(leaf, broadcast) if broadcast else leaf)
+        axes.append([0 if is_mapped else None for is_mapped in mapped])
 
     def one(*leaves):
-        rest = iter(leaves)
-        filled = {name: _filled(check, value, rest) for name, check, value in arrays}
-        return _call(function, values | filled, positional)
+        remaining = iter(leaves)
+        replaced = {
+            name: _replace_leaves(check, value, remaining)
+            for name, check, value in arrays
+        }
+        return _call(function, values | replaced, positional)
 
     for level in reversed(range(len(batch))):
         one = jax.vmap(one, tuple(axis[level] for axis in axes))
@@ -403,7 +406,7 @@ def _call(function, values, positional):
 
 
 def _leaves(check, value):
-    """The checked arrays of one argument, in the order in which they are checked."""
+    """Return the checked arrays of one argument, in the order of the checks."""
     if isinstance(check, _Leaf):
         return [value]
     return [
@@ -414,12 +417,12 @@ def _leaves(check, value):
     ]
 
 
-def _filled(check, value, leaves):
-    """The argument with its checked arrays taken from `leaves`."""
+def _replace_leaves(check, value, leaves):
+    """Replace the checked arrays of one argument by the next ones of `leaves`."""
     if isinstance(check, _Leaf):
         return next(leaves)
     parts = [
-        part if field is None or part is None else _filled(field, part, leaves)
+        part if field is None or part is None else _replace_leaves(field, part, leaves)
         for field, part in zip(check.fields, value, strict=True)
     ]
     return check.kind(*parts)

@@ -1,4 +1,4 @@
-"""Equal shares of one step, computed in sequence or on one device each."""
+"""Data parallelism: equal shares of a step, in sequence or one on each device."""
 
 import functools
 from collections.abc import Callable, Hashable, Iterator
@@ -16,7 +16,7 @@ AXIS = "shares"
 
 
 def device_count(shares: int) -> int:
-    """Return the number of this process's devices that equal shares of a step can use.
+    """Return the number of local devices that equal shares of a step can use.
 
     A CPU is one device unless `jax_num_cpu_devices` is larger.
 
@@ -35,9 +35,9 @@ def on_devices(
 ) -> PyTree:
     """Compute all shares of a step, on one or more devices.
 
-    On one device they are computed in sequence, on several each device computes an
-    equal number. Results equal those of one device to rounding. For 10,000 Gaussians at
-    256x192 on two cores, two views with their gradients take 37 ms, one takes 32.
+    On one device they are computed in sequence. On several devices, each computes an
+    equal number of shares. Results are the same up to rounding. On two cores, two views
+    of 10,000 Gaussians at 256x192 and their gradients take 37 ms, and one takes 32 ms.
 
     Args:
       work: Function `work(i, *inputs)` of the index of a share.
@@ -48,23 +48,22 @@ def on_devices(
     Returns:
       Results stacked along a new first axis.
     """
-    number = jnp.arange(shares, dtype=jnp.int32)  # as steps are, also where x64 is on
+    indices = jnp.arange(shares, dtype=jnp.int32)  # the dtype of steps, even with x64
     if devices == 1:
-        return lax.map(lambda share: work(share, *inputs), number)
-    each = shares // devices
+        return lax.map(lambda share: work(share, *inputs), indices)
+    per_device = shares // devices
 
-    def own(first, *inputs):
-        return lax.map(lambda i: work(first[0] + i, *inputs), number[:each])
+    def on_device(first, *inputs):
+        return lax.map(lambda i: work(first[0] + i, *inputs), indices[:per_device])
 
-    spread = jax.shard_map(
-        own,
+    sharded = jax.shard_map(
+        on_device,
         mesh=_mesh(devices),
         in_specs=(PartitionSpec(AXIS), *(PartitionSpec() for _ in inputs)),
         out_specs=PartitionSpec(AXIS),
-        # JAX does not track the results of a `while_loop`.
-        check_vma=False,
+        check_vma=False,  # not supported for results of a `while_loop`
     )
-    return spread(number[::each], *inputs)
+    return sharded(indices[::per_device], *inputs)
 
 
 def rows_on_devices(
@@ -73,7 +72,7 @@ def rows_on_devices(
     rows: PyTree,
     program: Callable[[PyTree], PyTree] | None = None,
 ) -> Iterator[PyTree]:
-    """Map a function over rows, one row at a time on each of this process's devices.
+    """Map a function over rows, one row at a time on each local device.
 
     All rows use one program, which is compiled once for `work` and `fixed`.
 
@@ -90,18 +89,18 @@ def rows_on_devices(
     devices = _devices_of(count)
     program = program or functools.partial(_one_each, work, fixed, devices)
     for start in range(0, count, devices):
-        # The last rows again where fewer are left than there are devices.
-        chosen = np.minimum(np.arange(start, start + devices), count - 1)
-        few = jax.tree.map(lambda leaf, chosen=chosen: np.asarray(leaf)[chosen], rows)
-        done = jax.device_get(program(few))
+        # If fewer rows than devices remain, the last row is repeated.
+        batch = np.minimum(np.arange(start, start + devices), count - 1)
+        inputs = jax.tree.map(lambda leaf, batch=batch: np.asarray(leaf)[batch], rows)
+        results = jax.device_get(program(inputs))
         for share in range(min(devices, count - start)):
-            yield jax.tree.map(lambda leaf, share=share: leaf[share], done)
+            yield jax.tree.map(lambda leaf, share=share: leaf[share], results)
 
 
 def lower_rows(
     work: Callable[..., PyTree], fixed: Hashable, rows: PyTree
 ) -> jax.stages.Lowered:
-    """Lower the program of `rows_on_devices`, to be compiled.
+    """Lower the program of `rows_on_devices`, for compilation.
 
     Args:
       work: Function `work(fixed, *row)`.
@@ -112,10 +111,10 @@ def lower_rows(
       The lowered program.
     """
     devices = _devices_of(len(jax.tree.leaves(rows)[0]))
-    few = jax.tree.map(
+    shapes = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct((devices, *leaf.shape[1:]), leaf.dtype), rows
     )
-    return _one_each.lower(work, fixed, devices, few)
+    return _one_each.lower(work, fixed, devices, shapes)
 
 
 def _devices_of(count):
@@ -131,10 +130,10 @@ def _one_each(work, fixed, devices, rows):
 
 
 def shared(tree: PyTree, devices: int) -> PyTree:
-    """Replicate arrays that no program overwrites, without a copy on the first device.
+    """Replicate arrays without a copy on the first device.
 
     Args:
-      tree: A pytree of arrays.
+      tree: A pytree of arrays, which must never be donated to a program.
       devices: Number of devices.
 
     Returns:
@@ -168,10 +167,10 @@ def replicate(tree: PyTree, devices: int) -> PyTree:
 
 
 def first_copy(tree: PyTree, devices: int) -> PyTree:
-    """Return the part of replicated arrays on the first device.
+    """Return the part of replicated arrays that is on the first device.
 
-    It is not a copy, which would keep the mesh in its type, so that everything compiled
-    for the earlier state, such as events and images, would be compiled again.
+    The result is not sharded over a mesh. Programs that were compiled for the state
+    before it was replicated, such as events and the renderer, need no recompilation.
 
     Args:
       tree: A pytree from `replicate`.

@@ -1,8 +1,8 @@
 """The event stream: current work, its progress and its measurements.
 
 Code that does work calls `stage` and `emit`. Sinks, which are functions of an event,
-receive every event of the process: the progress display of the terminal always, and any
-that `subscribe` adds (the `events.jsonl` of a run folder, experiment trackers).
+receive every event of the process. They are the progress display of the terminal, and
+those that `subscribe` adds (`events.jsonl` of a run folder, experiment trackers).
 
 An event is a dictionary with `time` (seconds since 1970), `kind` and, inside a stage,
 `phase` (the name of the innermost stage of the thread). docs/events.md lists the kinds
@@ -27,16 +27,16 @@ STAGE_SECONDS = 0.2  # between two progress events of a stage
 
 _sinks: tuple[Sink, ...] = ()
 _display: Sink | None = progress.Display()
-_thread = threading.local()  # stages: those that are open in this thread
+_thread = threading.local()  # `stages`: the open stages of this thread, outermost first
 _numbers = itertools.count(1)
 
 
 class Stage:
-    """A step of the work that may take longer than two seconds.
+    """A part of the work that may take longer than two seconds.
 
     Attributes:
       name: Name for the user, such as `structure from motion`.
-      total: Number of items, or None if it is not known.
+      total: Number of items, or None if it is unknown.
       done: Number of finished items.
     """
 
@@ -46,13 +46,13 @@ class Stage:
         outer = _open_stages()
         if outer:
             self._about["parent"] = outer[-1]._about["stage"]
-        self._emitted = -float("inf")
+        self._emit_time = -float("inf")
 
     def advance(self, count: int = 1, text: str | None = None) -> None:
         """Record that more items are finished.
 
         Args:
-          count: Number of them.
+          count: Number of additional finished items.
           text: Text to show next to the numbers. None to keep the previous one.
         """
         self.reach(self.done + count, text=text)
@@ -60,7 +60,7 @@ class Stage:
     def reach(
         self, done: int, total: int | None = None, text: str | None = None
     ) -> None:
-        """Record the number of finished items. A signal ends the work here.
+        """Record the number of finished items. If a signal has arrived, stop the work.
 
         Args:
           done: Number of finished items.
@@ -72,11 +72,11 @@ class Stage:
         self.total = self.total if total is None else total
         if text is not None:
             self._about["text"] = text
-        if time.monotonic() - self._emitted >= STAGE_SECONDS:
+        if time.monotonic() - self._emit_time >= STAGE_SECONDS:
             self._emit("progress")
 
     def _emit(self, status, **fields):
-        self._emitted = time.monotonic()
+        self._emit_time = time.monotonic()
         numbers = {"done": self.done, "total": self.total}
         emit("stage", name=self.name, status=status, **numbers, **self._about, **fields)
 
@@ -85,20 +85,20 @@ class Stage:
 def stage(name: str, total: int | None = None, done: int = 0) -> Iterator[Stage]:
     """Show a named progress bar, and emit `stage` events, while the block runs.
 
-    On a terminal the bar has the name, a count where `total` is known, and the
-    remaining time. Elsewhere stderr gets a line when the stage has lasted two seconds
-    and one every ten seconds after that.
+    On a terminal the bar shows the name, the remaining time, and the number of items if
+    `total` is known. Otherwise a line is written to stderr when the stage has lasted
+    two seconds, and another one every ten seconds after that.
 
     Args:
       name: Name for the user, such as `structure from motion`.
       total: Number of items, or None for a stage without a count.
-      done: Number of items that were finished before.
+      done: Number of items that are already finished.
 
     Yields:
-      The stage, whose `advance` is called after each item.
+      The stage. Call its `advance` after each item.
     """
     stopping.check()
-    current, began = Stage(name, total, done), time.monotonic()
+    current, start_time = Stage(name, total, done), time.monotonic()
     _open_stages().append(current)
     status = "failed"
     try:
@@ -106,7 +106,7 @@ def stage(name: str, total: int | None = None, done: int = 0) -> Iterator[Stage]
         yield current
         status = "done"
     finally:
-        current._emit(status, seconds=round(time.monotonic() - began, 3))
+        current._emit(status, seconds=round(time.monotonic() - start_time, 3))
         _open_stages().remove(current)
 
 
@@ -119,8 +119,7 @@ def _open_stages():
 def emit(kind: str, **fields: Any) -> None:
     """Send an event to every sink.
 
-    A sink that raises receives no further events, which a warning reports. Following a
-    run never ends it.
+    A sink that raises an error is removed, with a warning, and does not end the run.
 
     Args:
       kind: Kind of the event, such as `train` or `evaluation`.
@@ -134,7 +133,7 @@ def emit(kind: str, **fields: Any) -> None:
     for sink in (*_sinks, *([] if _display is None else [_display])):
         try:
             sink(event)
-        except Exception as problem:  # of a tracker's library: whatever it raises
+        except Exception as problem:  # libraries of trackers may raise any type
             _remove(sink)
             name = getattr(sink, "name", type(sink).__name__)
             console.warn(
@@ -181,11 +180,11 @@ def _remove(sink):
 
 @contextlib.contextmanager
 def shown_on(target: rich.console.Console | None) -> Iterator[None]:
-    """Show progress on a console of rich while the block runs, or as before.
+    """Show progress on a console of rich while the block runs.
 
     Args:
-      target: Console for bars and lines. One with `quiet=True` shows nothing, and None
-        leaves the display as it is: stderr.
+      target: Console for bars and lines. With `quiet=True` it shows nothing. None keeps
+        the current display, which by default uses stderr.
 
     Yields:
       None.

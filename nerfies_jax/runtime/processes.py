@@ -1,4 +1,4 @@
-"""Names of processes from which it can later be told whether a process has ended."""
+"""Unique names of processes, from which others can test if a process has ended."""
 
 import functools
 import hashlib
@@ -21,9 +21,9 @@ def own_name() -> str:
 
 
 def has_ended(name: str) -> bool:
-    """Return whether the process of a name has ended.
+    """Test if the process with a name has ended.
 
-    A process of another machine, or of another container, counts as running.
+    A process of another machine or another container is assumed to be running.
 
     Args:
       name: Result of `own_name` in that process.
@@ -44,7 +44,7 @@ def machine() -> str:
     Returns:
       The digits.
     """
-    try:  # containers number their processes anew
+    try:  # process ids are unique only within a container
         processes = os.readlink("/proc/self/ns/pid")
     except OSError:
         processes = ""
@@ -52,14 +52,14 @@ def machine() -> str:
 
 
 def _start_of(pid):
-    """Start of a process by a monotonic clock, or None if it has ended."""
+    """Return the start time of a process, or None if it has ended."""
     try:
         stat = pathlib.Path(f"/proc/{pid}/stat").read_text()
     except OSError:
         return None if pathlib.Path("/proc/self/stat").exists() else _created(pid)
-    # The name of the program, in parentheses, may hold anything.
+    # The name of the program, in parentheses, may contain any characters.
     state, *fields = stat.rpartition(")")[2].split()
-    return None if state in "ZX" else int(fields[18])  # ticks since the system started
+    return None if state in "ZX" else int(fields[18])  # clock ticks since boot
 
 
 def _created(pid):

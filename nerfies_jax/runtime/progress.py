@@ -1,7 +1,4 @@
-"""The progress display: named bars on a terminal, a few lines elsewhere.
-
-It is a sink of events and knows the work only by them.
-"""
+"""The progress display, a sink of events: bars on a terminal, lines in a log file."""
 
 import contextlib
 import math
@@ -15,15 +12,15 @@ import rich.progress
 from nerfies_jax.runtime import console
 
 LINE_SECONDS = 10.0  # between lines in a log file
-FIRST_LINE_SECONDS = 2.0  # a shorter stage is not worth a line
-BAR_SECONDS = 0.3  # a shorter stage would only flicker
+FIRST_LINE_SECONDS = 2.0  # shorter stages have no line
+BAR_SECONDS = 0.3  # bars of shorter stages would only flicker
 TICK_SECONDS = 0.25
 
 
 class Display:
-    """Shows the stages that are open, by their events.
+    """Shows the open stages.
 
-    A thread of its own shows stages that say nothing while they last, as compilation.
+    A separate thread updates stages that emit no progress events, such as compilation.
     """
 
     def __init__(self, target: rich.console.Console | None = None):
@@ -48,7 +45,7 @@ class Display:
             if shown.name == event.get("phase"):
                 shown.done, shown.total = event["step"], event["steps"]
                 shown.text, shown.eta = training_text(event), event["eta_seconds"]
-                shown.counted = "step {:,} of {:,}"
+                shown.count_format = "step {:,} of {:,}"
                 self._view.update(shown)
                 return
 
@@ -69,7 +66,7 @@ class Display:
                 self._start()
             self._open[number] = _Shown(event["name"])
         shown = self._open.get(number)
-        if shown is None:  # begun on another display
+        if shown is None:  # the stage began on another display
             return
         shown.done, shown.total = event["done"], event["total"]
         shown.text = event.get("text", shown.text)
@@ -93,10 +90,10 @@ class Display:
         else:
             self._view = _Lines(self._target)
         self._idle = threading.Event()
-        waiting = threading.Thread(
+        ticker = threading.Thread(
             target=self._tick, args=(self._idle,), name="progress", daemon=True
         )
-        waiting.start()
+        ticker.start()
 
     def _tick(self, idle):
         while not idle.wait(TICK_SECONDS):
@@ -106,36 +103,36 @@ class Display:
 
 
 class _Shown:
-    """A stage that is open, as it is shown."""
+    """State of an open stage."""
 
     def __init__(self, name: str):
-        self.name, self.began = name, time.monotonic()
+        self.name, self.start_time = name, time.monotonic()
         self.done, self.total = 0, None
         self.text = ""
-        self.eta: float | None = None  # seconds that remain, where the stage says so
-        self.counted = "{:,} of {:,}"
-        self.first = True  # nothing was shown of it yet
+        self.eta: float | None = None  # remaining seconds, if the stage reports them
+        self.count_format = "{:,} of {:,}"
+        self.first = True  # no line has been written about it yet
         self.task = None  # of its bar
 
     @property
     def seconds(self) -> float:
         """Seconds since it began."""
-        return time.monotonic() - self.began
+        return time.monotonic() - self.start_time
 
     def line(self) -> str:
-        """Return the line of a log about the stage."""
+        """Return a line about the stage for a log."""
         parts = []
         if self.total is not None and self.done:
-            parts.append(self.counted.format(self.done, self.total))
+            parts.append(self.count_format.format(self.done, self.total))
         if self.text:
             parts.append(self.text)
         if self.eta is None and self.seconds >= LINE_SECONDS:
-            parts.append(f"{duration(self.seconds)} so far")
+            parts.append(f"{duration(self.seconds)} elapsed")
         return f"{self.name}: {'  '.join(parts)}" if parts else f"{self.name} ..."
 
 
 class _Lines:
-    """A line when a stage has lasted two seconds, and then every ten seconds."""
+    """A line about the innermost stage after two seconds, and every ten after that."""
 
     def __init__(self, target: rich.console.Console | None):
         self._target = target
@@ -148,7 +145,7 @@ class _Lines:
             _print(self._target, text)
 
     def update(self, shown):
-        # Training says at once how fast it is.
+        # The speed of training is reported immediately.
         if shown.first and shown.eta is not None:
             self._show(shown)
 
@@ -161,7 +158,7 @@ class _Lines:
         if innermost.first:
             due = innermost.seconds >= FIRST_LINE_SECONDS
         else:
-            # Without a count there is less and less to say.
+            # Without a number of items, lines become less frequent.
             wait = innermost.seconds / 2 if innermost.total is None else 0.0
             due = time.monotonic() - self._last >= max(LINE_SECONDS, wait)
         if due:
@@ -175,7 +172,7 @@ class _Lines:
 
 
 class _Bars:
-    """A bar for each stage that is open, below the lines that are written meanwhile."""
+    """A bar for each open stage, below other lines of output."""
 
     def __init__(self, target: rich.console.Console):
         self._console = target
@@ -186,10 +183,10 @@ class _Bars:
             columns.TextColumn("{task.fields[text]}"),
             console=target,
             transient=True,
-            # Lines of other libraries stay above the bars; a file gets its own lines.
+            # Lines of other libraries appear above the bars, unless stdout is a file.
             redirect_stdout=console.safe("stdout").isatty(),
         )
-        self._held = contextlib.ExitStack()
+        self._stack = contextlib.ExitStack()
         self._live = False
 
     def write(self, text):
@@ -208,11 +205,11 @@ class _Bars:
         for shown in stages:
             if shown.task is None and shown.seconds >= BAR_SECONDS:
                 shown.task = self._bars.add_task(shown.name, total=None, text="")
-            self.update(shown)  # the time goes on
+            self.update(shown)  # shows the elapsed time
         if not self._live and any(shown.task is not None for shown in stages):
             self._live = True
-            self._held.enter_context(self._bars)
-            self._held.enter_context(console.display(self.write))
+            self._stack.enter_context(self._bars)
+            self._stack.enter_context(console.display(self.write))
 
     def remove(self, shown):
         if shown.task is not None:
@@ -221,11 +218,11 @@ class _Bars:
             self.write(f"{shown.name}: {duration(shown.seconds)}")
 
     def close(self):
-        self._held.close()
+        self._stack.close()
 
 
 def _print(target, text):
-    # A console of the caller's may be on a terminal that was closed.
+    # The terminal of a console that the caller has passed may be closed.
     with contextlib.suppress(OSError, SystemExit):
         target.print(text, highlight=False, markup=False, soft_wrap=True)
 
@@ -237,16 +234,16 @@ def _bar_text(shown):
     if shown.text:
         parts.append(shown.text)
     if shown.eta is None:
-        left = _seconds_left(shown)
-        if left is not None:
-            parts.append(f"{duration(left)} left")
+        remaining = _remaining_seconds(shown)
+        if remaining is not None:
+            parts.append(f"{duration(remaining)} left")
         elif shown.seconds >= FIRST_LINE_SECONDS:
             parts.append(duration(shown.seconds))
     return "  ".join(parts)
 
 
-def _seconds_left(shown):
-    """Remaining time by the number of finished items, or None if there are too few."""
+def _remaining_seconds(shown):
+    """Estimate the remaining time, or return None if too few items are finished."""
     if not shown.total or not shown.done or shown.seconds < FIRST_LINE_SECONDS:
         return None
     return max(0.0, shown.seconds * (shown.total / shown.done - 1))
@@ -281,6 +278,6 @@ def duration(seconds: float) -> str:
     Returns:
       The text.
     """
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"

@@ -1,23 +1,22 @@
-"""Ctrl-C, SIGTERM and SIGHUP end a command soon and in good order.
+"""Graceful shutdown: Ctrl-C, SIGTERM and SIGHUP end a command soon and safely.
 
-Python raises KeyboardInterrupt wherever the main thread happens to be. Inside a
-callback of the garbage collector, a `__del__` method or a weak reference's callback,
-such an exception is printed and dropped, and the process goes on. While compiled code
-runs, it is not raised at all. Commands therefore do not rely on exceptions from
-handlers:
+Python raises KeyboardInterrupt at any point of the main thread. Inside a callback of
+the garbage collector, a `__del__` method or a callback of a weak reference, the
+exception is printed and ignored, and the process continues. While compiled code runs,
+it is not raised at all. Commands therefore do not rely on exceptions from handlers:
 
-1. `install` turns the first signal into a request. Nothing is interrupted by it.
-2. Code that can end in good order looks for the request at a safe point. `check` raises
-   `Stopped` there, and the training loop finishes its chunk, saves and returns.
-3. A thread learns of the signal from the C handler through a socket, whatever the main
+1. `install` turns the first signal into a request, which interrupts nothing.
+2. Code checks for requests at points where it can end safely. `check` raises `Stopped`
+   there. The training loop finishes its chunk, saves a checkpoint and returns.
+3. A thread receives the signal from the C handler through a socket, whatever the main
    thread is doing. If the process has not ended after `GRACE_SECONDS`, the thread runs
-   the functions registered with `at_end`, which remove what is half written, and ends
-   the process with exit code 128 + signal. It waits while a `protected` block is open,
-   so a save is never cut off.
-4. A second signal ends the process at once, as it would without a handler.
+   the functions registered with `at_end`, which remove incomplete files, and ends the
+   process with exit code 128 + signal. It waits while a `protected` block is open, so
+   that saving is never interrupted.
+4. A second signal ends the process immediately, as it would without a handler.
 
 A signal that is ignored when the process starts, as SIGHUP is under nohup, stays
-ignored. Where `install` was not called, as in a notebook, `check` does nothing, and
+ignored. If `install` has not been called, as in a notebook, `check` does nothing, and
 signals are handled only inside `StopRequests` and `exits`.
 """
 
@@ -32,7 +31,8 @@ from collections.abc import Callable, Iterator
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 GRACE_SECONDS = 2.0  # from a request to the forced end
-# `timeout` sends its signal to the process and to its group: one request, twice.
+# A second signal within this time belongs to the same request, because the program
+# `timeout` sends its signal to the process and to its group.
 SAME_REQUEST_SECONDS = 0.3
 POLL_SECONDS = 0.1
 
@@ -46,20 +46,20 @@ class Stopped(SystemExit):
 
 
 class _Process:
-    """The requests of this process, once `install` was called."""
+    """Requests of this process, after `install`."""
 
     def __init__(self):
         self.number: int | None = None  # of the first signal
-        self.requested_at = 0.0
-        self.second = False  # whether another one followed
-        self.answered = False  # by `Stopped`, or by a training loop that saved
-        self.advice = ""  # what a person may do next
+        self.request_time = 0.0
+        self.second = False  # whether another signal followed
+        self.handled = False  # by `Stopped`, or by a training loop that saves
+        self.advice = ""  # line about what the user can do next
         self.protections = 0
-        self.unprotected_at = 0.0
+        self.unprotected_time = 0.0  # end of the last protected block
         self.lock = threading.Lock()
         self.reader, self.writer = socket.socketpair()
         self.writer.setblocking(False)
-        self.before = _installed(self._note, NAMES)
+        self.before = _install_handler(self._note, NAMES)
         self.wakeup_before = signal.set_wakeup_fd(
             self.writer.fileno(), warn_on_full_buffer=False
         )
@@ -67,17 +67,17 @@ class _Process:
         self.thread.start()
 
     def _note(self, number, _frame):
-        """Handle a signal in the main thread, between two operations of Python."""
+        """Handle a signal in the main thread, between two Python instructions."""
         self._request(number)
         if self.second:
             _end_by_default(number)
 
     def _request(self, number):
         if self.number is None:
-            self.requested_at, self.number = time.monotonic(), number
+            self.request_time, self.number = time.monotonic(), number
 
     def _watch(self):
-        """Read the signals as they arrive and end the process when time is up."""
+        """Receive signals, and end the process when the grace period is over."""
         self.reader.settimeout(POLL_SECONDS)
         first = None
         while True:
@@ -99,7 +99,7 @@ class _Process:
                 self._end()
 
     def _end_at_once(self, number):
-        """End the process by the signal itself, which only its main thread can do."""
+        """End the process by the signal itself, which needs its main thread."""
         self.second = True
         os.kill(os.getpid(), number)
         time.sleep(POLL_SECONDS)
@@ -107,29 +107,30 @@ class _Process:
 
     def _is_over(self):
         with self.lock:
-            begun = max(self.requested_at, self.unprotected_at)
-            return not self.protections and time.monotonic() - begun > GRACE_SECONDS
+            start_time = max(self.request_time, self.unprotected_time)
+            elapsed = time.monotonic() - start_time
+            return not self.protections and elapsed > GRACE_SECONDS
 
     def _end(self):
-        """End the process wherever the main thread is."""
+        """End the process, whatever the main thread is doing."""
         for clean_up in reversed(_AT_END):
             with contextlib.suppress(Exception):
                 clean_up()
-        # The main thread may hold the lock of a stream.
+        # In another thread, because the main thread may hold the lock of a stream.
         flusher = threading.Thread(target=_flush, daemon=True)
         flusher.start()
         flusher.join(POLL_SECONDS)
         with contextlib.suppress(OSError):
-            lines = [] if self.answered else ending(signal.Signals(self.number).name)
-            # A progress display hides the cursor of a terminal.
-            shown = "\x1b[?25h" if os.isatty(2) else ""
-            os.write(2, (shown + "".join(f"{line}\n" for line in lines)).encode())
+            lines = [] if self.handled else ending(signal.Signals(self.number).name)
+            # Show the cursor, which progress bars hide.
+            cursor = "\x1b[?25h" if os.isatty(2) else ""
+            os.write(2, (cursor + "".join(f"{line}\n" for line in lines)).encode())
         os._exit(128 + self.number)
 
 
 _PROCESS: _Process | None = None
 _AT_END: list[Callable[[], object]] = []
-_LOOPS: list["StopRequests"] = []  # that are open
+_LOOPS: list["StopRequests"] = []  # open contexts
 
 
 def _flush():
@@ -144,7 +145,10 @@ def _end_by_default(number):
 
 
 def install() -> None:
-    """Make signals requests for the rest of this process, from its main thread."""
+    """Turn signals into requests for the rest of this process.
+
+    It has no effect outside the main thread.
+    """
     global _PROCESS
     if _PROCESS is None and threading.current_thread() is threading.main_thread():
         _PROCESS = _Process()
@@ -164,25 +168,26 @@ def uninstall() -> None:
 def install_for_program(package: str, script: str) -> None:
     """Call `install` if this process runs `python -m PACKAGE...` or a console script.
 
-    The package calls this in its `__init__`, before anything else is imported.
+    The `__init__` of the package calls this before it imports anything else.
 
     Args:
       package: Name of the package.
       script: Name of the console script that the package installs.
     """
     words = list(sys.orig_argv)
-    if "--multiprocessing-fork" in words:  # a worker of a program, with its `sys.argv`
+    # A worker process has the `sys.argv` of its parent.
+    if "--multiprocessing-fork" in words:
         return
-    at = words.index("-m") + 1 if "-m" in words else 0
-    # Until a module is found, `sys.argv[0]` is "-m".
-    by_module = sys.argv[:1] == ["-m"] and words[at].partition(".")[0] == package
+    index = words.index("-m") + 1 if "-m" in words else 0
+    # While Python imports the package of a module, `sys.argv[0]` is "-m".
+    by_module = sys.argv[:1] == ["-m"] and words[index].partition(".")[0] == package
     name = os.path.basename(sys.argv[0]) if sys.argv else ""
     if by_module or name.removesuffix(".exe") == script:
         install()
 
 
 def is_installed() -> bool:
-    """Return whether signals are requests in this process.
+    """Test if signals are requests in this process.
 
     Returns:
       True after `install`.
@@ -191,22 +196,22 @@ def is_installed() -> bool:
 
 
 def check() -> None:
-    """Raise `Stopped` if a signal has arrived and nothing has answered it yet."""
+    """Raise `Stopped` if a signal has arrived that has not been handled yet."""
     process = _PROCESS
-    if process is None or process.number is None or process.answered:
+    if process is None or process.number is None or process.handled:
         return
-    if _LOOPS:  # which look for requests themselves
+    if _LOOPS:  # loops check for requests themselves
         return
     if threading.current_thread() is threading.main_thread():
-        process.answered = True
+        process.handled = True
         raise Stopped(process.number)
 
 
 def requested() -> bool:
-    """Return whether a signal has arrived that a loop or a safe point is to answer.
+    """Test if a signal has arrived.
 
     Returns:
-      True if one has.
+      True if work should end at the next safe point.
     """
     if _PROCESS is not None:
         return _PROCESS.number is not None
@@ -215,7 +220,7 @@ def requested() -> bool:
 
 @contextlib.contextmanager
 def protected() -> Iterator[None]:
-    """Keep the process from being ended by the first signal while the block runs.
+    """Prevent that the first signal ends the process while the block runs.
 
     Yields:
       None.
@@ -231,13 +236,13 @@ def protected() -> Iterator[None]:
     finally:
         with process.lock:
             process.protections -= 1
-            process.unprotected_at = time.monotonic()
+            process.unprotected_time = time.monotonic()
 
 
 def at_end(clean_up: Callable[[], object]) -> None:
-    """Register a function to call before the process is ended by force.
+    """Register a function to call before the process is forcibly ended.
 
-    It runs in another thread while the main thread goes on, so it must not wait for
+    It runs in another thread while the main thread continues, so it must not wait for
     locks.
 
     Args:
@@ -251,7 +256,7 @@ def advise(line: str) -> None:
     """Set the line that is printed when a signal ends the process.
 
     Args:
-      line: The line, "" for none.
+      line: The line, or "" for none.
     """
     if _PROCESS is not None:
         _PROCESS.advice = line
@@ -273,11 +278,11 @@ def ending(name: str) -> list[str]:
 
 
 class StopRequests:
-    """Lets a loop answer signals: the first is only noted, and the loop then returns.
+    """Lets a loop handle signals: the first one is recorded, and the loop returns.
 
-    After `install`, a second signal ends the process. Elsewhere a second SIGINT raises
-    KeyboardInterrupt. A signal that was ignored stays ignored. Outside the main thread,
-    where Python delivers no signals, nothing is installed.
+    After `install`, a second signal ends the process. Otherwise a second SIGINT raises
+    KeyboardInterrupt. Ignored signals stay ignored. Outside the main thread, to which
+    Python delivers signals, no handlers are installed.
     """
 
     def __init__(self):
@@ -288,29 +293,29 @@ class StopRequests:
 
     def __enter__(self):
         if _PROCESS is None:
-            self._before = _installed(self._note, NAMES)
+            self._before = _install_handler(self._note, NAMES)
         _LOOPS.append(self)
         return self
 
     @property
     def name(self) -> str | None:
-        """The signal's name, or None. A loop that reads a name must return."""
+        """Name of the signal, or None. A loop that reads a name must return."""
         main = threading.current_thread() is threading.main_thread()
         process = _PROCESS
         if main and self._name is None and process is not None and process.number:
-            process.answered = True
+            process.handled = True
             self._name = signal.Signals(process.number).name
         return self._name
 
     def protect(self) -> None:
-        """Keep the process alive until the block ends: there is something to save."""
+        """Prevent that signals end the process before the block ends and has saved."""
         if not self._is_protected:
             self._is_protected = True
             self._protection.enter_context(protected())
 
     def _note(self, number, _frame):
         if self._name is not None and number == signal.SIGINT:
-            raise KeyboardInterrupt("interrupted a second time, without saving")
+            raise KeyboardInterrupt("interrupted twice, nothing was saved")
         self._name = signal.Signals(number).name
 
     def __exit__(self, *_):
@@ -321,7 +326,7 @@ class StopRequests:
 
 @contextlib.contextmanager
 def exits() -> Iterator[None]:
-    """End the block by SIGTERM and SIGHUP as by Ctrl-C, with exit code 128 + signal.
+    """Let SIGTERM and SIGHUP raise SystemExit with code 128 + signal in the block.
 
     For code that is called without `install`. The next signal of the same kind ends the
     process.
@@ -337,15 +342,15 @@ def exits() -> Iterator[None]:
         signal.signal(number, signal.SIG_DFL)
         raise SystemExit(128 + number)
 
-    before = _installed(leave, NAMES[1:])
+    before = _install_handler(leave, NAMES[1:])
     try:
         yield
     finally:
         _restore(before)
 
 
-def _installed(handler, names):
-    """Install a handler, and return the earlier ones by number."""
+def _install_handler(handler, names):
+    """Install a handler for signals, and return the earlier ones by number."""
     before = {}
     if threading.current_thread() is threading.main_thread():
         for name in names:

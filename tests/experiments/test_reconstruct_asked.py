@@ -37,7 +37,7 @@ def refused(capsys, *arguments):
     # On a slow machine lines on progress come before it.
     lines = capsys.readouterr().err.splitlines(keepends=True)
     *progress, line = lines
-    assert all(" ..." in each or " so far" in each for each in progress), lines
+    assert all(" ..." in each or " elapsed" in each for each in progress), lines
     assert line.startswith("error: ")
     return line
 
