@@ -16,18 +16,18 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="process ids of POSIX
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 CHILD = """
 import sys, time
-from nerfies_jax import children
+from nerfies_jax.runtime import children
 if sys.argv[1] == "watched":  # as where the kernel has no such signal
     children._ask_kernel = lambda: False
     children.POLL_SECONDS = 0.05
 children.end_with_parent()
-from nerfies_jax import processes
+from nerfies_jax.runtime import processes
 print(processes.own_name(), flush=True)
 time.sleep(60)
 """
 PARENT = """
 import sys, time
-from nerfies_jax import children
+from nerfies_jax.runtime import children
 children.start([sys.executable, "-c", sys.argv[1], sys.argv[2]])
 time.sleep(60)
 """
@@ -50,7 +50,10 @@ def test_a_child_ends_with_a_parent_that_is_killed(by):
 
 
 def test_a_child_that_begins_as_an_orphan_ends():
-    code = "from nerfies_jax import children; children.end_with_parent(1); print('on')"
+    code = (
+        "from nerfies_jax.runtime import children; "
+        "children.end_with_parent(1); print('on')"
+    )
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT)
     assert (done.returncode, done.stdout) == (143, "")

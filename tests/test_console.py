@@ -120,7 +120,7 @@ def test_rich_does_not_end_the_process_when_the_reader_goes(broken_pipe):
 CLOSED = """
 import os, sys
 import experiments  # what a command imports first
-from nerfies_jax import console
+from nerfies_jax.runtime import console
 path = sys.argv[1]
 with open(path, "w") as file:
     os.write(2, b"a native library's words")

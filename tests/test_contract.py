@@ -63,7 +63,7 @@ REFUSED = {
     ),
     "a mask of bytes": (
         lambda: pair(jnp.ones(5), jnp.ones((5, 3)), mask=jnp.ones(5, jnp.uint8)),
-        r"`mask` must be boolean, got uint8\[5\]; compare it",
+        r"`mask` must be boolean, got uint8\[5\]; convert it",
     ),
     "a raw key": (
         lambda: pair(jnp.ones(5), jnp.ones((5, 3)), key=jax.random.PRNGKey(0)),

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 SETUP = """
 import gc, os, pathlib, sys, threading, time
-from nerfies_jax import stopping
+from nerfies_jax.runtime import stopping
 stopping.GRACE_SECONDS = 0.5
 stopping.install()
 stopping.at_end(lambda: print("cleaned up", flush=True))

@@ -1,8 +1,8 @@
-"""Baselines of held-out frames: neighboring frames, and the scene without its motion.
+"""Baseline images for held-out frames: neighboring frames, and static renders.
 
-One baseline is the mean of the two neighboring frames, the other the mean of the
-scene's own renders over time. A scene below the first is worse than two superimposed
-frames, and one below the second is better without its motion.
+One baseline is the mean of the two neighboring training frames, the other the mean of
+renders of the model over time. A model that scores below the first is worse than two
+superimposed frames. One that scores below the second is better without its motion.
 """
 
 from typing import NamedTuple
@@ -18,15 +18,15 @@ NEIGHBORS = 2
 
 
 class Averages(NamedTuple):
-    """Baseline images of held-out frames, in NumPy, with one row for each."""
+    """Baseline images of held-out frames, in NumPy."""
 
-    places: np.ndarray  # which of the scored frames
+    places: np.ndarray  # [places] indices into the scored frames
     color: np.ndarray  # [places, height, width, 3] float32 in [0, 1]
-    known: np.ndarray | None  # [places, height, width] bool; None where all of it is
+    known: np.ndarray | None  # [places, height, width] bool, None if all pixels are
 
 
 class Baselines(NamedTuple):
-    """Both baselines of one run, None where they do not exist."""
+    """Both baselines of one run, None if they do not exist."""
 
     neighbors: Averages | None
     static: Averages | None
@@ -35,8 +35,8 @@ class Baselines(NamedTuple):
 def neighbor_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
     """Find the two training frames nearest in time to a frame, nearest first.
 
-    They are of the same camera if that has at least two training frames, else of any
-    camera. Ties go to the first in the capture.
+    Only frames of the same camera are used if it has at least two training frames. Of
+    frames at the same distance, the first in the capture is used.
 
     Args:
       capture: The capture.
@@ -48,33 +48,35 @@ def neighbor_rows(capture: Capture, row: int | np.integer) -> np.ndarray:
     rows = capture.train
     same = rows[capture.camera_ids[rows] == capture.camera_ids[row]]
     rows = np.sort(same if len(same) >= NEIGHBORS else rows)
-    apart = np.abs(capture.times[rows].astype(np.float64) - float(capture.times[row]))
-    # Times are float32: a tie is within 1e-6.
-    return rows[np.argsort(np.round(apart, 6), kind="stable")[:NEIGHBORS]]
+    difference = np.abs(
+        capture.times[rows].astype(np.float64) - float(capture.times[row])
+    )
+    # Rounded, because timestamps are float32.
+    return rows[np.argsort(np.round(difference, 6), kind="stable")[:NEIGHBORS]]
 
 
 def neighbor_means(capture: Capture, rows: np.ndarray) -> Averages | None:
-    """Compute the mean of the neighboring frames of each row, as captured.
+    """Compute the mean of the two neighboring training frames of each row.
 
     Args:
       capture: The capture.
       rows: Indices of the frames.
 
     Returns:
-      The means over those neighbors that observed a pixel, unknown where none did. None
-      if there are no two training frames at different times.
+      The means over the neighbors in which a pixel is valid. Pixels that are valid in
+      none are unknown. None if there are no two training frames at different times.
     """
     if len(capture.train) < NEIGHBORS or not np.ptp(capture.times[capture.train]):
         return None
     colors, known = [], []
     for row in rows:
-        chosen = neighbor_rows(capture, row)
-        pictures = capture.images[chosen].astype(np.float32) / 255
-        filmed = np.ones(pictures.shape[:3], bool)
+        neighbors = neighbor_rows(capture, row)
+        images = capture.images[neighbors].astype(np.float32) / 255
+        valid = np.ones(images.shape[:3], bool)
         if capture.valid is not None:
-            filmed = capture.valid[chosen]
-        count = filmed.sum(axis=0)
-        total = np.where(filmed[..., None], pictures, 0).sum(axis=0)
+            valid = capture.valid[neighbors]
+        count = valid.sum(axis=0)
+        total = np.where(valid[..., None], images, 0).sum(axis=0)
         colors.append(total / np.maximum(count, 1)[..., None])
         known.append(count > 0)
     return Averages(
@@ -90,40 +92,40 @@ def time_averages(
     capture: Capture,
     rows: np.ndarray,
     frames: int,
-    moments: int,
+    timestamps: int,
 ) -> Averages:
     """Average renders over time, from the cameras of some frames.
 
-    Cameras and appearance stay the same. Colors are clipped, then averaged as stored
-    (sRGB).
+    Camera and appearance of each frame stay the same. Colors are clipped and averaged
+    in sRGB.
 
     Args:
       draw: Renderer.
       state: Trained state.
       capture: The capture.
       rows: Indices of the frames.
-      frames: Largest number of frames, evenly spread over the rows.
-      moments: Largest number of times, evenly spread over those of training frames.
+      frames: Largest number of frames, evenly spaced over the rows.
+      timestamps: Largest number of times, evenly spaced over those of training frames.
 
     Returns:
       The means.
 
     Raises:
-      ValueError: If `frames` or `moments` is below 1.
+      ValueError: If `frames` or `timestamps` is below 1.
     """
-    if frames < 1 or moments < 1:
+    if frames < 1 or timestamps < 1:
         raise ValueError(
-            f"an average over time needs at least one frame and one time, got "
-            f"frames={frames} and moments={moments}"
+            f"frames={frames} and timestamps={timestamps} must be at least 1 for an "
+            "average over time"
         )
     places = spread(np.arange(len(rows)), frames)
-    times = spread(np.unique(capture.times[capture.train]), moments)
+    times = spread(np.unique(capture.times[capture.train]), timestamps)
     views = [view_of(capture, row) for row in rows[places]]
     width, height = capture.size
     total = np.zeros((len(views), height, width, 3))
-    for time in times:  # outside: what is deformed for an instant serves all its views
-        instant = in_default_precision(time)
+    # Time is the outer loop, because renderers cache the deformed scene.
+    for time in map(in_default_precision, times):
         for place, view in enumerate(views):
-            color = draw(state, view._replace(time=instant)).color
+            color = draw(state, view._replace(time=time)).color
             total[place] += np.clip(color, 0, 1)
     return Averages(places, (total / len(times)).astype(np.float32), None)

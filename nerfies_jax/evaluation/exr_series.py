@@ -20,7 +20,7 @@ def write(
     move: Move | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Render views to `0000.exr`, `0001.exr`, ..., all of them or none.
+    """Render views to `0000.exr`, `0001.exr` and so on, all of them or none.
 
     Args:
       folder: The folder.
@@ -34,14 +34,14 @@ def write(
     Raises:
       CaptureError: If the folder may not be replaced or cannot be written.
     """
-    names = [f"{place:04d}.exr" for place in range(len(views))]
+    names = [f"{index:04d}.exr" for index in range(len(views))]
     with replaced_folder(folder, overwrite, alike(folder, names)) as partial:
-        for place, (name, view) in enumerate(zip(names, views, strict=True)):
+        for index, (name, view) in enumerate(zip(names, views, strict=True)):
             rendering = draw(state, view)
             flow = None
             if move is not None:
-                there = views[min(place + 1, len(views) - 1)]
-                flow = model_flow.picture_flow(move, state, view, there, rendering)
+                target = views[min(index + 1, len(views) - 1)]
+                flow = model_flow.picture_flow(move, state, view, target, rendering)
             write_frame(partial / name, rendering, view, flow)
 
 
@@ -55,7 +55,7 @@ def write_frame(
       rendering: The rendered image.
       view: Its view.
       flow: Flow in pixels right and down, [height, width, 2], for the channels `flow.x`
-        and `flow.y`. Where it is NaN they are 0, and so is `flow.A`.
+        and `flow.y`. If it is NaN, these and `flow.A` are 0.
     """
     extra = {}
     if flow is not None:

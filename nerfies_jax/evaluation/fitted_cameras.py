@@ -1,8 +1,8 @@
 """Camera refinement for held-out frames, with the scene frozen.
 
-A wrong camera costs a good scene several dB. The camera is fitted to the colors alone,
-by the gradient of the squared error of the rendered frame with respect to a twist in
-the camera's own frame.
+An inaccurate camera reduces the PSNR of a good model by several dB. The camera is
+fitted to the colors of the frame by the gradient of the squared error with respect to a
+twist in the camera frame.
 """
 
 import dataclasses
@@ -29,16 +29,16 @@ LEVELS = 255.0  # of an 8-bit image, the unit of the error
 class CameraFitSpec:
     """Settings of the camera refinement, and its convergence criterion.
 
-    The unknowns are a rotation and a translation, scaled such that they move an image
-    at `depth` by so many pixels, so that one step size suits all. A fit has converged
-    if the gradient of the mean squared error, in gray levels of 255, is at most
-    `tolerance` per pixel. For images with gradients of two levels per pixel, that is
-    0.001 pixel from the minimum.
+    The unknowns are a rotation and a translation in pixels by which they move an image
+    at `depth`, so that one step size suits all. A fit has converged if the gradient of
+    the mean squared error, in gray levels of 255, is at most `tolerance` per pixel. For
+    images with gradients of two levels per pixel, this is 0.001 pixel from the minimum.
     """
 
     max_steps: int = 100  # of L-BFGS
     tolerance: float = 0.01  # squared gray levels per pixel
-    # Larger images are halved, thirded, ...: a field would take minutes for each.
+    # Larger images are downsampled by a whole factor. A radiance field would take
+    # minutes for each of them.
     most_pixels: int = 5000
 
     def __post_init__(self):
@@ -65,14 +65,14 @@ def photometric_loss(
     valid: Bool[Array, "height width"] | None,
     depth: Float[Array, ""],
 ) -> Callable[[Float[Array, "6"]], Float[Array, ""]]:
-    """Make the loss of a camera: the mean squared error of a frame in gray levels.
+    """Return the loss of a camera: the mean squared error of a frame in gray levels.
 
     Args:
       model: The model.
       state: Trained state.
       view: View of the frame with its initial camera.
       picture: The frame, [height, width, 3].
-      valid: True for observed pixels, [height, width], or None.
+      valid: True for observed pixels, [height, width], or None for all.
       depth: z-depth in scene units at which twists are measured in pixels.
 
     Returns:
@@ -80,10 +80,10 @@ def photometric_loss(
     """
     size = picture.shape[1], picture.shape[0]
     truth = picture.astype(view.camera.position.dtype) / LEVELS
-    draw = _drawer(model, state, view, size)
+    render = _camera_renderer(model, state, view, size)
 
-    def loss(screw_px):
-        color = draw(_moved(view.camera, screw_px, depth))
+    def loss(twist_px):
+        color = render(_move_camera(view.camera, twist_px, depth))
         return LEVELS**2 * losses.mse(color, truth, valid)
 
     return loss
@@ -98,15 +98,16 @@ def fit_camera(
     depth: Float[Array, ""],
     spec: CameraFitSpec = CameraFitSpec(),
 ) -> Fit:
-    """Refine the camera of a view so that its rendering matches an image. Runs under
-    `jit`.
+    """Refine the camera of a view so that its rendering matches an image.
+
+    It can run under `jit`.
 
     Args:
       model: The model.
       state: Trained state.
       view: View of the frame with its initial camera.
       picture: The frame, [height, width, 3].
-      valid: True for observed pixels, [height, width], or None.
+      valid: True for observed pixels, [height, width], or None for all.
       depth: z-depth in scene units at which twists are measured in pixels.
       spec: Settings.
 
@@ -121,8 +122,9 @@ def fit_camera(
         loss, start, max_steps=spec.max_steps, tolerance=spec.tolerance
     )
     return fitted._replace(
-        value=_moved(view.camera, fitted.value, depth),
-        converged=fitted.converged & (fitted.residual > 0),  # rounding leaves a slope
+        value=_move_camera(view.camera, fitted.value, depth),
+        # Rounding errors keep the gradient of a real image from being exactly zero.
+        converged=fitted.converged & (fitted.residual > 0),
     )
 
 
@@ -144,8 +146,8 @@ def fit_cameras(
       capture: The capture, undistorted if the model renders pinhole cameras.
       rows: Indices of the frames.
       spec: Settings.
-      filmed: The capture with its lens distortion, which the metrics are computed on.
-        None for `capture` itself.
+      filmed: The original, distorted capture, which metrics are computed on. None for
+        `capture` itself.
 
     Returns:
       The cameras, convergence flags and metrics.
@@ -155,8 +157,8 @@ def fit_cameras(
         factor += 1
     width, height = capture.size
     size = width // factor, height // factor
-    # Pixels trimmed at the right and the bottom are not part of the smaller image.
-    whole = size[0] * factor, size[1] * factor
+    # The smaller image does not contain the remaining pixels at the right and bottom.
+    cropped = size[0] * factor, size[1] * factor
     program = jax.jit(
         lambda params, step, view, picture, valid, depth: fit_camera(
             model,
@@ -169,7 +171,7 @@ def fit_cameras(
         )
     )
     depth = in_default_precision(np.float32(2 / (1 / capture.near + 1 / capture.far)))
-    moved, converged = [], []
+    cameras, converged = [], []
     for row in rows:
         view = view_of(capture, int(row))
         valid = None
@@ -178,28 +180,27 @@ def fit_cameras(
         fitted = program(
             state.params,
             state.step,
-            resized(view, whole, size),
+            resized(view, cropped, size),
             jnp.asarray(shrink(capture.images[row], factor)),
             valid,
             depth,
         )
-        moved.append(
+        cameras.append(
             view.camera._replace(
                 camera_from_world=fitted.value.camera_from_world,
                 position=fitted.value.position,
             )
         )
         converged.append(bool(fitted.converged))
-    cameras = jax.tree.map(
-        lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *moved
+    stacked = jax.tree.map(
+        lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *cameras
     )
-    posed = _with_poses(filmed or capture, rows, cameras)
-    scored = score(draw, state, posed, rows)
-    return FittedCameras(cameras, np.asarray(converged), scored)
+    scored = score(draw, state, _with_poses(filmed or capture, rows, stacked), rows)
+    return FittedCameras(stacked, np.asarray(converged), scored)
 
 
-def _drawer(model, state, view, size):
-    """Function from a camera to colors, with everything else computed once."""
+def _camera_renderer(model, state, view, size):
+    """Return a function from a camera to colors. The deformation is computed once."""
     if model.stages is None:
         return lambda camera: (
             model.render(
@@ -215,16 +216,14 @@ def _drawer(model, state, view, size):
     )
 
 
-def _moved(camera, screw_px, depth):
-    angle = screw_px / camera.focal_px
+def _move_camera(camera, twist_px, depth):
+    angle = twist_px / camera.focal_px
     return move(camera, angle[:3], depth * angle[3:])
 
 
 def _with_poses(capture, rows, cameras):
-    def replaced(name):
-        old = np.array(getattr(capture.cameras, name))
-        old[rows] = getattr(cameras, name)
-        return old
-
-    poses = {name: replaced(name) for name in ("camera_from_world", "position")}
+    poses = {}
+    for name in ("camera_from_world", "position"):
+        poses[name] = np.array(getattr(capture.cameras, name))
+        poses[name][rows] = getattr(cameras, name)
     return dataclasses.replace(capture, cameras=capture.cameras._replace(**poses))

@@ -25,8 +25,8 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
 
     Args:
       capture: The capture.
-      required_data: Names of further data to include if the capture has it: "depths",
-        "points", "flow", "moving".
+      required_data: Names of additional data to include if the capture has it:
+        "depths", "points", "flow", "moving".
 
     Returns:
       The frames.
@@ -42,7 +42,7 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
     if "moving" in required_data and capture.moving is not None:
         extras["moving"] = capture.moving[rows]
     if frame_memory.is_shared(capture):
-        # Unlike `jnp.asarray`, this takes the array as it is.
+        # Unlike `jnp.asarray`, this does not copy the array.
         images = jax.device_put(capture.images)
         extras["image_rows"] = rows.astype(np.int32)
     else:
@@ -59,7 +59,7 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
 
 
 def as_found(model: Model, state: TrainState, capture: Capture) -> Capture:
-    """Replace the cameras of a capture by those that training has refined.
+    """Replace the cameras of a capture by the refined cameras of a model.
 
     Args:
       model: The model.
@@ -122,14 +122,14 @@ def path_views(path: Camera, times: np.ndarray, like: View) -> list[View]:
     return [
         like._replace(
             camera=in_default_precision(cameras.take(path, row)),
-            time=jnp.asarray(moment, like.time.dtype),
+            time=jnp.asarray(time, like.time.dtype),
         )
-        for row, moment in enumerate(times)
+        for row, time in enumerate(times)
     ]
 
 
 def spread(rows: np.ndarray, most: int) -> np.ndarray:
-    """Select evenly spread rows, in their order.
+    """Select evenly spaced rows, in their order.
 
     Args:
       rows: Rows, [rows, ...].
@@ -138,5 +138,5 @@ def spread(rows: np.ndarray, most: int) -> np.ndarray:
     Returns:
       The selected rows.
     """
-    picked = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
-    return rows[picked]
+    indices = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
+    return rows[indices]

@@ -22,11 +22,11 @@ from nerfies_jax.metrics.metric_table import metric
 from nerfies_jax.metrics.perceptual import LpipsParams, Network
 from nerfies_jax.training.model import in_default_precision
 
-# Five scales halve an image four times, and the window of 11 must fit into the last.
+# Five scales halve an image four times, and the last one must hold the window of 11.
 MS_SSIM_SIDE = 160  # pixels that the shorter side must exceed
 
 
-# Tolerated decline in a later run, in the unit of `metric_table.METRICS`.
+# Tolerated decline in a later run, in the units of `metric_table.METRICS`.
 TOLERANCES = {
     "heldout.psnr": 0.2,
     "heldout.ssim": 0.01,
@@ -70,7 +70,7 @@ _TRACKS = {
 
 
 class Lpips(NamedTuple):
-    """A classifier for LPIPS and its trained weights."""
+    """A network for LPIPS and its trained weights."""
 
     network: Network
     params: LpipsParams
@@ -88,8 +88,9 @@ def check_large_enough(network: Network, size: tuple[int, int]) -> None:
     """
     if min(size) < network.smallest:
         raise ValueError(
-            f"LPIPS with {network.name} needs {network.smallest} pixels on the shorter "
-            f"side, and the pictures are {size[0]}x{size[1]}; leave its weights out"
+            f"LPIPS with {network.name} needs at least {network.smallest} pixels on "
+            f"the shorter side, but the images are {size[0]}x{size[1]}; remove its "
+            "weights"
         )
 
 
@@ -107,8 +108,7 @@ def heldout_metrics(
     """Compute all metrics of held-out frames for which there is data.
 
     PSNR and SSIM are always computed. Others need data of the capture (masks of moving
-    pixels, depths) or an argument. Metrics that would be a mean over nothing are left
-    out.
+    pixels, depths) or an argument. Metrics without any values to average are omitted.
 
     Args:
       scored: Rendered frames.
@@ -127,7 +127,7 @@ def heldout_metrics(
         "heldout.psnr": known_mean(scored.psnr),
         "heldout.ssim": known_mean(scored.ssim),
     }
-    more = _pictures(scored, capture, lpips)
+    more = _image_metrics(scored, capture, lpips)
     if capture.valid is not None:
         more["heldout.unscored"] = 1 - capture.valid[scored.rows].mean()
     more |= _baselines(baselines, scored, capture)
@@ -160,9 +160,9 @@ def metrics(numbers: Mapping[str, float]) -> list[Metric]:
     ]
 
 
-def _pictures(scored, capture, lpips):
-    """Means over the frames, each over the pixels that have what it needs."""
-    parts = {}
+def _image_metrics(scored, capture, lpips):
+    """Compute means over frames of metrics over the valid, moving or static pixels."""
+    values = {}
     for row, color in zip(scored.rows, scored.color, strict=True):
         valid = None if capture.valid is None else capture.valid[row]
         moving = None if capture.moving is None else capture.moving[row]
@@ -172,40 +172,39 @@ def _pictures(scored, capture, lpips):
                 lpips.params, lpips.network, color, capture.images[row], valid
             )
         for key, value in jax.device_get(scores).items():
-            parts.setdefault(key, []).append(value)
-    # A frame without anything that moves has no score of it, and none is all moving.
-    return {key: known_mean(np.asarray(values)) for key, values in parts.items()}
+            values.setdefault(key, []).append(value)
+    # Frames without moving or without static pixels are skipped.
+    return {key: known_mean(np.asarray(each)) for key, each in values.items()}
 
 
 def _baselines(baselines, scored, capture):
-    """PSNR of pictures that cost nothing, and how far motion is above the second."""
+    """Compute the PSNR of the baselines, and the gain over static renders."""
     numbers = {}
     if baselines.neighbors is not None:
-        own = _baseline_psnr(baselines.neighbors, scored, capture)
-        numbers["baseline.neighbor_mean"] = known_mean(own[:, 0])
+        psnr = _baseline_psnr(baselines.neighbors, scored, capture)
+        numbers["baseline.neighbor_mean"] = known_mean(psnr[:, 0])
     if baselines.static is not None:
-        own = _baseline_psnr(baselines.static, scored, capture)
-        drawn = baselines.static._replace(color=scored.color[baselines.static.places])
-        gain = _baseline_psnr(drawn, scored, capture) - own
-        numbers["baseline.static"] = known_mean(own[:, 0])
+        psnr = _baseline_psnr(baselines.static, scored, capture)
+        model = baselines.static._replace(color=scored.color[baselines.static.places])
+        gain = _baseline_psnr(model, scored, capture) - psnr
+        numbers["baseline.static"] = known_mean(psnr[:, 0])
         numbers["motion.gain"] = known_mean(gain[:, 0])
         numbers["motion.moving_gain"] = known_mean(gain[:, 1])
     return numbers
 
 
 def _baseline_psnr(averages, scored, capture):
-    """PSNR of all observed pixels and of the moving ones, [places, 2], NaN for none."""
+    """Compute the PSNR of all valid pixels and of the moving ones, [places, 2]."""
     psnrs = []
-    for number, (place, color) in enumerate(
+    for index, (place, color) in enumerate(
         zip(averages.places, averages.color, strict=True)
     ):
         row = scored.rows[place]
         mask = np.ones(color.shape[:2], bool)
-        for part in (
-            None if capture.valid is None else capture.valid[row],
-            None if averages.known is None else averages.known[number],
-        ):
-            mask = mask if part is None else mask & part
+        if capture.valid is not None:
+            mask &= capture.valid[row]
+        if averages.known is not None:
+            mask &= averages.known[index]
         none = np.zeros_like(mask)
         moving = none if capture.moving is None else mask & capture.moving[row]
         psnrs.append(_masked_psnrs(color, capture.images[row], mask, moving))
@@ -214,50 +213,44 @@ def _baseline_psnr(averages, scored, capture):
 
 @jax.jit
 def _masked_psnrs(color, truth, mask, moving):
-    picture = image_quality.quantize(color)
+    image = image_quality.quantize(color)
     truth = truth.astype(color.dtype) / 255
-    return [image_quality.masked_psnr(picture, truth, one) for one in (mask, moving)]
+    return [image_quality.masked_psnr(image, truth, each) for each in (mask, moving)]
 
 
 @jax.jit
 def _score(color, truth, valid, moving):
-    picture = image_quality.quantize(color)
+    image = image_quality.quantize(color)
     truth = truth.astype(color.dtype) / 255
     numbers = {}
     if moving is not None:
-        still = ~moving
+        static = ~moving
         if valid is not None:
-            moving, still = moving & valid, still & valid
-        numbers["heldout.moving_psnr"] = image_quality.masked_psnr(
-            picture, truth, moving
-        )
-        numbers["heldout.moving_ssim"] = image_quality.masked_ssim(
-            picture, truth, moving
-        )
-        numbers["heldout.static_psnr"] = image_quality.masked_psnr(
-            picture, truth, still
-        )
-    if valid is None and min(picture.shape[:2]) > MS_SSIM_SIDE:
-        numbers["heldout.ms_ssim"] = image_quality.ms_ssim(picture, truth)
+            moving, static = moving & valid, static & valid
+        numbers["heldout.moving_psnr"] = image_quality.masked_psnr(image, truth, moving)
+        numbers["heldout.moving_ssim"] = image_quality.masked_ssim(image, truth, moving)
+        numbers["heldout.static_psnr"] = image_quality.masked_psnr(image, truth, static)
+    if valid is None and min(image.shape[:2]) > MS_SSIM_SIDE:
+        numbers["heldout.ms_ssim"] = image_quality.ms_ssim(image, truth)
     return numbers
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def _lpips(params, network, color, truth, valid):
-    picture = image_quality.quantize(color)
+    image = image_quality.quantize(color)
     truth = truth.astype(color.dtype) / 255
     if valid is None:
-        return perceptual.lpips(params, network, picture, truth)
-    return perceptual.masked_lpips(params, network, picture, truth, valid)
+        return perceptual.lpips(params, network, image, truth)
+    return perceptual.masked_lpips(params, network, image, truth, valid)
 
 
-# One program each: by themselves their operations take longer to compile.
+# One program each, because their operations take longer to compile separately.
 _depth_errors = jax.jit(geometry_quality.depth_errors)
 _flow_errors = jax.jit(geometry_quality.flow_errors)
 
 
 def _depths(scored, capture):
-    """Over the known pixels of all frames together."""
+    """Compute depth errors over the known pixels of all frames together."""
     truth = jnp.asarray(capture.depths[scored.rows])
     depth = jnp.asarray(scored.depth)
     masks = {"": None}
@@ -265,8 +258,8 @@ def _depths(scored, capture):
         masks["moving_"] = jnp.asarray(capture.moving[scored.rows])
     numbers = {}
     for name, mask in masks.items():
-        compared = np.asarray(geometry_quality.known_depth(depth, truth, mask))
-        error = np.abs(np.asarray(depth - truth))[compared]
+        known = np.asarray(geometry_quality.known_depth(depth, truth, mask))
+        error = np.abs(np.asarray(depth - truth))[known]
         errors = _depth_errors(depth, truth, mask)
         numbers[f"heldout.{name}depth_median"] = known_mean(error, np.median)
         numbers[f"heldout.{name}depth_rmse"] = errors.rmse
@@ -277,29 +270,28 @@ def _depths(scored, capture):
 
 
 def _flow(flow):
-    """End-point errors of the pixels with a prediction. The others count as
-    outliers.
-    """
-    answered = np.isfinite(flow.predicted).all(axis=-1)
-    both = in_default_precision((flow.predicted, flow.truth))
+    """Compute end-point errors of pixels with a prediction. Others are outliers."""
+    predicted = np.isfinite(flow.predicted).all(axis=-1)
+    flows = in_default_precision((flow.predicted, flow.truth))
 
     def errors(mask=None):
-        return _flow_errors(*both, None if mask is None else jnp.asarray(mask))
+        return _flow_errors(*flows, None if mask is None else jnp.asarray(mask))
 
     numbers = {
-        "flow.epe": errors(answered).endpoint,
+        "flow.epe": errors(predicted).endpoint,
         "flow.outliers": errors().outliers,
-        "flow.missing": 1 - answered.mean(),
+        "flow.missing": 1 - predicted.mean(),
     }
     if flow.moving is not None:
-        numbers["flow.moving_epe"] = errors(answered & flow.moving).endpoint
+        numbers["flow.moving_epe"] = errors(predicted & flow.moving).endpoint
     return numbers
 
 
 def _cameras(fitted, capture, exact):
-    """PSNR with fitted cameras, and their errors if the capture's cameras are `exact`.
+    """Compute the PSNR with fitted cameras, and their pose errors if `exact`.
 
-    The alignment has no scale, since cameras were fitted to a scene in scene units.
+    `exact` means that the cameras of the capture are ground truth. The alignment does
+    not change the scale, which the trained scene determines.
     """
     numbers = {"heldout.camera_fitted_psnr": known_mean(fitted.scored.psnr)}
     true = cameras.take(capture.cameras, fitted.scored.rows)

@@ -1,4 +1,4 @@
-"""Cameras, image sizes and channels of an interactive viewer, without any GUI."""
+"""Cameras, image sizes and channels of an interactive viewer, without its GUI."""
 
 import math
 from typing import Any, NamedTuple
@@ -14,8 +14,8 @@ from nerfies_jax.visualization import panels
 from nerfies_jax.visualization.panels import Colored
 
 CHANNELS = ("color", "depth", "opacity", "motion")
-MOVING_SECONDS = 0.1  # an image may take while the view changes: ten a second
-SKIPPED_SECONDS = 0.5  # an image that is expected sooner needs no coarser one before it
+MOVING_SECONDS = 0.1  # time limit of an image while the view changes
+SKIPPED_SECONDS = 0.5  # levels are skipped if a finer one takes less than this
 SHORTEST_SIDE_PX = 12
 
 
@@ -33,15 +33,15 @@ class Look(NamedTuple):
 
     time: float  # in [0, 1]
     channel: str = "color"  # one of `CHANNELS`
-    without: tuple[str, ...] = ()  # effects left out
+    without: tuple[str, ...] = ()  # disabled effects
     appearance: int = 0  # id
 
 
 def camera_of(eye: Eye, size: tuple[int, int]) -> Camera:
     """Return the camera of a viewpoint for an image that is stretched to the window.
 
-    Pixels have the aspect that the window gives them, so that a window of any shape is
-    filled by images of one size. Each size is a program to compile.
+    The pixel aspect compensates for the stretching, so that images of one size fill
+    windows of any shape. Every image size needs a compiled program.
 
     Args:
       eye: Viewpoint, with the aspect of the window.
@@ -53,21 +53,23 @@ def camera_of(eye: Eye, size: tuple[int, int]) -> Camera:
     width, height = size
     vertical_px = height / 2 / math.tan(eye.fov_rad / 2)
     focal_px = width / height / eye.aspect * vertical_px
-    turn = Rotation.from_quat(eye.quaternion, scalar_first=True).as_matrix()
-    one = cameras.pinhole(turn.T, eye.position, focal_px, size)
+    rotation = Rotation.from_quat(eye.quaternion, scalar_first=True).as_matrix()
+    camera = cameras.pinhole(rotation.T, eye.position, focal_px, size)
     aspect: Any = np.float32(vertical_px / focal_px)
-    return one._replace(pixel_aspect=aspect)
+    return camera._replace(pixel_aspect=aspect)
 
 
 class Pyramid(NamedTuple):
-    """Images of one view, each twice as wide and high as the one before.
+    """Images of one view at several levels, each twice the size of the previous one.
 
-    All of them are rendered in tiles of one size. A single compiled program serves
-    every level, a change of the view waits for one tile at most, and the finest level
+    All levels are rendered in tiles of one size, so that one compiled program serves
+    all of them, a change of the view waits for at most one tile, and the finest level
     is always reached, however long a tile takes.
     """
 
-    tile: tuple[int, int]  # width and height in pixels, of the coarsest image too
+    tile: tuple[
+        int, int
+    ]  # width and height in pixels, also those of the coarsest level
     levels: int
 
     def size(self, level: int) -> tuple[int, int]:
@@ -83,9 +85,7 @@ class Pyramid(NamedTuple):
         return width << level, height << level
 
     def tiles(self, level: int) -> list[tuple[int, int]]:
-        """Return the tiles of a level, the central ones first.
-
-        Viewers look at the center more often than at the border.
+        """Return the tiles of a level, beginning at the center.
 
         Args:
           level: Index of the level, 0 for the coarsest.
@@ -107,16 +107,15 @@ def pyramid(full: tuple[int, int], tile_pixels: int) -> Pyramid:
       tile_pixels: Number of pixels of a tile.
 
     Returns:
-      The pyramid. Its finest level has the size `full`, or a few pixels more where that
-      does not divide evenly.
+      The pyramid. Its finest level has the size `full`, or a few pixels more if that is
+      not divisible.
     """
     levels = 1
     while True:
         width, height = (math.ceil(side / (1 << levels - 1)) for side in full)
-        tile = width, height
-        enough = math.prod(tile) <= tile_pixels
-        if enough or min(tile) < 2 * SHORTEST_SIDE_PX:
-            return Pyramid(tile, levels)
+        small = width * height <= tile_pixels
+        if small or min(width, height) < 2 * SHORTEST_SIDE_PX:
+            return Pyramid((width, height), levels)
         levels += 1
 
 
@@ -125,7 +124,7 @@ def tile_camera(camera: Camera, pyramid: Pyramid, cell: tuple[int, int]) -> Came
 
     Args:
       camera: Camera of the whole image of a level.
-      pyramid: The pyramid, which has the size of a tile.
+      pyramid: The pyramid.
       cell: Column and row of the tile.
 
     Returns:
@@ -142,9 +141,9 @@ def next_level(
     """Return the level of a pyramid to render next.
 
     Args:
-      tile_seconds: Seconds that a tile takes, None before the first one.
+      tile_seconds: Seconds to render a tile, None before the first one.
       levels: Number of levels.
-      complete: The finest level rendered of this view, None before the first.
+      complete: The finest level of this view that has been rendered, or None.
       moving: True while the view changes.
 
     Returns:
@@ -152,13 +151,13 @@ def next_level(
     """
     expected = [(tile_seconds or 0.0) * 4**level for level in range(levels)]
     if complete is None:
-        quick = (level for level, each in enumerate(expected) if each <= MOVING_SECONDS)
-        return 0 if tile_seconds is None else max(quick, default=0)
+        fast = (level for level, each in enumerate(expected) if each <= MOVING_SECONDS)
+        return 0 if tile_seconds is None else max(fast, default=0)
     if moving or complete + 1 == levels:
         return None
     finer = range(complete + 1, levels)
-    soon = [level for level in finer if expected[level] <= SKIPPED_SECONDS]
-    return max(soon, default=complete + 1)
+    fast_levels = [level for level in finer if expected[level] <= SKIPPED_SECONDS]
+    return max(fast_levels, default=complete + 1)
 
 
 def as_channel(
@@ -172,10 +171,10 @@ def as_channel(
     Args:
       channel: One of `CHANNELS`.
       rendering: The rendering.
-      distance: Displacement of the surface that each pixel shows, in scene units,
-        [height, width]. Needed for "motion".
-      limits: Values of the two ends of the color map for depth and motion, which keep
-        images comparable. None takes them from this image.
+      distance: Displacement of the surface visible in each pixel, in scene units,
+        [height, width]. Required for "motion".
+      limits: Values of the two ends of the color map for depth and motion, for a common
+        range of several images. None for the range of this image.
 
     Returns:
       The image with the values that its color map spans.
@@ -194,4 +193,7 @@ def as_channel(
         return panels.color_depth(np.asarray(rendering.depth), solid, limits)
     if channel == "motion" and distance is not None:
         return panels.color_distance(distance, 0.0 if limits is None else limits[1])
-    raise ValueError(f"channel {channel!r}: there are {', '.join(CHANNELS)}")
+    raise ValueError(
+        f"channel={channel!r} must be one of {', '.join(CHANNELS)}, and motion needs "
+        "`distance`"
+    )

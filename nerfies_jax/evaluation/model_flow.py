@@ -20,29 +20,29 @@ from nerfies_jax.training.model import (
     in_default_precision,
 )
 
-PIXELS = 500  # of a frame whose flow is scored, evenly spread
+PIXELS = 500  # evaluated pixels of a frame, evenly spaced
 FRAMES = 4
 
 
 class Moved(NamedTuple):
     """Positions of points at another time, in NumPy."""
 
-    points: np.ndarray  # [points, 3] scene units; where they were, if not found
-    found: np.ndarray  # [points] bool
+    points: np.ndarray  # [points, 3] scene units, the original ones if not found
+    found: np.ndarray  # [points] bool, False if the inverse warp did not converge
 
 
-# (state, points [points, 3] in scene units, their view, another view) -> where they are
+# (state, points [points, 3] in scene units, their view, target view) -> new positions
 Move = Callable[[TrainState, np.ndarray, View, View], Moved]
-# (spec, metadata, effects=()) -> None where nothing in the scene moves points
+# (spec, metadata, effects=()) -> None if the model does not move points
 Mover = Callable[..., Move | None]
 
 
 class Flow(NamedTuple):
     """Predicted and true flow of some pixels of some frames, in NumPy."""
 
-    predicted: np.ndarray  # [pixels, 2]; NaN where the model has no answer
+    predicted: np.ndarray  # [pixels, 2], NaN without a prediction
     truth: np.ndarray  # [pixels, 2]
-    moving: np.ndarray | None  # [pixels] bool: shows what moves by itself
+    moving: np.ndarray | None  # [pixels] bool, True for pixels of moving objects
 
 
 def pixel_flow(
@@ -66,16 +66,16 @@ def pixel_flow(
       depth: z-depths in scene units, [pixels].
 
     Returns:
-      Flow in pixels [pixels, 2], NaN where there is no depth, the point is lost, or it
-      is behind the other camera.
+      Flow in pixels [pixels, 2]. It is NaN for pixels without depth, points that are
+      not found, and points behind the other camera.
     """
     known = np.isfinite(depth) & (depth > 0)
     pixels = np.asarray(in_default_precision(pixels))
     points = surface(here.camera, pixels, np.where(known, depth, 1))
     moved = move(state, points, here, there)
-    place, ahead = _project(there.camera, in_default_precision(moved.points))
-    known = known & moved.found & np.asarray(ahead)
-    return np.where(known[:, None], np.asarray(place) - pixels, np.nan)
+    target, in_front = _project(there.camera, in_default_precision(moved.points))
+    known = known & moved.found & np.asarray(in_front)
+    return np.where(known[:, None], np.asarray(target) - pixels, np.nan)
 
 
 def picture_flow(
@@ -91,7 +91,7 @@ def picture_flow(
       rendering: The rendered image.
 
     Returns:
-      Flow in pixels [height, width, 2], NaN where opacity is below one half or
+      Flow in pixels [height, width, 2]. It is NaN if opacity is below one half or
       `pixel_flow` has no result.
     """
     pixels = _pixels(rendering)
@@ -103,7 +103,7 @@ def picture_flow(
 def picture_distance(
     move: Move, state: TrainState, here: View, there: View, rendering: Rendering
 ) -> np.ndarray:
-    """Compute how far the surface in a rendered image has moved between two times.
+    """Compute the distance that visible surfaces have moved between two times.
 
     Args:
       move: Motion of points.
@@ -113,8 +113,8 @@ def picture_distance(
       rendering: The rendered image.
 
     Returns:
-      Distances in scene units [height, width], NaN where opacity is below one half or
-      the point is lost.
+      Distances in scene units [height, width]. They are NaN if opacity is below one
+      half or the point is not found.
     """
     depth = np.asarray(rendering.depth).ravel()
     solid = np.asarray(rendering.alpha).ravel() > 0.5
@@ -127,7 +127,7 @@ def picture_distance(
 
 
 def _pixels(rendering):
-    """The centers [height * width, 2] of its pixels, row after row."""
+    """Return the centers [height * width, 2] of the pixels, row by row."""
     height, width = rendering.alpha.shape
     column, line = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([column.ravel(), line.ravel()], axis=1)
@@ -169,10 +169,10 @@ def _project(
 def heldout_flow(
     move: Move, state: TrainState, capture: Capture, scored: Scored
 ) -> Flow | None:
-    """Compute the flow of rendered frames to the next of their camera, with its truth.
+    """Compute the flow of rendered frames to the next frame of their camera.
 
-    At most `FRAMES` frames and `PIXELS` pixels of each are used, where both frames show
-    the point.
+    At most `FRAMES` frames and `PIXELS` pixels of each are used, whose points are
+    visible in both frames.
 
     Args:
       move: Motion of points.
@@ -185,14 +185,14 @@ def heldout_flow(
     """
     if capture.flow is None:
         return None
-    seen = capture.flow.forward_seen[scored.rows]
-    places = np.flatnonzero(seen.any(axis=(1, 2)))
+    visible = capture.flow.forward_seen[scored.rows]
+    places = np.flatnonzero(visible.any(axis=(1, 2)))
     if not len(places):
         return None
     predicted, truth, moving = [], [], []
     for place in spread(places, FRAMES):
         row = int(scored.rows[place])
-        line, column = spread(np.argwhere(seen[place]), PIXELS).T
+        line, column = spread(np.argwhere(visible[place]), PIXELS).T
         predicted.append(
             pixel_flow(
                 move,

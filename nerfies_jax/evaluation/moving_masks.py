@@ -12,10 +12,10 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.preprocessing import frame_masks, record
 
-MOST_PIXELS = 4_000_000  # of all frames looked at: 45 s on one core
+MAX_PIXELS = 4_000_000  # of all frames together, which take 45 s on one core
 
 
-def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
+def with_masks(capture: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
     """Add masks of moving pixels to a capture that has none.
 
     They are computed by preprocessing all frames together, including held-out ones, so
@@ -23,59 +23,62 @@ def with_masks(filmed: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
     may be read.
 
     Args:
-      filmed: The capture.
+      capture: The capture, possibly with lens distortion.
       folder: Cache folder of preprocessing.
 
     Returns:
       The capture and a note. The capture has no masks if tracking fails.
     """
-    if filmed.moving is not None or not len(filmed.heldout):
-        return filmed, ""
-    moving, unusable = np.zeros(filmed.images.shape[:3], bool), ""
-    for rows in _films(filmed):
-        factor = math.ceil(math.sqrt(len(rows) * math.prod(filmed.size) / MOST_PIXELS))
-        film = dataclasses.replace(filmed, train=rows, heldout=np.zeros(0, int))
-        film = captures.downscale(captures.select(film, rows), factor)
-        evidence = record.cached(film, folder)
+    if capture.moving is not None or not len(capture.heldout):
+        return capture, ""
+    moving, unusable = np.zeros(capture.images.shape[:3], bool), ""
+    for rows in _candidate_rows(capture):
+        factor = math.ceil(math.sqrt(len(rows) * math.prod(capture.size) / MAX_PIXELS))
+        video = dataclasses.replace(capture, train=rows, heldout=np.zeros(0, int))
+        video = captures.downscale(captures.select(video, rows), factor)
+        evidence = record.cached(video, folder)
         if not evidence.unusable:
             break
         unusable = unusable or evidence.unusable
     else:
-        return filmed, f"What moves is not scored apart: {unusable}."
+        return capture, (
+            f"Dynamic regions are not evaluated separately, because the capture has no "
+            f"masks and tracking failed: {unusable}."
+        )
     for row, mask in zip(rows[evidence.row], evidence.moving, strict=True):
-        times = factor * evidence.factor
-        moving[row] = frame_masks.enlarged(mask, times, filmed.size)
-    moving = _bent(moving, filmed)
-    share = moving[filmed.heldout].mean()
+        scale = factor * evidence.factor
+        moving[row] = frame_masks.enlarged(mask, scale, capture.size)
+    moving = _distorted(moving, capture)
+    share = moving[capture.heldout].mean()
     note = (
-        f"What moves is where tracks do ({share:.1%} of the held-out pixels): the "
-        "capture has no masks of its own."
+        f"Dynamic regions ({share:.1%} of the held-out pixels) are detected from point "
+        "tracks, because the capture has no masks."
     )
     if evidence.left_out:
         note += f" {record.left_out_note(evidence)}"
-    return dataclasses.replace(filmed, moving=moving), note
+    return dataclasses.replace(capture, moving=moving), note
 
 
-def _films(capture):
-    """Rows to follow points through: all, then those of the cameras that are scored.
+def _candidate_rows(capture):
+    """Return frames to track points in: all, then those of the held-out cameras.
 
-    The second where pictures jump between the cameras of a rig. Held-out frames of the
-    built-in scene, filmed by a camera beside that learned from: the masks overlap the
-    true ones to 0.72 in the first way (0.79 where frames are learned from), and to 0.40
-    in the second, whose frames are four times as far apart.
+    The second choice is for camera rigs, between whose images the view jumps. With
+    held-out frames of the built-in scene from a camera next to the training camera, the
+    overlap (IoU) with the true masks is 0.72 for the first choice (0.79 in training
+    frames), and 0.40 for the second, whose frames are four times as far apart.
     """
     used = np.sort(np.concatenate([capture.train, capture.heldout]))
-    scored = np.unique(capture.camera_ids[capture.heldout])
-    own = used[np.isin(capture.camera_ids[used], scored)]
-    return (used,) if len(own) == len(used) else (used, own)
+    heldout_cameras = np.unique(capture.camera_ids[capture.heldout])
+    same_cameras = used[np.isin(capture.camera_ids[used], heldout_cameras)]
+    return (used,) if len(same_cameras) == len(used) else (used, same_cameras)
 
 
-def _bent(moving, filmed):
+def _distorted(moving, capture):
     """Distort masks of pinhole images to the pixels of the captured images."""
-    if not pinholes.has_lens(filmed.cameras):
+    if not pinholes.has_lens(capture.cameras):
         return moving
-    maps = pinholes.Maps(pinholes.pinhole_places, filmed.size)
-    for row in filmed.heldout:
-        place, inside = maps.of(cameras.take(filmed.cameras, row))
-        moving[row] = inside & resampling.nearest(moving[row], place)
+    maps = pinholes.Maps(pinholes.pinhole_places, capture.size)
+    for row in capture.heldout:
+        position, inside = maps.of(cameras.take(capture.cameras, row))
+        moving[row] = inside & resampling.nearest(moving[row], position)
     return moving

@@ -1,6 +1,6 @@
-"""Ground truth of a trained scene, and point tracks by its learned motion.
+"""Ground truth of a scene, and evaluation of point tracks by its learned motion.
 
-Everything is in scene units. `heldout.heldout_metrics` computes the metrics.
+Lengths are in scene units. `heldout.heldout_metrics` computes all metrics.
 """
 
 from collections.abc import Callable
@@ -16,40 +16,39 @@ from nerfies_jax.capture.synthetic import TRUTH_FILE, SceneTruth
 from nerfies_jax.capture.synthetic import truth as truths
 from nerfies_jax.metrics import geometry_quality
 
-CORRECT_WITHIN = 0.01  # scene units: a quarter of the default cube's half-side
-STATIC_POINTS = 500  # of the capture's static points, to see whether they drift
+CORRECT_WITHIN = 0.01  # scene units, a quarter of the half-side of the default cube
+STATIC_POINTS = 500  # of the capture, for measuring the drift of static points
 
 
 class GroundTruth(NamedTuple):
     """Ground truth of a built-in scene, in NumPy."""
 
-    rows: np.ndarray  # held-out frames of the capture that are rendered
-    moments: np.ndarray  # frames learned from, in time: when points are looked for
-    path: np.ndarray  # [tracks, moments, 3] where they are, scene units
-    seen: (
-        np.ndarray
-    )  # [tracks, moments] whether the camera that is learned from sees it
-    # The moment from which points are followed: the middle one. D-NeRF's template is
-    # what it sees at time 0, and its warp jumps there.
+    rows: np.ndarray  # held-out frames to render
+    moments: np.ndarray  # training frames in temporal order, at which tracks are known
+    path: np.ndarray  # [tracks, moments, 3] positions in scene units
+    seen: np.ndarray  # [tracks, moments] True if visible to the training camera
+    # Index into `moments` from which points are tracked, the middle one. It is not the
+    # first, because the template of D-NeRF is the scene at time 0, where its warp is
+    # discontinuous.
     start: int
 
     @property
     def start_points(self) -> np.ndarray:
-        """Known positions of the points at the start, [tracks, 3], in scene units."""
+        """True positions of the points at the start, [tracks, 3], in scene units."""
         return self.path[:, self.start]
 
 
 class PointTracks(NamedTuple):
-    """Points as moved by a learned warp."""
+    """Points moved by a learned deformation."""
 
-    path: np.ndarray  # [tracks, moments, 3] scene units; the start where not found
+    path: np.ndarray  # [tracks, moments, 3] scene units, the start if not found
     found: np.ndarray  # [tracks, moments] bool
-    # Mean distance of static points in the template from where they are on average;
-    # where that is does not matter: a template may lie anywhere. Gaussians have no
-    # template: the distance is that of the points themselves. Scene units.
+    # Mean distance, in scene units, of static points from their mean over time. Points
+    # are mapped to the template, whose own position is arbitrary. Gaussians have no
+    # template, so the distance is that of the points themselves.
     drift: float
-    # Root mean square of ||log Σ|| of the Jacobian at the true points; NaN where there
-    # is no Jacobian.
+    # Root mean square of ||log Σ||, where Σ are the singular values of the Jacobian of
+    # the deformation at the true points. NaN if there is no Jacobian.
     strain: float
 
 
@@ -84,25 +83,24 @@ def ground_truth(
       The selected ground truth.
 
     Raises:
-      ValueError: If the truth is not that of the capture.
+      ValueError: If the ground truth belongs to another capture.
     """
     moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     path = truths.track_places(capture, truth, moments)
     start = len(moments) // 2
-    chosen = np.flatnonzero(truth.track_seen[:, moments[start]])
-    if len(chosen):
-        chosen = evaluation.spread(chosen, tracks)
+    visible = np.flatnonzero(truth.track_seen[:, moments[start]])
+    points = evaluation.spread(visible, tracks) if len(visible) else visible
     return GroundTruth(
         rows=evaluation.spread(capture.heldout, frames),
         moments=moments,
-        path=path[chosen],
-        seen=truth.track_seen[chosen][:, moments],
+        path=path[points],
+        seen=truth.track_seen[points][:, moments],
         start=start,
     )
 
 
 def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, float]:
-    """Evaluate point tracks over the visible points of all times but the start.
+    """Evaluate point tracks at the visible points of all times except the start.
 
     Args:
       known: Ground truth.
@@ -121,7 +119,7 @@ def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, 
 
 
 def static_error(known: GroundTruth) -> float:
-    """Compute the end-point error of the prediction that nothing moves.
+    """Compute the end-point error of static tracks, the baseline of point tracks.
 
     Args:
       known: Ground truth.
@@ -131,16 +129,12 @@ def static_error(known: GroundTruth) -> float:
     """
     if not len(known.path):
         return float("nan")
-    return float(
-        _endpoints(
-            np.broadcast_to(known.start_points[:, None], known.path.shape),
-            known,
-        )[0]
-    )
+    static = np.broadcast_to(known.start_points[:, None], known.path.shape)
+    return float(_endpoints(static, known)[0])
 
 
 def _scored(known):
-    """Seen, and not given."""
+    """Return a mask of the visible points, except at the start."""
     scored = known.seen.copy()
     scored[:, known.start] = False
     return scored
@@ -152,10 +146,10 @@ def _endpoints(path, known):
     )
 
 
-@jax.jit  # by themselves its operations take longer to compile
+@jax.jit  # because its operations take longer to compile separately
 def _track_errors(path, truth, seen):
     return geometry_quality.track_errors(path, truth, seen, CORRECT_WITHIN)
 
 
-# (spec, metadata, state, capture, known, effects=()) -> None where nothing is warped
+# (spec, metadata, state, capture, known, effects=()) -> None without a deformation
 Follow = Callable[..., PointTracks | None]

@@ -1,7 +1,7 @@
-"""Interface of a representation to runs, which each package fills in one record.
+"""Interface between runs and representations (radiance fields, Gaussian splats).
 
-`nerfies_jax.runs` finds the records by the entry points of the group
-"nerfies_jax.representations", so it imports no package that has one.
+Each package provides a `Representation` as an entry point of the group
+"nerfies_jax.representations", so that `nerfies_jax.runs` imports none of them directly.
 """
 
 import pathlib
@@ -19,21 +19,20 @@ from nerfies_jax.metrics.part_time import StepParts
 from nerfies_jax.training.model import Model, TrainState
 
 Spec = Any
-MODEL = "model.npz"  # in a run folder: all of a trained scene of Gaussians
+MODEL = "model.npz"  # in a run folder: a complete trained scene of Gaussians
 
 
 class Saved(NamedTuple):
-    """Files of a trained scene, besides its checkpoint."""
+    """Exported files of a trained scene."""
 
-    model_bytes: int | None = None  # of the one file that holds all of it
-    notes: tuple[str, ...] = ()  # what the reader should know of them
-    coded_bytes: float | None = (
-        None  # of the same scene, by bits where a law is learned
-    )
+    model_bytes: int | None = None  # size of the file with the complete scene
+    notes: tuple[str, ...] = ()  # sentences about the files for the report
+    # Size of the same scene if parameters with a learned entropy model are coded by it.
+    coded_bytes: float | None = None
 
 
 class Player(NamedTuple):
-    """A page that plays a trained scene, and a description of its contents."""
+    """An interactive page of a trained scene, and a description of its contents."""
 
     path: pathlib.Path
     about: str
@@ -42,18 +41,19 @@ class Player(NamedTuple):
 class Choice(NamedTuple):
     """A preset with overrides.
 
-    Advice names the preset without "-small", a default preset as it is.
+    Recommendations name the preset without "-small". The name of a default preset is
+    complete.
     """
 
     preset: str
     overrides: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()  # what could not be decided or done
+    notes: tuple[str, ...] = ()  # on undecided or unsupported effects
 
 
 class Pair(NamedTuple):
-    """Two scenes of a preset that differ in one decision.
+    """Two variants of a preset that differ in one effect.
 
-    The names are those of the keys of `experiments.speed effects`.
+    The names are those in the metric keys of `experiments.speed effects`.
     """
 
     preset: str
@@ -62,10 +62,10 @@ class Pair(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Choices that a trained scene offers when it is rendered."""
+    """Options for rendering a trained scene."""
 
-    removable: tuple[str, ...]  # effects that it can be drawn without
-    appearance: bool  # whether it looks otherwise for each appearance id
+    removable: tuple[str, ...]  # effects that can be disabled
+    appearance: bool  # whether images depend on the appearance id
 
 
 class SplatCloud(NamedTuple):
@@ -73,27 +73,28 @@ class SplatCloud(NamedTuple):
 
     centers: np.ndarray  # [gaussians, 3], scene units
     covariances: np.ndarray  # [gaussians, 3, 3], scene units squared
-    rgb: np.ndarray  # [gaussians, 3] sRGB as seen from the camera; not clipped
+    rgb: np.ndarray  # [gaussians, 3] sRGB seen from the camera, not clipped
     opacity: np.ndarray  # [gaussians] in [0, 1]
     background: np.ndarray  # [3] sRGB
     view_dependent: bool  # whether `rgb` depends on the position of the camera
 
 
-# (state, time in [0, 1], appearance id, camera position [3]) -> the Gaussians then
+# (state, time in [0, 1], appearance id, camera position [3]) -> Gaussians
 Splatting = Callable[[TrainState, float, int, np.ndarray], SplatCloud]
 
 
 class Resources(NamedTuple):
     """Cores, memory and time that training needs."""
 
-    # Cores that XLA:CPU should see: "one" if its own threading slows the loops down.
+    # Cores that XLA:CPU should see: "one" if dividing its loops slows them down.
     threads: Literal["one", "all"] = "all"
-    # Number of equal shares of a spec's step, for as many devices.
+    # Number of equal shares that a step of a spec can be divided into, one per device.
     shares: Callable[[Spec], int] = lambda spec: 1
-    # (spec, capture) -> bytes of frames, first state and step; None: not checked
+    # (spec, capture) -> bytes of training frames, initial state and step. None disables
+    # the check.
     estimate_memory_bytes: Callable[[Spec, Capture], int] | None = None
-    memory_hint: str = ""  # which settings make the first state smaller
-    # Mean time of a step over a run, relative to one with the first state.
+    memory_hint: str = ""  # advice on settings that reduce the initial state
+    # Mean time of a step over a run, relative to one with the initial state.
     growth: Callable[[Spec, TrainState], float] = lambda spec, state: 1.0
     # (spec, metadata, model, state, frames) -> the parts of a step
     step_parts: Callable[..., StepParts] | None = None
@@ -105,8 +106,8 @@ class Scoring(NamedTuple):
     # True if rays are traced through the lens. Otherwise pinhole images are rendered,
     # and distorted before held-out frames are evaluated.
     traces_lenses: bool = False
-    # (spec, metadata, state, capture, rows) -> scores with codes fitted to half of each
-    # frame, None if the scene has no codes of its own for each frame
+    # (spec, metadata, state, capture, rows) -> metrics with codes fitted to half of
+    # each frame, or None if the model has no per-frame codes
     score_halves: Callable[..., Halves | None] = lambda *args: None
     fitted_rays: int = 0  # rendered to fit the codes of one frame
     follow: Follow = lambda *args: None
@@ -120,17 +121,16 @@ def _no_variants(spec, metadata, without, blended):
 class Products(NamedTuple):
     """Files and variants of a trained scene."""
 
-    # (folder, spec, metadata, state) -> files beside the checkpoint
+    # (folder, spec, metadata, state) -> exported files
     save: Callable[..., Saved] = lambda *args: Saved()
-    # (path, title, spec, model, state, capture, poster) -> a page that shows the scene
-    # from anywhere at any time
+    # (path, title, spec, model, state, capture, poster) -> an interactive page
     player: Callable[..., Player] | None = None
-    # (spec, metadata, names left out) -> the Gaussians of a trained scene, for other
-    # rasterizers
+    # (spec, metadata, disabled effects) -> a function that returns the Gaussians of a
+    # trained scene for another rasterizer
     splatting: Callable[..., Splatting] | None = None
-    # (spec, metadata) -> the effects that can be left out
+    # (spec, metadata) -> options for rendering
     parts: Callable[..., Parts] = lambda spec, metadata: Parts((), False)
-    # (spec, metadata, names left out, whether appearances are blended) -> model. With
+    # (spec, metadata, disabled effects, whether appearances are blended) -> model. With
     # blended appearances it renders a `nerfies_jax.scene.variants.Between` in place of
     # a view.
     variant: Callable[..., Model] = _no_variants
@@ -139,8 +139,8 @@ class Products(NamedTuple):
 class Recommendation(NamedTuple):
     """Presets and settings for a capture."""
 
-    # ({effect: True, False, or None if undecided}, whether in the sizes of the papers,
-    # preset of the user without "-small", or None) -> the choice
+    # ({effect: True if needed, None if undecided}, True for the sizes of the papers,
+    # preset of the user without "-small" or None) -> recommendation
     advise: Callable[[dict[str, bool | None], bool, str | None], Choice]
     # Preset of a capture if the user names none.
     default_preset: Callable[[Capture], Choice] | None = None
@@ -149,12 +149,12 @@ class Recommendation(NamedTuple):
 
 
 class Representation(NamedTuple):
-    """A kind of scenes that runs can train. The last four fields are optional."""
+    """A type of scene model that runs can train. The last four fields are optional."""
 
     name: str
     spec_type: type
     presets: dict[str, Spec]
-    with_steps: Callable[[Spec, int], Spec]  # schedules stretch with the steps
+    with_steps: Callable[[Spec, int], Spec]  # rescales schedules to the steps
     metadata_of: Callable[[Capture, Spec], Any]
     build: Callable[..., Model]  # (spec, metadata) -> model
     resources: Resources = Resources()
@@ -167,15 +167,15 @@ def check_there(without: tuple[str, ...], there: tuple[str, ...]) -> None:
     """Check that a trained scene can be rendered without some effects.
 
     Args:
-      without: Names of the effects to leave out.
-      there: Names of the removable effects.
+      without: Names of the effects to disable.
+      there: Names of the effects that can be disabled.
 
     Raises:
-      ValueError: If one of them is not removable.
+      ValueError: If one of them cannot be disabled.
     """
     for name in without:
         if name not in there:
             raise ValueError(
-                f"{name!r} is no effect that this run can be rendered without; "
-                f"those are: {', '.join(there) or 'none'}"
+                f"{name!r} cannot be disabled when this run is rendered; effects that "
+                f"can be: {', '.join(there) or 'none'}"
             )

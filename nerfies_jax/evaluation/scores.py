@@ -12,7 +12,7 @@ from nerfies_jax.metrics import image_quality
 from nerfies_jax.runtime import events
 from nerfies_jax.training.model import Rendering, TrainState, View
 
-Draw = Callable[[TrainState, View], Rendering]  # as a `Renderer` does
+Draw = Callable[[TrainState, View], Rendering]  # such as a `Renderer`
 
 
 class Scored(NamedTuple):
@@ -23,7 +23,7 @@ class Scored(NamedTuple):
     alpha: np.ndarray  # [frames, height, width]
     depth: np.ndarray  # [frames, height, width] z-depth, scene units
     psnr: np.ndarray  # dB, of the 8-bit image
-    ssim: np.ndarray  # scikit-image's Gaussian form
+    ssim: np.ndarray  # with Gaussian weights, as in scikit-image
 
 
 class Halves(NamedTuple):
@@ -39,7 +39,7 @@ def score(
 ) -> Scored:
     """Render frames of a capture and compare them with the captured images.
 
-    Metrics are those of the image after rounding to 8 bits, over the observed pixels.
+    Metrics are computed on images rounded to 8 bits, over the observed pixels.
 
     Args:
       renderer: The renderer.
@@ -53,7 +53,7 @@ def score(
     Raises:
       ValueError: If there are no frames.
     """
-    _check_some(rows, capture)
+    _check_rows(rows, capture)
     renderings, scores = [], []
     with events.stage("scoring held-out frames", len(rows)) as stage:
         for row in rows:
@@ -80,7 +80,7 @@ def score_halves(
     capture: Capture,
     rows: np.ndarray,
 ) -> Halves:
-    """Evaluate frames with unknown appearance by the protocol of NeRF-W.
+    """Evaluate frames with unknown appearance with the protocol of NeRF-W.
 
     Codes are fitted to the left half of a frame with the network frozen, and the right
     half is evaluated.
@@ -100,10 +100,10 @@ def score_halves(
     """
     colors = []
     for row in rows:
-        view, picture = view_of(capture, row), capture.images[row]
-        half = picture.shape[1] // 2
-        left = None if capture.valid is None else capture.valid[row, :, :half]
-        codes = fit_code(view, picture[:, :half], left)
+        view, image = view_of(capture, row), capture.images[row]
+        half = image.shape[1] // 2
+        valid = None if capture.valid is None else capture.valid[row, :, :half]
+        codes = fit_code(view, image[:, :half], valid)
         colors.append(np.asarray(render(view, codes).color))
     return score_right_halves(capture, rows, colors)
 
@@ -124,7 +124,7 @@ def score_right_halves(
     Raises:
       ValueError: If there are no frames.
     """
-    _check_some(rows, capture)
+    _check_rows(rows, capture)
     scores = []
     for row, color in zip(rows, colors, strict=True):
         half = color.shape[1] // 2
@@ -135,11 +135,11 @@ def score_right_halves(
     return Halves(np.asarray(rows), psnr, ssim)
 
 
-def _check_some(rows, capture):
+def _check_rows(rows, capture):
     if not len(rows):
         raise ValueError(
-            f"{capture.path or capture.name}: no rows to score; hold frames out when "
-            "the capture is read (heldout=8), or give rows of its training frames"
+            f"{capture.path or capture.name}: no frames to evaluate; hold out frames "
+            "when the capture is read (heldout=8), or pass rows of training frames"
         )
 
 
@@ -148,14 +148,14 @@ def known_mean(
 ) -> float:
     """Compute the mean of the values that are not NaN.
 
-    NaN is the metric of a frame without observed pixels.
+    Metrics of frames without observed pixels are NaN.
 
     Args:
       values: Values.
       mean: Another statistic in place of the mean.
 
     Returns:
-      The mean, NaN over nothing.
+      The mean, NaN if there are no values.
     """
     values = values[~np.isnan(values)]
     return float(mean(values)) if values.size else float("nan")
@@ -163,10 +163,10 @@ def known_mean(
 
 @jax.jit
 def _score(color, truth, valid):
-    picture = image_quality.quantize(color)
+    image = image_quality.quantize(color)
     if valid is None:
-        return image_quality.psnr(picture, truth), image_quality.ssim(picture, truth)
+        return image_quality.psnr(image, truth), image_quality.ssim(image, truth)
     return (
-        image_quality.masked_psnr(picture, truth, valid),
-        image_quality.masked_ssim(picture, truth, valid),
+        image_quality.masked_psnr(image, truth, valid),
+        image_quality.masked_ssim(image, truth, valid),
     )

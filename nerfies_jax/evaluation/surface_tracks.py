@@ -1,4 +1,4 @@
-"""Point tracks on the surfaces that a trained scene shows at one time."""
+"""Point tracks on the surfaces of a trained scene that are visible at one time."""
 
 from typing import NamedTuple
 
@@ -14,22 +14,21 @@ from nerfies_jax.evaluation.model_flow import Move
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.training.model import TrainState
 
-LEAST_ALPHA = 0.5  # below it a pixel shows no surface
-# A point counts as seen up to this share of its depth behind what is drawn there: a
-# drawn depth is a mean over what is soft. In a video of a bookshelf, 250 steps trained,
-# the depth drawn of a point differs from one frame to the next by 1 % below to 14 %
-# above its own, from the lower quartile to the upper.
-DEPTH_SLACK = 0.1
+MIN_ALPHA = 0.5  # of a pixel that shows a surface
+# A point is visible if its depth exceeds the rendered depth by at most this share,
+# because rendered depth is a mean over semi-transparent surfaces. In a video of a
+# bookshelf after 250 steps of training, the rendered depth of a point differs from its
+# own in the next frame by -1 % (lower quartile) to 14 % (upper quartile).
+DEPTH_TOLERANCE = 0.1
 
 
 class SurfaceTracks(NamedTuple):
-    """Points over training frames in the order of time, in NumPy."""
+    """Points over training frames in temporal order, in NumPy."""
 
-    positions: np.ndarray  # [points, frames, 3] scene units; the start where lost
-    # [points, frames] bool: followed, in the image, and not behind what is drawn
-    visible: np.ndarray
+    positions: np.ndarray  # [points, frames, 3] scene units, the start if not found
+    visible: np.ndarray  # [points, frames] bool: found, in the image and not occluded
     times: np.ndarray  # [frames] in [0, 1]
-    pixels: np.ndarray  # [points, frames, 2] in that frame's image, right and down
+    pixels: np.ndarray  # [points, frames, 2] in the image of the frame, right and down
     rows: np.ndarray  # [frames] of the capture
 
 
@@ -49,8 +48,8 @@ def follow(
       draw: Renderer.
       state: Trained state.
       capture: The capture.
-      count: Largest number of points, evenly spread over the image.
-      frames: Number of frames, evenly spread over the training frames. None for all.
+      count: Largest number of points, evenly spaced over the image.
+      frames: Number of frames, evenly spaced over the training frames. None for all.
       time: Time at which the points are selected, in the frame nearest to it.
 
     Returns:
@@ -66,16 +65,16 @@ def follow(
     here = view_of(capture, start)
     rendering = draw(state, here)
     surface_depth = np.asarray(rendering.depth)
-    shown = np.argwhere((rendering.alpha > LEAST_ALPHA) & (surface_depth > 0))
-    if not len(shown):
+    surface = np.argwhere((rendering.alpha > MIN_ALPHA) & (surface_depth > 0))
+    if not len(surface):
         raise ValueError(
-            f"nothing is drawn at time {capture.times[start]:g} to pick points from; "
-            "choose another, or train for longer"
+            f"the model renders no surface at time={capture.times[start]:g} to select "
+            "points on; choose another time, or train for more steps"
         )
-    line, column = spread(shown, count).T
+    line, column = spread(surface, count).T
     pixels = np.stack([column, line], axis=1) + 0.5
     points = model_flow.surface(here.camera, pixels, surface_depth[line, column])
-    places, seen, projected = [], [], []
+    positions, visible, projected = [], [], []
     for row in rows.tolist():
         there = view_of(capture, row)
         moved = move(state, points, here, there)
@@ -85,14 +84,14 @@ def follow(
         )
         column, line = np.where(inside[:, None], pixel, 0).astype(int).T
         surface_depth = np.asarray(rendering.depth)
-        in_front = depth <= surface_depth[line, column] * (1 + DEPTH_SLACK)
-        solid = rendering.alpha[line, column] > LEAST_ALPHA
-        places.append(moved.points)
-        seen.append(moved.found & inside & solid & in_front)
+        in_front = depth <= surface_depth[line, column] * (1 + DEPTH_TOLERANCE)
+        solid = rendering.alpha[line, column] > MIN_ALPHA
+        positions.append(moved.points)
+        visible.append(moved.found & inside & solid & in_front)
         projected.append(pixel)
     return SurfaceTracks(
-        positions=np.stack(places, axis=1).astype(np.float32),
-        visible=np.stack(seen, axis=1),
+        positions=np.stack(positions, axis=1).astype(np.float32),
+        visible=np.stack(visible, axis=1),
         times=times,
         pixels=np.stack(projected, axis=1).astype(np.float32),
         rows=rows,
@@ -122,7 +121,7 @@ def write(
     arrays = tracks._asdict()
     rows = arrays.pop("rows")
     arrays["frames"] = np.array([capture.ids[row] for row in rows])
-    # World coordinates may be large: float32 has meters of a map to 3 cm only.
+    # World coordinates may be large: float32 resolves map coordinates to only 3 cm.
     positions = places_in(units, capture, tracks.positions)
     arrays["positions"] = positions.astype(np.float32 if units == "scene" else float)
     with replaced_file(path) as partial:

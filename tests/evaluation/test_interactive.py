@@ -98,5 +98,5 @@ def test_channels_show_what_they_are_called():
     # What moved nothing at all is black, not the middle of a range of no length.
     still = picture("motion", distance=np.zeros((1, 2), np.float32))
     assert still.picture.max() < 10
-    with pytest.raises(ValueError, match="there are color, depth"):
+    with pytest.raises(ValueError, match="must be one of color, depth"):
         picture("heat")

@@ -146,7 +146,7 @@ def test_a_renderer_keeps_what_stays_and_drops_what_changes():
         equal = params | {name: params[name] + 0.0}  # of equal value, but another array
         assert drawn(equal, here) == (1, 1, 1)
         assert drawn(params, later) == (1, 1, 1)
-    assert renderer.deformed_anew == [True, False, False, *[True] * 8]
+    assert renderer.newly_deformed == [True, False, False, *[True] * 8]
 
 
 def test_a_survey_is_made_once_for_trained_parameters_and_their_step():
@@ -193,7 +193,7 @@ def test_nothing_is_kept_of_arrays_that_can_be_written_into():
 def test_a_frame_costs_what_it_costs_with_its_share_of_the_poses():
     renderer = evaluation.Renderer(MODEL, SIZE)
     renderer.seconds = [9.0, 0.010, 0.002, 0.030, 0.004, 0.010, 0.003]
-    renderer.deformed_anew = [True, True, False, True, False, True, False]
+    renderer.newly_deformed = [True, True, False, True, False, True, False]
     # Medians 0.010 of the three new instants and 0.003 of the other three.
     np.testing.assert_allclose(renderer.ms_per_frame(6), (3 * 10 + 3 * 3) / 6)
     np.testing.assert_allclose(renderer.ms_per_frame(1), 3)
@@ -255,7 +255,7 @@ def test_scores_are_those_of_the_picture_as_eight_bits():
             use_sample_covariance=False,
         )
         np.testing.assert_allclose(scored.ssim[place], ssim, atol=1e-4)
-    with pytest.raises(ValueError, match="no rows to score; hold frames out"):
+    with pytest.raises(ValueError, match="no frames to evaluate; hold out frames"):
         evaluation.score(renderer, state_at(10, 0.3), capture, capture.heldout[:0])
 
 

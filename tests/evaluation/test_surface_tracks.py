@@ -80,5 +80,7 @@ def test_a_picture_that_shows_nothing_has_no_points(capture):
         rendering = drawn(state, view)
         return rendering._replace(alpha=0 * rendering.alpha)
 
-    with pytest.raises(ValueError, match=r"nothing is drawn at time .* train for long"):
+    with pytest.raises(
+        ValueError, match=r"renders no surface at time=.* train for more"
+    ):
         surface_tracks.follow(moved, empty, state_of(1.0), capture, 5)

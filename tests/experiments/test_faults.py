@@ -19,7 +19,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 # Stands for a job: writes numbered files, slowly, and goes on where it was ended.
 SETUP = """
 import os, pathlib, subprocess, sys, time
-from nerfies_jax import console, stopping
+from nerfies_jax.runtime import console, stopping
 stopping.install()
 out = pathlib.Path("out")
 out.mkdir(exist_ok=True)

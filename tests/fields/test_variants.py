@@ -72,7 +72,7 @@ def test_what_cannot_be_left_out_or_blended_is_refused():
         dataclasses.replace(TINY_FIELD, appearance=None),
     )
     with pytest.raises(
-        ValueError, match=r"'appearance' is no effect .* those are: warp"
+        ValueError, match=r"'appearance' cannot be disabled .* that can be: warp"
     ):
         variants.without_effects(TINY_FIELD, metadata, ("appearance",), False)
     with pytest.raises(ValueError, match="has no appearance codes"):

@@ -143,10 +143,10 @@ def drawn_still(model, *args):
         (lambda m, s: variants.without_moving(m._replace(stages=None), s, 0.1),
          "--hide-moving is for runs of Gaussians"),
         (lambda m, _: variants.without_effects(*m.spec, ("warp",), False),
-         r"'warp' is no effect .* those are: motion"),
+         r"'warp' cannot be disabled .* that can be: motion"),
         (lambda m, _: variants.without_effects(
             scenes.TINY_SPLATS, m.spec[1], ("motion",), False),
-         r"'motion' is no effect .* those are: none"),
+         r"'motion' cannot be disabled .* that can be: none"),
         (lambda m, _: variants.without_effects(*m.spec, (), True),
          r"--appearance: splats .* nerf-w"),
     ],

@@ -120,7 +120,7 @@ def test_what_cannot_be_told_keeps_the_default_that_moves():
     spec, advice = spec_of("gaussians", motion=None)
     assert spec.motion is not None
     assert spec.start.motion == "none"  # there may be no tracks either
-    assert any("cannot tell" in note for note in advice.notes)
+    assert any("undecided" in note for note in advice.notes)
 
 
 def test_codes_and_media_come_in_where_the_preset_has_none():

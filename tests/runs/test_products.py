@@ -44,7 +44,9 @@ def test_a_run_that_learned_nothing_has_no_report():
     quality.check_learned(History(), known)
     with pytest.raises(FloatingPointError, match="the loss was 0 in all steps"):
         quality.check_learned(History(learned.rows[:1]), known)
-    with pytest.raises(FloatingPointError, match="none of the 1 held-out frames"):
+    with pytest.raises(
+        FloatingPointError, match="none of the 1 scored held-out frames"
+    ):
         quality.check_learned(learned, scored)
 
 
@@ -108,7 +110,7 @@ def test_a_profile_that_fails_loses_nothing_but_itself():
         with step_profile.profiling(run, state) as profile:
             step_ms, (note,) = profile()
         assert step_ms == {}
-        assert "is not known: KeyError: 'kept'" in note
+        assert "could not be measured: KeyError: 'kept'" in note
 
 
 def test_the_curve_and_the_headline_agree_visibly(tmp_path, monkeypatch):
