@@ -1,4 +1,4 @@
-"""Figures with axes, made by matplotlib, which comes with the extra `report`."""
+"""Figures with axes, made by matplotlib (extra `report`)."""
 
 import functools
 from typing import Any
@@ -11,7 +11,7 @@ library = functools.partial(extras.library, extra="report")
 def new_figure(**options: Any) -> Any:
     """Create a `matplotlib.figure.Figure` that can be saved, without pyplot.
 
-    pyplot keeps every figure and a global state.
+    pyplot would keep all figures in a global state.
 
     Args:
       **options: Arguments of the figure.

@@ -1,6 +1,6 @@
-"""Images to inspect a run: comparisons, color maps, contact sheets, a curve.
+"""Images to inspect a run: comparisons, color maps, contact sheets, curves.
 
-Functions take NumPy arrays and return uint8 [height, width, 3], or write one PNG.
+Functions take NumPy arrays and return uint8 [height, width, 3], or write a PNG file.
 """
 
 import functools
@@ -19,21 +19,21 @@ from nerfies_jax.capture import images
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.visualization import figures
 
-PANEL_WIDTH = 240  # pixels at least: smaller images are enlarged so labels fit
+PANEL_WIDTH = 240  # minimum in pixels. Smaller images are enlarged so that labels fit.
 GAP = 6  # pixels between panels
 TEXT_HEIGHT = 20
-INK, PAPER, FADED = (32, 33, 36), (255, 255, 255), (110, 113, 120)
-UNKNOWN = (128, 128, 128)  # gray is in none of the color maps
-# Rows of color_maps.png, 256 colors each, which are matplotlib's inferno and viridis
-# (CC0): a run is looked at without matplotlib.
+TEXT, BACKGROUND, CAPTION = (32, 33, 36), (255, 255, 255), (110, 113, 120)
+UNKNOWN = (128, 128, 128)  # gray, which no color map contains
+# Rows of color_maps.png, with the 256 colors of inferno and viridis (CC0) of
+# matplotlib, which need not be installed.
 ERROR_MAP, DEPTH_MAP = 0, 1
-# The share of depths beyond each end of the shown range; one stray splat in front of
-# the camera would otherwise turn the whole image into one color.
-STRAY_SHARE = 0.01
+# Share of depths beyond each end of the color range. Otherwise a single outlier in
+# front of the camera would turn the whole image into one color.
+OUTLIER_SHARE = 0.01
 
 
 class Colored(NamedTuple):
-    """A quantity as a color-mapped image, with the values of the map's two ends."""
+    """A color-mapped image, with the values of the two ends of the color map."""
 
     picture: np.ndarray  # [..., height, width, 3] uint8
     low: float
@@ -43,7 +43,7 @@ class Colored(NamedTuple):
 class History(NamedTuple):
     """PSNR over the course of a run, with one entry for each evaluation."""
 
-    seconds: Sequence[float]  # of training, without compiling
+    seconds: Sequence[float]  # of training, without compilation
     psnr: Sequence[float]  # dB, held-out frames
 
 
@@ -52,14 +52,14 @@ def color_depth(
     known: np.ndarray | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Colored:
-    """Map depth to viridis, near bright and far dark, unknown gray.
+    """Map depth to viridis: near is bright, far is dark, unknown is gray.
 
     All images share one range, so that frames can be compared.
 
     Args:
       depth: Depths, [..., height, width].
-      known: True where depth is known, of the same shape. None for all. Depths that are
-        not finite and positive are unknown in any case.
+      known: True for known depths, of the same shape. None for all. Depths that are not
+        finite and positive are always unknown.
       limits: Lowest and highest value. None for the 1st and 99th percentile of known
         depths.
 
@@ -67,13 +67,13 @@ def color_depth(
       The image and the range.
     """
     depth = np.asarray(depth, np.float32)
-    shown = np.isfinite(depth) & (depth > 0)
-    shown = shown if known is None else shown & known
+    positive = np.isfinite(depth) & (depth > 0)
+    known = positive if known is None else positive & known
     if limits is None:
-        limits = _limits(depth[shown])
+        limits = _limits(depth[known])
     low, high = limits
-    nearness = 1 - np.where(shown, depth - low, 0) / _span(low, high)
-    return Colored(_mapped(nearness, shown, DEPTH_MAP), low, high)
+    nearness = 1 - np.where(known, depth - low, 0) / _span(low, high)
+    return Colored(_apply_map(nearness, known, DEPTH_MAP), low, high)
 
 
 def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> Colored:
@@ -82,47 +82,43 @@ def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> C
     Args:
       image: Images in [0, 1] or uint8, [..., height, width, 3].
       truth: Ground truth of the same shape.
-      largest: Error shown in light yellow, as are larger ones.
+      largest: Error shown in light yellow. Larger errors have the same color.
 
     Returns:
-      The image, black for 0 and gray where either is not finite.
+      The image, black for 0 and gray for values that are not finite.
 
     Raises:
       ValueError: If `largest` is not positive.
     """
     if not largest > 0:
-        raise ValueError(
-            f"the error that is drawn brightest is positive, got {largest}"
-        )
+        raise ValueError(f"largest={largest} must be positive")
     error = np.mean(np.abs(as_unit(image) - as_unit(truth)), axis=-1)
-    shown = np.isfinite(error)
-    return Colored(
-        _mapped(np.where(shown, error, 0) / largest, shown, ERROR_MAP), 0, largest
-    )
+    known = np.isfinite(error)
+    unit = np.where(known, error, 0) / largest
+    return Colored(_apply_map(unit, known, ERROR_MAP), 0, largest)
 
 
 def color_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Colored:
-    """Map displacements to inferno, black for none and gray for unknown.
+    """Map displacements to inferno, black for zero and gray for unknown.
 
     Args:
       distance: Displacements in scene units, [..., height, width].
-      at_least: Smallest value for the bright end of the map, which is otherwise the
-        99th percentile.
+      at_least: Lower bound of the bright end of the map, which is the 99th percentile.
 
     Returns:
       The image and the range.
     """
-    shown = np.isfinite(distance)
-    largest = max(float(at_least), _limits(distance[shown])[1] if shown.any() else 0.0)
-    unit = np.where(shown, distance, 0) / _span(0.0, largest)
-    return Colored(_mapped(unit, shown, ERROR_MAP), 0.0, largest)
+    known = np.isfinite(distance)
+    largest = max(float(at_least), _limits(distance[known])[1] if known.any() else 0.0)
+    unit = np.where(known, distance, 0) / _span(0.0, largest)
+    return Colored(_apply_map(unit, known, ERROR_MAP), 0.0, largest)
 
 
 def color_flow(flow: np.ndarray, largest: float | int | None = None) -> Colored:
     """Map optical flow to colors: direction as hue, length as saturation.
 
-    Static is white, right is red, down yellow-green, left cyan, up violet, and unknown
-    gray.
+    Zero is white, right is red, down is yellow-green, left is cyan, up is violet, and
+    unknown is gray.
 
     Args:
       flow: Flow in pixels, [..., height, width, 2].
@@ -132,20 +128,18 @@ def color_flow(flow: np.ndarray, largest: float | int | None = None) -> Colored:
       The image and the range.
     """
     flow = np.asarray(flow, np.float32)
-    shown = np.all(np.isfinite(flow), axis=-1)
-    flow = np.where(shown[..., None], flow, 0)
+    known = np.all(np.isfinite(flow), axis=-1)
+    flow = np.where(known[..., None], flow, 0)
     length = np.linalg.norm(flow, axis=-1)
     if largest is None:
-        largest = (
-            float(np.quantile(length[shown], 1 - STRAY_SHARE)) if shown.any() else 1
-        )
+        largest = _limits(length[known])[1]
     hue = np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi) % 1
     saturation = np.clip(length / (largest or 1), 0, 1)
     color = skimage.color.hsv2rgb(
         np.stack([hue, saturation, np.ones_like(hue)], axis=-1)
     )
-    picture = np.where(shown[..., None], as_bytes(color), np.array(UNKNOWN, np.uint8))
-    return Colored(picture, 0.0, float(largest))
+    image = np.where(known[..., None], as_bytes(color), np.array(UNKNOWN, np.uint8))
+    return Colored(image, 0.0, float(largest))
 
 
 def comparison(
@@ -161,10 +155,10 @@ def comparison(
     Args:
       truth: Images in [0, 1] or uint8, [frames, height, width, 3].
       render: Renders of the same shape.
-      depth: Depths in scene units, [frames, height, width], with one color range.
-      captions: One caption above each row.
+      depth: Depths in scene units, [frames, height, width]. They share a color range.
+      captions: A caption for each row.
       largest_error: Error shown in light yellow.
-      known_depth: True where depth is known, [frames, height, width]. None for all.
+      known_depth: True for known depths, [frames, height, width]. None for all.
 
     Returns:
       The image, with color bars below.
@@ -175,9 +169,8 @@ def comparison(
     frames = len(truth)
     if not (len(render) == len(depth) == len(captions) == frames > 0):
         raise ValueError(
-            "a comparison pairs frames, got "
-            f"{frames} true, {len(render)} rendered, {len(depth)} depths and "
-            f"{len(captions)} captions; pass one of each for every row"
+            "a comparison needs a true image, a render, a depth map and a caption for "
+            f"each row, got {frames}, {len(render)}, {len(depth)} and {len(captions)}"
         )
     error = color_error(render, truth, largest_error)
     colored_depth = color_depth(depth, known_depth)
@@ -185,14 +178,14 @@ def comparison(
     columns = [_enlarged(column) for column in columns]
     width = columns[0].shape[2]
     titles = ("truth", "render", "error", "depth")
-    rows = [_beside([_text(title, width) for title in titles])]
+    rows = [_join_horizontally([_text(title, width) for title in titles])]
     for frame, caption in enumerate(captions):
-        rows.append(_text(caption, 4 * width + 3 * GAP, color=FADED))
-        rows.append(_beside([column[frame] for column in columns]))
-    blank = _paper(2 * TEXT_HEIGHT + GAP, width)
+        rows.append(_text(caption, 4 * width + 3 * GAP, color=CAPTION))
+        rows.append(_join_horizontally([column[frame] for column in columns]))
+    blank = _blank(2 * TEXT_HEIGHT + GAP, width)
     far, near = colored_depth.high, colored_depth.low
     rows.append(
-        _beside(
+        _join_horizontally(
             [
                 blank,
                 blank,
@@ -201,7 +194,7 @@ def comparison(
             ]
         )
     )
-    return _framed(_stacked(rows))
+    return _add_margin(_join_vertically(rows))
 
 
 def contact_sheet(
@@ -222,18 +215,21 @@ def contact_sheet(
     """
     if not len(pictures) == len(captions) > 0:
         raise ValueError(
-            f"a contact sheet needs one caption for each picture, got {len(pictures)} "
-            f"pictures and {len(captions)} captions"
+            f"a contact sheet needs a caption for each image, got {len(pictures)} "
+            f"images and {len(captions)} captions"
         )
-    cells = _enlarged(np.stack([as_bytes(picture) for picture in pictures]))
-    cells = [
-        _stacked([cell, _text(caption, cell.shape[1], color=FADED)])
-        for cell, caption in zip(cells, captions, strict=True)
+    enlarged = _enlarged(np.stack([as_bytes(picture) for picture in pictures]))
+    tiles = [
+        _join_vertically([image, _text(caption, image.shape[1], color=CAPTION)])
+        for image, caption in zip(enlarged, captions, strict=True)
     ]
-    columns = min(columns, len(cells))
-    cells += [_paper(*cells[0].shape[:2])] * (-len(cells) % columns)
-    rows = [_beside(cells[i : i + columns]) for i in range(0, len(cells), columns)]
-    return _framed(_stacked(rows))
+    columns = min(columns, len(tiles))
+    tiles += [_blank(*tiles[0].shape[:2])] * (-len(tiles) % columns)
+    rows = [
+        _join_horizontally(tiles[i : i + columns])
+        for i in range(0, len(tiles), columns)
+    ]
+    return _add_margin(_join_vertically(rows))
 
 
 class Final(NamedTuple):
@@ -241,8 +237,8 @@ class Final(NamedTuple):
 
     seconds: float  # of training
     psnr: float  # dB
-    frames: int  # that it is the mean of
-    watched: int  # frames that the history is of
+    frames: int  # number of frames that it is the mean of
+    watched: int  # number of frames of the history
 
 
 def curve(
@@ -250,19 +246,19 @@ def curve(
     path: str | pathlib.Path,
     final: Final | None = None,
 ):
-    """Draw the PSNR of held-out frames against seconds of training, as a PNG.
+    """Plot the PSNR of held-out frames against seconds of training, as a PNG.
 
     Args:
-      histories: One line for each, by name, with a mark at every evaluation.
+      histories: Histories by name. Each is a line with a marker for every evaluation.
         Evaluations that are not finite leave a gap.
       path: The PNG file.
-      final: A score that is marked next to the line of a single history.
+      final: Final PSNR of a single history, marked separately.
 
     Raises:
-      ValueError: There is no evaluation to draw.
+      ValueError: There are no evaluations.
     """
     if not any(len(history.seconds) for history in histories.values()):
-        raise ValueError(f"{path}: no evaluation to draw; evaluate at least once")
+        raise ValueError(f"{path}: no evaluations to plot; evaluate at least once")
     figure = figures.new_figure(figsize=(7.2, 4.2), dpi=130, layout="constrained")
     axes = figure.add_subplot()
     for name, history in histories.items():
@@ -292,7 +288,7 @@ def curve(
 
 
 def _mark_final(axes, final):
-    """Mark the score over all frames, below the end of the line over a few."""
+    """Mark the PSNR over all frames."""
     (line,) = axes.get_lines()
     line.set_label(f"{final.watched} frames during training")
     label = f"all {final.frames} frames after training"
@@ -311,7 +307,7 @@ def _mark_final(axes, final):
     )
 
 
-def save(picture: np.ndarray, path: str | pathlib.Path):
+def save(picture: np.ndarray, path: str | pathlib.Path) -> None:
     """Write an image as PNG, atomically.
 
     Args:
@@ -354,18 +350,19 @@ def as_unit(picture: np.ndarray) -> np.ndarray:
 def _limits(values):
     if values.size == 0:
         return 0.0, 1.0
-    low, high = np.quantile(values, [STRAY_SHARE, 1 - STRAY_SHARE])
+    low, high = np.quantile(values, [OUTLIER_SHARE, 1 - OUTLIER_SHARE])
     return float(low), float(high)
 
 
 def _span(low, high):
-    return high - low if high > low else 1.0  # a flat depth has one color
+    return high - low if high > low else 1.0  # a constant has one color
 
 
-def _mapped(unit, shown, row):
+def _apply_map(unit, known, row):
+    """Map values in [0, 1] to a row of the color maps, unknown ones to gray."""
     table = _tables()[row]
     index = np.round(np.clip(unit, 0, 1) * 255).astype(np.uint8)
-    return np.where(shown[..., None], table[index], np.array(UNKNOWN, np.uint8))
+    return np.where(known[..., None], table[index], np.array(UNKNOWN, np.uint8))
 
 
 @functools.cache
@@ -377,44 +374,44 @@ def _tables():
 
 @functools.cache
 def _font():
-    return PIL.ImageFont.load_default(15)  # the one that Pillow brings along
+    return PIL.ImageFont.load_default(15)
 
 
-def _text(words, width, color=INK, align="left"):
-    strip = PIL.Image.new("RGB", (width, TEXT_HEIGHT), PAPER)
+def _text(text, width, color=TEXT, align="left"):
+    strip = PIL.Image.new("RGB", (width, TEXT_HEIGHT), BACKGROUND)
     draw = PIL.ImageDraw.Draw(strip)
-    at = 0 if align == "left" else width - draw.textlength(words, font=_font())
-    draw.text((at, 0), words, fill=color, font=_font())
+    start = 0 if align == "left" else width - draw.textlength(text, font=_font())
+    draw.text((start, 0), text, fill=color, font=_font())
     return np.asarray(strip)
 
 
 def _bar(row, left, right, width):
-    """The color map from its low to its high end, with the two values below it."""
-    ramp = _tables()[row][np.linspace(0, 255, width).astype(int)]
+    """Show a color map, with the values of its two ends below it."""
+    colors = _tables()[row][np.linspace(0, 255, width).astype(int)]
     ends = np.minimum(_text(left, width), _text(right, width, align="right"))
-    return _stacked([np.repeat(ramp[None], TEXT_HEIGHT, 0), ends])
+    return _join_vertically([np.repeat(colors[None], TEXT_HEIGHT, 0), ends])
 
 
 def _enlarged(pictures):
-    """Enlarge by a whole factor, without smoothing, to show rendered pixels."""
+    """Enlarge by a whole factor without interpolation, so that pixels stay visible."""
     factor = max(1, math.ceil(PANEL_WIDTH / pictures.shape[2]))
     return pictures.repeat(factor, 1).repeat(factor, 2)
 
 
-def _paper(height, width):
-    return np.full((height, width, 3), PAPER, np.uint8)
+def _blank(height, width):
+    return np.full((height, width, 3), BACKGROUND, np.uint8)
 
 
-def _beside(panels):
-    gap = _paper(panels[0].shape[0], GAP)
+def _join_horizontally(panels):
+    gap = _blank(panels[0].shape[0], GAP)
     spaced = [part for panel in panels for part in (panel, gap)][:-1]
     return np.concatenate(spaced, axis=1)
 
 
-def _stacked(rows):
-    gap = _paper(GAP, rows[0].shape[1])
+def _join_vertically(rows):
+    gap = _blank(GAP, rows[0].shape[1])
     return np.concatenate([part for row in rows for part in (row, gap)][:-1], axis=0)
 
 
-def _framed(picture):
-    return np.pad(picture, ((GAP, GAP), (GAP, GAP), (0, 0)), constant_values=255)
+def _add_margin(image):
+    return np.pad(image, ((GAP, GAP), (GAP, GAP), (0, 0)), constant_values=255)

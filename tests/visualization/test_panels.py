@@ -135,7 +135,7 @@ def test_the_curve_is_a_picture_with_a_line_for_each_history(tmp_path):
     assert first.shape[1] == 936
     assert (second[..., :3] != first[..., :3]).any()
     assert [p.name for p in tmp_path.iterdir()] == ["psnr.png"]
-    with pytest.raises(ValueError, match="no evaluation to draw"):
+    with pytest.raises(ValueError, match="no evaluations to plot"):
         panels.curve({"one": panels.History([], [])}, path)
 
 
