@@ -339,9 +339,9 @@ def test_a_path_is_edited_saved_loaded_and_rendered(tmp_path, capsys):
         until(lambda: frames[2].time == 0.5)
         browser.press(page, label_of(page, "1: "), "✕")
         until(lambda: len(frames) == 2)
-        shown = len(page.path._drawn)
+        shown = len(page.path._handles)
         browser.press(page, "show path", False)
-        until(lambda: len(page.path._drawn) == 0 < shown)
+        until(lambda: len(page.path._handles) == 0 < shown)
         browser.press(page, "seconds", 0.2)
         browser.press(page, "save")
         saved = tmp_path / "exports" / "path-1.json"
