@@ -1,4 +1,4 @@
-"""Runnable studies and the main job: `python -m experiments.NAME`."""
+"""Commands, benchmarks and checks: `python -m experiments.NAME`."""
 
 import os
 import sys
@@ -10,12 +10,12 @@ def _leave_current_folder() -> None:
     A run folder from a stranger may be current and hold a `numpy.py`. The folder stays
     if this package was found in it, as in a checkout.
     """
-    asked = any(
+    by_name = any(
         word.removeprefix("-m").partition(".")[0] == "experiments"
         for word in sys.orig_argv
     )
     # While runpy looks for the module, argv[0] is "-m", and "-c" in no case.
-    if sys.argv[:1] != ["-m"] or not asked or sys.flags.safe_path:
+    if sys.argv[:1] != ["-m"] or not by_name or sys.flags.safe_path:
         return
     home = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
     if os.path.realpath(sys.path[0]) != home:

@@ -1,4 +1,4 @@
-"""The command line: settings read by tyro, wrong input told in one line.
+"""Command lines: settings parsed by tyro, wrong input reported in one line.
 
 JAX is not imported here, so `--help` is quick and `--device` can still choose the
 platform.
@@ -320,14 +320,14 @@ def formerly(option):
     return tyro.conf.arg(aliases=[option])
 
 
-RATE = 24.0  # frames per second of films and camera paths
+RATE = 24.0  # frames per second of videos and camera paths
 VIEW_PORT = 8080
 # Those of `nerfies_jax.capture.camera_paths`, which loads JAX.
 PATHS = ("sway", "orbit", "lemniscate", "stabilized", "captured")
 
 
 def check_frames(frames: int | None, path: str) -> None:
-    """Raise for a number of pictures that a camera path cannot have."""
+    """Raise ValueError for a number of images that a camera path cannot have."""
     if frames is None:
         return
     if frames < 1:

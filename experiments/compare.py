@@ -145,15 +145,15 @@ def _progress(folder, name):
     from nerfies_jax.runs import curves
 
     scores = folder / "metrics.json"
-    told = curves.course_of(folder)
-    if told is None or told.ended:
+    course = curves.course_of(folder)
+    if course is None or course.ended:
         return json.loads(scores.read_text()), ""
     metrics = {
-        "train.steps": told.step,
-        "train.seconds": told.seconds,
-        "train.compile_seconds": told.compile_seconds,
+        "train.steps": course.step,
+        "train.seconds": course.seconds,
+        "train.compile_seconds": course.compile_seconds,
     }
-    return metrics, f"{name} has not ended and has no final scores: {told.line()}."
+    return metrics, f"{name} has not ended and has no final scores: {course.line()}."
 
 
 def _names(folders):
@@ -283,7 +283,7 @@ def save(folder: pathlib.Path, compared, goals) -> None:
 
 
 def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
-    """Held-out frames: the truth and every run's picture, below them the errors."""
+    """Draw held-out frames: the truth, the renders of every run and their errors."""
     from nerfies_jax import evaluation, runs
     from nerfies_jax.visualization import panels
 
@@ -299,13 +299,13 @@ def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
     tiles, captions = [], []
     for place, row in enumerate(scored[0].rows):
         truth = capture.images[row]
-        filmed = None if capture.valid is None else capture.valid[row][..., None]
-        drawn = [evaluation.as_picture(each.color[place]) for each in scored]
-        if filmed is not None:  # what was not filmed is no error
-            truth, drawn = truth * filmed, [picture * filmed for picture in drawn]
-        errors = [panels.color_error(x, truth, LARGEST_ERROR).picture for x in drawn]
+        renders = [evaluation.as_picture(each.color[place]) for each in scored]
+        if capture.valid is not None:  # unobserved pixels are no error
+            valid = capture.valid[row][..., None]
+            truth, renders = truth * valid, [image * valid for image in renders]
+        errors = [panels.color_error(x, truth, LARGEST_ERROR).picture for x in renders]
         blank = truth * 0 + 255
-        tiles += [truth, *drawn, blank, *errors]
+        tiles += [truth, *renders, blank, *errors]
         captions += [capture.ids[row]]
         captions += [
             f"{run.name}: {each.psnr[place]:.2f} dB"

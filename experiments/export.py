@@ -1,11 +1,11 @@
 """Export a finished run for other programs: Gaussians, cameras, tracks, EXR.
 
-python -m experiments.export RUN ply --time 0.4          # the scene at one instant
+python -m experiments.export RUN ply --time 0.4          # the scene at one time
 python -m experiments.export RUN ply --frames 48         # a numbered sequence
 python -m experiments.export RUN splat
 python -m experiments.export RUN spz --units world
 python -m experiments.export RUN splatv                  # all times in one file
-python -m experiments.export RUN transforms              # cameras, pictures, points
+python -m experiments.export RUN transforms              # cameras, images, points
 python -m experiments.export RUN colmap --units world
 python -m experiments.export RUN nerfies
 python -m experiments.export RUN path --path stabilized  # camera_path.json, with times
@@ -22,7 +22,7 @@ from experiments import cli, render_folder
 from nerfies_jax.runs import platform, representations, run_folder
 from nerfies_jax.runtime import console, events
 
-# Which options each format knows, beside --out, --overwrite and --device.
+# Options of each format, in addition to --out, --overwrite and --device.
 GAUSSIANS = ("time", "frames", "units")
 PATHS = ("frames", "path")
 OPTIONS = {
@@ -208,7 +208,7 @@ def _splatv(args: Export, run: Any) -> str:
 
 
 def _cameras(args: Export, run: Any) -> str:
-    """The capture as the run learned from it: of splats without the lens."""
+    """Write the capture as the run was trained on it: undistorted for splats."""
     from nerfies_jax.capture import colmap_writer, nerfies_format, transforms_writer
     from nerfies_jax.capture.json_files import replaced_folder
 
@@ -234,7 +234,7 @@ def _path(args: Export, run: Any) -> str:
 
 
 def _planned(args: Export, run: Any) -> Any:
-    """A path with times: its own, or there and back as `experiments.render` goes."""
+    """Return a path with its times, or with those of `experiments.render`."""
     from nerfies_jax.capture import camera_paths, path_files, pinholes
 
     planned = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)

@@ -1,4 +1,4 @@
-"""Film a built-in moving scene into a Nerfies directory, with its truth beside.
+"""Render a built-in dynamic scene as a Nerfies directory, with its ground truth.
 
 python -m experiments.make_scene OUT [--preset NAME] [--frames N] [--set path=value]
 """
@@ -16,9 +16,9 @@ from nerfies_jax.training import specs
 
 @dataclasses.dataclass(frozen=True)
 class MakeScene:
-    """Film a built-in moving scene into a Nerfies directory.
+    """Render a built-in dynamic scene as a Nerfies directory.
 
-    `truth.npz` beside it holds flow, point tracks, thing ids and transient masks.
+    `truth.npz` in it holds flow, point tracks, thing ids and transient masks.
     """
 
     out: cli.Positional[pathlib.Path]
@@ -39,14 +39,14 @@ class MakeScene:
 
 @cli.command(MakeScene)
 def main(args):
-    """Parse, film, write, and say where it is."""
+    """Render and write the scene. Wrong input ends with exit code 2."""
     with cli.user_errors():
         platform.start_jax(args.device)
         from nerfies_jax.capture import synthetic
 
-        given = {"frames": args.frames, "size": args.size}
-        given = {name: value for name, value in given.items() if value is not None}
-        spec = dataclasses.replace(synthetic.PRESETS[args.preset], **given)
+        sizes = {"frames": args.frames, "size": args.size}
+        sizes = {name: value for name, value in sizes.items() if value is not None}
+        spec = dataclasses.replace(synthetic.PRESETS[args.preset], **sizes)
         spec = specs.override(spec, args.set)
         synthetic.write(spec, args.out, args.seed)
     width, height = spec.size

@@ -22,7 +22,7 @@ def with_spread(mean: float, spread: float, digits: int) -> str:
 
 
 def over_seeds(values: Sequence[float], digits: int) -> str:
-    """Their mean, and beside it the standard deviation where there are several."""
+    """Format the mean, and the standard deviation if there are several values."""
     spread = statistics.stdev(values) if len(values) > 1 else math.nan
     return with_spread(statistics.fmean(values), spread, digits)
 
@@ -53,19 +53,19 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -
 
 
 def bullets(lines: Iterable[str]) -> str:
-    """A list."""
+    """Format a list."""
     return "\n".join(f"- {line.strip()}" for line in lines)
 
 
 def outline(lines: Iterable[str]) -> str:
-    """A list, in which indented lines are below the one before that is not."""
+    """Format a list of two levels, from lines that are indented or not."""
     return "\n".join(
         f"  - {line.strip()}" if line.startswith(" ") else f"- {line}" for line in lines
     )
 
 
 def title_and_text(docstring: str | None) -> tuple[str, str]:
-    """A module's first line as a heading, and the rest of what it says."""
+    """Split a docstring into a heading, its first line, and the rest."""
     title, _, text = (docstring or "").strip().partition("\n")
     return f"# {title.rstrip('.:')}", text.strip("\n")
 

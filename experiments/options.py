@@ -82,10 +82,10 @@ def _kinds(settings):
 
 @functools.cache
 def shown(settings: type, offering: bool = False, top: bool = True) -> type:
-    """The same fields as tyro is to show them, with `--json` beside a command's own.
+    """Make a class for tyro with the fields of settings, and `--json` at the top.
 
-    Nested settings keep their defaults of the class. `offering` is for a shell, which
-    is told the names that are known.
+    Nested settings keep the defaults of their class. `offering` is for the completion
+    of a shell, which gets the known names.
     """
     heading_of, docs = _headings(settings), field_words(settings)
     parts: list[Entry] = []
@@ -107,8 +107,8 @@ def shown(settings: type, offering: bool = False, top: bool = True) -> type:
         place = under.get(heading_of.get(field.name), parts)
         place.append((field.name, annotated, entry))
     if top:
-        asked = tyro.conf.arg(help=JSON_HELP, help_behavior_hint="")
-        flag = Annotated[bool, asked, tyro.conf.FlagCreatePairsOff]
+        marks_of_json = tyro.conf.arg(help=JSON_HELP, help_behavior_hint="")
+        flag = Annotated[bool, marks_of_json, tyro.conf.FlagCreatePairsOff]
         parts.append((JSON.strip("-"), flag, dataclasses.field(default=False)))
     groups = list(itertools.starmap(_group, under.items()))
     doc = inspect.cleandoc(settings.__doc__ or "")
@@ -144,7 +144,7 @@ def _headings(settings):
 
 
 def _plain(kind, marks, offering):
-    """The type as a command line has it: a path is not a string besides."""
+    """Return the type on a command line: of a path or a string, the path."""
     known = next((mark for mark in marks if isinstance(mark, Known)), None)
     several = typing.get_origin(kind) is tuple
     if offering and known is not None:
@@ -170,7 +170,7 @@ def _words(doc, field):
 
 
 def _settled(settings, parsed):
-    """The settings themselves, of what tyro made of those that are shown."""
+    """Convert what tyro parsed to the settings themselves."""
     heading_of = _headings(settings)
     values = {}
     for field, kind, _ in _fields(settings):

@@ -1,4 +1,4 @@
-"""Make a capture out of something else: an archive of arrays, a film, or pictures.
+"""Convert an archive of arrays, a video or images to a capture.
 
 python -m experiments.prepare npz FILE OUT       images, poses, times, focal in one .npz
 python -m experiments.prepare video FILE OUT     sharp frames, cameras by COLMAP
@@ -23,8 +23,8 @@ How = Annotated[Preparation, tyro.conf.OmitArgPrefixes]
 class Npz:
     """Arrays `images`, `poses` (OpenGL camera to world), `focal` and `times`.
 
-    Where rows in a row share one pose, those are a validation sweep: they are held out,
-    the rows before them are learned from and the rows after them are left out.
+    If consecutive rows share one pose, they are a validation sweep and held out. The
+    rows before them are training frames, and the rows after them are left out.
     """
 
     file: cli.Positional[pathlib.Path]
@@ -39,7 +39,7 @@ class Npz:
 
 @dataclasses.dataclass(frozen=True)
 class Video:
-    """A film: its sharpest frames, their cameras by COLMAP, as a Nerfies directory."""
+    """Convert a video: its sharpest frames, with cameras from COLMAP."""
 
     file: cli.Positional[pathlib.Path]
     """The video."""
@@ -50,7 +50,7 @@ class Video:
 
 @dataclasses.dataclass(frozen=True)
 class Pictures:
-    """A folder of pictures: cameras by COLMAP, as a Nerfies directory."""
+    """Convert a folder of images, with cameras from COLMAP."""
 
     file: cli.Positional[pathlib.Path]
     """Folder of images, in the order of their names."""
@@ -61,8 +61,8 @@ class Pictures:
 
 @cli.command(Npz | Video | Pictures)
 def main(args):
-    """Parse, convert, and say what came out."""
-    record = None  # of arrays, whose cameras need not be found
+    """Convert. Wrong input ends with exit code 2."""
+    record = None  # arrays come with cameras
     with cli.user_errors():
         if isinstance(args, Npz):
             from nerfies_jax.capture import npz_archive

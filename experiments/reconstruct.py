@@ -1,10 +1,10 @@
-"""The main job: a filmed moving scene comes back as a model that can be looked at.
+"""Reconstruct a dynamic scene from a capture, a video or images.
 
     python -m experiments.reconstruct              # the built-in scene
     python -m experiments.reconstruct CAPTURE      # your own
-    python -m experiments.reconstruct CLIP.mp4     # a film, its cameras found first
+    python -m experiments.reconstruct CLIP.mp4     # a video: cameras first
 
-Leaves a run folder with checkpoints, metrics, pictures, a video and a report.
+Writes a run folder with checkpoints, metrics, images, a video and a report.
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ class Reconstruct:
     grids, exist with -small only (default: splats-tracked-small, splats-static-small if
     nothing moves, or spacetime-small without tracks if tracking fails)."""
     effects: Literal["preset", "auto"] = "preset"
-    """auto: look at the capture first and take the effects that it calls for, in the
+    """auto: inspect the capture first and enable the effects that it needs, in the
     representation and size of the preset (see experiments.inspect_scene)."""
     steps: int | None = None
     """Training steps. Schedules are stretched with them."""
@@ -84,10 +84,10 @@ class Reconstruct:
 
 @cli.command(Reconstruct)
 def main(args):
-    """Run the job of the command line.
+    """Train a run and write its products.
 
-    Exit code 0 where all went well, 1 where training blew up or could not be saved or
-    drawn, 2 where the input is wrong, and 128 and more for a signal.
+    The exit code is 1 if training diverged or results could not be written, 2 for
+    wrong input, and 128 + number after a signal.
     """
     try:
         outcome = _outcome(args)
@@ -171,7 +171,7 @@ def _watched(args):
 
 
 def _with_folder(args):
-    """The same with --out, where it is said by what was filmed."""
+    """Return the options with --out, the newest run of the capture if not given."""
     if args.out is not None:
         return args
     capture = args.source.capture

@@ -1,4 +1,4 @@
-"""Files of measured numbers, to which the same command adds until it is done."""
+"""Files of measurements, which the same command extends until it is done."""
 
 import json
 import pathlib

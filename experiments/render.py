@@ -3,12 +3,12 @@
 python -m experiments.render RUN                         # the held-out frames
 python -m experiments.render RUN --path orbit            # mp4 of the moving scene
 python -m experiments.render RUN --path sway --freeze 0.5
-python -m experiments.render RUN --path stabilized       # as filmed, without the shake
+python -m experiments.render RUN --path stabilized       # as captured, smoothed
 python -m experiments.render RUN --path camera_path.json # as nerfstudio writes it
 python -m experiments.render RUN --path sway --show depth
 python -m experiments.render RUN --path sway --show flow
 python -m experiments.render RUN --without warp          # the canonical scene
-python -m experiments.render RUN --hide-moving 0.02       # what stands still alone
+python -m experiments.render RUN --hide-moving 0.02       # the static scene
 python -m experiments.render RUN --path sway --freeze 0 --appearance 0 7
 python -m experiments.render RUN --path sway --knots 32   # the motion from a table
 python -m experiments.render RUN --path sway --static-threshold 1e-4
@@ -156,7 +156,7 @@ def main(args):
         _write(args, partial, renderer, state, names, views, picture_of)
         record = render_folder.record(made, args, files)
         json_files.write_json(partial / render_folder.RECORD, record)
-    return _told(out, renderer, len(names), files)
+    return _report(out, renderer, len(names), files)
 
 
 def _made(args, restored):
@@ -198,7 +198,7 @@ def _mover(args, run):
 
 
 def _shown(args, model, state):
-    """The state without what is hidden in all pictures."""
+    """Return the state without what is hidden in all images."""
     if args.hide_moving is None:
         return state
     from gaussians_jax.scene import variants
@@ -209,7 +209,7 @@ def _shown(args, model, state):
 
 
 def _faster(args, model, state):
-    """The model and its state, the motion from a table or of what moves alone."""
+    """Return the model and state with the motion from a table or of moving parts."""
     from gaussians_jax.scene import variants
 
     static_threshold = 0.0 if args.static_threshold is None else args.static_threshold
@@ -226,7 +226,7 @@ def _faster(args, model, state):
 
 
 def _blended(args, run, views):
-    """Views with, where that is wanted, each its share of the two appearances."""
+    """Return views that interpolate between the two appearances, if requested."""
     import jax.numpy as jnp
 
     from nerfies_jax.scene import variants
@@ -248,7 +248,7 @@ def _blended(args, run, views):
 
 
 def _views(args, run):
-    """Names and views of all pictures, and their size."""
+    """Return names and views of all images, and their size."""
     from nerfies_jax import evaluation
     from nerfies_jax.capture import camera_paths, path_files, pinholes
 
@@ -300,7 +300,7 @@ def _write(args, out, renderer, state, names, views, picture_of):
                 pass
 
 
-def _told(out, renderer, count, files):
+def _report(out, renderer, count, files):
     """Print the location of the render, and return the result as JSON values."""
     width, height = renderer.size
     ms = renderer.ms_per_frame(count)
@@ -314,9 +314,9 @@ def _told(out, renderer, count, files):
 
 
 class _Pictures:
-    """Renderings as 8-bit pictures.
+    """Convert renderings to 8-bit images.
 
-    Depths and flows are all over the range of the first that has any.
+    Depth and flow are normalized by the range of the first image that has any.
     """
 
     def __init__(self, show, move, state, views):

@@ -1,8 +1,8 @@
 """The folder of one render: its name, and the record of what made it.
 
 Renders of other settings have other names in RUN/renders. `render.json` in a folder
-says which request, checkpoint and revision made it, so that a folder is only replaced
-without being asked for where the same images would be rendered again.
+records the request, checkpoint and revision, so that a folder is only replaced without
+--overwrite if the same images would be rendered again.
 """
 
 import dataclasses

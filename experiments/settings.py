@@ -1,9 +1,9 @@
-"""All fields of a preset that `--set` can change: value, default, meaning and source.
+"""List the fields of a preset that `--set` changes: value, default and meaning.
 
     python -m experiments.settings splats-tracked-small
     python -m experiments.settings nerfies-small --json
 
-A line is what `--set` takes, and what it has now. Where a field holds one of several
+A line is an argument of `--set` with the present value. If a field holds one of several
 kinds of settings, or none, the kinds are named: `--set strategy=MCMCStrategySpec`.
 """
 
@@ -16,7 +16,7 @@ from experiments import cli
 from nerfies_jax.runs import platform, representations
 from nerfies_jax.runtime import console
 
-WIDTH, COLUMN = 88, 40  # of the page, and where words begin beside a field
+WIDTH, COLUMN = 88, 40  # of the page, and of the text next to a field
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +39,7 @@ def main(args):
 
 
 def described_preset(kind: Any, preset: str) -> dict[str, Any]:
-    """The preset's source and, by path, each field."""
+    """Describe the source of a preset and, by path, each field."""
     from nerfies_jax.training import spec_fields
 
     spec = kind.presets[preset]
@@ -60,7 +60,7 @@ def described_preset(kind: Any, preset: str) -> dict[str, Any]:
 
 
 def lines(described: dict[str, Any]) -> list[str]:
-    """For a person: fields under the settings that have them."""
+    """Format fields under the settings that have them."""
     groups: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]] = {}
     for path, field in described["fields"].items():
         above = path.rpartition(".")[0]
@@ -75,18 +75,18 @@ def lines(described: dict[str, Any]) -> list[str]:
 
 
 def _entry(assignment, field):
-    """The assignment, and beside it what the field can be and what it is."""
+    """Format an assignment with the kind and meaning of its field next to it."""
     said = [field["kind"]]
     if field["default"] not in ("", field["value"]):
         said.append(f"default {field['default']}")
     words = ", ".join(said) + (f"; {field['about']}" if field["about"] else "")
-    beside = textwrap.wrap(words, WIDTH - COLUMN)
+    notes = textwrap.wrap(words, WIDTH - COLUMN)
     if len(assignment) + 4 > COLUMN:
-        beside.insert(0, "")
-    heads = [f"  {assignment}", *[""] * (len(beside) - 1)]
+        notes.insert(0, "")
+    heads = [f"  {assignment}", *[""] * (len(notes) - 1)]
     return [
         f"{head:{COLUMN}}{text}".rstrip()
-        for head, text in zip(heads, beside, strict=True)
+        for head, text in zip(heads, notes, strict=True)
     ]
 
 

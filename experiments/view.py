@@ -1,4 +1,4 @@
-"""Look around in a run, in the browser: any view, any time, effects on and off.
+"""View a run in the browser: any view, any time, effects on and off.
 
 python -m experiments.view RUN                # and open the address it prints
 python -m experiments.view RUN --max-side 640
@@ -57,12 +57,12 @@ def main(args):
         restored = runs.restore(args.run, run)
         size = cli.sized(run.capture.size, args.max_side)
         page = viewer.Viewer(run, size, args.port, args.run)
-        told = curves.course_of(args.run)
+        course = curves.course_of(args.run)
         rows = (restored.record or {}).get("rows", ())
-        page.add_history(rows if told is None else told.training or rows)
-    if told is not None and not told.ended:
+        page.add_history(rows if course is None else course.training or rows)
+    if course is not None and not course.ended:
         console.say(
-            f"the run has not ended: {told.line()}; shown is what it saved last"
+            f"the run has not ended: {course.line()}; shown is what it saved last"
         )
     console.say(f"look around at {page.address} (Ctrl-C ends)")
     with contextlib.suppress(KeyboardInterrupt):
