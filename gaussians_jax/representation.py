@@ -1,4 +1,4 @@
-"""Gaussian splats, as `nerfies_jax.runs` finds them."""
+"""Gaussian splats as a `Representation` of `nerfies_jax.runs`."""
 
 import pathlib
 from typing import Any
@@ -13,8 +13,8 @@ from gaussians_jax.motion.basis import BasisMotionSpec
 from gaussians_jax.player import browser_splats, page
 from gaussians_jax.scene import (
     first_state,
+    gaussian_tracks,
     held_out_exposure,
-    point_tracks,
     presets,
     scene,
     step_time,
@@ -41,40 +41,43 @@ from nerfies_jax.training import specs
 from nerfies_jax.training.model import Model, TrainState
 from nerfies_jax.training.track_start import FROM_REST
 
-SMALL_PIXELS = 176 * 132  # for which the counts of the small presets were chosen
-# SE(3) bases by the paths: the first that explain four fifths of what the last do
-# beyond one body. Median misses of 1, 8, 12, 16, 20 and 24 groups, in 1e-4 of the unit:
-# 100, 33, 29, 29, 28, 26 of the built-in scene and 106, 30, 27, 25, 23, 23 of its fast
-# one (8), 160, 115, 108, 101, 102, 101 of a hand before books (12) and 128, 75, 69, 67,
-# 55, 53 of a bag that is handled (16). Held out, whole and where it moves, 8 beside 12:
-# 32.14 / 29.28 and 31.72 / 29.10 dB, 31.23 / 27.74 and 31.03 / 27.36, 38.26 / 34.28 and
-# 38.38 / 34.16 (one seed each).
+SMALL_PIXELS = 176 * 132  # image size that the counts of the small presets are for
+# Candidates for the number of SE(3) bases. The smallest is chosen that explains four
+# fifths of the residual that the largest explains beyond one rigid body. Median
+# residuals of 1, 8, 12, 16, 20 and 24 groups, in 1e-4 scene units (number chosen):
+# 100, 33, 29, 29, 28, 26 in the built-in scene and 106, 30, 27, 25, 23, 23 in its fast
+# variant (8), 160, 115, 108, 101, 102, 101 for a hand before books (12) and 128, 75,
+# 69, 67, 55, 53 for a bag that is handled (16). Held-out PSNR with 8 and with 12 bases,
+# in the whole image and in moving regions: 32.14 / 29.28 and 31.72 / 29.10 dB, 31.23 /
+# 27.74 and 31.03 / 27.36, 38.26 / 34.28 and 38.38 / 34.16 (one seed each).
 BASES, EXPLAINED = (8, 12, 16, 20, 24), 0.8
-# Share of the film through which tracks are followed on average: 0.68 and 0.56 in the
-# built-in scenes, 0.27 of a hand before books, 0.23 of a bag that is handled. The bag
-# with 8000 for 4100 lifted Gaussians: 27.28 / 22.39 for 27.16 / 22.04 dB, the hand with
-# 8000 for 4400 and 25 knots 39.15 / 34.83 for 39.22 / 34.86 in 1.2 times the time (one
-# seed each): hence the root.
+# Mean share of the video that a track covers: 0.68 and 0.56 in the built-in scenes,
+# 0.27 for a hand before books, 0.23 for a bag that is handled. Below `LONG`, more
+# moving Gaussians are initialized, by the square root of the ratio. The bag with 8000
+# instead of 4100 of them has 27.28 / 22.39 instead of 27.16 / 22.04 dB, the hand with
+# 8000 instead of 4400 and 25 knots 39.15 / 34.83 instead of 39.22 / 34.86 in 1.2 times
+# the time (one seed each), which is why the square root is used.
 LONG, MOST_TIMES = 0.5, 3.0
-# As in the built-in scenes, where 20 knots serve 60 frames.
+# The ratio of the built-in scenes, with 20 knots for 60 frames.
 FRAMES_A_KNOT, MOST_KNOTS = 3, 60
-# Between these advice chooses by whether anything moves.
+# Presets among which `advise` chooses by the presence of motion.
 ADVISED = ("splats-static", "splats-tracked", "splats-deformable")
-# What moves where nothing can be followed, of the small size and from rest. Held out in
-# equal seconds, and those of `splats-deformable-small` and `dynmf-small` from rest:
-# D-NeRF's lego 21.8 dB, 20.7 and 21.3; bookshelf 36.8, 34.5 and 36.4; built-in scene
-# 25.1, 24.6 and 25.9.
+# Preset for motion without usable tracks, in its small size and without them. Held-out
+# PSNR in equal time, compared with `splats-deformable-small` and `dynmf-small` without
+# tracks: D-NeRF's lego 21.8 dB, 20.7 and 21.3; bookshelf 36.8, 34.5 and 36.4; built-in
+# scene 25.1, 24.6 and 25.9.
 UNTRACKED = "spacetime"
-# Of a scene's spec: the motion, and what is nothing without one.
+# Settings of the motion, and those that have no effect without one.
 MOTION_PARTS = ("motion", "neighbors", *OF_MOTION)
 
 
 def growth(spec: Any, state: TrainState) -> float:
     """Predict how much longer the steps of a whole run take than its first steps.
 
-    The root of how many times the Gaussians may become, two at most. Built-in scene:
-    1.5 times from 4500 to 8379 under a cap of 10,000 (`splats-static-small`, 600
-    steps), 1.1 times from 7000 to the cap (`splats-tracked-small`, 250 steps).
+    The prediction is the square root of the growth in the number of Gaussians, at most
+    two. Built-in scene: 1.5 times from 4500 to 8379 under a cap of 10,000
+    (`splats-static-small`, 600 steps), 1.1 times from 7000 to the cap
+    (`splats-tracked-small`, 250 steps).
     """
     if spec.strategy is None:
         return 1.0
@@ -88,31 +91,32 @@ def save(
     metadata: Any,
     state: TrainState,
 ) -> Saved:
-    """`model.npz`, all of the scene, and `gaussians.ply` for viewers."""
+    """Write `model.npz`, the whole scene, and `gaussians.ply` for other viewers."""
     if not bool(splats.active_mask(state.params.rows["splats"]).any()):
         return Saved(notes=(f"No Gaussian is left, so there is no {MODEL}.",))
     about = {"spec": spec, "metadata": metadata, "step": int(state.step)}
     size = model_file.save(folder / MODEL, state.params, about)
-    every = scene.all_effects(spec, metadata)
-    drawn = deformation.drawn_rows(every, state.params)
-    files.save(folder / "gaussians.ply", drawn)
-    if all(effect.deform is None for effect in every):
+    effects = scene.all_effects(spec, metadata)
+    rendered = deformation.rendered_rows(effects, state.params)
+    files.save(folder / "gaussians.ply", rendered)
+    if all(effect.deform is None for effect in effects):
         return Saved(size)
     coded = None
     notes = ["gaussians.ply holds the canonical Gaussians, without their motion."]
     if isinstance(spec.motion, AnchorMotionSpec):
-        features, others = anchor_motion.kept_bytes(state.params, spec.motion)
+        features, others = anchor_motion.coded_bytes(state.params, spec.motion)
         coded = features + others
         notes.append(
-            f"The features of its anchors are {features / 1e6:.2f} MB by their bits "
-            f"under the learned law, the rest {others / 1e6:.2f} MB at 32 bits each "
-            f"({MODEL} holds all at 32 bits)."
+            f"The features of the anchors take {features / 1e6:.2f} MB with entropy "
+            f"coding by the learned distribution, the other parameters "
+            f"{others / 1e6:.2f} MB at 32 bits each ({MODEL} stores all of them at 32 "
+            "bits)."
         )
     if isinstance(spec.motion, BasisMotionSpec):
         notes.append(
-            f"{MODEL} holds all of the scene in {size / 1e6:.1f} MB. MoBa-GS reports "
-            "11.3 MB and 163 frames per second, on an A100, of other scenes: context, "
-            "no comparison."
+            f"{MODEL} holds the whole scene in {size / 1e6:.1f} MB. MoBa-GS reports "
+            "11.3 MB and 163 frames per second on an A100, for other scenes, so the "
+            "numbers are not comparable."
         )
     return Saved(size, tuple(notes), coded)
 
@@ -135,9 +139,9 @@ def player(
 def advise(
     wanted: dict[str, bool | None], full: bool, family: str | None = None
 ) -> Choice:
-    """The preset and its changes for what a capture calls for.
+    """Choose a preset and overrides for the needs of a capture.
 
-    A `family` that is none of `ADVISED` stays, unless it cannot move and should.
+    A `family` outside of `ADVISED` is kept, unless it has no motion and needs one.
     """
     overrides, notes = [], []
     moves = wanted.get(MOTION)
@@ -146,7 +150,7 @@ def advise(
         preset = "splats-tracked" if moves else "splats-static"
     if family is not None and family not in ADVISED:
         if moves and _spec_of(family, full).motion is None:
-            notes.append(f"{MOTION}: {family} has none; {preset} is taken")
+            notes.append(f"{MOTION}: {family} has none, so {preset} is used")
         else:
             preset = family
     spec = _spec_of(preset, full)
@@ -162,7 +166,7 @@ def advise(
     if wanted.get(LIGHT) is False and spec.exposure is not None:
         overrides.append("exposure=none")
     if wanted.get(TRANSIENT) and (moves is False or spec.motion is None):
-        notes.append(f"{TRANSIENT}: splats have no medium for it; prefer the field")
+        notes.append(f"{TRANSIENT}: splats cannot model transient objects; use a field")
     if wanted.get(START) is False:
         overrides.append("init.source=random")
     if wanted.get(DEPTH) and spec.depth is None:
@@ -177,33 +181,35 @@ def _spec_of(family, full):
 
 
 def default_preset(capture: Capture) -> Choice:
-    """The small preset by what tracks say of the capture, gathered or from the cache.
+    """Choose a small preset by the tracks of a capture, from the cache or computed.
 
-    Few rigid motions where tracks tell them, no motion where nothing moves, and
-    polynomials of each Gaussian, from rest, where tracks are of no use.
+    SE(3) bases are used if there are usable tracks, no motion if the scene is static,
+    and a polynomial per Gaussian otherwise.
     """
-    evidence = record.cached(capture, CACHE / "evidence")
-    reason = usable_paths.unusable(evidence)
-    start: tuple[str, ...] = ()
+    preprocessed = record.cached(capture, CACHE / "evidence")
+    reason = usable_paths.unusable(preprocessed)
+    without_tracks: tuple[str, ...] = ()
     name, notes = "splats-tracked-small", []
-    if reason and usable_paths.stands_still(evidence, capture.times):
+    if reason and usable_paths.stands_still(preprocessed, capture.times):
         name, notes = "splats-static-small", [reason]
     elif reason:
-        name, start = f"{UNTRACKED}-small", (FROM_REST,)
-        notes = [f"tracks are of no use: {reason}"]
-    spec = specs.override(presets.PRESETS[name], start)
-    paths = usable_paths.known_paths(evidence)
+        name, without_tracks = f"{UNTRACKED}-small", (FROM_REST,)
+        notes = [f"tracks are not usable: {reason}"]
+    spec = specs.override(presets.PRESETS[name], without_tracks)
+    paths = usable_paths.known_paths(preprocessed)
     followed = 1.0 if reason else float(paths.known.mean())
-    overrides = start + capacity(spec, capture.size, followed)
-    if overrides != start:
+    overrides = without_tracks + capacity(spec, capture.size, followed)
+    if overrides != without_tracks:
         size = "x".join(map(str, capture.size))
-        short = f" and tracks of {followed:.0%} of the film" if followed < LONG else ""
-        notes.append(f"for pictures of {size}{short}")
+        coverage = (
+            f" and tracks of {followed:.0%} of the video" if followed < LONG else ""
+        )
+        notes.append(f"for images of {size}{coverage}")
     if not reason:
         bases = rigid_groups.enough(paths.position, paths.known, BASES, EXPLAINED)
         if bases > spec.motion.bases:
             overrides += (f"motion.bases={bases}",)
-            notes.append(f"its tracks move as {bases} rigid things or more")
+            notes.append(f"the tracks move as {bases} rigid groups or more")
         frames = paths.known.shape[1]
         knots = min(round(frames / FRAMES_A_KNOT), MOST_KNOTS)
         if knots > spec.motion.knots:
@@ -215,12 +221,21 @@ def default_preset(capture: Capture) -> Choice:
 def capacity(
     spec: Any, size: tuple[int, int], followed: float = 1.0
 ) -> tuple[str, ...]:
-    """Overrides that let a small scene have more Gaussians where it needs them.
+    """Return overrides that allow more Gaussians for large images and short tracks.
 
-    With the root of the pixels beyond those of the built-in scene: detail grows with
-    the pixels, the time of a step with both. And more of what moves, with the root of
-    how much shorter tracks are than there, which are `followed` through that share of
-    the film: each is first seen for about as long. To two digits.
+    Counts are multiplied by the square root of the image size relative to the built-in
+    scene: details grow with the number of pixels, and the time of a step with both. The
+    number of moving Gaussians is also multiplied by the square root of the ratio of
+    track lengths, because each Gaussian is observed about as long as a track. Counts
+    are rounded to two digits.
+
+    Args:
+      spec: Settings of a small preset.
+      size: (width, height) of the images in pixels.
+      followed: Mean share of the video that a track covers.
+
+    Returns:
+      Overrides such as "init.points=5000".
     """
     share = max((size[0] * size[1] / SMALL_PIXELS) ** 0.5, 1.0)
     counts = {
@@ -229,9 +244,9 @@ def capacity(
     }
     if spec.start.motion == "tracks":
         moving = share * spec.start.moving_points
-        more = min(max(LONG / followed, 1.0) ** 0.5, MOST_TIMES) * moving
-        counts["start.moving_points"] = more
-        counts["strategy.cap_max"] += more - moving
+        count = min(max(LONG / followed, 1.0) ** 0.5, MOST_TIMES) * moving
+        counts["start.moving_points"] = count
+        counts["strategy.cap_max"] += count - moving
     if share <= 1 and counts.get("start.moving_points", 0) <= spec.start.moving_points:
         return ()
     return tuple(f"{k}={float(f'{n:.2g}'):.0f}" for k, n in counts.items())
@@ -245,10 +260,10 @@ GAUSSIANS = Representation(
     metadata_of=lambda capture, spec: scene.metadata_of(capture),
     build=scene.build,
     resources=Resources(
-        # Splats are tight loops. XLA splits their bodies over all cores it sees and
-        # gains nothing: 87 to 94 ms a training step with one, 94 to 109 with four
-        # (10,000 Gaussians, 176x132). With one, the bits do not depend on the core
-        # count either.
+        # Splatting consists of small loops. XLA splits them over all cores without a
+        # gain: a training step takes 87 to 94 ms with one thread and 94 to 109 with
+        # four (10,000 Gaussians, 176x132). With one, results also do not depend on the
+        # number of cores.
         threads="one",
         shares=lambda spec: spec.batch_size,
         estimate_memory_bytes=first_state.estimate_memory_bytes,
@@ -258,8 +273,8 @@ GAUSSIANS = Representation(
     ),
     scoring=Scoring(
         score_halves=held_out_exposure.score,
-        follow=point_tracks.follow,
-        mover=point_tracks.mover,
+        follow=gaussian_tracks.follow,
+        mover=gaussian_tracks.mover,
     ),
     products=Products(
         save=save,

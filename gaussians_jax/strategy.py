@@ -34,32 +34,35 @@ def select(
 ) -> Population:
     """Keep, copy and drop Gaussians, on the host.
 
-    Arrays grow and shrink in few sizes, so that few programs are compiled.
+    Arrays are padded to one of a few capacities, so that few programs are compiled.
 
     Args:
       population: The Gaussians.
-      rows: Indices of the rows that there are afterwards. A row that is named twice is
-        copied, and one that is not named is dropped.
-      fresh: Where the optimizer starts anew. None: nowhere.
+      rows: Indices of the Gaussians to keep, in their new order. An index that occurs
+        twice copies a Gaussian, and one that is missing drops it.
+      fresh: True where the optimizer state starts anew. None: nowhere.
 
     Returns:
       The selected Gaussians with their parameters and optimizer state.
+
+    Raises:
+      ValueError: If `rows` is empty.
     """
     count = len(rows)
     if not count:
-        raise ValueError("rows names no Gaussian; keep at least one")
+        raise ValueError("rows is empty; keep at least one Gaussian")
     capacity = splats.capacity_for(count)
-    idle = capacity - count
+    padding = capacity - count
     fresh = np.zeros(count, bool) if fresh is None else np.asarray(fresh)
-    params, moments = _selected(
+    params, moments = _gather(
         population.optimizer,
         population.params,
         population.moments,
-        np.pad(np.asarray(rows), (0, idle)).astype(np.int32),
-        np.pad(fresh, (0, idle)),
+        np.pad(np.asarray(rows), (0, padding)).astype(np.int32),
+        np.pad(fresh, (0, padding)),
         np.arange(capacity) >= count,
     )
     return population._replace(params=params, moments=moments)
 
 
-_selected = functools.partial(jax.jit, static_argnums=0)(row_optimizer.gather_rows)
+_gather = functools.partial(jax.jit, static_argnums=0)(row_optimizer.gather_rows)

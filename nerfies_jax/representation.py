@@ -12,11 +12,11 @@ from nerfies_jax.evaluation.representation import (
 from nerfies_jax.preprocessing.findings import BACKGROUND, LIGHT, MOTION, TRANSIENT
 from nerfies_jax.scene import (
     held_out_codes,
-    point_tracks,
     presets,
     scene,
     step_time,
     variants,
+    warp_tracks,
 )
 from nerfies_jax.training.track_start import FROM_REST
 
@@ -105,8 +105,8 @@ RADIANCE = Representation(
         traces_lenses=True,
         score_halves=held_out_codes.score,
         fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
-        follow=point_tracks.follow,
-        mover=point_tracks.mover,
+        follow=warp_tracks.follow,
+        mover=warp_tracks.mover,
     ),
     products=Products(parts=variants.parts, variant=variants.without_effects),
     recommendation=Recommendation(

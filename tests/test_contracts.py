@@ -314,7 +314,7 @@ REACH = {
     "lie.inverse_left_jacobian": 0.0,  # singular from 2π on
     "lie.log_se3": 0.5,
     # products of two inputs
-    **dict.fromkeys(["quaternion.exp", "quaternion.multiply", "splats.turned"], 0.45),
+    **dict.fromkeys(["quaternion.exp", "quaternion.multiply", "splats.rotate"], 0.45),
     **dict.fromkeys(["compositing.composite", "compositing.expected_distance"], 0.45),
     **dict.fromkeys(["losses.mse", "grids.total_variation"], 0.45),
     "distortion.distort": 0.1,  # seventh powers of the radius, and their slopes

@@ -1,9 +1,9 @@
 """Conversion between Gaussians and triangles, to view and edit them as a mesh.
 
-GaMeS (Waczyńska et al. 2024, arXiv:2402.01459), as D-MiSo uses it (arXiv:2405.14276,
-section 3): the first corner is the mean, and the other two are the ends of the second
-and third axes. A triangle does not contain the first scale, across the face, which is
-tiny and fixed there and is stored separately.
+Follows GaMeS (Waczyńska et al. 2024, arXiv:2402.01459) as D-MiSo uses it
+(arXiv:2405.14276, section 3). The first corner is the mean, and the other two are the
+ends of the second and third axes. The first scale, across the face, is tiny and fixed.
+It is not part of the triangle and is stored separately.
 """
 
 import jax
@@ -14,13 +14,20 @@ from gaussians_jax.core.splats import Gaussians
 from nerfies_jax.geometry import quaternion
 
 Vector = Float[Array, "3"]
-# Of the sine between two edges, in units of its precision: below, they count as one
-# line. The rest of the edge is then rounding.
+# Edges count as collinear if the sine of their angle is below this many machine
+# epsilons. The rejection of one from the other is then only rounding error.
 ONE_LINE = 8
 
 
 def corners(gaussians: Gaussians) -> Float[Array, "gaussians 3 3"]:
-    """The three corners of each, scene units: the mean, and the ends of two axes."""
+    """Convert Gaussians to triangles: the mean and the ends of two axes.
+
+    Args:
+      gaussians: The Gaussians.
+
+    Returns:
+      The three corners of each Gaussian in scene units.
+    """
     axes = jax.vmap(quaternion.to_matrix)(gaussians.quaternion)
     ends = jnp.swapaxes(axes * gaussians.scale[:, None], 1, 2)[:, 1:]
     first = gaussians.mean[:, None]
@@ -54,31 +61,32 @@ def gaussians(
 
 
 def _face(first, second):
-    """The rotation of two edges as a quaternion, and the scales along them."""
-    one, length = _unit(first)
-    other, far = _unit(second)
-    # A first edge without a length leaves all to the second one.
-    one = jnp.where(length > 0, one, _across(other))
-    across = _rejected(other, one)
-    flat = jnp.max(jnp.abs(across)) < ONE_LINE * jnp.finfo(one.dtype).eps
-    across = jnp.where(flat, _across(one), across)
-    across, _ = _unit(across)
-    # Once more: where edges are all but one line, the rest is mostly rounding.
-    across, _ = _unit(_rejected(across, one))
-    axes = jnp.stack([jnp.cross(one, across), one, across], axis=1)
-    width = jnp.where(flat, 0, far * jnp.sum(other * across))
+    """Return the rotation of two edges as a quaternion, and the scales along them."""
+    first_axis, length = _unit(first)
+    second_axis, second_length = _unit(second)
+    # If the first edge has no length, the second one determines the axes.
+    first_axis = jnp.where(length > 0, first_axis, _across(second_axis))
+    rejection = _rejected(second_axis, first_axis)
+    collinear = jnp.max(jnp.abs(rejection)) < ONE_LINE * jnp.finfo(first_axis.dtype).eps
+    rejection = jnp.where(collinear, _across(first_axis), rejection)
+    rejection, _ = _unit(rejection)
+    # Repeated, because the first rejection is mostly rounding if the edges are almost
+    # collinear.
+    rejection, _ = _unit(_rejected(rejection, first_axis))
+    axes = jnp.stack([jnp.cross(first_axis, rejection), first_axis, rejection], axis=1)
+    width = jnp.where(collinear, 0, second_length * jnp.sum(second_axis * rejection))
     return quaternion.from_matrix(axes), jnp.stack([length, width])
 
 
 def _unit(vector):
     """Return direction and length; the x axis and zero for a zero vector."""
     largest = jnp.max(jnp.abs(vector))
-    nothing = largest < jnp.finfo(vector.dtype).tiny
-    # Scaled first: in float32 squares are lost from 1e-19 down.
-    held = jnp.where(nothing, 1, jax.lax.stop_gradient(largest))
-    away = jnp.where(nothing, jnp.eye(3, dtype=vector.dtype)[0], vector / held)
-    length = jnp.sqrt(jnp.sum(away * away))
-    return away / length, jnp.where(nothing, 0, length * held)
+    is_zero = largest < jnp.finfo(vector.dtype).tiny
+    # Scaled first, because squares underflow in float32 below 1e-19.
+    divisor = jnp.where(is_zero, 1, jax.lax.stop_gradient(largest))
+    scaled = jnp.where(is_zero, jnp.eye(3, dtype=vector.dtype)[0], vector / divisor)
+    length = jnp.sqrt(jnp.sum(scaled * scaled))
+    return scaled / length, jnp.where(is_zero, 0, length * divisor)
 
 
 def _rejected(vector: Vector, unit: Vector) -> Vector:

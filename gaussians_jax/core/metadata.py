@@ -6,19 +6,20 @@ import math
 
 @dataclasses.dataclass(frozen=True)
 class SceneMetadata:
-    """Sizes of a capture that a scene of Gaussians depends on.
+    """Sizes and bounds of a capture that a scene of Gaussians depends on.
 
     Attributes:
-      extent: Spread of the cameras, scene units.
+      extent: Spread of the cameras in scene units.
       background: Color behind the Gaussians, sRGB in [0, 1].
       frames: Number of training frames.
-      exposures: For each appearance id the two rows of the exposure table it lies
-        between and its position between them, as in
+      exposures: For each appearance id, two row indices of the exposure table and the
+        interpolation weight of the second, as in
         `nerfies_jax.capture.scene_metadata`.
-      box: Low and high corner of the observed volume, scene units. None: unknown.
-      near: Smallest z-depth of the observed volume, scene units.
-      depth: z-depth halfway into the observed volume, scene units.
-      times: Number of distinct frame times. None: each frame has its own.
+      box: Minimum and maximum corner of the observed volume in scene units. None if
+        unknown.
+      near: Smallest z-depth of the observed volume in scene units.
+      depth: z-depth in the middle of the observed volume in scene units.
+      times: Number of distinct frame times. None if each frame has its own.
     """
 
     extent: float
@@ -32,5 +33,5 @@ class SceneMetadata:
 
     @property
     def moments(self) -> int:
-        """Number of distinct training times, fewer than frames with several cameras."""
+        """Number of distinct training times, which several cameras may share."""
         return self.frames if self.times is None else self.times

@@ -1,8 +1,8 @@
 """Extension points of a scene of Gaussians.
 
-A value of a field of `SplatScene` is either the object with the functions of its
-protocol, or settings with `bind(steps, metadata)`, which returns that object for a run
-of so many steps of a capture. The built-in parts are of the second kind.
+A field of `SplatScene` takes either an object that implements the protocol, or settings
+with a method `bind(steps, metadata)` that returns such an object for one training run.
+The built-in components are settings.
 """
 
 import dataclasses
@@ -48,12 +48,12 @@ class MotionParams(NamedTuple):
 class Motion(Protocol):
     """Motion of the Gaussians over time.
 
-    Optional members: `precompute(params, gaussians)` returns the cache of `apply`,
-    which does not depend on the time; without it the cache is None.
+    Optional members: `precompute(params, gaussians)` returns the cache that `apply`
+    receives. The cache must not depend on the time, and is None without this method.
     `loss(params, context)` adds terms to the loss, as `Regularizer.loss` does.
-    `fit(paths, key)` returns a `path_fit.Guess`, from which a fit to tracks starts.
-    `warm_up` is the number of steps before which nothing moves. `name` is the key of
-    its parameters and metrics; the default is the class name in snake case.
+    `fit(paths, key)` returns a `motion_fit.Guess`, from which a fit to tracks starts.
+    `warm_up` is the number of steps before the motion begins. `name` is the key of its
+    parameters and metrics, by default the class name in snake case.
 
     Attributes:
       learning_rate: A float, a schedule of the traced step, or `MotionParams` with one
@@ -70,10 +70,10 @@ class Motion(Protocol):
 
         Args:
           key: PRNG key of this motion.
-          gaussians: The Gaussians that it is to move.
+          gaussians: The Gaussians to move.
 
         Returns:
-          Parameters with one row for each of `gaussians`, and shared ones.
+          Parameters with one row for each of `gaussians`, and shared parameters.
         """
         ...
 
@@ -89,9 +89,9 @@ class Motion(Protocol):
         Args:
           params: Parameters of this motion.
           cache: Result of `precompute`.
-          gaussians: Gaussians in their canonical state, or as the part before this one
-            left them.
-          frame: Time in [0, 1] over the capture; `step` and `key` while training.
+          gaussians: Gaussians in their canonical state, or as the previous component
+            returned them.
+          frame: Time in [0, 1] over the capture, and `step` and `key` in training.
 
         Returns:
           The moved Gaussians.
@@ -101,7 +101,7 @@ class Motion(Protocol):
 
 @runtime_checkable
 class Appearance(Protocol):
-    """Change of the rendered image from one appearance id (exposure) to the next."""
+    """Appearance model: maps a render to the exposure or color of an observed frame."""
 
     @property
     def learning_rate(self) -> LearningRate:
@@ -124,10 +124,10 @@ class Appearance(Protocol):
 
 @runtime_checkable
 class CameraOptimizer(Protocol):
-    """Corrections of the training cameras that are learned with the scene.
+    """Refinement of the training cameras together with the scene.
 
     Optional member: `apply_to_capture(params, capture)` returns the capture with the
-    refined cameras of all frames, those held out as well; host side.
+    refined cameras of all frames, including held-out ones, on the host.
     """
 
     @property
@@ -145,30 +145,31 @@ class CameraOptimizer(Protocol):
 
 
 class StepInfo(NamedTuple):
-    """Observation of the Gaussians in one view of a training step.
+    """Statistics of the Gaussians in one view of a training step.
 
     Attributes:
-      mean2d_gradient: Gradient of the view's own loss with respect to the projected
+      mean2d_gradient: Gradient of the loss of this view with respect to the projected
         means, per pixel.
-      visible: Whether a Gaussian reaches into the image.
-      radius_px: Radius of its footprint.
+      visible: True where the footprint of a Gaussian overlaps the image.
+      radius_px: Radius of the footprint in pixels.
       size: (width, height) of the image in pixels.
       canonical: The Gaussians in their canonical state.
-      moved: The same at the time of the frame.
-      significance: Weight of each drawn Gaussian for its row, where rows carry several.
+      moved: The Gaussians at the time of the frame.
+      significance: Weight of each rendered Gaussian in the statistics of its parent.
+        None if Gaussians have no children.
     """
 
-    mean2d_gradient: Float[Array, "drawn 2"]
-    visible: Bool[Array, " drawn"]
-    radius_px: Float[Array, " drawn"]
+    mean2d_gradient: Float[Array, "rendered 2"]
+    visible: Bool[Array, " rendered"]
+    radius_px: Float[Array, " rendered"]
     size: tuple[int, int]
     canonical: Gaussians
     moved: Gaussians
-    significance: Float[Array, " drawn"] | None = None
+    significance: Float[Array, " rendered"] | None = None
 
 
 class Population(NamedTuple):
-    """The Gaussians of a scene in training, for an event of a `Strategy`.
+    """The Gaussians of a scene in training, as an event of a `Strategy` receives them.
 
     Attributes:
       params: Parameters of the scene.
@@ -176,8 +177,8 @@ class Population(NamedTuple):
       state: State of the strategy.
       key: PRNG key of this step.
       step: Number of completed steps.
-      extent: Spread of the cameras, scene units.
-      optimizer: The optimizer, which knows its state.
+      extent: Spread of the cameras in scene units.
+      optimizer: The optimizer that `moments` belongs to.
     """
 
     params: Params
@@ -190,14 +191,14 @@ class Population(NamedTuple):
 
 
 class StrategyEvent(NamedTuple):
-    """A change of the Gaussians between two steps.
+    """A change of the set of Gaussians between two steps.
 
     Attributes:
       name: Name in logs.
-      steps: Numbers of completed steps after which it happens, sorted.
-      apply: Returns the changed population; host side.
-      changes_rows: Whether Gaussians come, go or change their places. The strategy's
-        state is then initialized anew.
+      steps: Numbers of completed steps after which the event happens, sorted.
+      apply: Returns the changed population, on the host.
+      changes_rows: True if Gaussians are added, removed or reordered. The state of the
+        strategy is then initialized again.
     """
 
     name: str
@@ -208,11 +209,11 @@ class StrategyEvent(NamedTuple):
 
 @runtime_checkable
 class Strategy(Protocol):
-    """Control of the number of Gaussians, as gsplat's strategies.
+    """Control of the number of Gaussians, as in gsplat's strategies.
 
     Optional members: `loss(params, context)` adds terms to the loss, as
-    `Regularizer.loss` does. `perturb(key, params, learning_rate)` returns the
-    parameters after each update; `learning_rate` is that of the means.
+    `Regularizer.loss` does. `perturb(key, params, learning_rate)` returns changed
+    parameters after each update, where `learning_rate` is that of the means.
 
     Attributes:
       cap_max: Largest number of Gaussians.
@@ -224,25 +225,25 @@ class Strategy(Protocol):
         ...
 
     def init(self, gaussians: Splats) -> PyTree:
-        """Return the state between two events: arrays, or () without any."""
+        """Return the initial state: a pytree of arrays, or () without any."""
         ...
 
     def update(self, state: PyTree, info: StepInfo) -> PyTree:
-        """Return the state after one more view, traced."""
+        """Return the state after one more view. This function is traced."""
         ...
 
     def events(self, steps: int) -> tuple[StrategyEvent, ...]:
-        """Return the events of a run of so many steps."""
+        """Return the events of a run of this many steps."""
         ...
 
 
 def bound(part: Any, steps: int, metadata: SceneMetadata) -> Any:
-    """Return the object with the functions of a part of a scene.
+    """Return the object that implements a component of a scene.
 
     Args:
-      part: An object of a protocol, or settings with `bind`.
-      steps: Length of the run.
-      metadata: Sizes of the capture.
+      part: An object that implements a protocol, or settings with `bind`.
+      steps: Number of training steps.
+      metadata: Metadata of the capture.
     """
     return part.bind(steps, metadata) if hasattr(part, "bind") else part
 
@@ -254,7 +255,7 @@ def moving_at_once(motion: Any) -> Any:
     return dataclasses.replace(motion, warm_up=0)
 
 
-# Optional members of built-in motions whose Gaussians carry others, or fade.
+# Optional members of built-in motions that have child Gaussians or temporal opacity.
 _HOOKS = ("derive_rows", "derive", "significance", "lifted_rows")
 
 
@@ -262,35 +263,37 @@ def compile_motion(motion: Motion) -> SplatRecord:
     """Compile a motion to the internal record that a scene is built from."""
     name = name_of(motion)
 
-    def own(scene):
+    def own_params(scene):
         return MotionParams(scene.rows.get(name), scene.nets.get(name))
 
-    more = {hook: getattr(motion, hook) for hook in _HOOKS if hasattr(motion, hook)}
+    hooks = {hook: getattr(motion, hook) for hook in _HOOKS if hasattr(motion, hook)}
     if getattr(motion, "moves", True):
-        more["deform"] = lambda scene, gaussians, frame, cache: motion.apply(
-            own(scene), cache, gaussians, frame
+        hooks["deform"] = lambda scene, gaussians, frame, cache: motion.apply(
+            own_params(scene), cache, gaussians, frame
         )
     if hasattr(motion, "precompute"):
-        more["prepare"] = lambda scene: motion.precompute(
-            own(scene), scene.rows["splats"]
+        hooks["prepare"] = lambda scene: motion.precompute(
+            own_params(scene), scene.rows["splats"]
         )
     if hasattr(motion, "refresh"):
-        more["state"] = lambda scene: motion.refresh(own(scene), scene.rows["splats"])
-        more["ready_by_state"] = True
+        hooks["state"] = lambda scene: motion.refresh(
+            own_params(scene), scene.rows["splats"]
+        )
+        hooks["ready_by_state"] = True
     if hasattr(motion, "loss"):
-        more["penalty"] = lambda _, context: as_terms(
-            motion.loss(own(context.params), context)
+        hooks["penalty"] = lambda _, context: as_terms(
+            motion.loss(own_params(context.params), context)
         )
     if hasattr(motion, "project"):
-        more["revise"] = motion.project
-        more["revise_at"] = getattr(motion, "project_steps", ())
+        hooks["revise"] = motion.project
+        hooks["revise_at"] = getattr(motion, "project_steps", ())
     return SplatRecord(
         name,
         init=motion.init,
         learning_rate=functools.partial(rate_at, motion.learning_rate),
         warm_up=getattr(motion, "warm_up", 0),
         fit_to_paths=getattr(motion, "fit", None),
-        **more,
+        **hooks,
     )
 
 
@@ -301,14 +304,17 @@ def compile_appearance(appearance: Appearance) -> SplatRecord:
 
 def compile_camera_optimizer(optimizer: CameraOptimizer) -> SplatRecord:
     """Compile a camera optimizer to the internal record."""
-    found = getattr(optimizer, "apply_to_capture", None)
-    return SplatRecord(**_hooks(optimizer), pose=optimizer.apply, found=found)
+    apply_to_capture = getattr(optimizer, "apply_to_capture", None)
+    return SplatRecord(
+        **_hooks(optimizer), pose=optimizer.apply, found=apply_to_capture
+    )
 
 
 def compile_regularizer(regularizer: Regularizer) -> SplatRecord:
-    """Compile a regularizer, which may have parameters, to the internal record.
+    """Compile a regularizer to the internal record.
 
-    Those are its `init(key)` and `learning_rate`; it finds them in `params.nets`.
+    A regularizer may have parameters, from its `init(key)` and `learning_rate`. Its
+    loss finds them in `params.nets`.
     """
     hooks = regularizer_hooks(regularizer)
     if hasattr(regularizer, "init"):
@@ -317,7 +323,7 @@ def compile_regularizer(regularizer: Regularizer) -> SplatRecord:
 
 
 def _hooks(part):
-    """The hooks of a part that has shared parameters alone."""
+    """Return the hooks of a component that has only shared parameters."""
     return {
         "name": name_of(part),
         "init": lambda key, gaussians: MotionParams(shared=part.init(key)),
@@ -330,17 +336,19 @@ def _hooks(part):
 def initialized(
     parts: tuple[SplatRecord, ...], key: Key[Array, ""], scene: Params
 ) -> Params:
-    """Return a scene with the initial parameters of its parts, on the host.
+    """Add the initial parameters of all components to a scene, on the host.
 
-    Each part has a key of its own by its name, whatever other parts there are.
+    The PRNG key of a component depends on its name only, not on the other components.
     """
     rows, nets = dict(scene.rows), dict(scene.nets)
     for part in parts:
         if part.init is None:
             continue
-        own = part.init(jax.random.fold_in(key, stream(part.name)), rows["splats"])
-        if own.per_gaussian is not None:
-            rows[part.name] = own.per_gaussian
-        if own.shared is not None:
-            nets[part.name] = own.shared
+        own_params = part.init(
+            jax.random.fold_in(key, stream(part.name)), rows["splats"]
+        )
+        if own_params.per_gaussian is not None:
+            rows[part.name] = own_params.per_gaussian
+        if own_params.shared is not None:
+            nets[part.name] = own_params.shared
     return Params(rows, nets)

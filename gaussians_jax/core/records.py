@@ -12,50 +12,54 @@ from nerfies_jax.training.effects import FrameCondition, PyTree, Record
 
 @dataclasses.dataclass(frozen=True)
 class SplatRecord(Record):
-    """Hooks of a part of a scene of Gaussians, None where a part has none.
+    """Hooks of a component of a scene of Gaussians. None disables a hook.
 
-    `params` are the part's shared parameters, None without any; `scene` is the
-    `splats.Params` of all, for deforming takes rows.
+    `params` are the shared parameters of the component, or None if it has none. `scene`
+    are the `splats.Params` of the whole scene, because a deformation needs the
+    per-Gaussian parameters.
     """
 
-    # (time of the picture, for how long tracks near were followed) [gaussians] each, in
-    # films -> the rows of those lifted from moving pixels; host side
+    # ([gaussians] frame times, [gaussians] durations of the nearby tracks, both as
+    # shares of the video) -> per-Gaussian parameters of the Gaussians that are lifted
+    # from moving pixels. Host side.
     lifted_rows: Callable[[Any, Any], PyTree] | None = None
-    warm_up: int = 0  # steps before which it does not deform
-    # scene -> what stays as it is while the parameters do, whatever the time
+    warm_up: int = 0  # steps before the deformation begins
+    # scene -> cache that does not depend on the time
     prepare: Callable[[Any], PyTree] | None = None
-    # (scene, `Gaussians`, condition, what `prepare` returned or None) -> `Gaussians`
+    # (scene, `Gaussians`, condition, cache of `prepare` or None) -> `Gaussians`
     deform: Callable[[Any, Any, FrameCondition, PyTree], Any] | None = None
-    # What is drawn in the place of the rows, where each of them carries several
-    # Gaussians, those of the first row first; one effect of a scene at most.
-    # (scene, condition or None once trained) -> `splats.Splats` at rest, and what else
-    # `derive` reads
+    # Child Gaussians, which are rendered in place of their parents. The children of one
+    # parent are consecutive, in the order of the parents. At most one component of a
+    # scene has children.
+    # (scene, condition, or None after training) -> canonical `splats.Splats`, and other
+    # input of `derive`
     derive_rows: Callable[[Any, FrameCondition | None], tuple[Any, PyTree]] | None = (
         None
     )
-    # (scene, what `derive_rows` returned, rows as `Gaussians` where `deform` left them,
-    # condition) -> `Gaussians`; what is drawn has the looks at rest
+    # (scene, output of `derive_rows`, deformed parents as `Gaussians`, condition) ->
+    # the children as `Gaussians`, which have the colors of `derive_rows`
     derive: Callable[[Any, tuple[Any, PyTree], Any, FrameCondition], Any] | None = None
-    # what `derive` returned -> how much the slope of each counts in that of its row,
-    # which the density control compares; None: all that is seen alike
+    # output of `derive` -> weight of the gradient of each child in the gradient of its
+    # parent, for densification. None: all visible children count equally.
     significance: Callable[[Any], Any] | None = None
-    # (params, picture [height, width, 3] sRGB, appearance id) -> the picture as it was
-    # filmed; of all that is drawn, in training and afterwards
+    # (params, render [height, width, 3] sRGB, appearance id) -> the render with the
+    # exposure of the observed frame, in training and afterwards
     expose: Callable[[PyTree, Any, Int[Array, ""]], Any] | None = None
-    # (params, cameras of the frames that are learned from) -> the same, refined;
-    # whoever reads the frames of a step has these
+    # (params, cameras of the training frames) -> refined cameras. All readers of a
+    # training step's frames get these.
     pose: Callable[[PyTree, Camera], Camera] | None = None
-    # (params, capture) -> the capture with all cameras as `pose` has them; host side
+    # (params, capture) -> the capture with refined cameras of all frames. Host side.
     found: Callable[[PyTree, Any], Any] | None = None
-    # (`path_fit.Paths`, key) -> `path_fit.Guess`, from which the motion is fitted to
-    # tracks; host side. None: it is fitted from where `init` starts it.
+    # (`motion_fit.Paths`, key) -> `motion_fit.Guess`, from which the fit to tracks
+    # starts. Host side. None: the fit starts from `init`.
     fit_to_paths: Callable[[Any, Key[Array, ""]], Any] | None = None
-    # scene -> state, arrays only; host side, at the start and after every change of the
-    # rows, up to the next
+    # scene -> state of arrays only. Host side, at the beginning and after each change
+    # of the number or order of the Gaussians.
     state: Callable[[Any], PyTree] | None = None
-    # Whether in training `deform` gets the state for what `prepare` returns: where that
-    # is dear, and good enough until the rows change.
+    # True if training passes the state to `deform` in place of the output of `prepare`,
+    # because `prepare` is expensive and its result good enough until the next change.
     ready_by_state: bool = False
-    # (params, step) -> params of the same shapes, after each of these steps; host side
+    # Projection step: (params, step) -> params of the same shapes, after each of the
+    # steps `revise_at`. Host side.
     revise: Callable[[PyTree, int], PyTree] | None = None
     revise_at: tuple[int, ...] = ()

@@ -23,12 +23,12 @@ PyTree = Any
 
 INACTIVE_LOGIT = -1000.0  # sigmoid and its gradient are 0 below -745 in float64
 # exp(15)^2 = 1e13 and exp(-20)^2 = 4e-18 keep products of scales far from overflow and
-# from the flush to zero; raw values beyond are clamped and get no gradient.
-# An unbounded exp is inf at 89 in float32.
+# underflow. Raw values outside the range are clamped and get no gradient. Without the
+# range, exp overflows to inf at 89 in float32.
 LOG_SCALE_RANGE = (-20.0, 15.0)
 SH_DC = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant harmonic
 BUCKET = 256  # capacities are multiples of this
-TREMOR = 0.1  # of a typical depth: cameras that move less stand still, nearly
+TREMOR = 0.1  # smallest extent of the cameras, as a share of a typical depth
 
 
 class Splats(NamedTuple):
@@ -62,14 +62,14 @@ class Params(NamedTuple):
 
 
 def refuse_half(dtype: Any) -> None:
-    """Raise for a type that cannot hold Gaussians: they are float32 or float64.
+    """Raise for a half-precision type. Gaussians are float32 or float64.
 
-    bfloat16 places a mean at 256 px to a whole pixel, and at usual rates Adam's steps
-    are below half an ulp of such parameters: nothing moves.
+    In bfloat16, a mean at 256 px is accurate to one pixel only, and at usual learning
+    rates the steps of Adam are below half an ulp, so no parameter would change.
     """
     if jnp.finfo(dtype).bits < 32:
         raise ValueError(
-            f"Gaussians in {jnp.dtype(dtype).name} cannot be drawn or trained; cast "
+            f"Gaussians in {jnp.dtype(dtype).name} cannot be rendered or trained; cast "
             "them to float32"
         )
 
@@ -97,23 +97,25 @@ def activate(splats: Splats) -> Gaussians:
     )
 
 
-def turned(
-    gaussians: Gaussians, turn: Float[Array, "gaussians 3"]
+def rotate(
+    gaussians: Gaussians, rotation: Float[Array, "gaussians 3"]
 ) -> Float[Array, "gaussians 4"]:
-    """Rotate Gaussians in world axes: exp(turn) q / |q|.
+    """Rotate Gaussians in world axes: exp(rotation) q / |q|.
 
     Args:
       gaussians: The Gaussians.
-      turn: Rotation vectors (rad, world axes).
+      rotation: Rotation vectors (rad, world axes).
 
     Returns:
       Unit quaternions (wxyz).
     """
 
-    def one(turn, own):
-        return quaternions.multiply(quaternions.exp(turn), quaternions.normalize(own))
+    def compose(rotation, orientation):
+        return quaternions.multiply(
+            quaternions.exp(rotation), quaternions.normalize(orientation)
+        )
 
-    return jax.vmap(one)(turn, gaussians.quaternion)
+    return jax.vmap(compose)(rotation, gaussians.quaternion)
 
 
 def active_mask(splats: Splats) -> Bool[Array, " gaussians"]:
@@ -131,7 +133,7 @@ def active_mask(splats: Splats) -> Bool[Array, " gaussians"]:
 def in_use(gaussians: Gaussians) -> Bool[Array, " gaussians"]:
     """Select the Gaussians that can be seen.
 
-    The opacity of an inactive row is exactly zero.
+    The opacity of an inactive Gaussian is exactly zero.
 
     Args:
       gaussians: Gaussians of a scene, at any time.
@@ -158,39 +160,56 @@ def rows_to_write(splats: Splats, path: pathlib.Path) -> np.ndarray:
     active = np.asarray(active_mask(splats))
     if not active.any():
         raise ValueError(
-            f"{path}: none of the {len(active)} rows is active; not written"
+            f"{path}: none of the {len(active)} Gaussians is active, so there is "
+            "nothing to write"
         )
     return active
 
 
 def active_degree(step: Int[Array, ""], every: int, degree: int) -> Int[Array, ""]:
-    """The harmonic degree in use after `step` updates: one more `every` steps."""
+    """Compute the harmonic degree in use: one more after every `every` steps.
+
+    Args:
+      step: Number of updates so far.
+      every: Number of steps from one degree to the next.
+      degree: Largest degree.
+
+    Returns:
+      The degree.
+    """
     return jnp.minimum(step // every, degree)
 
 
 def active_harmonics(
     splats: Splats, degree: Int[Array, ""] | int
 ) -> Float[Array, "gaussians coefficients 3"]:
-    """All coefficients, degree 0 first, those above `degree` set to zero.
+    """Return all coefficients, with those above a degree set to zero.
 
-    `degree` may be traced, so a schedule that raises it compiles once. A band that is
-    masked also gets no gradient.
+    Masked coefficients get no gradient.
+
+    Args:
+      splats: Raw parameters.
+      degree: Largest degree in use. It may be traced, so that a schedule that raises it
+        compiles once.
+
+    Returns:
+      The coefficients, degree 0 first.
     """
     rest = splats.sh_rest.shape[1]
     # Coefficient k belongs to the degree floor(sqrt(k)); k = 0 is `sh_dc`.
     band = np.array([math.isqrt(k) for k in range(1, rest + 1)], np.int32)
-    shown = jnp.asarray(band) <= degree
-    masked = jnp.where(shown[:, None], splats.sh_rest, jnp.zeros_like(splats.sh_rest))
+    used = jnp.asarray(band) <= degree
+    masked = jnp.where(used[:, None], splats.sh_rest, jnp.zeros_like(splats.sh_rest))
     return jnp.concatenate([splats.sh_dc, masked], axis=1)
 
 
 def capacity_for(count: int, most: int | None = None) -> int:
     """Compute the smallest bucket that holds a number of Gaussians.
 
-    Buckets grow from 256 by a factor of 1.5, rounded up to a multiple of 256, so that a
-    growing scene compiles a handful of programs and has at most half as many unused
-    slots as used ones. A maximum that is not beyond the next bucket is used at once: a
-    program takes 10 s to compile, and 3000 unused slots cost 1 ms of a step.
+    Buckets grow from 256 by a factor of 1.5, rounded up to a multiple of 256. A growing
+    scene then compiles a handful of programs, and at most a third of its slots are
+    unused. A maximum that is not beyond the next bucket is used at once: a program
+    takes 10 s to compile, and 3000 unused slots cost 1 ms of a step.
 
     Args:
       count: Number of Gaussians.
@@ -198,6 +217,9 @@ def capacity_for(count: int, most: int | None = None) -> int:
 
     Returns:
       The capacity.
+
+    Raises:
+      ValueError: If `count` is larger than `most`.
     """
     if most is not None and count > most:
         raise ValueError(
@@ -211,7 +233,7 @@ def capacity_for(count: int, most: int | None = None) -> int:
 
 
 def take_rows(params: Params, rows: Int[Array, " kept"]) -> Params:
-    """Gather the given Gaussians in all per-Gaussian parameters.
+    """Gather Gaussians by index in all per-Gaussian parameters.
 
     Args:
       params: All parameters.
@@ -242,8 +264,8 @@ def deactivate(splats: Splats, inactive: Bool[Array, " gaussians"]) -> Splats:
 def pad_rows(params: Params, capacity: int) -> Params:
     """Append inactive Gaussians up to a capacity.
 
-    They repeat the first one, so every leaf keeps values that its code can handle (a
-    unit quaternion, a finite scale).
+    They repeat the first Gaussian, so that all values are valid (a unit quaternion, a
+    finite scale).
 
     Args:
       params: All parameters.
@@ -251,12 +273,15 @@ def pad_rows(params: Params, capacity: int) -> Params:
 
     Returns:
       Parameters of that capacity.
+
+    Raises:
+      ValueError: If there are no Gaussians, or more than `capacity`.
     """
     count = params.rows["splats"].mean.shape[0]
     if not 0 < count <= capacity:
         raise ValueError(
-            f"{count} rows cannot be padded to a capacity of {capacity}; "
-            "it must hold at least one row and no fewer than there are"
+            f"{count} Gaussians cannot be padded to a capacity of {capacity}; pass at "
+            "least one Gaussian and a capacity that is not smaller than their number"
         )
     rows = np.concatenate([np.arange(count), np.zeros(capacity - count, int)])
     padded = take_rows(params, jnp.asarray(rows, jnp.int32))
@@ -279,9 +304,9 @@ def from_points(
     """Initialize one isotropic Gaussian per point, on the host.
 
     The standard deviation is `scale` times the root mean square distance to the three
-    nearest points at other positions. Kerbl et al. 2023, section 5.1, use the mean
-    distance, and their code counts a duplicate as a neighbor at distance zero and
-    clamps the result to at least 3e-4 in any unit.
+    nearest points at other positions. This differs from Kerbl et al. 2023, section 5.1,
+    who use the mean distance. Their code counts a duplicate as a neighbor at distance
+    zero and clamps the result to at least 3e-4 in any unit.
 
     Args:
       points: [n, 3] positions in scene units.
@@ -294,27 +319,31 @@ def from_points(
 
     Returns:
       Raw parameters of n Gaussians.
+
+    Raises:
+      ValueError: If a shape, value or setting is invalid.
     """
     refuse_half(dtype)
     points = np.asarray(points, np.float64)
     colors = np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
         raise ValueError(
-            f"points and colors are both [n, 3], got {points.shape} and {colors.shape}"
+            "points and colors must have shape [n, 3], got "
+            f"{points.shape} and {colors.shape}"
         )
     if not len(points):
-        raise ValueError("no points to start from; use `random_in_views` instead")
+        raise ValueError("points is empty; use `random_in_views` to sample points")
     if not 0 < opacity < 1:
-        raise ValueError(f"the first opacity lies between 0 and 1, got {opacity}")
+        raise ValueError(f"opacity must lie between 0 and 1, got {opacity}")
     for name, values in (("point", points), ("color", colors)):
         bad = ~np.isfinite(values).all(axis=1)
         if bad.any():
             raise ValueError(
-                f"{name} {np.flatnonzero(bad)[0]} is not finite, and so are "
-                f"{bad.sum() - 1} more; drop those rows before starting from them"
+                f"{name} {np.flatnonzero(bad)[0]} is not finite, like {bad.sum() - 1} "
+                "others; remove those rows"
             )
     if not 0 < scale < math.inf:
-        raise ValueError(f"the first scale must be positive and finite, got {scale}")
+        raise ValueError(f"scale must be positive and finite, got {scale}")
     distance = neighbor_distance(points, lone_scale)
     log_scale = np.clip(np.log(scale * distance), *LOG_SCALE_RANGE)
     count, rest = len(points), (degree + 1) ** 2 - 1
@@ -341,14 +370,14 @@ def neighbor_distance(
     Returns:
       The distance of each point, to fewer neighbors if there are fewer.
     """
-    # Distinct in float32, the precision they are trained in.
-    distinct, place = np.unique(points.astype(np.float32), axis=0, return_inverse=True)
+    # Duplicates are found in float32, the precision of training.
+    distinct, index = np.unique(points.astype(np.float32), axis=0, return_inverse=True)
     neighbors = min(3, len(distinct) - 1)
     if neighbors == 0:
         return np.full(len(points), float(lone_scale))
     tree = scipy.spatial.cKDTree(distinct.astype(np.float64))
     distance, _ = tree.query(tree.data, k=neighbors + 1)
-    return np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1))[place.reshape(-1)]
+    return np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1))[index.reshape(-1)]
 
 
 def random_in_views(
@@ -362,7 +391,7 @@ def random_in_views(
     """Sample points that the cameras see, on the host.
 
     Camera, pixel and z-depth are uniform, so every image has the same density at every
-    depth. Uniform over the volume, most points would lie at the far end. Lens
+    depth. Samples uniform in the volume would mostly lie at its far end. Lens
     distortion is ignored.
 
     Args:
@@ -382,7 +411,7 @@ def random_in_views(
     )
     if not (np.isfinite(far).all() and (near > 0).all() and (near < far).all()):
         raise ValueError(
-            "near and far need 0 < near < far and a finite far, got near in "
+            "near and far must satisfy 0 < near < far < inf, got near in "
             f"[{near.min()}, {near.max()}] and far in [{far.min()}, {far.max()}]"
         )
     view = rng.integers(views, size=count)
@@ -397,18 +426,18 @@ def random_in_views(
     y = offset[:, 1] / (focal * per_view(cameras.pixel_aspect))
     x = (offset[:, 0] - per_view(cameras.skew_px) * y) / focal
     in_camera = np.stack([x, y, np.ones_like(x)], axis=-1) * z[:, None]
-    turn = per_view(cameras.camera_from_world, 3, 3)
-    return np.einsum("nij,ni->nj", turn, in_camera) + per_view(cameras.position, 3)
+    rotation = per_view(cameras.camera_from_world, 3, 3)
+    return np.einsum("nij,ni->nj", rotation, in_camera) + per_view(cameras.position, 3)
 
 
 def scene_extent(position: np.ndarray, static: float | None = None) -> float:
     """Compute 1.1 times the largest distance of a camera from their mean, on the host.
 
-    It is the unit of the learning rate of the means and of the densification thresholds
-    (Kerbl et al. 2023, reference implementation). It is zero for static cameras, which
-    would stop the means from learning. A tenth of `static` replaces the extent of
-    cameras that hardly move: the tremor of a hand is no unit for surfaces meters away,
-    and densification would prune all of them.
+    This is the unit of the learning rate of the means and of the densification
+    thresholds (Kerbl et al. 2023, reference implementation). It would be zero for a
+    static camera, whose means would not learn. The extent is at least a tenth of
+    `static`: the tremor of a hand-held camera is no unit for surfaces meters away, and
+    densification would prune all of them.
 
     Args:
       position: [cameras, 3] camera centers in scene units.
@@ -416,16 +445,19 @@ def scene_extent(position: np.ndarray, static: float | None = None) -> float:
 
     Returns:
       The extent in scene units.
+
+    Raises:
+      ValueError: If the cameras are static and `static` is None.
     """
     position = np.asarray(position, np.float64).reshape(-1, 3)
     middle = position.mean(axis=0)
     extent = 1.1 * float(np.linalg.norm(position - middle, axis=1).max())
-    # Rounding of float32 positions far from the origin is no motion.
+    # Rounding of float32 positions far from the origin is not motion.
     if extent > 1e-5 * float(np.abs(position).max()):
         return extent if static is None else max(extent, TREMOR * float(static))
     if static is None:
         raise ValueError(
-            f"the cameras stand still (extent {extent:g} scene units), which would "
-            "stop the means from learning; pass `static`, a typical depth of the scene"
+            f"the cameras are static (extent {extent:g} scene units), so the means "
+            "would not learn; pass `static`, a typical depth of the scene"
         )
     return float(static)

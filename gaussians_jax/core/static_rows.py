@@ -41,10 +41,10 @@ def max_displacement(before: Gaussians, after: Gaussians) -> Float[Array, " gaus
     """Bound the displacement of the surface of each Gaussian.
 
     A point of the one-sigma ellipsoid, mean + R S u with |u| = 1, moves by no more than
-    |Δmean| + max |ΔS| + 2 sin(θ/2) max S, with θ the angle between the rotations and S
-    the scales before. This is exact for a translation or a growth, and an upper bound
-    for a rotation, which is invisible on an isotropic Gaussian. Its gradient is
-    undefined where nothing moves.
+    |Δmean| + max |ΔS| + 2 sin(θ/2) max S, where θ is the angle between the rotations
+    and S are the scales before. The bound is exact for a translation or a change of
+    scale. It is an upper bound for a rotation, which is invisible on an isotropic
+    Gaussian. Its gradient is undefined where nothing moves.
 
     Args:
       before: Gaussians.
@@ -59,12 +59,12 @@ def max_displacement(before: Gaussians, after: Gaussians) -> Float[Array, " gaus
     first, second = (
         jax.vmap(quaternion.normalize)(g.quaternion) for g in (before, after)
     )
-    # |q - q'| = 2 sin(θ/4) for the nearer sign: 1 - q·q' would lose small angles.
-    apart = jnp.minimum(
+    # |q - q'| = 2 sin(θ/4) for the nearer sign. 1 - q·q' would lose small angles.
+    difference = jnp.minimum(
         jnp.linalg.norm(second - first, axis=-1),
         jnp.linalg.norm(second + first, axis=-1),
     )
-    chord = 2 * apart * jnp.sqrt(jnp.maximum(1 - apart**2 / 4, 0))
+    chord = 2 * difference * jnp.sqrt(jnp.maximum(1 - difference**2 / 4, 0))
     return shift + growth + chord * widest
 
 
@@ -77,8 +77,8 @@ def row_index(moves: np.ndarray) -> RowIndex:
     Returns:
       The index.
     """
-    place = np.where(moves, np.cumsum(moves) - 1, 0)
-    return RowIndex(jnp.asarray(moves), jnp.asarray(place, jnp.int32))
+    index = np.where(moves, np.cumsum(moves) - 1, 0)
+    return RowIndex(jnp.asarray(moves), jnp.asarray(index, jnp.int32))
 
 
 def dynamic_mask(
@@ -95,16 +95,19 @@ def dynamic_mask(
 
     Returns:
       [gaussians] bool.
+
+    Raises:
+      ValueError: If the threshold is negative.
     """
     if not static_threshold >= 0:
         raise ValueError(
             f"static_threshold={static_threshold} is a distance in scene units; it "
             "cannot be negative (0 keeps every row that moves at all)"
         )
-    # "not <=": a row whose motion is not a number is not taken for static.
-    far = ~(np.asarray(_max_displacement(static, now)) <= static_threshold)
-    drawn = (np.asarray(static.opacity) > 0) | (np.asarray(now.opacity) > 0)
-    return far & drawn
+    # "not <=" also selects a Gaussian whose displacement is NaN.
+    moves = ~(np.asarray(_max_displacement(static, now)) <= static_threshold)
+    visible = (np.asarray(static.opacity) > 0) | (np.asarray(now.opacity) > 0)
+    return moves & visible
 
 
 def split(
@@ -116,8 +119,8 @@ def split(
 ) -> StaticDynamicSplit:
     """Separate moving from static Gaussians, on the host.
 
-    Gaussians are compared with the middle time, at which static ones stay. At `times`,
-    no point of a Gaussian is farther than `static_threshold` from its deformed
+    The static state of a Gaussian is its state at the middle time. At all `times`, no
+    point of a static Gaussian is farther than `static_threshold` from its deformed
     position. A Gaussian that moves only between two of the times is not detected.
 
     Args:
@@ -129,9 +132,12 @@ def split(
 
     Returns:
       The separated scene.
+
+    Raises:
+      ValueError: If there are no times or the threshold is negative.
     """
     if not len(times):
-        raise ValueError("no times to look for motion at; 16 over [0, 1] will do")
+        raise ValueError("times is empty; 16 times over [0, 1] are enough")
     dtype = params.rows["splats"].mean.dtype
     deformed = jax.jit(deform)
     static = deformed(params, jnp.asarray(times[len(times) // 2], dtype))
@@ -141,30 +147,39 @@ def split(
         moves |= dynamic_mask(static, now, static_threshold)
         if fading:
             moves |= ~(np.abs(np.asarray(now.opacity - static.opacity)) <= FADES)
-    carrying = of_rows(params, moves)
-    rows = jnp.asarray(np.flatnonzero(carrying), jnp.int32)
-    every = np.repeat(carrying, len(moves) // len(carrying))
-    return StaticDynamicSplit(static, row_index(every), splats.take_rows(params, rows))
+    parent_moves = of_rows(params, moves)
+    rows = jnp.asarray(np.flatnonzero(parent_moves), jnp.int32)
+    moves = np.repeat(parent_moves, len(moves) // len(parent_moves))
+    return StaticDynamicSplit(static, row_index(moves), splats.take_rows(params, rows))
 
 
-def of_rows(params: Params, drawn: np.ndarray) -> np.ndarray:
+def of_rows(params: Params, rendered: np.ndarray) -> np.ndarray:
     """Select the Gaussians of which any child is selected, on the host.
 
     Args:
       params: Trained parameters.
-      drawn: [children] bool.
+      rendered: [children] bool, with the children of one parent consecutive.
 
     Returns:
-      [gaussians] bool; `drawn` itself if Gaussians have no children.
+      [gaussians] bool; `rendered` itself if Gaussians have no children.
     """
-    by_row = np.asarray(drawn).reshape(len(params.rows["splats"].mean), -1)
+    by_row = np.asarray(rendered).reshape(len(params.rows["splats"].mean), -1)
     return np.any(by_row, axis=1)
 
 
 def deform(
     parts: StaticDynamicSplit, deform_rows: DeformRows, time: Float[Array, ""]
 ) -> Gaussians:
-    """All Gaussians at one time, the deformation evaluated for those that move."""
+    """Evaluate the deformation at one time, for the moving Gaussians only.
+
+    Args:
+      parts: The separated scene.
+      deform_rows: The deformation.
+      time: Normalized time in [0, 1].
+
+    Returns:
+      All Gaussians.
+    """
     if not len(parts.dynamic.rows["splats"].mean):
         return parts.static
     return merge(parts.static, deform_rows(parts.dynamic, time), parts.row_index)
@@ -183,7 +198,7 @@ def merge(static: Gaussians, moved: Gaussians, table: RowIndex) -> Gaussians:
     """
 
     def leaf(static, moved):
-        # A gather, not a scatter: XLA:CPU runs a scatter row by row.
+        # A gather, because XLA on CPUs executes a scatter row by row.
         moves = table.moves.reshape(-1, *[1] * (static.ndim - 1))
         return jnp.where(moves, moved[table.place], static)
 

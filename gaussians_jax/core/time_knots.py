@@ -1,9 +1,9 @@
 """A trained motion as a table: Gaussians at knots in time, interpolated in between.
 
-The deformation is evaluated once per knot. A time then costs reading two or four
-entries of a table, independent of the network. The error falls with the number of knots
-(docs/results/deformation_cost.md), and the table takes 40 bytes (ten float32) per knot
-and moving Gaussian: 10 000 of them at 32 knots are 13 MB. A static Gaussian is stored
+The deformation is evaluated once per knot. A frame then reads two or four entries of a
+table, whatever the network costs. The error falls with the number of knots
+(docs/results/deformation_cost.md). The table takes 40 bytes (ten float32) per knot and
+moving Gaussian, 13 MB for 10,000 Gaussians at 32 knots. A static Gaussian is stored
 once.
 """
 
@@ -21,7 +21,6 @@ from gaussians_jax.core.static_rows import RowIndex
 from nerfies_jax.geometry import quaternion
 
 MIN_KNOTS = {"linear": 2, "cubic": 4}  # knots that an interpolation reads at once
-BYTES = 40  # of a moving Gaussian at a knot, in float32
 
 
 class Track(NamedTuple):
@@ -36,14 +35,14 @@ class Track(NamedTuple):
 class Knots(NamedTuple):
     """A motion over [0, 1] as a table."""
 
-    times: Float[Array, " knots"]  # evenly over [0, 1]
-    track: Track  # of the rows that move
+    times: Float[Array, " knots"]  # evenly spaced over [0, 1]
+    track: Track  # of the moving Gaussians
     row_index: RowIndex
-    static: Gaussians  # all rows, as they are at the middle knot
+    static: Gaussians  # all Gaussians at the middle knot
 
     @property
     def bytes(self) -> int:
-        """Memory of the table, without what every scene has."""
+        """Size of the table in bytes, without the static Gaussians."""
         return sum(leaf.nbytes for leaf in self.track)
 
 
@@ -56,8 +55,8 @@ def bake(
     """Evaluate a motion at all knots, on the host.
 
     Args:
-      deform: The motion, from a normalized time to Gaussians. It is called as it is, so
-        compile it.
+      deform: The motion, from a normalized time to Gaussians. It is called without
+        `jax.jit`, so pass a compiled function.
       knots: Number of knots.
       static_threshold: Gaussians none of whose points moves farther than this from the
         middle knot (scene units) are stored once.
@@ -65,11 +64,14 @@ def bake(
 
     Returns:
       The table.
+
+    Raises:
+      ValueError: If there are fewer than two knots, or opacities change over time.
     """
     if knots < MIN_KNOTS["linear"]:
         raise ValueError(
-            f"knots={knots}: a motion needs at least {MIN_KNOTS['linear']}, its first "
-            "and its last instant"
+            f"knots={knots}: a table needs at least {MIN_KNOTS['linear']}, at the "
+            "first and the last frame time"
         )
     times = jnp.linspace(0, 1, knots, dtype=dtype)
     frames = [jax.device_get(deform(time)) for time in times]
@@ -78,9 +80,9 @@ def bake(
     for time, now in zip(times, frames, strict=True):
         if not np.array_equal(now.opacity, static.opacity):
             raise ValueError(
-                f"the opacities at time {float(time):g} are not those at "
-                f"{float(times[knots // 2]):g}; a table of knots keeps them fixed, so "
-                "draw this motion without one"
+                f"the opacities at time {float(time):g} differ from those at "
+                f"{float(times[knots // 2]):g}; a table of knots keeps opacities fixed,"
+                " so render this motion without one"
             )
         moves |= static_rows.dynamic_mask(static, now, static_threshold)
     rows = np.flatnonzero(moves)
@@ -97,8 +99,8 @@ def at(
     """Interpolate the Gaussians at one time.
 
     Scales are interpolated in the logarithm and stay positive. Quaternions are
-    interpolated as vectors of one sign and normalized. Neighbors are at most 90 degrees
-    apart as vectors, so the interpolated ones are never short.
+    interpolated as vectors with consistent signs and normalized. Adjacent ones are at
+    most 90 degrees apart as vectors, so an interpolated one is never short.
 
     Args:
       knots: The table.
@@ -123,7 +125,7 @@ def at(
         mean=mean,
         quaternion=jax.vmap(quaternion.normalize)(turn),
         scale=jnp.exp(log_scale),
-        # Not interpolated: merged only to be overwritten.
+        # Opacities are not interpolated. The table's are set after the merge.
         opacity=jnp.zeros_like(mean[:, 0]),
     )
     merged = static_rows.merge(knots.static, moved, knots.row_index)
@@ -148,36 +150,36 @@ def check(knots: int, interpolation: str) -> None:
     if knots < MIN_KNOTS[interpolation]:
         raise ValueError(
             f"{interpolation} interpolation reads {MIN_KNOTS[interpolation]} knots at "
-            f"once, got {knots}; take more, or linear"
+            f"once, got {knots}; use more knots or linear interpolation"
         )
 
 
 def _window(
     times: Float[Array, " knots"], time: Float[Array, ""], interpolation: str
 ) -> tuple[Int[Array, ""], list[Float[Array, ""]]]:
-    """The first of the knots to read, and the weight of each."""
+    """Return the index of the first knot to read, and the weight of each knot."""
     count = times.shape[0]
     check(count, interpolation)
-    held = jnp.clip(time, times[0], times[-1])
-    # Searched for, not floor(time * (count - 1)): at a knot the share is exactly 0 or
-    # 1 whatever the rounding of the product.
-    left = jnp.searchsorted(times, held, side="right") - 1
+    clamped = jnp.clip(time, times[0], times[-1])
+    # Searched for, because floor(time * (count - 1)) may round to the wrong interval.
+    # At a knot the weights are exactly 0 and 1.
+    left = jnp.searchsorted(times, clamped, side="right") - 1
     left = jnp.clip(left, 0, count - 2).astype(jnp.int32)
-    u = (held - times[left]) / (times[left + 1] - times[left])
+    u = (clamped - times[left]) / (times[left + 1] - times[left])
     if interpolation == "linear":
         return left, [1 - u, u]
-    before, here, there, after = catmull_rom(u)
-    # In the first and the last interval the missing neighbor is the continuation of
-    # the parabola through three knots, 3a - 3b + c: its weight goes to those three.
-    first, last = left == 0, left == count - 2
+    w0, w1, w2, w3 = catmull_rom(u)
+    # In the first and the last interval the missing knot is extrapolated by the
+    # parabola through three knots, 3a - 3b + c: its weight is added to those three.
+    is_first, is_last = left == 0, left == count - 2
     start = jnp.clip(left - 1, 0, count - 4)
     zero = jnp.zeros_like(u)
-    at_first = here + 3 * before, there - 3 * before, after + before, zero
-    at_last = zero, before + after, here - 3 * after, there + 3 * after
-    inside = before, here, there, after
+    at_first = w1 + 3 * w0, w2 - 3 * w0, w3 + w0, zero
+    at_last = zero, w0 + w3, w1 - 3 * w3, w2 + 3 * w3
+    inside = w0, w1, w2, w3
     weights = [
-        jnp.where(first, a, jnp.where(last, b, c))
-        for a, b, c in zip(at_first, at_last, inside, strict=True)
+        jnp.where(is_first, begin, jnp.where(is_last, end, middle))
+        for begin, end, middle in zip(at_first, at_last, inside, strict=True)
     ]
     return start, weights
 
@@ -185,9 +187,16 @@ def _window(
 def catmull_rom(
     u: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Weights of four even knots at the share `u` between the middle two.
+    """Compute the Catmull-Rom weights of four evenly spaced knots.
 
-    At 0 and 1 exactly those of one knot. Catmull and Rom 1974, tension 1/2.
+    Args:
+      u: Position between the middle two knots, in [0, 1].
+
+    Returns:
+      Four weights that sum to one, exactly those of one knot at 0 and 1.
+
+    References:
+      Catmull and Rom 1974, with tension 1/2.
     """
     return (
         u * (u * (2 - u) - 1) / 2,
@@ -200,10 +209,10 @@ def catmull_rom(
 def spline_weights(knots: int, time: Float[Array, ""]) -> Float[Array, " knots"]:
     """Compute the weights of evenly spaced knots over [0, 1] in a Catmull-Rom spline.
 
-    The weights and their derivative are continuous. The end knots stand for those
-    beyond them. All weights are returned, four of them nonzero: a product with a table
-    of few knots is cheaper than reading four of its columns and scattering into them in
-    the gradient.
+    The weights and their derivative are continuous. The end knots are repeated beyond
+    the ends. All weights are returned, of which four are nonzero: a product with a
+    table of few knots is cheaper than a gather of four columns, whose gradient is a
+    scatter.
 
     Args:
       knots: Number of knots.
@@ -213,17 +222,17 @@ def spline_weights(knots: int, time: Float[Array, ""]) -> Float[Array, " knots"]
       Weights that sum to one.
     """
     last = knots - 1
-    place = jnp.clip(time, 0, 1) * last
-    left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, last - 1)
-    part = place - left.astype(place.dtype)
+    position = jnp.clip(time, 0, 1) * last
+    left = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, last - 1)
+    offset = position - left.astype(position.dtype)
     rows = jnp.clip(left + jnp.arange(-1, 3, dtype=jnp.int32), 0, last)
-    return jnp.zeros(knots, place.dtype).at[rows].add(jnp.stack(catmull_rom(part)))
+    return jnp.zeros(knots, position.dtype).at[rows].add(jnp.stack(catmull_rom(offset)))
 
 
 @jax.jit
 def _track(gaussians):
     """Convert Gaussians to table entries."""
-    # A scale that the motion made negative counts by its absolute value.
+    # The absolute value, because a motion may make a scale negative.
     scale = jnp.clip(jnp.abs(gaussians.scale), *np.exp(splats.LOG_SCALE_RANGE).tolist())
     return Track(
         gaussians.mean,
@@ -234,11 +243,11 @@ def _track(gaussians):
 
 @jax.jit
 def _aligned(turns):
-    """The same rotations, each quaternion of the sign nearer to the knot before."""
+    """Choose the sign of each quaternion that is nearer to the previous knot."""
 
     def step(before, turn):
-        same = jnp.sum(before * turn, axis=-1, keepdims=True) >= 0
-        turn = jnp.where(same, turn, -turn)
+        same_sign = jnp.sum(before * turn, axis=-1, keepdims=True) >= 0
+        turn = jnp.where(same_sign, turn, -turn)
         return turn, turn
 
     return jax.lax.scan(step, turns[0], turns)[1]

@@ -1,4 +1,4 @@
-"""Initial Gaussians, from the points of the capture and from random points."""
+"""Initialization of Gaussians from the points of the capture and random points."""
 
 import dataclasses
 import math
@@ -20,22 +20,22 @@ SOURCES = ("auto", "points", "random")
 class InitSpec:
     """Settings of the initial Gaussians.
 
-    `source` "auto" uses the capture's points if there are at least `min_points`, and
-    random ones otherwise. "points" and "random" require one of them, as MoBa-GS does
-    with either (it claims to need no points from structure from motion).
+    `source="auto"` uses the capture's points if there are at least `min_points`, and
+    random ones otherwise. "points" and "random" require one of them. MoBa-GS, which
+    claims to need no points from structure from motion, supports both.
 
     `extra_random` points are sampled in the views in addition to the capture's points.
     None means half as many as `points`, or none if tracks initialize the motion
     (`of_start`).
     """
 
-    points: int = 100_000  # at most so many of the capture's own points
-    random: int = 10_000  # sampled in the views instead
+    points: int = 100_000  # largest number of the capture's own points
+    random: int = 10_000  # number of random points, without the capture's own
     min_points: int = 100
     extra_random: int | None = 0
     opacity: float = 0.1
-    scale: float = 1.0  # over the distance to the nearest neighbors
-    max_scale: float = 0.03  # first scale, over the distance to the nearest camera
+    scale: float = 1.0  # initial scale relative to the distance of nearest neighbors
+    max_scale: float = 0.03  # relative to the distance of the nearest camera
     source: str = "auto"
 
     def __post_init__(self):
@@ -43,8 +43,9 @@ class InitSpec:
             raise ValueError(f"unknown source {self.source!r}; choose from {SOURCES}")
         if self.points < 1 or self.random < 1 or (self.extra_random or 0) < 0:
             raise ValueError(
-                f"a scene starts from at least one Gaussian, got points={self.points}, "
-                f"random={self.random} and extra_random={self.extra_random}"
+                "a scene needs at least one initial Gaussian, got points="
+                f"{self.points}, random={self.random} and "
+                f"extra_random={self.extra_random}"
             )
         if not 0 < self.opacity < 1:
             raise ValueError(f"opacity={self.opacity} must be between 0 and 1")
@@ -60,15 +61,14 @@ class StartSpec(TrackStartSpec):
     fit_steps: int = 3000
     fit_rate: float = 5e-3
     moving_points: int = 3000  # Gaussians lifted from moving pixels
-    fill_hidden: bool = (
-        True  # guess what stands where something hides it in every frame
-    )
+    # Guess the background that a moving object hides in every frame.
+    fill_hidden: bool = True
 
     def __post_init__(self):
         super().__post_init__()
         if self.moving_points < 1:
             raise ValueError(
-                "a start from tracks takes at least one moving point, got "
+                "an initialization from tracks needs at least one moving point, got "
                 f"moving_points={self.moving_points}"
             )
 
@@ -94,13 +94,16 @@ def uses_capture_points(spec: InitSpec, capture: Capture) -> bool:
 
     Returns:
       True if they are, False if they are random.
+
+    Raises:
+      ValueError: If the settings require points and the capture has none.
     """
     points = point_count(capture)
     if spec.source == "points" and not points:
         raise ValueError(
-            f"{capture.path or capture.name}: the scene shall start from the capture's "
-            'own points, and it has none; choose source="random", or "auto" for random '
-            "ones only where there are no others"
+            f'{capture.path or capture.name}: source="points" needs a capture with '
+            'points, but it has none; choose source="random", or "auto" for random '
+            "points only if there are no others"
         )
     enough = 1 if spec.source == "points" else max(spec.min_points, 1)
     return spec.source != "random" and points >= enough
@@ -167,46 +170,45 @@ def initial_points(spec: InitSpec, capture: Capture, seed: int):
     assert cloud is not None
     position, color = cloud.position, cloud.color / 255
     if len(position) > spec.points:
-        kept = np.sort(rng.choice(len(position), spec.points, replace=False))
-        position, color = position[kept], color[kept]
-    span = filmed_depths(capture)
-    more, more_color = _random_points(rng, capture, spec.extra_random, span)
-    return np.concatenate([position, more]), np.concatenate([color, more_color])
+        indices = np.sort(rng.choice(len(position), spec.points, replace=False))
+        position, color = position[indices], color[indices]
+    span = observed_depths(capture)
+    extra, extra_color = _random_points(rng, capture, spec.extra_random, span)
+    return np.concatenate([position, extra]), np.concatenate([color, extra_color])
 
 
-def filmed_box(
+def observed_box(
     capture: Capture, span: tuple[float, float] | None = None
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Compute the bounding box of the observed volume, on the host.
 
-    It is the central 98 % along each axis of points sampled in the views, between the
-    depths of the capture's points.
+    The box is the central 98 % along each axis of points sampled in the views, between
+    the depths of the capture's points.
 
     Args:
       capture: The capture.
-      span: Smallest and largest depth, if they are known already.
+      span: Smallest and largest depth, if known.
 
     Returns:
-      Low and high corner in scene units.
+      Minimum and maximum corner in scene units.
     """
     rng = np.random.default_rng(0)
-    point, _ = _random_points(rng, capture, 4000, span or filmed_depths(capture))
+    point, _ = _random_points(rng, capture, 4000, span or observed_depths(capture))
     low, high = np.quantile(point, (0.01, 0.99), axis=0)
     return tuple(low.tolist()), tuple(high.tolist())
 
 
 def _random_points(rng, capture, count, span):
-    filmed = jax.tree.map(lambda leaf: leaf[capture.train], capture.cameras)
-    position = splats.random_in_views(rng, filmed, capture.size, *span, count)
+    cameras = jax.tree.map(lambda leaf: leaf[capture.train], capture.cameras)
+    position = splats.random_in_views(rng, cameras, capture.size, *span, count)
     return position, rng.uniform(size=position.shape)
 
 
 def clamp_scales(rows: Splats, capture: Capture, max_scale: float) -> Splats:
     """Limit the scale of Gaussians to a share of the distance to the nearest camera.
 
-    An isolated point gets the distance to its neighbors as its scale. Close to a camera
-    it would cover the image: the first steps on a capture with such points took 2 s
-    each.
+    An isolated point gets the distance to its neighbors as its scale. Near a camera it
+    would cover the image: the first steps on a capture with such points took 2 s each.
 
     Args:
       rows: Raw parameters.
@@ -222,11 +224,18 @@ def clamp_scales(rows: Splats, capture: Capture, max_scale: float) -> Splats:
     return rows._replace(log_scale=jnp.minimum(rows.log_scale, bound[:, None]))
 
 
-def filmed_depths(capture):
-    """Compute the z-depths that contain the capture's points, slightly widened.
+def observed_depths(capture):
+    """Compute the range of z-depths of the capture's points, slightly widened.
 
-    The near plane is often much nearer than any surface (0.05 where the first point is
-    at 0.4), and a Gaussian there covers the whole image: 20 times slower steps.
+    The near plane is often much nearer than any surface (0.05 with the first point at
+    0.4). A Gaussian there would cover the whole image, and steps would take 20 times
+    longer.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Smallest and largest z-depth in scene units.
     """
     depth = point_depths(capture)
     # Points beyond the far plane are rendered, but surfaces are in front of it.

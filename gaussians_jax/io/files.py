@@ -22,7 +22,7 @@ from nerfies_jax.capture.json_files import replaced_file
 MOST_HEADER_BYTES = ply_files.MAX_HEADER  # 62 properties take 1.5 kB
 MOST_BYTES = 4 * 2**30  # of a .splat or .spz file: 100 million Gaussians
 SUFFIXES = (".ply", ".splat", ".spz")
-MOST_ROUNDING = 0.1  # of coordinates in double, in sizes of the median Gaussian
+MOST_ROUNDING = 0.1  # of float64 coordinates, relative to the median scale
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
@@ -33,10 +33,16 @@ _SPLAT_ROW = np.dtype(
 
 
 class Loaded(NamedTuple):
-    """The Gaussians of a file, and what the reader did not take over as it stood."""
+    """The Gaussians of a file, and notes about data that was not loaded.
 
-    splats: Splats  # float32
-    dropped: int  # rows with a value that is not finite
+    Attributes:
+      splats: Raw parameters, float32.
+      dropped: Number of Gaussians with a value that is not finite.
+      notes: Properties and elements of the file that were ignored.
+    """
+
+    splats: Splats
+    dropped: int
     notes: tuple[str, ...]
 
 
@@ -58,8 +64,8 @@ def load(path: str | os.PathLike, *, drop_broken: bool = False) -> Loaded:
     readers = dict(zip(SUFFIXES, (_read_ply, _read_splat, _read_spz), strict=True))
     if path.suffix.lower() not in readers:
         raise FileError(
-            f"{path}: no reader for {path.suffix or 'a name without suffix'}; "
-            f"known are {', '.join(SUFFIXES)}"
+            f"{path}: cannot read {path.suffix or 'a file without suffix'}; supported "
+            f"formats are {', '.join(SUFFIXES)}"
         )
     if not path.is_file():
         raise FileError(f"{path}: no such file")
@@ -91,19 +97,19 @@ def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
     path = pathlib.Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(
-            f"{path}: no writer for {path.suffix or 'a name without suffix'}; "
-            f"known are {', '.join(SUFFIXES)}"
+            f"{path}: cannot write {path.suffix or 'a file without suffix'}; supported "
+            f"formats are {', '.join(SUFFIXES)}"
         )
     active = splats.rows_to_write(rows, path)
-    kept = Splats(*(np.asarray(leaf, np.float32)[active] for leaf in rows))
+    rows_to_write = Splats(*(np.asarray(leaf, np.float32)[active] for leaf in rows))
     try:
-        kept, _ = _without_broken(kept, False)
+        rows_to_write, _ = _without_broken(rows_to_write, False)
         if path.suffix.lower() == ".ply":
-            data = _ply_bytes(kept)
+            data = _ply_bytes(rows_to_write)
         elif path.suffix.lower() == ".splat":
-            data = _splat_bytes(kept)
+            data = _splat_bytes(rows_to_write)
         else:
-            data = spz.encode(spz.Unpacked._make((*kept, ())), spz_version)
+            data = spz.encode(spz.Unpacked._make((*rows_to_write, ())), spz_version)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; not written") from error
     with replaced_file(path) as partial:
@@ -112,24 +118,24 @@ def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
 
 
 def _without_broken(rows, drop):
-    whole = np.ones(len(rows.mean), bool)
+    finite = np.ones(len(rows.mean), bool)
     for leaf in rows:
-        whole &= np.isfinite(leaf.reshape(len(whole), -1)).all(axis=1)
-    broken = int((~whole).sum())
+        finite &= np.isfinite(leaf.reshape(len(finite), -1)).all(axis=1)
+    broken = int((~finite).sum())
     if broken and not drop:
-        first = np.flatnonzero(~whole)[0]
+        first = np.flatnonzero(~finite)[0]
         name = next(
             name
             for name, leaf in zip(rows._fields, rows, strict=True)
             if not np.isfinite(leaf[first]).all()
         )
         raise ValueError(
-            f"row {first} has a {name} that is not finite, {broken} such rows in all; "
-            "load with drop_broken=True to leave them out"
+            f"row {first} has a {name} that is not finite, {broken} such rows in "
+            "total; load with drop_broken=True to skip them"
         )
-    if not whole.any():
+    if not finite.any():
         raise ValueError("every row has a value that is not finite")
-    return Splats(*(leaf[whole] for leaf in rows)), broken
+    return Splats(*(leaf[finite] for leaf in rows)), broken
 
 
 # The PLY of 3D Gaussian splatting ---------------------------------------------------
@@ -143,7 +149,7 @@ def _read_ply(path):
     except ValueError as error:
         raise ValueError(f"damaged PLY ({error})") from error
     if "vertex" not in ply:
-        raise ValueError("no element 'vertex' in it")
+        raise ValueError("it has no element 'vertex'")
     vertex = ply["vertex"].data
     _refuse_other_ply(ply, vertex)
     names = vertex.dtype.names
@@ -160,7 +166,7 @@ def _read_ply(path):
     def columns(*which):
         if not which:
             return np.zeros((len(vertex), 0), np.float32)
-        # A float64 or text column may hold what float32 cannot: inf, caught as broken.
+        # float64 values beyond float32's range become inf, reported as not finite.
         with np.errstate(over="ignore", invalid="ignore"):
             return np.stack([vertex[name] for name in which], -1).astype(np.float32)
 
@@ -177,15 +183,15 @@ def _read_ply(path):
     known = {*_REQUIRED, *rest, "nx", "ny", "nz"}
     extra = [name for name in names if name not in known]
     extra += [f"element {part.name}" for part in ply.elements if part.name != "vertex"]
-    notes = (f"left out: {', '.join(extra)}",) if extra else ()
-    behind = path.stat().st_size - len(header) - vertex.nbytes
-    if behind > 0 and not text and len(ply.elements) == 1:
-        notes += (f"left out: {behind} bytes after the last row",)
+    notes = (f"ignored: {', '.join(extra)}",) if extra else ()
+    trailing = path.stat().st_size - len(header) - vertex.nbytes
+    if trailing > 0 and not text and len(ply.elements) == 1:
+        notes += (f"ignored: {trailing} bytes after the last row",)
     return rows, notes
 
 
 def _refuse_map_coordinates(vertex):
-    """Refuse coordinates in double that float32 would move by the size of Gaussians."""
+    """Refuse float64 coordinates that float32 rounds by the size of Gaussians."""
     axes = [axis for axis in "xyz" if vertex[axis].dtype == np.float64]
     if not axes or not len(vertex):
         return
@@ -198,14 +204,14 @@ def _refuse_map_coordinates(vertex):
         size = float(np.exp(np.median(scales)))
     if np.isfinite(moved) and moved > MOST_ROUNDING * size:
         raise ValueError(
-            f"float32 would move its coordinates in double by up to {moved:.2g}, where "
-            f"the median Gaussian has a size of {size:.2g}; subtract an origin from "
-            "them and write the file again"
+            f"float32 would round its float64 coordinates by up to {moved:.2g}, but "
+            f"the median scale of a Gaussian is {size:.2g}; subtract an origin from "
+            "the coordinates and write the file again"
         )
 
 
 def _ply_header(path):
-    """The header's bytes, once it is short and its counts can be true."""
+    """Return the header after checking its length and counts."""
     with safe_files.open_file(path) as stream:
         head = text_files.utf8(stream.read(MOST_HEADER_BYTES))
     return ply_files.check_header(head, path.stat().st_size)
@@ -215,22 +221,22 @@ def _refuse_other_ply(ply, vertex):
     names = vertex.dtype.names
     if "chunk" in ply and "packed_position" in names:
         raise ValueError(
-            "a compressed PLY of SuperSplat; convert it with `splat-transform in.ply "
-            "out.spz`"
+            "it is a compressed PLY of SuperSplat; convert it with `splat-transform "
+            "in.ply out.spz`"
         )
     missing = [name for name in _REQUIRED if name not in names]
     if "x" in names and "f_dc_0" in missing:
         raise ValueError(
-            "points or a mesh, not Gaussians: no property f_dc_0; start from its "
-            "points with splats.from_points"
+            "it holds points or a mesh, not Gaussians: property f_dc_0 is missing; "
+            "initialize Gaussians from its points with splats.from_points"
         )
     if missing:
-        raise ValueError(f"properties missing: {', '.join(missing)}")
+        raise ValueError(f"missing properties: {', '.join(missing)}")
     lists = [name for name in names if vertex.dtype[name].kind not in "fiu"]
     if lists:
-        raise ValueError(f"properties that are no numbers: {', '.join(lists)}")
+        raise ValueError(f"properties that are not numbers: {', '.join(lists)}")
     if not len(vertex):
-        raise ValueError("no Gaussians in it: element vertex 0")
+        raise ValueError("it holds no Gaussians: element vertex 0")
 
 
 def _ply_bytes(rows):
@@ -260,11 +266,11 @@ def _ply_bytes(rows):
 def _read_splat(path):
     data = safe_files.read_bytes(path, MOST_BYTES)
     if not data:
-        raise ValueError("empty: no Gaussians in it")
+        raise ValueError("it is empty and holds no Gaussians")
     if len(data) % _SPLAT_ROW.itemsize:
         raise ValueError(
-            f"{len(data)} bytes is no multiple of {_SPLAT_ROW.itemsize}: truncated, or "
-            "not a .splat file"
+            f"{len(data)} bytes is not a multiple of {_SPLAT_ROW.itemsize}: truncated, "
+            "or not a .splat file"
         )
     table = np.frombuffer(data, _SPLAT_ROW)
     with np.errstate(invalid="ignore"):  # a signaling NaN, refused later
@@ -284,11 +290,11 @@ def _read_splat(path):
 
 
 def _splat_bytes(rows):
-    # Viewers draw such a file while it loads: what covers most comes first. Opacity
-    # times volume, as logarithms, which cannot overflow.
-    seen = -np.logaddexp(0, -rows.opacity_logit.astype(np.float64))
+    # Viewers render the file while it loads, so the largest Gaussians come first, by
+    # opacity times volume. Logarithms cannot overflow.
+    log_opacity = -np.logaddexp(0, -rows.opacity_logit.astype(np.float64))
     log_scale = np.clip(rows.log_scale.astype(np.float64), *splats.LOG_SCALE_RANGE)
-    largest_first = np.argsort(-(seen + log_scale.sum(axis=1)), kind="stable")
+    largest_first = np.argsort(-(log_opacity + log_scale.sum(axis=1)), kind="stable")
     rows = Splats(*(leaf[largest_first] for leaf in rows))
     log_scale = log_scale[largest_first]
     table = np.zeros(len(rows.mean), _SPLAT_ROW)

@@ -22,10 +22,10 @@ from nerfies_jax.capture.json_files import alike, replaced_folder
 from nerfies_jax.runtime import events
 from nerfies_jax.training.model import Model, TrainState
 
-# The Gaussians at a time in [0, 1].
+# Function from a time in [0, 1] to Gaussians.
 At = Callable[[float], Gaussians]
-MOST_STEP_PX = 0.1  # of coordinates in float32
-NUMBERED = "frame_{:04d}"  # viewers play files whose names differ in a number alone
+MOST_STEP_PX = 0.1  # largest rounding error of float32 coordinates
+NUMBERED = "frame_{:04d}"  # viewers play files whose names differ in a number only
 
 
 def check_time(time: float) -> None:
@@ -38,13 +38,13 @@ def check_time(time: float) -> None:
       ValueError: If the time is not in [0, 1].
     """
     if not 0 <= time <= 1:
-        raise ValueError(f"time {time:g}: the capture runs from 0 to 1")
+        raise ValueError(f"time={time:g} must lie in [0, 1]")
 
 
 def gaussians_at(model: Model, state: TrainState) -> At:
     """Return a function from normalized time to all Gaussians.
 
-    Everything that does not depend on time is computed once, now.
+    Everything that does not depend on time is computed once, in this call.
 
     Args:
       model: The model.
@@ -52,11 +52,14 @@ def gaussians_at(model: Model, state: TrainState) -> At:
 
     Returns:
       A host function of a time in [0, 1].
+
+    Raises:
+      ValueError: If the model is not a scene of Gaussians.
     """
     if model.stages is None:
         raise ValueError(
-            "Gaussian files are for runs of Gaussians; a radiance field has none, so "
-            "export its cameras, pictures or tracks"
+            "Gaussian files need a run of Gaussians; a radiance field has none, so "
+            "export its cameras, images or tracks"
         )
     params = state.params
     prepared = jax.jit(model.stages.prepare)(params)
@@ -88,14 +91,14 @@ def splats_at(model: Model, state: TrainState) -> Callable[[float], Splats]:
 
 
 def written_rows(model: Model, state: TrainState) -> Splats:
-    """Return the rows of a run of Gaussians that a file holds.
+    """Return the raw parameters of the Gaussians that a file holds.
 
     Args:
       model: The model.
       state: Trained state.
 
     Returns:
-      The rows.
+      Raw parameters.
     """
     assert model.stages is not None
     assert model.stages.rows is not None
@@ -105,21 +108,21 @@ def written_rows(model: Model, state: TrainState) -> Splats:
 def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:
     """Invert the activations of the deformed Gaussians."""
     trained = splats.activate(rows)
-    # What the motion leaves alone keeps its trained number: the logit of an opacity
-    # that rounded to 1 would be infinite, and that of 0 marks a row as inactive, which
-    # no motion changes.
+    # Values that the motion does not change keep their trained parameters. The logit of
+    # an opacity that rounds to 1 would be infinite, and that of 0 marks an inactive
+    # Gaussian, which no motion changes.
     eps = jnp.finfo(deformed.opacity.dtype).eps
     opacity = jnp.clip(deformed.opacity, jnp.finfo(eps.dtype).tiny, 1 - eps)
     logit = jnp.log(opacity) - jnp.log1p(-opacity)
     smallest = math.exp(splats.LOG_SCALE_RANGE[0])
-    # A linear rule makes scales negative, and rendering squares them.
+    # A linear scale rule may make scales negative, and rendering squares them.
     log_scale = jnp.log(jnp.maximum(jnp.abs(deformed.scale), smallest))
-    kept = (deformed.opacity == trained.opacity) | ~splats.active_mask(rows)
+    unchanged = (deformed.opacity == trained.opacity) | ~splats.active_mask(rows)
     return rows._replace(
         mean=deformed.mean,
         quaternion=deformed.quaternion,
         log_scale=jnp.where(deformed.scale == trained.scale, rows.log_scale, log_scale),
-        opacity_logit=jnp.where(kept, rows.opacity_logit, logit),
+        opacity_logit=jnp.where(unchanged, rows.opacity_logit, logit),
     )
 
 
@@ -136,18 +139,18 @@ def in_world(rows: Splats, capture: Capture) -> Splats:
       Raw parameters in world units.
 
     Raises:
-      ValueError: If world coordinates are so large, as those of maps, that the float32
-        of Gaussian files would move Gaussians visibly.
+      ValueError: If world coordinates are so large, like map coordinates, that float32
+        would move Gaussians visibly.
     """
     mean = units.places_in("world", capture, np.asarray(rows.mean))
     step = units.float32_step(mean)
     step_px = units.in_pixels(capture, step * capture.scale)
     if step_px > MOST_STEP_PX:
-        origin = ", ".join(f"{each:.9g}" for each in capture.center)
+        origin = ", ".join(f"{coordinate:.9g}" for coordinate in capture.center)
         raise ValueError(
             f"world coordinates reach {np.abs(mean).max():.4g}, where float32 has "
-            f"steps of {step:.2g}: {step_px:.2g} pixels of this capture, more than "
-            f"{MOST_STEP_PX}; write scene units instead, of which world = scene * "
+            f"steps of {step:.2g}, which are {step_px:.2g} pixels of this capture (at "
+            f"most {MOST_STEP_PX}); write scene units instead, where world = scene * "
             f"{1 / capture.scale:.6g} + ({origin})"
         )
     log_scale = np.asarray(rows.log_scale, np.float64) - math.log(capture.scale)
@@ -167,7 +170,7 @@ def save_sequence(
 ) -> np.ndarray:
     """Write numbered files of evenly spaced times, including 0 and 1.
 
-    The folder appears when it is complete, or not at all.
+    The folder is written completely or not at all.
 
     Args:
       folder: Folder to write.
@@ -178,9 +181,14 @@ def save_sequence(
 
     Returns:
       The times.
+
+    Raises:
+      ValueError: If `count` is less than two.
     """
     if count < 2:
-        raise ValueError(f"{count} frame(s) are no sequence; export a time instead")
+        raise ValueError(
+            f"count={count} is not a sequence; use at least 2, or export a single time"
+        )
     times = np.linspace(0, 1, count)
     names = [NUMBERED.format(number) + suffix for number in range(count)]
     stage = events.stage("writing Gaussians", count)

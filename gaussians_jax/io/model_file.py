@@ -1,10 +1,9 @@
 """A trained scene in one file: active Gaussians, networks and settings.
 
 The file is a NumPy archive (.npz): one float32 array for each leaf of the parameters,
-and one text, JSON, with the format's version, the structure that the leaves form and a
-description. The description may hold the settings of a scene of this package; they come
-back as what they were, so that a file is enough to render a frame:
-
+and one JSON text with the version of the format, the structure of the leaves and a
+description. The description may hold the settings of a scene of this package, so that
+the file is enough to render a frame:
     params, about = model_file.load("model.npz")
     model = scene.build(about["spec"], about["metadata"])
     step = jnp.asarray(about["step"], jnp.int32)
@@ -42,8 +41,7 @@ ABOUT = "about.json"  # the archive's member with the text
 def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -> int:
     """Write the active Gaussians and the networks in float32.
 
-    The file appears whole or not at all.
-
+    The file is written completely or not at all.
     Args:
       path: File to write.
       params: Trained parameters.
@@ -61,7 +59,7 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[active], params.rows)
     arrays: dict[str, np.ndarray] = {}
     try:
-        structure = _taken_apart(params._replace(rows=rows), "params", arrays)
+        structure = _flatten(params._replace(rows=rows), "params", arrays)
         described = specs.as_json(description)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; not written") from error
@@ -83,7 +81,7 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
 def load(
     path: str | os.PathLike, trusted: Collection[str] = ()
 ) -> tuple[Params, dict[str, Any]]:
-    """Read parameters and description, as they were saved.
+    """Read parameters and description.
 
     Args:
       path: The file.
@@ -91,11 +89,11 @@ def load(
         which runs their code.
 
     Returns:
-      The parameters and the description, whose sequences come back as tuples.
+      The parameters and the description, in which sequences are tuples.
 
     Raises:
-      FileError: If it is damaged or no model file, or names a class that is not
-        trusted.
+      FileError: If the file is damaged or not a model file, or names a class that is
+        not trusted.
     """
     path = pathlib.Path(path)
     if not path.is_file():
@@ -103,10 +101,10 @@ def load(
     try:
         with npz_files.archive(path) as archive:
             about = _about(archive)
-            others = _others(about, trusted)
-            params = _put_together(about["params"], archive, others)
+            classes = _trusted_classes(about, trusted)
+            params = _unflatten(about["params"], archive, classes)
         description = specs.from_json(
-            about["description"], SplatScene, SceneMetadata, *others.values()
+            about["description"], SplatScene, SceneMetadata, *classes.values()
         )
         _check(params)
     except FileError:  # it names the path already
@@ -114,14 +112,14 @@ def load(
     except _BROKEN as error:
         if isinstance(error.__cause__, zipfile.BadZipFile):
             raise FileError(
-                f"{path}: not the file of a model, or damaged ({_line(error)}); save "
-                "it again with model_file.save"
+                f"{path}: not a model file, or damaged ({_line(error)}); save it again "
+                "with model_file.save"
             ) from error
         raise FileError(f"{path}: {_line(error)}") from error
     return params, description
 
 
-# What reading bytes that anyone may have written can raise.
+# Errors that reading a damaged file can raise.
 _BROKEN = (*npz_files.DAMAGED, OSError, ArithmeticError)
 
 
@@ -132,73 +130,72 @@ def _line(error):
 def _about(archive):
     if ABOUT not in archive.names:
         raise ValueError(
-            "an archive, but not of a model: it has no about.json; models are written "
-            "by model_file.save"
+            "the archive is not a model: it has no about.json; save models with "
+            "model_file.save"
         )
     about = json.loads(archive.read(ABOUT).tobytes())
     if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise ValueError(f"its about.json is not that of a {FORMAT}")
+        raise ValueError(f"its about.json does not describe a {FORMAT}")
     if about.get("version") != VERSION:
         raise ValueError(
-            f"a model of version {about.get('version')}, and this program reads "
-            f"version {VERSION}; load it with the program that wrote it"
+            f"the model has version {about.get('version')}, but this version of the "
+            f"library reads version {VERSION}; load it with the one that wrote it"
         )
     return about
 
 
 def _check(params):
-    """Check what every reader of parameters relies on."""
+    """Check the structure, shapes and values that readers of parameters rely on."""
     if not isinstance(params, Params) or "splats" not in params.rows:
-        raise ValueError("no Gaussians in it: params.rows['splats'] is missing")
+        raise ValueError("it holds no Gaussians: params.rows['splats'] is missing")
     count = len(params.rows["splats"].mean)
     for leaf in jax.tree.leaves(params.rows):
         if not leaf.ndim or len(leaf) != count:
             raise ValueError(
-                f"an array of shape {leaf.shape} among the rows of {count} Gaussians"
+                f"per-Gaussian parameters of {count} Gaussians have an array of shape "
+                f"{leaf.shape}"
             )
     for leaf in jax.tree.leaves(params):
         if not np.isfinite(leaf).all():
-            raise ValueError("a value that is not finite; save the model again")
+            raise ValueError("a value is not finite; save the model again")
 
 
 # The structure of the parameters ----------------------------------------------------
 
 
-def _taken_apart(tree, name, arrays):
-    """Return the structure as JSON, and put its leaves into `arrays`, named by their
-    path.
-    """
+def _flatten(tree, name, arrays):
+    """Return the structure as JSON, and add its leaves to `arrays` by their path."""
     if tree is None:
         return None
     if isinstance(tree, dict):
         return {
             "dict": {
-                key: _taken_apart(item, f"{name}.{key}", arrays)
+                key: _flatten(item, f"{name}.{key}", arrays)
                 for key, item in tree.items()
             }
         }
     if isinstance(tree, tuple) and hasattr(tree, "_fields"):
         fields = {
-            key: _taken_apart(item, f"{name}.{key}", arrays)
+            key: _flatten(item, f"{name}.{key}", arrays)
             for key, item in tree._asdict().items()
         }
         return {"record": specs.type_name(type(tree)), "fields": fields}
     if isinstance(tree, tuple | list):
-        items = [_taken_apart(x, f"{name}.{i}", arrays) for i, x in enumerate(tree)]
+        items = [_flatten(x, f"{name}.{i}", arrays) for i, x in enumerate(tree)]
         return {"tuple": items}
     leaf = np.asarray(tree)
     if leaf.dtype.kind == "f" or leaf.dtype == jnp.bfloat16:
         leaf = leaf.astype(np.float32)
     if leaf.dtype.kind not in "fiub":
-        raise ValueError(f"{name} is of type {leaf.dtype}, which is no number")
+        raise ValueError(f"{name} has type {leaf.dtype}, which is not a number")
     if not np.isfinite(leaf).all():
         raise ValueError(f"{name} has a value that is not finite")
     arrays[name] = leaf
     return {"array": name}
 
 
-def _others(about, trusted):
-    """Classes of other packages that the file names, by name."""
+def _trusted_classes(about, trusted):
+    """Import classes of other packages that the file names and the caller trusts."""
     names = (
         *extensions.names_in(about["params"], "record"),
         *extensions.names_in(about["description"], specs.TYPE),
@@ -206,27 +203,27 @@ def _others(about, trusted):
     for name in names:
         if name not in trusted:
             raise ValueError(
-                f"it names {name!r} of another package, which runs code when it is "
-                f"loaded; load it with trusted=({name!r},) if you trust it"
+                f"it names {name!r} of another package, whose code would be executed; "
+                f"load it with trusted=({name!r},) if you trust it"
             )
     return {name: extensions.load_class(name) for name in names}
 
 
-def _put_together(structure, archive, others):
+def _unflatten(structure, archive, classes):
     if structure is None:
         return None
     if "array" in structure:
         return jnp.asarray(archive.read(structure["array"]))
     if "dict" in structure:
         items = structure["dict"].items()
-        return {key: _put_together(item, archive, others) for key, item in items}
+        return {key: _unflatten(item, archive, classes) for key, item in items}
     if "tuple" in structure:
         items = structure["tuple"]
-        return tuple(_put_together(item, archive, others) for item in items)
+        return tuple(_unflatten(item, archive, classes) for item in items)
     name = structure["record"]
-    record = others[name] if name in others else specs.record_named(name)
+    record = classes[name] if name in classes else specs.record_named(name)
     fields = {
-        key: _put_together(item, archive, others)
+        key: _unflatten(item, archive, classes)
         for key, item in structure["fields"].items()
     }
     return specs.build_record(record, fields)

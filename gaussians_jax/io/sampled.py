@@ -1,4 +1,4 @@
-"""A trained scene at a few times, for players that do not evaluate the model."""
+"""A trained scene sampled at a few times, for players without the model."""
 
 import math
 from typing import NamedTuple
@@ -19,34 +19,34 @@ from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.runtime import data_parallel, events
 
 LEAST_INSTANTS, MOST_INSTANTS = 24, 48
-MOST_VIEWS = 48  # training views that say what was seen, and in which color
-MOST_SIDE_PX = 320  # of their images: larger ones take longer with the same result
-# Pixels' worth of picture, in the view that shows most of it: what shows less is left
-# out. Built-in scene, `splats-tracked-small`, 300 steps: this
-# leaves out 436 of 10,000, and held-out frames are 56.6 dB from the model's own; 0.3
-# leaves out 1,426 (53.4 dB), 1 3,359 (42.5 dB), nothing none (56.8 dB).
+MOST_VIEWS = 48  # training views that determine visibility and color
+MOST_SIDE_PX = 320  # of their images, because larger ones give the same result
+# Gaussians are left out if they contribute less to every view, in pixels. Built-in
+# scene, `splats-tracked-small`, 300 steps: this leaves out 436 of 10,000, and held-out
+# renders have 56.6 dB with respect to the model's own. 0.3 leaves out 1,426 (53.4 dB),
+# 1 leaves out 3,359 (42.5 dB), and 0 none (56.8 dB).
 LEAST_SEEN_PX = 0.1
-# What stands hidden is looked at without what moves: farther than this share of its
-# distance, at so many times.
+# Gaussians count as moving if they move by more than this share of their distance to
+# the cameras, at this number of times. Hidden ones are evaluated without them.
 MOVES, TIMES = 0.01, 8
 
 
 class Instants(NamedTuple):
-    """Gaussians at evenly spread times from 0 to 1, without what no camera saw."""
+    """Gaussians at evenly spaced times from 0 to 1, without invisible ones."""
 
     mean: np.ndarray  # [instants, gaussians, 3], scene units
-    quaternion: np.ndarray  # [instants, gaussians, 4] wxyz, unit length, sign steady
+    quaternion: np.ndarray  # [instants, gaussians, 4] wxyz, unit, with steady signs
     log_scale: np.ndarray  # [instants, gaussians, 3]
     opacity: np.ndarray  # [instants, gaussians]
-    color: np.ndarray  # [gaussians, 3] from 0, the same from everywhere
+    color: np.ndarray  # [gaussians, 3], not negative, independent of the direction
     left_out: int  # Gaussians that no camera saw
 
 
 class Seen(NamedTuple):
     """Contribution of each Gaussian to the training views."""
 
-    most: np.ndarray  # [gaussians] pixels, in the view that shows most of it
-    color: np.ndarray  # [gaussians, 3], mean over the views by how much they show
+    most: np.ndarray  # [gaussians] pixels, in the view with the largest contribution
+    color: np.ndarray  # [gaussians, 3], mean over the views weighted by contribution
 
 
 def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
@@ -54,23 +54,26 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
 
     Args:
       at: Function from time to Gaussians.
-      rows: Raw parameters, which tell the active Gaussians.
+      rows: Raw parameters, for the number of active Gaussians.
       seen: Contribution of each Gaussian to the training views.
       count: Number of times.
 
     Returns:
       The Gaussians at these times.
+
+    Raises:
+      ValueError: If no Gaussian is visible from a training camera.
     """
-    # NaN compares false: it is left out.
-    (kept,) = np.nonzero(seen.most >= LEAST_SEEN_PX)
-    if not kept.size:
+    # NaN compares false and is left out.
+    (visible,) = np.nonzero(seen.most >= LEAST_SEEN_PX)
+    if not visible.size:
         raise ValueError(
-            f"none of the {len(seen.most)} Gaussians is to be seen from a training "
+            f"none of the {len(seen.most)} Gaussians is visible from a training "
             "camera; train for more steps"
         )
     poses = [jax.device_get(at(float(time))) for time in np.linspace(0, 1, count)]
     mean, quaternion, scale, opacity = (
-        np.stack([leaf[kept] for leaf in each]) for each in zip(*poses, strict=True)
+        np.stack([leaf[visible] for leaf in each]) for each in zip(*poses, strict=True)
     )
     return Instants(
         mean=mean,
@@ -80,8 +83,8 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
             *splats.LOG_SCALE_RANGE,
         ),
         opacity=opacity,
-        color=seen.color[kept],
-        left_out=int(splats.active_mask(rows).sum()) - kept.size,
+        color=seen.color[visible],
+        left_out=int(splats.active_mask(rows).sum()) - visible.size,
     )
 
 
@@ -106,11 +109,10 @@ def seen_in_training(
     degree: Int[Array, ""],
     capture: Capture,
 ) -> Seen:
-    """Measure the contribution and the mean color of each Gaussian in the training
-    views.
+    """Measure the contribution and mean color of each Gaussian in the training views.
 
-    Every view is evaluated twice, with and without moving Gaussians, to include what
-    these occlude. If this process has two devices, each evaluates one of them.
+    Every view is evaluated twice, with and without moving Gaussians, to include
+    Gaussians that they occlude. With two devices, each evaluates one of the two.
 
     Args:
       at: Function from time to Gaussians.
@@ -125,26 +127,26 @@ def seen_in_training(
     factor = math.ceil(max(capture.size) / MOST_SIDE_PX)
     size = (max(1, capture.size[0] // factor), max(1, capture.size[1] // factor))
     coefficients = splats.active_harmonics(rows, degree)
-    toward = jax.jit(harmonics.color_toward)
+    color_toward = jax.jit(harmonics.color_toward)
     moves = _moves(at, capture)
     most: np.ndarray | float = 0.0
     total, color = 0.0, 0.0
     for row in evaluation.spread(capture.train, MOST_VIEWS):
         view = evaluation.resized(evaluation.view_of(capture, row), capture.size, size)
         deformed = at(float(view.time))
-        looks = [(deformed, view.camera)]
+        variants = [(deformed, view.camera)]
         if moves.any():
             opacity = jnp.where(moves, 0, deformed.opacity)
-            looks.append((deformed._replace(opacity=opacity), view.camera))
-        both = jax.tree.map(lambda *leaves: np.stack(leaves), *looks)
-        weights = list(data_parallel.rows_on_devices(_shown, (size, raster), both))
+            variants.append((deformed._replace(opacity=opacity), view.camera))
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *variants)
+        weights = list(data_parallel.rows_on_devices(_shown, (size, raster), stacked))
         most = np.maximum(most, np.max(weights, axis=0) * factor**2)
         weight = np.sum(weights, axis=0)
-        colors = toward(coefficients, deformed.mean, view.camera.position)
+        colors = color_toward(coefficients, deformed.mean, view.camera.position)
         total = total + weight
         color = color + weight[:, None] * jax.device_get(colors)
-    seen = np.maximum(total, np.finfo(np.float32).tiny)
-    return Seen(np.asarray(most), color / seen[:, None])
+    total_weight = np.maximum(total, np.finfo(np.float32).tiny)
+    return Seen(np.asarray(most), color / total_weight[:, None])
 
 
 def _shown(how, gaussians: Gaussians, camera: Camera):
@@ -163,10 +165,10 @@ def _shown(how, gaussians: Gaussians, camera: Camera):
 
 
 def _moves(at, capture):
-    """[gaussians] bool: which are elsewhere at some time."""
+    """Return the Gaussians that move, [gaussians] bool."""
     means = np.stack([np.asarray(at(float(t)).mean) for t in np.linspace(0, 1, TIMES)])
-    filmed_from = capture.cameras.position[capture.train].mean(axis=0)
-    distance = np.linalg.norm(means[0] - filmed_from, axis=-1)
+    center = capture.cameras.position[capture.train].mean(axis=0)
+    distance = np.linalg.norm(means[0] - center, axis=-1)
     return np.linalg.norm(np.ptp(means, axis=0), axis=-1) > MOVES * distance
 
 
@@ -183,6 +185,6 @@ def steady(quaternion: np.ndarray) -> np.ndarray:
     """
     length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
     unit = quaternion / np.maximum(length, np.finfo(np.float32).tiny)
-    agree = np.einsum("tnk,tnk->tn", unit[1:], unit[:-1])
-    sign = np.cumprod(np.where(agree < 0, -1, 1), axis=0)
+    cosine = np.einsum("tnk,tnk->tn", unit[1:], unit[:-1])
+    sign = np.cumprod(np.where(cosine < 0, -1, 1), axis=0)
     return np.concatenate([unit[:1], unit[1:] * sign[..., None]])

@@ -1,4 +1,4 @@
-"""`.splatv`: a dynamic scene in one file for antimatter15's viewer of that name.
+"""`.splatv`: a dynamic scene in one file for antimatter15's viewer of this format.
 
 Each Gaussian moves on a cubic in time, rotates by a quaternion linear in time, and has
 an opacity that is a Gaussian in time, as in SpacetimeGaussians (Li et al. 2024,
@@ -28,14 +28,14 @@ from nerfies_jax.metrics.image_quality import psnr, quantize
 from nerfies_jax.training.model import TrainState
 
 MAGIC = 0x674B
-TEXELS_ACROSS = 4096  # of the viewer's texture, four for each Gaussian
+TEXELS_ACROSS = 4096  # width of the viewer's texture, four texels per Gaussian
 ALWAYS = 1e4  # width of a constant opacity, in units of the video: 1 - 3e-9 at its ends
-FARTHEST_CENTER = 10.0  # largest center of a fading opacity, in units of the video
-FAINTEST = 1e-3  # weight in the fit of motion of what cannot be seen at all
-FAINTEST_SEEN = 0.05  # opacity; fainter Gaussians are not measured
+FARTHEST_CENTER = 10.0  # largest distance of a temporal center, in units of the video
+FAINTEST = 1e-3  # weight of invisible Gaussians in the fit
+FAINTEST_SEEN = 0.05  # Gaussians with a lower opacity are not measured
 MEASURED = 12  # views
-MOST = 6e4  # of a number in the file, whose half floats end at 65504
-NEAREST = 0.2  # scene units: what is nearer the viewer does not draw
+MOST = 6e4  # largest number in the file, below 65504 of half floats
+NEAREST = 0.2  # near plane of the viewer, scene units
 _ROW = np.dtype(
     [
         ("position", "<f4", 3),
@@ -55,8 +55,8 @@ class Curves(NamedTuple):
     """Curves of the file, as float64 in scene units.
 
     With u the time since `center`, in units of the video: a mean is `position +
-    motion[0] u + motion[1] u² + motion[2] u³`, a rotation `quaternion + turning u` at
-    unit length, and an opacity `opacity exp(-(u / width)²)`.
+    motion[0] u + motion[1] u² + motion[2] u³`, a rotation `quaternion + turning u`,
+    normalized, and an opacity `opacity exp(-(u / width)²)`.
     """
 
     position: np.ndarray  # [gaussians, 3]
@@ -74,8 +74,8 @@ class Fit(NamedTuple):
     """Error of the curves with respect to the trained motion."""
 
     rms: float  # of the visible means at all times, scene units
-    most: float  # of 99 of 100 Gaussians at their worst time
-    psnr: float  # dB, renders of the curves against the run's own
+    most: float  # 99th percentile of the largest error over time, scene units
+    psnr: float  # dB, renders of the curves against those of the trained motion
     views: int
 
 
@@ -90,14 +90,14 @@ def fit(instants: Instants) -> Curves:
     """
     times = np.linspace(0, 1, len(instants.mean))
     opacity, center, width = _bells(times, instants.opacity.astype(np.float64))
-    since = times - 0.5
+    elapsed = times - 0.5
     weight = instants.opacity.astype(np.float64) + FAINTEST
     means = instants.mean.astype(np.float64)
-    place = _polynomials(since, weight, means, 4)
-    turn = _polynomials(since, weight, instants.quaternion.astype(np.float64), 2)
-    # From powers of the time since the middle to those of the time since the center.
+    position = _polynomials(elapsed, weight, means, 4)
+    turn = _polynomials(elapsed, weight, instants.quaternion.astype(np.float64), 2)
+    # Change of variables from the time since the middle to the time since the center.
     shift = (center - 0.5)[:, None]
-    a, b, c, d = np.moveaxis(place, 1, 0)
+    a, b, c, d = np.moveaxis(position, 1, 0)
     motion = np.stack([b + shift * (2 * c + 3 * d * shift), c + 3 * d * shift, d], 1)
     return Curves(
         position=a + shift * (b + shift * (c + shift * d)),
@@ -112,42 +112,39 @@ def fit(instants: Instants) -> Curves:
     )
 
 
-def _polynomials(since, weight, values, terms):
-    """Return coefficients [gaussians, terms, parts] of values [times, gaussians,
-    parts].
-    """
-    powers = since[:, None] ** np.arange(terms)
+def _polynomials(elapsed, weight, values, terms):
+    """Fit coefficients [gaussians, terms, parts] to [times, gaussians, parts]."""
+    powers = elapsed[:, None] ** np.arange(terms)
     squares = np.einsum("tn,ti,tj->nij", weight, powers, powers, optimize=True)
-    right = np.einsum("tn,ti,tnd->nid", weight, powers, values, optimize=True)
-    return np.linalg.solve(squares, right)
+    moments = np.einsum("tn,ti,tnd->nid", weight, powers, values, optimize=True)
+    return np.linalg.solve(squares, moments)
 
 
 def _bells(times, opacity):
-    """Return height, center and width of the curves nearest to opacities [times,
-    gaussians].
+    """Fit height, center and width of a bell curve to opacities [times, gaussians].
 
-    A parabola is fitted to the logarithm, and used if it opens downward and is closer
-    than a constant opacity.
+    A parabola is fitted to the logarithm. It is used if it opens downward and has a
+    smaller error than a constant opacity.
     """
     constant = opacity.mean(axis=0)
     logarithm = np.log(np.maximum(opacity, 1e-4))[..., None]
-    # An error of the logarithm is one of the opacity times the opacity.
+    # The error of the opacity is its logarithm's error times the opacity.
     weight = np.maximum(opacity, 1e-4) ** 2
-    since = times - 0.5
-    fitted = _polynomials(since, weight, logarithm, 3)[..., 0]
+    elapsed = times - 0.5
+    fitted = _polynomials(elapsed, weight, logarithm, 3)[..., 0]
     opens_down = fitted[:, 2] < -((1 / ALWAYS) ** 2)
     curvature = np.where(opens_down, -fitted[:, 2], 1.0)
     offset = fitted[:, 1] / (2 * curvature)
     opens_down &= np.abs(offset) < FARTHEST_CENTER
     offset = np.where(opens_down, offset, 0.0)
     height = np.exp(np.minimum(fitted[:, 0] + curvature * offset**2, 0))
-    bell = height * np.exp(-curvature * (since[:, None] - offset) ** 2)
-    nearer = ((bell - opacity) ** 2).sum(0) < ((constant - opacity) ** 2).sum(0)
-    taken = opens_down & nearer
+    bell = height * np.exp(-curvature * (elapsed[:, None] - offset) ** 2)
+    is_better = ((bell - opacity) ** 2).sum(0) < ((constant - opacity) ** 2).sum(0)
+    use_bell = opens_down & is_better
     return (
-        np.where(taken, height, constant),
-        0.5 + np.where(taken, offset, 0.0),
-        np.where(taken, curvature**-0.5, ALWAYS),
+        np.where(use_bell, height, constant),
+        0.5 + np.where(use_bell, offset, 0.0),
+        np.where(use_bell, curvature**-0.5, ALWAYS),
     )
 
 
@@ -161,11 +158,11 @@ def at(curves: Curves, time: float) -> Gaussians:
     Returns:
       The Gaussians.
     """
-    since = (time - curves.center)[:, None]
+    elapsed = (time - curves.center)[:, None]
     first, second, third = np.moveaxis(curves.motion, 1, 0)
-    mean = curves.position + since * (first + since * (second + since * third))
-    turn = curves.quaternion + curves.turning * since
-    bell = np.exp(-((since[:, 0] / curves.width) ** 2))
+    mean = curves.position + elapsed * (first + elapsed * (second + elapsed * third))
+    turn = curves.quaternion + curves.turning * elapsed
+    bell = np.exp(-((elapsed[:, 0] / curves.width) ** 2))
     parts = mean, turn, curves.scale, curves.opacity * bell
     return Gaussians(*(jnp.asarray(part, jnp.float32) for part in parts))
 
@@ -179,12 +176,15 @@ def encode(curves: Curves, capture: Capture) -> bytes:
 
     Returns:
       Bytes of the file.
+
+    Raises:
+      ValueError: If a number exceeds the range of the format.
     """
     for name, values in curves._asdict().items():
         if not np.abs(values).max(initial=0) < MOST:
             raise ValueError(
-                f"{name} of {np.abs(values).max():.3g}: .splatv holds numbers below "
-                f"{MOST:g}; scale the capture down"
+                f"{name} of {np.abs(values).max():.3g} exceeds {MOST:g}, the largest "
+                "number of .splatv; scale the capture down"
             )
     count = len(curves.position)
     rows = np.zeros(-(-count // 1024) * 1024, _ROW)
@@ -206,17 +206,17 @@ def encode(curves: Curves, capture: Capture) -> bytes:
 
 
 def _camera(capture, row):
-    one = cameras.take(capture.cameras, row)
-    focal = float(one.focal_px)
+    camera = cameras.take(capture.cameras, row)
+    focal = float(camera.focal_px)
     return {
         "id": int(row),
         "img_name": capture.ids[row],
         "width": capture.size[0],
         "height": capture.size[1],
-        "position": one.position.tolist(),
-        "rotation": one.camera_from_world.T.tolist(),  # world from camera
+        "position": camera.position.tolist(),
+        "rotation": camera.camera_from_world.T.tolist(),  # world from camera
         "fx": focal,
-        "fy": focal * float(one.pixel_aspect),
+        "fy": focal * float(camera.pixel_aspect),
     }
 
 
@@ -231,9 +231,11 @@ def decode(data: bytes) -> Curves:
     """
     magic, length = np.frombuffer(data[:8], "<u4")
     if magic != MAGIC:
-        raise ValueError(f"begins with {magic:#x}, not {MAGIC:#x}: not a .splatv file")
+        raise ValueError(
+            f"it begins with {magic:#x}, not {MAGIC:#x}: not a .splatv file"
+        )
     rows = np.frombuffer(data[8 + int(length) :], _ROW)
-    rows = rows[rows["bell"][:, 1] > 0]  # the rest of the texture is empty
+    rows = rows[rows["bell"][:, 1] > 0]  # without padding of the texture
     rgba = rows["rgba"] / 255
     bell = rows["bell"].astype(np.float64)
     names = ("position", "motion", "quaternion", "turning", "scale")
@@ -281,12 +283,12 @@ def measured(
       The errors.
     """
     times = np.linspace(0, 1, len(instants.mean))
-    fitted = np.stack([np.asarray(at(curves, time).mean) for time in times])
-    off = np.linalg.norm(fitted - instants.mean, axis=-1)
-    off = np.where(instants.opacity > FAINTEST_SEEN, off, 0)
+    fitted_means = np.stack([np.asarray(at(curves, time).mean) for time in times])
+    error = np.linalg.norm(fitted_means - instants.mean, axis=-1)
+    error = np.where(instants.opacity > FAINTEST_SEEN, error, 0)
     background = jnp.asarray(capture.background or (0.0, 0.0, 0.0), jnp.float32)
     colors = jnp.asarray(curves.color, jnp.float32)
-    pictured = jax.jit(
+    render = jax.jit(
         lambda gaussians, camera: (
             rendering.render(
                 gaussians,
@@ -304,12 +306,12 @@ def measured(
     for row in rows:
         view = evaluation.view_of(capture, row)
         camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), view.camera)
-        picture = pictured(at(curves, float(view.time)), camera)
-        own = jnp.clip(draw(state, view).color, 0, 1)
-        scores.append(float(psnr(quantize(picture), quantize(own))))
+        image = render(at(curves, float(view.time)), camera)
+        reference = jnp.clip(draw(state, view).color, 0, 1)
+        scores.append(float(psnr(quantize(image), quantize(reference))))
     return Fit(
-        rms=float(np.sqrt(np.mean(off**2))),
-        most=float(np.quantile(off.max(axis=0), 0.99)),
+        rms=float(np.sqrt(np.mean(error**2))),
+        most=float(np.quantile(error.max(axis=0), 0.99)),
         psnr=float(np.mean(scores)),
         views=len(rows),
     )

@@ -1,9 +1,9 @@
 """SPZ, the packed format of Niantic: versions 2 and 3 (gzip) and 4 (zstd).
 
-Layout and quantization follow github.com/nianticlabs/spz, README and headers. Fields
-follow one another for all Gaussians: 24-bit fixed-point means, opacities, colors,
-logarithms of scales, rotations, harmonics. Its axes are right, up, back. Ours, like
-those of 3DGS PLY files, are right, down, front.
+Layout and quantization follow the README and headers of github.com/nianticlabs/spz.
+Fields follow one another for all Gaussians: 24-bit fixed-point means, opacities,
+colors, logarithms of scales, rotations, harmonics. SPZ axes are right, up, back. Ours,
+like those of 3DGS PLY files, are right, down, front.
 """
 
 import gzip
@@ -18,18 +18,18 @@ from gaussians_jax.core.splats import LOG_SCALE_RANGE
 from nerfies_jax.capture import extras
 
 MAGIC = b"NGSP"
-COLOR_SCALE = 0.15  # of the constant harmonic's coefficient, to a byte from 0 to 1
-FRACTION_BITS = 12  # of a mean: steps of 1/4096 scene unit, range +-2048
-# Neither deflate nor the reference reader allows more; a header that asks for more rows
-# than the file could hold is refused before anything is allocated.
+COLOR_SCALE = 0.15  # from the coefficient of the constant harmonic to [0, 1]
+FRACTION_BITS = 12  # of a mean: steps of 1/4096 scene unit, range ±2048
+# Largest compression ratio of deflate, also enforced by the reference reader. A header
+# that claims more Gaussians is refused before anything is allocated.
 MOST_EXPANSION = 1032
-MOST_WINDOW = 1 << 27  # bytes that decompressing may allocate; zstd's own default
+MOST_WINDOW = 1 << 27  # bytes allocated for decompression, zstd's default
 SMALLEST_THREE_STEPS = 511 * math.sqrt(2)  # nine bits over 1/sqrt(2)
 
-# y and z change sign between the two systems of axes.
+# Signs under the change between the two systems of axes, which flips y and z.
 _MEAN_SIGN = np.array([1, -1, -1], np.float32)
 _TURN_SIGN = np.array([1, 1, -1, -1], np.float32)  # wxyz, of F R F
-# Parity of each basis function of degrees 1 to 3 under that change of axes.
+# Parity of each spherical harmonic of degrees 1 to 3 under that change.
 _SH_SIGN = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
@@ -101,22 +101,22 @@ def encode(rows: Unpacked, version: int = 3) -> bytes:
       ValueError: If a mean exceeds the fixed-point range of 2048 scene units.
     """
     if version not in (2, 3, 4):
-        raise ValueError(f"SPZ versions 2, 3 and 4 can be written, not {version}")
+        raise ValueError(f"version={version}: SPZ versions 2, 3 and 4 can be written")
     count, rest = len(rows.mean), rows.sh_rest.shape[1]
     steps = np.rint(rows.mean.astype(np.float64) * 2**FRACTION_BITS * _MEAN_SIGN)
     if np.abs(steps).max() >= 1 << 23:
         raise ValueError(
-            f"a mean lies {np.abs(rows.mean).max():g} scene units out and SPZ ends at "
-            "2048; write a .ply, or scale the scene down"
+            f"a mean is {np.abs(rows.mean).max():g} scene units from the origin, but "
+            "SPZ ends at 2048; write a .ply file, or scale the scene down"
         )
     mean = np.ascontiguousarray(steps.astype("<i4")[..., None]).view(np.uint8)[..., :3]
     quaternion = _normalize(rows.quaternion) * _TURN_SIGN
     pack = _pack_first_three if version == 2 else _pack_smallest_three
-    # Held before they are scaled, which float32 coefficients above 2e36 would overflow;
-    # their bytes end at 1 and at 10 / 3.
+    # Clamped before scaling, because coefficients above 2e36 would overflow float32.
+    # Their largest bytes stand for 1 and 10 / 3.
     sh = np.rint(np.clip(rows.sh_rest, -1, 1) * _SH_SIGN[:rest, None] * 128) + 128
     color = np.clip(rows.sh_dc, -4, 4) * (COLOR_SCALE * 255) + 127.5
-    # The reference keeps 5 bits of degree 1 and 4 of the others; the zeros compress.
+    # The reference keeps 5 bits of degree 1 and 4 of the others; zeros compress well.
     step = np.where(np.arange(rest) < 3, 8, 16)[:, None]
     logit = rows.opacity_logit.astype(np.float64)
     parts = [
@@ -141,15 +141,22 @@ def encode(rows: Unpacked, version: int = 3) -> bytes:
 
 
 def logit_of_byte(opacity: np.ndarray) -> np.ndarray:
-    """The logit whose opacity rounds to the given byte, finite at 0 and at 255."""
-    # A quarter of a step inside: it rounds back to the byte it came from.
-    share = np.clip(opacity.astype(np.float64), 0.25, 254.75) / 255
-    return (np.log(share) - np.log1p(-share)).astype(np.float32)
+    """Convert an opacity byte to a logit that is finite at 0 and at 255.
+
+    Args:
+      opacity: Opacities as bytes.
+
+    Returns:
+      Logits, whose opacity rounds to the byte.
+    """
+    # A quarter of a step inside the range, so that it rounds back to the same byte.
+    opacity_value = np.clip(opacity.astype(np.float64), 0.25, 254.75) / 255
+    return (np.log(opacity_value) - np.log1p(-opacity_value)).astype(np.float32)
 
 
 def _open_gzip(data):
     if data[:4] != MAGIC and data[:2] != b"\x1f\x8b":
-        raise ValueError("neither gzip nor NGSP at its start: not an SPZ file")
+        raise ValueError("it begins with neither gzip nor NGSP: not an SPZ file")
     inflate = zlib.decompressobj(31)
     raw = data[:4] == MAGIC  # some tools write the contents uncompressed
     try:
@@ -167,7 +174,8 @@ def _open_gzip(data):
         raise ValueError(f"the gzip stream is damaged ({error})") from error
     if len(body) < total:
         raise ValueError(
-            f"truncated: {count} Gaussians need {total} bytes, found {len(body)}"
+            f"truncated: {count} Gaussians need {total} bytes, but there are "
+            f"{len(body)}"
         )
     values = np.frombuffer(body, np.uint8)
     return (version, count, degree, bits, flags), np.split(
@@ -177,31 +185,33 @@ def _open_gzip(data):
 
 def _open_zstd(data):
     if len(data) < 32:
-        raise ValueError(f"truncated: an SPZ header has 32 bytes, found {len(data)}")
+        raise ValueError(
+            f"truncated: an SPZ header has 32 bytes, but there are {len(data)}"
+        )
     version, count, degree, bits, flags, streams, table = struct.unpack_from(
         "<IIBBBBI", data, 4
     )
     if version != 4:
         raise ValueError(f"SPZ version {version}; versions 2, 3 and 4 can be read")
     sizes = _sizes(version, count, degree, bits, len(data))
-    wanted = [size for size in sizes if size]
+    nonempty = [size for size in sizes if size]
     start = table + 16 * streams
-    if table < 32 or start > len(data) or streams != len(wanted):
+    if table < 32 or start > len(data) or streams != len(nonempty):
         raise ValueError(
             f"its table of {streams} streams at byte {table} does not fit the file"
         )
     decompressor = _zstandard().ZstdDecompressor(max_window_size=MOST_WINDOW)
     parts = []
-    for index, size in enumerate(wanted):
+    for index, size in enumerate(nonempty):
         packed, unpacked = struct.unpack_from("<QQ", data, table + 16 * index)
         piece = data[start : start + packed]
         if unpacked != size or len(piece) < packed:
             raise ValueError(
-                f"stream {index} has {len(piece)} of {packed} bytes and stands for "
-                f"{unpacked}; {count} Gaussians need {size}"
+                f"stream {index} has {len(piece)} of {packed} bytes and decompresses "
+                f"to {unpacked}; {count} Gaussians need {size}"
             )
         try:
-            # Streamed, because a frame need not say its size; one byte more would show.
+            # One byte more reveals a longer stream. Frames need not store their size.
             with decompressor.stream_reader(piece, read_across_frames=True) as reader:
                 part = reader.read(size + 1)
         except Exception as error:
@@ -216,7 +226,7 @@ def _open_zstd(data):
 
 
 def _sizes(version, count, degree, bits, file_bytes):
-    """Bytes of each field, once the header is believable."""
+    """Return the bytes of each field, after checking the header."""
     if version not in (2, 3, 4):
         raise ValueError(f"SPZ version {version}; versions 2, 3 and 4 can be read")
     if degree > 3 or bits > 23:
@@ -225,7 +235,7 @@ def _sizes(version, count, degree, bits, file_bytes):
             "3 and 23 can be read"
         )
     if count == 0:
-        raise ValueError("no Gaussians in it")
+        raise ValueError("it holds no Gaussians")
     rest = (degree + 1) ** 2 - 1
     sizes = [9 * count, count, 3 * count, 3 * count]
     sizes += [(3 if version == 2 else 4) * count, 3 * rest * count]
@@ -240,14 +250,14 @@ def _sizes(version, count, degree, bits, file_bytes):
 def _notes(flags):
     notes = []
     if flags & 1:
-        notes.append("made for antialiased rendering (opacity compensation)")
+        notes.append("it was made for antialiased rendering (opacity compensation)")
     if flags & 2:
-        notes.append("vendor extensions were left out")
+        notes.append("ignored: vendor extensions")
     return tuple(notes)
 
 
 def _byte(values):
-    # Half away from zero, as the C++ reference rounds; numpy rounds half to even.
+    # Half away from zero as in the C++ reference, because numpy rounds half to even.
     return np.clip(np.floor(np.asarray(values, np.float64) + 0.5), 0, 255).astype(
         np.uint8
     )
@@ -264,8 +274,8 @@ def _normalize(quaternion):
 
 def _first_three(bytes_):
     xyz = bytes_.astype(np.float32) / 127.5 - 1
-    left = 1 - np.sum(xyz.astype(np.float64) ** 2, axis=1, keepdims=True)
-    w = np.sqrt(np.maximum(left, 0)).astype(np.float32)
+    remainder = 1 - np.sum(xyz.astype(np.float64) ** 2, axis=1, keepdims=True)
+    w = np.sqrt(np.maximum(remainder, 0)).astype(np.float32)
     return np.concatenate([w, xyz], axis=1)
 
 
@@ -275,19 +285,19 @@ def _pack_first_three(quaternion):
 
 
 def _smallest_three(bytes_):
-    """Index of the largest component (xyzw) and the others as sign and nine bits."""
+    """Decode the index of the largest component (xyzw) and the others in ten bits."""
     word = np.ascontiguousarray(bytes_).view("<u4")[:, 0]
     largest = (word >> 30).astype(int)
     xyzw = np.zeros((len(word), 4))
-    left = np.ones(len(word))
-    for axis in (3, 2, 1, 0):  # the last one written lies lowest
-        held = largest != axis
+    remainder = np.ones(len(word))
+    for axis in (3, 2, 1, 0):  # the last component has the lowest bits
+        is_stored = largest != axis
         value = (word & 511) / SMALLEST_THREE_STEPS
         value = np.where(word & 512, -value, value)
-        xyzw[:, axis] = np.where(held, value, 0)
-        left -= xyzw[:, axis] ** 2
-        word = np.where(held, word >> np.uint32(10), word)
-    xyzw[np.arange(len(word)), largest] = np.sqrt(np.maximum(left, 0))
+        xyzw[:, axis] = np.where(is_stored, value, 0)
+        remainder -= xyzw[:, axis] ** 2
+        word = np.where(is_stored, word >> np.uint32(10), word)
+    xyzw[np.arange(len(word)), largest] = np.sqrt(np.maximum(remainder, 0))
     return xyzw[:, [3, 0, 1, 2]].astype(np.float32)
 
 

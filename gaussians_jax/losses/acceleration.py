@@ -1,8 +1,8 @@
-"""Penalty on small motions, which leaves large motions free.
+"""Acceleration penalty for small motions, which leaves large motions free.
 
 MoBa-GS, section 3.3 ("intrinsic structural prior"), describes an acceleration penalty
 that decays exponentially for moving points, without a formula. This one uses the second
-difference in time of SC-GS, arXiv:2312.14937, with a weight that falls with the
+difference in time of SC-GS, arXiv:2312.14937, with a weight that decays with the
 distance from the canonical position, and adds the first difference.
 """
 
@@ -21,26 +21,26 @@ from nerfies_jax.training.effects import PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "acceleration"
-_STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the choice of rows
+_STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, to sample Gaussians
 
 
 @dataclasses.dataclass(frozen=True)
 class AccelerationSpec:
     """Settings of the acceleration penalty.
 
-    `decay` is the distance from the canonical position at which the weight has fallen
+    `decay` is the distance from the canonical position at which the weight has decayed
     to 1/e, as a share of the scene's extent. It is also the unit of the differences, so
     that `weight` means the same in every scene. `drift` is the weight of the first
-    difference relative to the second, which does not see a steady drift: static points
-    drifted by 9 cm at an acceleration of 1e-17.
+    difference relative to the second. The second alone does not penalize a constant
+    velocity: static points drifted by 9 cm at an acceleration of 1e-17.
     """
 
     weight: float = 1e-2
     decay: float = 1e-2
     drift: float = 1.0
-    interval: float = 1.0  # between the times compared, in frames
-    samples: int = 1024  # Gaussians drawn in a step
-    start: int = steps(0)  # steps before which it is not evaluated
+    interval: float = 1.0  # between the compared times, in frames
+    samples: int = 1024  # Gaussians sampled in a step
+    start: int = steps(0)  # first step with this penalty
 
     def __post_init__(self):
         for name in ("weight", "drift"):
@@ -53,19 +53,27 @@ class AccelerationSpec:
                 raise ValueError(f"{name}={value} must be finite and positive")
         if self.samples < 1 or self.start < 0:
             raise ValueError(
-                f"samples >= 1 and start >= 0, got {self.samples} and {self.start}"
+                "samples must be at least 1 and start at least 0, got "
+                f"samples={self.samples} and start={self.start}"
             )
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the regularizer of a scene of this capture."""
+        """Return the regularizer for this capture."""
         return Bound(self, metadata.extent, metadata.moments)
 
 
 def instants(time: Float[Array, ""], interval: float) -> Float[Array, "3"]:
-    """Three times an `interval` apart, all within [0, 1], `time` in their middle.
+    """Return three times an `interval` apart, with `time` in the middle.
 
-    At the ends of the capture they are moved inwards together, for a motion is not
-    trained outside. An interval of more than a half counts as a half.
+    Near the ends of the capture they are shifted inwards together, because a motion is
+    not trained outside of it.
+
+    Args:
+      time: Normalized time.
+      interval: Distance of the times, at most one half.
+
+    Returns:
+      Times in [0, 1].
     """
     interval = min(interval, 0.5)
     middle = jnp.clip(time, interval, 1 - interval)
@@ -81,13 +89,25 @@ def acceleration_loss(
     decay: float,
     drift: float,
 ) -> Float[Array, ""]:
-    """Mean of exp(-|p - c| / s) (|p+ - 2 p + p-|^2 + drift |(p+ - p-) / 2|^2) / s^2.
+    """Compute the weighted mean of squared accelerations and velocities.
 
-    c, p-, p, p+ are the places given and s = `decay`, all in scene units. The weight
-    has no slope: a point must not escape the penalty by moving away.
+    The loss is the mean of exp(-|p - c| / s) (|p+ - 2 p + p-|^2 + drift |(p+ - p-) /
+    2|^2) / s^2, where c, p-, p, p+ are the positions and s is `decay`. The weight has
+    no gradient, so that a point cannot reduce the penalty by moving away.
+
+    Args:
+      canonical: Canonical positions in scene units.
+      before: Positions at the earlier time.
+      now: Positions at the middle time.
+      after: Positions at the later time.
+      decay: Distance at which the weight has decayed to 1/e, in scene units.
+      drift: Weight of the velocities.
+
+    Returns:
+      The loss.
     """
     weight = _stillness(canonical, now, decay)
-    # Each difference of two close places is exact; their sum is not, in another order.
+    # Differences of two close positions are exact, in contrast to their sum.
     ahead, behind = (after - now) / decay, (now - before) / decay
     energy = jnp.sum(jnp.square(ahead - behind), axis=-1)
     if drift > 0:
@@ -97,8 +117,8 @@ def acceleration_loss(
 
 
 def _stillness(canonical, now, decay):
-    moved = jax.lax.stop_gradient(now - canonical) / decay
-    return jnp.exp(-jnp.sqrt(jnp.sum(jnp.square(moved), axis=-1)))
+    displacement = jax.lax.stop_gradient(now - canonical) / decay
+    return jnp.exp(-jnp.sqrt(jnp.sum(jnp.square(displacement), axis=-1)))
 
 
 def draw_active(
@@ -107,7 +127,7 @@ def draw_active(
     """Sample active Gaussians uniformly, with replacement.
 
     Args:
-      key: Random key.
+      key: PRNG key.
       active: True for active Gaussians. If there are none, any are sampled.
       count: Number of samples.
 
@@ -115,8 +135,8 @@ def draw_active(
       Indices.
     """
     rank = jnp.cumsum(active)
-    drawn = jax.random.randint(key, (count,), 1, jnp.maximum(rank[-1], 1) + 1)
-    rows = jnp.searchsorted(rank, drawn.astype(rank.dtype))
+    ranks = jax.random.randint(key, (count,), 1, jnp.maximum(rank[-1], 1) + 1)
+    rows = jnp.searchsorted(rank, ranks.astype(rank.dtype))
     return jnp.minimum(rows, active.shape[0] - 1)
 
 
@@ -125,12 +145,12 @@ class Bound:
     """The `Regularizer` of an `AccelerationSpec`, for `frames` spread over [0, 1].
 
     It evaluates `spec.samples` Gaussians at three times. Forward and backward on one
-    core, 1024 samples: 8 ms with a motion network 4 x 64, 155 ms with 8 x 256, a third
-    of what moving all of 10k rows once takes.
+    core take 8 ms for 1024 samples with a motion network 4 x 64, and 155 ms with 8 x
+    256, a third of the time to move all of 10k Gaussians once.
     """
 
     spec: AccelerationSpec
-    extent: float  # of the scene, scene units
+    extent: float  # of the scene, in scene units
     frames: int
 
     name = NAME
@@ -138,9 +158,9 @@ class Bound:
     def __post_init__(self):
         if self.frames < 2 or not 0 < self.extent < math.inf:
             raise ValueError(
-                "an acceleration needs at least two frames and a finite, positive "
-                f"extent, got frames={self.frames} and extent={self.extent}; leave it "
-                "out of this scene"
+                "an acceleration penalty needs at least two frames and a finite, "
+                f"positive extent, got frames={self.frames} and extent={self.extent}; "
+                "leave it out of this scene"
             )
 
     def loss(self, params: Params, context: PenaltyContext) -> dict[str, Term]:
@@ -158,23 +178,23 @@ class Bound:
         at_time = context.at_time
 
         def evaluate(params):
-            some = splats.take_rows(params, rows)
-            canonical = some.rows["splats"].mean
+            selected = splats.take_rows(params, rows)
+            canonical = selected.rows["splats"].mean
             times = instants(condition.time, interval)
-            before, now, after = (at_time(some, t).mean for t in times)
+            before, now, after = (at_time(selected, t).mean for t in times)
             value = acceleration_loss(canonical, before, now, after, decay, spec.drift)
-            still = jnp.mean(_stillness(canonical, now, decay))
-            there = jnp.any(active)
-            return jnp.where(there, value, 0), jnp.where(there, still, 0)
+            static = jnp.mean(_stillness(canonical, now, decay))
+            any_active = jnp.any(active)
+            return jnp.where(any_active, value, 0), jnp.where(any_active, static, 0)
 
         def nothing(params):
             zero = jnp.zeros((), params.rows["splats"].mean.dtype)
             return zero, zero
 
         if spec.start == 0:
-            value, still = evaluate(params)
+            value, static = evaluate(params)
         else:
-            value, still = jax.lax.cond(
+            value, static = jax.lax.cond(
                 condition.step < spec.start, nothing, evaluate, params
             )
-        return {"unrest": Term(value, spec.weight), "still": Term(still, None)}
+        return {"unrest": Term(value, spec.weight), "still": Term(static, None)}

@@ -1,16 +1,16 @@
 """Optical flow loss on the motion of Gaussians, without the flow of the camera.
 
 Zhu et al. 2024 (MotionGS), arXiv:2410.07707, section 4.2 (equations 4 to 8) and
-appendix A.1. Flow from one frame to the next is that of the camera, which the drawn
-depth and both cameras say (equations 4 to 6), and that of things, which is left
-(equation 7). The latter is held against the flow of the Gaussians (equation 8): where
-each goes in the next camera's picture between the two moments, with the ellipse that it
-is drawn as, blended as its color is (equations 10 to 14). A Gaussian's flow is linear
-in the pixel, so that six channels are exact for all pixels.
+appendix A.1. The flow from one frame to the next consists of camera flow, which is
+computed from the rendered depth and both cameras (equations 4 to 6), and of motion
+flow, the remainder (equation 7). The motion flow is compared with the flow of the
+Gaussians (equation 8): the displacement of each footprint between the two times in the
+next camera's image, blended like colors (equations 10 to 14). The flow of a Gaussian is
+linear in the pixel, so six channels are exact for all pixels.
 
-The paper also masks out what is at rest, as `FlowSpec.moving_only` does. In which
-camera the Gaussians flow it says twice and differently (section 4.2: the next, the end
-of A.1: the first); here footprints move in the picture of the next, and are met at the
+The paper also masks static regions, as `FlowSpec.moving_only` does. It is inconsistent
+about the camera of the Gaussians' flow (section 4.2: the next, the end of A.1: the
+first). Here footprints move in the image of the next camera and are evaluated at the
 pixels of the first.
 """
 
@@ -36,25 +36,26 @@ from nerfies_jax.training.effects import PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
 
 NAME = "flow"
-LEAST_SHARE = 1e-10  # of opacity that is divided by
+LEAST_SHARE = 1e-10  # smallest opacity that is divided by
 
 
 @dataclasses.dataclass(frozen=True)
 class FlowSpec:
-    """Weight of the flow loss, and its first step.
+    """Settings of the flow loss.
 
-    Weight and form are the paper's code's: absolute differences of flows in units of
-    the picture's sides, each held to one side; 0.5 is for NeRF-DS, and for HyperNeRF
-    the paper has 0.1. `opaque` is the least opacity of a pixel that is compared, where
-    flow is known as well; there all are. With `moving_only` those are compared alone
-    that a capture's masks mark as moving (all where it has none).
+    Weight and form are those of the paper's code: absolute differences of flows in
+    units of the image's width and height, clamped to ±1. The weight 0.5 is for NeRF-DS.
+    The paper uses 0.1 for HyperNeRF. `opaque` is the smallest opacity of a pixel that
+    is compared, where the paper compares all pixels with known flow. With
+    `moving_only`, only pixels that the masks of a capture mark as moving are compared
+    (all pixels without masks).
 
-    As there, neither the weights of the blending nor the depth get a slope. Otherwise
-    than there, both ends of a Gaussian's way get one: with the first held still, the
-    Gaussian itself would be pulled along the flow.
+    As in the paper, the blending weights and the depth get no gradient. In contrast to
+    the paper, the Gaussians get a gradient at both times. With the first time fixed,
+    the Gaussian itself would be pulled along the flow.
 
-    Cameras that are refined beside it (`pose_refinement`) get a slope by the camera's
-    flow, both of them, and the next one by what Gaussians do in its picture.
+    Cameras that are refined at the same time (`per_frame.poses`) get a gradient from
+    the camera flow, and the next camera also from the flow of the Gaussians.
     """
 
     weight: float = 0.5
@@ -65,21 +66,21 @@ class FlowSpec:
     def __post_init__(self):
         if not (math.isfinite(self.weight) and self.weight >= 0):
             raise ValueError(
-                f"weight={self.weight} of the flow must be finite and not negative"
+                f"weight={self.weight} of the flow loss must be finite and not negative"
             )
         if self.start < 0 or not 0 < self.opaque < 1:
             raise ValueError(
-                "flow needs start >= 0 and 0 < opaque < 1, got "
+                "the flow loss needs start >= 0 and 0 < opaque < 1, got "
                 f"start={self.start} and opaque={self.opaque}"
             )
 
 
-class Drawn(NamedTuple):
-    """The Gaussians' flow in one picture."""
+class RenderedFlow(NamedTuple):
+    """Flow of the Gaussians in one image."""
 
-    flow: Float[Array, "height width 2"]  # px right and down; zero where nothing is
-    share: Float[Array, "height width"]  # opacity of what both moments show
-    depth: Float[Array, "height width"]  # expected z-depth, scene units; 0 of nothing
+    flow: Float[Array, "height width 2"]  # px right and down, zero without Gaussians
+    share: Float[Array, "height width"]  # opacity of Gaussians visible at both times
+    depth: Float[Array, "height width"]  # expected z-depth, scene units, or 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,24 +88,24 @@ class Bound:
     """The `Regularizer` of a `FlowSpec`, without a term if the capture has no flow."""
 
     spec: FlowSpec
-    picture: RasterSpec
+    raster_spec: RasterSpec
 
     name = NAME
 
     @property
     def required_data(self) -> frozenset[str]:
-        """Data of the capture that it reads."""
+        """Names of the capture data that the loss needs."""
         return frozenset({"flow", "moving"} if self.spec.moving_only else {"flow"})
 
     def loss(self, params: Params, context: PenaltyContext) -> dict[str, Term]:
-        """Compute the difference of the Gaussians' flow and that of the capture."""
+        """Compute the difference between the flows of Gaussians and capture."""
         assert context.observation is not None
         frames, spec = context.observation.frames, self.spec
         if frames is None or frames.flow is None:
             return {}
 
         def evaluate(params):
-            return compared(spec, self.picture, params, context)
+            return flow_error(spec, self.raster_spec, params, context)
 
         def nothing(params):
             zero = jnp.zeros((), params.rows["splats"].mean.dtype)
@@ -118,10 +119,10 @@ class Bound:
         return {"error": Term(error, spec.weight), "known": Term(known, None)}
 
 
-def compared(
-    spec: FlowSpec, picture: RasterSpec, params: Any, context: PenaltyContext
+def flow_error(
+    spec: FlowSpec, raster_spec: RasterSpec, params: Any, context: PenaltyContext
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Error of the frame of a step, and the share of its pixels that are compared."""
+    """Compute the flow error of a step's frame, and the share of compared pixels."""
     observation, at_time = context.observation, context.at_time
     assert observation is not None
     assert at_time is not None
@@ -133,50 +134,63 @@ def compared(
     first, second = (cameras.take(frames.cameras, at) for at in (row, other))
     pair = first, second
     size = frames.images.shape[2], frames.images.shape[1]
-    drawn = drawn_flow(here, there, pair, size, picture)
-    shift = frames.flow.forward[row].astype(drawn.flow.dtype)
-    seen = frames.flow.forward_seen[row] & (drawn.share >= spec.opaque)
+    rendered = render_flow(here, there, pair, size, raster_spec)
+    shift = frames.flow.forward[row].astype(rendered.flow.dtype)
+    seen = frames.flow.forward_seen[row] & (rendered.share >= spec.opaque)
     if observation.valid is not None:
         seen = seen & observation.valid
     if spec.moving_only and frames.moving is not None:
         seen = seen & frames.moving[row]
-    things = shift - camera_flow(pair, drawn.depth)
-    return error(drawn.flow, things, seen), jnp.mean(seen.astype(shift.dtype))
+    object_flow = shift - camera_flow(pair, rendered.depth)
+    return error(rendered.flow, object_flow, seen), jnp.mean(seen.astype(shift.dtype))
 
 
-def drawn_flow(
+def render_flow(
     here: Gaussians,
     there: Gaussians,
     pair: tuple[Camera, Camera],
     size: tuple[int, int],
-    picture: RasterSpec,
-) -> Drawn:
-    """Flow of the Gaussians from `here` to `there`, seen by the first camera.
+    raster_spec: RasterSpec,
+) -> RenderedFlow:
+    """Render the flow of the Gaussians between two times, as seen by the first camera.
 
-    In pixels of the second camera, which stands still meanwhile: at a pixel x of the
-    first, Gaussian k goes by m' - m + (L' - L) L1⁻¹ (x - m1), with means m and Cholesky
-    factors L of its footprint in the second camera, before and after, and those with a
-    1 in the first: a point keeps its place in the ellipse. (Equations 10 and 11 print
-    covariances for factors, and m for m'.) What only one moment shows does not count,
-    and the blend is over the opacity of what does. `size` is (width, height) of both.
+    The flow is in pixels of the second camera. At a pixel x of the first, Gaussian k
+    moves by m' - m + (L' - L) L1⁻¹ (x - m1), where m and L are the mean and the
+    Cholesky factor of its footprint in the second camera at the first time, m' and L'
+    at the second time, and m1 and L1 those in the first camera. A point keeps its
+    position in the ellipse. (Equations 10 and 11 print covariances for factors, and m
+    for m'.) Gaussians that are visible at only one of the times do not count, and the
+    blend is normalized by the opacity of the others.
+
+    Args:
+      here: Gaussians at the first time.
+      there: Gaussians at the second time.
+      pair: Both cameras.
+      size: (width, height) of both images in pixels.
+      raster_spec: Settings of the rasterizer.
+
+    Returns:
+      Flow, opacity and depth.
     """
-    first = lax.stop_gradient(projection.project(here, pair[0], size, picture))
-    start, end = (projection.project(g, pair[1], size, picture) for g in (here, there))
+    first = lax.stop_gradient(projection.project(here, pair[0], size, raster_spec))
+    start, end = (
+        projection.project(g, pair[1], size, raster_spec) for g in (here, there)
+    )
     stretch, shift = linear_flow(first, start, end)
-    both = (start.visible & end.visible)[:, None]
-    # Selected before they are blended: what is not drawn has stand-ins, of any size.
+    visible = (start.visible & end.visible)[:, None]
+    # Selected before blending, because invisible footprints have arbitrary values.
     values = jnp.concatenate([stretch.reshape(-1, 4), shift], axis=1)
-    values = jnp.where(both, values, 0)
-    more = [first.depth[:, None], both.astype(values.dtype)]
-    image, left = raster.rasterize(
-        first, jnp.concatenate([values, *more], axis=1), size, picture
+    values = jnp.where(visible, values, 0)
+    extra = [first.depth[:, None], visible.astype(values.dtype)]
+    image, transmittance = raster.rasterize(
+        first, jnp.concatenate([values, *extra], axis=1), size, raster_spec
     )
     matrix, offset = image[..., :4].reshape(*image.shape[:2], 2, 2), image[..., 4:6]
     center = rays.pixel_centers(size, image.dtype)
     flow = exact_einsum("hwij,hwj->hwi", matrix, center) + offset
     depth, share = lax.stop_gradient(image[..., 6]), lax.stop_gradient(image[..., 7])
-    alpha = lax.stop_gradient(1 - left)
-    return Drawn(
+    alpha = lax.stop_gradient(1 - transmittance)
+    return RenderedFlow(
         flow / jnp.maximum(share, LEAST_SHARE)[..., None],
         share,
         depth / jnp.maximum(alpha, LEAST_SHARE),
@@ -186,18 +200,18 @@ def drawn_flow(
 def linear_flow(
     first: Footprints, start: Footprints, end: Footprints
 ) -> tuple[Float[Array, "gaussians 2 2"], Float[Array, "gaussians 2"]]:
-    """A and b of each Gaussian's flow A x + b at a pixel x, as `drawn_flow` says."""
+    """Return A and b of the flow A x + b of each Gaussian (see `render_flow`)."""
     p, k, r = first.whitening.T
     zero = jnp.zeros_like(p)
-    into = _matrix(p, zero, -r * k, r)
-    before, after = (_factor(one.whitening) for one in (start, end))
-    stretch = exact_einsum("gij,gjk->gik", after - before, into)
-    moved = end.mean_px - start.mean_px
-    return stretch, moved - exact_einsum("gij,gj->gi", stretch, first.mean_px)
+    whiten = _matrix(p, zero, -r * k, r)
+    before, after = (_factor(footprints.whitening) for footprints in (start, end))
+    stretch = exact_einsum("gij,gjk->gik", after - before, whiten)
+    displacement = end.mean_px - start.mean_px
+    return stretch, displacement - exact_einsum("gij,gj->gi", stretch, first.mean_px)
 
 
 def _factor(whitening):
-    """The inverse of [[p, 0], [-rk, r]]: the Cholesky factor, times the root of two."""
+    """Invert [[p, 0], [-rk, r]]: the Cholesky factor times the square root of two."""
     p, k, r = whitening.T
     return _matrix(1 / p, jnp.zeros_like(p), k / p, 1 / r)
 
@@ -227,17 +241,17 @@ def camera_flow(
     offset = center - first.principal_point_px
     y = offset[..., 1] / (first.focal_px * first.pixel_aspect)
     x = (offset[..., 0] - first.skew_px * y) / first.focal_px
-    slopes = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
-    place = first.position + depth[..., None] * exact_product(
-        slopes, first.camera_from_world
+    directions = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
+    point = first.position + depth[..., None] * exact_product(
+        directions, first.camera_from_world
     )
-    pixel, _ = jax.vmap(jax.vmap(cameras.project, (None, 0)), (None, 0))(second, place)
+    pixel, _ = jax.vmap(jax.vmap(cameras.project, (None, 0)), (None, 0))(second, point)
     return pixel - center
 
 
 def error(
-    drawn: Float[Array, "height width 2"],
-    things: Float[Array, "height width 2"],
+    rendered: Float[Array, "height width 2"],
+    object_flow: Float[Array, "height width 2"],
     seen: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
     """Compute the mean absolute difference of two flows.
@@ -246,16 +260,18 @@ def error(
     and each is clamped to ±1.
 
     Args:
-      drawn: Flow of the Gaussians in pixels.
-      things: Flow of the objects in pixels.
+      rendered: Flow of the Gaussians in pixels.
+      object_flow: Motion flow of the capture in pixels.
       seen: Pixels to compare.
 
     Returns:
       The mean, zero without pixels.
     """
     height, width = seen.shape
-    side = jnp.asarray((width, height), drawn.dtype)
-    # Selected first: pixels that are not seen may hold anything.
-    ways = (jnp.where(seen[..., None], flow, 0) / side for flow in (drawn, things))
-    drawn, things = (jnp.clip(way, -1, 1) for way in ways)
-    return losses.l1(drawn, things, seen)
+    side = jnp.asarray((width, height), rendered.dtype)
+    # Selected first, because other pixels may have arbitrary values.
+    flows = (
+        jnp.where(seen[..., None], flow, 0) / side for flow in (rendered, object_flow)
+    )
+    rendered, object_flow = (jnp.clip(flow, -1, 1) for flow in flows)
+    return losses.l1(rendered, object_flow, seen)

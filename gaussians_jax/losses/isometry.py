@@ -1,8 +1,8 @@
-"""Neighboring Gaussians keep their distances as they move.
+"""Local isometry: neighboring Gaussians keep their distances as they move.
 
 Luiten et al. 2024, "Dynamic 3D Gaussians", arXiv:2308.09713, the long-term local
 isometry of section 3.3: distances at a time are compared with those in the canonical
-state. Bodies may turn and shift freely, while stretching has a cost.
+state. Rigid motions are free, while stretching has a cost.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from gaussians_jax.losses.acceleration import draw_active
 from gaussians_jax.losses.neighbors import Neighbors, NeighborSpec
 from nerfies_jax.training.effects import PenaltyContext
 
-FLOOR = 1e-12  # squared distances in units of the extent, below which there is no slope
+FLOOR = 1e-12  # added to squared distances (extent²) to bound the gradient at zero
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +28,7 @@ class IsometrySpec:
     """Settings of the local isometry loss.
 
     Attributes:
-      weight: Weight of the loss, whose unit is the scene's extent.
+      weight: Weight of the loss, which is in units of the scene's extent.
       count: Number of neighbors of each Gaussian.
       gamma: Decay of a neighbor's weight with its squared distance, as in
         `NeighborSpec`.
@@ -45,14 +45,14 @@ class IsometrySpec:
             raise ValueError(f"samples={self.samples} must be at least 1")
         if not 0 <= self.weight < math.inf:
             raise ValueError(f"weight={self.weight} must be finite and not negative")
-        self.graph()  # refuses wrong counts
+        self.graph()  # raises for invalid counts
 
     def graph(self) -> NeighborSpec:
         """Return the settings of the graph of neighbors."""
         return NeighborSpec(count=self.count, gamma=self.gamma)
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the regularizer of a scene of this capture."""
+        """Return the regularizer for this capture."""
         return Bound(self, metadata.extent)
 
 
@@ -61,7 +61,7 @@ class Bound:
     """The `Regularizer` of an `IsometrySpec`."""
 
     spec: IsometrySpec
-    extent: float  # of the scene, scene units
+    extent: float  # of the scene, in scene units
 
     name = "isometry"
 
@@ -80,12 +80,12 @@ class Bound:
         count = min(self.spec.samples, active.shape[0])
         rows = draw_active(context.key, active, count)
         graph = context.state
-        every = jnp.concatenate([rows[:, None], graph.neighbor[rows]], axis=1)
-        some = splats.take_rows(params, every.ravel())
-        shape = (*every.shape, 3)
-        canonical = some.rows["splats"].mean.reshape(shape) / self.extent
+        indices = jnp.concatenate([rows[:, None], graph.neighbor[rows]], axis=1)
+        selected = splats.take_rows(params, indices.ravel())
+        shape = (*indices.shape, 3)
+        canonical = selected.rows["splats"].mean.reshape(shape) / self.extent
         assert context.at_time is not None
-        moved = context.at_time(some, context.condition.time).mean
+        moved = context.at_time(selected, context.condition.time).mean
         return change_of_distances(
             canonical, moved.reshape(shape) / self.extent, graph.weight[rows]
         )
@@ -99,17 +99,17 @@ def change_of_distances(
     """Compute the weighted mean change of distances from a point to its neighbors.
 
     Args:
-      canonical: Places of each sample, first, and of its neighbors.
-      moved: The same at another time.
+      canonical: Positions of each sample (first) and of its neighbors.
+      moved: The same points at another time.
       weight: Weights of the neighbors, in [0, 1].
 
     Returns:
-      Mean of |d' - d| in the unit of the places, zero where all weights are.
+      Mean of |d' - d| in the unit of the positions, zero if all weights are zero.
     """
 
-    def distances(places):
-        apart = places[:, 1:] - places[:, :1]
-        return jnp.sqrt(jnp.sum(apart**2, axis=-1) + FLOOR)
+    def distances(points):
+        difference = points[:, 1:] - points[:, :1]
+        return jnp.sqrt(jnp.sum(difference**2, axis=-1) + FLOOR)
 
     before = jax.lax.stop_gradient(distances(canonical))
     change = jnp.abs(distances(moved) - before)

@@ -1,8 +1,8 @@
-"""Neighboring Gaussians keep similar embeddings, and so move alike.
+"""Neighboring Gaussians keep similar embeddings, and therefore move alike.
 
 "Sonata", equation 18, after Luiten et al. 2024, "Dynamic 3D Gaussians",
-arXiv:2308.09713: the neighbors are found on the host whenever the rows have changed
-and stay as they are in between.
+arXiv:2308.09713. Neighbors are searched on the host after each change of the set of
+Gaussians, and are fixed in between.
 """
 
 import dataclasses
@@ -23,19 +23,19 @@ from nerfies_jax.training.step_counts import steps
 
 NAME = "neighbors"
 SCALES = ("spacing", "extent", "units")
-# The unit of length of `scale="spacing"`, as a multiple of the median distance to the
-# farthest of the 20 neighbors: that distance is 0.020, 0.030 and 0.034 scene units in
+# The unit of length of `scale="spacing"` is this multiple of the median distance to the
+# farthest of the 20 neighbors. That distance is 0.020, 0.030 and 0.034 scene units in
 # three reconstructions of real rooms and gardens (4k, 139k and 3k points).
 SPACING = 0.03
-# The equation's, of an embedding squared: its square root has a slope at zero, and
-# pairs closer than 1e-10 count as equal.
+# The equation's epsilon under the square root. It bounds the gradient at zero. Pairs
+# closer than 1e-10 count as equal.
 FLOOR = 1e-20
-LINKED = 1e-3  # pairs of a larger weight are logged as linked
+LINKED = 1e-3  # pairs with a larger weight are logged as linked
 
 
 @dataclasses.dataclass(frozen=True)
 class NeighborSpec:
-    """Number of neighbors, and decay of their weight with the distance.
+    """Number of neighbors, and decay of their weight with distance.
 
     The weight is exp(-gamma d^2). The equation has the distance unsquared, but the code
     it is based on squares it, and unsquared it would be 0 in float32 beyond d = 0.044.
@@ -50,16 +50,17 @@ class NeighborSpec:
     gamma: float = 2000.0
     weight: float = 1.0
     scale: str = "spacing"
-    start: int = steps(0)  # steps before which it is not evaluated
+    start: int = steps(0)  # first step with this loss
 
     def __post_init__(self):
         if self.count < 1 or self.start < 0:
             raise ValueError(
-                f"count >= 1 and start >= 0, got {self.count} and {self.start}"
+                "count must be at least 1 and start at least 0, got "
+                f"count={self.count} and start={self.start}"
             )
         if not (0 <= self.gamma < math.inf and 0 <= self.weight < math.inf):
             raise ValueError(
-                "gamma and weight are finite and not negative, got "
+                "gamma and weight must be finite and not negative, got "
                 f"gamma={self.gamma} and weight={self.weight}"
             )
         if self.scale not in SCALES:
@@ -67,10 +68,10 @@ class NeighborSpec:
 
 
 class Neighbors(NamedTuple):
-    """The graph between two changes of the rows, nearest neighbors first.
+    """Graph of neighbors, nearest first, fixed between two changes of the Gaussians.
 
-    Inactive rows, and active ones that have fewer neighbors, name themselves with
-    weight zero.
+    Inactive Gaussians, and active ones with fewer neighbors, are their own neighbors
+    with weight zero.
     """
 
     neighbor: Int[Array, "gaussians neighbors"]
@@ -84,7 +85,7 @@ def find(spec: NeighborSpec, params: Params, extent: float) -> Neighbors:
 
     Args:
       spec: Settings.
-      params: Trained parameters, whose canonical means count.
+      params: Trained parameters, of which the canonical means are used.
       extent: Scene extent in scene units.
 
     Returns:
@@ -107,10 +108,10 @@ def find(spec: NeighborSpec, params: Params, extent: float) -> Neighbors:
 
 
 def _nearest(points, count):
-    """Indices and distances [n, count] of the nearest other points."""
+    """Return indices and distances [n, count] of the nearest other points."""
     distance, index = scipy.spatial.cKDTree(points).query(points, k=count + 1)
     itself = index == np.arange(len(points))[:, None]
-    # Of points that coincide, the tree may name others first and drop the point itself.
+    # If points coincide, the tree may return others first and omit the point itself.
     itself[~itself.any(axis=1), -1] = True
     others = np.argsort(itself, axis=1, kind="stable")[:, :count]
     return (np.take_along_axis(x, others, axis=1) for x in (index, distance))
@@ -121,7 +122,7 @@ def _unit(spec, distance, extent):
         return 1.0
     if spec.scale == "extent":
         return extent
-    # Clones lie on their parents, so the nearest distance may be zero for most rows.
+    # Clones lie on their parents, so the nearest distance may be zero for most.
     farthest = float(np.median(distance[:, -1]))
     if farthest == 0:
         apart = distance[distance > 0]
@@ -134,17 +135,26 @@ def inconsistency(
     neighbors: Neighbors,
     active: Bool[Array, " gaussians"],
 ) -> Float[Array, ""]:
-    """1 / (N K) sum sqrt(w |x_i - x_k|^2 + 1e-20) over active i, their neighbors k.
+    """Compute the mean weighted difference of embeddings of neighbors.
 
-    Equation 18 of "Sonata". Its slope in an embedding is at most a few sqrt(w) / (N K)
-    long and zero where the two are equal. K is the number there are, if fewer.
+    Equation 18 of "Sonata": 1 / (N K) sum sqrt(w |x_i - x_k|^2 + 1e-20) over active i
+    and their neighbors k. Its gradient with respect to an embedding has a norm of at
+    most a few sqrt(w) / (N K), and is zero where two embeddings are equal.
+
+    Args:
+      embedding: Embeddings.
+      neighbors: Graph with K neighbors per Gaussian. K counts existing ones only.
+      active: True for active Gaussians.
+
+    Returns:
+      The mean.
     """
-    # float16 rounds 1e-20 to zero and the slope at equality to NaN.
+    # float16 rounds 1e-20 to zero, and the gradient at equality would be NaN.
     floor = max(FLOOR, float(jnp.finfo(embedding.dtype).tiny))
 
-    # One neighbor of all rows after the other. Width 32, 20 neighbors, 10k rows, one
-    # core, forward and backward: 11.6 ms and 2.6 MB, against 61 ms and 77 MB for one
-    # gather of all pairs, whose slopes no longer fit the cache when they are summed.
+    # A scan over the neighbors of all Gaussians. With width 32, 20 neighbors and 10k
+    # Gaussians, forward and backward take 11.6 ms and 2.6 MB on one core, compared with
+    # 61 ms and 77 MB for one gather of all pairs, whose gradients exceed the cache.
     @functools.partial(jax.remat, prevent_cse=False)
     def one_neighbor(total, pair):
         index, weight = pair
@@ -164,7 +174,7 @@ class Bound:
     """The `Regularizer` of a `NeighborSpec` on `params.rows[of]`."""
 
     spec: NeighborSpec
-    extent: float  # of the scene, scene units
+    extent: float  # of the scene, in scene units
     of: str
 
     name = NAME
@@ -173,13 +183,13 @@ class Bound:
         """Find the neighbors, on the host."""
         if self.of not in params.rows:
             raise ValueError(
-                f"there are no rows {self.of!r} whose neighbors could be alike, only "
-                f"{sorted(params.rows)}; leave the neighbors out of this scene"
+                f"the scene has no per-Gaussian parameters {self.of!r} for the "
+                f"neighbors loss, only {sorted(params.rows)}; leave the loss out"
             )
         return find(self.spec, params, self.extent)
 
     def loss(self, params: Params, context: PenaltyContext) -> dict[str, Term]:
-        """Compute how unlike the embeddings of neighbors are."""
+        """Compute the difference between the embeddings of neighbors."""
         active = splats.active_mask(params.rows["splats"])
         graph, spec = context.state, self.spec
 
@@ -189,7 +199,7 @@ class Bound:
         value = _from_step(spec.start, context.step, evaluate, params.rows[self.of])
         linked = jnp.mean((graph.weight > LINKED).astype(value.dtype), axis=1)
         active_count = jnp.maximum(jnp.sum(active), 1).astype(value.dtype)
-        # Inactive rows have no weight and so are not counted.
+        # Inactive Gaussians have no weight and are not counted.
         return {
             "inconsistency": Term(value, spec.weight),
             "linked": Term(jnp.sum(linked) / active_count, None),
@@ -197,7 +207,7 @@ class Bound:
 
 
 def _from_step(start, step, evaluate, embedding):
-    """`evaluate(embedding)`, or zero in the steps before `start`."""
+    """Return `evaluate(embedding)`, or zero before step `start`."""
     if start == 0:
         return evaluate(embedding)
 

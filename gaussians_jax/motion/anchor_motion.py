@@ -1,25 +1,28 @@
 """Anchors whose features produce child Gaussians and their motion.
 
 ADC-GS (Huang et al. 2025, IJCAI, arXiv:2505.08196, "Anchor-driven deformable and
-compressed Gaussian splatting"): an anchor has a place, scales, a turn and a color, a
-reference feature, and a residual feature for each of the ten Gaussians it carries. A
-network makes these of the features, against the anchor; a coarse network of reference
-feature and time moves the anchor, a fine one of residual feature and time each of what
-it carries. Features are kept rounded: they are trained with noise as wide as a step,
-and their bits under a learned law are part of the loss.
+compressed Gaussian splatting"): an anchor has a position, scales, a rotation and a
+color, a reference feature, and a residual feature for each of its ten children. A
+network computes the children from the features, relative to the anchor. A coarse
+network of reference feature and time moves the anchor, a fine network of residual
+feature and time moves each child. Features are quantized: they are trained with noise
+as wide as a quantization step, and their bits under a learned prior are a loss.
 
-Read were the paper's abstract, a summary of its method and the settings of its code
-(H-Huang774/ADC-GS); its equations were not at hand. What they leave open is settled so.
-Half of a residual feature makes a Gaussian, half moves it, as in the code, whose fine
-stage is switched off; here it is on. The law of a reference feature is normal, with a
-mean and a deviation for each channel (there with a hyperprior), that of the residual
-ones is normal as a network makes it of the former. Places, scales, turns, opacities and
-colors of anchors are kept as they are, at 32 bits a number, where the code has a codec
-for points. Colors and opacities do not change over time; in the summary an anchor's
-color does. Growth clones or splits anchors by the slopes of what they carry, each by
-its share in what is to be seen of the anchor at the moments that were drawn
-(`significance`), where the code puts a new anchor at each carried Gaussian of a steep
-slope; how much anchors are seen over time beside each other counts for nothing more.
+The sources were the paper's abstract, a summary of its method and the settings of its
+code (H-Huang774/ADC-GS). Its equations were not available. Our choices for the rest:
+
+- Half of a residual feature produces a child, half moves it, as in the code, whose fine
+  stage is disabled. Here it is enabled.
+- The prior of a reference feature is normal, with a mean and a deviation per channel
+  (in the paper with a hyperprior). That of residual features is normal with parameters
+  from a network of the reference feature.
+- Positions, scales, rotations, opacities and colors of anchors are stored at 32 bits
+  per number, where the code has a codec for points.
+- Colors and opacities do not change over time. In the summary an anchor's color does.
+- Densification clones or splits anchors by the gradients of their children, weighted by
+  their share in the visibility of the anchor at the sampled times (`significance`).
+  The code places a new anchor at each child with a large gradient. The visibility of
+  anchors over time relative to each other is not used otherwise.
 """
 
 import dataclasses
@@ -32,22 +35,22 @@ from jaxtyping import Array, Float, Int, Key
 from gaussians_jax.core import splats
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Params, Splats
-from gaussians_jax.init import path_fit
-from gaussians_jax.init.path_fit import Guess, Paths, Points
+from gaussians_jax.init import motion_fit
+from gaussians_jax.init.motion_fit import Guess, Paths, Points
 from gaussians_jax.motion import carried
 from gaussians_jax.motion import kan as kan_motion
 from gaussians_jax.motion.anchors import (
     AnchorMotionSpec,
     Anchors,
     Features,
+    add_noise,
     bits,
     coarse_spec,
     fine_spec,
     init,
     init_features,
-    kept,
-    made,
-    noised,
+    make_children,
+    quantize,
     residual_width,
 )
 from gaussians_jax.motion.blocks import in_blocks
@@ -65,19 +68,19 @@ from nerfies_jax.training.effects import (
 )
 
 NAME = "anchor_motion"
-RESTING = 256  # features at rest that a fit to tracks looks at
-# Of the volumes, where one counts as large, and how little smaller ones lose (the
-# code's); at most so many give that volume.
+RESTING = 256  # features of static anchors in the penalty of a fit to tracks
+# Quantile of the volumes above which one counts as large, exponent for smaller ones
+# (both as in the code), and the number of Gaussians from which it is computed.
 LARGE, VOLUME_POWER, VOLUME_ROWS = 0.8, 0.01, 512
-NUMBER_BITS = 32  # of what has no law
+NUMBER_BITS = 32  # of parameters without a prior
 
 
-def kept_bytes(params: Params, spec: AnchorMotionSpec) -> tuple[float, float]:
-    """Compute the bytes of a trained scene, on the host.
+def coded_bytes(params: Params, spec: AnchorMotionSpec) -> tuple[float, float]:
+    """Compute the storage of a trained scene, on the host.
 
     Args:
       params: Trained parameters.
-      spec: Settings. With a prior, features count by their bits.
+      spec: Settings. With a prior, features count by their entropy-coded size.
 
     Returns:
       Bytes of the features, and of all other parameters at 32 bits each.
@@ -89,7 +92,7 @@ def kept_bytes(params: Params, spec: AnchorMotionSpec) -> tuple[float, float]:
     if net.law is None:
         numbers = sum(leaf[active].size for leaf in own)
         return numbers * NUMBER_BITS / 8, plain * NUMBER_BITS / 8
-    each = bits(kept(own, net.law, spec), net.law, spec)
+    each = bits(quantize(own, net.law, spec), net.law, spec)
     total = sum(float(np.asarray(leaf, np.float64)[active].sum()) for leaf in each)
     return total / 8, plain * NUMBER_BITS / 8
 
@@ -112,11 +115,11 @@ def offsets(
       Offsets.
     """
     at_time = mlp.with_known(spec, network, code)
-    alone = dataclasses.replace(spec, inputs=features.shape[-1])
-    return Offsets(**mlp.apply(alone, at_time, features))
+    feature_spec = dataclasses.replace(spec, inputs=features.shape[-1])
+    return Offsets(**mlp.apply(feature_spec, at_time, features))
 
 
-def posed(
+def pose_children(
     net: Anchors,
     spec: AnchorMotionSpec,
     derived: tuple[Splats, tuple[Carried, Features]],
@@ -128,25 +131,26 @@ def posed(
     Args:
       net: Parameters of the networks.
       spec: Settings.
-      derived: Children in canonical position.
+      derived: Children in their canonical state, and what they were computed from.
       rows: Anchors, moved by the motion or by hand.
       code: Code of the time. None disables the motion of the children.
 
     Returns:
       The child Gaussians.
     """
-    still, (own, features) = derived
+    canonical, (children, features) = derived
     if code is None:
-        return carried.posed(own, None, still, rows)
-    reads = features.residual[..., spec.residual // 2 :]
+        return carried.pose_children(children, None, canonical, rows)
+    inputs = features.residual[..., spec.residual // 2 :]
     assert net.fine is not None
-    fine = offsets(net.fine, fine_spec(spec), reads, code)
+    fine = offsets(net.fine, fine_spec(spec), inputs, code)
     assert fine.position is not None
     assert fine.log_scale is not None
-    own = own._replace(
-        offset=own.offset + fine.position, log_scale=own.log_scale + fine.log_scale
+    children = children._replace(
+        offset=children.offset + fine.position,
+        log_scale=children.log_scale + fine.log_scale,
     )
-    return carried.posed(own, fine.turn, still, rows)
+    return carried.pose_children(children, fine.turn, canonical, rows)
 
 
 def significance(gaussians: Gaussians) -> Float[Array, " gaussians"]:
@@ -159,33 +163,43 @@ def significance(gaussians: Gaussians) -> Float[Array, " gaussians"]:
       Weights in [0, 1].
     """
     volume = jnp.prod(gaussians.scale, axis=1)
-    every = -(-len(volume) // VOLUME_ROWS)
-    large = jnp.quantile(volume[::every], LARGE)
-    share = jnp.clip(volume / jnp.where(large > 0, large, 1), 0, 1)
-    weight = gaussians.opacity * share**VOLUME_POWER
+    stride = -(-len(volume) // VOLUME_ROWS)
+    large = jnp.quantile(volume[::stride], LARGE)
+    relative = jnp.clip(volume / jnp.where(large > 0, large, 1), 0, 1)
+    weight = gaussians.opacity * relative**VOLUME_POWER
     return jax.lax.stop_gradient(weight)
 
 
 def fit_to_paths(
     spec: AnchorMotionSpec, frames: int, paths: Paths, key: Key[Array, ""]
 ) -> Guess:
-    """Anchors where points are in the middle of the film, their features as drawn.
+    """Initialize anchors at the middle of the video, with random features, on the host.
 
-    Features of anchors that no path tells of are asked to be at rest. Host side.
+    Motion of other random features is penalized, so that anchors without paths are
+    static.
+
+    Args:
+      spec: Settings.
+      frames: Number of training frames.
+      paths: 3D paths of points.
+      key: PRNG key.
+
+    Returns:
+      Initial guess of a fit.
     """
     rows_key, nets_key, rest_key = jax.random.split(key, 3)
-    points = jnp.asarray(path_fit.places_at_one_moment(paths), jnp.float32)
+    points = jnp.asarray(motion_fit.positions_at_middle(paths), jnp.float32)
     rest = init_features(rest_key, spec, RESTING)
 
     def penalty(points, times):
         net = points.nets
 
-        def moved(time):
+        def motion(time):
             code = codes.at_time(net.times, time)
-            by = offsets(net.coarse, coarse_spec(spec), rest.reference, code)
-            return by.turn, by.position
+            residuals = offsets(net.coarse, coarse_spec(spec), rest.reference, code)
+            return residuals.turn, residuals.position
 
-        return path_fit.rest_loss(moved, paths.unit, times)
+        return motion_fit.rest_loss(motion, paths.unit, times)
 
     rows = init_features(rows_key, spec, len(points))
     start = Points(points, rows, init(nets_key, spec, frames))
@@ -196,53 +210,68 @@ def fit_to_paths(
 def features_of(
     spec: AnchorMotionSpec, params: MotionParams, condition: FrameCondition | None
 ) -> Features:
-    """Features as they are read: with noise in training, kept afterwards."""
+    """Return features with noise in training, and quantized features afterwards.
+
+    Args:
+      spec: Settings.
+      params: Parameters of the motion.
+      condition: Step and key in training. None afterwards.
+
+    Returns:
+      The features.
+    """
     own, net = params
     if spec.rate is None:
         return own
     if condition is None or condition.step is None:
-        return kept(own, net.law, spec)
+        return quantize(own, net.law, spec)
     assert condition.key is not None
     key = jax.random.fold_in(condition.key, stream(NAME))
     return jax.lax.cond(
         condition.step < spec.rate.start,
         lambda own, law: own,
-        lambda own, law: noised(key, own, law),
+        lambda own, law: add_noise(key, own, law),
         own,
         net.law,
     )
 
 
 def _derive_rows(spec, scene, condition):
-    own = MotionParams(scene.rows[NAME], scene.nets[NAME])
-    features = features_of(spec, own, condition)
+    params = MotionParams(scene.rows[NAME], scene.nets[NAME])
+    features = features_of(spec, params, condition)
     rows = scene.rows["splats"]
-    own = made(scene.nets[NAME], spec, features, rows.sh_rest.shape[1])
-    return carried.at_rest(rows, own), (own, features)
+    params = make_children(scene.nets[NAME], spec, features, rows.sh_rest.shape[1])
+    return carried.canonical_children(rows, params), (params, features)
 
 
 def _derive(spec, scene, derived, rows, condition):
-    """Return what anchors carry, moved finely once the warm-up is over."""
+    """Return the children, with fine motion after the warm-up."""
     net = scene.nets[NAME]
     if not spec.moves:
-        return posed(net, spec, derived, rows, None)
+        return pose_children(net, spec, derived, rows, None)
     code = codes.at_time(net.times, condition.time)
     if not spec.warm_up or condition.step is None:
-        return posed(net, spec, derived, rows, code)
+        return pose_children(net, spec, derived, rows, code)
     return jax.lax.cond(
         condition.step < spec.warm_up,
-        lambda net, derived, rows: posed(net, spec, derived, rows, None),
-        lambda net, derived, rows: posed(net, spec, derived, rows, code),
+        lambda net, derived, rows: pose_children(net, spec, derived, rows, None),
+        lambda net, derived, rows: pose_children(net, spec, derived, rows, code),
         net,
         derived,
         rows,
     )
 
 
-def penalty(
-    spec: AnchorMotionSpec, _: Anchors, context: PenaltyContext
-) -> dict[str, Term]:
-    """Compute the mean bits of a feature value, zero before quantization starts."""
+def penalty(spec: AnchorMotionSpec, context: PenaltyContext) -> dict[str, Term]:
+    """Compute the mean bits per feature value, zero before quantization starts.
+
+    Args:
+      spec: Settings.
+      context: Context of the step.
+
+    Returns:
+      The term.
+    """
     assert spec.rate is not None
     scene = context.params
     active = splats.active_mask(scene.rows["splats"])
@@ -281,7 +310,7 @@ class Bound(BoundMotion):
         return self.spec.moves
 
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
-        """Evaluate the learning rates of features, networks and law."""
+        """Evaluate the learning rates of features, networks and prior."""
         spec = self.spec
 
         def falling(of, name):
@@ -310,21 +339,21 @@ class Bound(BoundMotion):
         gaussians: Gaussians,
         frame: FrameCondition,
     ) -> Gaussians:
-        """Move the anchors coarsely."""
+        """Move the anchors by the coarse network."""
         spec, net = self.spec, params.shared
         code = codes.at_time(net.times, frame.time)
-        by = in_blocks(
-            lambda reads: offsets(net.coarse, coarse_spec(spec), reads, code),
+        residuals = in_blocks(
+            lambda reference: offsets(net.coarse, coarse_spec(spec), reference, code),
             (features_of(spec, params, frame).reference,),
             splats.in_use(gaussians),
             spec.block,
         )
-        return kan_motion.apply(gaussians, by)
+        return kan_motion.apply(gaussians, residuals)
 
     def derive_rows(
         self, scene: Params, condition: FrameCondition | None
     ) -> tuple[Splats, tuple[Carried, Features]]:
-        """Return what anchors carry at rest, and what it was made of."""
+        """Return the children in their canonical state, and their features."""
         return _derive_rows(self.spec, scene, condition)
 
     def derive(
@@ -334,15 +363,15 @@ class Bound(BoundMotion):
         rows: Gaussians,
         condition: FrameCondition,
     ) -> Gaussians:
-        """Return what anchors carry where they are now."""
+        """Return the children at a time."""
         return _derive(self.spec, scene, derived, rows, condition)
 
     def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
         """Compute the bits of the features."""
         if self.spec.rate is None:
             return {}
-        return penalty(self.spec, params.shared, context)
+        return penalty(self.spec, context)
 
     def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
-        """Return anchors at the points of the paths, to fit from."""
+        """Return anchors at the points of the paths, to start a fit from."""
         return fit_to_paths(self.spec, self.frames, paths, key)

@@ -1,11 +1,11 @@
-"""Features of anchors: what is made of them, and what they cost to keep.
+"""Features of anchors: their networks, quantization and entropy model.
 
-The law of a reference feature is normal, with a mean and a deviation for each channel,
-that of the residual ones is normal as a network makes it of the former: a factorized
-model and one with a context, as Balle et al. 2018, arXiv:1802.01436, have them for
-pictures (equation 6, where the law has no fixed form, and equation 7, where it has no
-mean). Which part of ADC-GS (Huang et al. 2025, arXiv:2505.08196) this is, and that its
-equations were not at hand, is said in `anchor_motion`.
+The distribution of a reference feature is normal, with a mean and a deviation per
+channel. That of residual features is normal with parameters from a network of the
+reference feature. These are a factorized and a context model as in Balle et al. 2018,
+arXiv:1802.01436, for images (equation 6, where the distribution has no fixed form, and
+equation 7, where it has no mean). `anchor_motion` says how this relates to ADC-GS
+(Huang et al. 2025, arXiv:2505.08196), whose equations were not available.
 """
 
 import dataclasses
@@ -29,12 +29,12 @@ from nerfies_jax.training.step_counts import steps
 
 @dataclasses.dataclass(frozen=True)
 class RateSpec:
-    """Weight of the bits, its first step, and the first steps of quantization."""
+    """Settings of the rate loss, of its start and of the quantization."""
 
-    weight: float = 1e-3  # of the mean bits of a number of the features
-    start: int = steps(20_000)  # of noise and cost
-    step: float = 0.1  # first, in units of the features; it is learned
-    width: int = 32  # of the network that tells residual from reference features
+    weight: float = 1e-3  # of the mean bits per feature value
+    start: int = steps(20_000)  # first step with quantization noise and this loss
+    step: float = 0.1  # initial quantization step, in units of the features; learned
+    width: int = 32  # of the network that predicts residual from reference features
     learning_rate: float = 2e-4
     learning_rate_end: float = 1e-5
 
@@ -43,8 +43,8 @@ class RateSpec:
             raise ValueError(f"weight={self.weight} must be finite and not negative")
         if self.start < 0 or self.width < 1 or not 0 < self.step < math.inf:
             raise ValueError(
-                f"start >= 0, width >= 1 and a positive step, got start={self.start}, "
-                f"width={self.width} and step={self.step}"
+                "start must be at least 0, width at least 1 and step positive, got "
+                f"start={self.start}, width={self.width} and step={self.step}"
             )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
@@ -54,21 +54,21 @@ class AnchorMotionSpec:
     """Sizes and schedules, by default those of ADC-GS's code for HyperNeRF's videos.
 
     Features are initialized from a normal distribution of deviation `spread`, where the
-    code has zeros, and children are `first_scale` as large as their anchor. Without
-    `moves` there is neither coarse nor fine motion, nor its inputs, and children are
-    static.
+    code has zeros, and children are `first_scale` times as large as their anchor.
+    Without `moves` there is neither coarse nor fine motion, nor its inputs, and
+    children are static.
     """
 
-    count: int = 10  # Gaussians of an anchor
+    count: int = 10  # children of an anchor
     reference: int = 32
-    residual: int = 16  # of each of them; the first half makes it, the other moves it
+    residual: int = 16  # per child; the first half produces it, the second moves it
     time_code: int = 256
     frames_per_code: int = 2
-    width: int = 128  # of the networks that move
-    make_width: int = 32  # of the one that makes
+    width: int = 128  # of the motion networks
+    make_width: int = 32  # of the network that produces children
     spread: float = 0.5
     first_scale: float = 0.4
-    rate: RateSpec | None = RateSpec()  # None: features are kept as they are
+    rate: RateSpec | None = RateSpec()  # None: no quantization
     moves: bool = True
     warm_up: int = steps(5000)  # steps without motion
     feature_rate: float = 7.5e-3
@@ -85,7 +85,8 @@ class AnchorMotionSpec:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
         if self.residual < 2 or self.residual % 2:
             raise ValueError(
-                f"residual={self.residual} must be even: half makes, half moves"
+                f"residual={self.residual} must be even and at least 2; one half "
+                "produces a child, the other moves it"
             )
         if self.warm_up < 0:
             raise ValueError(f"warm_up={self.warm_up} must not be negative")
@@ -97,49 +98,49 @@ class AnchorMotionSpec:
         for name in ("feature_rate", "make_rate", "learning_rate"):
             schedules.check_falling(getattr(self, name), getattr(self, f"{name}_end"))
         for network in (make_spec, coarse_spec, fine_spec):
-            network(self)  # checks its sizes
+            network(self)  # validates the sizes
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> Any:
-        """Return the motion for a run of `run_steps` of this capture."""
-        from gaussians_jax.motion import anchor_motion  # it reads this module
+        """Return the motion for a run of `run_steps` on this capture."""
+        from gaussians_jax.motion import anchor_motion  # imports this module
 
         return anchor_motion.Bound(self, run_steps, metadata.moments)
 
 
 class Features(NamedTuple):
-    """The rows: what an anchor and what each it carries is made of."""
+    """Per-Gaussian parameters: features of anchors and of their children."""
 
     reference: Float[Array, "anchors reference"]
-    residual: Float[Array, "anchors carried residual"]  # half of it without motion
+    residual: Float[Array, "anchors children residual"]  # first half without motion
 
 
 class Law(NamedTuple):
-    """Prior of the features: one distribution per channel, or one from a network."""
+    """Prior of the features: per channel, or from a network for residual features."""
 
     mean: Float[Array, " reference"]
     log_scale: Float[Array, " reference"]
     log_step: Float[Array, " reference"]
     residual_log_step: Float[Array, " residual"]
-    context: MLP  # of a reference feature: mean and log_scale of its residual ones
+    context: MLP  # from a reference feature to mean and log_scale of residual ones
 
 
 class Anchors(NamedTuple):
-    """Parameters that all anchors share."""
+    """Shared parameters."""
 
-    times: Float[Array, "moments code"] | None  # evenly over [0, 1]
+    times: Float[Array, "moments code"] | None  # evenly spaced over [0, 1]
     make: MLP
-    coarse: MLP | None  # None, as `times` and `fine`, where nothing moves
+    coarse: MLP | None  # None without motion, like `times` and `fine`
     fine: MLP | None
     law: Law | None
 
 
 def residual_width(spec: AnchorMotionSpec) -> int:
-    """Residual features of one: without motion, only those that it is made of."""
+    """Return the number of residual features per child."""
     return spec.residual if spec.moves else spec.residual // 2
 
 
 def make_spec(spec: AnchorMotionSpec) -> MLPSpec:
-    """From [reference, half of residual] to what a Gaussian is against its anchor."""
+    """Settings of the network from [reference, half of residual] to a child."""
     heads = (
         ("offset", HeadSpec(3)),
         ("log_scale", HeadSpec(3, "zero")),
@@ -152,22 +153,22 @@ def make_spec(spec: AnchorMotionSpec) -> MLPSpec:
 
 
 def coarse_spec(spec: AnchorMotionSpec) -> MLPSpec:
-    """From [reference, code of the time] to how an anchor is moved."""
+    """Settings of the network from [reference, time code] to motion of an anchor."""
     return _moving_spec(spec, spec.reference)
 
 
 def fine_spec(spec: AnchorMotionSpec) -> MLPSpec:
-    """From [other half of residual, code of the time] to how a carried one is moved."""
+    """Settings of the network from [half of residual, time code] to child motion."""
     return _moving_spec(spec, spec.residual // 2)
 
 
-def _moving_spec(spec, reads):
+def _moving_spec(spec, inputs):
     heads = tuple((name, HeadSpec(3, "zero")) for name in Offsets._fields)
-    return MLPSpec(reads + spec.time_code, 2, spec.width, heads, (), "relu", "he")
+    return MLPSpec(inputs + spec.time_code, 2, spec.width, heads, (), "relu", "he")
 
 
 def context_spec(spec: AnchorMotionSpec) -> MLPSpec:
-    """From a reference feature to the law of the residual ones of its anchor."""
+    """Settings of the network from reference features to the prior of residual ones."""
     each = spec.count * residual_width(spec)
     heads = (("mean", HeadSpec(each, "zero")), ("log_scale", HeadSpec(each, "zero")))
     assert spec.rate is not None
@@ -177,20 +178,40 @@ def context_spec(spec: AnchorMotionSpec) -> MLPSpec:
 def init_features(
     key: Key[Array, ""], spec: AnchorMotionSpec, count: int, dtype=jnp.float32
 ) -> Features:
-    """Features of so many anchors that nothing is known of."""
+    """Initialize random features of anchors.
+
+    Args:
+      key: PRNG key.
+      spec: Settings.
+      count: Number of anchors.
+      dtype: Floating-point type.
+
+    Returns:
+      The features.
+    """
     shapes = (count, spec.reference), (count, spec.count, spec.residual)
-    drawn = (
-        jax.random.normal(one, shape, jnp.float32)
-        for one, shape in zip(jax.random.split(key), shapes, strict=True)
+    noise = (
+        spec.spread * jax.random.normal(subkey, shape, jnp.float32).astype(dtype)
+        for subkey, shape in zip(jax.random.split(key), shapes, strict=True)
     )
-    first, others = (spec.spread * one.astype(dtype) for one in drawn)
-    return Features(first, others[..., : residual_width(spec)])
+    reference, residual = noise
+    return Features(reference, residual[..., : residual_width(spec)])
 
 
 def init(
     key: Key[Array, ""], spec: AnchorMotionSpec, frames: int, dtype=jnp.float32
 ) -> Anchors:
-    """Networks that move nothing yet, for a capture of `frames` to learn from."""
+    """Initialize networks without motion.
+
+    Args:
+      key: PRNG key.
+      spec: Settings.
+      frames: Number of training frames.
+      dtype: Floating-point type.
+
+    Returns:
+      Shared parameters.
+    """
     times_key, make_key, coarse_key, fine_key, law_key = jax.random.split(key, 5)
     make = mlp.init(make_spec(spec), make_key, dtype)
     law = None if spec.rate is None else _init_law(law_key, spec, dtype)
@@ -210,13 +231,15 @@ def init(
 
 def _init_law(key, spec, dtype):
     context = mlp.init(context_spec(spec), key, dtype)
-    wide = math.log(spec.spread)
+    log_spread = math.log(spec.spread)
     head = context.heads["log_scale"]
-    context.heads["log_scale"] = head._replace(bias=jnp.full_like(head.bias, wide))
+    context.heads["log_scale"] = head._replace(
+        bias=jnp.full_like(head.bias, log_spread)
+    )
     first = math.log(spec.rate.step)
     return Law(
         mean=jnp.zeros(spec.reference, dtype),
-        log_scale=jnp.full(spec.reference, wide, dtype),
+        log_scale=jnp.full(spec.reference, log_spread, dtype),
         log_step=jnp.full(spec.reference, first, dtype),
         residual_log_step=jnp.full(residual_width(spec), first, dtype),
         context=context,
@@ -226,46 +249,68 @@ def _init_law(key, spec, dtype):
 def law_of_residual(
     law: Law, spec: AnchorMotionSpec, reference: Float[Array, "anchors reference"]
 ) -> tuple[
-    Float[Array, "anchors carried residual"], Float[Array, "anchors carried residual"]
+    Float[Array, "anchors children residual"], Float[Array, "anchors children residual"]
 ]:
-    """Means and logarithms of deviations of the residual features.
+    """Compute the prior of the residual features.
 
-    As many as the law has: what was trained to move may be drawn without.
+    Args:
+      law: The prior. It may have more residual features than `spec`, if a scene with
+        motion is rendered without.
+      spec: Settings.
+      reference: Reference features.
+
+    Returns:
+      Means and logarithms of the standard deviations.
     """
-    made = mlp.apply(context_spec(spec), law.context, reference)
+    outputs = mlp.apply(context_spec(spec), law.context, reference)
     shape = (len(reference), spec.count, len(law.residual_log_step))
-    return made["mean"].reshape(shape), made["log_scale"].reshape(shape)
+    return outputs["mean"].reshape(shape), outputs["log_scale"].reshape(shape)
 
 
-def kept(features: Features, law: Law, spec: AnchorMotionSpec) -> Features:
-    """The features rounded to whole steps from their means, as they are kept.
+def quantize(features: Features, law: Law, spec: AnchorMotionSpec) -> Features:
+    """Round features to whole steps from their means, with straight-through gradients.
 
-    Slopes pass as if they were not rounded.
+    Args:
+      features: The features.
+      law: Their prior.
+      spec: Settings.
+
+    Returns:
+      The features as they are stored.
     """
     step, residual_step = _steps(law)
-    reference = _through(
+    reference = _straight_through(
         features.reference, entropy.rounded(features.reference, law.mean, step)
     )
     mean, _ = law_of_residual(law, spec, reference)
-    whole = entropy.rounded(features.residual, mean, residual_step)
-    return Features(reference, _through(features.residual, whole))
+    quantized = entropy.rounded(features.residual, mean, residual_step)
+    return Features(reference, _straight_through(features.residual, quantized))
 
 
-def _through(values, rounded):
-    """The rounded values, with the slope of the others."""
+def _straight_through(values, rounded):
+    """Return rounded values with the gradient of the unrounded ones."""
     return values + jax.lax.stop_gradient(rounded - values)
 
 
 def _steps(law):
-    """Steps of rounding of each channel, positive."""
+    """Return the quantization step of each channel, positive."""
     return (
         jnp.exp(jnp.clip(log_step, *entropy.LOG_RANGE))
         for log_step in (law.log_step, law.residual_log_step)
     )
 
 
-def noised(key: Key[Array, ""], features: Features, law: Law) -> Features:
-    """The features as far off as rounding could take them."""
+def add_noise(key: Key[Array, ""], features: Features, law: Law) -> Features:
+    """Add noise as wide as a quantization step to features.
+
+    Args:
+      key: PRNG key.
+      features: The features.
+      law: Their prior, which has the steps.
+
+    Returns:
+      The noisy features.
+    """
     keys = jax.random.split(key)
     return Features(
         *(
@@ -277,10 +322,18 @@ def noised(key: Key[Array, ""], features: Features, law: Law) -> Features:
 
 def bits(
     features: Features, law: Law, spec: AnchorMotionSpec
-) -> tuple[Float[Array, "anchors reference"], Float[Array, "anchors carried residual"]]:
+) -> tuple[
+    Float[Array, "anchors reference"], Float[Array, "anchors children residual"]
+]:
     """Compute the bits of an ideal coder for each quantized feature value.
 
-    `entropy.bits`, under the priors of reference and residual features.
+    Args:
+      features: The features.
+      law: Their prior.
+      spec: Settings.
+
+    Returns:
+      Bits (`entropy.bits`) of reference and of residual features.
     """
     step, residual_step = _steps(law)
     first = entropy.bits(features.reference, law.mean, law.log_scale, step)
@@ -288,15 +341,25 @@ def bits(
     return first, entropy.bits(features.residual, mean, log_scale, residual_step)
 
 
-def made(
+def make_children(
     net: Anchors, spec: AnchorMotionSpec, features: Features, rest: int
 ) -> Carried:
-    """Produce the children of anchors in canonical position, with `rest` harmonics."""
+    """Compute the children of anchors in their canonical state.
+
+    Args:
+      net: Shared parameters.
+      spec: Settings.
+      features: Features of the anchors.
+      rest: Number of higher harmonics, which are zero.
+
+    Returns:
+      Parameters of the children relative to their anchors.
+    """
     half = spec.residual // 2
     shape = (*features.residual.shape[:2], spec.reference)
     reference = jnp.broadcast_to(features.reference[:, None], shape)
-    reads = jnp.concatenate([reference, features.residual[..., :half]], axis=-1)
-    heads = mlp.apply(make_spec(spec), net.make, reads)
+    inputs = jnp.concatenate([reference, features.residual[..., :half]], axis=-1)
+    heads = mlp.apply(make_spec(spec), net.make, inputs)
     turn = jax.vmap(jax.vmap(quaternion.exp))(heads["turn"])
     return Carried(
         offset=heads["offset"],
@@ -304,5 +367,5 @@ def made(
         quaternion=turn,
         opacity_logit=heads["opacity_logit"][..., 0],
         sh_dc=heads["sh_dc"][..., None, :],
-        sh_rest=jnp.zeros((*shape[:2], rest, 3), reads.dtype),
+        sh_rest=jnp.zeros((*shape[:2], rest, 3), inputs.dtype),
     )

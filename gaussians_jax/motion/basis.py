@@ -1,10 +1,10 @@
 """Motion as a slow displacement and a basis of directions for each Gaussian.
 
 MoBa-GS, equations 3 to 6. A base network moves the canonical mean p with a
-low-frequency time: p'(t) = p + D(p, t). A basis network makes of p alone K directions
-V(p), a weight network of p' and t the K lengths to go along them, the turn and the
-stretch. A Gaussian is then at p' + V(p) w(p', t). What depends on p alone (`prepare`)
-stays as it is for all times while the parameters do.
+low-frequency time: p'(t) = p + D(p, t). A basis network maps p to K directions V(p). A
+weight network maps p' and t to K weights w, a rotation and a change of scale. A
+Gaussian is then at p' + V(p) w(p', t). Everything that depends on p only is cached by
+`prepare` and valid for all times.
 """
 
 import dataclasses
@@ -38,15 +38,16 @@ _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the noise on 
 
 @dataclasses.dataclass(frozen=True)
 class BasisMotionSpec:
-    """The three networks and their schedule, with the paper's sizes where it has them.
+    """Settings of the three networks and their schedule, with the paper's sizes if
+    given.
 
     `count` is K. None removes the basis, and the weight network predicts the residual
-    displacement, the paper's ablation "base + residual". All networks use SiLU: the
-    paper calls its motion C1 in time, which ReLU networks are not.
+    displacement, the paper's ablation "base + residual". All networks use SiLU, because
+    the paper calls its motion C1 in time, which ReLU networks are not.
 
-    V w = (V A)(A^-1 w) for every invertible A, so the size of V has no meaning alone.
-    The form "bounded" shortens directions longer than one to length one. Then w is in
-    scene units, and |V w| <= sum |w| for any basis network. The form "free" keeps them.
+    V w = (V A)(A^-1 w) for every invertible A, so the size of V is arbitrary.
+    `basis_form="bounded"` shortens directions longer than one to length one. Then w is
+    in scene units, and |V w| <= sum |w| for any basis network. "free" keeps directions.
     """
 
     position: EncodingSpec = EncodingSpec(10)
@@ -61,8 +62,8 @@ class BasisMotionSpec:
     width: int = 256
     skips: tuple[int, ...] = (5,)  # layers of the weight network that read p' again
     activation: str = "silu"
-    # No gradient to the canonical means through the networks, as in Deformable 3DGS:
-    # they would chase a moving target. The paper does not say.
+    # No gradient reaches the canonical means through the networks, as in Deformable
+    # 3DGS, because the networks themselves change. The paper does not say.
     detach: bool = True
     warm_up: int = steps(3000)  # steps without motion
     smoothing: SmoothingSpec | None = None
@@ -73,8 +74,8 @@ class BasisMotionSpec:
     def __post_init__(self):
         if self.count is not None and self.count < 1:
             raise ValueError(
-                f"a basis has at least one direction, got count={self.count}; None "
-                "leaves the basis out"
+                f"count={self.count}: a basis needs at least one direction; None "
+                "disables the basis"
             )
         if self.basis_form not in BASIS_FORMS:
             raise ValueError(
@@ -87,24 +88,25 @@ class BasisMotionSpec:
             )
         if self.block < 1 or self.warm_up < 0:
             raise ValueError(
-                f"block >= 1 and warm_up >= 0, got {self.block} and {self.warm_up}"
+                "block must be at least 1 and warm_up not negative, got "
+                f"block={self.block} and warm_up={self.warm_up}"
             )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
-        base_spec(self)  # these check sizes, layers and activation
+        base_spec(self)  # these validate sizes, layers and activation
         weights_spec(self)
         if self.count is not None:
             basis_spec(self)
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the motion for a run of `run_steps` of this capture."""
+        """Return the motion for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.moments)
 
 
 class BasisMotion(NamedTuple):
-    """Parameters of the field."""
+    """Parameters of the networks."""
 
     base: MLP
-    basis: MLP | None  # None where the spec has no basis
+    basis: MLP | None  # None without a basis
     weights: MLP
 
 
@@ -112,11 +114,12 @@ class Prepared(NamedTuple):
     """Time-independent quantities of each Gaussian.
 
     They take 4 (3 K + base_width) bytes each: 608 with the paper's sizes, 24 MB for its
-    39,000 Gaussians. On one core, deforming 10,000 takes 160 ms without, 154 with the
-    directions, 147 with both, and 10.2, 8.5 and 6.8 in the small sizes.
+    39,000 Gaussians. On one core, the deformation of 10,000 takes 160 ms without this
+    cache, 154 with cached directions, 147 with both, and 10.2, 8.5 and 6.8 in the small
+    sizes.
     """
 
-    base: Float[Array, "gaussians width"]  # p's share of the base's first layer
+    base: Float[Array, "gaussians width"]  # contribution of p to the first base layer
     basis: Float[Array, "gaussians 3 count"] | None  # the directions
 
 
@@ -129,7 +132,7 @@ class Offsets(NamedTuple):
 
 
 def base_spec(spec: BasisMotionSpec) -> MLPSpec:
-    """From [encoded canonical mean, encoded time] to the slow displacement."""
+    """Settings of the network from [mean, time], encoded, to the slow displacement."""
     inputs = spec.position.width(3) + spec.base_time.width(1)
     heads = (("mean", HeadSpec(3, "small")),)
     return MLPSpec(
@@ -138,10 +141,17 @@ def base_spec(spec: BasisMotionSpec) -> MLPSpec:
 
 
 def basis_spec(spec: BasisMotionSpec) -> MLPSpec:
-    """From the encoded canonical mean to K directions, about as long as one at first.
+    """Settings of the network from the encoded mean to K directions.
 
-    One hidden layer and the output are the paper's "2 layers": its storage column
-    leaves room for 570k to 590k numbers in all networks, and this makes 589k.
+    Directions have a length of about one at first. One hidden layer and the output are
+    the paper's "2 layers": its storage column leaves room for 570k to 590k numbers in
+    all networks, and this gives 589k.
+
+    Args:
+      spec: Settings of the motion.
+
+    Returns:
+      Settings of the network.
     """
     assert spec.count is not None
     heads = (("directions", HeadSpec(3 * spec.count)),)
@@ -150,11 +160,12 @@ def basis_spec(spec: BasisMotionSpec) -> MLPSpec:
 
 
 def weights_spec(spec: BasisMotionSpec) -> MLPSpec:
-    """Settings of the network from [encoded p', encoded time] to weights, rotation and
-    scale.
+    """Settings of the network from [encoded p', encoded time] to weights and others.
 
-    All heads start near zero, so that a Gaussian starts in its canonical state while
-    its directions are nonzero. If both were zero, neither would get a gradient.
+    The other outputs are rotation and scale.
+
+    All heads are initialized near zero, so that a Gaussian starts in its canonical
+    state, but directions are not. If both were zero, neither would get a gradient.
 
     Args:
       spec: Settings of the motion.
@@ -173,9 +184,9 @@ def weights_spec(spec: BasisMotionSpec) -> MLPSpec:
     )
 
 
-# One core, forward and backward with what is prepared, at 5k and 10k Gaussians: 17 and
-# 33 ms; `mlp_motion.SMALL_MOTION` takes 14 and 28 in the same run. The encoding has pi
-# for its polynomial sines, which take 5 ms less here than XLA's.
+# Forward and backward with `prepare`, for 5k and 10k Gaussians on one core: 17 and 33
+# ms, compared with 14 and 28 for `mlp.SMALL_MOTION`. The encoding has pi for its
+# polynomial sines, which take 5 ms less than XLA's.
 SMALL_BASIS_MOTION = BasisMotionSpec(
     position=EncodingSpec(4, times_pi=True),
     base_time=EncodingSpec(2),
@@ -190,7 +201,7 @@ SMALL_BASIS_MOTION = BasisMotionSpec(
 
 
 def init(key: Key[Array, ""], spec: BasisMotionSpec, dtype=jnp.float32) -> BasisMotion:
-    """A field that hardly moves anything yet."""
+    """Initialize networks that hardly move anything."""
     base_key, basis_key, weights_key = jax.random.split(key, 3)
     basis = None
     if spec.count is not None:
@@ -205,7 +216,7 @@ def init(key: Key[Array, ""], spec: BasisMotionSpec, dtype=jnp.float32) -> Basis
 def prepare_point(
     params: BasisMotion, spec: BasisMotionSpec, point: Float[Array, "3"]
 ) -> Prepared:
-    """The row of `Prepared` of one canonical mean."""
+    """Compute the cache of one canonical mean."""
     encoded = encoding.encode(spec.position, point, None)
     base = encoded @ params.base.hidden[0].weight[: len(encoded)]
     if params.basis is None:
@@ -216,19 +227,19 @@ def prepare_point(
 def basis_vectors(
     basis: MLP, spec: BasisMotionSpec, encoded: Float[Array, " features"]
 ) -> Float[Array, "3 count"]:
-    """V(p), equation 4, of one encoded canonical mean."""
+    """Compute V(p), equation 4, for one encoded canonical mean."""
     directions = mlp.apply(basis_spec(spec), basis, encoded)["directions"]
     directions = directions.reshape(3, spec.count)
     if spec.basis_form == "free":
         return directions
-    # The length has no slope at zero, and is not needed there.
+    # The gradient of the length is undefined at zero, where it is not needed.
     length_sq = jnp.sum(directions**2, axis=0)
     too_long = length_sq > 1
     return directions / jnp.sqrt(jnp.where(too_long, length_sq, 1))
 
 
 class AtTime(NamedTuple):
-    """The networks that know the time, at one time: functions of position alone."""
+    """The time-dependent networks at one time, as functions of position alone."""
 
     base: MLP
     weights: MLP
@@ -237,9 +248,17 @@ class AtTime(NamedTuple):
 def fold_time(
     params: BasisMotion, spec: BasisMotionSpec, time: Float[Array, ""]
 ) -> AtTime:
-    """Both networks with what they read of the time moved into their biases.
+    """Evaluate the contribution of the time to the first layers of both networks.
 
-    It is the same vector for every Gaussian, summed once instead of for each.
+    It is the same for all Gaussians and is computed once.
+
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      time: Normalized time.
+
+    Returns:
+      The networks at that time.
     """
     slow = encoding.encode(spec.base_time, time[None], None)
     fast = encoding.encode(spec.time, time[None], None)
@@ -250,11 +269,11 @@ def fold_time(
 
 
 def base_displacement(
-    base: MLP, spec: BasisMotionSpec, share: Float[Array, " width"]
+    base: MLP, spec: BasisMotionSpec, first_layer: Float[Array, " width"]
 ) -> Float[Array, "3"]:
-    """Compute D(p, t), equation 3, of one Gaussian from prepared parameters."""
+    """Compute D(p, t), equation 3, of one Gaussian from its cached first layer."""
     first, *others = base.hidden
-    hidden = mlp.ACTIVATIONS[spec.activation](share + first.bias)
+    hidden = mlp.ACTIVATIONS[spec.activation](first_layer + first.bias)
     rest = dataclasses.replace(
         base_spec(spec), inputs=spec.base_width, depth=spec.base_depth - 1
     )
@@ -262,10 +281,10 @@ def base_displacement(
 
 
 def residual(
-    weights: MLP, spec: BasisMotionSpec, moved: Float[Array, "3"]
+    weights: MLP, spec: BasisMotionSpec, slow_mean: Float[Array, "3"]
 ) -> dict[str, Float[Array, " outputs"]]:
     """Compute w(p', t), equation 5, with rotation and scale, of one Gaussian."""
-    encoded = encoding.encode(spec.position, moved, None)
+    encoded = encoding.encode(spec.position, slow_mean, None)
     position_only = dataclasses.replace(weights_spec(spec), inputs=len(encoded))
     return mlp.apply(position_only, weights, encoded)
 
@@ -273,7 +292,7 @@ def residual(
 def offsets_at_time(
     at_time: AtTime, spec: BasisMotionSpec, point: Float[Array, "3"], prepared: Prepared
 ) -> Offsets:
-    """Equations 3, 5 and 6 of one Gaussian, from its row of `Prepared`."""
+    """Evaluate equations 3, 5 and 6 for one Gaussian."""
     slow = base_displacement(at_time.base, spec, prepared.base)
     heads = residual(at_time.weights, spec, point + slow)
     fast = heads["weights"]
@@ -288,14 +307,23 @@ def prepare(
     mean: Float[Array, "gaussians 3"],
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Prepared:
-    """All that `deform` needs and the time does not change. Pure.
+    """Compute everything that `deform` needs and that does not depend on the time.
 
-    The paper calls it time-invariant caching: right for these means and parameters
-    only, so it pays when a trained scene is drawn. In training it runs in every step.
+    The paper calls it time-invariant caching. The cache is valid for these means and
+    parameters only, so it pays off for rendering. In training it runs in every step.
+
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      mean: Canonical means.
+      active: Active Gaussians. Blocks without any are zero.
+
+    Returns:
+      The cache.
     """
     return in_blocks(
         jax.vmap(lambda point: prepare_point(params, spec, point)),
-        (_seen(spec, mean),),
+        (_network_input(spec, mean),),
         active,
         spec.block,
     )
@@ -309,21 +337,29 @@ def deform(
     prepared: Prepared,
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Evaluate the residuals of all Gaussians at a time, zero in blocks without active
-    ones.
+    """Evaluate the residuals of all Gaussians at a time.
 
-    `mean` is canonical, and what `prepared` was made of.
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      mean: Canonical means that `prepared` was computed from.
+      time: Normalized time.
+      prepared: Result of `prepare`.
+      active: Active Gaussians. Blocks without any are zero.
+
+    Returns:
+      The residuals.
     """
     at_time = fold_time(params, spec, time)
     return in_blocks(
         jax.vmap(lambda point, row: offsets_at_time(at_time, spec, point, row)),
-        (_seen(spec, mean), prepared),
+        (_network_input(spec, mean), prepared),
         active,
         spec.block,
     )
 
 
-def _seen(spec, mean):
+def _network_input(spec, mean):
     return jax.lax.stop_gradient(mean) if spec.detach else mean
 
 
@@ -345,7 +381,7 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
     factor = jnp.exp(jnp.clip(offsets.log_scale, *splats.LOG_SCALE_RANGE))
     return Gaussians(
         mean=gaussians.mean + offsets.mean,
-        quaternion=splats.turned(gaussians, offsets.turn),
+        quaternion=splats.rotate(gaussians, offsets.turn),
         scale=gaussians.scale * factor,
         opacity=gaussians.opacity,
     )
@@ -370,7 +406,7 @@ class Bound(BoundMotion):
         return MotionParams(shared=init(shared_key, self.spec))
 
     def precompute(self, params: MotionParams, gaussians: Splats) -> Prepared:
-        """Evaluate what does not depend on the time."""
+        """Compute everything that does not depend on the time."""
         active = splats.active_mask(gaussians)
         return prepare(params.shared, self.spec, gaussians.mean, active)
 

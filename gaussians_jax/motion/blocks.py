@@ -1,4 +1,4 @@
-"""A function of one Gaussian's rows, evaluated a block of Gaussians at a time."""
+"""Evaluation of a per-Gaussian function, one block of Gaussians at a time."""
 
 import functools
 from collections.abc import Callable
@@ -17,11 +17,19 @@ def in_blocks(
     active: Bool[Array, " gaussians"] | None,
     block: int,
 ) -> PyTree:
-    """Evaluate `evaluate(*rows)` with the memory that `block` Gaussians need.
+    """Evaluate `evaluate(*rows)` with the memory of a block of Gaussians.
 
-    `evaluate` takes and returns pytrees whose leaves have the Gaussians first. A block
-    in which no row is active is not evaluated, so compacted rows do not pay for the
-    capacity behind them; what it would have returned is zero. None: all are active.
+    A block without active Gaussians is not evaluated, and its output is zero. Scenes
+    whose active Gaussians come first do not pay for their unused capacity.
+
+    Args:
+      evaluate: Takes and returns pytrees with the Gaussians as first axis.
+      rows: Its arguments.
+      active: True for active Gaussians. None: all are active.
+      block: Number of Gaussians in a block.
+
+    Returns:
+      The output for all Gaussians.
     """
     count = jax.tree.leaves(rows)[0].shape[0]
     if active is None:
@@ -33,17 +41,17 @@ def in_blocks(
         padding = [(0, blocks * block - count)] + [(0, 0)] * (leaf.ndim - 1)
         return jnp.pad(leaf, padding).reshape(blocks, block, *leaf.shape[1:])
 
-    def static(*rows):
+    def zeros(*rows):
         return jax.tree.map(
             lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
             jax.eval_shape(evaluate, *rows),
         )
 
-    # Recomputing a block in the backward pass keeps one block's activations, not all.
-    # The loop already keeps XLA from merging the two passes.
+    # The backward pass recomputes each block, so only one block's activations are kept.
+    # The loop prevents XLA from merging the two passes.
     @functools.partial(jax.remat, prevent_cse=False)
     def one_block(rows, is_used):
-        return jax.lax.cond(is_used, evaluate, static, *rows)
+        return jax.lax.cond(is_used, evaluate, zeros, *rows)
 
     pieces = jax.tree.map(cut, rows), cut(active).any(axis=1)
     outputs = jax.lax.map(lambda piece: one_block(*piece), pieces)

@@ -1,4 +1,4 @@
-"""A built-in motion in a run: its settings, and what every motion derives from them."""
+"""Base of the built-in motions in a run."""
 
 import dataclasses
 from typing import Any

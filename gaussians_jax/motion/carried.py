@@ -1,19 +1,20 @@
-"""Child Gaussians: each row is a core, and its children move with it and are rendered.
+"""Child Gaussians: each core moves its children, and the children are rendered.
 
 D-MiSo (Waczyńska et al. 2024, NeurIPS, arXiv:2405.14276, "Multi-Gaussians soup",
-section 3): a core Gaussian (equation 1) carries k sub-Gaussians in its own coordinates
-(equation 2), and these alone are drawn. A motion moves the cores; a second network, the
-paper's Sub-Rot (section 3.1), turns what they carry. A core moved by hand takes what it
-carries along (`posed`), and a core is a triangle as well (`gaussians_jax.core.faces`).
+section 3): a core Gaussian (equation 1) has k sub-Gaussians in its own coordinates
+(equation 2), and only these are rendered. A motion moves the cores. A second network,
+the paper's Sub-Rot (section 3.1), rotates the children. Children follow a core that is
+moved by hand (`pose_children`), and a core can also be edited as a triangle
+(`gaussians_jax.core.faces`).
 
-What is not as in the paper. Places count in the scales of the core (m + R S a, there
-m + R a), so that what is split, or enlarged by hand, takes along what it carries. Cores
-have three scales, where the paper's are flat. Looks, opacities, scales and turns are
-against those of the core (in its code scales and turns are), and so the density control
-of the rows, which clones, splits and prunes cores, needs to know nothing of them: it
-judges and lowers the core's share, and one that is carried is more or less opaque by
-what its own number says. There is no first stage in which the cores themselves are
-drawn: what is carried starts spread about its core with the core's looks.
+Differences from the paper: positions of children are in scales of the core (m + R S a,
+in the paper m + R a), so that children follow a core that is split or enlarged by hand.
+Cores have three scales, where the paper's are flat. Colors, opacities, scales and
+rotations are relative to the core's (in its code scales and rotations are), so the
+density control, which clones, splits and prunes cores, does not depend on children. It
+uses and resets the opacity of the core, to which each child adds its own logit. There
+is no first stage in which the cores themselves are rendered. Children are initialized
+around their core with the core's color.
 """
 
 import dataclasses
@@ -44,8 +45,8 @@ class TurnSpec:
     """Settings of the network that rotates children by their own rotation and the time.
 
     The paper's network has one layer (`depth` 0), and its output is added to the
-    rotation (section 3.1), as a quaternion in its code. Here it is a rotation vector
-    that starts near zero.
+    rotation (section 3.1), as a quaternion in its code. Here the output is a rotation
+    vector that is initially near zero.
     """
 
     time: EncodingSpec = EncodingSpec(10)
@@ -56,11 +57,18 @@ class TurnSpec:
 
     def __post_init__(self):
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
-        network_spec(self)  # checks its sizes
+        network_spec(self)  # validates the sizes
 
 
 def network_spec(spec: TurnSpec) -> MLPSpec:
-    """From [turn as a unit quaternion, encoded time] to a rotation vector."""
+    """Settings of the network from [rotation, encoded time] to a rotation vector.
+
+    Args:
+      spec: Settings of the rotation.
+
+    Returns:
+      Settings of the network, whose first four inputs are a unit quaternion.
+    """
     heads = (("turn", HeadSpec(3, "small")),)
     inputs = 4 + spec.time.width(1)
     return MLPSpec(inputs, spec.depth, spec.width, heads, (), "relu", "he")
@@ -70,16 +78,16 @@ def network_spec(spec: TurnSpec) -> MLPSpec:
 class CarriedSpec:
     """Settings of child Gaussians: number, initialization and learning rates.
 
-    25 is the paper's number. Its code starts all of them in the center of the core,
-    where only gradients distinguish them, and at its size. Rates are those of its code,
-    except for those of offsets, which there are in scene units and have 1e-3, and of
-    the higher harmonics, which there have the rate of the first.
+    25 is the paper's number. Its code initializes all of them in the center of the core
+    and at its size, where only gradients distinguish them. Rates are those of its code,
+    except for offsets, which there are in scene units with a rate of 1e-3, and for
+    higher harmonics, which there have the rate of the first.
     """
 
     count: int = 25
-    spread: float = 0.7  # standard deviation of first offsets, in scales of the core
-    first_scale: float = 0.5  # over the core's
-    turns: TurnSpec | None = TurnSpec()  # None: what is carried does not turn by itself
+    spread: float = 0.7  # standard deviation of initial offsets, in scales of the core
+    first_scale: float = 0.5  # initial scale relative to the core's
+    turns: TurnSpec | None = TurnSpec()  # None: children do not rotate on their own
     offset_rate: float = 1e-2
     log_scale_rate: float = 5e-3
     quaternion_rate: float = 1e-3
@@ -89,130 +97,147 @@ class CarriedSpec:
 
     def __post_init__(self):
         if self.count < 1:
-            raise ValueError(f"count={self.count}: a row carries at least one Gaussian")
+            raise ValueError(f"count={self.count}: a core needs at least one child")
         if not 0 <= self.spread < math.inf:
             raise ValueError(
-                f"spread={self.spread} must be finite and not negative; 0 starts all "
-                "in the middle of the core"
+                f"spread={self.spread} must be finite and not negative; 0 initializes "
+                "all children in the center of the core"
             )
         if not 0 < self.first_scale < math.inf:
             raise ValueError(
-                f"first_scale={self.first_scale} must be positive and finite; 1 starts "
-                "them as large as the core"
+                f"first_scale={self.first_scale} must be positive and finite; 1 "
+                "initializes children at the size of the core"
             )
         for field in dataclasses.fields(self):
             rate = getattr(self, field.name)
             if field.name.endswith("_rate") and not 0 <= rate < math.inf:
-                raise ValueError(f"{field.name}={rate} is finite and not negative")
+                raise ValueError(f"{field.name}={rate} must be finite and not negative")
 
 
 class Carried(NamedTuple):
     """Parameters of child Gaussians relative to their core: axes, scales and colors."""
 
-    offset: Float[Array, "rows carried 3"]  # of the mean, in scales of the row
-    log_scale: Float[Array, "rows carried 3"]  # added to the logarithm
-    quaternion: Float[Array, "rows carried 4"]  # wxyz, in the row's axes; any length
-    opacity_logit: Float[Array, "rows carried"]  # added
-    sh_dc: Float[Array, "rows carried 1 3"]  # added
-    sh_rest: Float[Array, "rows carried rest 3"]  # added
+    offset: Float[Array, "cores children 3"]  # of the mean, in scales of the core
+    log_scale: Float[Array, "cores children 3"]  # added to the core's
+    quaternion: Float[Array, "cores children 4"]  # wxyz, in the core's axes; any length
+    opacity_logit: Float[Array, "cores children"]  # added to the core's
+    sh_dc: Float[Array, "cores children 1 3"]  # added to the core's
+    sh_rest: Float[Array, "cores children rest 3"]  # added to the core's
 
 
 def init_rows(key: Key[Array, ""], spec: CarriedSpec, rows: Splats) -> Carried:
     """Initialize children as smaller copies of their core, spread around it.
 
     Args:
-      key: Random key.
+      key: PRNG key.
       spec: Settings.
       rows: Raw parameters of the cores.
 
     Returns:
       Parameters of the children.
     """
-    shape, kind = (len(rows.mean), spec.count), rows.mean.dtype
-    drawn = jax.random.normal(key, (*shape, 3), jnp.float32).astype(kind)
+    shape, dtype = (len(rows.mean), spec.count), rows.mean.dtype
+    noise = jax.random.normal(key, (*shape, 3), jnp.float32).astype(dtype)
     return Carried(
-        offset=spec.spread * drawn,
-        log_scale=jnp.full((*shape, 3), math.log(spec.first_scale), kind),
-        quaternion=jnp.broadcast_to(quaternion.identity(kind), (*shape, 4)),
-        opacity_logit=jnp.zeros(shape, kind),
-        sh_dc=jnp.zeros((*shape, 1, 3), kind),
-        sh_rest=jnp.zeros((*shape, *rows.sh_rest.shape[1:]), kind),
+        offset=spec.spread * noise,
+        log_scale=jnp.full((*shape, 3), math.log(spec.first_scale), dtype),
+        quaternion=jnp.broadcast_to(quaternion.identity(dtype), (*shape, 4)),
+        opacity_logit=jnp.zeros(shape, dtype),
+        sh_dc=jnp.zeros((*shape, 1, 3), dtype),
+        sh_rest=jnp.zeros((*shape, *rows.sh_rest.shape[1:]), dtype),
     )
 
 
-def at_rest(rows: Splats, own: Carried) -> Splats:
-    """Return the raw parameters of all children in canonical position, core by core.
+def canonical_children(rows: Splats, children: Carried) -> Splats:
+    """Return the raw parameters of all children in their canonical state, core by core.
 
-    An inactive row carries inactive ones, as long as `own.opacity_logit` is below 250.
-    """
-    mean, turned, _ = _standing(own, None, splats.activate(rows))
-    return Splats(
-        mean=mean,
-        log_scale=_flat(rows.log_scale[:, None] + own.log_scale),
-        quaternion=turned,
-        opacity_logit=_flat(rows.opacity_logit[:, None] + own.opacity_logit),
-        sh_dc=_flat(rows.sh_dc[:, None] + own.sh_dc),
-        sh_rest=_flat(rows.sh_rest[:, None] + own.sh_rest),
-    )
-
-
-def posed(
-    own: Carried,
-    turn: Float[Array, "rows carried 3"] | None,
-    still: Splats,
-    rows: Gaussians,
-) -> Gaussians:
-    """Compute the children of moved cores (equation 2, with offsets in the core's
-    scales).
-
-    A core of zero size has all children at its center, and one with a zero quaternion
-    has the axes of the world.
+    Children of an inactive core are inactive if their `opacity_logit` is below 250.
 
     Args:
-      own: Parameters of the children.
+      rows: Raw parameters of the cores.
+      children: Parameters of the children.
+
+    Returns:
+      Raw parameters of the children.
+    """
+    mean, rotation, _ = _place_children(children, None, splats.activate(rows))
+    return Splats(
+        mean=mean,
+        log_scale=_flat(rows.log_scale[:, None] + children.log_scale),
+        quaternion=rotation,
+        opacity_logit=_flat(rows.opacity_logit[:, None] + children.opacity_logit),
+        sh_dc=_flat(rows.sh_dc[:, None] + children.sh_dc),
+        sh_rest=_flat(rows.sh_rest[:, None] + children.sh_rest),
+    )
+
+
+def pose_children(
+    children: Carried,
+    turn: Float[Array, "cores children 3"] | None,
+    canonical: Splats,
+    rows: Gaussians,
+) -> Gaussians:
+    """Compute the children of moved cores.
+
+    Equation 2, with offsets in scales of the core. A core of zero size has all children
+    at its center, and one with a zero quaternion has the axes of the world.
+
+    Args:
+      children: Parameters of the children.
       turn: Rotation vectors (rad) in the axes of the core, after the child's own
         rotation.
-      still: Children in canonical position (`at_rest`), for their opacities.
+      canonical: Children in their canonical state (`canonical_children`), for their
+        opacities.
       rows: Cores, moved by a network or by hand.
 
     Returns:
       The child Gaussians.
     """
-    mean, turned, scale = _standing(own, turn, rows)
-    return Gaussians(mean, turned, scale, jax.nn.sigmoid(still.opacity_logit))
+    mean, rotation, scale = _place_children(children, turn, rows)
+    return Gaussians(mean, rotation, scale, jax.nn.sigmoid(canonical.opacity_logit))
 
 
-def _standing(own, turn, rows):
-    """Means, rotations and scales of what rows carry, one after the other."""
+def _place_children(children, turn, rows):
+    """Return means, rotations and scales of all children, core by core."""
     axes = jax.vmap(quaternion.to_matrix)(rows.quaternion)
-    places = exact_einsum("nij,nkj->nki", axes, rows.scale[:, None] * own.offset)
-    growth = jnp.exp(jnp.clip(own.log_scale, *splats.LOG_SCALE_RANGE))
+    offsets = exact_einsum("nij,nkj->nki", axes, rows.scale[:, None] * children.offset)
+    factor = jnp.exp(jnp.clip(children.log_scale, *splats.LOG_SCALE_RANGE))
 
-    def turned(row, one, turn):
-        one = quaternion.normalize(one)
+    def rotate(row, orientation, turn):
+        orientation = quaternion.normalize(orientation)
         if turn is not None:
-            one = quaternion.multiply(quaternion.exp(turn), one)
-        return quaternion.multiply(row, one)
+            orientation = quaternion.multiply(quaternion.exp(turn), orientation)
+        return quaternion.multiply(row, orientation)
 
     unit = jax.vmap(quaternion.normalize)(rows.quaternion)
     each = None if turn is None else 0
-    over_rows = jax.vmap(jax.vmap(turned, (None, 0, each)), (0, 0, each))
+    over_rows = jax.vmap(jax.vmap(rotate, (None, 0, each)), (0, 0, each))
     return (
-        _flat(rows.mean[:, None] + places),
-        _flat(over_rows(unit, own.quaternion, turn)),
-        _flat(rows.scale[:, None] * growth),
+        _flat(rows.mean[:, None] + offsets),
+        _flat(over_rows(unit, children.quaternion, turn)),
+        _flat(rows.scale[:, None] * factor),
     )
 
 
 def turns(
-    network: MLP, spec: TurnSpec, own: Carried, time: Float[Array, ""]
-) -> Float[Array, "rows carried 3"]:
-    """Evaluate the rotation of children at a time (rad, axes of their core)."""
-    moment = encoding.encode(spec.time, time[None], None)
-    at_time = mlp.with_known(network_spec(spec), network, moment)
-    unit = jax.vmap(jax.vmap(quaternion.normalize))(own.quaternion)
-    alone = dataclasses.replace(network_spec(spec), inputs=4)
-    return mlp.apply(alone, at_time, unit)["turn"]
+    network: MLP, spec: TurnSpec, children: Carried, time: Float[Array, ""]
+) -> Float[Array, "cores children 3"]:
+    """Evaluate the rotation of children at a time.
+
+    Args:
+      network: Parameters of the network.
+      spec: Settings.
+      children: Parameters of the children.
+      time: Normalized time.
+
+    Returns:
+      Rotation vectors (rad) in the axes of the core.
+    """
+    encoded = encoding.encode(spec.time, time[None], None)
+    at_time = mlp.with_known(network_spec(spec), network, encoded)
+    unit = jax.vmap(jax.vmap(quaternion.normalize))(children.quaternion)
+    rotation_only = dataclasses.replace(network_spec(spec), inputs=4)
+    return mlp.apply(rotation_only, at_time, unit)["turn"]
 
 
 def follow(
@@ -220,25 +245,32 @@ def follow(
 ) -> Gaussians:
     """Compute the children of cores that were moved, rotated or scaled by hand.
 
-    `rows` are those of `deformation.deform_rows`, moved, turned or enlarged.
+    Args:
+      params: Trained parameters.
+      spec: Settings.
+      rows: Cores of `deformation.deform_rows`, edited.
+      time: Normalized time.
+
+    Returns:
+      The child Gaussians.
     """
-    own = params.rows[NAME]
-    still = at_rest(params.rows["splats"], own)
+    children = params.rows[NAME]
+    canonical = canonical_children(params.rows["splats"], children)
     turn = None
     if spec.turns is not None:
-        turn = turns(params.nets[NAME], spec.turns, own, time)
-    return posed(own, turn, still, rows)
+        turn = turns(params.nets[NAME], spec.turns, children, time)
+    return pose_children(children, turn, canonical, rows)
 
 
 def effect(spec: CarriedSpec, steps: int, warm_up: int) -> SplatRecord:
     """Assemble the hooks of child Gaussians, which do not rotate before `warm_up`.
 
-    Opacities and looks are those at rest: a motion of the rows that changes opacities
-    has no say in them.
+    Opacities and colors are those of the canonical state: changes of the cores' opacity
+    by a motion have no effect.
     """
 
     def rates(step):
-        own = Carried(
+        children = Carried(
             spec.offset_rate,
             spec.log_scale_rate,
             spec.quaternion_rate,
@@ -247,30 +279,30 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> SplatRecord:
             spec.sh_rest_rate,
         )
         if spec.turns is None:
-            return MotionParams(own)
+            return MotionParams(children)
         first, last = spec.turns.learning_rate, spec.turns.learning_rate_end
-        return MotionParams(own, schedules.log_linear(first, last, steps)(step))
+        return MotionParams(children, schedules.log_linear(first, last, steps)(step))
 
     def derive_rows(
         params: Params, condition: FrameCondition | None
     ) -> tuple[Splats, None]:
         del condition
-        return at_rest(params.rows["splats"], params.rows[NAME]), None
+        return canonical_children(params.rows["splats"], params.rows[NAME]), None
 
     def turn_of(params, condition):
-        own = params.rows[NAME]
+        children = params.rows[NAME]
 
-        def evaluate(network, own):
-            return turns(network, spec.turns, own, condition.time)
+        def evaluate(network, children):
+            return turns(network, spec.turns, children, condition.time)
 
         if not warm_up or condition.step is None:
-            return evaluate(params.nets[NAME], own)
+            return evaluate(params.nets[NAME], children)
         return jax.lax.cond(
             condition.step < warm_up,
-            lambda _, own: jnp.zeros_like(own.offset),
+            lambda _, children: jnp.zeros_like(children.offset),
             evaluate,
             params.nets[NAME],
-            own,
+            children,
         )
 
     def derive(
@@ -280,14 +312,14 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> SplatRecord:
         condition: FrameCondition,
     ) -> Gaussians:
         turn = None if spec.turns is None else turn_of(params, condition)
-        return posed(params.rows[NAME], turn, derived[0], rows)
+        return pose_children(params.rows[NAME], turn, derived[0], rows)
 
     def init(key, gaussians):
         rows_key, shared_key = jax.random.split(key)
-        own = init_rows(rows_key, spec, gaussians)
+        children = init_rows(rows_key, spec, gaussians)
         if spec.turns is None:
-            return MotionParams(own)
-        return MotionParams(own, mlp.init(network_spec(spec.turns), shared_key))
+            return MotionParams(children)
+        return MotionParams(children, mlp.init(network_spec(spec.turns), shared_key))
 
     return SplatRecord(
         name=NAME,
@@ -299,6 +331,6 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> SplatRecord:
 
 
 def _flat(leaf):
-    """[rows, carried, ...] as [rows * carried, ...]."""
-    rows, carried, *rest = leaf.shape  # of which the last may be none
-    return leaf.reshape(rows * carried, *rest)
+    """Reshape [cores, children, ...] to [cores * children, ...]."""
+    cores, children, *rest = leaf.shape
+    return leaf.reshape(cores * children, *rest)

@@ -1,9 +1,9 @@
-"""Codes of Gaussians and of time that motions read, and what holds them in check.
+"""Embeddings of Gaussians and time codes that motions read, and their regularization.
 
 Bae et al. 2024, "Per-Gaussian embedding-based deformation", arXiv:2404.03613 (E-D3DGS),
-section 3.3, with the numbers of its code. Two networks read one table of codes over
-time: a coarse one as if it had a fifth of its rows, a fine one with ever more of them,
-so that slow motion is found before fast motion.
+section 3.3, with the numbers of its code. Two networks read one table of time codes:
+the coarse one resamples it to a fifth of its codes, the fine one to a growing number of
+codes, so that slow motion is learned before fast motion.
 """
 
 import dataclasses
@@ -29,49 +29,47 @@ class Codes(Protocol):
 
     @property
     def embedding(self) -> int:
-        """Numbers in the code of a Gaussian."""
+        """Size of the embedding of a Gaussian."""
 
     @property
     def time_code(self) -> int:
-        """Numbers in the code of a moment."""
+        """Size of a time code."""
 
     @property
     def frames_per_code(self) -> int:
-        """A table has one code for so many frames."""
+        """Number of frames per time code."""
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the first codes."""
+        """Standard deviation of the initial codes."""
 
     @property
     def waves(self) -> float | None:
-        """Frequencies of the initial codes over space and time; None for independent
-        ones.
-        """
+        """Frequency of the initial codes in space and time. None: independent."""
 
     @property
     def coarser(self) -> int | None:
-        """Ratio of fine to coarse time codes; None without a coarse network."""
+        """Ratio of fine to coarse time codes. None: no coarse network."""
 
     @property
     def grow_until(self) -> int:
-        """The step from which the fine network reads all rows."""
+        """Step from which the fine network reads all codes."""
 
     @property
     def smoothness(self) -> float:
-        """Weight of `second_differences`, 0 without it."""
+        """Weight of `second_differences`, 0 to disable it."""
 
     @property
     def opacity(self) -> float:
-        """Weight of `mean_opacity`, 0 without it."""
+        """Weight of `mean_opacity`, 0 to disable it."""
 
     @property
     def warm_up(self) -> int:
-        """Steps without motion."""
+        """Number of steps without motion."""
 
 
 def moments(spec: Codes, frames: int) -> int:
-    """Codes in the table of a capture of so many frames to learn from."""
+    """Return the number of time codes for a number of training frames."""
     return -(-frames // spec.frames_per_code)
 
 
@@ -80,54 +78,69 @@ def init_embedding(
     spec: Codes,
     mean: Float[Array, "gaussians 3"],
 ) -> Float[Array, "gaussians embedding"]:
-    """A code for each Gaussian, of standard deviation `spec.spread`.
+    """Initialize an embedding for each Gaussian, of standard deviation `spec.spread`.
 
-    Independent normal draws, or with `spec.waves` cosines of random direction, length
-    and phase over the positions (random Fourier features, Rahimi and Recht 2007): then
-    Gaussians that are near each other start alike, and what one frame says of one
-    Gaussian moves those around it.
+    Values are independent and normal. With `spec.waves` they are cosines of random
+    direction, frequency and phase over the positions (random Fourier features, Rahimi
+    and Recht 2007). Nearby Gaussians then have similar embeddings, and the gradient of
+    one Gaussian in one frame moves those around it.
+
+    Args:
+      key: PRNG key.
+      spec: Settings.
+      mean: Means of the Gaussians.
+
+    Returns:
+      The embeddings.
     """
     if spec.waves is None:
-        drawn = jax.random.normal(key, (mean.shape[0], spec.embedding), jnp.float32)
-        return spec.spread * drawn.astype(mean.dtype)
+        noise = jax.random.normal(key, (mean.shape[0], spec.embedding), jnp.float32)
+        return spec.spread * noise.astype(mean.dtype)
     centered = mean - jnp.mean(mean, axis=0)
     radius_sq = jnp.mean(jnp.sum(centered**2, axis=1))
-    # One Gaussian, or all in one place: every code is that of the middle.
+    # A single position has the phase of the center.
     unit = centered / jnp.sqrt(jnp.where(radius_sq > 0, radius_sq, 1))
     return _random_waves(key, spec, unit, spec.embedding)
 
 
-def _random_waves(key, spec, places, width):
-    """[places, width] cosines of random direction, length and phase over the places."""
+def _random_waves(key, spec, positions, width):
+    """Return cosines [places, width] of random direction, frequency and phase."""
     wave_key, phase_key = jax.random.split(key)
-    shape = places.shape[1], width
+    shape = positions.shape[1], width
     waves = spec.waves * jax.random.normal(wave_key, shape, jnp.float32)
     phase = jax.random.uniform(phase_key, (width,), jnp.float32, 0, 2 * jnp.pi)
-    angle = exact_product(places, waves.astype(places.dtype))
-    angle = angle + phase.astype(places.dtype)
+    angle = exact_product(positions, waves.astype(positions.dtype))
+    angle = angle + phase.astype(positions.dtype)
     return spec.spread * math.sqrt(2) * jnp.cos(angle)
 
 
 def init_times(
     key: Key[Array, ""], spec: Codes, frames: int, dtype=jnp.float32
 ) -> Float[Array, "moments code"]:
-    """The table of codes over time, started as the embeddings are."""
+    """Initialize the table of time codes like the embeddings.
+
+    Args:
+      key: PRNG key.
+      spec: Settings.
+      frames: Number of training frames.
+      dtype: Floating-point type.
+
+    Returns:
+      The table.
+    """
     if frames < 1:
-        raise ValueError(
-            f"frames={frames}: a motion is learned from at least one frame"
-        )
+        raise ValueError(f"frames={frames}: a motion needs at least one training frame")
     count = moments(spec, frames)
     if spec.waves is None:
-        scale = math.sqrt(3) * spec.spread  # of a uniform draw
+        scale = math.sqrt(3) * spec.spread  # bound of a uniform distribution
         return codes.init(key, count, spec.time_code, scale, dtype)
-    # Half the capture is to a moment what the mean radius is to a place.
+    # [-2, 2] has about the spread of the positions, whose mean square distance is one.
     moment = jnp.linspace(-2, 2, count, dtype=dtype)[:, None]
     return _random_waves(key, spec, moment, spec.time_code)
 
 
 def coarse_rows(spec: Codes, count: int) -> int:
-    """Compute the number of codes that the coarse network reads, and the fine one at
-    first.
+    """Compute the number of codes of the coarse network, and of the fine one at first.
 
     Args:
       spec: Settings.
@@ -140,8 +153,7 @@ def coarse_rows(spec: Codes, count: int) -> int:
 
 
 def fine_rows(spec: Codes, count: int, step: int) -> int:
-    """Compute the number of codes that the fine network reads after some steps, on the
-    host.
+    """Compute the number of codes of the fine network after some steps, on the host.
 
     Args:
       spec: Settings.
@@ -158,15 +170,15 @@ def fine_rows(spec: Codes, count: int, step: int) -> int:
 
 
 def growth_steps(spec: Codes, count: int) -> tuple[int, ...]:
-    """After which steps that number is another one."""
-    reads = [fine_rows(spec, count, step) for step in range(spec.grow_until + 1)]
-    return tuple(k for k in range(1, len(reads)) if reads[k] != reads[k - 1])
+    """Return the steps after which the number of codes of the fine network changes."""
+    counts = [fine_rows(spec, count, step) for step in range(spec.grow_until + 1)]
+    return tuple(k for k in range(1, len(counts)) if counts[k] != counts[k - 1])
 
 
-def revised(spec: Codes, own: Any, step: int) -> Any:
-    """A motion's parameters with the `rows` that its fine network reads from a step."""
-    count = fine_rows(spec, len(own.times), step)
-    return own._replace(rows=jnp.full_like(own.rows, count))
+def revised(spec: Codes, shared: Any, step: int) -> Any:
+    """Return shared parameters with the number of codes of the fine network."""
+    count = fine_rows(spec, len(shared.times), step)
+    return shared._replace(rows=jnp.full_like(shared.rows, count))
 
 
 def read(
@@ -175,13 +187,21 @@ def read(
     rows: Float[Array, "1"],
     time: Float[Array, ""],
 ) -> tuple[Float[Array, " code"], Float[Array, " code"]]:
-    """The code at a time for the coarse network, and for the fine one.
+    """Interpolate the time codes of the coarse and of the fine network.
 
-    That reads the table as if it had `rows`, which no slope reaches.
+    Args:
+      spec: Settings.
+      times: Table of codes.
+      rows: Number of codes to which the fine network resamples the table. It gets no
+        gradient.
+      time: Normalized time.
+
+    Returns:
+      The coarse and the fine code.
     """
     least = jnp.asarray(coarse_rows(spec, times.shape[0]), time.dtype)
-    reads = (least, jax.lax.stop_gradient(rows[0]))
-    coarse, fine = (codes.at_time_of(times, count, time) for count in reads)
+    counts = (least, jax.lax.stop_gradient(rows[0]))
+    coarse, fine = (codes.at_time_of(times, count, time) for count in counts)
     return coarse, fine
 
 
@@ -214,24 +234,20 @@ def mean_opacity(params: Params) -> Float[Array, ""]:
     return jnp.sum(opacity) / jnp.maximum(jnp.sum(active), 1).astype(opacity.dtype)
 
 
-def has_penalty(spec: Codes) -> bool:
-    """Test if `penalty` has a term.
-
-    Args:
-      spec: Settings.
-
-    Returns:
-      True if it has one.
-    """
-    return spec.smoothness > 0 or spec.opacity > 0
-
-
 def penalty(
     spec: Codes, times: Float[Array, "moments code"], context: PenaltyContext
 ) -> dict[str, Term]:
-    """`smoothness`, which codes wait for their motion with, and `opacity`.
+    """Compute the losses of the codes: `smoothness` after the warm-up, and `opacity`.
 
     A term of weight zero is not computed.
+
+    Args:
+      spec: Settings.
+      times: Table of codes.
+      context: Context of the step.
+
+    Returns:
+      The terms by name.
     """
     terms: dict[str, Term] = {}
     if spec.smoothness > 0:
@@ -244,7 +260,7 @@ def penalty(
 
 @dataclasses.dataclass(frozen=True)
 class BoundCodes(BoundMotion):
-    """Base of the motions that read codes of Gaussians and of time.
+    """Base of the motions that read embeddings and time codes.
 
     Attributes:
       frames: Number of training frames.
@@ -257,16 +273,16 @@ class BoundCodes(BoundMotion):
         return MotionParams(jnp.full((), self.spec.embedding_rate), self.rate(step))
 
     def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
-        """Compute the penalties on codes that bend, and on opacity."""
+        """Compute the smoothness of time codes, and the mean opacity."""
         return penalty(self.spec, params.shared.times, context)
 
     @property
     def project_steps(self) -> tuple[int, ...]:
-        """Steps after which the fine network reads more rows of the table."""
+        """Steps after which the fine network reads more time codes."""
         if self.spec.coarser is None:
             return ()
         return growth_steps(self.spec, moments(self.spec, self.frames))
 
     def project(self, shared: Any, step: int) -> Any:
-        """Return the shared parameters with the rows that are read from a step."""
+        """Return the shared parameters with the number of codes from a step on."""
         return revised(self.spec, shared, step)

@@ -1,7 +1,7 @@
-"""Motion of a scene: all deforming effects, one after the other.
+"""Motion of a scene: all deforming components, one after the other.
 
-Effects deform the Gaussians of the scene. If one of them defines children
-(`derive_rows`, `derive`), the children are rendered instead.
+If one of the components defines child Gaussians (`derive_rows`, `derive`), the children
+are rendered instead of their parents.
 """
 
 from collections.abc import Callable
@@ -21,9 +21,14 @@ Effects = tuple[SplatRecord, ...]
 
 
 def prepare(effects: Effects, params: Params) -> dict[str, PyTree]:
-    """Compute what depends on the parameters but not on the time, by effect name.
+    """Compute the caches of all components, which do not depend on the time.
 
-    A pure function: what it returned is right as long as `params` are the same arrays.
+    Args:
+      effects: Components of the scene.
+      params: Trained parameters. The caches are valid for these only.
+
+    Returns:
+      The caches by name of the component.
     """
     return {
         effect.name: effect.prepare(params)
@@ -38,7 +43,17 @@ def deform(
     prepared: dict[str, PyTree],
     time: Float[Array, ""],
 ) -> Gaussians:
-    """Compute the Gaussians to render at one time of a trained scene."""
+    """Compute the Gaussians to render at one time of a trained scene.
+
+    Args:
+      effects: Components of the scene.
+      params: Trained parameters.
+      prepared: Result of `prepare`.
+      time: Normalized time.
+
+    Returns:
+      The Gaussians, or their children.
+    """
     moved = deform_rows(effects, params, prepared, time)
     derivation = _derivation(effects)
     if derivation is None:
@@ -53,43 +68,53 @@ def deform_rows(
     prepared: dict[str, PyTree],
     time: Float[Array, ""],
 ) -> Gaussians:
-    """The rows of a trained scene as they are at one time."""
+    """Compute the Gaussians at one time of a trained scene, without their children.
+
+    Args:
+      effects: Components of the scene.
+      params: Trained parameters.
+      prepared: Result of `prepare`.
+      time: Normalized time.
+
+    Returns:
+      The Gaussians.
+    """
     gaussians = splats.activate(params.rows["splats"])
     for effect in effects:
         if effect.deform is not None:
-            ready = prepared.get(effect.name)
-            gaussians = effect.deform(params, gaussians, FrameCondition(time), ready)
+            cache = prepared.get(effect.name)
+            gaussians = effect.deform(params, gaussians, FrameCondition(time), cache)
     return gaussians
 
 
-def derives(effects: Effects) -> SplatRecord | None:
-    """Return the effect that defines child Gaussians, None if there is none."""
+def child_component(effects: Effects) -> SplatRecord | None:
+    """Return the component that defines child Gaussians, or None."""
     return next((effect for effect in effects if effect.derive is not None), None)
 
 
 def _derivation(effects):
-    """Return `derive_rows` and `derive` of the effect that has them, or None."""
-    by = derives(effects)
-    return None if by is None else (by.derive_rows, by.derive)
+    """Return `derive_rows` and `derive` of the component that has them, or None."""
+    component = child_component(effects)
+    return None if component is None else (component.derive_rows, component.derive)
 
 
 def check_derived(effects: Effects) -> None:
-    """Raise ValueError where more than one effect says what is drawn, or half of it."""
-    named = [e.name for e in effects if e.derive is not None]
-    if len(named) > 1:
+    """Raise ValueError unless one component at most defines children, completely."""
+    names = [e.name for e in effects if e.derive is not None]
+    if len(names) > 1:
         raise ValueError(
-            f"{' and '.join(named)} each say what rows carry; leave all but one out"
+            f"{' and '.join(names)} both define child Gaussians; leave all but one out"
         )
     for effect in effects:
         if (effect.derive is None) != (effect.derive_rows is None):
             raise ValueError(
-                f"the effect {effect.name!r} fills one of derive and derive_rows; what "
-                "rows carry needs both, at rest and at a time"
+                f"the component {effect.name!r} has only one of derive and "
+                "derive_rows; child Gaussians need both"
             )
 
 
-def drawn_rows(effects: Effects, params: Params) -> Splats:
-    """Return the raw parameters of the rendered Gaussians in canonical position."""
+def rendered_rows(effects: Effects, params: Params) -> Splats:
+    """Return the raw parameters of the rendered Gaussians in their canonical state."""
     derivation = _derivation(effects)
     if derivation is None:
         return params.rows["splats"]
@@ -97,10 +122,20 @@ def drawn_rows(effects: Effects, params: Params) -> Splats:
     return derive_rows(params, None)[0]
 
 
-def drawn(
+def rendered(
     effects: Effects, params: Params, moved: Gaussians, condition: FrameCondition
 ) -> tuple[Splats, Gaussians]:
-    """Return the rendered Gaussians in training: canonical parameters, and moved."""
+    """Return the rendered Gaussians in training: canonical parameters, and deformed.
+
+    Args:
+      effects: Components of the scene.
+      params: Trained parameters.
+      moved: Deformed Gaussians, without their children.
+      condition: Frame time, step and key.
+
+    Returns:
+      Raw parameters, and Gaussians at the frame time.
+    """
     derivation = _derivation(effects)
     if derivation is None:
         return params.rows["splats"], moved
@@ -112,25 +147,33 @@ def drawn(
 def significance(
     effects: Effects, gaussians: Gaussians
 ) -> Float[Array, " gaussians"] | None:
-    """Weight the children of each Gaussian; None for equal weights."""
-    by = derives(effects)
-    if by is None or by.significance is None:
+    """Return the weights of children in their parents' statistics, None if equal."""
+    component = child_component(effects)
+    if component is None or component.significance is None:
         return None
-    return by.significance(gaussians)
+    return component.significance(gaussians)
 
 
-def carried_by_each(effects: Effects, params: Params) -> int:
+def children_per_gaussian(effects: Effects, params: Params) -> int:
     """Return the number of children per Gaussian."""
-    if derives(effects) is None:
+    if child_component(effects) is None:
         return 1
-    drawn = jax.eval_shape(lambda params: drawn_rows(effects, params), params)
-    return drawn.mean.shape[0] // params.rows["splats"].mean.shape[0]
+    rendered = jax.eval_shape(lambda params: rendered_rows(effects, params), params)
+    return rendered.mean.shape[0] // params.rows["splats"].mean.shape[0]
 
 
 def probe(effects: Effects, params: Params) -> Float[Array, "gaussians 2"]:
-    """Zeros whose slope is that of the places in the picture of what is drawn, px."""
+    """Return zeros to add to the projected means, to get their gradients.
+
+    Args:
+      effects: Components of the scene.
+      params: Trained parameters.
+
+    Returns:
+      Zeros for all rendered Gaussians, in pixels.
+    """
     mean = params.rows["splats"].mean
-    count = carried_by_each(effects, params) * mean.shape[0]
+    count = children_per_gaussian(effects, params) * mean.shape[0]
     return jnp.zeros((count, 2), mean.dtype)
 
 
@@ -143,16 +186,16 @@ def deform_in_training(
 ) -> Gaussians:
     """Deform the Gaussians of a scene at a frame time in training.
 
-    An effect is not evaluated before its warm-up ends. Under the loop's scan the
-    condition is a branch, so such a step costs as much as without the effect.
+    A component is not evaluated before its warm-up ends. In a scanned loop the
+    condition is a branch, so such a step costs as much as without the component.
 
     Args:
-      effects: Effects of the scene.
+      effects: Components of the scene.
       params: Trained parameters.
       gaussians: Canonical Gaussians.
       condition: Frame time, codes, step and key.
-      states: State of effects that are `ready_by_state`. Without it they are prepared
-        anew.
+      states: State of components that are `ready_by_state`. Without it their caches are
+        computed.
 
     Returns:
       The deformed Gaussians.
@@ -161,22 +204,22 @@ def deform_in_training(
         if effect.deform is None:
             continue
 
-        def moved(params, gaussians, effect=effect):
-            ready = None
+        def deform_by(params, gaussians, effect=effect):
+            cache = None
             if effect.ready_by_state and states is not None:
-                ready = states[effect.name]
+                cache = states[effect.name]
             elif effect.prepare is not None:
-                ready = effect.prepare(params)
-            return effect.deform(params, gaussians, condition, ready)
+                cache = effect.prepare(params)
+            return effect.deform(params, gaussians, condition, cache)
 
         if not effect.warm_up:
-            gaussians = moved(params, gaussians)
+            gaussians = deform_by(params, gaussians)
             continue
         assert condition.step is not None
         gaussians = jax.lax.cond(
             condition.step < effect.warm_up,
             lambda params, gaussians: gaussians,
-            moved,
+            deform_by,
             params,
             gaussians,
         )
@@ -186,11 +229,11 @@ def deform_in_training(
 def deformer(
     effects: Effects, condition: FrameCondition
 ) -> Callable[[Params, Float[Array, ""]], Gaussians]:
-    """A function of rows and of a time near `condition`, for `PenaltyContext`."""
+    """Return a function of parameters and a time near `condition` for losses."""
 
     def at_time(params, time):
         gaussians = splats.activate(params.rows["splats"])
-        then = condition._replace(time=time)
-        return deform_in_training(effects, params, gaussians, then)
+        at_condition = condition._replace(time=time)
+        return deform_in_training(effects, params, gaussians, at_condition)
 
     return at_time

@@ -1,12 +1,11 @@
-"""Deformation by a per-Gaussian embedding and a time code, with a coarse and a fine
-network.
+"""Deformation by an embedding per Gaussian and a time code, with two networks.
 
 Bae et al. 2024, "Per-Gaussian embedding-based deformation", arXiv:2404.03613 (E-D3DGS),
-with the sizes of its code. A network makes residuals of the codes (section 3.2,
-equation 4); there are a coarse and a fine one, which read the same table of codes over
-time (section 3.3, `motion_codes`), and their residuals of position, scale and rotation
-add. Equation 4 has residuals of opacity and color as well, which the code switches off
-for HyperNeRF's films; that the fine network reads ever more rows is from the code.
+with the sizes of its code. A network maps the codes to residuals (section 3.2, equation
+4). A coarse and a fine network read the same table of time codes (section 3.3,
+`motion.codes`), and their residuals of position, scale and rotation are added. Equation
+4 also has residuals of opacity and color, which the code disables for HyperNeRF's
+videos. The growing number of codes of the fine network is taken from the code.
 """
 
 import dataclasses
@@ -37,28 +36,29 @@ NAME = "embedding_motion"
 
 @dataclasses.dataclass(frozen=True)
 class EmbeddingMotionSpec:
-    """Sizes, growth and penalties, by default those of E-D3DGS's code for HyperNeRF's
-    videos.
+    """Settings of the motion, by default those of E-D3DGS's code for HyperNeRF.
 
-    Rotations are rotation vectors where the code adds to quaternions, and the last
-    layers start at zero, where its start as any layer; for other films it fades offsets
-    in over a thousand steps, and learns how late a camera is. `smoothness` weighs the
-    mean square of second differences between codes that follow each other, which the
-    code means and misses by an index. `opacity` weighs the mean opacity, in the place
-    of resets; the code takes the sigmoid of the mean logit. A weight of zero leaves its
-    term out.
+    Differences: rotations are rotation vectors where the code adds to quaternions. The
+    last layers are initialized to zero, where the code initializes them like others.
+    For other videos the code fades in the residuals over a thousand steps, and learns a
+    time offset per camera.
+
+    `smoothness` is the weight of the mean squared second difference between consecutive
+    time codes, which the code intends but misses because of an index error. `opacity`
+    is the weight of the mean opacity, which replaces opacity resets. The code uses the
+    sigmoid of the mean logit instead. A weight of zero disables its loss.
     """
 
     embedding: int = 32
     time_code: int = 256
     frames_per_code: int = 2  # a table of ceil(frames / 2) codes
-    coarser: int = 5  # of so many rows one stays for the coarse network
-    # Standard deviation and waves of the first codes, as in `KanMotionSpec`; the code's
-    # are all zero.
+    coarser: int = 5  # ratio of the numbers of fine and coarse time codes
+    # Standard deviation and waves of the initial codes, as in `KanMotionSpec`. The
+    # code initializes them to zero.
     spread: float = 0.1
     waves: float | None = None
     width: int = 128
-    grow_until: int = steps(10_000)  # when the fine network reads all rows
+    grow_until: int = steps(10_000)  # step from which the fine network reads all codes
     smoothness: float = 1e-4
     opacity: float = 1e-4
     warm_up: int = steps(0)  # steps without motion
@@ -72,7 +72,7 @@ class EmbeddingMotionSpec:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
-        KanMotionSpec(  # checks what codes are made of
+        KanMotionSpec(  # validates the settings of the codes
             embedding=self.embedding,
             time_code=self.time_code,
             frames_per_code=self.frames_per_code,
@@ -86,7 +86,7 @@ class EmbeddingMotionSpec:
         )
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the motion for a run of `run_steps` of this capture."""
+        """Return the motion for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.moments)
 
 
@@ -100,9 +100,9 @@ class Decoder(NamedTuple):
 class EmbeddingMotion(NamedTuple):
     """Shared parameters. The embeddings are per-Gaussian parameters."""
 
-    times: Float[Array, "moments code"]  # evenly over [0, 1]
-    # As if of so many the table was read by the fine network; an event sets it, and no
-    # slope reaches it.
+    times: Float[Array, "moments code"]  # evenly spaced over [0, 1]
+    # Number of codes to which the fine network resamples the table. Projection steps
+    # set it, and it gets no gradient.
     rows: Float[Array, "1"]
     coarse: Decoder
     fine: Decoder
@@ -111,7 +111,17 @@ class EmbeddingMotion(NamedTuple):
 def init(
     key: Key[Array, ""], spec: EmbeddingMotionSpec, frames: int, dtype=jnp.float32
 ) -> EmbeddingMotion:
-    """Networks that move nothing yet, for a capture of `frames` to learn from."""
+    """Initialize networks without motion.
+
+    Args:
+      key: PRNG key.
+      spec: Settings.
+      frames: Number of training frames.
+      dtype: Floating-point type.
+
+    Returns:
+      Shared parameters.
+    """
     times_key, coarse_key, fine_key = jax.random.split(key, 3)
     times = motion_codes.init_times(times_key, spec, frames, dtype)
     rows = jnp.full(1, motion_codes.fine_rows(spec, len(times), 0), dtype)
@@ -147,9 +157,22 @@ def prepare(
     embedding: Float[Array, "gaussians embedding"],
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Float[Array, "gaussians features"]:
-    """Compute the time-independent part of both first layers from the embeddings."""
+    """Compute the time-independent part of both first layers.
+
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      embedding: Embeddings of the Gaussians.
+      active: Active Gaussians. Blocks without any are zero.
+
+    Returns:
+      Features [gaussians, features].
+    """
     weight = jnp.concatenate(
-        [one.first.weight[: spec.embedding] for one in (params.coarse, params.fine)],
+        [
+            decoder.first.weight[: spec.embedding]
+            for decoder in (params.coarse, params.fine)
+        ],
         axis=1,
     )
     return in_blocks(lambda rows: rows @ weight, (embedding,), active, spec.block)
@@ -162,25 +185,35 @@ def deform(
     prepared: Float[Array, "gaussians features"],
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Offsets of every Gaussian at one time, those of both networks added up.
+    """Evaluate the residuals of all Gaussians at a time, summed over both networks.
 
-    Equation 4 twice, of the coarse and the fine code of the time (section 3.3).
+    Equation 4 for the coarse and the fine time code (section 3.3).
+
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      time: Normalized time.
+      prepared: Result of `prepare`.
+      active: Active Gaussians. Blocks without any are zero.
+
+    Returns:
+      The residuals.
     """
     decoders = (params.coarse, params.fine)
-    reads = motion_codes.read(spec, params.times, params.rows, time)
-    shares = [
-        code @ one.first.weight[spec.embedding :] + one.first.bias
-        for one, code in zip(decoders, reads, strict=True)
+    time_codes = motion_codes.read(spec, params.times, params.rows, time)
+    time_parts = [
+        code @ decoder.first.weight[spec.embedding :] + decoder.first.bias
+        for decoder, code in zip(decoders, time_codes, strict=True)
     ]
 
     def evaluate(rows):
         parts = jnp.split(rows, 2, axis=-1)
         total = {name: 0.0 for name in Offsets._fields}
-        for one, part, share in zip(decoders, parts, shares, strict=True):
-            features = jax.nn.relu(part + share)
-            for name, head in one.heads.items():
-                answer = mlp.apply(_head_spec(spec), head, features)["out"]
-                total[name] = total[name] + answer
+        for decoder, part, time_part in zip(decoders, parts, time_parts, strict=True):
+            features = jax.nn.relu(part + time_part)
+            for name, head in decoder.heads.items():
+                residual = mlp.apply(_head_spec(spec), head, features)["out"]
+                total[name] = total[name] + residual
         return total
 
     return Offsets(**in_blocks(evaluate, (prepared,), active, spec.block))
@@ -188,7 +221,7 @@ def deform(
 
 @dataclasses.dataclass(frozen=True)
 class Bound(motion_codes.BoundCodes):
-    """The `Motion` of a `EmbeddingMotionSpec` in a run of `steps`."""
+    """The `Motion` of an `EmbeddingMotionSpec` in a run of `steps`."""
 
     spec: EmbeddingMotionSpec
 
@@ -205,7 +238,7 @@ class Bound(motion_codes.BoundCodes):
     def precompute(
         self, params: MotionParams, gaussians: Splats
     ) -> Float[Array, "gaussians features"]:
-        """Evaluate what does not depend on the time."""
+        """Compute the features that do not depend on the time."""
         active = splats.active_mask(gaussians)
         return prepare(params.shared, self.spec, params.per_gaussian, active)
 
@@ -222,7 +255,7 @@ class Bound(motion_codes.BoundCodes):
         return kan_motion.apply(gaussians, offsets)
 
 
-# 30 codes for the built-in scene: the coarse network reads six, the fine one six to 30.
+# 30 codes for the built-in scene. The coarse network reads 6, the fine one 6 to 30.
 SMALL_EMBEDDING_MOTION = EmbeddingMotionSpec(
     time_code=16, width=64, waves=2.0, spread=0.5, grow_until=1300
 )

@@ -1,10 +1,10 @@
-"""Growth where things move: densification's threshold depends on the motion.
+"""Motion-guided densification: the gradient threshold depends on the motion.
 
-MoBa-GS, section 3.4: a Gaussian is cloned or split only if its gradient on the screen
-and its motion both pass a threshold (equation 7). Printed so, what stands still never
-grows, however badly it is drawn: a scene that starts from random points keeps them for
-its background, and one whose motion has not begun does not grow at all. The soft form
-asks what stands still for a steeper gradient instead.
+MoBa-GS, section 3.4: a Gaussian is cloned or split only if its screen-space gradient
+and its motion both exceed a threshold (equation 7). In this form, static regions are
+never densified, however badly they are reconstructed: a scene that starts from random
+points keeps those for its background, and a scene whose motion has not begun is not
+densified at all. The soft form requires a larger gradient of static Gaussians instead.
 """
 
 import dataclasses
@@ -23,8 +23,8 @@ from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
 FORMS = ("soft", "hard")
-# At most so many rows give the median of all. Measured at 10k rows, one core: 0.2 ms
-# for all of `traveled`, against 5.6 ms with every row, nearly all of it sorting.
+# Number of Gaussians from which the median is computed. At 10k Gaussians on one core,
+# `traveled` takes 0.2 ms, and 5.6 ms with all Gaussians, mostly for sorting.
 MEDIAN_ROWS = 512
 
 
@@ -32,64 +32,71 @@ MEDIAN_ROWS = 512
 class MotionGrowthSpec:
     """Settings of motion-guided densification.
 
-    `start` is the step from which motion counts. It should be some hundred steps after
+    `start` is the step from which motion is used. It should be some hundred steps after
     the warm-up of the motion. In the soft form a static Gaussian needs 1 + `beta` times
-    the gradient, one at the threshold `motion` needs twice as much, and a fast one no
-    more than without this effect. The paper does not give the threshold. Where all
-    Gaussians move by more than ours, growth is unchanged, bit for bit. This is so in
-    the built-in scene from tracks, where static objects move by 0.015 to 0.03 of the
+    the gradient, one at the threshold `motion` twice as much, and a fast one no more
+    than without this component. The paper does not give the threshold. If all Gaussians
+    move by more than our default, densification is unchanged, bit for bit. This is so
+    in the built-in scene from tracks, where static objects move by 0.015 to 0.03 of the
     extent.
     """
 
-    form: str = "soft"  # or "hard", the conjunction as printed
+    form: str = "soft"  # or "hard", the rule as printed
     start: int = steps(5000)  # step
-    motion: float = 1e-3  # threshold, of the scene's extent
+    motion: float = 1e-3  # threshold, as a share of the scene's extent
     beta: float = 4.0  # of the soft form
 
     def __post_init__(self):
         if self.form not in FORMS:
             raise ValueError(f"unknown form {self.form!r}; choose from {FORMS}")
         if self.start < 0:
-            raise ValueError(f"start={self.start} is a step and not negative")
+            raise ValueError(f"start={self.start} must not be negative")
         if not 0 < self.motion < math.inf:
             raise ValueError(
-                f"motion={self.motion} must be positive and finite: a share of the "
-                "scene's extent; for growth without regard to motion leave this effect "
-                "out (None)"
+                f"motion={self.motion} must be positive and finite; for densification "
+                "independent of motion disable this component (motion_growth=none)"
             )
         if not 1 < self.beta < math.inf:
             raise ValueError(
-                f"beta={self.beta} must be finite and above 1, or what stands still "
-                'grows as easily as what moves; for no growth at rest use form="hard"'
+                f"beta={self.beta} must be finite and above 1, or static regions are "
+                'densified as easily as moving ones; to exclude them use form="hard"'
             )
 
 
 class Travel(NamedTuple):
-    """The box around where each row was seen, relative to its canonical place."""
+    """Bounding box of the observed displacements of each Gaussian."""
 
-    low: Float[Array, "gaussians 3"]  # scene units; above `high` where not seen yet
+    low: Float[Array, "gaussians 3"]  # scene units; above `high` if never observed
     high: Float[Array, "gaussians 3"]
 
 
 def no_travel(gaussians: Splats | Gaussians) -> Travel:
-    """Return a state in which nothing was seen yet."""
+    """Return the state before any observation."""
     mean = gaussians.mean
-    # Not infinity: a state is finite throughout, or the loop stops.
+    # The largest float, not infinity, because the loop stops if a state is not finite.
     most = jnp.finfo(mean.dtype).max
     return Travel(jnp.full_like(mean, most), jnp.full_like(mean, -most))
 
 
 def traveled(state: Travel, canonical: Gaussians, moved: Gaussians) -> Travel:
-    """One more instant.
+    """Add the positions at one time to the bounding boxes.
 
-    A displacement counts relative to the median displacement of the active rows at that
-    instant: what the field moves as a whole, such as the camera's own motion, is not
-    motion of a Gaussian. Where most of a scene moves as one, it is therefore the rest
-    that counts as moving. Displacements that are not finite are passed over.
+    Displacements are relative to the median displacement of the active Gaussians at
+    that time, because a common motion, such as that of the camera, is not motion of a
+    Gaussian. If most of a scene moves rigidly, the remainder therefore counts as
+    moving. Displacements that are not finite are ignored.
+
+    Args:
+      state: Bounding boxes.
+      canonical: Gaussians in their canonical state.
+      moved: The Gaussians at the time.
+
+    Returns:
+      The bounding boxes with the added positions.
     """
     displacement = moved.mean - canonical.mean
     known = jnp.all(jnp.isfinite(displacement), axis=1)
-    # The logistic function of an inactive row's mark is exactly zero.
+    # The opacity of an inactive Gaussian is exactly zero.
     common = common_motion(displacement, known & (canonical.opacity > 0))
     relative = displacement - common
     known = known[:, None]
@@ -102,8 +109,7 @@ def traveled(state: Travel, canonical: Gaussians, moved: Gaussians) -> Travel:
 def common_motion(
     displacement: Float[Array, "gaussians 3"], counts: Bool[Array, " gaussians"]
 ) -> Float[Array, "3"]:
-    """Compute the median displacement of the selected Gaussians, zero if there are
-    none.
+    """Compute the median displacement of the selected Gaussians, zero without any.
 
     It uses every k-th Gaussian, at most `MEDIAN_ROWS`. If most are static, or move
     together, such a sample suffices.
@@ -115,8 +121,8 @@ def common_motion(
     Returns:
       The median of each component.
     """
-    every = max(1, -(-displacement.shape[0] // MEDIAN_ROWS))
-    counts, displacement = counts[::every], displacement[::every]
+    stride = max(1, -(-displacement.shape[0] // MEDIAN_ROWS))
+    counts, displacement = counts[::stride], displacement[::stride]
     ordered = jnp.sort(jnp.where(counts[:, None], displacement, jnp.inf), axis=0)
     number = jnp.sum(counts, dtype=jnp.int32)
     middle = (ordered[jnp.maximum(number - 1, 0) // 2] + ordered[number // 2]) / 2
@@ -140,12 +146,12 @@ def motion(state: Travel) -> Float[np.ndarray, " gaussians"]:
       Distances in scene units, zero if never observed.
     """
     low, high = (np.asarray(x, np.float64) for x in state)
-    seen = (low <= high).all(axis=1, keepdims=True)
-    side = np.subtract(high, low, where=seen, out=np.zeros_like(low))
-    # Scaled by the largest side, whose square may leave the range of a float.
+    observed = (low <= high).all(axis=1, keepdims=True)
+    side = np.subtract(high, low, where=observed, out=np.zeros_like(low))
+    # Scaled by the largest side, because its square may overflow or underflow.
     longest = side.max(axis=1, initial=0.0, keepdims=True)
-    share = np.divide(side, longest, where=longest > 0, out=np.zeros_like(side))
-    return longest[:, 0] / 2 * np.linalg.norm(share, axis=1)
+    scaled = np.divide(side, longest, where=longest > 0, out=np.zeros_like(side))
+    return longest[:, 0] / 2 * np.linalg.norm(scaled, axis=1)
 
 
 def growth_factor(
@@ -153,11 +159,10 @@ def growth_factor(
 ) -> Float[np.ndarray, " gaussians"]:
     """Compute the factor of the gradient in [0, 1].
 
-    Soft: 1 / (1 + beta^(1 - m/tau)). The obvious softening, a threshold tau_grad (1 +
-      beta
-    exp(-m/tau)), does not converge to equation 7: with increasing beta it stops
-    everything that moves less than tau log(beta). With m log(beta) / tau in the
-    exponent the midpoint stays at tau, and the limit of beta is the hard form.
+    The soft form is 1 / (1 + beta^(1 - m/tau)). The obvious softening, a threshold
+    tau_grad (1 + beta exp(-m/tau)), does not converge to equation 7: with increasing
+    beta it stops everything that moves less than tau log(beta). With m log(beta) / tau
+    in the exponent the midpoint stays at tau, and the limit of beta is the hard form.
 
     Args:
       spec: Settings.
@@ -169,7 +174,7 @@ def growth_factor(
     """
     if spec.form == "hard":
         return (motion > threshold).astype(np.float64)
-    # The exponent is at most one: the power underflows to 0 and never overflows.
+    # The exponent is at most one, so the power may underflow but not overflow.
     return 1 / (1 + spec.beta ** (1 - motion / threshold))
 
 
@@ -186,17 +191,17 @@ def grow_score(
 class Guided(NamedTuple):
     """State of a `MotionGuided` strategy."""
 
-    stats: PyTree  # of the strategy that is guided
+    stats: PyTree  # state of the guided strategy
     travel: Travel
 
 
 @dataclasses.dataclass(frozen=True)
 class MotionGuided:
-    """The default strategy, its threshold of growth dependent on the motion."""
+    """The default strategy with a gradient threshold that depends on the motion."""
 
     base: DefaultStrategySpec
     spec: MotionGrowthSpec
-    extent: float  # of the scene, scene units
+    extent: float  # of the scene, in scene units
 
     def __post_init__(self):
         if not 0 < self.extent < math.inf:
@@ -211,7 +216,7 @@ class MotionGuided:
         return self.base.cap_max
 
     def init(self, gaussians: Splats) -> Guided:
-        """Return the state of no view yet."""
+        """Return the state before any view."""
         return Guided(self.base.init(gaussians), no_travel(gaussians))
 
     def update(self, state: Guided, info: StepInfo) -> Guided:

@@ -1,13 +1,15 @@
-"""Motion as a network of Gaussian kernels, of a code for each Gaussian and the time.
+"""Motion as an RBF-KAN of an embedding per Gaussian and a time code.
 
 "Sonata", equation 11: a learned embedding of each Gaussian and a learned code of the
-time go through an RBF-KAN to residuals of position, scale and rotation. Where the paper
-is silent this follows Bae et al. 2024, "Per-Gaussian embedding-based deformation",
-arXiv:2404.03613 (E-D3DGS), whose inputs, neighbors and constants it shares, and where
-`coarser` is set its two networks, a coarse and a fine one (`motion_codes`).
+time are mapped by an RBF-KAN to residuals of position, scale and rotation. Details that
+the paper does not give are those of Bae et al. 2024, "Per-Gaussian embedding-based
+deformation", arXiv:2404.03613 (E-D3DGS), whose inputs, neighbors and constants it
+shares. With `coarser` there are a coarse and a fine network as in E-D3DGS
+(`motion.codes`).
 
-The first layer of the network is a sum over its inputs. What the embeddings add to it
-is the same at all times (`prepare`), what the time adds the same for all Gaussians.
+The first layer of the network is a sum over its inputs. The contribution of the
+embeddings is the same at all times (`prepare`), and that of the time is the same for
+all Gaussians.
 """
 
 import dataclasses
@@ -38,26 +40,24 @@ NETWORKS = ("kan", "mlp", "bspline")
 
 @dataclasses.dataclass(frozen=True)
 class KanMotionSpec:
-    """Sizes and schedule; the paper gives the size of the embedding, and E-D3DGS the
-    rest.
+    """Settings of the motion, with sizes of E-D3DGS and the embedding of the paper.
 
     `position`, `scale` and `rotation` enable the residuals (the paper's ablation). A
-    disabled head has no parameters. `network` "bspline" is the KAN that the paper
-    argues against, with cubic B-splines instead of Gaussians (equations 4 and 5). "mlp"
-    is its ablation without a KAN: as many ReLU layers of the same inputs and heads, and
-    as wide as makes the
-      number of
-    parameters equal, unless `mlp_width` is given.
+    disabled head has no parameters. `network="bspline"` is the KAN that the paper
+    argues against, with cubic B-splines instead of Gaussians (equations 4 and 5).
+    `network="mlp"` is its ablation without a KAN: ReLU layers with the same inputs,
+    heads and depth, with the width that gives an equal number of parameters unless
+    `mlp_width` is given.
     """
 
     embedding: int = 32
     time_code: int = 256
     frames_per_code: int = 2  # a table of ceil(frames / 2) codes
-    # Standard deviation of the first embeddings and time codes. E-D3DGS starts from
-    # zero embeddings, which a penalty on differing neighbors never tells apart.
+    # Standard deviation of the initial embeddings and time codes. E-D3DGS initializes
+    # embeddings to zero, and the neighbors loss then never lets them differ.
     spread: float = 0.1
-    # First embeddings as random waves over space, so many radians from the middle of
-    # the Gaussians to their root mean square distance; None draws each by itself.
+    # Initial embeddings are random waves over space, with this phase (rad) from the
+    # center of the Gaussians to their root mean square distance. None: independent.
     waves: float | None = None
     hidden: tuple[int, ...] = (128, 128)
     kernels: int = 8
@@ -69,11 +69,11 @@ class KanMotionSpec:
     position: bool = True
     scale: bool = True
     rotation: bool = True
-    # Of so many rows of the table one stays for a coarse network; None: there is none.
+    # Ratio of the numbers of fine and coarse time codes. None: no coarse network.
     coarser: int | None = None
-    grow_until: int = steps(10_000)  # when the fine network beside it reads all rows
-    # Weights, of which zero leaves the term out: of `motion_codes.second_differences`,
-    # and of the mean opacity, in the place of resets.
+    grow_until: int = steps(10_000)  # step from which the fine network reads all codes
+    # Weights of `motion.codes.second_differences` and of the mean opacity, which
+    # replaces opacity resets. Zero disables a loss.
     smoothness: float = 0.0
     opacity: float = 0.0
     warm_up: int = steps(0)  # steps without motion
@@ -86,8 +86,8 @@ class KanMotionSpec:
         sizes = self.embedding, self.time_code, self.frames_per_code, self.block
         if min(sizes) < 1 or self.warm_up < 0 or not self.hidden:
             raise ValueError(
-                "embedding, time_code, frames_per_code and block are at least 1, "
-                "warm_up is not negative and there is a hidden layer; got "
+                "embedding, time_code, frames_per_code and block must be at least 1, "
+                "warm_up must not be negative and hidden not empty; got "
                 f"embedding={self.embedding}, time_code={self.time_code}, "
                 f"frames_per_code={self.frames_per_code}, block={self.block}, "
                 f"warm_up={self.warm_up}, hidden={self.hidden}"
@@ -98,19 +98,21 @@ class KanMotionSpec:
             )
         if self.mlp_width is not None and self.network != "mlp":
             raise ValueError(
-                f"mlp_width={self.mlp_width} is read by network='mlp' only"
+                f"mlp_width={self.mlp_width} is used by network='mlp' only; leave it "
+                "out"
             )
         if not (self.position or self.scale or self.rotation):
             raise ValueError(
-                "position, scale and rotation are all off; leave the motion out instead"
+                "position, scale and rotation are all off; disable the motion instead"
             )
         if not 0 < self.spread < math.inf:
             raise ValueError(
-                f"spread={self.spread}: equal codes stay equal; start at about 0.1"
+                f"spread={self.spread} must be positive, because equal codes stay "
+                "equal; use about 0.1"
             )
         if (self.coarser is not None and self.coarser < 1) or self.grow_until < 0:
             raise ValueError(
-                f"coarser={self.coarser} must be at least 1, or none, and grow_until="
+                f"coarser={self.coarser} must be at least 1, or None, and grow_until="
                 f"{self.grow_until} not negative"
             )
         if not all(0 <= x < math.inf for x in (self.smoothness, self.opacity)):
@@ -121,20 +123,20 @@ class KanMotionSpec:
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
         if not self.embedding_rate > 0:
             raise ValueError(f"embedding_rate={self.embedding_rate} must be positive")
-        field_spec(self)  # checks what the network is made of
+        field_spec(self)  # validates the settings of the network
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the motion for a run of `run_steps` of this capture."""
+        """Return the motion for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.moments)
 
 
 class KanMotion(NamedTuple):
     """Shared parameters. The embeddings are per-Gaussian parameters."""
 
-    times: Float[Array, "moments code"]  # evenly over [0, 1]
-    field: KAN | MLP  # the fine one of two
-    # As if of so many the table was read by the fine network; an event sets it, and no
-    # slope reaches it.
+    times: Float[Array, "moments code"]  # evenly spaced over [0, 1]
+    field: KAN | MLP  # the fine network, if there are two
+    # Number of codes to which the fine network resamples the table. Projection steps
+    # set it, and it gets no gradient.
     rows: Float[Array, "1"] | None = None
     coarse: KAN | MLP | None = None
 
@@ -148,9 +150,15 @@ class Offsets(NamedTuple):
 
 
 def field_spec(spec: KanMotionSpec) -> KANSpec | MLPSpec:
-    """The network from [embedding, time code] to the residuals that are on.
+    """Settings of the network from [embedding, time code] to the enabled residuals.
 
-    Its heads start at zero, and so does the motion.
+    The heads are initialized to zero, so that nothing moves.
+
+    Args:
+      spec: Settings of the motion.
+
+    Returns:
+      Settings of the network.
     """
     kan_spec = _kan_spec(spec)
     if spec.network != "mlp":
@@ -162,13 +170,13 @@ def field_spec(spec: KanMotionSpec) -> KANSpec | MLPSpec:
 
 
 def _kan_spec(spec):
-    wanted = {
+    enabled = {
         "position": spec.position,
         "log_scale": spec.scale,
         "turn": spec.rotation,
     }
     heads = tuple(
-        (name, HeadSpec(3, "zero")) for name, is_on in wanted.items() if is_on
+        (name, HeadSpec(3, "zero")) for name, is_on in enabled.items() if is_on
     )
     return KANSpec(
         in_features=spec.embedding + spec.time_code,
@@ -189,7 +197,14 @@ def _mlp_spec(spec: KANSpec, width):
 
 
 def equal_width(spec: KANSpec) -> int:
-    """The width of an MLP with the KAN's layers and nearest to its parameters."""
+    """Find the width of an MLP with the KAN's depth and about as many parameters.
+
+    Args:
+      spec: Settings of the KAN.
+
+    Returns:
+      The width.
+    """
     goal = parameter_count(spec)
     width = 1
     while parameter_count(_mlp_spec(spec, width + 1)) <= goal:
@@ -201,39 +216,50 @@ def equal_width(spec: KANSpec) -> int:
 
 
 def parameter_count(spec: KANSpec | MLPSpec) -> int:
-    """Count the parameters of the network, which do not depend on the number of
-    Gaussians.
-
+    """Count the parameters of the network, without per-Gaussian parameters.
     Args:
       spec: Settings of the network.
 
     Returns:
       Number of parameters.
     """
-    each, trained = 1, 0
+    per_input, kernel_parameters = 1, 0
     if isinstance(spec, KANSpec):
         widths = spec.widths()
-        each = spec.kernels + spec.base
-        trained = 2 * spec.kernels * sum(widths) if spec.trainable_kernels else 0
+        per_input = spec.kernels + spec.base
+        kernel_parameters = (
+            2 * spec.kernels * sum(widths) if spec.trainable_kernels else 0
+        )
     else:
         widths = (spec.inputs, *(spec.width,) * spec.depth)
     outputs = (*widths[1:], sum(head.width for _, head in spec.heads))
-    return trained + sum(
-        each * read * out + out for read, out in zip(widths, outputs, strict=True)
+    return kernel_parameters + sum(
+        per_input * inputs * outputs_of + outputs_of
+        for inputs, outputs_of in zip(widths, outputs, strict=True)
     )
 
 
-# One core, forward and backward with what is prepared, at 5k and 10k Gaussians: 16 and
-# 30 ms; `mlp_motion.SMALL_MOTION` takes 12 and 23 in the same run. SiLU would add a
-# quarter, a sixth kernel a fifth. The default sizes take 270 ms at 10k, an MLP of as
-# many parameters 370, the 8x256 of Deformable 3DGS 510.
+# Forward and backward with `prepare`, for 5k and 10k Gaussians on one core: 16 and 30
+# ms, compared with 12 and 23 for `mlp.SMALL_MOTION`. SiLU would add a quarter, a sixth
+# kernel a fifth. The default sizes take 270 ms for 10k, an MLP with as many parameters
+# 370, the 8x256 network of Deformable 3DGS 510.
 SMALL_KAN_MOTION = KanMotionSpec(time_code=16, hidden=(32, 32), kernels=5, base=False)
 
 
 def init(
     key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
 ) -> KanMotion:
-    """A field that moves nothing yet, for a capture of `frames` to learn from."""
+    """Initialize a motion model without motion.
+
+    Args:
+      key: PRNG key.
+      spec: Settings.
+      frames: Number of training frames.
+      dtype: Floating-point type.
+
+    Returns:
+      Shared parameters.
+    """
     times_key, field_key, coarse_key = jax.random.split(key, 3)
     times = motion_codes.init_times(times_key, spec, frames, dtype)
     network = field_spec(spec)
@@ -258,10 +284,10 @@ def prepare(
 ) -> Float[Array, "gaussians features"]:
     """Compute the time-independent contribution of the embeddings to the first layer.
 
-    With two networks, both contributions are next to each other. They take 4 bytes per
+    With two networks, their contributions are concatenated. They take 4 bytes per
     feature of the first layer and Gaussian: 5 MB for 10,000 Gaussians with the default
-    sizes. On one core, deforming 10,000 takes 68 ms without and 58 with this, or 10 and
-    7 in the small sizes.
+    sizes. On one core, the deformation of 10,000 takes 68 ms without and 58 with this
+    cache, or 10 and 7 in the small sizes.
 
     Args:
       params: Shared parameters.
@@ -273,11 +299,11 @@ def prepare(
       Contributions [gaussians, features].
     """
 
-    def both(rows):
-        parts = [_first_layer_part(spec, one, rows, 0) for one in _fields(params)]
+    def features(rows):
+        parts = [_first_layer_part(spec, field, rows, 0) for field in _fields(params)]
         return jnp.concatenate(parts, axis=-1)
 
-    return in_blocks(both, (embedding,), active, spec.block)
+    return in_blocks(features, (embedding,), active, spec.block)
 
 
 def deform(
@@ -287,49 +313,56 @@ def deform(
     prepared: Float[Array, "gaussians features"],
     active: Bool[Array, " gaussians"] | None = None,
 ) -> Offsets:
-    """Evaluate the residuals of all Gaussians at a time, zero in blocks without active
-    ones.
+    """Evaluate the residuals of all Gaussians at a time.
+
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      time: Normalized time.
+      prepared: Result of `prepare`.
+      active: Active Gaussians. Blocks without any are zero.
+
+    Returns:
+      The residuals.
     """
     fields = _fields(params)
-    read: tuple[Float[Array, " code"], ...]
+    time_codes: tuple[Float[Array, " code"], ...]
     if params.coarse is None:
-        read = (codes.at_time(params.times, time),)
+        time_codes = (codes.at_time(params.times, time),)
     else:
         assert params.rows is not None
-        read = motion_codes.read(spec, params.times, params.rows, time)
-    shares = [
-        _first_layer_part(spec, one, code, spec.embedding)
-        for one, code in zip(fields, read, strict=True)
+        time_codes = motion_codes.read(spec, params.times, params.rows, time)
+    time_parts = [
+        _first_layer_part(spec, field, code, spec.embedding)
+        for field, code in zip(fields, time_codes, strict=True)
     ]
 
     def evaluate(rows):
         parts = jnp.split(rows, len(fields), axis=-1)
-        answers = [
-            _after_first_layer(spec, one, part + share)
-            for one, part, share in zip(fields, parts, shares, strict=True)
+        residuals = [
+            _after_first_layer(spec, field, part + time_part)
+            for field, part, time_part in zip(fields, parts, time_parts, strict=True)
         ]
-        return functools.reduce(functools.partial(jax.tree.map, jnp.add), answers)
+        return functools.reduce(functools.partial(jax.tree.map, jnp.add), residuals)
 
     heads = in_blocks(evaluate, (prepared,), active, spec.block)
     return Offsets(*(heads.get(name) for name in Offsets._fields))
 
 
 def _fields(params):
-    """The networks: one, or a coarse and a fine one, whose answers add."""
+    """Return the networks whose residuals are added."""
     return (params.field,) if params.coarse is None else (params.coarse, params.field)
 
 
 def _first_layer_part(spec, field, part, start):
-    """Compute the contribution of the inputs from `start` on to the first layer,
-    without bias.
-    """
+    """Return the contribution of inputs from `start` on to the first layer, no bias."""
     if isinstance(field, KAN):
         return kan.first_layer_part(field_spec(spec), field, part, start)
     return part @ field.hidden[0].weight[start : start + part.shape[-1]]
 
 
 def _after_first_layer(spec, field, first):
-    """The heads' outputs from the sum of the first layer's parts."""
+    """Compute the outputs of the heads from the sum of the first layer's parts."""
     network = field_spec(spec)
     if isinstance(field, KAN):
         return kan.after_first_layer(network, field, first)
@@ -340,12 +373,20 @@ def _after_first_layer(spec, field, first):
 
 
 def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
-    """Gaussians moved by the offsets there are.
+    """Apply the enabled residuals to Gaussians.
 
-    Position adds. The logarithm of the scale adds, as in E-D3DGS, held to the range of
-    the scale's own. The paper's rotation has three numbers where a quaternion has four:
-    a rotation vector, applied after the Gaussian's own turn, exp(turn) q / |q|, of unit
-    length whatever the network says. Opacity and color stay.
+    The position is added. The residual of the scale is added to its logarithm, as in
+    E-D3DGS, and clamped to the range of the logarithm. The paper's rotation has three
+    numbers where a quaternion has four. Here it is a rotation vector, applied after the
+    Gaussian's own rotation, exp(turn) q / |q|, which has unit length for any network
+    output. Opacity and color do not change.
+
+    Args:
+      gaussians: Canonical Gaussians.
+      offsets: Residuals.
+
+    Returns:
+      The deformed Gaussians.
     """
     if offsets.position is not None:
         gaussians = gaussians._replace(mean=gaussians.mean + offsets.position)
@@ -354,7 +395,7 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
         gaussians = gaussians._replace(scale=gaussians.scale * factor)
     if offsets.turn is not None:
         gaussians = gaussians._replace(
-            quaternion=splats.turned(gaussians, offsets.turn)
+            quaternion=splats.rotate(gaussians, offsets.turn)
         )
     return gaussians
 
@@ -378,7 +419,7 @@ class Bound(motion_codes.BoundCodes):
     def precompute(
         self, params: MotionParams, gaussians: Splats
     ) -> Float[Array, "gaussians features"]:
-        """Evaluate what does not depend on the time."""
+        """Compute the features that do not depend on the time."""
         active = splats.active_mask(gaussians)
         return prepare(params.shared, self.spec, params.per_gaussian, active)
 

@@ -1,8 +1,7 @@
 """Motion of all Gaussians as one network of position and time.
 
-Yang et al. 2023, "Deformable 3D Gaussians", arXiv:2309.13101. The network reads the
-encoded canonical mean and the encoded time and says how far mean, rotation and scale
-are from their canonical values at that time.
+Yang et al. 2023, "Deformable 3D Gaussians", arXiv:2309.13101. The network maps the
+encoded canonical mean and the encoded time to residuals of mean, rotation and scale.
 """
 
 import dataclasses
@@ -34,9 +33,9 @@ _STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the noise on 
 
 @dataclasses.dataclass(frozen=True)
 class SmoothingSpec:
-    """Noise on the time that fades over training (section 3.3, "annealing smooth").
+    """Noise on the time that decays over training (section 3.3, "annealing smooth").
 
-    Its first standard deviation is `first` of the interval between two frames.
+    Its initial standard deviation is `first` times the interval between two frames.
     """
 
     first: float = 0.1
@@ -55,8 +54,8 @@ class MotionSpec:
     """The network and its schedule, by default those of the paper for real captures.
 
     `time_code` is the width of a code that a small network computes from the encoded
-    time (30 for the paper's synthetic scenes, where the time has six bands).
-    `scale_rule` "log" multiplies scales by an exponential. "linear" adds to them as in
+    time (30 for the paper's synthetic scenes, where the time has six frequencies).
+    `scale_rule="log"` multiplies scales by an exponential. "linear" adds to them as in
     the paper, which may make them negative.
     """
 
@@ -71,8 +70,8 @@ class MotionSpec:
     smoothing: SmoothingSpec | None = SmoothingSpec()
     learning_rate: float = 8e-4
     learning_rate_end: float = 1.6e-6
-    # Gaussians per evaluation. Measured at 10k, one core, forward and backward: 8x256
-    # takes 598 ms and 11 MB in blocks of 512, 601 ms and 194 MB at once.
+    # Gaussians per evaluation. Forward and backward of 10k on one core with 8x256 take
+    # 598 ms and 11 MB in blocks of 512, 601 ms and 194 MB at once.
     block: int = 512
 
     def __post_init__(self):
@@ -82,27 +81,28 @@ class MotionSpec:
             )
         if self.block < 1 or self.warm_up < 0:
             raise ValueError(
-                f"block >= 1 and warm_up >= 0, got {self.block} and {self.warm_up}"
+                f"block={self.block} must be at least 1 and warm_up={self.warm_up} "
+                "not negative"
             )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the motion for a run of `run_steps` of this capture."""
+        """Return the motion for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.moments)
 
 
-# One core, forward and backward, at 5k and 10k Gaussians: 14 and 28 ms, about what
-# drawing them takes; 281 and 562 ms for the paper's, 38 and 77 ms for 4x128.
+# Forward and backward of 5k and 10k Gaussians on one core: 14 and 28 ms, about the time
+# to render them. The paper's size takes 281 and 562 ms, 4x128 takes 38 and 77 ms.
 SMALL_MOTION = MotionSpec(
     position=EncodingSpec(6), time=EncodingSpec(4), depth=4, width=64, skips=()
 )
 
 
 class Motion(NamedTuple):
-    """Parameters of the field."""
+    """Parameters of the deformation network."""
 
     trunk: mlp.MLP
-    time: mlp.MLP | None  # makes the code of the time
+    time: mlp.MLP | None  # computes the time code
 
 
 class Offsets(NamedTuple):
@@ -116,9 +116,9 @@ class Offsets(NamedTuple):
 def trunk_spec(spec: MotionSpec) -> MLPSpec:
     """Settings of the network from [encoded position, time features] to three heads.
 
-    The heads start at 1e-4 of a Glorot initialization in effect, so that motion is
-    continuous when the warm-up ends. The paper's code initializes them like hidden
-    layers, and the scene jumps.
+    The heads are initialized so that their output is 1e-4 of a Glorot initialization's,
+    and the motion is continuous when the warm-up ends. The paper's code initializes
+    them like hidden layers, and the scene jumps.
 
     Args:
       spec: Settings of the motion.
@@ -136,7 +136,7 @@ def trunk_spec(spec: MotionSpec) -> MLPSpec:
 
 
 def time_spec(spec: MotionSpec) -> MLPSpec:
-    """The network from the encoded time to its code."""
+    """Settings of the network from the encoded time to its code."""
     assert spec.time_code is not None
     heads = (("code", HeadSpec(spec.time_code)),)
     return MLPSpec(spec.time.width(1), 1, spec.width, heads, (), "relu", "he")
@@ -147,7 +147,7 @@ def _time_width(spec):
 
 
 def init(key: Key[Array, ""], spec: MotionSpec, dtype=jnp.float32) -> Motion:
-    """A field that hardly moves anything yet."""
+    """Initialize a network that hardly moves anything."""
     trunk_key, time_key = jax.random.split(key)
     trunk = mlp.init(trunk_spec(spec), trunk_key, dtype)
     if spec.time_code is None:
@@ -164,9 +164,9 @@ def deform(
 ) -> Offsets:
     """Evaluate the residuals of all Gaussians at a time.
 
-    No gradient reaches the means through the network, as in the paper, because they
-    would follow a moving target. Blocks without active Gaussians are not evaluated and
-    are zero.
+    No gradient reaches the means through the network, as in the paper, because the
+    network itself changes. Blocks without active Gaussians are zero and are not
+    evaluated.
 
     Args:
       params: Shared parameters.
@@ -190,9 +190,17 @@ def deform(
 
 
 def fold_time(params: Motion, spec: MotionSpec, time: Float[Array, ""]) -> mlp.MLP:
-    """The trunk at one time, a network of the position alone.
+    """Evaluate the first layer for a time, to a network of the position alone.
 
-    What it makes of the time is the same for every Gaussian and is summed once.
+    The contribution of the time is the same for all Gaussians and is computed once.
+
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      time: Normalized time.
+
+    Returns:
+      The trunk at that time.
     """
     features = encoding.encode(spec.time, time[None], None)
     if params.time is not None:
@@ -203,7 +211,16 @@ def fold_time(params: Motion, spec: MotionSpec, time: Float[Array, ""]) -> mlp.M
 def offsets_at_time(
     at_time: mlp.MLP, spec: MotionSpec, points: Float[Array, "points 3"]
 ) -> Offsets:
-    """Offsets of points, from the trunk that `fold_time` made for the time."""
+    """Evaluate the residuals of points at the time of `fold_time`.
+
+    Args:
+      at_time: Result of `fold_time`.
+      spec: Settings.
+      points: Canonical means.
+
+    Returns:
+      The residuals.
+    """
     encoded = jax.vmap(lambda point: encoding.encode(spec.position, point, None))(
         points
     )
@@ -227,7 +244,7 @@ def apply(gaussians: Gaussians, offsets: Offsets, scale_rule: str) -> Gaussians:
     """
     unit = jax.vmap(quaternion.normalize)(gaussians.quaternion)
     if scale_rule == "log":
-        # Bounded like the canonical logarithm, so that a wild field stays finite.
+        # Clamped like the canonical logarithm, so that large residuals stay finite.
         factor = jnp.exp(jnp.clip(offsets.scale, *splats.LOG_SCALE_RANGE))
         scale = gaussians.scale * factor
     else:
@@ -247,12 +264,22 @@ def smooth_time(
     step: Int[Array, ""],
     frames: int,
 ) -> Float[Array, ""]:
-    """The time with noise that fades linearly to none at `spec.steps`.
+    """Add noise to a time that decays linearly to zero at `spec.steps`.
 
-    Equation 6 of the paper, whose interval between frames is 1 / `frames`. The
-    published code divides by the number of frames not yet drawn in the epoch, so its
-    interval grows to 1 within every epoch: 26 times the intended noise in the root mean
-    square at 400 frames. Here it is the paper's.
+    Equation 6 of the paper, with an interval between frames of 1 / `frames`. The
+    published code divides by the number of frames that are left in the epoch, so its
+    interval grows to 1 within every epoch, which is 26 times the intended noise (root
+    mean square at 400 frames).
+
+    Args:
+      key: PRNG key.
+      spec: Settings.
+      time: Normalized time.
+      step: Training step.
+      frames: Number of training frames.
+
+    Returns:
+      The time with noise.
     """
     deviation = schedules.time_noise(frames, spec.steps, spec.first)(step)
     noise = jax.random.normal(key, (), time.dtype)

@@ -1,35 +1,38 @@
-"""Sparse control nodes that a network moves as rigid bodies, and that move all
-Gaussians.
+"""Sparse control nodes: a network moves them, and they move all Gaussians.
 
 SC-GS (Huang et al. 2024, CVPR, arXiv:2312.14937, "Sparse-Controlled Gaussian
-Splatting"): nodes with a place and a radius of influence, a network that makes a turn
-and a shift of each node and the time, and linear blend skinning from the nodes near a
-Gaussian (`effects.skinning`). Nodes that stay near each other are asked to move as one
-rigid body. The network is asked for the nodes alone, so it costs the same however many
-Gaussians there are.
+Splatting"): nodes with a position and a radius of influence, a network that maps each
+node and the time to a rotation and a translation, and linear blend skinning from the
+nodes near a Gaussian (`motion.skinning`). A loss asks nodes that stay near each other
+to move rigidly. The network is evaluated for the nodes only, so its cost does not
+depend on the number of Gaussians.
 
-With a mask (`MaskSpec`) it is the motion of EDGS (Kong et al. 2025, AAAI,
-arXiv:2502.20378): sparse anchors carry Gaussians by a radial kernel, and a mask that is
-learned along says which of them move. The network is asked for those alone, and
-Gaussians that only resting anchors carry are passed over. Its anchors also make the
-looks of their Gaussians, which here keep their own.
+With a mask (`MaskSpec`) this is the motion of EDGS (Kong et al. 2025, AAAI,
+arXiv:2502.20378): sparse anchors move Gaussians by a radial kernel, and a learned mask
+selects the moving anchors. The network is evaluated for those only, and Gaussians whose
+anchors are all static are skipped. Its anchors also produce the colors of their
+Gaussians. Here Gaussians have their own.
 
-The texts were not at hand. SC-GS is as in its code (yihua7/SC-GS), EDGS, which has
-none, as its abstract and the caption of its pipeline say.
+The papers were not available. SC-GS follows its code (yihua7/SC-GS), and EDGS, which
+has no public code, its abstract and the caption of its pipeline.
 
-What is not as in SC-GS: turns are rotation vectors, where it has quaternions; which
-nodes are near is found when rows change and not in every step; the rigid term is a mean
-and not a sum, over a fixed number of links and not those within a radius, and compares
-any two moments, in the code two within a twentieth of the film; a node's kernel has no
-weight of its own, as it has in the code, and starts as wide as neighbors are far, not
-as a tenth of the scene; one turn of a node moves and turns what it carries, where the
-code has two; and nodes start among the first Gaussians, or from tracks half on what
-moves and half on what is at rest, where the paper first trains them as Gaussians of
-their own. Their number stays as it is, where the paper adds and prunes nodes. Slopes
-reach the places of nodes and of Gaussians through weights, turns and the network, where
-the published code cuts them (of a node, through network and weights). Its further
-coordinates of nodes and Gaussians, its mask of those that move, its scales that change
-and its noise on the times of real captures are not there.
+Differences from SC-GS:
+
+- Rotations are rotation vectors instead of quaternions.
+- Neighborhoods are updated when the set of Gaussians changes, not in every step.
+- The rigidity loss is a mean over a fixed number of links, not a sum over those within
+  a radius, and compares any two times, in the code two within a twentieth of the video.
+- Kernels have no weight of their own, as they have in the code. Their radius is
+  initialized to the distance of the neighbors, not to a tenth of the scene.
+- One rotation of a node moves and rotates its Gaussians, where the code has two.
+- Nodes are initialized at Gaussians, or from tracks at moving and static points, half
+  each, where the paper first trains them as Gaussians. Their number is constant, where
+  the paper adds and prunes nodes.
+- Gradients reach the positions of nodes and Gaussians through weights, rotations and
+  the network, where the published code stops them (of a node, through network and
+  weights).
+- Missing are its hyper coordinates of nodes and Gaussians, its mask of moving
+  Gaussians, its changing scales and its noise on the times of real captures.
 """
 
 import dataclasses
@@ -46,8 +49,8 @@ from gaussians_jax.core import splats
 from gaussians_jax.core.metadata import SceneMetadata
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
-from gaussians_jax.init import path_fit
-from gaussians_jax.init.path_fit import Guess, Paths, Points
+from gaussians_jax.init import motion_fit
+from gaussians_jax.init.motion_fit import Guess, Paths, Points
 from gaussians_jax.motion import skinning
 from gaussians_jax.motion.blocks import in_blocks
 from gaussians_jax.motion.bound import BoundMotion
@@ -66,30 +69,30 @@ from nerfies_jax.training.effects import (
 from nerfies_jax.training.step_counts import steps
 
 NAME = "node_motion"
-MOMENTS = 8  # of the film, at which the paths of nodes are compared
+MOMENTS = 8  # frame times at which the paths of nodes are compared
 STRETCH = 1.2  # of a mask, see `openness`
-ROWS_AT_ONCE, NODES_AT_ONCE = 512, 32  # blocks that are passed over where nothing moves
+ROWS_AT_ONCE, NODES_AT_ONCE = 512, 32  # blocks that are skipped if nothing moves
 
 
 @dataclasses.dataclass(frozen=True)
 class MaskSpec:
     """A learned mask that selects moving nodes (EDGS).
 
-    Each node keeps a number of its own, where EDGS has a small network of an anchor's
-    feature; its kernel and loss were not at hand. Sizes and weights are our choice.
+    Each node has a logit, where EDGS has a small network of an anchor's feature. Its
+    kernel and loss were not available. Sizes and weights are our choice.
     """
 
-    # Weight of the mean of the logistic function of the mask; 0 leaves it out.
+    # Weight of the mean of the logistic function of the logits. 0 disables it.
     sparsity: float = 3e-3
-    rate: float = 1e-2  # of the mask's number
-    moving: float = 2.0  # where it starts: 96 % open
-    still: float = -1.0  # of a node at rest, where tracks tell: 22 % open
+    rate: float = 1e-2  # learning rate of the logits
+    moving: float = 2.0  # initial logit, 96 % open
+    still: float = -1.0  # initial logit of nodes that are static by tracks, 22 % open
 
     def __post_init__(self):
         for name in ("sparsity", "rate"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(
-                    f"{name}={getattr(self, name)} is finite and not negative"
+                    f"{name}={getattr(self, name)} must be finite and not negative"
                 )
 
 
@@ -97,27 +100,27 @@ class MaskSpec:
 class NodeMotionSpec:
     """Number of nodes, nodes per Gaussian, and the network that moves the nodes.
 
-    Nodes, nearest nodes and the network are the paper's; the number of links and the
-    weight of the rigid term, of squared scene extents, are our choice. `moving_share`
-    of the nodes lie on what moves where a motion starts from tracks. Rates of places
-    and the answers of the network are in scene extents.
+    The number of nodes, of nearest nodes and the network are the paper's. The number of
+    links and the weight of the rigidity loss (of squared scene extents) are our choice.
+    With an initialization from tracks, `moving_share` of the nodes lie on moving
+    points. Rates of positions and the outputs of the network are in scene extents.
     """
 
     nodes: int = 512
-    near: int = 3  # nodes that carry a Gaussian
+    near: int = 3  # nodes that move a Gaussian
     position: EncodingSpec = EncodingSpec(10)
     time: EncodingSpec = EncodingSpec(10)
     depth: int = 8
     width: int = 256
     skips: tuple[int, ...] = (5,)  # layers that read the input again
-    links: int = 8  # of each node, to nodes that it is to be rigid with
-    rigidity: float | None = 0.1  # weight; None leaves it out
+    links: int = 8  # neighbors of each node in the rigidity loss
+    rigidity: float | None = 0.1  # weight of the rigidity loss; None disables it
     moving_share: float = 0.5
-    mask: MaskSpec | None = None  # of the nodes that move; None: all may
+    mask: MaskSpec | None = None  # selects moving nodes; None: all may move
     warm_up: int = steps(3000)  # steps without motion
     learning_rate: float = 8e-4  # of the network
     learning_rate_end: float = 1.6e-6
-    place_rate: float = 1.6e-4  # both fall as the network's does
+    place_rate: float = 1.6e-4  # both decay like that of the network
     radius_rate: float = 1e-3  # of the logarithm
 
     def __post_init__(self):
@@ -126,8 +129,8 @@ class NodeMotionSpec:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
         if self.rigidity is not None and not 0 < self.rigidity < math.inf:
             raise ValueError(
-                f"rigidity={self.rigidity} is a weight, finite and positive; None "
-                "leaves it out"
+                f"rigidity={self.rigidity} must be finite and positive; None disables "
+                "it"
             )
         if not 0 < self.moving_share <= 1:
             raise ValueError(f"moving_share={self.moving_share} must lie in (0, 1]")
@@ -136,13 +139,13 @@ class NodeMotionSpec:
         for name in ("place_rate", "radius_rate"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(
-                    f"{name}={getattr(self, name)} is finite and not negative"
+                    f"{name}={getattr(self, name)} must be finite and not negative"
                 )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
-        network_spec(self)  # checks its sizes
+        network_spec(self)  # validates the sizes
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the motion for a run of `run_steps` of this capture."""
+        """Return the motion for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.extent)
 
 
@@ -155,16 +158,23 @@ class Nodes(NamedTuple):
     mask: Float[Array, " nodes"] | None  # see `openness`
 
 
-class Found(NamedTuple):
-    """Neighborhoods, which are updated when the number of Gaussians changes."""
+class Neighborhoods(NamedTuple):
+    """Neighborhoods, which are updated when the set of Gaussians changes."""
 
     near: Int[Array, "gaussians near"]
-    links: Links | None  # None where nothing asks for them
-    moving: Bool[Array, " gaussians"] | None  # None: all of them may
+    links: Links | None  # None without a rigidity loss
+    moving: Bool[Array, " gaussians"] | None  # None: all may move
 
 
 def network_spec(spec: NodeMotionSpec) -> MLPSpec:
-    """From [encoded place, encoded time] of a node to its turn and shift."""
+    """Settings of the network from [encoded position, encoded time] to rigid motions.
+
+    Args:
+      spec: Settings of the motion.
+
+    Returns:
+      Settings of the network.
+    """
     heads = (("turn", HeadSpec(3, "small")), ("shift", HeadSpec(3, "small")))
     inputs = spec.position.width(3) + spec.time.width(1)
     return MLPSpec(inputs, spec.depth, spec.width, heads, spec.skips, "relu", "he")
@@ -181,7 +191,7 @@ SMALL_NODE_MOTION = NodeMotionSpec(
 
 
 def init(key: Key[Array, ""], spec: NodeMotionSpec, dtype=jnp.float32) -> Nodes:
-    """Nodes that hardly move anything yet, all at the origin until they are placed."""
+    """Initialize nodes that hardly move anything, all at the origin (`place_nodes`)."""
     return Nodes(
         position=jnp.zeros((spec.nodes, 3), dtype),
         log_radius=jnp.zeros(spec.nodes, dtype),
@@ -195,9 +205,9 @@ def init(key: Key[Array, ""], spec: NodeMotionSpec, dtype=jnp.float32) -> Nodes:
 def openness(mask: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
     """Compute the mask of each node in [0, 1], a stretched logistic function.
 
-    It is exactly zero where the function is below 1/12 (and one above 11/12), without a
-    gradient beyond. Such a node is static and nothing is computed for it. The stretch
-    is that of Louizos et al. 2018, arXiv:1712.01312, without noise.
+    The mask is exactly zero where the function is below 1/12, and one above 11/12,
+    without a gradient there. A node with a zero mask is static and is not evaluated.
+    The stretch is that of Louizos et al. 2018, arXiv:1712.01312, without noise.
 
     Args:
       mask: Logits.
@@ -208,47 +218,59 @@ def openness(mask: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
     return jnp.clip(STRETCH * jax.nn.sigmoid(mask) - (STRETCH - 1) / 2, 0, 1)
 
 
-def placed(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes:
+def place_nodes(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes:
     """Initialize nodes at positions, with the distance to their neighbors as radius.
 
     Args:
       nodes: Parameters of the nodes.
-      position: Positions. Fewer than nodes are repeated, and coincident nodes share
-        their influence.
+      position: Positions. They are repeated if there are fewer than nodes, and
+        coincident nodes share their influence.
 
     Returns:
       Parameters of the nodes.
     """
-    count, kind = len(nodes.position), nodes.position.dtype
-    everywhere = position[np.arange(count) % len(position)]
-    radius = splats.neighbor_distance(everywhere, 1.0)
+    count, dtype = len(nodes.position), nodes.position.dtype
+    positions = position[np.arange(count) % len(position)]
+    radius = splats.neighbor_distance(positions, 1.0)
     return nodes._replace(
-        position=jnp.asarray(everywhere, kind),
-        log_radius=jnp.asarray(np.log(radius), kind),
+        position=jnp.asarray(positions, dtype),
+        log_radius=jnp.asarray(np.log(radius), dtype),
     )
 
 
 def moves(
     nodes: Nodes, spec: NodeMotionSpec, extent: float, time: Float[Array, ""]
 ) -> Moves:
-    """Evaluate the motion of the nodes at a time, in units of `extent`."""
-    place = jax.vmap(lambda one: encoding.encode(spec.position, one, None))
-    moment = encoding.encode(spec.time, time[None], None)
-    features = place(nodes.position)
-    moment = jnp.broadcast_to(moment, (len(features), len(moment)))
-    inputs = jnp.concatenate([features, moment], axis=1)
+    """Evaluate the motion of the nodes at a time.
+
+    Args:
+      nodes: Parameters of the nodes.
+      spec: Settings.
+      extent: Scene extent, the unit of the network's translations, in scene units.
+      time: Normalized time.
+
+    Returns:
+      The motion.
+    """
+    encode_position = jax.vmap(
+        lambda point: encoding.encode(spec.position, point, None)
+    )
+    time_features = encoding.encode(spec.time, time[None], None)
+    features = encode_position(nodes.position)
+    time_features = jnp.broadcast_to(time_features, (len(features), len(time_features)))
+    inputs = jnp.concatenate([features, time_features], axis=1)
 
     def network(inputs):
         return mlp.apply(network_spec(spec), nodes.network, inputs)
 
     if spec.mask is None:
-        made = network(inputs)
-        turn, shift = made["turn"], made["shift"]
+        outputs = network(inputs)
+        turn, shift = outputs["turn"], outputs["shift"]
     else:
         assert nodes.mask is not None
         share = openness(nodes.mask)
-        made = in_blocks(network, (inputs,), share > 0, NODES_AT_ONCE)
-        turn, shift = (share[:, None] * made[name] for name in ("turn", "shift"))
+        outputs = in_blocks(network, (inputs,), share > 0, NODES_AT_ONCE)
+        turn, shift = (share[:, None] * outputs[name] for name in ("turn", "shift"))
     return Moves(jax.vmap(quaternion.exp)(turn), extent * shift)
 
 
@@ -258,34 +280,60 @@ def find(
     extent: float,
     mean: Float[Array, "gaussians 3"],
     linked: bool = True,
-) -> Found:
-    """The nodes near each Gaussian, and where asked for which stay near each other."""
+) -> Neighborhoods:
+    """Find the nodes near each Gaussian, and the links between nodes.
+
+    Args:
+      nodes: Parameters of the nodes.
+      spec: Settings.
+      extent: Scene extent in scene units.
+      mean: Canonical means of the Gaussians.
+      linked: False to omit the links.
+
+    Returns:
+      The neighborhoods.
+    """
     near = skinning.nearest(mean, nodes.position, spec.near)
     moving = None
     if spec.mask is not None:
         assert nodes.mask is not None
         moving = jnp.any((openness(nodes.mask) > 0)[near], axis=1)
     if spec.rigidity is None or not linked:
-        return Found(near, None, moving)
+        return Neighborhoods(near, None, moving)
     moments = jnp.linspace(0, 1, MOMENTS, dtype=mean.dtype)
     shifts = jax.vmap(lambda time: moves(nodes, spec, extent, time).shift)(moments)
     paths = jnp.swapaxes(nodes.position + shifts, 0, 1)
-    return Found(near, skinning.links(paths, nodes.log_radius, spec.links), moving)
+    return Neighborhoods(
+        near, skinning.links(paths, nodes.log_radius, spec.links), moving
+    )
 
 
-def displaced(
-    nodes: Nodes, now: Moves, found: Found, mean: Float[Array, "gaussians 3"]
-) -> skinning.Displaced:
-    """Evaluate the motion of Gaussians by their nodes, skipping blocks that do not
-    move.
+def displace(
+    nodes: Nodes,
+    now: Moves,
+    neighborhoods: Neighborhoods,
+    mean: Float[Array, "gaussians 3"],
+) -> skinning.Displacement:
+    """Evaluate the motion of Gaussians by their nodes, without static blocks.
+
+    Args:
+      nodes: Parameters of the nodes.
+      now: Motion of the nodes at a time.
+      neighborhoods: The neighborhoods.
+      mean: Canonical means of the Gaussians.
+
+    Returns:
+      Displacements and rotations.
     """
 
     def evaluate(near, mean):
-        return skinning.displaced(nodes.position, nodes.log_radius, now, near, mean)
+        return skinning.displace(nodes.position, nodes.log_radius, now, near, mean)
 
-    if found.moving is None:
-        return evaluate(found.near, mean)
-    return in_blocks(evaluate, (found.near, mean), found.moving, ROWS_AT_ONCE)
+    if neighborhoods.moving is None:
+        return evaluate(neighborhoods.near, mean)
+    return in_blocks(
+        evaluate, (neighborhoods.near, mean), neighborhoods.moving, ROWS_AT_ONCE
+    )
 
 
 def arap_loss(
@@ -295,7 +343,18 @@ def arap_loss(
     linked: Links,
     times: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> Float[Array, ""]:
-    """Measure the deviation of linked nodes from rigid motion, in squared extents."""
+    """Compute the deviation of linked nodes from rigid motion, in squared extents.
+
+    Args:
+      nodes: Parameters of the nodes.
+      spec: Settings.
+      extent: Scene extent in scene units.
+      linked: Links between nodes.
+      times: Two normalized times.
+
+    Returns:
+      The loss.
+    """
     before, after = (
         (nodes.position + moves(nodes, spec, extent, time).shift) / extent
         for time in times
@@ -309,47 +368,49 @@ def fit_to_paths(
     """Distribute nodes over moving and static points, on the host.
 
     Paths are moved to the middle of the video by the rigid bodies they belong to. The
-    network starts without motion, and is penalized for motion of static nodes.
+    network is initialized without motion, and motion of static nodes is penalized.
 
     Args:
       spec: Settings.
       extent: Scene extent in scene units.
       paths: 3D paths of points.
-      key: Random key.
+      key: PRNG key.
 
     Returns:
       Initial guess of a fit.
     """
-    unit, canonical = paths.unit, path_fit.places_at_one_moment(paths)
+    unit, canonical = paths.unit, motion_fit.positions_at_middle(paths)
     still = np.zeros((0, 3))
     if paths.still is not None:
         still = np.asarray(paths.still, np.float64)
     moving = spec.nodes if not len(still) else round(spec.moving_share * spec.nodes)
     moving_nodes = canonical[skinning.farthest_points(canonical, max(moving, 1))]
-    resting = still[skinning.farthest_points(still, spec.nodes - len(moving_nodes))]
-    nodes = placed(init(key, spec), np.concatenate([moving_nodes, resting]))
-    at_rest = slice(len(moving_nodes), len(moving_nodes) + len(resting))
+    static_nodes = still[
+        skinning.farthest_points(still, spec.nodes - len(moving_nodes))
+    ]
+    nodes = place_nodes(init(key, spec), np.concatenate([moving_nodes, static_nodes]))
+    static_rows = slice(len(moving_nodes), len(moving_nodes) + len(static_nodes))
     if spec.mask is not None:
         assert nodes.mask is not None
-        nodes = nodes._replace(mask=nodes.mask.at[at_rest].set(spec.mask.still))
+        nodes = nodes._replace(mask=nodes.mask.at[static_rows].set(spec.mask.still))
 
     def penalty(points, times):
-        every = points.nets
-        those = every._replace(position=every.position[at_rest])
-        if every.mask is not None:
-            those = those._replace(mask=every.mask[at_rest])
+        all_nodes = points.nets
+        static = all_nodes._replace(position=all_nodes.position[static_rows])
+        if all_nodes.mask is not None:
+            static = static._replace(mask=all_nodes.mask[static_rows])
 
-        def moved(time):
-            now = moves(those, spec, extent, time)
+        def motion(time):
+            now = moves(static, spec, extent, time)
             return now.turn[:, 1:], now.shift
 
-        return path_fit.rest_loss(moved, unit, times)
+        return motion_fit.rest_loss(motion, unit, times)
 
     start = Points(jnp.asarray(canonical, jnp.float32), None, nodes)
     mask = None if spec.mask is None else 1.0
     node_rates = Nodes._make((0.0, 1.0, 0.4, mask))
     rates = Points._make((unit, None, node_rates, None))
-    return Guess(start, rates, penalty if len(resting) else None)
+    return Guess(start, rates, penalty if len(static_nodes) else None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -357,52 +418,50 @@ class Bound(BoundMotion):
     """The `Motion` of a `NodeMotionSpec` in a run of `steps`."""
 
     spec: NodeMotionSpec
-    extent: float  # of the scene, the unit of shifts, scene units
+    extent: float  # of the scene, the unit of translations, in scene units
 
     name = NAME
 
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rates of the nodes and their network."""
         spec = self.spec
-        now = self.rate(step)
-        share = now / spec.learning_rate
-        mask = None if spec.mask is None else spec.mask.rate * share
-        place, radius = self.extent * spec.place_rate * share, spec.radius_rate * share
-        return MotionParams(shared=Nodes._make((place, radius, now, mask)))
+        rate = self.rate(step)
+        decay = rate / spec.learning_rate
+        mask = None if spec.mask is None else spec.mask.rate * decay
+        place, radius = self.extent * spec.place_rate * decay, spec.radius_rate * decay
+        return MotionParams(shared=Nodes._make((place, radius, rate, mask)))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
-        """Initialize the network, with nodes distributed over the Gaussians, on the
-        host.
-        """
+        """Initialize the network and nodes spread over the Gaussians, on the host."""
         _, shared_key = jax.random.split(key)
         means = np.asarray(gaussians.mean)
         places = means[skinning.farthest_points(means, self.spec.nodes)]
-        return MotionParams(shared=placed(init(shared_key, self.spec), places))
+        return MotionParams(shared=place_nodes(init(shared_key, self.spec), places))
 
-    def precompute(self, params: MotionParams, gaussians: Splats) -> Found:
+    def precompute(self, params: MotionParams, gaussians: Splats) -> Neighborhoods:
         """Find the nodes near each Gaussian."""
         mean = gaussians.mean
         return find(params.shared, self.spec, self.extent, mean, linked=False)
 
     @functools.partial(jax.jit, static_argnums=0)
-    def refresh(self, params: MotionParams, gaussians: Splats) -> Found:
-        """Find nodes near Gaussians and each other, when Gaussians come and go."""
+    def refresh(self, params: MotionParams, gaussians: Splats) -> Neighborhoods:
+        """Find nodes near Gaussians and each other, for a new set of Gaussians."""
         return find(params.shared, self.spec, self.extent, gaussians.mean)
 
     def apply(
         self,
         params: MotionParams,
-        cache: Found,
+        cache: Neighborhoods,
         gaussians: Gaussians,
         frame: FrameCondition,
     ) -> Gaussians:
         """Move the Gaussians to their state at a time."""
         now = moves(params.shared, self.spec, self.extent, frame.time)
-        offsets = displaced(params.shared, now, cache, gaussians.mean)
+        offsets = displace(params.shared, now, cache, gaussians.mean)
         return skinning.apply(gaussians, offsets)
 
     def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
-        """Compute how little nodes move as rigid bodies, and how many move at all."""
+        """Compute the rigidity loss, and the mean of the mask."""
         nodes, spec, time = params.shared, self.spec, context.condition.time
         terms = {}
         if spec.rigidity is not None:
@@ -415,5 +474,5 @@ class Bound(BoundMotion):
         return from_step(spec.warm_up, context.step, terms)
 
     def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
-        """Return nodes spread over moving and static points, to fit from."""
+        """Return nodes spread over moving and static points, to start a fit from."""
         return fit_to_paths(self.spec, self.extent, paths, key)

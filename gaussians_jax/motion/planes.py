@@ -1,18 +1,18 @@
 """Motion from planes over space and time (4DGS), decoded by a small network.
 
-4DGS (Wu et al. 2024, arXiv:2310.08528): six planes at several resolutions are read at
-the canonical mean and the time (equation 7, the product over planes, levels side by
-side), and a small network makes of the features how far mean, rotation and scale are
-from their canonical values (equation 8). Planes of space are kept smooth, those of time
-steady and near one, as in K-Planes (`nets.planes`). Its coarse stage, in which nothing
-moves, is the `warm_up`. The text was not at hand: the numbers are those of a reader who
-quotes it, the rest is as in its code (hustvl/4DGaussians).
+4DGS (Wu et al. 2024, arXiv:2310.08528): six planes at several resolutions are
+interpolated at the canonical mean and the time (equation 7, the product over planes,
+with levels concatenated), and a small network maps the features to residuals of mean,
+rotation and scale (equation 8). Spatial planes are regularized to be smooth, and those
+of time to be smooth and near one, as in K-Planes (`nn.planes`). The coarse stage
+without motion is the `warm_up`. The paper itself was not available: numbers are taken
+from a paper that cites it, the rest from its code (hustvl/4DGaussians).
 
-As there but for: the heads are linear read-outs of one network, there each has a hidden
-layer of its own; turns are rotation vectors, there they are added to the quaternion;
-the time has all of its planes, of which the published code uses the half above their
-middle; and `variation` is the total variation, where that code has second differences
-along one axis.
+Differences: the heads are linear layers of one network, where the code has a hidden
+layer for each. Rotations are rotation vectors, where the code adds to quaternions. The
+time uses all of its planes, where the published code uses the half above their middle.
+`variation` is the total variation, where that code has second differences along one
+axis.
 """
 
 import dataclasses
@@ -48,19 +48,18 @@ Features = Float[Array, "gaussians levels features"]
 
 @dataclasses.dataclass(frozen=True)
 class PlaneMotionSpec:
-    """Planes, network, and regularization of the planes, with the sizes for HyperNeRF
-    scenes.
+    """Settings of planes, network and regularization, with the sizes for HyperNeRF.
 
-    Rates of planes do not depend on the scene's unit, heads answer in its extents.
-    Weights are of the sums over planes and levels; zero leaves a term out.
+    Rates of planes do not depend on the scene's unit, and heads output scene extents.
+    Weights are of sums over planes and levels. Zero disables a loss.
     """
 
     planes: PlanesSpec = PlanesSpec(moments=150)
     depth: int = 1
     width: int = 128
-    variation: float = 2e-4  # weight, planes of space
-    bend: float = 1e-3  # weight, planes of time
-    unrest: float = 1e-4  # weight, planes of time
+    variation: float = 2e-4  # weight of the total variation of spatial planes
+    bend: float = 1e-3  # weight of second differences in time
+    unrest: float = 1e-4  # weight of the distance of the time planes from one
     warm_up: int = steps(3000)  # steps without motion
     plane_rate: float = 1.6e-3
     plane_rate_end: float = 1.6e-4
@@ -70,41 +69,41 @@ class PlaneMotionSpec:
     def __post_init__(self):
         if self.planes.moments is None or self.planes.combination != "product":
             raise ValueError(
-                "a motion takes planes with moments that are multiplied, got moments="
-                f"{self.planes.moments} and {self.planes.combination!r}"
+                "the planes of a motion need moments and a product, got moments="
+                f"{self.planes.moments} and combination={self.planes.combination!r}"
             )
         for name in ("variation", "bend", "unrest"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(
-                    f"{name}={getattr(self, name)} is a weight, finite and not negative"
+                    f"{name}={getattr(self, name)} must be finite and not negative"
                 )
         if self.warm_up < 0:
             raise ValueError(f"warm_up={self.warm_up} must not be negative")
         schedules.check_falling(self.plane_rate, self.plane_rate_end)
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
-        network_spec(self)  # checks its sizes
+        network_spec(self)  # validates the sizes
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the motion for a run of `run_steps` of this capture."""
+        """Return the motion for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.extent, metadata.box)
 
 
 class Motion(NamedTuple):
-    """Parameters of the field."""
+    """Parameters of planes and network."""
 
     planes: tuple[Level, ...]
     network: MLP
 
 
 def network_spec(spec: PlaneMotionSpec) -> MLPSpec:
-    """From the features of a place at a time to the offsets, small at first."""
+    """Settings of the network from features to residuals, which are small at first."""
     heads = tuple((name, HeadSpec(3, "small")) for name in Offsets._fields)
     inputs = spec.planes.width(4)
     return MLPSpec(inputs, spec.depth, spec.width, heads, (), "relu", "he")
 
 
-# One core, forward and backward, 10,000 Gaussians: 10 ms to read the planes and 5 for
-# the network; 120 ms for the paper's size, and 12 for its penalties.
+# Forward and backward of 10,000 Gaussians on one core: 10 ms for the planes and 5 for
+# the network. The paper's size takes 120 ms, and its regularization 12.
 SMALL_PLANE_MOTION = PlaneMotionSpec(
     planes=PlanesSpec(vertices=32, multiples=(1, 2), moments=24, features=8),
     width=64,
@@ -114,7 +113,7 @@ SMALL_PLANE_MOTION = PlaneMotionSpec(
 
 
 def init(key: Key[Array, ""], spec: PlaneMotionSpec, dtype=jnp.float32) -> Motion:
-    """A field that hardly moves anything yet."""
+    """Initialize planes and a network that hardly move anything."""
     planes_key, network_key = jax.random.split(key)
     return Motion(
         planes.init(spec.planes, planes_key, dtype),
@@ -122,10 +121,18 @@ def init(key: Key[Array, ""], spec: PlaneMotionSpec, dtype=jnp.float32) -> Motio
     )
 
 
-def places(
+def in_unit_cube(
     box: tuple[Corner, Corner], mean: Float[Array, "gaussians 3"]
 ) -> Float[Array, "gaussians 3"]:
-    """Means in the unit cube over the box (its low and its high corner)."""
+    """Map means to the unit cube over a box.
+
+    Args:
+      box: Minimum and maximum corner in scene units.
+      mean: Means in scene units.
+
+    Returns:
+      Positions in the unit cube.
+    """
     low, high = (jnp.asarray(corner, mean.dtype) for corner in box)
     return (mean - low) / (high - low)
 
@@ -133,10 +140,10 @@ def places(
 def prepare(
     params: Motion, spec: PlaneMotionSpec, place: Float[Array, "gaussians 3"]
 ) -> Features:
-    """Read the spatial planes, which do not depend on the time."""
-    return jax.vmap(lambda one: planes.space_features(spec.planes, params.planes, one))(
-        place
-    )
+    """Interpolate the spatial planes, which do not depend on the time."""
+    return jax.vmap(
+        lambda point: planes.space_features(spec.planes, params.planes, point)
+    )(place)
 
 
 def offsets(
@@ -146,7 +153,7 @@ def offsets(
     time: Float[Array, ""],
     ready: Features,
 ) -> Offsets:
-    """Compute the offsets of Gaussians at a time.
+    """Evaluate the residuals of Gaussians at a time.
 
     Args:
       params: Shared parameters.
@@ -156,33 +163,40 @@ def offsets(
       ready: Result of `prepare` for the same positions.
 
     Returns:
-      Offsets, those of means in scene extents.
+      Residuals, those of means in scene extents.
     """
     lines = planes.at_time(params.planes, time)
 
-    def features(one, space):
-        now = planes.time_features(spec.planes, lines, one)
-        return planes.features(spec.planes, space, now)
+    def features(point, space):
+        time_features = planes.time_features(spec.planes, lines, point)
+        return planes.features(spec.planes, space, time_features)
 
     encoded = jax.vmap(features)(place, ready)
     return Offsets(**mlp.apply(network_spec(spec), params.network, encoded))
 
 
 def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Term]:
-    """Total variation in space, steadiness in time, and how far time is from one.
+    """Compute the total variation in space, and smoothness and sparsity in time.
 
     A term of weight zero is not computed.
+
+    Args:
+      spec: Settings.
+      levels: The planes.
+
+    Returns:
+      The terms by name.
     """
     space = [plane for level in levels for plane in level.space]
     time = [plane for level in levels for plane in level.time]
-    asked = {
+    losses = {
         "variation": (planes.total_variation, space, spec.variation),
         "bend": (planes.time_smoothness, time, spec.bend),
         "unrest": (planes.l1_time_planes, time, spec.unrest),
     }
     return {
-        name: Term(total(map(of_one, every)), weight)
-        for name, (of_one, every, weight) in asked.items()
+        name: Term(total(map(loss, planes_of)), weight)
+        for name, (loss, planes_of, weight) in losses.items()
         if weight > 0
     }
 
@@ -191,11 +205,11 @@ def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Te
 class Bound(BoundMotion):
     """The `Motion` of a `PlaneMotionSpec` in a run of `steps`.
 
-    `box` is the low and the high corner of the volume of the planes, scene units.
+    `box` is the minimum and maximum corner of the volume of the planes, scene units.
     """
 
     spec: PlaneMotionSpec
-    extent: float  # of the scene, the unit of shifts, scene units
+    extent: float  # of the scene, the unit of shifts, in scene units
     box: tuple[Corner, Corner] | None
 
     name = NAME
@@ -205,8 +219,8 @@ class Bound(BoundMotion):
             low < high for low, high in zip(*self.box, strict=True)
         ):
             raise ValueError(
-                f"the planes of a motion lie in a box of the scene, got box={self.box};"
-                " give SceneMetadata its low and its high corner, as scene.metadata_of "
+                f"the planes of a motion need a bounding box, got box={self.box}; pass "
+                "the minimum and maximum corner to SceneMetadata, as scene.metadata_of "
                 "does"
             )
 
@@ -222,9 +236,9 @@ class Bound(BoundMotion):
         return MotionParams(shared=init(shared_key, self.spec))
 
     def precompute(self, params: MotionParams, gaussians: Splats) -> Features:
-        """Read the planes of space."""
+        """Interpolate the spatial planes."""
         assert self.box is not None
-        return prepare(params.shared, self.spec, places(self.box, gaussians.mean))
+        return prepare(params.shared, self.spec, in_unit_cube(self.box, gaussians.mean))
 
     def apply(
         self,
@@ -235,11 +249,11 @@ class Bound(BoundMotion):
     ) -> Gaussians:
         """Move the Gaussians to their state at a time."""
         assert self.box is not None
-        place = places(self.box, gaussians.mean)
-        off = offsets(params.shared, self.spec, place, frame.time, cache)
-        return apply(gaussians, off._replace(mean=self.extent * off.mean))
+        place = in_unit_cube(self.box, gaussians.mean)
+        residuals = offsets(params.shared, self.spec, place, frame.time, cache)
+        return apply(gaussians, residuals._replace(mean=self.extent * residuals.mean))
 
     def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
-        """Compute the smoothness of the planes, once the motion has begun."""
+        """Compute the regularization of the planes, after the warm-up."""
         terms = smoothness(self.spec, params.shared.planes)
         return from_step(self.spec.warm_up, context.step, terms)

@@ -1,17 +1,18 @@
-"""Motion as few rigid motions over time, and weights that say who takes part in which.
+"""Motion as few rigid motions over time, with weights of each Gaussian.
 
-Each basis is a turn and a shift about a center of its own at knots in time, with a
-Catmull-Rom spline between them. A Gaussian moves by the mean of the bases under softmax
-weights of its own, one of which stands for staying where it is. The form of Shape of
-Motion (Wang et al. 2024, arXiv:2407.13764), which has a basis for each frame and no
-entry for what is still. Where nothing turns or shifts, nothing moves, exactly.
+Each basis is a rotation and a translation about a center at knots in time, interpolated
+by a Catmull-Rom spline. A Gaussian moves by the mean of the bases under its softmax
+weights, one of which is for a static basis. This is the form of Shape of Motion (Wang
+et al. 2024, arXiv:2407.13764), which has a basis pose for each frame and no static
+basis. With zero rotations and translations nothing moves, exactly.
 
-Two splines are added: one of many knots takes over what tracks know, one of few learns
-ten times faster from pictures, and less of their noise. Against the former alone, three
-seeds of the built-in scene: 0.3 dB more, 0.7 where it moves, points 0.0074 units off
-for 0.0085 (`docs/results/ablate_tracked.md`). Ten knots alone are better still there
-(one seed, 900 steps: 33.27 / 29.94 dB, 0.0060), but fifteen are too stiff for a hand
-before books: 37.12 dB, 33.12 where it moves, for 37.56 and 34.18.
+Two splines are added. One with many knots is initialized from tracks. One with few
+knots learns ten times faster from images, with less noise. Compared with the former
+alone, on three seeds of the built-in scene, PSNR is 0.3 dB higher, 0.7 in moving
+regions, and the error of tracked points is 0.0074 instead of 0.0085 scene units
+(`docs/results/ablate_tracked.md`). Ten knots alone are even better in that scene (one
+seed, 900 steps: 33.27 / 29.94 dB, 0.0060), but fifteen are too stiff for a hand in
+front of books: 37.12 dB, 33.12 in moving regions, instead of 37.56 and 34.18.
 """
 
 import dataclasses
@@ -26,7 +27,7 @@ from gaussians_jax.core import splats, time_knots
 from gaussians_jax.core.metadata import SceneMetadata
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
-from gaussians_jax.init.path_fit import Guess, Paths, Points
+from gaussians_jax.init.motion_fit import Guess, Paths, Points
 from gaussians_jax.motion.bound import BoundMotion
 from nerfies_jax.geometry import lie
 from nerfies_jax.geometry.fusion import components, stacked
@@ -38,7 +39,7 @@ from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.step_counts import steps
 
 NAME = "se3_bases"
-MEMBER_LOGIT, STILL_LOGIT = 3.0, -6.0  # of a moving point, before the fit to paths
+MEMBER_LOGIT, STILL_LOGIT = 3.0, -6.0  # of a moving point, before the fit to tracks
 SMOOTHNESS, TURN_SMOOTHNESS = 0.02, 0.002  # weights of second differences of knots
 
 
@@ -46,38 +47,39 @@ SMOOTHNESS, TURN_SMOOTHNESS = 0.02, 0.002  # weights of second differences of kn
 class SE3BasesSpec:
     """Number of bases and knots, and their learning rates.
 
-    `still_logit` is the initial logit of the static basis. From 4 on static points keep
-    13 % of their neighbors' motion, from 9 on 0.1 %. At 100 they could never move: 35.5
-    instead of 36.7 dB on a video of a hand in front of books, whose cameras are wrong
-    by half a pixel. The rate of translations is in scene extents.
+    `still_logit` is the initial logit of the static basis. With 4, static points move
+    by 13 % of their neighbors' motion, with 9 by 0.1 %. With 100 they could never move:
+    35.5 instead of 36.7 dB on a video of a hand in front of books whose camera poses
+    are wrong by half a pixel. The rate of translations is in scene extents.
     """
 
     bases: int = 8
-    knots: int = 20  # evenly over the film
-    coarse_knots: int = 10  # of the spline that pictures change; 0: there is none
-    fine_rate: float = 0.1  # what the other learns with, a share of the rate
+    knots: int = 20  # evenly spaced over the video
+    coarse_knots: int = 10  # of the spline that learns from images; 0 disables it
+    fine_rate: float = 0.1  # learning rate of the other spline, relative
     still_logit: float = 9.0
     logit_rate: float = 1e-2
-    learning_rate: float = 1e-3  # of turns (rad) and shifts
+    learning_rate: float = 1e-3  # of rotations (rad) and translations
     learning_rate_end: float = 1e-4
-    warm_up: int = steps(0)  # steps without motion: none, for it starts from tracks
+    warm_up: int = steps(0)  # steps without motion; none, because it starts from tracks
 
     def __post_init__(self):
         if self.bases < 1:
-            raise ValueError(f"bases={self.bases}: a motion has at least one basis")
+            raise ValueError(f"bases={self.bases} must be at least 1")
         if self.knots < 2:
             raise ValueError(
-                f"knots={self.knots}: a motion has at least two, its first and its "
-                "last instant"
+                f"knots={self.knots} must be at least two, at the first and the last "
+                "frame time"
             )
         if self.coarse_knots < 2 and self.coarse_knots != 0:
             raise ValueError(
-                f"coarse_knots={self.coarse_knots}: a spline has at least two, or "
-                "none (0)"
+                f"coarse_knots={self.coarse_knots} must be at least two, or 0 to "
+                "disable the coarse spline"
             )
         if not 0 <= self.fine_rate <= 1:
             raise ValueError(
-                f"fine_rate={self.fine_rate} is a share of the rate, from 0 to 1"
+                f"fine_rate={self.fine_rate} must lie in [0, 1], because it is "
+                "relative to learning_rate"
             )
         if self.logit_rate <= 0:
             raise ValueError(f"logit_rate={self.logit_rate} must be positive")
@@ -86,21 +88,21 @@ class SE3BasesSpec:
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the motion for a run of `run_steps` of this capture."""
+        """Return the motion for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.extent)
 
 
 class Poses(NamedTuple):
-    """Turns and shifts at knots that lie evenly over [0, 1]."""
+    """Rotations and translations at knots that are evenly spaced over [0, 1]."""
 
     turn: Float[Array, "bases knots 3"]  # rotation vectors, rad
     shift: Float[Array, "bases knots 3"]  # scene units
 
 
 class Bases(NamedTuple):
-    """The rigid motions: x goes to center + R(turn) (x - center) + shift.
+    """The rigid motions: x maps to center + R(turn) (x - center) + shift.
 
-    Turn and shift are the sums of the two splines.
+    `turn` and `shift` are the sums of the two splines.
     """
 
     fine: Poses
@@ -117,33 +119,46 @@ class Motion(NamedTuple):
 
 
 def init(key: Key[Array, ""], spec: SE3BasesSpec, dtype=jnp.float32) -> Bases:
-    """Bases that hardly move: were all alike, all would keep the same slopes."""
+    """Initialize bases with small motions. Equal bases would get equal gradients."""
     shape = (spec.bases, spec.knots, 3)
     shift = 1e-3 * jax.random.normal(key, shape, dtype)
     fine = Poses(jnp.zeros(shape, dtype), shift)
-    none = jnp.zeros((spec.bases, spec.coarse_knots, 3), dtype)
-    return Bases(fine, Poses(none, none), jnp.zeros((spec.bases, 3), dtype))
+    zero = jnp.zeros((spec.bases, spec.coarse_knots, 3), dtype)
+    return Bases(fine, Poses(zero, zero), jnp.zeros((spec.bases, 3), dtype))
 
 
 def init_logits(spec: SE3BasesSpec, gaussians: int, dtype=jnp.float32):
-    """[gaussians, 1 + bases]: all stay where they are."""
+    """Initialize logits [gaussians, 1 + bases] of static Gaussians."""
     logits = jnp.zeros((gaussians, 1 + spec.bases), dtype)
     return logits.at[:, 0].set(spec.still_logit)
 
 
 def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
-    """The rigid motions of all bases at one time.
+    """Evaluate the rigid motions of all bases at one time.
 
-    R - 1 without the 1: a small turn keeps all its digits.
+    R - 1 is computed without cancellation, so that small rotations are accurate.
+
+    Args:
+      bases: The bases.
+      time: Normalized time.
+
+    Returns:
+      The rigid motions.
     """
-    levels = [one for one in (bases.fine, bases.coarse) if one.turn.shape[1]]
-    tables = jnp.concatenate([jnp.concatenate(one, axis=-1) for one in levels], axis=1)
-    weights = [time_knots.spline_weights(one.turn.shape[1], time) for one in levels]
-    now = exact_einsum("k,bkc->bc", jnp.concatenate(weights), tables)
-    turn, shift = now[:, :3], now[:, 3:]
-    axes, none = jnp.eye(3, dtype=turn.dtype), jnp.zeros_like(turn[0])
-    turned = jax.vmap(lie.displacement, (None, None, 0))
-    linear = jnp.swapaxes(jax.vmap(turned, (0, None, None))(turn, none, axes), 1, 2)
+    levels = [spline for spline in (bases.fine, bases.coarse) if spline.turn.shape[1]]
+    tables = jnp.concatenate(
+        [jnp.concatenate(spline, axis=-1) for spline in levels], axis=1
+    )
+    weights = [
+        time_knots.spline_weights(spline.turn.shape[1], time) for spline in levels
+    ]
+    pose = exact_einsum("k,bkc->bc", jnp.concatenate(weights), tables)
+    turn, shift = pose[:, :3], pose[:, 3:]
+    axes, zero = jnp.eye(3, dtype=turn.dtype), jnp.zeros_like(turn[0])
+    displacement = jax.vmap(lie.displacement, (None, None, 0))
+    linear = jnp.swapaxes(
+        jax.vmap(displacement, (0, None, None))(turn, zero, axes), 1, 2
+    )
     return Motion(
         turn, linear, shift - exact_einsum("bij,bj->bi", linear, bases.center)
     )
@@ -152,10 +167,18 @@ def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
 def deform(
     motion: Motion, logits: Float[Array, "gaussians weights"], gaussians: Gaussians
 ) -> Gaussians:
-    """Gaussians moved by the mean of the bases under their weights.
+    """Move Gaussians by the mean of the bases under their weights.
 
-    Means move by the mean of the rigid motions (linear blend skinning), and turn by the
-    mean of the rotation vectors.
+    Means move by the mean of the rigid motions (linear blend skinning), and rotate by
+    the mean of the rotation vectors.
+
+    Args:
+      motion: The rigid motions at a time.
+      logits: Logits of the weights, the static basis first.
+      gaussians: Gaussians in their canonical state.
+
+    Returns:
+      The moved Gaussians.
     """
     weights = jax.nn.softmax(logits, axis=-1)[:, 1:]
     rows = len(motion.turn)
@@ -164,11 +187,11 @@ def deform(
     mixed, mean = components(exact_product(weights, table)), components(gaussians.mean)
     linear, offset, turn = mixed[:9], mixed[9:12], stacked(mixed[12:])
     moved = [
-        own + (dot(linear[3 * i : 3 * i + 3], mean) + offset[i])
-        for i, own in enumerate(mean)
+        coordinate + (dot(linear[3 * i : 3 * i + 3], mean) + offset[i])
+        for i, coordinate in enumerate(mean)
     ]
     return gaussians._replace(
-        mean=stacked(moved), quaternion=splats.turned(gaussians, turn)
+        mean=stacked(moved), quaternion=splats.rotate(gaussians, turn)
     )
 
 
@@ -188,12 +211,12 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     bodies = rigid_groups.motion(position, known, label, canonical_frame)
     canonical, middle = rigid_groups.centers(position, known, bodies)
     turn = rigid_groups.rotation_vectors(bodies.rotation, canonical_frame)
-    moved = np.einsum("gtij,gj->gti", bodies.rotation, middle) + bodies.shift
+    middle_path = np.einsum("gtij,gj->gti", bodies.rotation, middle) + bodies.shift
     turn = _at_knots(rigid_groups.smoothed(turn), times, spec)
-    shift = _at_knots(rigid_groups.smoothed(moved - middle[:, None]), times, spec)
+    shift = _at_knots(rigid_groups.smoothed(middle_path - middle[:, None]), times, spec)
     middle = np.concatenate([middle, np.zeros((spec.bases - len(middle), 3))])
-    none = np.zeros((spec.bases, spec.coarse_knots, 3))
-    fine, coarse = Poses._make((turn, shift)), Poses._make((none, none))
+    zero = np.zeros((spec.bases, spec.coarse_knots, 3))
+    fine, coarse = Poses._make((turn, shift)), Poses._make((zero, zero))
     bases = Bases._make((fine, coarse, middle))
     bases = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), bases)
     logits = np.zeros((len(position), 1 + spec.bases), np.float32)
@@ -203,7 +226,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
 
     def penalty(points, _times):
         def bend(table):
-            if table.shape[1] < 3:  # two knots are on a straight line
+            if table.shape[1] < 3:  # two knots have no second difference
                 return jnp.zeros((), table.dtype)
             return jnp.mean(jnp.abs(table[:, 2:] - 2 * table[:, 1:-1] + table[:, :-2]))
 
@@ -218,7 +241,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
 
 
 def _at_knots(track, times, spec):
-    """Interpolate values at the knots: [bases, knots, 3], static without a group."""
+    """Interpolate values at the knots: [bases, knots, 3], zero without a group."""
     knots = np.linspace(0, 1, spec.knots)
     table = np.zeros((spec.bases, spec.knots, 3))
     for group, one in enumerate(track):
@@ -232,21 +255,21 @@ class Bound(BoundMotion):
     """The `Motion` of a `SE3BasesSpec` in a run of `steps`."""
 
     spec: SE3BasesSpec
-    extent: float  # of the scene, the unit of shifts, scene units
+    extent: float  # of the scene, the unit of translations, in scene units
 
     name = NAME
 
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rates of logits and bases."""
-        # A center and a shift say the same twice over; centers stay.
-        now = self.rate(step)
-        coarse = Poses(now, self.extent * now)
-        fine = jax.tree.map(lambda own: self.spec.fine_rate * own, coarse)
-        bases = Bases(fine, coarse, jnp.zeros_like(now))
+        # Centers are fixed, because a center and a shift are redundant.
+        rate = self.rate(step)
+        coarse = Poses(rate, self.extent * rate)
+        fine = jax.tree.map(lambda rate: self.spec.fine_rate * rate, coarse)
+        bases = Bases(fine, coarse, jnp.zeros_like(rate))
         return MotionParams(jnp.full((), self.spec.logit_rate), bases)
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
-        """Initialize the bases, and logits with which nothing moves."""
+        """Initialize the bases, and logits without motion."""
         _, shared_key = jax.random.split(key)
         mean = gaussians.mean
         logits = init_logits(self.spec, len(mean), mean.dtype)
@@ -264,5 +287,5 @@ class Bound(BoundMotion):
         return deform(motion, params.per_gaussian, gaussians)
 
     def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
-        """Return a closed-form fit of groups of points, from which a fit starts."""
+        """Fit groups of points in closed form, to start a fit of all points from."""
         return fit_to_paths(self.spec, paths)

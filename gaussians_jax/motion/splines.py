@@ -1,12 +1,12 @@
 """Motion of each Gaussian along its own cubic spline.
 
 SplineGS (Park et al. 2025, CVPR, arXiv:2412.09982), section 4.2, its motion-adaptive
-spline (equations 3 and 4): control points at even times, and between them a cubic
-Hermite polynomial whose slopes are those of the chord between the neighbors, which is
-Catmull-Rom. Left open are the slopes at the ends, where a neighbor is missing (here
-the end stands for it), and how many control points there are at first. All Gaussians
-have as many here; the paper takes away those that hardly matter (equations 7 and 8). It
-moves means; here turns have control points, too: rotation vectors, interpolated alike.
+spline (equations 3 and 4): control points at evenly spaced times, with cubic Hermite
+interpolation whose tangents are the chords between the neighbors (Catmull-Rom). The
+paper does not specify the tangents at the ends, where a neighbor is missing (here the
+end point is repeated), and the initial number of control points. Here it is the same
+for all Gaussians and constant, while the paper prunes control points (equations 7 and
+8). The paper moves means only. Here rotation vectors are interpolated in the same way.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from gaussians_jax.core import splats, time_knots
 from gaussians_jax.core.metadata import SceneMetadata
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
-from gaussians_jax.init import path_fit
-from gaussians_jax.init.path_fit import Guess, Paths, Points
+from gaussians_jax.init import motion_fit
+from gaussians_jax.init.motion_fit import Guess, Paths, Points
 from gaussians_jax.motion.bound import BoundMotion
 from nerfies_jax.geometry.precision import exact_einsum
 from nerfies_jax.training import schedules
@@ -33,59 +33,82 @@ NAME = "spline_motion"
 
 @dataclasses.dataclass(frozen=True)
 class SplineMotionSpec:
-    """Number and learning rates of control points, with shifts in scene extents."""
+    """Settings of the splines. Learning rates of shifts are relative to the extent."""
 
-    knots: int = 12  # evenly over the film
+    knots: int = 12  # evenly spaced over the video
     warm_up: int = steps(0)  # steps without motion
-    learning_rate: float = 1e-3  # of turns (rad) and shifts
+    learning_rate: float = 1e-3  # of rotations (rad) and shifts
     learning_rate_end: float = 1e-5
 
     def __post_init__(self):
         if self.knots < 2:
             raise ValueError(
-                f"knots={self.knots}: a motion has at least two, its first and its "
-                "last instant"
+                f"knots={self.knots} must be at least two, at the first and the last "
+                "frame time"
             )
         if self.warm_up < 0:
             raise ValueError(f"warm_up={self.warm_up} must not be negative")
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the motion for a run of `run_steps` of this capture."""
+        """Return the motion for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.extent)
 
 
 class Splines(NamedTuple):
     """Per-Gaussian parameters of the motion."""
 
-    shift: Float[Array, "gaussians knots 3"]  # from the mean of its row, scene units
+    shift: Float[Array, "gaussians knots 3"]  # from the canonical mean, scene units
     turn: Float[Array, "gaussians knots 3"]  # rotation vectors, rad, in world axes
 
 
 def init(spec: SplineMotionSpec, gaussians: int, dtype=jnp.float32) -> Splines:
-    """Nothing moves yet."""
+    """Initialize control points without motion.
+
+    Args:
+      spec: Settings.
+      gaussians: Number of Gaussians.
+      dtype: Floating-point type.
+
+    Returns:
+      The control points.
+    """
     zero = jnp.zeros((gaussians, spec.knots, 3), dtype)
     return Splines(zero, zero)
 
 
 def deform(rows: Splines, gaussians: Gaussians, time: Float[Array, ""]) -> Gaussians:
-    """Move Gaussians along their splines, with the time clamped to [0, 1].
+    """Move Gaussians along their splines (equation 3).
 
-    Equation 3, of shifts from the mean of the row.
+    Args:
+      rows: Control points.
+      gaussians: Gaussians in their canonical state.
+      time: Normalized time, clamped to [0, 1].
+
+    Returns:
+      The moved Gaussians.
     """
     weights = time_knots.spline_weights(rows.shift.shape[1], time)
     shift, turn = (exact_einsum("k,nkc->nc", weights, leaf) for leaf in rows)
     return gaussians._replace(
-        mean=gaussians.mean + shift, quaternion=splats.turned(gaussians, turn)
+        mean=gaussians.mean + shift, quaternion=splats.rotate(gaussians, turn)
     )
 
 
 def fit_to_paths(spec: SplineMotionSpec, paths: Paths) -> Guess:
-    """Each path by its own least squares (equation 6), in closed form."""
+    """Fit each path by its own least squares (equation 6), in closed form.
+
+    Args:
+      spec: Settings.
+      paths: The paths.
+
+    Returns:
+      The fit.
+    """
     weights = np.stack(
         [time_knots.spline_weights(spec.knots, jnp.asarray(t)) for t in paths.times]
     )
-    fitted = path_fit.combination(weights, paths)
+    fitted = motion_fit.combination(weights, paths)
     mean = fitted.mean(axis=1)
     shift = jnp.asarray(fitted - mean[:, None], jnp.float32)
     rows = Splines(shift, jnp.zeros_like(shift))
@@ -99,7 +122,7 @@ class Bound(BoundMotion):
     """The `Motion` of a `SplineMotionSpec` in a run of `steps`."""
 
     spec: SplineMotionSpec
-    extent: float  # of the scene, the unit of shifts, scene units
+    extent: float  # of the scene, the unit of shifts, in scene units
 
     name = NAME
 
@@ -108,7 +131,7 @@ class Bound(BoundMotion):
         return MotionParams(Splines(self.extent * self.rate(step), self.rate(step)))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
-        """Initialize control points with which nothing moves."""
+        """Initialize control points without motion."""
         mean = gaussians.mean
         return MotionParams(init(self.spec, len(mean), mean.dtype))
 
@@ -123,5 +146,5 @@ class Bound(BoundMotion):
         return deform(params.per_gaussian, gaussians, frame.time)
 
     def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
-        """Return a closed-form fit of each path by itself, from which a fit starts."""
+        """Fit each path separately in closed form, to start a fit of all from."""
         return fit_to_paths(self.spec, paths)

@@ -1,11 +1,11 @@
 """Gaussians that are visible during a part of the video only.
 
 The temporal opacity of Spacetime Gaussians (Li et al. 2024, arXiv:2312.16812, equation
-7 as readers quote it: the text was not at hand) by itself, beside any motion: what
-turns its back on the camera need not be the same Gaussians as what it shows then, and a
-track that is lost need not be found again. One that was lifted from a moving pixel is
-first seen around the time of that picture, for about as long as tracks there were
-followed; any other one all the time, until training finds a time for it.
+7 as cited by others, because the paper was not available), combined with any motion. It
+allows a surface that turns away and its other side to be different Gaussians, and a
+track that is lost to continue as a new one. A Gaussian lifted from a moving pixel is
+initially visible around the time of that frame, for as long as nearby tracks last. Any
+other Gaussian is always visible until training changes its time.
 """
 
 import dataclasses
@@ -23,37 +23,37 @@ from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.fit import check_positive
 
 NAME = "temporal_opacity"
-# Of the width of the opacity over time, in films: from a ten-thousandth to longer than
-# any. Outside it has no slope, and the quotient s / w stays finite.
+# Range of the logarithm of the width, in videos. Outside there is no gradient, and the
+# quotient s / w stays finite.
 LOG_WIDTH_RANGE = (-9.0, 9.0)
-ALWAYS = LOG_WIDTH_RANGE[1] / 2  # 90 films: the least share of one film is 0.99997
+ALWAYS = LOG_WIDTH_RANGE[1] / 2  # 90 videos: opacities are at least 0.99997 of theirs
 
 
 @dataclasses.dataclass(frozen=True)
 class TemporalOpacitySpec:
     """Initial duration of visibility, and its learning rates.
 
-    `width` is relative to the duration of nearby tracks. 1/e of the opacity is left at
-    that distance from the Gaussian's own time.
+    `width` is relative to the duration of nearby tracks. At that distance from the
+    temporal center, 1/e of the opacity is left.
     """
 
     width: float = 0.5
     width_rate: float = 3e-2  # of the logarithm
-    time_rate: float = 1e-3  # of the time of its own, in films
+    time_rate: float = 1e-3  # of the temporal center, in videos
 
     def __post_init__(self):
         check_positive(**dataclasses.asdict(self))
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the part of a scene with these settings."""
+        """Return the component of a scene with these settings."""
         return Bound(self)
 
 
 class Fading(NamedTuple):
-    """When a Gaussian is to be seen."""
+    """Temporal center and width of the opacity of each Gaussian."""
 
-    time: Float[Array, " gaussians"]  # of its own, in films from the first frame
-    log_width: Float[Array, " gaussians"]  # of films
+    time: Float[Array, " gaussians"]  # temporal center, in videos from the first frame
+    log_width: Float[Array, " gaussians"]  # width in videos
 
 
 def visible_share(
@@ -61,31 +61,40 @@ def visible_share(
 ) -> Float[Array, "*gaussians"]:
     """Compute exp(-(s / w)^2) with w = exp(`log_width`).
 
-    The paper's code has the same, and the paper writes exp(-c s^2) with c = 1 / w^2.
-    Value and gradients are finite for any width. The published exponential of an
-    unclamped width is 0/0 at s = 0 once the width has underflowed.
+    The paper's code is the same, and the paper writes exp(-c s^2) with c = 1 / w^2.
+    Values and gradients are finite for any width. The published exponential of an
+    unclamped width is 0/0 at s = 0 once the width underflows.
 
     Args:
-      since: Time s from the Gaussian's own time, in units of the video.
+      since: Time s since the temporal center, in units of the video.
       log_width: Logarithm of the width.
 
     Returns:
       Factors of the opacity.
     """
-    held = jnp.clip(log_width, *LOG_WIDTH_RANGE)
-    return jnp.exp(-jnp.square(since * jnp.exp(-held)))
+    clamped = jnp.clip(log_width, *LOG_WIDTH_RANGE)
+    return jnp.exp(-jnp.square(since * jnp.exp(-clamped)))
 
 
 def faded(rows: Fading, gaussians: Gaussians, time: Float[Array, ""]) -> Gaussians:
-    """Gaussians with the share of their opacity that is left at a time in [0, 1]."""
+    """Multiply opacities by `visible_share` at a time.
+
+    Args:
+      rows: Temporal centers and widths.
+      gaussians: The Gaussians.
+      time: Normalized time in [0, 1].
+
+    Returns:
+      The Gaussians with the opacity at that time.
+    """
     share = visible_share(time - rows.time, rows.log_width)
     return gaussians._replace(opacity=gaussians.opacity * share)
 
 
 def always(gaussians: int, dtype) -> Fading:
-    """Seen all the time."""
-    own = jnp.full(gaussians, 0.5, dtype)
-    return Fading(own, jnp.full(gaussians, ALWAYS, dtype))
+    """Return parameters of Gaussians that are visible at all times."""
+    center = jnp.full(gaussians, 0.5, dtype)
+    return Fading(center, jnp.full(gaussians, ALWAYS, dtype))
 
 
 def around(
@@ -110,7 +119,7 @@ def around(
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """The `Motion` of a `TemporalOpacitySpec`: it moves nothing, and fades."""
+    """The `Motion` of a `TemporalOpacitySpec`, which changes opacities only."""
 
     spec: TemporalOpacitySpec
 
@@ -134,7 +143,7 @@ class Bound:
         gaussians: Gaussians,
         frame: FrameCondition,
     ) -> Gaussians:
-        """Fade the Gaussians at a time."""
+        """Multiply the opacities by their value at a time."""
         return faded(params.per_gaussian, gaussians, frame.time)
 
     def lifted_rows(

@@ -1,16 +1,15 @@
-"""Motion along a few trajectories that all Gaussians share, with their own
-coefficients.
+"""Motion along a few shared trajectories, with coefficients of each Gaussian.
 
-DynMF (Kratimenos et al. 2024, arXiv:2312.00112): a tiny network of the time alone makes
-K trajectories b_k(t), a Gaussian keeps K coefficients c_k, and is at p + sum_k c_k
-b_k(t). The factorization of all paths into K is that of a singular value decomposition,
-so a scene of few bodies needs few. Like the paper, one coefficient stands for all parts
-of a trajectory, here a shift and a turn; coefficients are sparse (`sparsity`) and alike
-among neighbors (`effects.neighbors`). A Gaussian whose coefficients are zero does not
-move, exactly, and so all start.
+DynMF (Kratimenos et al. 2024, arXiv:2312.00112): a tiny network of the time alone
+computes K trajectories b_k(t). A Gaussian has K coefficients c_k and is at p + sum_k
+c_k b_k(t). This factorizes all paths into K like a singular value decomposition, so a
+scene of few rigid bodies needs few trajectories. As in the paper, one coefficient
+applies to all components of a trajectory, here a translation and a rotation.
+Coefficients are sparse (`sparsity`) and similar among neighbors (`losses.neighbors`).
+A Gaussian with zero coefficients is exactly static, and all are initialized like that.
 
-The paper's equations were not at hand, only its abstract and accounts of its method,
-and its repository (agelosk/dynmf) holds no code: these are followed, without numbers.
+The paper's equations were not available, only its abstract and descriptions by others,
+and its repository (agelosk/dynmf) has no code. These descriptions give no numbers.
 """
 
 import dataclasses
@@ -40,8 +39,8 @@ from nerfies_jax.training.effects import (
 from nerfies_jax.training.step_counts import steps
 
 NAME = "time_basis"
-# A row whose largest coefficient is well below this counts as one at rest: it would
-# move by 1e-3 of a trajectory.
+# A Gaussian whose largest coefficient is well below this counts as static, because it
+# moves by less than 1e-3 of a trajectory.
 REST = 1e-3
 
 
@@ -49,17 +48,17 @@ REST = 1e-3
 class TimeBasisSpec:
     """Number of trajectories, their network, and learning rates.
 
-    Trajectories are in scene extents (translations) and rad (rotations), coefficients
-    are numbers. Ten trajectories are published, and their network is called tiny. Its
-    size, the weight of the sparsity and the rates are our choice, because no code of
-    the paper is public.
+    Trajectories are in scene extents (translations) and rad (rotations), and
+    coefficients have no unit. The paper uses ten trajectories and calls their network
+    tiny. Its size, the weight of the sparsity and the rates are our choice, because the
+    code is not public.
     """
 
     count: int = 10
     time: EncodingSpec = EncodingSpec(6, times_pi=True)
     depth: int = 3
     width: int = 128
-    sparsity: float | None = 1e-3  # weight; None leaves it out
+    sparsity: float | None = 1e-3  # weight; None disables the loss
     warm_up: int = steps(3000)  # steps without motion
     learning_rate: float = 8e-4  # of the network
     learning_rate_end: float = 1.6e-6
@@ -69,21 +68,21 @@ class TimeBasisSpec:
     def __post_init__(self):
         if self.count < 1:
             raise ValueError(
-                f"count={self.count}: a time basis has at least one trajectory"
+                f"count={self.count}: a time basis needs at least one trajectory"
             )
         if self.sparsity is not None and not 0 < self.sparsity < math.inf:
             raise ValueError(
-                f"sparsity={self.sparsity} is a weight, finite and positive; None "
-                "leaves it out"
+                f"sparsity={self.sparsity} must be finite and positive; None disables "
+                "it"
             )
         if self.warm_up < 0:
             raise ValueError(f"warm_up={self.warm_up} must not be negative")
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
         schedules.check_falling(self.coefficient_rate, self.coefficient_rate_end)
-        network_spec(self)  # checks its sizes
+        network_spec(self)  # validates the sizes
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the motion for a run of `run_steps` of this capture."""
+        """Return the motion for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.extent)
 
 
@@ -95,10 +94,16 @@ class Trajectories(NamedTuple):
 
 
 def network_spec(spec: TimeBasisSpec) -> MLPSpec:
-    """From the encoded time to all trajectories.
+    """Settings of the network from the encoded time to all trajectories.
 
-    They start about as long as one: coefficients start at zero, and were both zero,
-    neither would get a gradient.
+    Trajectories are initialized with a length of about one. Coefficients are zero at
+    first, and if trajectories were zero as well, neither would get a gradient.
+
+    Args:
+      spec: Settings.
+
+    Returns:
+      Settings of the network.
     """
     heads = (
         ("shift", HeadSpec(3 * spec.count)),
@@ -112,22 +117,32 @@ SMALL_TIME_BASIS = TimeBasisSpec(time=EncodingSpec(4, times_pi=True), depth=2, w
 
 
 def init(key: Key[Array, ""], spec: TimeBasisSpec, dtype=jnp.float32) -> MLP:
-    """A network whose trajectories are all different."""
+    """Initialize a network whose trajectories are all different."""
     return mlp.init(network_spec(spec), key, dtype)
 
 
 def init_coefficients(spec: TimeBasisSpec, gaussians: int, dtype=jnp.float32):
-    """[gaussians, count]: all stay where they are."""
+    """Initialize static coefficients [gaussians, count]."""
     return jnp.zeros((gaussians, spec.count), dtype)
 
 
 def at_time(
     params: MLP, spec: TimeBasisSpec, extent: float, time: Float[Array, ""]
 ) -> Trajectories:
-    """Evaluate the trajectories at a time, with `extent` (scene units) as unit."""
+    """Evaluate the trajectories at a time.
+
+    Args:
+      params: Parameters of the network.
+      spec: Settings.
+      extent: Extent of the scene, the unit of translations, in scene units.
+      time: Normalized time.
+
+    Returns:
+      The trajectories.
+    """
     encoded = encoding.encode(spec.time, time[None], None)
-    made = mlp.apply(network_spec(spec), params, encoded)
-    shift, turn = (made[name].reshape(spec.count, 3) for name in ("shift", "turn"))
+    outputs = mlp.apply(network_spec(spec), params, encoded)
+    shift, turn = (outputs[name].reshape(spec.count, 3) for name in ("shift", "turn"))
     return Trajectories(extent * shift, turn)
 
 
@@ -136,11 +151,20 @@ def deform(
     coefficients: Float[Array, "gaussians count"],
     gaussians: Gaussians,
 ) -> Gaussians:
-    """Gaussians moved along the trajectories in their own measure."""
-    moved = exact_product(coefficients, jnp.concatenate(trajectories, axis=-1))
+    """Move Gaussians along the trajectories by their coefficients.
+
+    Args:
+      trajectories: Trajectories at a time.
+      coefficients: Coefficients of each Gaussian.
+      gaussians: Gaussians in their canonical state.
+
+    Returns:
+      The moved Gaussians.
+    """
+    offset = exact_product(coefficients, jnp.concatenate(trajectories, axis=-1))
     return gaussians._replace(
-        mean=gaussians.mean + moved[:, :3],
-        quaternion=splats.turned(gaussians, moved[:, 3:]),
+        mean=gaussians.mean + offset[:, :3],
+        quaternion=splats.rotate(gaussians, offset[:, 3:]),
     )
 
 
@@ -149,7 +173,7 @@ def sparsity(
 ) -> Float[Array, ""]:
     """Compute the mean over the active Gaussians of sum_k |c_k| / max_k |c_k|.
 
-    The sparsity term of DynMF, as others describe it. It measures the number of
+    The sparsity loss of DynMF, as others describe it. It measures the number of
     trajectories in use, from 1 to K, and not the distance. The plain quotient is 0/0
     for a static Gaussian. With `REST` added to its denominator it goes to zero there,
     and its gradient is at most K / REST.
@@ -161,7 +185,7 @@ def sparsity(
     Returns:
       The mean.
     """
-    # Not `abs`, whose slope at zero is one: all that rests would be pushed one way.
+    # Not `abs`, whose gradient at zero is one and would move static Gaussians.
     size = coefficients * jnp.sign(coefficients)
     used = jnp.sum(size, axis=-1) / (jnp.max(size, axis=-1) + REST)
     number = jnp.sum(active, dtype=jnp.int32)
@@ -174,7 +198,7 @@ class Bound(BoundMotion):
     """The `Motion` of a `TimeBasisSpec` in a run of `steps`."""
 
     spec: TimeBasisSpec
-    extent: float  # of the scene, the unit of shifts, scene units
+    extent: float  # of the scene, the unit of translations, in scene units
 
     name = NAME
 
@@ -187,7 +211,7 @@ class Bound(BoundMotion):
         return MotionParams(coefficients(step), self.rate(step))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
-        """Initialize the network, and coefficients with which nothing moves."""
+        """Initialize the network, and coefficients without motion."""
         _, shared_key = jax.random.split(key)
         mean = gaussians.mean
         coefficients = init_coefficients(self.spec, len(mean), mean.dtype)
@@ -205,7 +229,7 @@ class Bound(BoundMotion):
         return deform(trajectories, params.per_gaussian, gaussians)
 
     def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:
-        """Compute how many trajectories a Gaussian uses, once the motion has begun."""
+        """Compute the number of trajectories in use, after the warm-up."""
         if self.spec.sparsity is None:
             return {}
         active = splats.active_mask(context.params.rows["splats"])

@@ -1,9 +1,9 @@
 """Adaptive density control: clone small Gaussians, split large ones, prune faint ones.
 
 Kerbl et al. 2023, arXiv:2308.04079, section 5.2, with the constants of its reference
-implementation. Statistics are gathered inside the step (`observe`, pure). Events run on
+implementation. Statistics are accumulated in the step (`observe`, pure). Events run on
 the host between two chunks, because they may change the capacity. They decide in NumPy
-and move parameters in one compiled gather per pair of capacities.
+and change parameters by one compiled gather per pair of capacities.
 """
 
 import dataclasses
@@ -26,27 +26,27 @@ from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
 FAINT_LOGIT = -20.0  # below it an opacity is halved by its series
-KEPT, CLONED, CLONE, CHILD = 0, 1, 2, 3  # what a row is after the event
+KEPT, CLONED, CLONE, CHILD = 0, 1, 2, 3  # role of a Gaussian after the event
 
 
 @dataclasses.dataclass(frozen=True)
 class DefaultStrategySpec:
-    """When and where Gaussians are added and removed."""
+    """Settings of densification, pruning and opacity resets."""
 
     refine_every: int = 100  # steps
     refine_start_iter: int = steps(600)  # the first event (500 in the paper)
     refine_stop_iter: int = steps(15_000)
-    grow_grad2d: float = 2e-4  # of the mean on the screen, in NDC units per view
-    grow_scale3d: float = 0.01  # largest scale, of the scene extent
-    shrink: float = 1.6  # scale of a parent over that of its children
+    grow_grad2d: float = 2e-4  # gradient of the projected mean, NDC units per view
+    grow_scale3d: float = 0.01  # larger ones are split, as a share of the scene extent
+    shrink: float = 1.6  # scale of a parent divided by that of its children
     prune_opa: float = 0.005
-    prune_scale3d: float = 0.1  # largest scale, of the scene extent
+    prune_scale3d: float = 0.1  # larger ones are pruned, as a share of the scene extent
     prune_radius_px: float | None = None  # 20 in the paper, where it had no effect
     # Pruning by size starts after the first reset.
     reset_every: int = steps(3000)
     reset_opacity: float = 0.01
     cap_max: int = 1_000_000  # Gaussians
-    revised_opacity: bool = False  # two halves together as opaque as the parent
+    revised_opacity: bool = False  # two halves have the opacity of the parent together
 
     def __post_init__(self):
         if not 0 < self.prune_opa < self.reset_opacity < 1:
@@ -57,12 +57,17 @@ class DefaultStrategySpec:
             )
         for name in ("refine_every", "reset_every", "cap_max"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} is at least 1, got {getattr(self, name)}")
+                raise ValueError(
+                    f"{name} must be at least 1, got {getattr(self, name)}"
+                )
         if not self.shrink > 1:
-            raise ValueError(f"children are smaller: shrink > 1, got {self.shrink}")
+            raise ValueError(
+                f"shrink must be larger than 1, got {self.shrink}, because children "
+                "are smaller than their parent"
+            )
 
     def init(self, gaussians: Splats) -> "RowStats":
-        """Return statistics of no view yet."""
+        """Return the statistics before any view."""
         return empty_stats(gaussians)
 
     def update(self, state: "RowStats", info: StepInfo) -> "RowStats":
@@ -77,7 +82,7 @@ class DefaultStrategySpec:
         )
 
     def events(self, steps: int) -> tuple[StrategyEvent, ...]:
-        """Return when Gaussians grow and are pruned, and when opacities are reset."""
+        """Return the events of densification, with pruning, and of opacity resets."""
         last = min(self.refine_stop_iter, steps)
         grow = tuple(range(self.refine_start_iter, last, self.refine_every))
         resets = tuple(range(self.reset_every, last, self.reset_every))
@@ -111,8 +116,8 @@ class RowStats(NamedTuple):
 
     active: Bool[Array, " gaussians"]
     grad2d: Float[Array, " gaussians"]  # summed norms, NDC units
-    views: Int[Array, " gaussians"]  # in which the row was visible
-    radius_px: Float[Array, " gaussians"]  # the largest seen
+    views: Int[Array, " gaussians"]  # in which the Gaussian was visible
+    radius_px: Float[Array, " gaussians"]  # largest in any view
 
 
 class Report(NamedTuple):
@@ -122,7 +127,7 @@ class Report(NamedTuple):
     split: int = 0
     pruned: int = 0  # faint or too large
     broken: int = 0  # pruned because a value was not finite
-    refused: int = 0  # should have grown, but the cap is reached
+    refused: int = 0  # not densified because the cap is reached
     relocated: int = 0
     active: int = 0
     capacity: int = 0
@@ -138,38 +143,38 @@ class Changed(NamedTuple):
 
 
 def empty_stats(rows: Splats) -> RowStats:
-    """Nothing observed yet."""
+    """Return the statistics before any view."""
     like = rows.opacity_logit
     return RowStats(
         active=splats.active_mask(rows),
         grad2d=jnp.zeros_like(like),
         views=jnp.zeros(like.shape, jnp.int32),
-        radius_px=jnp.zeros_like(like),  # its own buffer: the loop donates them all
+        radius_px=jnp.zeros_like(like),  # a separate buffer, because all are donated
     )
 
 
 def observe(
     stats: RowStats,
-    mean2d_gradient_px: Float[Array, "drawn 2"],
-    visible: Bool[Array, " drawn"],
-    radius_px: Float[Array, " drawn"],
+    mean2d_gradient_px: Float[Array, "rendered 2"],
+    visible: Bool[Array, " rendered"],
+    radius_px: Float[Array, " rendered"],
     size: tuple[int, int],
-    significance: Float[Array, " drawn"] | None = None,
+    significance: Float[Array, " rendered"] | None = None,
 ) -> RowStats:
     """Add one view to the statistics.
 
     Thresholds are in normalized device coordinates. A pixel is 2/width of their range,
-    so gradients are multiplied by width/2 and height/2. Each view of a batch counts by
-    itself. 4DGS, E-D3DGS and ADC-GS add the gradients of the mean loss and count a
-    batch once: for two views that is as large if both agree, and half if only one sees
-    the Gaussian.
+    so gradients are multiplied by width/2 and height/2. Each view of a batch counts
+    separately. 4DGS, E-D3DGS and ADC-GS add the gradients of the mean loss and count a
+    batch once. For two views that is as large if both gradients agree, and half if only
+    one view shows the Gaussian.
 
     Args:
       stats: Statistics so far.
-      mean2d_gradient_px: Gradient of that view's own loss (not of the mean over a
+      mean2d_gradient_px: Gradient of the view's own loss (not of the mean over a
         batch) with respect to the projected means in pixels. For the absolute variant,
         the sum of its absolute values over the pixels.
-      visible: Whether the Gaussian lies in the image.
+      visible: True where the Gaussian overlaps the image.
       radius_px: Radius of the footprint in pixels.
       size: (width, height) of the image in pixels.
       significance: Weights of child Gaussians, if each parent has several. A parent
@@ -219,17 +224,17 @@ def densify(
 ) -> Changed:
     """Clone, split and prune Gaussians, on the host.
 
-    A Gaussian grows if its mean gradient per view reaches the threshold: a small one is
-    duplicated, and a large one is replaced by two samples from it. If the cap does not
-    suffice for all, those with the largest gradient grow. An effect with its own score
-    scales `stats.grad2d` first. New Gaussians have zero moments.
+    A Gaussian is densified if its mean gradient per view reaches the threshold: a small
+    one is cloned, and a large one is replaced by two samples from it. If the cap does
+    not suffice for all, those with the largest gradient are chosen. A component with
+    its own score scales `stats.grad2d` first. New Gaussians have zero moments.
 
     Args:
       optimizer: The optimizer.
       params: All parameters.
       moments: State of the optimizer.
       stats: Statistics since the last event.
-      key: Random key of the samples.
+      key: PRNG key of the samples.
       spec: Settings.
       step: Number of completed steps.
       extent: Scene extent (`splats.scene_extent`).
@@ -240,16 +245,16 @@ def densify(
     rows, kind, report = _plan(params.rows["splats"], stats, spec, step, extent)
     count, capacity = len(rows), stats.active.shape[0]
     needed = splats.capacity_for(count, spec.cap_max)
-    # Two buckets of slack before shrinking: a wavering count must not recompile.
+    # Shrinks by two buckets only, so that small changes of the count do not recompile.
     if needed > capacity or count * 9 < capacity * 4:
         capacity = needed
-    idle = capacity - count
+    padding = capacity - count
     params, moments, fresh = _rebuild(
         optimizer,
         params,
         moments,
-        np.pad(rows, (0, idle)).astype(np.int32),
-        np.pad(kind, (0, idle)).astype(np.int32),
+        np.pad(rows, (0, padding)).astype(np.int32),
+        np.pad(kind, (0, padding)).astype(np.int32),
         np.arange(capacity) >= count,
         key,
         spec.shrink,
@@ -262,10 +267,10 @@ def densify(
 def _plan(rows, stats, spec, step, extent):
     """Choose the source of each new Gaussian, and its role."""
     stats = jax.tree.map(np.asarray, stats)
-    whole, opacity, scale = map(np.asarray, row_summary(rows))
+    finite, opacity, scale = map(np.asarray, row_summary(rows))
     score = stats.grad2d / np.maximum(stats.views, 1)
 
-    kept = stats.active & whole & (opacity >= spec.prune_opa)
+    kept = stats.active & finite & (opacity >= spec.prune_opa)
     grows = kept & (score >= spec.grow_grad2d)
     splits = grows & (scale > spec.grow_scale3d * extent)
     large = np.zeros_like(kept)
@@ -276,32 +281,32 @@ def _plan(rows, stats, spec, step, extent):
             large |= stats.radius_px > spec.prune_radius_px
         kept &= np.where(splits, scale / spec.shrink <= bound, ~large)
     grows &= kept
-    room = max(spec.cap_max - int(kept.sum()), 0)
-    wanting = np.flatnonzero(grows)
-    best = wanting[np.argsort(-score[wanting], kind="stable")][:room]
+    free_slots = max(spec.cap_max - int(kept.sum()), 0)
+    candidates = np.flatnonzero(grows)
+    best = candidates[np.argsort(-score[candidates], kind="stable")][:free_slots]
     chosen = np.zeros_like(grows)
     chosen[best] = True
     splits &= chosen
-    kept &= splits | ~large  # whom the cap refuses to split stays as large as it is
+    kept &= splits | ~large  # large ones that the cap prevents from splitting stay
 
     clones = np.flatnonzero(chosen & ~splits)
     parents = np.flatnonzero(splits)
-    stay = np.flatnonzero(kept & ~splits)
-    source = np.concatenate([stay, clones, np.repeat(parents, 2)])
+    unchanged = np.flatnonzero(kept & ~splits)
+    source = np.concatenate([unchanged, clones, np.repeat(parents, 2)])
     kind = np.concatenate(
         [
-            np.where(np.isin(stay, clones), CLONED, KEPT),
+            np.where(np.isin(unchanged, clones), CLONED, KEPT),
             np.full(len(clones), CLONE),
             np.full(2 * len(parents), CHILD),
         ]
     )
-    broken = int((stats.active & ~whole).sum())
+    broken = int((stats.active & ~finite).sum())
     report = Report(
         cloned=len(clones),
         split=len(parents),
         pruned=int((stats.active & ~kept).sum()) - broken,
         broken=broken,
-        refused=len(wanting) - len(best),
+        refused=len(candidates) - len(best),
     )
     return source, kind, report
 
@@ -317,12 +322,12 @@ def row_summary(rows):
       Three arrays [gaussians].
     """
 
-    def finite(leaf):
+    def is_finite(leaf):
         return jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1)
 
-    whole = functools.reduce(jnp.logical_and, map(finite, rows))
-    drawn = splats.activate(rows)
-    return whole, drawn.opacity, jnp.max(drawn.scale, axis=1)
+    finite = functools.reduce(jnp.logical_and, map(is_finite, rows))
+    activated = splats.activate(rows)
+    return finite, activated.opacity, jnp.max(activated.scale, axis=1)
 
 
 @functools.partial(jax.jit, static_argnames=("optimizer", "shrink", "revised"))
@@ -331,13 +336,13 @@ def _rebuild(optimizer, params, moments, rows, kind, inactive, key, shrink, revi
     params, moments = row_optimizer.gather_rows(
         optimizer, params, moments, rows, fresh, inactive
     )
-    moved = split_rows(params.rows["splats"], kind == CHILD, key, shrink)
+    split = split_rows(params.rows["splats"], kind == CHILD, key, shrink)
     if revised:
-        halved = halve_opacity(moved.opacity_logit)
-        logit = jnp.where((kind == KEPT) | inactive, moved.opacity_logit, halved)
-        moved = moved._replace(opacity_logit=logit)
-    params = params._replace(rows=params.rows | {"splats": moved})
-    return params, moments, empty_stats(moved)
+        half_logit = halve_opacity(split.opacity_logit)
+        logit = jnp.where((kind == KEPT) | inactive, split.opacity_logit, half_logit)
+        split = split._replace(opacity_logit=logit)
+    params = params._replace(rows=params.rows | {"splats": split})
+    return params, moments, empty_stats(split)
 
 
 def split_rows(
@@ -351,15 +356,15 @@ def split_rows(
     Args:
       rows: Raw parameters.
       child: True for the children.
-      key: Random key.
+      key: PRNG key.
       shrink: Divisor of their scale.
 
     Returns:
       Raw parameters.
     """
-    drawn = splats.activate(rows)
+    activated = splats.activate(rows)
     noise = jax.random.normal(key, rows.mean.shape, rows.mean.dtype)
-    offset = jax.vmap(quaternion.rotate)(rows.quaternion, drawn.scale * noise)
+    offset = jax.vmap(quaternion.rotate)(rows.quaternion, activated.scale * noise)
     child = child[:, None]
     return rows._replace(
         mean=jnp.where(child, rows.mean + offset, rows.mean),
@@ -368,7 +373,7 @@ def split_rows(
 
 
 def halve_opacity(logit: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Compute the logit of 1 - sqrt(1 - o), two of which occlude as much as one of o.
+    """Compute the logit of 1 - sqrt(1 - o), two of which together have opacity o.
 
     Args:
       logit: Opacity logits.
@@ -380,10 +385,11 @@ def halve_opacity(logit: Float[Array, " n"]) -> Float[Array, " n"]:
       Rota Bulò et al. 2024 (arXiv:2404.06109), opacity correction after cloning.
     """
     faint = logit < FAINT_LOGIT
-    # l - log 2 - e^l / 4: off by e^2l. The closed form is log 0 from -88 in float32.
+    # l - log 2 - e^l / 4, with an error of e^2l. The closed form is log 0 below -88 in
+    # float32.
     low = jnp.where(faint, logit, FAINT_LOGIT)
     series = low - math.log(2) - jnp.exp(low) / 4
-    # log sqrt(1 - o) without forming 1 - o, which is 0 from a logit of 17 in float32.
+    # log sqrt(1 - o) without 1 - o, which is 0 above a logit of 17 in float32.
     half = jax.nn.log_sigmoid(-jnp.where(faint, 0, logit)) / 2
     return jnp.where(faint, series, jnp.log(-jnp.expm1(half)) - half)
 
@@ -397,7 +403,7 @@ def reset_opacity(
     """Clamp opacities to `spec.reset_opacity`, and reset the moments of the opacities.
 
     If Gaussians have children, only the shared opacity is clamped, and a child may
-    exceed the bound. Inactive Gaussians stay inactive. With the renderer's cut at
+    exceed the bound. Inactive Gaussians stay inactive. With the renderer's cutoff of
     1/255, a Gaussian reset to 0.01 gets gradients only within 1.37 standard deviations.
 
     Args:
@@ -413,8 +419,8 @@ def reset_opacity(
     bound = math.log(spec.reset_opacity / (1 - spec.reset_opacity))
     lowered = rows._replace(opacity_logit=jnp.minimum(rows.opacity_logit, bound))
     params = params._replace(rows=params.rows | {"splats": lowered})
-    chosen = jax.tree.map(lambda _: False, params)
-    only = chosen.rows["splats"]._replace(opacity_logit=True)
-    chosen = chosen._replace(rows=chosen.rows | {"splats": only})
-    moments = row_optimizer.map_moments(optimizer, jnp.zeros_like, moments, chosen)
+    mirrored = jax.tree.map(lambda _: False, params)
+    opacity_only = mirrored.rows["splats"]._replace(opacity_logit=True)
+    mirrored = mirrored._replace(rows=mirrored.rows | {"splats": opacity_only})
+    moments = row_optimizer.map_moments(optimizer, jnp.zeros_like, moments, mirrored)
     return params, moments

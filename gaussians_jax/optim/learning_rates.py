@@ -17,7 +17,7 @@ from nerfies_jax.training import schedules
 class LearningRateSpec:
     """Adam's learning rates: the defaults of Kerbl et al. 2023, reference code.
 
-    Means learn in units of the scene's extent, decaying log-linearly over the run.
+    Rates of means are in units of the scene's extent and decay log-linearly.
     """
 
     mean: float = 1.6e-4
@@ -33,7 +33,7 @@ class LearningRateSpec:
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(
-                    f"a learning rate is finite and not negative, got "
+                    f"a learning rate must be finite and not negative, got "
                     f"{field.name}={value}"
                 )
         if self.mean_end <= 0 < self.mean:

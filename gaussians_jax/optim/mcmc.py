@@ -1,7 +1,7 @@
 """3DGS-MCMC densification: a fixed budget of Gaussians that are relocated.
 
 Kheradmand et al. 2024, "3D Gaussian splatting as Markov chain Monte Carlo",
-arXiv:2404.09591, is the alternative to `densification` without gradient thresholds,
+arXiv:2404.09591. In contrast to `densification` there are no gradient thresholds,
 resets and statistics. Noise is added to the means in every step (`position_noise`),
 opacity and scale are penalized (`penalty`), and events (`refine`) run on the host.
 """
@@ -29,8 +29,8 @@ from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
 
-# Trapezoid over [0, 6.4] in steps of 0.1: the integrand is even and entire, so the rule
-# converges geometrically; the tests compare 400-digit sums up to 1000 copies.
+# Trapezoidal rule over [0, 6.4] in steps of 0.1. The integrand is even and entire, so
+# the rule converges geometrically. Tests compare with 400-digit sums up to 1000 copies.
 _NODES = np.arange(64) * 0.1
 
 
@@ -40,15 +40,15 @@ class MCMCStrategySpec:
 
     The values are those of the paper's code, where `cap_max` is set for each scene to
     the final number of Kerbl et al. 2023. The noise depends on the unit of the scene:
-    it grows with the square of the scales and with the extent, which is in the learning
-    rate of the means.
+    it is proportional to the square of the scales and to the extent, which is a factor
+    of the learning rate of the means.
     """
 
     refine_every: int = 100  # steps
     refine_start_iter: int = steps(500)
     refine_stop_iter: int = steps(25_000)
-    min_opacity: float = 0.005  # at most this is free to move
-    growth: float = 1.05  # of the count, per event
+    min_opacity: float = 0.005  # Gaussians at or below it are relocated
+    growth: float = 1.05  # factor of the number of Gaussians per event
     cap_max: int = 1_000_000  # Gaussians
     noise_lr: float = 5e5  # per unit of the learning rate of the means
     opacity_reg: float = 0.01
@@ -69,25 +69,25 @@ class MCMCStrategySpec:
             if getattr(self, name) < 1:
                 raise ValueError(
                     f"{name}={getattr(self, name)} must be at least 1; to keep the "
-                    "Gaussians as they are, leave the strategy out (none)"
+                    "number of Gaussians constant, disable the strategy (None)"
                 )
         for name in ("noise_lr", "opacity_reg", "scale_reg"):
             value = getattr(self, name)
             if not 0 <= value < math.inf:
                 raise ValueError(
-                    f"{name}={value} must be finite and not negative; 0 leaves it out"
+                    f"{name}={value} must be finite and not negative; 0 disables it"
                 )
 
     def init(self, gaussians: Splats) -> tuple[()]:
-        """Return no state: nothing is observed."""
+        """Return an empty state, because no statistics are needed."""
         return ()
 
     def update(self, state: tuple[()], info: StepInfo) -> tuple[()]:
-        """Return no state."""
+        """Return the empty state."""
         return state
 
     def events(self, steps: int) -> tuple[StrategyEvent, ...]:
-        """Return when Gaussians are relocated and added."""
+        """Return the events that relocate and add Gaussians."""
         last = min(self.refine_stop_iter, steps)
         when = tuple(range(self.refine_start_iter, last, self.refine_every))
         return (StrategyEvent("relocate and add", when, self._refine),)
@@ -125,8 +125,8 @@ def compute_relocation(
     """Compute opacity and scale of copies that together replace one Gaussian.
 
     The opacity satisfies (1 - o')^copies = 1 - o, and the scale conserves the mass of
-    the composite along a line through the center. As in the reference, no copy is
-    fainter than `least`, which the scale compensates, and none has an infinite logit.
+    the composite along a line through the center. As in the reference, the opacity of a
+    copy is at least `least`, which the scale compensates. Logits are finite.
 
     Args:
       opacity: Opacity of the Gaussians in [0, 1].
@@ -141,17 +141,17 @@ def compute_relocation(
       Kheradmand et al. 2024 (3DGS-MCMC, arXiv:2404.09591), Equation 9.
     """
     count = copies.astype(opacity.dtype)
-    most = 1 - float(jnp.finfo(opacity.dtype).epsneg)
-    # log1p(-1) is -inf and expm1 of it is -1: an opaque one becomes opaque ones.
-    each = jnp.clip(-jnp.expm1(jnp.log1p(-opacity) / count), least, most)
-    # The paper's double sum of alternating binomials is this integral of what n copies
-    # of o' exp(-u^2) composite to. Every term is positive: nothing cancels in float32
-    # and no table limits the number of copies (51 in the reference).
-    fall = jnp.asarray(np.exp(-(_NODES**2)), opacity.dtype)
+    largest = 1 - float(jnp.finfo(opacity.dtype).epsneg)
+    # log1p(-1) is -inf and expm1 of it is -1, so an opaque one becomes opaque copies.
+    copy_opacity = jnp.clip(-jnp.expm1(jnp.log1p(-opacity) / count), least, largest)
+    # The paper's double sum of alternating binomials equals this integral of the
+    # composite of n copies of o' exp(-u^2). All terms are positive, so nothing cancels
+    # in float32, and no table limits the number of copies (51 in the reference).
+    profile = jnp.asarray(np.exp(-(_NODES**2)), opacity.dtype)
     weight = jnp.asarray(np.where(_NODES == 0, 0.5, 1.0), opacity.dtype)
-    covered = -jnp.expm1(count[:, None] * jnp.log1p(-each[:, None] * fall))
-    mass = exact_product(covered, weight) * (2 * 0.1 / math.sqrt(math.pi))
-    return each, scale * (opacity / mass)[:, None]
+    composite = -jnp.expm1(count[:, None] * jnp.log1p(-copy_opacity[:, None] * profile))
+    mass = exact_product(composite, weight) * (2 * 0.1 / math.sqrt(math.pi))
+    return copy_opacity, scale * (opacity / mass)[:, None]
 
 
 def relocate(
@@ -166,33 +166,33 @@ def relocate(
     Targets are sampled in proportion to their opacity. A target and its copies share
     opacity and scale (`compute_relocation`) and start with zero moments. A Gaussian
     that is not finite is relocated as well, and reported as broken. If nothing is
-    visible, faint ones stay, and the report counts them as refused.
+    visible, faint ones are not relocated, and the report counts them as refused.
 
     Args:
       optimizer: The optimizer.
       params: All parameters.
       moments: State of the optimizer.
-      key: Random key.
+      key: PRNG key.
       spec: Settings.
 
     Returns:
       Parameters, optimizer state and a report.
     """
     rows = params.rows["splats"]
-    active, whole, opacity = _opacities(rows)
-    faint = active & ~(whole & (opacity > spec.min_opacity))
-    seen = active & ~faint
+    active, finite, opacity = _opacities(rows)
+    faint = active & ~(finite & (opacity > spec.min_opacity))
+    visible = active & ~faint
     report = densification.Report(
         active=int(active.sum()),
         capacity=len(active),
-        broken=int((active & ~whole).sum()),
+        broken=int((active & ~finite).sum()),
     )
     if not faint.any():
         return params, moments, report
-    if not seen.any():
+    if not visible.any():
         return params, moments, report._replace(refused=int(faint.sum()))
     source = np.arange(len(active))
-    source[faint] = _draw(key, opacity, seen, int(faint.sum()))
+    source[faint] = _draw(key, opacity, visible, int(faint.sum()))
     params, moments = _spread(optimizer, params, moments, source, ~active, spec)
     return params, moments, report._replace(relocated=int(faint.sum()))
 
@@ -210,19 +210,19 @@ def refine(
       optimizer: The optimizer.
       params: All parameters.
       moments: State of the optimizer.
-      key: Random key.
+      key: PRNG key.
       spec: Settings.
 
     Returns:
       Parameters, optimizer state and a report.
     """
     move_key, add_key = jax.random.split(key)
-    params, moments, moved = relocate(optimizer, params, moments, move_key, spec)
+    params, moments, relocated = relocate(optimizer, params, moments, move_key, spec)
     params, moments, added = add(optimizer, params, moments, add_key, spec)
     report = added._replace(
-        relocated=moved.relocated,
-        refused=moved.refused + added.refused,
-        broken=moved.broken,
+        relocated=relocated.relocated,
+        refused=relocated.refused + added.refused,
+        broken=relocated.broken,
     )
     return params, moments, report
 
@@ -236,37 +236,38 @@ def add(
 ) -> tuple[Params, PyTree, densification.Report]:
     """Grow the number of Gaussians by `spec.growth` up to the cap, on the host.
 
-    The number is rounded down, as in the reference: at 1.05, fewer than 20 do not grow.
+    The number is rounded down, as in the reference: with a factor of 1.05, fewer than
+    20 Gaussians do not grow.
 
     Args:
       optimizer: The optimizer.
       params: All parameters.
       moments: State of the optimizer.
-      key: Random key.
+      key: PRNG key.
       spec: Settings.
 
     Returns:
       Parameters, optimizer state and a report.
     """
     rows = params.rows["splats"]
-    active, whole, opacity = _opacities(rows)
+    active, finite, opacity = _opacities(rows)
     count = int(active.sum())
-    wanted = int(spec.growth * count) - count
-    extra = max(min(wanted, spec.cap_max - count), 0)
-    seen = active & whole & (opacity > 0)
+    requested = int(spec.growth * count) - count
+    extra = max(min(requested, spec.cap_max - count), 0)
+    visible = active & finite & (opacity > 0)
     report = densification.Report(
-        active=count, capacity=len(active), refused=wanted - extra
+        active=count, capacity=len(active), refused=requested - extra
     )
-    if extra == 0 or not seen.any():
-        return params, moments, report._replace(refused=wanted)
+    if extra == 0 or not visible.any():
+        return params, moments, report._replace(refused=requested)
     capacity = max(splats.capacity_for(count + extra, spec.cap_max), len(active))
     source = np.zeros(capacity, int)
     source[: len(active)] = np.arange(len(active))
     inactive = np.ones(capacity, bool)
     inactive[: len(active)] = ~active
-    places = np.flatnonzero(inactive)[:extra]
-    source[places] = _draw(key, opacity, seen, extra)
-    inactive[places] = False
+    slots = np.flatnonzero(inactive)[:extra]
+    source[slots] = _draw(key, opacity, visible, extra)
+    inactive[slots] = False
     params, moments = _spread(optimizer, params, moments, source, inactive, spec)
     report = report._replace(cloned=extra, active=count + extra, capacity=capacity)
     return params, moments, report
@@ -274,16 +275,16 @@ def add(
 
 def _opacities(rows):
     """Return whether each Gaussian is active, whether it is finite, and its opacity."""
-    whole, opacity, _ = densification.row_summary(rows)
+    finite, opacity, _ = densification.row_summary(rows)
     active = np.asarray(splats.active_mask(rows))
-    return active, np.asarray(whole), np.asarray(opacity, np.float64)
+    return active, np.asarray(finite), np.asarray(opacity, np.float64)
 
 
-def _draw(key, opacity, seen, count):
+def _draw(key, opacity, visible, count):
     """Sample `count` of the visible Gaussians in proportion to their opacity."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
-    chance = np.where(seen, opacity, 0)
-    return rng.choice(len(opacity), size=count, p=chance / chance.sum())
+    probability = np.where(visible, opacity, 0)
+    return rng.choice(len(opacity), size=count, p=probability / probability.sum())
 
 
 def _spread(optimizer, params, moments, source, inactive, spec):
@@ -305,8 +306,10 @@ def _share(optimizer, params, moments, source, copies, inactive, least):
         optimizer, params, moments, source, copies > 1, inactive
     )
     rows = params.rows["splats"]
-    drawn = splats.activate(rows)
-    opacity, scale = compute_relocation(drawn.opacity, drawn.scale, copies, least)
+    activated = splats.activate(rows)
+    opacity, scale = compute_relocation(
+        activated.opacity, activated.scale, copies, least
+    )
     shared = copies > 1
     logit = jnp.log(opacity) - jnp.log1p(-opacity)
     rows = rows._replace(
@@ -328,7 +331,7 @@ def position_noise(
     the means, and affects faint Gaussians only. Inactive ones have none.
 
     Args:
-      key: Random key.
+      key: PRNG key.
       rows: Raw parameters.
       learning_rate: Current learning rate of the means.
       spec: Settings.
@@ -339,17 +342,17 @@ def position_noise(
     References:
       Kheradmand et al. 2024 (3DGS-MCMC, arXiv:2404.09591), Equation 8.
     """
-    drawn = splats.activate(rows)
+    activated = splats.activate(rows)
     noise = jax.random.normal(key, rows.mean.shape, rows.mean.dtype)
     axes = jax.vmap(quaternion.to_matrix)(
         rows.quaternion
     )  # columns are the principal axes
-    along = exact_einsum("nji,nj->ni", axes, noise) * drawn.scale**2
-    shaped = exact_einsum("nij,nj->ni", axes, along)
-    faint = jax.nn.sigmoid(-100 * (drawn.opacity - spec.min_opacity))
+    principal = exact_einsum("nji,nj->ni", axes, noise) * activated.scale**2
+    displacement = exact_einsum("nij,nj->ni", axes, principal)
+    faint = jax.nn.sigmoid(-100 * (activated.opacity - spec.min_opacity))
     rate = jnp.asarray(spec.noise_lr * learning_rate, faint.dtype)
     strength = jnp.where(splats.active_mask(rows), faint * rate, 0)
-    return strength[:, None] * shaped
+    return strength[:, None] * displacement
 
 
 def inject_noise(
@@ -378,7 +381,7 @@ def inject_noise(
 def penalty(rows: Splats, spec: MCMCStrategySpec) -> Float[Array, ""]:
     """Penalize the mean opacity and scale of the active Gaussians.
 
-    The paper has sums, its code has means.
+    The paper uses sums, its code means.
 
     Args:
       rows: Raw parameters.
@@ -390,9 +393,9 @@ def penalty(rows: Splats, spec: MCMCStrategySpec) -> Float[Array, ""]:
     References:
       Kheradmand et al. 2024 (3DGS-MCMC, arXiv:2404.09591), Equation 10.
     """
-    drawn = splats.activate(rows)
+    activated = splats.activate(rows)
     active = splats.active_mask(rows)
-    count = jnp.maximum(jnp.sum(active), 1).astype(drawn.opacity.dtype)
-    opacity = jnp.sum(jnp.where(active, drawn.opacity, 0)) / count
-    scale = jnp.sum(jnp.where(active[:, None], drawn.scale, 0)) / (3 * count)
+    count = jnp.maximum(jnp.sum(active), 1).astype(activated.opacity.dtype)
+    opacity = jnp.sum(jnp.where(active, activated.opacity, 0)) / count
+    scale = jnp.sum(jnp.where(active[:, None], activated.scale, 0)) / (3 * count)
     return spec.opacity_reg * opacity + spec.scale_reg * scale

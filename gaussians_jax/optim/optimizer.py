@@ -27,11 +27,11 @@ class RowAdamState(NamedTuple):
 def scale_by_row_adam(
     b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15
 ) -> optax.GradientTransformation:
-    """Adam (Kingma and Ba, arXiv:1412.6980) with one step count per Gaussian.
+    """Create Adam (Kingma and Ba, arXiv:1412.6980) with a step count per Gaussian.
 
     The first axis of all parameters must be that of the Gaussians. Moments and count of
     a Gaussian that is created late start at zero. With a shared count of 1000 its first
-    five updates would be 2.5, 3.4, 3.9, 4.3 and 4.6 times too large for a steady
+    five updates would be 2.5, 3.4, 3.9, 4.3 and 4.6 times too large for a constant
     gradient, as in the reference implementations. A Gaussian starts to count at its
     first nonzero gradient, so that harmonics that are enabled late and networks that
     wait for a warm-up start in the same way.
@@ -56,11 +56,11 @@ def scale_by_row_adam(
 def scale_by_row_radam(
     b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15, threshold: float = 5.0
 ) -> optax.GradientTransformation:
-    """RAdam (Liu et al. 2020, arXiv:1908.03265) with one step count per Gaussian.
+    """Create RAdam (Liu et al. 2020, arXiv:1908.03265) with a step count per Gaussian.
 
-    Counts and moments are those of `scale_by_row_adam`. A Gaussian whose
-    `moment_length` is below `threshold` (its first five updates at b2 = 0.999) follows
-    its mean gradient, not normalized by its size. After that come Adam's updates times
+    Counts and moments are those of `scale_by_row_adam`. While the `moment_length` of a
+    Gaussian is below `threshold` (its first five updates at b2 = 0.999), updates are
+    its mean gradient without normalization. After that they are Adam's times
     `rectification`: 0.026 at first, 0.5 after 556 updates and 0.92 after 3000. A
     Gaussian that is created late has 0.15 of Adam's step after 50 updates and 0.31
     after 200.
@@ -73,13 +73,16 @@ def scale_by_row_radam(
 
     Returns:
       An optax transformation.
+
+    Raises:
+      ValueError: If a decay or the threshold is out of its range.
     """
     _check_decays(b1, b2)
-    longest = _longest(b2)
-    if not 4 <= threshold < longest:
+    max_length = _max_length(b2)
+    if not 4 <= threshold < max_length:
         raise ValueError(
-            f"threshold={threshold} must lie in [4, {longest:g}), the longest length "
-            f"that b2={b2} allows; raise b2 or choose a threshold in between"
+            f"threshold={threshold} must lie in [4, {max_length:g}), where the upper "
+            f"bound follows from b2={b2}; raise b2 or choose a threshold in between"
         )
 
     def direction(age, first, second):
@@ -94,7 +97,7 @@ def moment_length(updates: Float[Array, "*rows"], b2: float) -> Float[Array, "*r
     """Compute the effective number of gradients in the second moment.
 
     rho_t = rho_inf - 2 t b2^t / (1 - b2^t) with rho_inf = 2 / (1 - b2) - 1, algorithm 2
-    of Liu et al. 2020. It rises from 1 to rho_inf.
+    of Liu et al. 2020. It increases from 1 to rho_inf.
 
     Args:
       updates: Number of updates t, at least 1.
@@ -104,14 +107,18 @@ def moment_length(updates: Float[Array, "*rows"], b2: float) -> Float[Array, "*r
       The length rho_t.
     """
     # With L = -log b2 and h(x) = x coth x - 1 it is t - (2 / L) (h(tL/2) - h(L/2)).
-    # As printed, float32 is off by 0.03 around t = 5, where the switch is: rho_inf is
-    # 1999, and 1 - b2^t keeps four digits. From tL = 1 on nothing cancels.
+    # The printed form has an error of 0.03 in float32 around t = 5, the threshold,
+    # because rho_inf is 1999 and 1 - b2^t has four digits. Nothing cancels for tL > 1.
     rate = -math.log(b2)
-    near = updates * rate < 1
-    x_sq = jnp.square(jnp.where(near, updates, 1) * (rate / 2))
+    is_near = updates * rate < 1
+    x_sq = jnp.square(jnp.where(is_near, updates, 1) * (rate / 2))
     series = updates - (2 / rate) * (_coth_excess(x_sq) - _coth_excess(rate**2 / 4))
-    late = jnp.where(near, 1 / rate, updates)
-    return jnp.where(near, series, _longest(b2) - 2 * late / jnp.expm1(late * rate))
+    far_updates = jnp.where(is_near, 1 / rate, updates)
+    return jnp.where(
+        is_near,
+        series,
+        _max_length(b2) - 2 * far_updates / jnp.expm1(far_updates * rate),
+    )
 
 
 def rectification(length: Float[Array, "*rows"], b2: float) -> Float[Array, "*rows"]:
@@ -125,18 +132,18 @@ def rectification(length: Float[Array, "*rows"], b2: float) -> Float[Array, "*ro
       Factor of the step, at most 1, and zero up to a length of 4, where the variance is
       not finite.
     """
-    longest = _longest(b2)
+    max_length = _max_length(b2)
     usable = jnp.maximum(length, 4)
-    scale = longest / ((longest - 4) * (longest - 2))
+    scale = max_length / ((max_length - 4) * (max_length - 2))
     return jnp.sqrt((usable - 4) * (usable - 2) / usable * scale)
 
 
-def _longest(b2):
+def _max_length(b2):
     return (1 + b2) / (1 - b2)
 
 
-# x coth x - 1 as a series in x^2 with radius pi^2; ten terms leave 1e-17 at x = 1/2.
-# Python's floats: NumPy's make float64 of float32 where x64 is on.
+# x coth x - 1 as a series in x^2 with radius pi^2. Ten terms have an error of 1e-17 at
+# x = 1/2. Python floats, because NumPy's would promote float32 to float64 with x64.
 _COTH = tuple(
     float(2 * (-1) ** (n + 1) * scipy.special.zeta(2 * n) / math.pi ** (2 * n))
     for n in range(1, 11)
@@ -151,11 +158,11 @@ def _coth_excess(x_sq):
 
 
 def _scale_by_row_moments(b1, b2, direction):
-    """Make updates by `direction(age, mean gradient, mean squared gradient)`.
+    """Create updates `direction(age, mean gradient, mean squared gradient)`.
 
     The square of a gradient above 5e20 is infinite in float32, and a parameter divided
-    by it never moves again. The loop checks moments too, and stops. (Scaling would not
-    help: float64 forgets a gradient of 1e20 after 9e4 updates.)
+    by it never changes again. The loop checks moments as well, and stops. (Scaling
+    would not help: float64 forgets a gradient of 1e20 after 9e4 updates.)
     """
     _check_decays(b1, b2)
 
@@ -177,14 +184,14 @@ def _scale_by_row_moments(b1, b2, direction):
         )
 
         def step(n, m, v):
-            # A row that has not started has zero moments: any age will do but zero.
+            # Moments are zero before the first update, so any age but zero is fine.
             age = (
                 jnp.maximum(n, 1).astype(m.dtype).reshape(n.shape + (1,) * (m.ndim - 1))
             )
             # 1 - b^n, which cancels in float32 for b = 0.999 and small n.
-            seen = -jnp.expm1(age * math.log(b1))
-            seen_sq = -jnp.expm1(age * math.log(b2))
-            return direction(age, m / seen, v / seen_sq)
+            correction = -jnp.expm1(age * math.log(b1))
+            correction_sq = -jnp.expm1(age * math.log(b2))
+            return direction(age, m / correction, v / correction_sq)
 
         return jax.tree.map(step, count, first, second), RowAdamState(
             count, first, second
@@ -202,7 +209,7 @@ def _check_decays(b1, b2):
 
 
 def _check_wide(params):
-    """Steps of a thousandth are lost in eight bits: nothing would ever move."""
+    """Raise for half precision, in which steps of a thousandth round to nothing."""
     for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
         if leaf.dtype.itemsize < 4:
             name = (
@@ -215,8 +222,8 @@ def _check_wide(params):
 
 
 def _count_once_started(count, grads):
-    moved = jnp.any(grads.reshape(*count.shape, -1) != 0, axis=-1)
-    return count + ((count > 0) | moved).astype(count.dtype)
+    has_gradient = jnp.any(grads.reshape(*count.shape, -1) != 0, axis=-1)
+    return count + ((count > 0) | has_gradient).astype(count.dtype)
 
 
 def row_leaves(params: Params) -> Params:
@@ -240,20 +247,29 @@ def map_moments(
     moments: PyTree,
     chosen: Params,
 ) -> PyTree:
-    """The optimizer state with `change` applied to all that mirrors a chosen leaf.
+    """Apply a function to all optimizer state that mirrors selected parameters.
 
-    Which leaves those are is asked of optax, never guessed from shapes. Parts that
-    `optax.partition` or `optax.masked` hides are passed over.
+    Optax identifies that state, not its shape. Parts that `optax.partition` or
+    `optax.masked` hide are skipped.
+
+    Args:
+      optimizer: The optimizer.
+      change: Function of one leaf of the state.
+      moments: State of the optimizer.
+      chosen: True for the selected parameters.
+
+    Returns:
+      The changed state.
     """
 
-    def hidden(node):
+    def is_masked(node):
         return isinstance(node, optax.MaskedNode)
 
     def visit(moment, is_chosen):
-        return change(moment) if is_chosen and not hidden(moment) else moment
+        return change(moment) if is_chosen and not is_masked(moment) else moment
 
     return optax.tree_utils.tree_map_params(
-        optimizer, visit, moments, chosen, is_leaf=hidden
+        optimizer, visit, moments, chosen, is_leaf=is_masked
     )
 
 
@@ -265,7 +281,7 @@ def gather_rows(
     fresh: Bool[Array, " capacity"],
     inactive: Bool[Array, " capacity"],
 ) -> tuple[Params, PyTree]:
-    """Gather Gaussians in parameters and moments alike.
+    """Gather Gaussians in parameters and optimizer state.
 
     Args:
       optimizer: The optimizer.
@@ -278,12 +294,12 @@ def gather_rows(
     Returns:
       Parameters and optimizer state of the new capacity.
     """
-    taken = splats.take_rows(params, rows)
-    deactivated = splats.deactivate(taken.rows["splats"], inactive)
-    taken = taken._replace(rows=taken.rows | {"splats": deactivated})
+    gathered = splats.take_rows(params, rows)
+    deactivated = splats.deactivate(gathered.rows["splats"], inactive)
+    gathered = gathered._replace(rows=gathered.rows | {"splats": deactivated})
 
     def gather(moment):
-        forget = (fresh | inactive).reshape(fresh.shape + (1,) * (moment.ndim - 1))
-        return jnp.where(forget, jnp.zeros_like(moment[:1]), moment[rows])
+        is_reset = (fresh | inactive).reshape(fresh.shape + (1,) * (moment.ndim - 1))
+        return jnp.where(is_reset, jnp.zeros_like(moment[:1]), moment[rows])
 
-    return taken, map_moments(optimizer, gather, moments, row_leaves(params))
+    return gathered, map_moments(optimizer, gather, moments, row_leaves(params))

@@ -1,8 +1,8 @@
-"""When what is trained: alternating updates and the annealing of the positions.
+"""Phases of training: alternating updates and annealing of positions.
 
 MoBa-GS, sections 3.6 and 3.5 (equation 8). All are functions of a traced step, so that
 a chunk of any length is one program. The phase before them, a warm-up without motion,
-belongs to each motion: `SplatRecord.warm_up`.
+belongs to each motion (`SplatRecord.warm_up`).
 """
 
 import dataclasses
@@ -20,20 +20,20 @@ from nerfies_jax.training.schedules import Schedule
 from nerfies_jax.training.step_counts import steps
 
 PyTree = Any
-SHARED = "shared"  # marks what mirrors no parameter in an optimizer's state
+SHARED = "shared"  # labels optimizer state that mirrors no parameter
 
 
 @dataclasses.dataclass(frozen=True)
 class AlternationSpec:
     """Alternate between networks and per-Gaussian parameters from `start` to `stop`.
 
-    `nets` steps for the networks are followed by `rows` steps for the per-Gaussian
-    parameters. Outside of this interval everything trains. The paper alternates between
-    the end of densification and the annealing of positions.
+    `nets` steps for the shared parameters are followed by `rows` steps for the
+    per-Gaussian parameters. Outside of this interval all parameters train. In the paper
+    the interval lies between densification and the annealing of positions.
     """
 
     start: int = steps()  # step
-    stop: int = steps()  # the first step in which everything trains again
+    stop: int = steps()  # first step in which all parameters train again
     nets: int = 2  # steps of a cycle
     rows: int = 1  # steps of a cycle
 
@@ -41,38 +41,38 @@ class AlternationSpec:
         if not 0 <= self.start <= self.stop:
             raise ValueError(
                 "an alternation needs 0 <= start <= stop, got "
-                f"start={self.start} and stop={self.stop}; leave it out (None) where "
-                "everything shall train in every step"
+                f"start={self.start} and stop={self.stop}; disable it (None) to train "
+                "all parameters in every step"
             )
         if self.nets < 1 or self.rows < 1:
             raise ValueError(
-                "each turn of an alternation has at least one step, got "
-                f"nets={self.nets} and rows={self.rows}; a group without a turn would "
-                "not train between start and stop"
+                "each phase of an alternation needs at least one step, got "
+                f"nets={self.nets} and rows={self.rows}; parameters without a phase "
+                "would not train between start and stop"
             )
 
 
 @dataclasses.dataclass(frozen=True)
 class AnnealingSpec:
-    """From step `after` on the canonical positions learn less and less, then nothing.
+    """Decay of the learning rate of positions from step `after` on.
 
-    The paper gives neither its second phase's rate nor its beginning, only that it is a
-    share of the run (3/4 here). `annealed` has the rate.
+    The paper does not give the rate of its second phase, and of its beginning only that
+    it is a share of the run (3/4 here). `annealed` computes the rate.
     """
 
     after: int = steps()  # step
-    decay: float = 5.0  # the rate would fall to exp(-decay) by the end of the run
-    freeze_share: float = 0.05  # of the whole run: its last steps, with a rate of zero
+    decay: float = 5.0  # the rate decays to exp(-decay) by the end of the run
+    freeze_share: float = 0.05  # share of the run, at its end, with a rate of zero
 
     def __post_init__(self):
         if self.after < 0:
-            raise ValueError(f"annealing begins at a step >= 0, got after={self.after}")
+            raise ValueError(f"after={self.after} must not be negative")
         if not 0 <= self.decay < math.inf:
             raise ValueError(f"decay={self.decay} must be finite and not negative")
         if not 0 <= self.freeze_share < 1:
             raise ValueError(
                 f"freeze_share={self.freeze_share} of the run must lie in [0, 1); "
-                "to train nothing but networks, set the rate of the means to zero"
+                "to train shared parameters only, set the rate of the means to zero"
             )
 
 
@@ -91,14 +91,16 @@ class Trained(NamedTuple):
 
 
 def update_mask(spec: AlternationSpec | None, step: Int[Array, ""] | int) -> UpdateMask:
-    """Whose turn it is at a traced step."""
+    """Return the parameter groups that train at a step."""
     step = jnp.asarray(step, jnp.int32)
     if spec is None:
         return UpdateMask(jnp.asarray(True), jnp.asarray(True))
     outside = (step < spec.start) | (step >= spec.stop)
-    # Before `start` the remainder is not negative either, and `outside` decides.
-    place = (step - spec.start) % (spec.nets + spec.rows)
-    return UpdateMask(outside | (place >= spec.nets), outside | (place < spec.nets))
+    # Python's remainder is not negative before `start`, where `outside` decides.
+    position = (step - spec.start) % (spec.nets + spec.rows)
+    return UpdateMask(
+        outside | (position >= spec.nets), outside | (position < spec.nets)
+    )
 
 
 def freeze(
@@ -109,31 +111,31 @@ def freeze(
 ) -> Trained:
     """Undo a step for the frozen parameter group, including its moments and counts.
 
-    Zero gradients would not suffice: Adam's momentum goes on moving frozen parameters.
-    Optax identifies the state that mirrors a parameter. A count belongs to the group
-    with which it shares the smallest part of the state, and is refused if that is both
-    (`optax.adam` over everything).
+    Zero gradients would not suffice, because Adam's momentum would still move frozen
+    parameters. Optax identifies the state that mirrors a parameter. A count belongs to
+    the group with which it shares the smallest part of the state. It is refused if that
+    part has both groups (`optax.adam` for all parameters).
 
     Args:
       optimizer: The optimizer.
       mask: Groups that the step trains.
       before: Parameters and optimizer state before the step.
-      after: The same after the step.
+      after: Parameters and optimizer state after the step.
 
     Returns:
-      The state after the step with the frozen group of before, bit for bit.
+      The state after the step, with the frozen group unchanged, bit for bit.
     """
-    # Selected, not branched over: at 10k rows of 59 numbers, one core, a step of Adam
-    # takes 2.2 ms (2.8 ms with 524k numbers of networks), 1.7 (2.9) with the selection
-    # and 0.9 (1.4) in branches, which know less than `jnp.where` of what they may
-    # overwrite and need an optimizer for each group. Drawing takes 30 ms.
+    # A selection, not a branch. At 10k Gaussians of 59 numbers on one core, a step of
+    # Adam takes 2.2 ms (2.8 ms with 524k network parameters), 1.7 (2.9) with the
+    # selection and 0.9 (1.4) with branches. Branches overwrite fewer buffers and need
+    # an optimizer for each group. Rendering takes 30 ms.
     params = _by_group(before.params)
     moments = _groups_of_moments(optimizer, params, before.opt_state)
 
-    def kept(group, old, new):
+    def select(group, old, new):
         return jnp.where(getattr(mask, group), new, old)
 
-    return jax.tree.map(kept, Trained(params, moments), before, after)
+    return jax.tree.map(select, Trained(params, moments), before, after)
 
 
 def stop_frozen_gradients(
@@ -141,8 +143,9 @@ def stop_frozen_gradients(
 ) -> Callable[..., PyTree]:
     """Skip the computation of gradients of frozen networks.
 
-    Forward and backward of 10k Gaussians on one core, 539 ms become 127 ms for 8x256,
-    and 98 become 29 for 4x128. When the networks train, it takes 537 and 96 ms.
+    Forward and backward of 10k Gaussians on one core take 127 ms instead of 539 for
+    8x256, and 29 instead of 98 for 4x128. When the networks train, they take 537 and 96
+    ms.
 
     Args:
       mask: Groups that the step trains.
@@ -162,11 +165,22 @@ def stop_frozen_gradients(
 
 
 def annealed(rate: Schedule, spec: AnnealingSpec, steps: int) -> Schedule:
-    """`rate` up to `spec.after`, decaying from its value there, at last zero.
+    """Anneal a learning rate: exponential decay after `spec.after`, zero at the end.
 
     Equation 8 with eta_anneal(i) = eta_main(a) exp(-decay (i - a) / (steps - a)), where
-    a = `spec.after`: continuous at a. The last `freeze_share` of the steps get 0. In a
-    run of few steps nothing may lie between the two.
+    a = `spec.after`. The rate is continuous at a. It is zero in the last `freeze_share`
+    of the steps.
+
+    Args:
+      rate: The schedule before annealing.
+      spec: Settings.
+      steps: Total number of steps.
+
+    Returns:
+      The annealed schedule.
+
+    Raises:
+      ValueError: If annealing begins after the positions are frozen.
     """
     frozen = steps - round(spec.freeze_share * steps)
     if spec.after > frozen:
@@ -179,11 +193,11 @@ def annealed(rate: Schedule, spec: AnnealingSpec, steps: int) -> Schedule:
 
     def schedule(step):
         step = jnp.asarray(step, jnp.int32)
-        # Subtracted as integers: exactly 0 up to `after`, where exp(0) is exactly 1.
-        passed = jnp.clip(step - spec.after, 0, length)
-        share = passed.astype(jnp.result_type(float)) / length
+        # Subtracted as integers, so exp(0) is exactly 1 up to `after`.
+        elapsed = jnp.clip(step - spec.after, 0, length)
+        progress = elapsed.astype(jnp.result_type(float)) / length
         main = rate(jnp.minimum(step, spec.after))
-        return jnp.where(step >= frozen, 0.0, main * jnp.exp(-spec.decay * share))
+        return jnp.where(step >= frozen, 0.0, main * jnp.exp(-spec.decay * progress))
 
     return schedule
 
@@ -197,33 +211,35 @@ def _by_group(params):
 def _groups_of_moments(optimizer, groups, moments):
     """Label each leaf of the optimizer's state with its parameter group."""
 
-    def hidden(node):
+    def is_masked(node):
         return isinstance(node, optax.MaskedNode)
 
-    marked = optax.tree_utils.tree_map_params(
+    labels = optax.tree_utils.tree_map_params(
         optimizer,
-        lambda moment, group: moment if hidden(moment) else group,
+        lambda moment, group: moment if is_masked(moment) else group,
         moments,
         groups,
         transform_non_params=lambda _: SHARED,
-        is_leaf=hidden,
+        is_leaf=is_masked,
     )
-    leaves, structure = jax.tree_util.tree_flatten_with_path(marked)
+    leaves, structure = jax.tree_util.tree_flatten_with_path(labels)
     return jax.tree.unflatten(structure, [_owner(path, leaves) for path, _ in leaves])
 
 
 def _owner(path, leaves):
-    """The group of the smallest part of the state around `path` that has one."""
+    """Return the group of the smallest part of the state around `path` that has one."""
     for depth in range(len(path), -1, -1):
-        around = path[:depth]
-        owners = {mark for where, mark in leaves if where[:depth] == around} - {SHARED}
+        prefix = path[:depth]
+        owners = {
+            label for leaf_path, label in leaves if leaf_path[:depth] == prefix
+        } - {SHARED}
         if len(owners) == 1:
             return owners.pop()
         if owners:
             break
     name = jax.tree_util.keystr(path, simple=True, separator=".")
     raise ValueError(
-        f"the optimizer's {name} belongs to rows and networks alike, so it cannot stay "
-        "as it is for one of them; give each its own by `optax.partition`, or use "
-        "`scale_by_row_adam`, which counts for each leaf"
+        f"the optimizer's {name} belongs to both per-Gaussian and shared parameters, "
+        "so it cannot be frozen for one of them; give each its own with "
+        "`optax.partition`, or use `scale_by_row_adam`, which counts per leaf"
     )

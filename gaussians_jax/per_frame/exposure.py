@@ -1,9 +1,9 @@
-"""An affine change of color for each exposure: what light and camera did to a frame.
+"""Exposure model: an affine color transform for each exposure of the capture.
 
-The picture of a frame is `(1 + linear) color + offset` of what the Gaussians show, as
-in the exposure compensation of 3D Gaussian splatting (Kerbl et al. 2023, in its code
-since 2024). What counts is by how much an exposure differs from the mean of all, or
-Gaussians could be of any color.
+The image of a frame is `(1 + linear) color + offset` of the rendered color, as in the
+exposure compensation of 3D Gaussian splatting (Kerbl et al. 2023, in its code since
+2024). The mean over all exposures is subtracted, because the colors of the Gaussians
+would be ambiguous otherwise.
 """
 
 import dataclasses
@@ -19,10 +19,10 @@ from nerfies_jax.nn import codes
 from nerfies_jax.training import schedules
 
 NAME = "exposure"
-# For each appearance id the rows it lies between, and where, as in
-# `nerfies_jax.capture.scene_metadata.exposures`.
+# For each appearance id, two row indices and the interpolation weight of the second, as
+# in `nerfies_jax.capture.scene_metadata.exposures`.
 Places = tuple[tuple[int, int, float], ...]
-HELD = 1e-6  # squared error a pixel that a change of one in one number counts for
+HELD = 1e-6  # ridge per pixel in a fit, in squared color
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ExposureSpec:
     """Learning rate of the exposure model.
 
     Each exposure is updated by its own frames only, once in as many steps as there are
-    frames, and then by about eight of Adam's steps.
+    frames, and then by about eight steps of Adam.
     """
 
     learning_rate: float = 1e-2
@@ -40,12 +40,12 @@ class ExposureSpec:
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the appearance model for a run of `run_steps` of this capture."""
+        """Return the appearance model for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.exposures)
 
 
 def init(key: Key[Array, ""], exposures: int) -> Float[Array, "exposures 3 4"]:
-    """No change: zero linear part and offset."""
+    """Initialize transforms that change nothing, with zero linear part and offset."""
     del key
     return jnp.zeros((exposures, 3, 4), jnp.float32)
 
@@ -53,12 +53,11 @@ def init(key: Key[Array, ""], exposures: int) -> Float[Array, "exposures 3 4"]:
 def of_id(
     table: Float[Array, "exposures 3 4"], places: Places, appearance: Int[Array, ""]
 ) -> Float[Array, "3 4"]:
-    """Look up the exposure of an appearance id; untrained ones are interpolated in
-    time.
+    """Look up the exposure of an appearance id. Untrained ones are interpolated.
 
-    The mean of all exposures is the identity, and is treated as constant: a gradient
-    through it would reach all other frames, and Adam normalizes even the smallest
-    gradients. An unknown id uses the nearest one.
+    The mean of all exposures is the identity and treated as constant, because a
+    gradient through it would reach all other frames, and Adam normalizes even the
+    smallest gradients. An unknown id uses the nearest one.
 
     Args:
       table: Affine color transforms.
@@ -69,28 +68,28 @@ def of_id(
       The transform.
     """
     left, right, progress = (np.asarray(column) for column in zip(*places, strict=True))
-    one = jnp.clip(appearance, 0, len(places) - 1)
-    share = jnp.asarray(progress, table.dtype)[one]
-    own = table - jax.lax.stop_gradient(jnp.mean(table, axis=0))
-    flat = own.reshape(len(table), 12)
-    before, after = (jnp.asarray(side, jnp.int32)[one] for side in (left, right))
-    return codes.blend(flat, before, after, share).reshape(3, 4)
+    index = jnp.clip(appearance, 0, len(places) - 1)
+    weight = jnp.asarray(progress, table.dtype)[index]
+    deviation = table - jax.lax.stop_gradient(jnp.mean(table, axis=0))
+    flat = deviation.reshape(len(table), 12)
+    before, after = (jnp.asarray(side, jnp.int32)[index] for side in (left, right))
+    return codes.blend(flat, before, after, weight).reshape(3, 4)
 
 
-def changed(
-    picture: Float[Array, "*pixels 3"], change: Float[Array, "3 4"]
+def apply_exposure(
+    image: Float[Array, "*pixels 3"], change: Float[Array, "3 4"]
 ) -> Float[Array, "*pixels 3"]:
     """Apply an exposure to colors, without clipping.
 
     Args:
-      picture: sRGB colors.
+      image: sRGB colors.
       change: Affine transform.
 
     Returns:
       sRGB colors.
     """
-    mixed = exact_product(picture, change[:, :3].T)
-    return picture + mixed + change[:, 3]
+    product = exact_product(image, change[:, :3].T)
+    return image + product + change[:, 3]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +108,7 @@ class Bound:
         return schedules.log_linear(first, last, self.steps)(step)
 
     def init(self, key: Key[Array, ""]) -> Float[Array, "exposures 3 4"]:
-        """Initialize exposures that change nothing."""
+        """Initialize exposures that do not change colors."""
         count = 1 + max(max(left, right) for left, right, _ in self.places)
         return init(key, count)
 
@@ -120,20 +119,29 @@ class Bound:
         appearance: Int[Array, ""],
     ) -> Float[Array, "*pixels 3"]:
         """Return the image as observed under an appearance id."""
-        return changed(image, of_id(params, self.places, appearance))
+        return apply_exposure(image, of_id(params, self.places, appearance))
 
 
-def fitted(
-    picture: np.ndarray, filmed: np.ndarray, valid: np.ndarray | None
+def fit(
+    image: np.ndarray, observed: np.ndarray, valid: np.ndarray | None
 ) -> np.ndarray:
-    """The change [3, 4] that brings a picture nearest to what was filmed.
+    """Fit an exposure to an observed image by least squares.
 
-    Floats [height, width, 3] in sRGB, least squares over the pixels that are `valid`.
+    Args:
+      image: Rendered image [height, width, 3], sRGB.
+      observed: Observed image of the same shape.
+      valid: True for the pixels to fit, [height, width]. None: all.
+
+    Returns:
+      The affine transform [3, 4].
     """
-    keep = np.ones(picture.shape[:2], bool) if valid is None else valid
-    seen, truth = picture[keep].astype(np.float64), filmed[keep].astype(np.float64)
-    inputs = np.concatenate([seen, np.ones((len(seen), 1))], axis=1)
-    # Where a picture has one color only, what cannot be told stays as it is.
-    held = HELD * max(len(seen), 1) * np.eye(4)
-    squares = inputs.T @ inputs + held
-    return np.linalg.solve(squares, inputs.T @ (truth - seen)).T
+    is_valid = np.ones(image.shape[:2], bool) if valid is None else valid
+    rendered, truth = (
+        image[is_valid].astype(np.float64),
+        observed[is_valid].astype(np.float64),
+    )
+    inputs = np.concatenate([rendered, np.ones((len(rendered), 1))], axis=1)
+    # The ridge leaves undetermined directions unchanged, as in an image of one color.
+    ridge = HELD * max(len(rendered), 1) * np.eye(4)
+    squares = inputs.T @ inputs + ridge
+    return np.linalg.solve(squares, inputs.T @ (truth - rendered)).T

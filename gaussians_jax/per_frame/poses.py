@@ -3,12 +3,12 @@
 One screw per frame, in the camera's frame, is optimized with the Gaussians. This is the
 pose refinement of BARF (Lin et al. 2021, arXiv:2104.06405) for splats, which MotionGS
 uses with its flow (Zhu et al. 2024, arXiv:2410.07707, section 4.3, there alternating
-with the Gaussians) and gsplat as an option. The mean of all screws is subtracted, or
-cameras and scene could drift together. No gradient passes through that mean: each
-frame's would reach all others, and Adam normalizes even the smallest gradients, so that
-cameras would drift before their frame is first used.
+with the Gaussians) and gsplat as an option. The mean of all screws is subtracted,
+because cameras and scene could drift together. No gradient passes through that mean:
+the gradient of one frame would reach all others, and Adam normalizes even the smallest
+gradients, so cameras would drift before their frame is first used.
 
-The gain for cameras that are wrong by a pixel, and for cameras from structure from
+The gain for cameras with an error of one pixel, and for cameras from structure from
 motion with masked objects, is in `docs/results/ablate_poses.md` and
 `ablate_poses_bookshelf.md`.
 """
@@ -28,16 +28,15 @@ from nerfies_jax.training.model import in_default_precision
 
 NAME = "poses"
 
-Screws = Float[Array, "frames 6"]  # turn, and shift over the depth of the scene; rad
+Screws = Float[Array, "frames 6"]  # rotation (rad), translation over mid depth (rad)
 
 
 @dataclasses.dataclass(frozen=True)
 class PoseRefinementSpec:
-    """Learning rate of the cameras, in rad of a rotation and of a translation at mid
-    depth.
+    """Learning rates of the cameras, for rotations and translations at mid depth (rad).
 
-    A frame's screw is updated once in as many steps as there are frames, and then by
-    about eight of Adam's steps. With a flow loss (`motion_flow`) it is also updated in
+    The screw of a frame is updated once in as many steps as there are frames, and then
+    by about eight steps of Adam. With a flow loss (`losses.flow`) it is also updated in
     the steps of the previous frame.
     """
 
@@ -48,28 +47,36 @@ class PoseRefinementSpec:
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
-        """Return the camera optimizer for a run of `run_steps` of this capture."""
+        """Return the camera optimizer for a run of `run_steps` on this capture."""
         return Bound(self, run_steps, metadata.frames, metadata.depth)
 
 
-def refined(screws: Screws, cameras: Camera, depth: float) -> Camera:
-    """Cameras, one for each screw, moved by what it differs from the mean of all.
+def refine(screws: Screws, cameras: Camera, depth: float) -> Camera:
+    """Move cameras by the deviation of their screws from the mean.
 
-    `depth`, in scene units, is where a shift of one radian moves the picture as far as
-    such a turn. Equal screws leave every camera as it is. The mean counts as constant:
-    a camera's slope reaches its own screw alone.
+    Equal screws do not change any camera. The mean is treated as constant, so the
+    gradient of a camera reaches its own screw only.
+
+    Args:
+      screws: Corrections, one per camera.
+      cameras: The cameras.
+      depth: Mid depth in scene units, at which a translation of one radian moves the
+        image as far as a rotation of one radian.
+
+    Returns:
+      The refined cameras.
     """
-    own = screws - jax.lax.stop_gradient(jnp.mean(screws, axis=0))
-    return _moved(own, cameras, depth)
+    deviation = screws - jax.lax.stop_gradient(jnp.mean(screws, axis=0))
+    return _move(deviation, cameras, depth)
 
 
-def _moved(screws, cameras, depth):
+def _move(screws, cameras, depth):
     return jax.vmap(lambda camera, screw: move(camera, screw[:3], depth * screw[3:]))(
         cameras, screws
     )
 
 
-def found(screws: Screws, capture: Capture, depth: float) -> Capture:
+def refine_capture(screws: Screws, capture: Capture, depth: float) -> Capture:
     """Return a capture with refined cameras, on the host.
 
     The correction of a held-out frame is interpolated between the previous and next
@@ -83,22 +90,22 @@ def found(screws: Screws, capture: Capture, depth: float) -> Capture:
     Returns:
       The capture.
     """
-    own = np.asarray(screws)
-    own = own - own.mean(axis=0)
-    moves = np.zeros((len(capture.times), 6), own.dtype)
+    deviation = np.asarray(screws)
+    deviation = deviation - deviation.mean(axis=0)
+    moves = np.zeros((len(capture.times), 6), deviation.dtype)
     cameras_of, times = capture.camera_ids[capture.train], capture.times[capture.train]
-    for one in np.unique(cameras_of):
-        learned = np.flatnonzero(cameras_of == one)
-        learned = learned[np.argsort(times[learned], kind="stable")]
-        rows = np.flatnonzero(capture.camera_ids == one)
+    for camera_id in np.unique(cameras_of):
+        train_rows = np.flatnonzero(cameras_of == camera_id)
+        train_rows = train_rows[np.argsort(times[train_rows], kind="stable")]
+        rows = np.flatnonzero(capture.camera_ids == camera_id)
         for axis in range(6):
             moves[rows, axis] = np.interp(
-                capture.times[rows], times[learned], own[learned, axis]
+                capture.times[rows], times[train_rows], deviation[train_rows, axis]
             )
-    moves[capture.train] = own
-    given = in_default_precision((moves, capture.cameras))
-    moved = jax.jit(_moved, static_argnums=2)(*given, depth)
-    cameras = jax.tree.map(lambda new: np.asarray(new, np.float32), moved)
+    moves[capture.train] = deviation
+    inputs = in_default_precision((moves, capture.cameras))
+    refined = jax.jit(_move, static_argnums=2)(*inputs, depth)
+    cameras = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), refined)
     return dataclasses.replace(capture, cameras=cameras)
 
 
@@ -108,8 +115,8 @@ class Bound:
 
     spec: PoseRefinementSpec
     steps: int
-    frames: int  # that the scene is trained on
-    depth: float  # z-depth halfway into the scene, scene units
+    frames: int  # number of training frames
+    depth: float  # z-depth in the middle of the scene, scene units
 
     name = NAME
 
@@ -119,13 +126,13 @@ class Bound:
         return schedules.log_linear(first, last, self.steps)(step)
 
     def init(self, key: Key[Array, ""]) -> Screws:
-        """Initialize screws that leave every camera as it is."""
+        """Initialize screws that do not change any camera."""
         return jnp.zeros((self.frames, 6), jnp.float32)
 
     def apply(self, params: Screws, cameras: Camera) -> Camera:
         """Return the refined cameras of the training frames."""
-        return refined(params, cameras, self.depth)
+        return refine(params, cameras, self.depth)
 
     def apply_to_capture(self, params: Screws, capture: Capture) -> Capture:
         """Return the capture with the refined cameras of all frames, on the host."""
-        return found(params, capture, self.depth)
+        return refine_capture(params, capture, self.depth)

@@ -1,4 +1,4 @@
-"""Trained Gaussians at one time, as a rasterizer outside this package draws them."""
+"""Trained Gaussians at one time, for rasterizers outside of this package."""
 
 from typing import Any
 
@@ -23,19 +23,19 @@ def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
     once for each shape of the state.
 
     Args:
-      spec: Specification of the scene.
-      metadata: Its metadata.
-      without: Names of effects to leave out, of `variants.parts`.
+      spec: Settings of the scene.
+      metadata: Metadata of the capture.
+      without: Names of components to leave out, of `variants.parts`.
 
     Returns:
       A function of a trained state, a time in [0, 1], an appearance id and the position
       of the camera (scene units), which returns a `SplatCloud`.
 
     Raises:
-      ValueError: If the scene cannot be rendered without one of the effects.
+      ValueError: If the scene cannot be rendered without one of the components.
     """
     spec = variants.reduced(spec, metadata, without)
-    every = scene.all_effects(spec, metadata)
+    effects = scene.all_effects(spec, metadata)
     background = jnp.asarray(metadata.background)
 
     @jax.jit
@@ -46,23 +46,23 @@ def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
         appearance: Int[Array, ""],
         position: Float[Array, "3"],
     ):
-        prepared = deformation.prepare(every, params)
-        gaussians = deformation.deform(every, params, prepared, time)
-        rows = deformation.drawn_rows(every, params)
+        prepared = deformation.prepare(effects, params)
+        gaussians = deformation.deform(effects, params, prepared, time)
+        rows = deformation.rendered_rows(effects, params)
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
         coefficients = splats.active_harmonics(rows, degree)
         color = harmonics.color_toward(coefficients, gaussians.mean, position)
-        # The compositing weights and the transmittance sum to one, so an affine change
-        # of the image is the same change of every color and of the background.
-        behind = background.astype(color.dtype)
-        color = _exposed(every, params, color, appearance)
-        behind = _exposed(every, params, behind[None], appearance)[0]
+        # Compositing weights and transmittance sum to one, so an affine change of the
+        # image is the same change of all colors and of the background.
+        backdrop = background.astype(color.dtype)
+        color = _exposed(effects, params, color, appearance)
+        backdrop = _exposed(effects, params, backdrop[None], appearance)[0]
         leaves: dict[str, Any] = dict(
             centers=gaussians.mean,
             covariances=jax.vmap(_covariance)(gaussians.quaternion, gaussians.scale),
             rgb=color,
             opacity=gaussians.opacity,
-            background=behind,
+            background=backdrop,
             view_dependent=degree > 0,
         )
         return SplatCloud(**leaves), splats.active_mask(rows)
@@ -74,15 +74,15 @@ def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
             jnp.asarray(appearance, jnp.int32),
             jnp.asarray(position, dtype),
         )
-        every, active = jax.device_get(evaluate(state.params, state.step, *inputs))
-        # The rows do not change with the time, so their number does not either, and a
-        # browser can update its buffers in place.
-        return every._replace(
-            centers=every.centers[active],
-            covariances=every.covariances[active],
-            rgb=every.rgb[active],
-            opacity=every.opacity[active],
-            view_dependent=bool(every.view_dependent),
+        gaussians, active = jax.device_get(evaluate(state.params, state.step, *inputs))
+        # The number of active Gaussians does not depend on the time, so a browser can
+        # update its buffers in place.
+        return gaussians._replace(
+            centers=gaussians.centers[active],
+            covariances=gaussians.covariances[active],
+            rgb=gaussians.rgb[active],
+            opacity=gaussians.opacity[active],
+            view_dependent=bool(gaussians.view_dependent),
         )
 
     return cloud
@@ -92,12 +92,12 @@ def _exposed(effects, params, color, appearance):
     """Apply every exposure model to a list of colors, as one row of an image."""
     for effect in effects:
         if effect.expose is not None:
-            own = params.nets.get(effect.name)
-            color = effect.expose(own, color[None], appearance)[0]
+            own_params = params.nets.get(effect.name)
+            color = effect.expose(own_params, color[None], appearance)[0]
     return color
 
 
 def _covariance(quaternion, scale):
-    """R diag(scale²) Rᵀ of one Gaussian."""
+    """Compute R diag(scale²) Rᵀ of one Gaussian."""
     axes = quaternions.to_matrix(quaternion) * scale
     return exact_product(axes, axes.T)

@@ -1,11 +1,11 @@
 "use strict";
-// The camera of a player. Pure functions of numbers: nothing here knows the page.
+// The camera of a player. Pure functions of numbers, independent of the page.
 //
 // A view is { quaternion, target, distance }: the rotation from world to camera axes
-// (wxyz; x right, y down, z forward), a point on the viewing axis, and how far the
-// camera is from it. The controls are this small because three.js, which all
-// well-kept camera controls need, would add 0.7 MB to every page, and knows neither a
-// rolled camera nor a principal point off the center.
+// (wxyz; x right, y down, z forward), a point on the viewing axis, and the distance of
+// the camera from it. three.js, which all well-maintained camera controls need, would
+// add 0.7 MB to every page, and supports neither a rolled camera nor an off-center
+// principal point.
 
 function dot(a, b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -31,7 +31,7 @@ function unit(vector) {
   return vector.map((value) => value / length);
 }
 
-// The quaternion of a rotation matrix, row by row, by its largest component.
+// Convert a rotation matrix (row by row) to a quaternion, by its largest component.
 function quaternionOf(m) {
   const w = 1 + m[0] + m[4] + m[8], x = 1 + m[0] - m[4] - m[8];
   const y = 1 - m[0] + m[4] - m[8], z = 1 - m[0] - m[4] + m[8];
@@ -43,7 +43,7 @@ function quaternionOf(m) {
   return unit(most === y ? [b, d, y, f] : [c, e, f, z]);
 }
 
-// The rotation matrix, row by row, of a quaternion of any length.
+// Convert a quaternion of any length to a rotation matrix, row by row.
 function matrixOf([w, x, y, z]) {
   const d = 2 / (w * w + x * x + y * y + z * z);
   return [
@@ -53,14 +53,14 @@ function matrixOf([w, x, y, z]) {
   ];
 }
 
-// The view of a camera { rotation, position, target } that looks at its target.
+// Return the view of a camera { rotation, position, target } that looks at its target.
 function viewOf({ rotation, position, target }) {
   const distance = Math.hypot(...sum(position, target, -1));
   return { quaternion: quaternionOf(rotation), target, distance };
 }
 
-// The camera of a view in an image as large as fits into `width` x `height` px. `lens`
-// has the focal length, pixel aspect, skew and principal point of its own size.
+// Return the camera of a view in the largest image that fits into `width` x `height`
+// px. `lens` has the focal length, pixel aspect, skew and principal point for its size.
 function cameraOf(view, lens, width, height) {
   const rotation = matrixOf(view.quaternion);
   const enlarged = Math.min(width / lens.size[0], height / lens.size[1]);
@@ -77,33 +77,32 @@ function cameraOf(view, lens, width, height) {
   };
 }
 
-// The view with its camera turned about the target, by an angle (rad) about a unit axis
-// of the world.
+// Rotate the camera about the target by an angle (rad) about a unit axis of the world.
 function turned(view, axis, angle) {
   const half = -angle / 2, s = Math.sin(half);
   const turn = [Math.cos(half), s * axis[0], s * axis[1], s * axis[2]];
   return { ...view, quaternion: unit(product(view.quaternion, turn)) };
 }
 
-// The view turned to the right about `up` and upward about its own horizontal axis, rad.
+// Rotate to the right about `up`, and upward about the horizontal axis, in rad.
 function orbited(view, up, right, above) {
   const about = turned(view, up, right);
   return turned(about, matrixOf(about.quaternion).slice(0, 3), -above);
 }
 
-// The view and its target moved by scene units to the right and down in the image.
+// Move the view and its target by scene units to the right and down in the image.
 function moved(view, right, down) {
   const rotation = matrixOf(view.quaternion);
   const by = [0, 1, 2].map((k) => right * rotation[k] + down * rotation[3 + k]);
   return { ...view, target: sum(view.target, by) };
 }
 
-// The view at another distance from its target, `factor` times this one.
+// Multiply the distance from the target by `factor`.
 function nearer(view, factor) {
   return { ...view, distance: view.distance * factor };
 }
 
-// The view a share of the way from one to another, around the target.
+// Interpolate between two views, around the target.
 function toward(view, goal, share) {
   if (share >= 1) return goal;
   const { quaternion: from } = view;
@@ -116,11 +115,11 @@ function toward(view, goal, share) {
   };
 }
 
-// How far two views are from each other: the largest of the rotation (rad), the shift
-// of the target and the change of the distance, in distances.
+// Return the difference of two views: the largest of the rotation (rad), the shift of
+// the target and the change of the distance, relative to the distance.
 function apart(view, goal) {
   const from = unit(view.quaternion), to = unit(goal.quaternion);
-  // By the chord: the arc cosine of nearly one has no digits.
+  // By the chord, because the arc cosine near one is inaccurate.
   const chord = (sign) => Math.hypot(...sum(from, to, sign));
   return Math.max(
     2 * Math.min(chord(1), chord(-1)),
@@ -129,15 +128,15 @@ function apart(view, goal) {
   );
 }
 
-// A value kept between two limits, which it may pass by less than `give`.
+// Limit a value to a range, which it may exceed by less than `give`.
 function kept(value, [low, high], give) {
   const soft = (over) => (give ? give * Math.tanh(over / give) : 0);
   if (value > high) return high + soft(value - high);
   return value < low ? low - soft(low - value) : value;
 }
 
-// The view within the limits that the page was written with, which it may pass a
-// little: `give` in radians, or as a share of a distance.
+// Limit a view to the ranges in the page, which it may exceed slightly: by `give`, in
+// radians or as a share of a distance.
 function limited(view, limits, give) {
   const [side, ahead, up] = limits.axes;
   const distance = Math.exp(
@@ -152,7 +151,7 @@ function limited(view, limits, give) {
     if (to !== from) within = turned(within, axis, to - from);
   };
   const offset = away(), level = cross(offset, up);
-  // Straight above or below, no axis leads back: the limits of the elevation end before.
+  // The elevation is limited before the vertical, where the azimuth is undefined.
   if (Math.hypot(...level) > 1e-6) {
     const sine = Math.min(1, Math.max(-1, dot(offset, up)));
     turn(unit(level), Math.asin(sine), limits.elevation);
@@ -162,8 +161,8 @@ function limited(view, limits, give) {
   return within;
 }
 
-// The view as text for a link, and from there: eight numbers, to far below a pixel. The
-// text of a view from a text is that text.
+// Convert a view to text for a link, and back: eight numbers, accurate to far below a
+// pixel. The text of a view that was read from a text is the same text.
 function textOf(view) {
   const numbers = [...view.quaternion, ...view.target, view.distance];
   return numbers.map((number) => Number(number.toFixed(7))).join(",");

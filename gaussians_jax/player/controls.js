@@ -1,17 +1,17 @@
 "use strict";
-// Pointers, wheel and keys turn, move and zoom the camera.
+// Pointers, wheel and keys rotate, move and zoom the camera.
 
-const RADIANS = 0.006; // that the view turns for a pixel
-const ARROW = Math.PI / 36; // 5 degrees, or a share of the distance where Shift is held
-const SETTLING = 0.08; // seconds in which the camera makes up for most of its way
-const GIVE = 0.12; // how far a drag may pass the limits: radians, or shares of a distance
-const ARRIVED = 2e-5; // of the same: far below a pixel
+const RADIANS = 0.006; // rotation of the view per pixel
+const ARROW = Math.PI / 36; // 5 degrees, or a share of the distance with Shift
+const SETTLING = 0.08; // seconds in which the camera covers most of its way
+const GIVE = 0.12; // largest excess over the limits in a drag: radians, or shares of a distance
+const ARRIVED = 2e-5; // in the same units: far below a pixel
 
-// The camera that the controls steer: it follows its goal, `wake` is called where the
-// two part. `still` (reduced motion) lets it jump.
+// The controlled camera. It follows its goal, and calls `wake` when they differ.
+// `still` (reduced motion) makes it jump.
 function cameraman(header, wake, still) {
   const { up, limits } = header;
-  // At rest a view is what its link holds, so that a link gives the very same image.
+  // Without motion a view is what its link stores, so a link gives the same image.
   const rounded = (any) => viewFrom(textOf(any));
   const first = rounded(viewOf(header.view));
   let view = first, goal = first, held = false;
@@ -27,7 +27,7 @@ function cameraman(header, wake, still) {
     orbit: (right, above) => steer(orbited(goal, up, right, above)),
     pan: (right, down) => steer(moved(goal, right, down)),
     zoom: (factor) => steer(nearer(goal, factor)),
-    // A hand holds the camera, or lets it return within the limits.
+    // A drag holds the camera. Afterwards it returns within the limits.
     hold(yes) {
       held = yes;
       if (!yes) steer(goal);
@@ -40,7 +40,7 @@ function cameraman(header, wake, still) {
       view = goal = next;
       wake();
     },
-    // Move on by a time, in seconds.
+    // Advance by a time in seconds.
     advance(seconds) {
       if (view === goal) return;
       view = toward(view, goal, still() ? 1 : 1 - Math.exp(-seconds / SETTLING));
@@ -49,8 +49,8 @@ function cameraman(header, wake, still) {
   };
 }
 
-// Pointers and the wheel on the canvas. `unit` is how many scene units a pixel is wide
-// in the plane of the target.
+// Pointers and the wheel on the canvas. `unit` is the width of a pixel in the plane of
+// the target, in scene units.
 function steerByHand(canvas, camera, unit) {
   const pointers = new Map();
   const each = () => [...pointers.values()];
@@ -79,7 +79,7 @@ function steerByHand(canvas, camera, unit) {
       if (!before.includes(last)) return; // a third finger
       camera.pan(-dx / 2 * unit(), -dy / 2 * unit());
       camera.zoom(spread(before) / Math.max(spread(each()), 1));
-    } else if (event.shiftKey || event.buttons & 6) { // the right or middle button
+    } else if (event.shiftKey || event.buttons & 6) { // right or middle button
       camera.pan(-dx * unit(), -dy * unit());
     } else {
       camera.orbit(-dx * RADIANS, dy * RADIANS);
@@ -88,13 +88,13 @@ function steerByHand(canvas, camera, unit) {
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
-    const lines = event.deltaMode ? 30 : 1; // px, or lines of about 30
-    const rate = event.ctrlKey ? 0.01 : 0.001; // a pinch on a touchpad, in small steps
+    const lines = event.deltaMode ? 30 : 1; // px, or lines of about 30 px
+    const rate = event.ctrlKey ? 0.01 : 0.001; // a pinch on a touchpad comes in small steps
     camera.zoom(Math.exp(event.deltaY * lines * rate));
   }, { passive: false });
 }
 
-// What a key does to the camera; false for all other keys.
+// Apply a key to the camera. Returns false for unused keys.
 function steerByKey(event, camera, distance) {
   const step = event.shiftKey ? 0 : ARROW, pan = event.shiftKey ? ARROW * distance : 0;
   const toward = {

@@ -4,14 +4,14 @@ import numpy as np
 
 from nerfies_jax.geometry.camera import Camera
 
-# Beyond the cameras of the capture, in radians. Gaussians that no camera saw from the
-# side are long and thin, and are drawn as such there.
+# Margins beyond the cameras of the capture. Gaussians that no camera saw from the side
+# are long and thin, which shows there.
 AZIMUTH_MARGIN, ELEVATION_MARGIN = np.radians(30), np.radians(20)
-# A capture that leaves less of the circle open than this has been all around.
+# A capture whose largest gap is smaller than this counts as a full circle.
 OPEN_ARC = np.radians(90)
-WIDEST = np.pi - 0.2  # either way: the page counts angles from -pi to pi
-STEEPEST = np.radians(88)  # of the elevation: straight above, there is no azimuth
-NEAREST, FARTHEST = 0.25, 2.5  # of the least and the largest distance of a camera
+WIDEST = np.pi - 0.2  # of the azimuth, because the page counts from -pi to pi
+STEEPEST = np.radians(88)  # of the elevation, because the azimuth is undefined above
+NEAREST, FARTHEST = 0.25, 2.5  # factors of the smallest and largest camera distance
 
 
 def camera_limits(
@@ -28,9 +28,9 @@ def camera_limits(
     Returns:
       Lists and floats. `axes` are two directions in the ground plane, the first toward
       the first camera, and `up`. `azimuth` (None if the capture surrounds the target)
-      and `elevation` are ranges in radians of the direction from the target to the
-      camera, `distance` is one in scene units, and `pan` is the largest displacement of
-      the target.
+      and `elevation` are ranges of the direction from the target to the camera in
+      radians. `distance` is a range in scene units, and `pan` is the largest
+      displacement of the target.
     """
     offset = train.position.astype(np.float64) - target
     distance = np.linalg.norm(offset, axis=1)
@@ -41,7 +41,7 @@ def camera_limits(
         flat = -(image_up - (image_up @ up) * up)
     side = flat / np.linalg.norm(flat)
     ahead = np.cross(up, side)
-    # The first view is within, also where it is steeper than all others may be.
+    # Includes the first view, even if it is steeper than the limit.
     elevation = [
         min(max(height.min() - ELEVATION_MARGIN, -STEEPEST), height[0]),
         max(min(height.max() + ELEVATION_MARGIN, STEEPEST), height[0]),
@@ -60,15 +60,13 @@ def camera_limits(
 
 
 def _azimuth(angles):
-    """Return the arc of all angles with its margin, including 0; None if it is a full
-    circle.
-    """
+    """Return the arc of all angles with a margin, or None if it is a full circle."""
     angles = np.sort(np.append(angles, 0.0))
     gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
     widest = int(np.argmax(gaps))
     if gaps[widest] < OPEN_ARC + 2 * AZIMUTH_MARGIN:
         return None
-    # The arc begins behind the widest gap. Zero is in it, so it begins at most at zero.
+    # The arc begins after the widest gap. It contains zero, so it begins at most there.
     low = angles[(widest + 1) % len(angles)]
     low = low if low <= 0 else low - 2 * np.pi
     high = low + 2 * np.pi - gaps[widest]

@@ -1,4 +1,4 @@
-"""Compact encoding of Gaussians at a few times: integers, and offsets of what moves.
+"""Compact encoding of Gaussians at a few times: integers, and offsets of moving ones.
 
 A field (mean, quaternion, ...) is stored once at its reference value. Gaussians that
 change also have an offset for each time, in steps of their own size. The reference is
@@ -12,21 +12,21 @@ import numpy as np
 from gaussians_jax.core import splats
 from gaussians_jax.io.sampled import Instants
 
-# Offsets shorter than this stay out: a tenth of a pixel in the nearest training view
-# for the means, and what changes a picture by less than one of 255 for the others.
+# Smaller offsets are left out: a tenth of a pixel in the nearest training view for
+# means, and changes of an image by less than 1/255 for the others.
 STILL_PX = 0.1
 STILL = {"quaternion": 5e-3, "log_scale": 1e-2, "opacity": 4e-3}
-BRIGHTEST = 4.0  # of a color, 1 being white
+BRIGHTEST = 4.0  # largest color, where white is 1
 OFFSET_TYPES: dict[str, type[np.signedinteger]] = {
     "mean": np.int16,
-    "quaternion": np.int8,  # 1/254 of how far the row turns: 0.2 degrees of 60
+    "quaternion": np.int8,  # 1/254 of the range: 0.2 degrees of 60
     "log_scale": np.int8,
     "opacity": np.int8,
 }
 
 
 class Packed(NamedTuple):
-    """Arrays one behind the other, and where each is."""
+    """Concatenated arrays, and the location of each."""
 
     entries: dict[str, dict[str, Any]]  # value = shift + scale * stored number
     data: bytes
@@ -35,8 +35,8 @@ class Packed(NamedTuple):
 def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
     """Encode Gaussians at several times.
 
-    Reference means are float32, so that one distant Gaussian costs the near ones no
-    precision. Rotations, scales and colors have 16 bits, opacity has 8.
+    Reference means are float32, so that a distant Gaussian does not reduce the
+    precision of near ones. Rotations, scales and colors have 16 bits, opacity has 8.
 
     Args:
       instants: The Gaussians at these times, scene units.
@@ -53,33 +53,33 @@ def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
         "opacity": (np.uint8, 1 / 255, 0.0),
     }
     arrays = _Arrays()
-    # A Gaussian may be brighter than white where others lie before it.
+    # A Gaussian may be brighter than white if others occlude it.
     color = np.round(np.minimum(instants.color / BRIGHTEST, 1) * 65535)
     arrays.add("color", color.astype(np.uint16), BRIGHTEST / 65535)
-    for name, (kind, scale, shift) in quantizers.items():
+    for name, (dtype, scale, shift) in quantizers.items():
         values = getattr(instants, name).astype(np.float64)
         values = values.reshape(*values.shape[:2], -1)
-        rest = (values.min(axis=0) + values.max(axis=0)) / 2
-        stored = (rest - shift) / scale
-        stored = stored if kind is np.float32 else np.round(stored)
-        stored = stored.astype(kind)
-        # From what is stored, so that the offsets make up for its rounding as well.
+        reference = (values.min(axis=0) + values.max(axis=0)) / 2
+        stored = (reference - shift) / scale
+        stored = stored if dtype is np.float32 else np.round(stored)
+        stored = stored.astype(dtype)
+        # Relative to the stored value, so that offsets also correct its rounding.
         offset = values - (shift + scale * stored.astype(np.float64))
-        least = still_distance if name == "mean" else STILL[name]
-        (rows,) = np.nonzero(np.abs(values - rest).max(axis=(0, 2)) > least)
-        most = np.iinfo(OFFSET_TYPES[name]).max
-        step = (np.abs(offset[:, rows]).max(axis=(0, 2)) / most).astype(np.float32)
+        threshold = still_distance if name == "mean" else STILL[name]
+        (rows,) = np.nonzero(np.abs(values - reference).max(axis=(0, 2)) > threshold)
+        largest = np.iinfo(OFFSET_TYPES[name]).max
+        step = (np.abs(offset[:, rows]).max(axis=(0, 2)) / largest).astype(np.float32)
         steps = np.maximum(step, np.finfo(np.float32).tiny)[None, :, None]
-        change = np.clip(np.round(offset[:, rows] / steps), -most, most)
+        quantized = np.clip(np.round(offset[:, rows] / steps), -largest, largest)
         arrays.add(name, stored, scale, shift)
         arrays.add(f"{name}.rows", rows.astype(np.uint32))
         arrays.add(f"{name}.step", step)
-        arrays.add(f"{name}.change", change.astype(OFFSET_TYPES[name]))
+        arrays.add(f"{name}.change", quantized.astype(OFFSET_TYPES[name]))
     return arrays.packed()
 
 
 class _Arrays:
-    """Bytes of arrays, each beginning at a multiple of four."""
+    """Bytes of arrays, each aligned to four bytes."""
 
     def __init__(self):
         self._entries, self._parts, self._size = {}, [], 0
@@ -100,12 +100,12 @@ class _Arrays:
         self._size += len(content)
 
     def packed(self):
-        """All of them."""
+        """Return all arrays."""
         return Packed(self._entries, b"".join(self._parts))
 
 
 def moving_rows(packed: Packed) -> int:
-    """Count the Gaussians that change over time, at least.
+    """Count the Gaussians that change over time: the largest number in any field.
 
     Args:
       packed: The encoded Gaussians.

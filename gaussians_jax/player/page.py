@@ -1,8 +1,8 @@
 """`player.html`: a trained dynamic scene in one file that plays in any browser.
 
 Nothing is fetched: Gaussians, program and poster are in the file. The color of a
-Gaussian does not depend on the direction, but is the mean of what the training cameras
-see. Motion is linear between the stored times.
+Gaussian does not depend on the direction, but is its mean color in the training views.
+Motion is linear between the stored times.
 """
 
 import base64
@@ -29,16 +29,17 @@ from nerfies_jax.evaluation.representation import Player
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.training.model import Model, TrainState
 
-# A larger page takes a browser seconds to open. A scene that needs more gets fewer
-# times, as long as they still resolve the motion.
+# A larger page takes seconds to open in a browser. Larger scenes get fewer times, at
+# least enough to resolve the motion.
 MOST_BYTES, FEWEST_INSTANTS = 48 * 2**20, 8
+# Rasterizer settings that project() of the page reads.
 # Settings that the page's own project() reads.
 RASTER = (
     *("alpha_threshold", "alpha_max", "eps2d", "antialiased", "near", "far"),
     "tangent_margin",
 )
 PROGRAM = ("splats", "camera", "painter", "controls", "player")  # in this order
-LARGEST = 1e30  # for an infinite far plane, which JSON has not
+LARGEST = 1e30  # stands for an infinite far plane, which JSON cannot represent
 
 
 def write(
@@ -89,15 +90,15 @@ def compose(
     capture: Capture,
     poster: np.ndarray,
 ) -> Player:
-    """Write the page of Gaussians that are packed already.
+    """Write the page of encoded Gaussians.
 
     Args:
       path: File to write.
       title: Title of the page.
-      packed: The Gaussians.
+      packed: The encoded Gaussians.
       about: Sentences about them, for the caption.
       raster: Thresholds of the image.
-      capture: Cameras that the first view and the limits of the camera come from.
+      capture: Provides the first view and the limits of the camera.
       poster: Image [height, width, 3] (uint8) that is shown until the first frame.
 
     Returns:
@@ -114,7 +115,7 @@ def compose(
         "data": base64.b64encode(packed.data).decode("ascii"),
         **{name: _file(f"{name}.js") for name in PROGRAM},
     }
-    # In one pass: what stands in a name is never taken for a part.
+    # In one pass, so that a placeholder inside a name is not replaced.
     page = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("player.html"))
     with replaced_file(path) as partial:
         partial.write_text(page, encoding="utf-8")
@@ -141,8 +142,10 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
     first = cameras.take(train, 0)
     forward = np.asarray(first.camera_from_world, np.float64)[2]
     focus = camera_paths.focus_point(train, capture.near, capture.far)
-    away = float(np.clip((focus - first.position) @ forward, capture.near, capture.far))
-    target = np.asarray(first.position) + away * forward
+    distance = float(
+        np.clip((focus - first.position) @ forward, capture.near, capture.far)
+    )
+    target = np.asarray(first.position) + distance * forward
     up = camera_paths.up_axis(capture)
     half_diagonal = float(np.hypot(*capture.size) / 2 / first.focal_px)
     view = {
@@ -185,8 +188,8 @@ def still_distance(instants: Instants, capture: Capture) -> np.ndarray:
     train = cameras.take(capture.cameras, capture.train)
     nearest = np.full(instants.mean.shape[1], np.inf)
     for position, focal in zip(train.position, train.focal_px, strict=True):
-        away = np.linalg.norm(instants.mean[0] - position, axis=1)
-        nearest = np.minimum(nearest, away / focal)
+        distance = np.linalg.norm(instants.mean[0] - position, axis=1)
+        nearest = np.minimum(nearest, distance / focal)
     return packing.STILL_PX * nearest
 
 
@@ -194,17 +197,17 @@ def _about(instants, packed, capture):
     count = instants.mean.shape[1]
     return (
         f"{count:,} Gaussians, {packing.moving_rows(packed):,} of them moving, at "
-        f"{len(instants.mean)} instants; {instants.left_out:,} that no camera saw are "
-        f"left out; one unit is {1 / capture.scale:.3g} of the capture's world."
+        f"{len(instants.mean)} times. {instants.left_out:,} that no camera saw are "
+        f"left out. One unit is {1 / capture.scale:.3g} world units of the capture."
     )
 
 
-def _data_url(picture):
+def _data_url(image):
     content = io.BytesIO()
-    PIL.Image.fromarray(picture).save(content, "JPEG", quality=85)
+    PIL.Image.fromarray(image).save(content, "JPEG", quality=85)
     return "data:image/jpeg;base64," + base64.b64encode(content.getvalue()).decode()
 
 
 def _file(name):
-    place = importlib.resources.files("gaussians_jax.player").joinpath(name)
-    return place.read_text(encoding="utf-8")
+    resource = importlib.resources.files("gaussians_jax.player").joinpath(name)
+    return resource.read_text(encoding="utf-8")

@@ -1,9 +1,9 @@
 "use strict";
-// Drawing of Gaussians by WebGL 2. The formulas are those of gaussians_jax/projection.py.
+// Rendering of Gaussians in WebGL 2, with the formulas of splatting/projection.py.
 
-const WIDTH = 2048; // texels of a row, which every device has
+const WIDTH = 2048; // texels per row, supported by all devices
 
-// The footprint of one Gaussian at the time and from the camera of the uniforms.
+// The footprint of one Gaussian at the time and camera of the uniforms.
 const PROJECTION = `
 precision highp float;
 precision highp int;
@@ -57,7 +57,7 @@ Footprint footprintOf(int index) {
   vec2 tangent = view.xy / z;
   shown.mean = focal * tangent + vec2(skew * tangent.y, 0.0) + center;
 
-  // Rows of T = J W R diag(scale), with the tangents clamped in J alone.
+  // Rows of T = J W R diag(scale), with clamped tangents in J only.
   tangent = clamp(tangent, -(center + margin) / focal, (size - center + margin) / focal);
   float twice = 2.0 / dot(q, q);
   float w = q.x, x = q.y, y = q.z, s = q.w;
@@ -65,7 +65,7 @@ Footprint footprintOf(int index) {
     1.0 - twice * (y * y + s * s), twice * (x * y + w * s), twice * (x * s - w * y),
     twice * (x * y - w * s), 1.0 - twice * (x * x + s * s), twice * (y * s + w * x),
     twice * (x * s + w * y), twice * (y * s - w * x), 1.0 - twice * (x * x + y * y));
-  mat3 across = transpose(axes); // its columns: right, down and ahead of the three axes
+  mat3 across = transpose(axes); // columns: right, down and forward components of the axes
   vec3 right = across[0] - tangent.x * across[2], down = across[1] - tangent.y * across[2];
   vec3 first = (focal.x * right + skew * down) * scale / z;
   vec3 second = focal.y * down * scale / z;
@@ -81,14 +81,14 @@ Footprint footprintOf(int index) {
   return shown;
 }`;
 
-// Writes the footprints in their order: once for each Gaussian, not for each corner, as
-// that takes a third of a frame on a processor. `reach` is how far a footprint goes until
-// its alpha is the least that counts, squared, in powers of two, which hardware has.
+// Write the footprints in depth order, once per Gaussian and not per corner, which
+// would take a third of a frame on a CPU. `reach` is the squared radius at which alpha
+// falls to the threshold, as an exponent of two, which hardware evaluates.
 const PROJECT = `#version 300 es
 ${PROJECTION}
 layout(location = 0) in uint index;
 out vec4 place; // mean in px, k, reach
-out vec2 spread; // px along x and y of a unit of that reach
+out vec2 spread; // px along x and y per unit of that reach
 out vec3 color;
 void main() {
   Footprint shown = footprintOf(int(index));
@@ -102,10 +102,10 @@ void main() {
 }`;
 const NOTHING = `#version 300 es
 void main() {}`;
-const PARTS = { place: 4, spread: 2, color: 3 }; // floats of a footprint
+const PARTS = { place: 4, spread: 2, color: 3 }; // floats per footprint
 
-// The quad around a footprint is the square around the circle u^2 + v^2 = reach: no
-// smaller parallelogram holds the ellipse.
+// The quad around a footprint is the square around the circle u^2 + v^2 = reach, the
+// smallest parallelogram that contains the ellipse.
 const VERTEX = `#version 300 es
 uniform vec2 size;
 layout(location = 0) in vec4 place;
@@ -167,7 +167,7 @@ function programOf(gl, vertex, fragment, varyings = null) {
   return linked;
 }
 
-// A function that sets a uniform by its name.
+// Return a function that sets a uniform by its name.
 function uniformsOf(gl, program) {
   const places = {};
   return (name, kind, ...values) => {
@@ -176,7 +176,7 @@ function uniformsOf(gl, program) {
   };
 }
 
-// All of a scene in textures, at the units 0 to 4 in the order of SAMPLERS.
+// Store a scene in textures, at the units 0 to 4 in the order of SAMPLERS.
 const SAMPLERS = ["gaussians", "steps", "meanChange", "quaternionChange", "scaleChange"];
 
 function sceneTextures(gl, header, buffer) {
@@ -196,7 +196,7 @@ function sceneTextures(gl, header, buffer) {
     gaussians[16 * i + 11] = rowOf[i];
     for (let k = 0; k < 3; k++) gaussians[16 * i + 12 + k] = color[3 * i + k];
   }
-  // Of the mean, the quaternion, the scale and the opacity, which is with the mean.
+  // Of mean, quaternion, scale and opacity, which is stored with the mean.
   [[0, 0, 0], [4, 1, 0], [8, 2, 0], [3, 0, 3]].forEach(([at, texture, first], f) => {
     const { width, values, rows, step, change } = fields[f];
     for (let i = 0; i < count; i++) {
@@ -234,7 +234,7 @@ function newTexture(gl) {
   return texture;
 }
 
-// Set everything that PROJECTION reads.
+// Set all uniforms of PROJECTION.
 function setCamera(set, scene, camera, raster, time) {
   const { before, share } = between(time, scene.instants);
   SAMPLERS.forEach((name, unit) => set(name, "1i", unit));
@@ -253,8 +253,8 @@ function setCamera(set, scene, camera, raster, time) {
   set("antialiased", "1i", Number(raster.antialiased));
 }
 
-// Half floats keep a hundred thin layers from turning into bands, as eight bits would.
-// A software renderer blends whole floats in half the time.
+// Half floats prevent the banding that eight bits would show in a hundred thin layers.
+// A software renderer blends full floats in half the time.
 function formatOf(gl) {
   const float = gl.getExtension("EXT_color_buffer_float");
   const named = gl.getExtension("WEBGL_debug_renderer_info");
@@ -266,7 +266,7 @@ function formatOf(gl) {
   return half ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA8, gl.UNSIGNED_BYTE];
 }
 
-// Room for the footprints of so many Gaussians, which `quads` draws one by one.
+// Buffers for a number of footprints, which `quads` renders one by one.
 function footprintBuffer(gl, quads, count) {
   const widths = Object.values(PARTS), bytes = 4 * widths.reduce((a, b) => a + b);
   const footprints = gl.createBuffer();
@@ -283,7 +283,7 @@ function footprintBuffer(gl, quads, count) {
   return footprints;
 }
 
-// What draws a scene on the canvas: `sort` takes the rows to draw, the farthest first.
+// Return the renderer of a scene: `sort` sets the rows to render, farthest first.
 function painterOf(canvas, header, buffer) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false });
   if (!gl) throw new Error("this browser has no WebGL 2");
@@ -321,7 +321,7 @@ function painterOf(canvas, header, buffer) {
     gl.bufferData(gl.ARRAY_BUFFER, sorted, gl.STREAM_DRAW);
   }
 
-  // Compute the footprints of all rows that were sorted.
+  // Compute the footprints of all sorted rows.
   function project(camera, raster, time) {
     gl.useProgram(projector);
     setCamera(setProjector, scene, camera, raster, time);
@@ -332,11 +332,11 @@ function painterOf(canvas, header, buffer) {
     gl.drawArrays(gl.POINTS, 0, count);
     gl.endTransformFeedback();
     gl.disable(gl.RASTERIZER_DISCARD);
-    // A buffer that is written to cannot be drawn from.
+    // A buffer cannot be written and rendered from at the same time.
     gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
   }
 
-  // Draw a quad for each footprint with the program in use.
+  // Render a quad for each footprint with the current program.
   function drawQuads() {
     gl.bindVertexArray(quads);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);

@@ -1,13 +1,13 @@
 "use strict";
-// The page of a player: time, drawing and the buttons.
+// The page of a player: time, rendering and buttons.
 
-const SLOW = 1 / 25, FAST = 1 / 50; // seconds between frames that ask for other sizes
-const COARSEST = 0.3; // of the screen's pixels along an edge
-const LINKED_AFTER = 300; // ms at rest, after which the address bar has the view
+const SLOW = 1 / 25, FAST = 1 / 50; // seconds per frame above and below which the size changes
+const COARSEST = 0.3; // smallest resolution, as a share of the screen's along an edge
+const LINKED_AFTER = 300; // ms without motion after which the address bar shows the view
 
-// A function that asks for the order of the Gaussians, in a worker where there can be
-// one. `take` gets the rows and whether a worker sorted them. One request is under way
-// at a time, and the last one made meanwhile comes next.
+// Return a function that requests the depth order of the Gaussians, from a worker if
+// possible. `take` gets the rows, and whether a worker sorted them. One request is
+// active at a time, and only the last one of those made meanwhile follows.
 function sorterFor(header, buffer, source, take) {
   let worker = null, current = null, next = null, here = null;
 
@@ -22,7 +22,7 @@ function sorterFor(header, buffer, source, take) {
     worker.postMessage(request);
   }
 
-  function withoutWorker() { // where a browser runs none from a page like this one
+  function withoutWorker() { // for browsers that do not allow workers here
     worker = null;
     if (next ?? current) onThisThread(next ?? current);
   }
@@ -62,7 +62,7 @@ function start(header, buffer, source) {
     wake();
   });
 
-  // What the order depends on, and what the image depends on besides.
+  // Inputs of the order, and further inputs of the image.
   const orderKey = () => [time, textOf(camera.view)].join();
   const imageKey = () => [
     orderKey(), sorted, one("background").value, canvas.width, canvas.height].join();
@@ -72,15 +72,15 @@ function start(header, buffer, source) {
     const share = dense * (playing || camera.moving ? resolution : 1);
     const width = Math.max(1, Math.round(canvas.clientWidth * share));
     const height = Math.max(1, Math.round(canvas.clientHeight * share));
-    // Setting the size clears the canvas, even to the same one.
+    // Setting the size clears the canvas, even if it does not change.
     if (canvas.width !== width) canvas.width = width;
     if (canvas.height !== height) canvas.height = height;
   }
 
   function draw() {
     const shown = cameraOf(camera.view, lens, canvas.width, canvas.height);
-    // The least width of a footprint counts pixels as trained: in a larger image it
-    // grows along, or thin Gaussians would part.
+    // The dilation of footprints is in pixels of training. In a larger image it is
+    // scaled, or thin Gaussians would separate.
     const wider = Math.max(1, shown.enlarged);
     const raster = { ...header.raster, eps2d: header.raster.eps2d * wider * wider };
     const hex = parseInt(one("background").value.slice(1), 16);
@@ -102,7 +102,7 @@ function start(header, buffer, source) {
     if (playing) setTime((time + Number(one("speed").value) * since / header.seconds) % 1);
     camera.advance(passed);
     const busy = playing || camera.moving;
-    if (busy && before && since < 1) adapt(since); // longer where the page was hidden
+    if (busy && before && since < 1) adapt(since); // longer if the page was hidden
     before = now;
     resize();
     const key = orderKey();
@@ -120,7 +120,7 @@ function start(header, buffer, source) {
     else scheduleLink();
   }
 
-  // Fewer pixels while frames take long, more where they take little.
+  // Fewer pixels if frames take long, more if they take little time.
   function adapt(seconds) {
     lasted = lasted ? 0.7 * lasted + 0.3 * seconds : seconds;
     if (lasted > SLOW && resolution > COARSEST) resolution = Math.max(COARSEST, resolution * 0.8);
@@ -151,7 +151,7 @@ function start(header, buffer, source) {
     setTime(Math.min(Math.max(Math.round(time * last) + by, 0), last) / last);
   }
 
-  // The address has the time and the view while nothing moves.
+  // The address contains the time and the view when nothing moves.
   function scheduleLink() {
     clearTimeout(linking);
     linking = setTimeout(() => {
@@ -187,7 +187,7 @@ function start(header, buffer, source) {
       home: () => camera.reset(), f: fullscreen, "?": help,
     };
     const key = event.key.toLowerCase();
-    // A button is pressed by Space, and the slider moved by arrows.
+    // Space presses a button, and arrows move the slider.
     if (event.target.closest?.("button, summary") && event.key === " ") return;
     if (one("help").open && event.key !== "?") return;
     if (event.target === slider && ["ArrowLeft", "ArrowRight"].includes(event.key)) {
@@ -200,9 +200,9 @@ function start(header, buffer, source) {
     event.preventDefault();
   }
 
-  // Phones take the drawing of pages that are out of sight, and may give it back.
+  // Phones may take the WebGL context of hidden pages, and may restore it.
   canvas.addEventListener("webglcontextlost", (event) => {
-    event.preventDefault(); // or it is never given back
+    event.preventDefault(); // required for the context to be restored
     lost = true;
     one("poster").hidden = false;
     one("trouble").textContent =
@@ -229,7 +229,7 @@ function start(header, buffer, source) {
   });
   one("background").addEventListener("input", wake);
   window.addEventListener("hashchange", () => follow() && play(false));
-  new ResizeObserver(wake).observe(canvas); // also where the caption is opened
+  new ResizeObserver(wake).observe(canvas); // also when the caption is opened
   window.addEventListener("keydown", press);
   setTime(0);
   play(!follow() && !calm.matches);
@@ -239,7 +239,7 @@ function start(header, buffer, source) {
     get view() { return { ...camera.view, ...cameraOf(camera.view, lens, ...lens.size) }; },
     get resolution() { return canvas.width / canvas.clientWidth; },
     get byWorker() { return byWorker; },
-    // Nothing moves, and what is to be seen is drawn.
+    // Nothing moves, and the image is up to date.
     get ready() { return !awake && sorted === orderKey() && drawn === imageKey(); },
     painter,
   };
@@ -251,7 +251,7 @@ function bytesOf(text) {
   return bytes.buffer;
 }
 
-let player = null; // for tests, and for pages that show this one in a frame
+let player = null; // for tests, and for pages that embed this one in a frame
 try {
   const text = (id) => document.getElementById(id).textContent;
   player = start(JSON.parse(text("header")), bytesOf(text("data")), text("splats"));

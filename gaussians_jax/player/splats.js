@@ -1,6 +1,6 @@
 "use strict";
-// The Gaussians of a player as arrays, and their order from the camera. This file knows
-// neither the page nor WebGL: it also runs as the worker that sorts.
+// The Gaussians of a player as arrays, and their depth order. This file depends on
+// neither the page nor WebGL, because it also runs as the sorting worker.
 
 const TYPES = {
   uint8: Uint8Array, int8: Int8Array, uint16: Uint16Array, int16: Int16Array,
@@ -8,19 +8,19 @@ const TYPES = {
 };
 const FIELDS = { mean: 3, quaternion: 4, log_scale: 3, opacity: 1 };
 
-// The numbers of one array as they are stored.
+// Return the stored numbers of one array.
 function stored(entry, buffer) {
   const length = entry.shape.reduce((product, size) => product * size, 1);
   return new TYPES[entry.type](buffer, entry.offset, length);
 }
 
-// The values of one array.
+// Return the values of one array.
 function decoded(entry, buffer) {
   return Float32Array.from(
     stored(entry, buffer), (number) => entry.shift + entry.scale * number);
 }
 
-// One field: its static values, and the changes of the rows that move.
+// A field: its static values, and the changes of the moving rows.
 function fieldOf(name, header, buffer) {
   const entries = header.arrays;
   return {
@@ -32,15 +32,15 @@ function fieldOf(name, header, buffer) {
   };
 }
 
-// The two instants around a time from 0 to 1, and how far it is from the first.
+// Return the two stored times around a time in [0, 1], and the position between them.
 function between(time, instants) {
   const place = Math.min(Math.max(time, 0), 1) * (instants - 1);
   const before = Math.min(Math.floor(place), instants - 2);
   return { before, share: place - before };
 }
 
-// Write the values of a field at a time into `now`, which holds the static ones
-// elsewhere. Between two instants they go straight.
+// Write the values of a field at a time into `now`, which already has the static ones.
+// Interpolation between stored times is linear.
 function pose(field, time, instants, now) {
   const { width, values, rows, step, change } = field;
   const { before, share } = between(time, instants);
@@ -54,8 +54,8 @@ function pose(field, time, instants, now) {
   }
 }
 
-// A function of a camera's position, forward axis (world coordinates) and time that
-// returns the rows of the Gaussians ahead of the near plane, the farthest first.
+// Return a function of a camera's position, forward axis (world coordinates) and time
+// that returns the rows of the Gaussians beyond the near plane, farthest first.
 function sorterOf(header, buffer) {
   const field = fieldOf("mean", header, buffer), { near, far } = header.raster;
   const now = field.values.slice(), count = now.length / 3;
@@ -78,8 +78,8 @@ function sorterOf(header, buffer) {
   };
 }
 
-// Rows from the smallest depth to the largest, equal ones as they came. Positive floats
-// are in the order of their bits, so two counting sorts by 16 bits each are exact.
+// Sort rows by depth, with ties in their order. Positive floats have the order of their
+// bits, so two counting sorts by 16 bits each are exact.
 function order(depths) {
   const bits = new Uint32Array(depths.buffer, depths.byteOffset, depths.length);
   let rows = new Uint32Array(depths.length), next = new Uint32Array(depths.length);
@@ -96,7 +96,7 @@ function order(depths) {
   return rows;
 }
 
-// As a worker: the first message holds the scene, all others are requests.
+// As a worker: the first message contains the scene, all others are requests.
 if (typeof WorkerGlobalScope !== "undefined") {
   let sort = null;
   onmessage = ({ data }) => {

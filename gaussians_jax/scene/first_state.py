@@ -25,14 +25,19 @@ from nerfies_jax.preprocessing import hidden_points, record, usable_paths, view_
 from nerfies_jax.runtime import data_parallel
 from nerfies_jax.training.model import TrainState, in_default_precision
 
-# Nothing else will ever make opaque what no camera sees: 88 %.
+# Opacity logit of Gaussians that no camera sees and no gradient will make opaque: 88 %.
 HIDDEN_LOGIT = 2.0
 
 
 def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     """Estimate the memory of the initial state and a step, without allocating it.
 
-    Nothing is allocated. The capture's own memory is counted, too.
+    Args:
+      spec: Settings.
+      capture: The capture, whose own memory is included.
+
+    Returns:
+      Memory in bytes.
     """
     tracked = spec.start.motion == "tracks"
     init = initialization.of_start(spec.init, tracked)
@@ -40,9 +45,9 @@ def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     count += spec.start.moving_points if tracked else 0
     count *= 1 + (carried_count(spec) or 0)
     harmonics = 3 * (spec.sh_degree + 1) ** 2
-    # Parameters, two moments, gradient, update; the tables of one projection.
+    # Parameters, two moments, gradient, update, and the tables of one projection.
     numbers = count * (5 * (11 + harmonics) + 60)
-    # A chunk holds keys, rows and blending inputs of every pair.
+    # A chunk holds keys, rows and blending inputs of every Gaussian-tile pair.
     numbers += 16 * (spec.raster.capacity or 0)
     devices = data_parallel.device_count(spec.batch_size)
     return 4 * numbers + frame_bytes(capture, devices)
@@ -58,8 +63,19 @@ def first_state(
 ) -> TrainState:
     """Initialize parameters, moments and statistics, on the host.
 
-    Rows are padded to a capacity that `splats.capacity_for` says. `key` also becomes
-    the run's own, by a split.
+    Args:
+      spec: Settings.
+      strategy: Strategy of the scene, or None.
+      effects: Components of the scene.
+      optimizer: The optimizer.
+      capture: The capture.
+      key: PRNG key. A split of it becomes the key of the run.
+
+    Returns:
+      The state, padded to a capacity (`splats.capacity_for`).
+
+    Raises:
+      ValueError: If settings contradict each other or the capture.
     """
     refuse_what_cannot_train(spec)
     rendering.refuse_distortion(capture.cameras)
@@ -71,11 +87,11 @@ def first_state(
     position, color = initialization.initial_points(init, capture, seed)
     if hidden is not None and most is not None:
         hidden = _thinned(hidden, most - len(position) - len(tracked.position))
-    guessed = slice(len(position), len(position))
+    hidden_rows = slice(len(position), len(position))
     if hidden is not None:
         position = np.concatenate([position, hidden.position])
         color = np.concatenate([color, hidden.color / 255])
-        guessed = slice(guessed.start, len(position))
+        hidden_rows = slice(hidden_rows.start, len(position))
     if tracked is not None:
         position = np.concatenate([position, tracked.position])
         color = np.concatenate([color, tracked.color])
@@ -86,7 +102,7 @@ def first_state(
         opacity=spec.init.opacity,
         scale=spec.init.scale,
     )
-    opaque = rows.opacity_logit.at[guessed].set(HIDDEN_LOGIT)
+    opaque = rows.opacity_logit.at[hidden_rows].set(HIDDEN_LOGIT)
     rows = rows._replace(opacity_logit=opaque)
     rows = initialization.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
@@ -104,44 +120,50 @@ def first_state(
 
 
 def _from_tracks(spec, effects, capture, key):
-    """The start from tracks, what stands hidden, and the capture with what stands.
+    """Return Gaussians from tracks, points hidden behind them, and the capture.
 
-    Nothing of the two, and the capture as it is, where there is no such start.
+    The capture gets the static points of preprocessing if there are more of them than
+    its own. The first two are None without an initialization from tracks.
     """
-    evidence = usable_paths.evidence_to_start_from(capture, spec.start)
-    if evidence is None:
+    tracking = usable_paths.evidence_to_start_from(capture, spec.start)
+    if tracking is None:
         return None, None, capture
-    seeds = track_start.start(spec.start, effects[0], evidence, capture, key)
-    if len(evidence.still.position) > initialization.point_count(capture):
-        capture = dataclasses.replace(capture, points=evidence.still)
+    seeds = track_start.start(spec.start, effects[0], tracking, capture, key)
+    if len(tracking.still.position) > initialization.point_count(capture):
+        capture = dataclasses.replace(capture, points=tracking.still)
     hidden = None
     if spec.start.fill_hidden and initialization.point_count(capture):
-        views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
-        hidden = hidden_points.behind(views, capture.points, evidence.moving)
+        views = view_set.in_time_order(record.looked_at(capture, tracking.factor))
+        hidden = hidden_points.behind(views, capture.points, tracking.moving)
     return seeds, hidden, capture
 
 
 def _thinned(points, most):
-    """At most so many of them, evenly over their order."""
+    """Select at most `most` points, evenly over their order."""
     count = min(max(most, 0), len(points.position))
-    kept = np.linspace(0, len(points.position) - 1, count).round().astype(int)
-    return PointCloud(points.position[kept], points.color[kept])
+    indices = np.linspace(0, len(points.position) - 1, count).round().astype(int)
+    return PointCloud(points.position[indices], points.color[indices])
 
 
 def count_rows(effects: tuple[SplatRecord, ...], state: TrainState) -> dict[str, int]:
-    """Active Gaussians, and `parameters`: the numbers of rows and the networks.
+    """Count active Gaussians and trained parameters.
 
-    Where rows carry what is drawn, `gaussians` are those that are drawn and `rows`
-    those that carry.
+    Args:
+      effects: Components of the scene.
+      state: State of the training.
+
+    Returns:
+      "gaussians", the number of rendered Gaussians, and "parameters", the number of
+      scalars. With child Gaussians also "rows", the number of parents.
     """
     params = state.params
     active = int(splats.active_mask(params.rows["splats"]).sum())
     each = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves(params.rows))
     nets = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(params.nets))
     counts = {
-        "gaussians": active * deformation.carried_by_each(effects, params),
+        "gaussians": active * deformation.children_per_gaussian(effects, params),
         "parameters": active * each + nets,
     }
-    if deformation.derives(effects) is not None:
+    if deformation.child_component(effects) is not None:
         counts["rows"] = active
     return counts

@@ -1,4 +1,4 @@
-"""Events between the chunks of training, which add and remove Gaussians."""
+"""Events between the chunks of training: densification and projection steps."""
 
 from typing import Any, NamedTuple
 
@@ -15,19 +15,19 @@ from nerfies_jax.training.model import Event, TrainState
 
 PyTree = Any
 
-# Streams of the run's key beside those of the steps, which are its 0, 1, 2, ...
+# Streams of the run's PRNG key, apart from those of the steps, which are 0, 1, 2, ...
 EVENT, NOISE = 2**32 - 2, 2**32 - 3
 
 
 class AuxState(NamedTuple):
-    """State of a scene besides its parameters: statistics, and state of effects."""
+    """State of a scene besides its parameters."""
 
-    stats: PyTree  # of the strategy; () without one
-    effects: dict[str, PyTree]  # by the name of the effect
+    stats: PyTree  # state of the strategy, () without one
+    effects: dict[str, PyTree]  # state of each component, by name
 
 
 def states_of(effects: tuple[SplatRecord, ...], params: Params) -> dict[str, PyTree]:
-    """Initialize the state of each effect, on the host."""
+    """Initialize the state of each component, on the host."""
     return {
         effect.name: effect.state(params)
         for effect in effects
@@ -36,7 +36,7 @@ def states_of(effects: tuple[SplatRecord, ...], params: Params) -> dict[str, PyT
 
 
 def stream_key(state: TrainState, stream: int) -> Key[Array, ""]:
-    """A key of this step for something beside `loop.step_key`."""
+    """Return a PRNG key of this step that is independent of `loop.step_key`."""
     return jax.random.fold_in(jax.random.fold_in(state.key, stream), state.step)
 
 
@@ -46,22 +46,22 @@ def events(
     effects: tuple[SplatRecord, ...],
     optimizer: optax.GradientTransformation,
 ) -> tuple[Event, ...]:
-    """Return when rows are born, die and are reset, and when parameters are projected.
+    """Return the events of the strategy and the projection steps of a scene.
 
     Args:
       spec: Settings of the scene.
-      metadata: Sizes of the capture.
-      effects: Parts of the scene.
-      optimizer: The optimizer, which knows its state.
+      metadata: Metadata of the capture.
+      effects: Components of the scene.
+      optimizer: The optimizer.
 
     Returns:
-      The events of the strategy, and those of the effects behind them.
+      The events of the strategy, followed by those of the components.
     """
     strategy = strategy_of(spec, metadata)
-    own = () if strategy is None else strategy.events(spec.steps)
+    densification = () if strategy is None else strategy.events(spec.steps)
     return (
-        *(_event(one, strategy, metadata, effects, optimizer) for one in own),
-        *(_revision(one, spec.steps) for one in effects if one.revise_at),
+        *(_event(e, strategy, metadata, effects, optimizer) for e in densification),
+        *(_revision(effect, spec.steps) for effect in effects if effect.revise_at),
     )
 
 
@@ -95,8 +95,8 @@ def _event(event, strategy, metadata, effects, optimizer):
 def _revision(effect, steps):
     def revise(state, frames):
         del frames
-        own = effect.revise(state.params.nets[effect.name], int(state.step))
-        nets = state.params.nets | {effect.name: own}
+        projected = effect.revise(state.params.nets[effect.name], int(state.step))
+        nets = state.params.nets | {effect.name: projected}
         return state._replace(params=state.params._replace(nets=nets))
 
     when = tuple(step for step in effect.revise_at if step < steps)

@@ -1,7 +1,7 @@
-"""Exposures of frames that were never learned from, fitted to half of each.
+"""Exposures of held-out frames, fitted to one half of each frame.
 
-The protocol of NeRF-W (Martin-Brualla et al. 2021), as for the codes of fields: the
-scene stays as it is, and the other half is scored.
+This is the protocol of NeRF-W (Martin-Brualla et al. 2021). The scene is fixed, and
+metrics are computed on the other half, as for the codes of radiance fields.
 """
 
 import dataclasses
@@ -24,9 +24,10 @@ def score(
     capture: Capture,
     rows: np.ndarray,
 ) -> evaluation.Halves | None:
-    """Scores of the right halves of frames, their exposure fitted to the left ones.
+    """Compute metrics of right halves of frames, with exposures of the left halves.
 
-    None where the scene has no exposures.
+    Returns:
+      The metrics, or None if the scene has no exposure model.
     """
     if spec.exposure is None:
         return None
@@ -36,13 +37,13 @@ def score(
 
     def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
         color = np.asarray(renderer(state, view).color)
-        drawn = color[:, : left.shape[1]]
-        return exposure.fitted(drawn, left.astype(np.float32) / 255, valid)
+        rendering = color[:, : left.shape[1]]
+        return exposure.fit(rendering, left.astype(np.float32) / 255, valid)
 
     def render(view: View, change: np.ndarray) -> Rendering:
-        drawn = renderer(state, view)
-        picture = jnp.asarray(drawn.color)
-        color = exposure.changed(picture, jnp.asarray(change, picture.dtype))
-        return drawn._replace(color=jax.device_get(color))
+        rendering = renderer(state, view)
+        image = jnp.asarray(rendering.color)
+        color = exposure.apply_exposure(image, jnp.asarray(change, image.dtype))
+        return rendering._replace(color=jax.device_get(color))
 
     return evaluation.score_halves(fit_code, render, capture, rows)

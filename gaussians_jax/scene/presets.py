@@ -1,7 +1,7 @@
-"""Presets with the numbers of the papers; those for a CPU are in `small_presets`.
+"""Presets with the numbers of the papers. Presets for a CPU are in `small_presets`.
 
-Where a preset leaves its paper, that is said beside it. None of the full sizes was ever
-trained to its end: they want a GPU.
+Each comment says where a preset differs from its paper. None of the full-size presets
+was ever trained to its end, because they need a GPU.
 """
 
 import dataclasses
@@ -51,14 +51,14 @@ from gaussians_jax.scene.small_presets import (
 from gaussians_jax.scene.spec import SplatScene
 from nerfies_jax.training import step_counts
 
-# Kerbl et al. 2023, arXiv:2308.04079: every other number is a default of its spec.
+# Kerbl et al. 2023, arXiv:2308.04079: all other numbers are defaults of their specs.
 STATIC = SplatScene(steps=30_000)
 
-# Kheradmand et al. 2024, arXiv:2404.09591: its first opacity and scale, its noise and
-# its regularizers. The paper counts 1 to 6 million Gaussians, one number for each of
-# its scenes; here it is a million. Its noise and rates are the code's; rows that moved
-# or are new start with zero moments and their own count, where the code keeps the
-# moments of those that moved and has one count for all.
+# Kheradmand et al. 2024, arXiv:2404.09591: its initial opacity and scale, its noise and
+# its regularizers. The paper uses 1 to 6 million Gaussians depending on the scene, this
+# preset one million. Noise and rates are those of the code. Moved and new Gaussians
+# start with zero moments and a step count of their own, where the code keeps the
+# moments of moved ones and has one count for all.
 MCMC = SplatScene(
     steps=30_000,
     init=InitSpec(opacity=0.5, scale=0.1),
@@ -66,20 +66,20 @@ MCMC = SplatScene(
 )
 
 # Yang et al. 2023, arXiv:2309.13101, for real captures: the network, the warm-up and
-# the smoothing are defaults of `MotionSpec`. Rates of means fall until the end, there
-# to step 30,000.
+# the smoothing are defaults of `MotionSpec`. The rates of the means decay until the
+# end, in the paper until step 30,000.
 DEFORMABLE = SplatScene(
     steps=40_000,
     learning_rates=LearningRateSpec(log_scale=1e-3),
     motion=MotionSpec(),
 )
 
-# Zhu et al. 2024, arXiv:2410.07707, and its code's numbers: Deformable 3DGS with flow
-# that is not the camera's. Its flow and masks come from networks, these from
-# `evidence`; frames come in any order, where its come one after the other; and its
-# cameras stay those of the capture, as there by default (`poses=PoseRefinementSpec`
-# refines them). Rates of means fall over 30,000 steps there, so that after 20,000 they
-# are this.
+# Zhu et al. 2024, arXiv:2410.07707, and the numbers of its code: Deformable 3DGS
+# supervised by the flow that the camera motion does not explain. Differences: flow and
+# masks come from `preprocessing`, not from networks. Frames are visited in random, not
+# temporal order. Cameras are not refined, as in the paper's default
+# (`poses=PoseRefinementSpec()` refines them). The paper's rates of the means decay over
+# 30,000 steps, so `mean_end` is their value after 20,000.
 MOTION_GS = SplatScene(
     steps=20_000,
     learning_rates=LearningRateSpec(mean_end=7.4e-6, log_scale=1e-3),
@@ -87,8 +87,8 @@ MOTION_GS = SplatScene(
     flow=FlowSpec(),
 )
 
-# Rigid motions fitted to tracks before training, in the manner of Shape of Motion. Its
-# tracks and depths come from networks, these from optical flow (`evidence`).
+# Rigid motions fitted to tracks before training, similar to Shape of Motion. Tracks and
+# depths come from optical flow (`preprocessing`), not from networks.
 TRACKED = SplatScene(
     steps=30_000,
     init=InitSpec(points=50_000, extra_random=None),
@@ -97,13 +97,13 @@ TRACKED = SplatScene(
     start=StartSpec(motion="tracks", moving_points=20_000),
 )
 
-# Sonata. What it leaves open is as in E-D3DGS, which it descends from (`E_D3DGS`): two
-# views a step, no D-SSIM, 60,000 steps, growth to the end, a price on opacity for its
-# resets, rates, a table of half as many moments as frames, which bends little and which
-# a coarse and a fine network read. Turns are rotation vectors. Depth counts only where
-# a capture has it, and by correlation, which the paper leaves open. Codes start as
-# waves, not as zeros: see `SMALL_SONATA`. The KAN of the paper's equation 4 is
-# `motion.network=bspline`.
+# Sonata. Numbers that the paper does not give are those of E-D3DGS, which it is based
+# on (`E_D3DGS`): two views per step, no D-SSIM, 60,000 steps, densification until the
+# end, an opacity penalty instead of resets, learning rates, and a table of half as many
+# time codes as frames, read by a coarse and a fine network, with a smoothness penalty.
+# Rotations are rotation vectors. Depth is used only if a capture has it, with a
+# correlation loss, which the paper leaves open. Codes are initialized as waves, not as
+# zeros: see `SMALL_SONATA`. `motion.network=bspline` is the KAN of Equation 4.
 SONATA = SplatScene(
     steps=60_000,
     batch_size=2,
@@ -124,10 +124,11 @@ SONATA = SplatScene(
 )
 
 # E-D3DGS (Bae et al. 2024, arXiv:2404.03613), its code's numbers for HyperNeRF's
-# chicken: two views a step, no D-SSIM, growth to the end, no opacity reset but a price
-# on opacity. The two views are any two, where its are neighbors, and the rates of its
-# networks do not grow with the scene, but all do with the root of the views, which
-# there they do not. Codes and heads start otherwise (`EmbeddingMotionSpec`).
+# chicken: two views per step, no D-SSIM, densification until the end, and an opacity
+# penalty instead of resets. Differences: the two views are random, not adjacent. The
+# rates of the networks do not scale with the scene, and all rates scale with the square
+# root of the number of views. Codes and heads are initialized differently
+# (`EmbeddingMotionSpec`).
 E_D3DGS = SplatScene(
     steps=60_000,
     batch_size=2,
@@ -137,11 +138,11 @@ E_D3DGS = SplatScene(
     neighbors=NeighborSpec(),
 )
 
-# MoBa-GS: growth up to half of the run, then alternating updates, and from three
-# quarters on annealed positions. It starts from random points. Activations of the base,
-# bounds of the directions (by 1) and turns as rotation vectors are our choice where the
-# paper is silent; growth is guided by a soft factor where it prints a hard rule
-# (`MotionGrowthSpec(form="hard")`).
+# MoBa-GS: densification during the first half of the run, then alternating updates, and
+# annealed positions from three quarters on. Gaussians are initialized at random points.
+# Choices where the paper gives none: activations of the base network, direction bounds
+# of 1, rotation vectors. Densification is guided by a soft factor, where the paper
+# prints a hard rule (`MotionGrowthSpec(form="hard")`).
 MOBA = SplatScene(
     steps=20_000,
     init=InitSpec(source="random", random=100_000),
@@ -153,19 +154,20 @@ MOBA = SplatScene(
     acceleration=AccelerationSpec(start=3000),
 )
 
-# DynMF: ten trajectories, sparse coefficients that are alike among neighbors. What the
-# paper leaves open is as in 3D-GS and Deformable 3DGS.
+# DynMF: ten trajectories with sparse coefficients that are similar among neighbors.
+# Numbers that the paper does not give are those of 3DGS and Deformable 3DGS.
 DYNMF = SplatScene(
     steps=30_000, motion=TimeBasisSpec(), neighbors=NeighborSpec(start=3000)
 )
 
-# Spacetime Gaussians: cubic motion, opacity over time. Not here: features and a small
-# network for colors (this is its "lite" model), sampling guided by errors.
+# Spacetime Gaussians: cubic motion and temporal opacity. This is the "lite" model of
+# the paper, without features and a small network for colors. Error-guided sampling is
+# missing as well.
 SPACETIME = SplatScene(steps=30_000, motion=PolynomialMotionSpec())
 
-# The motion of SplineGS, from tracks as it starts there; its tracks and depths come
-# from networks, these from optical flow. It also finds the cameras, which here a
-# capture has, and takes control points away, which here stay.
+# The motion of SplineGS, initialized from tracks as in the paper. Differences: tracks
+# and depths come from optical flow, not from networks. Cameras come from the capture
+# and are not estimated. Control points are not pruned.
 SPLINE = SplatScene(
     steps=20_000,
     init=InitSpec(points=50_000, extra_random=None),
@@ -174,11 +176,12 @@ SPLINE = SplatScene(
 )
 
 # 4DGS (Wu et al. 2024, arXiv:2310.08528), its numbers for HyperNeRF's captures: 3000
-# steps without motion and 14,000 with it, growth up to 10,000 of those, 360,000
-# Gaussians at most, no opacity reset, no D-SSIM, two views a step (with all rates times
-# the root of that, which there they are not). 150 moments are for films of any length.
-# There, what is faint goes only where there are more than 200,000 Gaussians, and the
-# second stage begins with fresh moments and rates of its own.
+# steps without motion and 14,000 with it, densification during the first 10,000 of
+# those, at most 360,000 Gaussians, no opacity resets, no D-SSIM, two views per step.
+# Differences: all rates scale with the square root of the number of views. 150 knots in
+# time are used for videos of any length. The paper prunes transparent Gaussians only if
+# there are more than 200,000, and begins its second stage with fresh moments and other
+# rates.
 FOUR_D = SplatScene(
     steps=17_000,
     batch_size=2,
@@ -189,10 +192,10 @@ FOUR_D = SplatScene(
     motion=PlaneMotionSpec(),
 )
 
-# SC-GS: 512 nodes, 80,000 steps, growth up to step 50,000, and the rates of its code.
-# Its first 10,000 steps, which train the nodes as Gaussians, are replaced by a start
-# from tracks. Rates fall until the end; there those of positions do to step 30,000, and
-# of nodes to step 40,000.
+# SC-GS: 512 nodes, 80,000 steps, densification until step 50,000, and the rates of its
+# code. Differences: an initialization from tracks replaces the first 10,000 steps,
+# which train the nodes as Gaussians. Rates decay until the end, where the paper's
+# decay until step 30,000 (positions) and 40,000 (nodes).
 SC_GS = SplatScene(
     steps=80_000,
     init=InitSpec(points=50_000, extra_random=None),
@@ -202,10 +205,10 @@ SC_GS = SplatScene(
     start=StartSpec(motion="tracks", moving_points=20_000),
 )
 
-# The motion of EDGS: anchors, and a mask of those that move; nothing asks for rigidity.
-# Its anchors are the cells of a grid that hold points and make the looks of their
-# Gaussians; here they are spread over the points and carry alone. Their number and the
-# steps are our choice.
+# The motion of EDGS: anchors with a mask of the moving ones, without a rigidity loss.
+# The paper's anchors are the occupied cells of a grid and also produce the colors of
+# their Gaussians. Here they are spread over the points and only move Gaussians. Their
+# number and the number of steps are our choice.
 EDGS = SplatScene(
     steps=40_000,
     init=InitSpec(points=50_000, extra_random=None),
@@ -213,12 +216,13 @@ EDGS = SplatScene(
     start=StartSpec(motion="tracks", moving_points=20_000),
 )
 
-# D-MiSo: 80,000 steps, four views in each, cores that grow for 5000 steps (to some 3000
-# there; at most so many here) and carry 25 Gaussians each. Where the paper draws cores
-# alone for those steps, what they carry is here from the start (`effects.carried`); its
-# network reads all three corners of a core's triangle, this one the first; and all
-# rates are times two, the root of the views. In its code the times of real captures are
-# noisy, and the network that turns what is carried learns with a rate of 0.1.
+# D-MiSo: 80,000 steps, four views per step, core Gaussians that are densified for 5000
+# steps (to about 3000 in the paper, at most `cap_max` here), each with 25 children.
+# Differences: the paper renders only the cores during those steps, here the children
+# are rendered from the start (`motion.carried`). The paper's network reads all three
+# corners of a core's triangle, this one the first. All rates are multiplied by two, the
+# square root of the number of views. In the paper's code the times of real captures are
+# noisy, and the network that rotates the children has a rate of 0.1.
 D_MISO = SplatScene(
     steps=80_000,
     batch_size=4,
@@ -228,13 +232,14 @@ D_MISO = SplatScene(
     carried=CarriedSpec(),
 )
 
-# ADC-GS, its code's numbers for HyperNeRF's chicken (other films grow from 0.0035 or
-# 0.005 on): ten Gaussians of an anchor, two views a step, a fifth of the loss half of
-# 1 - SSIM, one color from everywhere, growth from step 9000 to 50,000, no resets. It
-# rounds from step 10,000 on, where bits cost from 15,000; here both begin together. Its
-# price on features that differ between neighbors (0.01), a codec for the places of
-# anchors and a rate for each part of what an anchor makes are not here. All rates are
-# times the root of the views, which there they are not.
+# ADC-GS, its code's numbers for HyperNeRF's chicken (other videos are densified from a
+# gradient of 0.0035 or 0.005): ten Gaussians per anchor, two views per step, a weight
+# of 0.1 for 1 - SSIM, colors independent of the view direction, densification from step
+# 9000 to 50,000, no resets. Differences: the paper quantizes from step 10,000 and adds
+# the rate loss at 15,000, here both begin together. Its penalty on feature differences
+# between neighbors (0.01), the coding of anchor positions and separate learning rates
+# for the outputs of an anchor are missing. All rates scale with the square root of the
+# number of views.
 ADC_GS = SplatScene(
     steps=60_000,
     batch_size=2,
@@ -290,7 +295,7 @@ PRESETS = {
 
 
 def with_steps(spec: SplatScene, steps: int) -> SplatScene:
-    """Change the number of training steps, and stretch all schedules in proportion.
+    """Change the number of training steps, and scale all schedules in proportion.
 
     Args:
       spec: Settings.
@@ -303,6 +308,6 @@ def with_steps(spec: SplatScene, steps: int) -> SplatScene:
       ValueError: If `steps` is less than one.
     """
     if steps < 1:
-        raise ValueError(f"steps={steps}: train for at least one step")
+        raise ValueError(f"steps={steps} must be at least 1")
     in_proportion = step_counts.stretched(spec, steps / spec.steps)
     return dataclasses.replace(in_proportion, steps=steps)

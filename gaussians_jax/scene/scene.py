@@ -1,4 +1,4 @@
-"""Gaussians and effects put together: a spec becomes a `Model` the loop can train."""
+"""Compile the settings of a scene of Gaussians to a `Model` that the loop trains."""
 
 import dataclasses
 from typing import Any
@@ -25,7 +25,7 @@ from gaussians_jax.scene.spec import (
     raster_of,
     strategy_of,
 )
-from gaussians_jax.scene.update import Drawn
+from gaussians_jax.scene.update import ViewStatistics
 from gaussians_jax.splatting import rendering
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.scene_metadata import exposures
@@ -52,10 +52,11 @@ from nerfies_jax.training.protocols import as_terms, name_of
 
 PyTree = Any
 
-# Of the nearest that structure from motion finds: what moves stands before that.
+# Near plane relative to the nearest point of structure from motion. Moving objects may
+# be nearer than that.
 NEAREST = 0.2
 
-ORDER = 2**32 - 1  # stream of the run's key, as those in `growth`
+ORDER = 2**32 - 1  # stream of the run's PRNG key, like those in `growth`
 
 
 def metadata_of(capture: Capture) -> SceneMetadata:
@@ -69,13 +70,13 @@ def metadata_of(capture: Capture) -> SceneMetadata:
     """
     positions = np.asarray(capture.cameras.position)[capture.train]
     halfway = 2 / (1 / capture.near + 1 / capture.far)
-    span = initialization.filmed_depths(capture)
+    span = initialization.observed_depths(capture)
     return SceneMetadata(
         extent=splats.scene_extent(positions, static=halfway),
         background=capture.background or (0.0, 0.0, 0.0),
         frames=len(capture.train),
         exposures=exposures(capture),
-        box=initialization.filmed_box(capture, span),
+        box=initialization.observed_box(capture, span),
         near=NEAREST * span[0],
         depth=2 / (1 / span[0] + 1 / span[1]),
         times=len(np.unique(capture.times[capture.train])),
@@ -85,29 +86,42 @@ def metadata_of(capture: Capture) -> SceneMetadata:
 def all_effects(
     spec: SplatScene, metadata: SceneMetadata, more: tuple[SplatRecord, ...] = ()
 ) -> tuple[SplatRecord, ...]:
-    """The effects of a spec and then `more`, each with the learning rates it needs."""
-    own = effects_of(spec, metadata)
-    every = joined(own, more, reserved=("splats",))
-    for effect in every:
+    """Compile all components of a scene, each with its learning rates.
+
+    Args:
+      spec: Settings.
+      metadata: Metadata of the capture.
+      more: Records of further components, which act after those of the settings.
+
+    Returns:
+      The records, in the order in which they act.
+
+    Raises:
+      ValueError: If a component has parameters but no learning rate, a name is taken,
+        or more than one component has child Gaussians.
+    """
+    built_in = effects_of(spec, metadata)
+    effects = joined(built_in, more, reserved=("splats",))
+    for effect in effects:
         if effect.init and not effect.learning_rate:
             raise ValueError(
-                f"the effect {effect.name!r} has init and no learning_rate, so its "
-                "parameters would not train; give it a learning_rate, a function of "
-                "the step"
+                f"the component {effect.name!r} has `init` but no `learning_rate`, so "
+                "its parameters would not train; give it a learning rate, a function "
+                "of the step"
             )
-    deformation.check_derived(every)
-    return every
+    deformation.check_derived(effects)
+    return effects
 
 
 def build(
     spec: SplatScene, metadata: SceneMetadata, effects: tuple[SplatRecord, ...] = ()
 ) -> Model:
-    """Compile settings to the functions that training, rendering and the report use.
+    """Compile settings to the functions of training, rendering and evaluation.
 
     Args:
       spec: Settings.
       metadata: Metadata of the capture.
-      effects: Records of further parts, which act after those of the settings.
+      effects: Records of further components, which act after those of the settings.
 
     Returns:
       The model.
@@ -115,9 +129,9 @@ def build(
     Raises:
       ValueError: If settings contradict each other or the capture.
     """
-    more = tuple(effect.name for effect in effects)
+    names = tuple(effect.name for effect in effects)
     effects = all_effects(spec, metadata, effects)
-    # Counts updates per row; for the networks, whose rows are never born, it is plain.
+    # Its update counts per Gaussian do not change the updates of shared parameters.
     optimizer = optimizer_of(spec)
     stages = _stages(spec, metadata, effects)
     devices = data_parallel.device_count(spec.batch_size)
@@ -135,8 +149,8 @@ def build(
         return init(capture, key, at_rest)
 
     return Model(
-        # By name alone: a run with other effects of one's own is another run.
-        spec=(spec, metadata, *more),
+        # Further components are identified by name: other names make another run.
+        spec=(spec, metadata, *names),
         init=init,
         step=_stepper(spec, metadata, effects, optimizer, devices),
         render=whole_frame,
@@ -152,7 +166,7 @@ def build(
 
 
 def _finder(effects):
-    """`Model.found` of these effects."""
+    """Return `Model.found` for these components."""
     finding = [effect for effect in effects if effect.found is not None]
 
     def found(params, capture):
@@ -164,7 +178,7 @@ def _finder(effects):
 
 
 def _stages(spec, metadata, effects):
-    """Rendering of trained parameters in parts."""
+    """Return the stages of rendering a trained scene."""
 
     def prepare(params):
         return deformation.prepare(effects, params)
@@ -173,12 +187,12 @@ def _stages(spec, metadata, effects):
         return deformation.deform(effects, params, prepared, time)
 
     def rows(params):
-        return deformation.drawn_rows(effects, params)
+        return deformation.rendered_rows(effects, params)
 
     def draw(params, deformed, view, size, step):
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        drawn = _draw(spec, metadata, rows(params), deformed, view, size, degree)
-        return _exposed(effects, params, drawn.rendering, view)
+        rendered = _draw(spec, metadata, rows(params), deformed, view, size, degree)
+        return _exposed(effects, params, rendered.rendering, view)
 
     return Stages(prepare, deform, draw, rows)
 
@@ -206,32 +220,32 @@ def _draw(
     )
 
 
-def _exposed(effects, params, drawn, view):
+def _exposed(effects, params, rendered, view):
     """Apply the exposure model of the view to a render."""
     for effect in effects:
         if effect.expose is not None:
-            own = params.nets.get(effect.name)
-            color = effect.expose(own, drawn.color, view.appearance)
-            drawn = drawn._replace(color=color)
-    return drawn
+            own_params = params.nets.get(effect.name)
+            color = effect.expose(own_params, rendered.color, view.appearance)
+            rendered = rendered._replace(color=color)
+    return rendered
 
 
 def _posed(effects, params, frames):
     """Return the training frames with their refined cameras."""
     for effect in effects:
         if effect.pose is not None:
-            own = params.nets.get(effect.name)
-            frames = frames._replace(cameras=effect.pose(own, frames.cameras))
+            own_params = params.nets.get(effect.name)
+            frames = frames._replace(cameras=effect.pose(own_params, frames.cameras))
     return frames
 
 
 def _stepper(spec, metadata, effects, optimizer, devices):
-    """One update from a batch of frames: (state, frames) -> (state, metrics), pure."""
+    """Return the pure function (state, frames) -> (state, metrics) of one step."""
     strategy = strategy_of(spec, metadata)
 
     def one_view(index, state, frames):
-        seen = _condition(spec, state, frames, index)
-        return _gradients(spec, metadata, effects, state, frames, *seen)
+        frame = _condition(spec, state, frames, index)
+        return _gradients(spec, metadata, effects, state, frames, *frame)
 
     def step(state: TrainState, frames: Frames):
         size = frames.images.shape[2], frames.images.shape[1]
@@ -250,8 +264,8 @@ def _stepper(spec, metadata, effects, optimizer, devices):
         metrics, grads = means
         trained = update.descend(spec, metadata, effects, optimizer, state, grads)
         aux_state = state.aux_state
-        for _, _, drawn in each:
-            aux_state = update.observed(strategy, aux_state, drawn, size)
+        for _, _, statistics in each:
+            aux_state = update.observe(strategy, aux_state, statistics, size)
         state = TrainState(*trained, aux_state, state.step + 1, state.key)
         return state, metrics
 
@@ -259,7 +273,7 @@ def _stepper(spec, metadata, effects, optimizer, devices):
 
 
 def _condition(spec, state, frames, index):
-    """The frame that is the `index`-th of a step's batch, and its condition."""
+    """Select a frame of a step's batch, and return its row and condition."""
     visit = state.step * spec.batch_size + index
     row = shuffled_row(state.key, visit, len(frames.times))
     key = loop.step_key(state)
@@ -269,7 +283,7 @@ def _condition(spec, state, frames, index):
 
 
 def _gradients(spec, metadata, effects, state, frames, row, condition):
-    """Metrics, slopes and what was drawn of one frame."""
+    """Compute metrics, gradients and the render of one frame."""
     size = frames.images.shape[2], frames.images.shape[1]
     degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
 
@@ -286,26 +300,26 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
     def loss(params, probe):
         canonical = splats.activate(params.rows["splats"])
         moved = deform(params, canonical)
-        rows, drawn = deformation.drawn(effects, params, moved, condition)
+        rows, rendered = deformation.rendered(effects, params, moved, condition)
         posed = _posed(effects, params, frames)
         view = _view(posed, row)
-        frame = _draw(spec, metadata, rows, drawn, view, size, degree, probe, depth)
+        frame = _draw(spec, metadata, rows, rendered, view, size, degree, probe, depth)
         exposed = _exposed(effects, params, frame.rendering, view)
-        seen = observe(posed, row, exposed)
+        observation = observe(posed, row, exposed)
         states = state.aux_state.effects
-        value, metrics = loss_of(spec, effects, params, seen, condition, states)
-        weight = deformation.significance(effects, drawn)
+        value, metrics = loss_of(spec, effects, params, observation, condition, states)
+        weight = deformation.significance(effects, rendered)
         return value, (metrics, frame.footprints, canonical, moved, weight)
 
     probe = deformation.probe(effects, state.params)
-    (value, (metrics, *drawn)), (grads, mean2d_grad) = jax.value_and_grad(
+    (value, (metrics, *statistics)), (grads, mean2d_grad) = jax.value_and_grad(
         loss, argnums=(0, 1), has_aux=True
     )(state.params, probe)
-    return {"loss": value, **metrics}, grads, Drawn(mean2d_grad, *drawn)
+    return {"loss": value, **metrics}, grads, ViewStatistics(mean2d_grad, *statistics)
 
 
 def draws_depth(effects: tuple[SplatRecord, ...], frames: Frames) -> bool:
-    """Test if a step renders depth, an unused channel of which would cost 4 %.
+    """Test if a step renders depth. An unused depth channel would cost 4 % of a step.
 
     Args:
       effects: Effects of the scene.
@@ -326,7 +340,19 @@ def loss_of(
     condition: FrameCondition,
     states: dict[str, PyTree],
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """The loss of one frame with what every effect adds, and numbers to log."""
+    """Compute the loss of one frame with the terms of all components.
+
+    Args:
+      spec: Settings.
+      effects: Components of the scene.
+      params: Parameters of the scene.
+      observation: The render and the observed frame.
+      condition: Conditioning of the frame, with step and key.
+      states: State of each component, by name.
+
+    Returns:
+      The loss and metrics to log.
+    """
     truth, valid = observation.truth, observation.valid
     assert observation.rendering is not None
     assert condition.step is not None
@@ -355,7 +381,16 @@ def loss_of(
 def observe(
     frames: Frames, row: Int[Array, ""] | int, rendering: Rendering | None
 ) -> Observation:
-    """Assemble the input of the losses: a render and the observed frame."""
+    """Assemble the input of the losses: a render and the observed frame.
+
+    Args:
+      frames: Training frames.
+      row: Index of the frame.
+      rendering: The render, or None.
+
+    Returns:
+      The observation, with the frame as floats in [0, 1].
+    """
     return Observation(
         rendering,
         frames.images[frames.image_row(row)].astype(frames.times.dtype) / 255,
@@ -374,6 +409,15 @@ def _view(frames, row):
 def shuffled_row(
     key: Key[Array, ""], step: Int[Array, ""], frames: int
 ) -> Int[Array, ""]:
-    """The frame of a step: every epoch visits each frame once, in a new order."""
+    """Choose the frame of a step. Each epoch visits all frames once, in a new order.
+
+    Args:
+      key: PRNG key of the run.
+      step: Number of frames visited so far.
+      frames: Number of frames.
+
+    Returns:
+      Index of the frame.
+    """
     epoch = jax.random.fold_in(jax.random.fold_in(key, ORDER), step // frames)
     return jax.random.permutation(epoch, frames)[step % frames]

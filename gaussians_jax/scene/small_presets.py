@@ -1,4 +1,4 @@
-"""Scenes that train on a CPU in minutes: the parts of the papers' ones, smaller."""
+"""Presets that train on a CPU in minutes: the papers' components at a smaller size."""
 
 import dataclasses
 
@@ -37,24 +37,26 @@ SMALL_STRATEGY = DefaultStrategySpec(
     cap_max=10_000,
 )
 
-# For a CPU: the same parts with fewer Gaussians, a smaller network, a shorter run.
-# Measured on the built-in scene at 2000 steps (held-out PSNR and SSIM, one seed):
+# For a CPU: the same components with fewer Gaussians, a smaller network and a shorter
+# run. Measured on the built-in scene at 2000 steps (held-out PSNR and SSIM, one seed):
 #   motion from 10 % of the run on, network rate 2e-3   18.20 / 0.466, worse than static
 #   motion from 35 % on, rate 8e-4                      20.36 / 0.740
-#   and random points beside the static ones            21.61 / 0.802
-#   and 96 wide, 6 bands of time, no smoothing          21.89 / 0.807
-# A field that may move everything before the static part stands bends the background to
-# follow the camera; without points of its own, what moves is painted onto the walls.
+#   with additional random points                       21.61 / 0.802
+#   with width 96, 6 time frequencies, no smoothing     21.89 / 0.807
+# A deformation field that starts before the static part has converged bends the
+# background to follow the camera. Without random points, moving objects are painted
+# onto the walls.
 SMALL_STATIC = SplatScene(
     steps=3000,
     init=InitSpec(points=4000, random=5000, extra_random=2000),
     sh_degree=1,
     sh_every=1000,
     strategy=SMALL_STRATEGY,
-    # Looks and shapes learn twice as fast as published, for a tenth of the steps. At
-    # 1500 steps, one seed: built-in still scene 32.29 -> 33.02 dB, `SMALL_TRACKED` on
-    # the default one 30.39 -> 30.74, on a film of 256x192 36.22 -> 36.65; four times as
-    # fast 36.69 there, opacities, too 36.57, means alone (4e-4) 36.24.
+    # Colors and shapes learn twice as fast as published, in a tenth of the steps. At
+    # 1500 steps, one seed: static built-in scene 32.29 -> 33.02 dB, `SMALL_TRACKED` on
+    # the default one 30.39 -> 30.74, on a video of 256x192 36.22 -> 36.65. On that
+    # video, four times as fast gives 36.69, faster opacities as well 36.57, faster
+    # means alone (4e-4) 36.24.
     learning_rates=LearningRateSpec(
         mean_end=3.2e-6,
         log_scale=1e-2,
@@ -64,10 +66,10 @@ SMALL_STATIC = SplatScene(
     ),
 )
 # Built-in scene, 1500 steps, up to 10,000 Gaussians (held-out PSNR and SSIM, one seed):
-#   clone and split (`SMALL_STATIC`)              22.41 / 0.816
-#   this                                          22.04 / 0.799
-#   with the paper's first opacity and scale      21.92 / 0.797
-#   and events every 100 steps (7692 Gaussians)   21.93 / 0.795
+#   clone and split (`SMALL_STATIC`)                22.41 / 0.816
+#   this preset                                     22.04 / 0.799
+#   with the paper's initial opacity and scale      21.92 / 0.797
+#   with events every 100 steps (7692 Gaussians)    21.93 / 0.795
 SMALL_MCMC = dataclasses.replace(
     SMALL_STATIC,
     strategy=MCMCStrategySpec(
@@ -80,8 +82,8 @@ STRATEGY_FROM_TRACKS = dataclasses.replace(
     refine_start_iter=200,
     refine_stop_iter=1300,
 )
-# Two views a step, on a core each: 37 ms for 32 (10,000 Gaussians, 256x192).
-# What the small scenes that start from tracks share.
+# Common settings of the small presets that are initialized from tracks. Two views per
+# step, on one core each: 37 ms instead of 32 (10,000 Gaussians, 256x192).
 SMALL_FROM_TRACKS = dataclasses.replace(
     SMALL_STATIC,
     steps=2000,
@@ -91,21 +93,24 @@ SMALL_FROM_TRACKS = dataclasses.replace(
     strategy=STRATEGY_FROM_TRACKS,
     start=StartSpec(motion="tracks"),
 )
-# What moves has no larger weight, for that gains nothing: of three times, 31.71 dB are
-# held out and 29.39 where it moves for 31.69 and 29.34 (built-in scene, 900 steps, one
-# seed), 36.22 and 32.32 for 36.38 and 32.22 (a hand before books, 600 steps).
+# Moving pixels have no larger weight, because that gains nothing. With three times the
+# weight, PSNR (held out, and in moving regions) is 31.71 / 29.39 dB instead of 31.69 /
+# 29.34 (built-in scene, 900 steps, one seed), and 36.22 / 32.32 instead of 36.38 /
+# 32.22 (a hand before books, 600 steps).
 SMALL_TRACKED = dataclasses.replace(
     SMALL_FROM_TRACKS,
     motion=SE3BasesSpec(bases=8),
     temporal_opacity=TemporalOpacitySpec(),
 )
-# Other motions from tracks. Built-in scene, one seed, as many steps as fitted into a
-# minute or two of a shared core (held-out PSNR, and where it moves):
-#   1300 steps: dynmf      29.83 / 26.51    738, from rest: 20.28 / 13.83
-#    940 steps: spline     28.57 / 26.28   1562, from rest: 20.04 / 13.81
-#   1600 steps: spacetime  28.63 / 24.03    700, from rest: 20.42 / 13.95
-#    649 steps: 4dgs       28.39 / 25.03    306, from rest: 20.32 / 13.90
-# A cubic is too stiff for the cloth and the box of this scene: its edges are soft.
+# Other motions initialized from tracks, and without them. Built-in scene, one seed, as
+# many steps as fit into a minute or two of a shared core (held-out PSNR, and in moving
+# regions):
+#   1300 steps: dynmf      29.83 / 26.51    738 steps, no tracks: 20.28 / 13.83
+#    940 steps: spline     28.57 / 26.28   1562 steps, no tracks: 20.04 / 13.81
+#   1600 steps: spacetime  28.63 / 24.03    700 steps, no tracks: 20.42 / 13.95
+#    649 steps: 4dgs       28.39 / 25.03    306 steps, no tracks: 20.32 / 13.90
+# A cubic polynomial is too stiff for the cloth and the box of this scene, which blurs
+# their edges.
 SMALL_DYNMF = dataclasses.replace(
     SMALL_FROM_TRACKS,
     motion=dataclasses.replace(SMALL_TIME_BASIS, warm_up=600),
@@ -117,7 +122,7 @@ SMALL_FOUR_D = dataclasses.replace(
     SMALL_FROM_TRACKS,
     motion=dataclasses.replace(SMALL_PLANE_MOTION, warm_up=600),
 )
-# From tracks and with D-SSIM, as the others above; the paper has neither.
+# With tracks and D-SSIM like the other small presets. The paper has neither.
 SMALL_E_D3DGS = dataclasses.replace(
     SMALL_FROM_TRACKS,
     motion=dataclasses.replace(
@@ -129,10 +134,11 @@ SMALL_E_D3DGS = dataclasses.replace(
     ),
     neighbors=NeighborSpec(start=600),
 )
-# Built-in scene, 600 steps of one view each, one seed (held-out PSNR, and where it
-# moves): 28.69 / 24.54, without the rigid term 28.59 / 24.49, with a weight of 1 28.28
-# / 23.93. `SMALL_EDGS` has 28.85 / 24.83, `SMALL_TRACKED` 29.66 / 26.72: the network's
-# fit to the tracks is off by 0.47 % of the scene's depth, that of bases by 0.17 %.
+# Built-in scene, 600 steps of one view each, one seed (held-out PSNR, and in moving
+# regions): 28.69 / 24.54, without the rigidity loss 28.59 / 24.49, with a weight of 1
+# 28.28 / 23.93. `SMALL_EDGS` has 28.85 / 24.83, `SMALL_TRACKED` 29.66 / 26.72: the
+# error of the network's fit to the tracks is 0.47 % of the scene's depth, that of bases
+# 0.17 %.
 SMALL_SC_GS = dataclasses.replace(
     SMALL_FROM_TRACKS,
     motion=dataclasses.replace(SMALL_NODE_MOTION, warm_up=600),
@@ -158,9 +164,9 @@ SMALL_DEFORMABLE = dataclasses.replace(
     ),
 )
 
-# A quarter of the rows of the others, and four Gaussians of each. Built-in scene, 600
-# steps of one view each, one seed: 29.23 dB, and 24.63 where it moves (`SMALL_SC_GS`
-# 28.69 / 24.54); followed points are off by 0.0099 scene units.
+# A quarter of the Gaussians of other presets, with four children each. Built-in scene,
+# 600 steps of one view each, one seed: 29.23 dB, and 24.63 in moving regions
+# (`SMALL_SC_GS` 28.69 / 24.54). The error of tracked points is 0.0099 scene units.
 SMALL_D_MISO = dataclasses.replace(
     SMALL_FROM_TRACKS,
     init=InitSpec(points=1500, random=1500, extra_random=None),
@@ -177,7 +183,7 @@ SMALL_D_MISO = dataclasses.replace(
     ),
 )
 
-# A tenth of the rows, and ten Gaussians of each.
+# A tenth of the Gaussians of other presets, as anchors with ten children each.
 SMALL_ADC_GS = dataclasses.replace(
     SMALL_FROM_TRACKS,
     init=InitSpec(points=500, random=600, extra_random=None),
@@ -197,19 +203,20 @@ SMALL_ADC_GS = dataclasses.replace(
 # Measured (held-out PSNR and SSIM, one seed):
 #   built-in, 1000 steps: RAdam                          21.84 / 0.755
 #                         Adam, network, embedding 1e-3  22.77 / 0.822
-#   D-NeRF lego, 1500:    codes drawn one by one         19.4
+#   D-NeRF lego, 1500:    independent random codes       19.4
 #                         codes as waves over space      19.4
 #                         and over time                  20.1 (deformable 20.7)
-# Per-row RAdam takes 0.15 of Adam's step after 50 updates of a newborn row and 0.5
-# after 556, which a short run cannot afford. Codes that start alike for what is near
-# in space and time let the first steps move more than one Gaussian in one frame.
+# Per-Gaussian RAdam takes 0.15 of Adam's step 50 updates after a Gaussian was added and
+# 0.5 after 556, which is too slow for a short run. Codes that are initially similar for
+# neighbors in space and time let the first steps move more than one Gaussian in one
+# frame.
 #
-# The network's rate is E-D3DGS', 1.6e-4. At 1e-3 the kernels, of which each input
-# always has some at work, move all Gaussians together, and motion stands in for depth.
-# Built-in scene, 900 steps (held-out PSNR, where it moves, median error of depth), one
-# seed, 1e-3 -> 2e-4: from tracks 28.61 / 22.85, 0.0080 -> 29.60 / 24.12, 0.0064; and
-# without the depth term 21.88 / 17.59, 0.0712 -> 29.38 / 23.98, 0.0153 (an MLP at 1e-3:
-# 30.44 / 25.21, 0.0135); from rest 23.53 / 17.23 -> 23.79 / 17.50.
+# The network's rate is E-D3DGS', 1.6e-4. At 1e-3 the kernels, some of which are active
+# for any input, move all Gaussians together, and motion takes the place of depth.
+# Built-in scene, 900 steps (held-out PSNR, PSNR in moving regions, median depth error),
+# one seed, 1e-3 -> 2e-4: from tracks 28.61 / 22.85, 0.0080 -> 29.60 / 24.12, 0.0064.
+# From tracks without the depth loss 21.88 / 17.59, 0.0712 -> 29.38 / 23.98, 0.0153 (an
+# MLP at 1e-3: 30.44 / 25.21, 0.0135). Without tracks 23.53 / 17.23 -> 23.79 / 17.50.
 SMALL_SONATA = dataclasses.replace(
     SMALL_STATIC,
     motion=dataclasses.replace(
@@ -223,8 +230,8 @@ SMALL_SONATA = dataclasses.replace(
     spectral=SpectralSpec(),
     depth=DepthSpec(),
 )
-# D-NeRF lego at 3000 steps: 20.96 dB with networks 32 and 48 wide and four bands of
-# time, 21.90 with these.
+# D-NeRF lego at 3000 steps: 20.96 dB with networks of widths 32 and 48 and four time
+# frequencies, 21.90 with these.
 SMALL_MOBA = dataclasses.replace(
     SMALL_STATIC,
     strategy=dataclasses.replace(SMALL_STRATEGY, refine_stop_iter=1500),
@@ -242,10 +249,11 @@ SMALL_MOBA = dataclasses.replace(
     motion_growth=MotionGrowthSpec(start=900),
     acceleration=AccelerationSpec(start=600),
 )
-# Built-in scene, 600 steps of one view each, one seed: 28.76 dB, and 24.52 where it
-# moves; followed points are off by 0.0097 scene units. Flow counts everywhere: where
-# things move alone, as in the paper, it is 0.25 ± 0.22 dB less over 435 steps, three
-# seeds (`docs/results/benchmark.md`): what is at rest stays so by it, too.
+# Built-in scene, 600 steps of one view each, one seed: 28.76 dB, and 24.52 in moving
+# regions. The error of tracked points is 0.0097 scene units. The flow loss applies
+# everywhere: restricted to moving regions, as in the paper, PSNR is 0.25 ± 0.22 dB
+# lower over 435 steps, three seeds (`docs/results/benchmark.md`), because the loss also
+# keeps static regions static.
 SMALL_MOTION_GS = dataclasses.replace(
     SMALL_FROM_TRACKS,
     motion=SMALL_DEFORMABLE.motion,

@@ -1,4 +1,4 @@
-"""Settings of a scene of Gaussians, and the effects that they enable."""
+"""Settings of a scene of Gaussians, and the components that they enable."""
 
 import dataclasses
 
@@ -59,7 +59,7 @@ AnyMotion = (
     | NodeMotionSpec
     | AnchorMotionSpec
 )
-# Motions with a vector for each Gaussian that neighbors may be kept alike in.
+# Parameters that `NeighborSpec` keeps similar among neighbors, by type of motion.
 EMBEDDED = {
     KanMotionSpec: kan_motion.NAME,
     TimeBasisSpec: time_basis.NAME,
@@ -67,11 +67,9 @@ EMBEDDED = {
 }
 
 
-# The way out where rows that carry Gaussians are refused.
-ALONE = (
-    "leave out what they carry (carried=none, or another motion than that of anchors)"
-)
-# What trains nothing without a motion.
+# Ends the messages that refuse a setting next to child Gaussians.
+ALONE = "disable child Gaussians (carried=none, and a motion without anchors)"
+# Settings that have no effect without a motion.
 OF_MOTION = (
     "temporal_opacity",
     "alternation",
@@ -86,7 +84,7 @@ PROTOCOLS = {
     "exposure": Appearance,
     "poses": CameraOptimizer,
 }
-WITHOUT_NETWORKS = PolynomialMotionSpec, SplineMotionSpec  # all in their rows
+WITHOUT_NETWORKS = PolynomialMotionSpec, SplineMotionSpec  # only per-Gaussian params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,10 +92,10 @@ class SplatScene:
     """Settings of a scene of Gaussians, with `None` for disabled components."""
 
     steps: int
-    batch_size: int = 1  # views a step; all rates are times its root
+    batch_size: int = 1  # views per step; all rates are multiplied by its square root
     init: InitSpec = InitSpec()
     sh_degree: int = 3
-    sh_every: int = step_counts.steps(1000)  # steps between one degree and the next
+    sh_every: int = step_counts.steps(1000)  # steps from one degree to the next
     dssim_weight: float = 0.2
     learning_rates: LearningRateSpec = LearningRateSpec()
     raster: RasterSpec = RasterSpec()
@@ -109,7 +107,7 @@ class SplatScene:
     annealing: AnnealingSpec | None = None
     motion: AnyMotion | Motion | Settings | None = None
     temporal_opacity: TemporalOpacitySpec | None = None
-    carried: CarriedSpec | None = None  # what is drawn of each row; None: the row
+    carried: CarriedSpec | None = None  # child Gaussians, rendered in place of each
     start: StartSpec = StartSpec()
     acceleration: AccelerationSpec | None = None
     neighbors: NeighborSpec | None = None
@@ -119,25 +117,25 @@ class SplatScene:
     exposure: ExposureSpec | Appearance | Settings | None = None
     flow: FlowSpec | None = None
     poses: PoseRefinementSpec | CameraOptimizer | Settings | None = None
-    # Beside those with a field of their own.
+    # In addition to those with a field of their own.
     regularizers: tuple[Regularizer | Settings, ...] = ()
 
     def __post_init__(self):
         for name, protocol in PROTOCOLS.items():
             if getattr(self, name) is not None:
                 check(name, getattr(self, name), protocol)
-        for one in self.regularizers:
-            check("regularizers", one, Regularizer)
+        for regularizer in self.regularizers:
+            check("regularizers", regularizer, Regularizer)
         if self.steps < 1:
-            raise ValueError(f"steps={self.steps}: train for at least one step")
+            raise ValueError(f"steps={self.steps} must be at least 1")
         if self.batch_size < 1:
-            raise ValueError(f"batch_size={self.batch_size}: a step takes a view")
+            raise ValueError(f"batch_size={self.batch_size} must be at least 1 view")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree={self.sh_degree} must be 0, 1, 2 or 3")
         if self.sh_every < 1:
             raise ValueError(
-                f"sh_every={self.sh_every}: steps between degrees, at least 1, with "
-                "which all are there almost at once"
+                f"sh_every={self.sh_every} must be at least 1 step; 1 enables all "
+                "degrees almost at once"
             )
         if not 0 <= self.dssim_weight <= 1:
             raise ValueError(f"dssim_weight={self.dssim_weight} must lie in [0, 1]")
@@ -152,10 +150,10 @@ Scene = SplatScene  # the public name
 
 
 def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
-    """Return rasterizer settings whose near plane is in front of all observed surfaces.
+    """Move the near plane of the rasterizer in front of all observed surfaces.
 
     Scenes with a distant background are small in the units of a box around all points.
-    A plane at 0.01 would then be meters in front of the camera.
+    The default near plane of 0.01 would then be meters in front of the camera.
 
     Args:
       spec: Settings.
@@ -169,29 +167,23 @@ def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
 
 
 def optimizer_of(spec: SplatScene) -> Optimizer:
-    """Return the optimizer of a scene, whose updates are scaled by learning rates."""
-    own = spec.optimizer
-    return OPTIMIZERS[own]() if isinstance(own, str) else own
+    """Return the optimizer of a scene. Learning rates scale its updates."""
+    optimizer = spec.optimizer
+    return OPTIMIZERS[optimizer]() if isinstance(optimizer, str) else optimizer
 
 
 def carried_count(spec: SplatScene) -> int | None:
-    """Return the number of children per Gaussian, None without children.
-
-    Args:
-      spec: Settings.
-
-    Returns:
-      The number.
-    """
+    """Return the number of children per Gaussian, None without children."""
     if isinstance(spec.motion, AnchorMotionSpec):
         return spec.motion.count
     return None if spec.carried is None else spec.carried.count
 
 
 def refuse_what_cannot_train(spec: SplatScene) -> None:
-    """Raise ValueError where parts that are asked for need others that are not.
+    """Raise ValueError if a component needs another one that is disabled.
 
-    Not when the settings are made: a trained scene may be drawn without its motion.
+    This is not checked when the settings are constructed, because a trained scene may
+    be rendered without its motion.
     """
     motion = spec.motion
     if motion is None:
@@ -199,85 +191,88 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
         orphans += ["start.motion"] if spec.start.motion == "tracks" else []
         if orphans:
             raise ValueError(
-                f"{' and '.join(orphans)} without a motion would train nothing; leave "
-                "them out as well, or choose a preset that moves"
+                f"{' and '.join(orphans)} without a motion would have no effect; leave "
+                "them out as well, or choose a preset with a motion"
             )
     if spec.alternation is not None and isinstance(motion, WITHOUT_NETWORKS):
         raise ValueError(
-            f"alternation takes turns with networks, and a {type(motion).__name__} has "
-            "none: their turns would train nothing; leave it out as well "
-            "(alternation=none)"
+            "alternation updates the networks of a motion in turn, and "
+            f"{type(motion).__name__} has none, so their turns would train nothing; "
+            "leave it out as well (alternation=none)"
         )
     if spec.neighbors is not None:
         _embedded(motion)
-    resting = isinstance(motion, AnchorMotionSpec) and not motion.moves
-    if resting and spec.start.motion == "tracks":
+    if (
+        isinstance(motion, AnchorMotionSpec)
+        and not motion.moves
+        and spec.start.motion == "tracks"
+    ):
         raise ValueError(
-            'motion.moves=false with start.motion="tracks": anchors at rest have no '
+            'motion.moves=false with start.motion="tracks": static anchors have no '
             "motion to fit to tracks; leave one of them out"
         )
-    _refuse_beside_carried(spec)
-    still = 0 if spec.start.motion == "tracks" else getattr(motion, "warm_up", 0)
-    if still and _fading(motion) is not None:
+    _refuse_beside_children(spec)
+    warm_up = 0 if spec.start.motion == "tracks" else getattr(motion, "warm_up", 0)
+    if warm_up and _fading(motion) is not None:
         raise ValueError(
-            f"motion.warm_up={still} with motion.fading: what is drawn fades from the "
-            "first step, and what is trained only then; leave one of them out "
-            "(motion.warm_up=0 or motion.fading=none)"
+            f"motion.warm_up={warm_up} with motion.fading: rendered opacities fade "
+            "from the first step, but are trained only after the warm-up; leave one of "
+            "them out (motion.warm_up=0 or motion.fading=none)"
         )
-    _refuse_growth(spec, still)
+    _refuse_growth(spec, warm_up)
     if spec.annealing is not None:
         phases.annealed(lambda step: step, spec.annealing, spec.steps)
     if isinstance(motion, MotionSpec):
         mlp_motion.trunk_spec(motion)
-    _refuse_late(spec, still)
+    _refuse_late(spec, warm_up)
 
 
-def _refuse_beside_carried(spec):
-    """Raise ValueError for what rows that carry Gaussians cannot have."""
-    carry = carried_count(spec) is not None
-    if carry and isinstance(spec.strategy, MCMCStrategySpec):
+def _refuse_beside_children(spec):
+    """Raise ValueError for settings that child Gaussians rule out."""
+    has_children = carried_count(spec) is not None
+    if has_children and isinstance(spec.strategy, MCMCStrategySpec):
         raise ValueError(
             "MCMCStrategySpec shares the opacity of a Gaussian among its copies, and "
-            "rows that carry several have none of their own; choose "
+            "parents of child Gaussians have none of their own; choose "
             f"DefaultStrategySpec, or {ALONE}"
         )
-    if carry and spec.flow is not None:
+    if has_children and spec.flow is not None:
         raise ValueError(
-            "flow is compared where rows are drawn, and rows that carry Gaussians are "
-            f"not; leave it out (flow=none), or {ALONE}"
+            "the flow loss needs rendered Gaussians, and parents of child Gaussians "
+            f"are not rendered; leave it out (flow=none), or {ALONE}"
         )
-    fading = {
+    settings = {
         "temporal_opacity": spec.temporal_opacity,
         "motion.fading": _fading(spec.motion),
     }
-    faded = [name for name, one in fading.items() if one is not None]
-    if carry and faded:
+    enabled = [name for name, value in settings.items() if value is not None]
+    if has_children and enabled:
         raise ValueError(
-            f"{faded[0]} fades rows, and of rows that carry Gaussians only these are "
-            "drawn, with opacities of their own; leave it out "
-            f"({faded[0]}=none), or {ALONE}"
+            f"{enabled[0]} changes opacities over time, but child Gaussians are "
+            "rendered with opacities of their own; leave it out "
+            f"({enabled[0]}=none), or {ALONE}"
         )
 
 
-def _refuse_growth(spec, still):
-    """Raise ValueError where motion would steer no growth."""
+def _refuse_growth(spec, warm_up):
+    """Raise ValueError if motion-guided densification would have no effect."""
     growth = spec.motion_growth
     if growth is not None and not isinstance(spec.strategy, DefaultStrategySpec):
         raise ValueError(
-            "motion_growth steers the gradient threshold of DefaultStrategySpec, which "
-            "this scene has not; leave it out as well (motion_growth=none)"
+            "motion_growth changes the gradient threshold of DefaultStrategySpec, "
+            "which this scene does not use; leave it out as well (motion_growth=none)"
         )
-    if growth is not None and growth.form == "hard" and growth.start <= still:
+    if growth is not None and growth.form == "hard" and growth.start <= warm_up:
         raise ValueError(
             f"motion_growth.start={growth.start} lies in the warm-up of the motion "
-            f"(up to step {still}), when nothing moves and so nothing would "
-            "grow; start it some hundred steps later"
+            f"(up to step {warm_up}), when nothing moves and therefore nothing would "
+            "be densified; start it some hundred steps later"
         )
 
 
-def _refuse_late(spec, still):
-    """Raise ValueError for what would begin after the last step."""
-    starts, motion = {"motion.warm_up": still}, spec.motion
+def _refuse_late(spec, warm_up):
+    """Raise ValueError for components that would begin after the last step."""
+    starts, motion = {"motion.warm_up": warm_up}, spec.motion
     parts = {
         "motion.rate": motion.rate if isinstance(motion, AnchorMotionSpec) else None,
         "neighbors": spec.neighbors,
@@ -285,12 +280,13 @@ def _refuse_late(spec, still):
         "flow": None if spec.start.motion == "tracks" else spec.flow,
     }
     starts |= {f"{name}.start": x.start for name, x in parts.items() if x is not None}
-    for name, at in starts.items():
-        if at >= max(spec.steps, 2):  # counts stay at least 1, in a run of one step too
+    for name, start in starts.items():
+        # Step counts are at least 1, even in a run of one step.
+        if start >= max(spec.steps, 2):
             raise ValueError(
-                f"{name}={at} of {spec.steps} steps: it would never begin; lower it, "
-                "or shorten the run by --steps (presets.with_steps), which shortens "
-                "all schedules with it"
+                f"{name}={start} of {spec.steps} steps: it would never begin; lower it,"
+                " or shorten the run with presets.with_steps, which scales all "
+                "schedules with it"
             )
 
 
@@ -300,10 +296,10 @@ def _fading(motion):
 
 
 def _embedded(motion):
-    """Return the motion parameter that neighbors keep similar, or raise ValueError."""
+    """Return the name of the motion parameter that neighbors keep similar."""
     if type(motion) not in EMBEDDED:
         raise ValueError(
-            "neighbors keep embeddings or coefficients alike, and this motion has "
+            "neighbors keep embeddings or coefficients similar, and this motion has "
             "none; leave them out (neighbors=none), or choose a preset with a KAN "
             "motion or a time basis"
         )
@@ -311,9 +307,7 @@ def _embedded(motion):
 
 
 def motion_of(spec: SplatScene, metadata: SceneMetadata) -> SplatRecord | None:
-    """Return the motion of the settings, without warm-up if it is initialized from
-    tracks.
-    """
+    """Return the motion of a scene. An initialization from tracks skips its warm-up."""
     motion = spec.motion
     if motion is None:
         return None
@@ -323,25 +317,24 @@ def motion_of(spec: SplatScene, metadata: SceneMetadata) -> SplatRecord | None:
 
 
 def strategy_of(spec: SplatScene, metadata: SceneMetadata) -> Strategy | None:
-    """Return the strategy of a scene, guided by its motion where the spec says so."""
-    own = spec.strategy
-    if own is None:
+    """Return the strategy of a scene, guided by its motion if the settings say so."""
+    if spec.strategy is None:
         return None
-    strategy = protocols.bound(own, spec.steps, metadata)
+    strategy = protocols.bound(spec.strategy, spec.steps, metadata)
     if spec.motion_growth is None:
         return strategy
     return MotionGuided(strategy, spec.motion_growth, metadata.extent)
 
 
 def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[SplatRecord, ...]:
-    """Return the parts of a scene, compiled, in the order in which they act.
+    """Compile the components of a scene, in the order in which they act.
 
     Args:
       spec: Settings of the scene.
-      metadata: Sizes of the capture.
+      metadata: Metadata of the capture.
 
     Returns:
-      The motion first, if there is one.
+      The records, the motion first if there is one.
     """
 
     def bound(part):
@@ -352,9 +345,9 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[SplatRecord, 
     if spec.temporal_opacity is not None:
         effects.append(protocols.compile_motion(bound(spec.temporal_opacity)))
     if spec.carried is not None:
-        # What is carried turns by itself from when on the rows move.
-        still = 0 if motion is None else motion.warm_up
-        effects.append(carried.effect(spec.carried, spec.steps, still))
+        # Children rotate on their own as soon as their parents move.
+        warm_up = 0 if motion is None else motion.warm_up
+        effects.append(carried.effect(spec.carried, spec.steps, warm_up))
     early, late = _regularizers(spec, metadata, motion)
     effects += [protocols.compile_regularizer(one) for one in early]
     if spec.exposure is not None:
@@ -366,17 +359,17 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[SplatRecord, 
 
 
 def _regularizers(spec, metadata, motion):
-    """The regularizers before and behind the exposure, which sums of terms keep to."""
+    """Return the regularizers before and after the exposure, the order of their sum."""
     early, late = [spec.acceleration], [*spec.regularizers]
-    # A trained scene is drawn without its motion as well.
+    # A trained scene may also be rendered without its motion.
     if spec.neighbors is not None and motion is not None:
-        of = _embedded(spec.motion)
-        early.append(neighbors.Bound(spec.neighbors, metadata.extent, of))
+        name = _embedded(spec.motion)
+        early.append(neighbors.Bound(spec.neighbors, metadata.extent, name))
     early += [spec.spectral, spec.depth]
     if spec.flow is not None:
-        at_once = spec.start.motion == "tracks"  # as the motion
-        one = dataclasses.replace(spec.flow, start=0) if at_once else spec.flow
-        late.insert(0, motion_flow.Bound(one, raster_of(spec, metadata)))
+        starts_at_once = spec.start.motion == "tracks"  # like the motion
+        flow = dataclasses.replace(spec.flow, start=0) if starts_at_once else spec.flow
+        late.insert(0, motion_flow.Bound(flow, raster_of(spec, metadata)))
     return tuple(
         [protocols.bound(one, spec.steps, metadata) for one in some if one is not None]
         for some in (early, late)

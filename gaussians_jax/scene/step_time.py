@@ -7,7 +7,7 @@ from gaussians_jax.core import splats
 from gaussians_jax.motion import deformation
 from gaussians_jax.scene import scene, update
 from gaussians_jax.scene.spec import optimizer_of, raster_of, strategy_of
-from gaussians_jax.scene.update import Drawn
+from gaussians_jax.scene.update import ViewStatistics
 from gaussians_jax.splatting import projection, rendering
 from nerfies_jax.metrics.part_time import StepParts, part
 from nerfies_jax.training import losses, rate
@@ -29,34 +29,37 @@ def parts(
 ) -> StepParts:
     """Begin to compile the parts of one step, forward and backward.
 
-    Their times are medians of warm calls, in milliseconds, each part timed by itself on
-    the first frame and one device, and counted for as many views as a device draws in a
-    step. "rest" is what they leave of the whole step.
+    Times are medians of warm calls in milliseconds. Each part is timed separately on
+    the first frame and one device, and multiplied by the number of views per device and
+    step. "rest" is the remainder of the whole step.
+
+    Returns:
+      The parts.
     """
     effects = scene.all_effects(spec, metadata)
     condition = FrameCondition(frames.times[0], step=state.step, key=state.key)
 
     @jax.jit
-    def drawn(params):
-        still = splats.activate(params.rows["splats"])
-        return deformation.drawn(effects, params, still, condition)
+    def render(params):
+        canonical = splats.activate(params.rows["splats"])
+        return deformation.rendered(effects, params, canonical, condition)
 
-    now = drawn(state.params)
-    a_view = _drawing(spec, metadata, effects, now, frames)
-    a_view |= _own_of_effects(effects, state, frames, condition)
-    once = _update(spec, metadata, effects, state, now, frames)
+    rendered = render(state.params)
+    per_view = _drawing(spec, metadata, effects, rendered, frames)
+    per_view |= _components(effects, state, frames, condition)
+    per_step = _update(spec, metadata, effects, state, rendered, frames)
     views = spec.batch_size // model.devices
 
     def with_rest(timed):
-        timed |= {name: views * timed[name] for name in a_view}
+        timed |= {name: views * timed[name] for name in per_view}
         whole = rate.step_ms(model, state, frames, spec.steps)
         return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
 
-    return StepParts(a_view | once, with_rest)
+    return StepParts(per_view | per_step, with_rest)
 
 
-def _drawing(spec, metadata, effects, now, frames):
-    """The picture of the rows and Gaussians of the moment, and its loss."""
+def _drawing(spec, metadata, effects, rendered, frames):
+    """Return the rendering of the current Gaussians, and its loss."""
     observation = scene.observe(frames, 0, None)
     camera = _first_camera(frames)
 
@@ -77,7 +80,7 @@ def _drawing(spec, metadata, effects, now, frames):
             color, observation.truth, observation.valid, dssim_weight=spec.dssim_weight
         )
 
-    rows, gaussians = now
+    rows, gaussians = rendered
     coefficients = splats.active_harmonics(rows, spec.sh_degree)
     args = gaussians, coefficients, jnp.zeros_like(gaussians.mean[:, :2])
     return {
@@ -86,30 +89,32 @@ def _drawing(spec, metadata, effects, now, frames):
     }
 
 
-def _own_of_effects(effects, state, frames, condition):
-    """Each effect that deforms or penalizes."""
+def _components(effects, state, frames, condition):
+    """Return the work of each component that deforms Gaussians or adds to the loss."""
     observation, parts = scene.observe(frames, 0, None), {}
-    drawn = Rendering(
+    rendered = Rendering(
         observation.truth, *(jnp.ones(observation.truth.shape[:2]) for _ in "ad")
     )
     for effect in effects:
-        # The step is an input, too: a warm-up that is compiled in costs nothing.
-        def one(params, rendering, kept, condition, effect=effect):
-            seen = observation._replace(rendering=rendering)
-            return _sum_of_effect(effect, effects, params, seen, condition, kept)
+        # The step is an input, because a compiled-in warm-up would cost nothing.
+        def value(params, rendering, component_state, condition, effect=effect):
+            rendered = observation._replace(rendering=rendering)
+            return _sum_of_effect(
+                effect, effects, params, rendered, condition, component_state
+            )
 
         if {effect.deform, effect.derive, effect.penalty} != {None}:
-            kept = state.aux_state.effects.get(effect.name)
-            grads = jax.grad(one, (0, 1))
+            component_state = state.aux_state.effects.get(effect.name)
+            grads = jax.grad(value, (0, 1))
             name = effect.name.replace("_", " ")
-            parts[name] = part(grads, state.params, drawn, kept, condition)
+            parts[name] = part(
+                grads, state.params, rendered, component_state, condition
+            )
     return parts
 
 
-def _update(spec, metadata, effects, state, now, frames):
-    """Apply the update that follows the gradient, with parameters as stand-in
-    gradients.
-    """
+def _update(spec, metadata, effects, state, rendered, frames):
+    """Return the optimizer update and the statistics, with stand-in gradients."""
     optimizer = optimizer_of(spec)
 
     def descend(state, grads):
@@ -117,24 +122,26 @@ def _update(spec, metadata, effects, state, now, frames):
 
     strategy = strategy_of(spec, metadata)
 
-    def gather(aux_state, *drawn):
-        return update.observed(strategy, aux_state, Drawn(*drawn), _size(frames))
+    def gather(aux_state, *statistics):
+        return update.observe(
+            strategy, aux_state, ViewStatistics(*statistics), _size(frames)
+        )
 
     parts = {"optimizer": part(descend, state, state.params)}
     if jax.tree.leaves(state.aux_state.stats):
         footprints = jax.eval_shape(
-            lambda *seen: projection.project(
-                *seen, _size(frames), raster_of(spec, metadata)
+            lambda *args: projection.project(
+                *args, _size(frames), raster_of(spec, metadata)
             ),
-            now[1],
+            rendered[1],
             _first_camera(frames),
         )
-        # What they take is the same for any values.
+        # The time does not depend on the values.
         footprints = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), footprints)
-        still = splats.activate(state.params.rows["splats"])
-        slope = deformation.probe(effects, state.params)
+        canonical = splats.activate(state.params.rows["splats"])
+        gradient = deformation.probe(effects, state.params)
         parts["statistics"] = part(
-            gather, state.aux_state, slope, footprints, still, still
+            gather, state.aux_state, gradient, footprints, canonical, canonical
         )
     return parts
 
@@ -148,7 +155,7 @@ def _size(frames):
 
 
 def _sum_of_effect(effect, effects, params, observation, condition, state):
-    """A scalar whose gradient takes the work of one effect in a step."""
+    """Compute a scalar whose gradient takes the work of one component in a step."""
     total = jnp.zeros(())
     if effect.deform is not None:
         gaussians = splats.activate(params.rows["splats"])
@@ -157,9 +164,9 @@ def _sum_of_effect(effect, effects, params, observation, condition, state):
         )
         total += sum(jnp.sum(leaf) for leaf in moved)
     if effect.derive is not None:
-        still = splats.activate(params.rows["splats"])
-        rows, drawn = deformation.drawn((effect,), params, still, condition)
-        total += sum(jnp.sum(leaf) for leaf in (*rows, *drawn))
+        canonical = splats.activate(params.rows["splats"])
+        rows, rendered = deformation.rendered((effect,), params, canonical, condition)
+        total += sum(jnp.sum(leaf) for leaf in (*rows, *rendered))
     context = PenaltyContext(
         condition=condition,
         step=condition.step,

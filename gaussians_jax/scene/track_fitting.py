@@ -15,8 +15,8 @@ from gaussians_jax.core.metadata import SceneMetadata
 from gaussians_jax.core.protocols import Motion
 from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Params
-from gaussians_jax.init import path_fit
-from gaussians_jax.init.path_fit import Paths, Points
+from gaussians_jax.init import motion_fit
+from gaussians_jax.init.motion_fit import Paths, Points
 from nerfies_jax.training.extensions import check
 
 
@@ -26,10 +26,10 @@ class TrackFit:
 
     Attributes:
       params: Parameters of a scene whose Gaussians are the tracked points at their
-        canonical places (`params.rows["splats"].mean`), with the motion's rows and
-        networks next to them.
-      error_before: Mean distance from the tracks before the descent, scene units.
-      error_after: The same after it.
+        canonical positions (`params.rows["splats"].mean`), together with the motion's
+        per-Gaussian and shared parameters.
+      error_before: Mean distance from the tracks before optimization, in scene units.
+      error_after: Mean distance from the tracks after optimization, in scene units.
     """
 
     params: Params
@@ -46,20 +46,23 @@ class TrackFit:
           times: Times [times] in the unit of the `times` of the fit.
 
         Returns:
-          Places of the tracked points at these times, scene units.
+          Positions of the tracked points at these times, in scene units.
+
+        Raises:
+          ValueError: If `times` is not one-dimensional.
         """
         first, last = self._span
-        share = (np.asarray(times, np.float64) - first) / (last - first)
-        if share.ndim != 1:
-            raise ValueError(f"times must have shape [times], got {share.shape}")
-        kind = self._points.canonical.dtype
-        return _positions(self._effect, self._points, jnp.asarray(share, kind))
+        fraction = (np.asarray(times, np.float64) - first) / (last - first)
+        if fraction.ndim != 1:
+            raise ValueError(f"times must have shape [times], got {fraction.shape}")
+        dtype = self._points.canonical.dtype
+        return _positions(self._effect, self._points, jnp.asarray(fraction, dtype))
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _positions(effect, points, times):
-    one = functools.partial(path_fit.places, effect, points)
-    return jnp.swapaxes(jax.vmap(one)(times), 0, 1)
+    position_at = functools.partial(motion_fit.positions_at, effect, points)
+    return jnp.swapaxes(jax.vmap(position_at)(times), 0, 1)
 
 
 def fit_tracks(
@@ -72,31 +75,32 @@ def fit_tracks(
     steps: int = 1000,
     learning_rate: float = 5e-3,
 ) -> TrackFit:
-    """Fit a motion model to the paths of points in 3D.
+    """Fit a motion model to 3D point tracks.
 
     Adam minimizes the mean distance between the moved points and the tracks where they
-    are visible, softened near zero so that single wrong tracks bend nothing. Motions
-    made of rigid bodies (`SE3BasesSpec`) start from a closed-form fit of groups of
-    points. Runs on the host and compiles one program; computed in float32.
+    are visible. The distance is smooth near zero, so that single wrong tracks have
+    little influence. Motions made of rigid bodies (`SE3BasesSpec`) start from a
+    closed-form fit of groups of points. The fit runs on the host, compiles one program
+    and computes in float32.
 
     Args:
-      motion: Settings of the motion, such as `SE3BasesSpec(bases=8)`: any that
-        `SplatScene.motion` takes.
-      tracks: Places of the points over time, [points, times, 3], scene units.
-      visible: Where a place is known, [points, times] bool. None: everywhere. Places
-        that are not finite count as unknown.
+      motion: Settings of the motion, such as `SE3BasesSpec(bases=8)`: any value of
+        `SplatScene.motion`.
+      tracks: Positions of the points over time, [points, times, 3], in scene units.
+      visible: True where a position is known, [points, times] bool. None: everywhere.
+        Positions that are not finite count as unknown.
       times: Increasing times of the columns, [times], in any unit. None: evenly spaced
         from 0 to 1.
-      key: Random key of the initialization and of the drawn times. None: key 0.
+      key: PRNG key of the initialization and of the sampled times. None: key 0.
       steps: Number of Adam steps.
-      learning_rate: Learning rate, relative to the rates of the motion's own parts.
+      learning_rate: Learning rate. The motion's own rates determine only its ratios
+        between parameters.
 
     Returns:
       The fitted motion.
 
     Raises:
-      ValueError: A shape or setting is not one of the above, or a track is never
-        visible.
+      ValueError: If a shape or setting is invalid, or a track is never visible.
 
     References:
       Wang et al. 2024 (Shape of Motion, arXiv:2407.13764), Section 3.3, for the
@@ -122,11 +126,11 @@ def fit_tracks(
                 f"shape {visible.shape}"
             )
         known &= visible
-    unseen = np.flatnonzero(~known.any(axis=1))
-    if len(unseen) or not len(known):
+    invisible = np.flatnonzero(~known.any(axis=1))
+    if len(invisible) or not len(known):
         raise ValueError(
-            f"every track must be visible somewhere, got {len(unseen)} of "
-            f"{len(known)} that never are (rows {unseen[:5].tolist()}); leave them out"
+            f"every track must be visible at some time, but {len(invisible)} of "
+            f"{len(known)} never are (rows {invisible[:5].tolist()}); remove them"
         )
     count = position.shape[1]
     times = np.linspace(0, 1, count) if times is None else np.asarray(times, np.float64)
@@ -135,18 +139,18 @@ def fit_tracks(
             f"times must be {count} increasing numbers, one for each column of tracks, "
             f"got {times}"
         )
-    places = position[known]
-    unit = float(np.sqrt(np.mean(np.sum((places - places.mean(0)) ** 2, axis=-1))))
+    observed = position[known]
+    unit = float(np.sqrt(np.mean(np.sum((observed - observed.mean(0)) ** 2, axis=-1))))
     unit = max(unit, float(np.finfo(np.float32).tiny) ** 0.5)
-    box = tuple(places.min(0) - unit), tuple(places.max(0) + unit)
+    box = tuple(observed.min(0) - unit), tuple(observed.max(0) + unit)
     metadata = SceneMetadata(unit, (0.0, 0.0, 0.0), count, box=box)
-    moving = protocols.bound(protocols.moving_at_once(motion), steps, metadata)
-    effect = protocols.compile_motion(moving)
-    share = (times - times[0]) / (times[-1] - times[0])
-    fitted = path_fit.fit(
+    component = protocols.bound(protocols.moving_at_once(motion), steps, metadata)
+    effect = protocols.compile_motion(component)
+    fraction = (times - times[0]) / (times[-1] - times[0])
+    fitted = motion_fit.fit(
         effect,
         Paths(
-            share.astype(np.float32),
+            fraction.astype(np.float32),
             np.where(known[..., None], position, np.nan).astype(np.float32),
             known,
             unit,
@@ -156,7 +160,7 @@ def fit_tracks(
         steps=steps,
     )
     return TrackFit(
-        path_fit.scene_of(effect, fitted.points),
+        motion_fit.scene_of(effect, fitted.points),
         fitted.first,
         fitted.last,
         effect,

@@ -20,15 +20,15 @@ from nerfies_jax.training.model import TrainState
 from nerfies_jax.training.updates import apply_updates
 
 
-class Drawn(NamedTuple):
-    """Observation of the Gaussians in one frame."""
+class ViewStatistics(NamedTuple):
+    """Statistics of the Gaussians in one frame."""
 
-    mean2d_grad: Float[Array, "drawn 2"]  # of the loss, per pixel
+    mean2d_grad: Float[Array, "rendered 2"]  # of the loss, per pixel
     footprints: Footprints
-    canonical: Gaussians  # the rows
-    moved: Gaussians  # the rows as they stood at the frame's time
-    # How much each of what was drawn counts for its row; None: all alike.
-    significance: Float[Array, " drawn"] | None = None
+    canonical: Gaussians  # before the deformation
+    moved: Gaussians  # at the time of the frame
+    # Weight of each child in the statistics of its parent. None: all weights are equal.
+    significance: Float[Array, " rendered"] | None = None
 
 
 def descend(
@@ -39,7 +39,19 @@ def descend(
     state: TrainState,
     grads: Params,
 ) -> Trained:
-    """Parameters and moments after one update along `grads`."""
+    """Update parameters and optimizer state by one gradient.
+
+    Args:
+      spec: Settings of the scene.
+      metadata: Metadata of the capture.
+      effects: Components of the scene.
+      optimizer: The optimizer.
+      state: State of the training.
+      grads: Gradient of the loss.
+
+    Returns:
+      The updated parameters and optimizer state.
+    """
     updates, opt_state = optimizer.update(grads, state.optimizer, state.params)
     by_part = _learning_rates(spec, metadata, effects, state.params, state.step)
     trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
@@ -56,39 +68,43 @@ def descend(
     return trained
 
 
-def observed(
+def observe(
     strategy: Strategy | None,
     aux_state: AuxState,
-    drawn: Drawn,
+    statistics: ViewStatistics,
     size: tuple[int, int],
 ) -> AuxState:
-    """Return the state of the strategy after one more frame.
+    """Update the state of the strategy by one frame.
 
     Args:
-      strategy: Control of the number of Gaussians; None: there is none.
+      strategy: The strategy of the scene, or None.
       aux_state: State of the scene.
-      drawn: Observation of the Gaussians in the frame.
+      statistics: Statistics of the Gaussians in the frame.
       size: (width, height) of the frame in pixels.
+
+    Returns:
+      The updated state of the scene.
     """
     if strategy is None:
         return aux_state
-    footprints = drawn.footprints
+    footprints = statistics.footprints
     info = StepInfo(
-        drawn.mean2d_grad,
+        statistics.mean2d_grad,
         footprints.seen(size),
         jnp.max(footprints.extent_px, axis=1),
         size,
-        drawn.canonical,
-        drawn.moved,
-        drawn.significance,
+        statistics.canonical,
+        statistics.moved,
+        statistics.significance,
     )
     return aux_state._replace(stats=strategy.update(aux_state.stats, info))
 
 
 def _learning_rates(spec, metadata, effects, params, step):
-    """A prefix of `Params` with the learning rate of everything below each leaf.
+    """Return a prefix of `Params` with the learning rate of all parameters.
 
-    Times the root of the views in a step: their mean is that much less noisy.
+    Rates are multiplied by the square root of the number of views in a step, because
+    the mean of their gradients has that much less noise.
     """
     rows = {
         "splats": learning_rates.at_step(
@@ -99,9 +115,9 @@ def _learning_rates(spec, metadata, effects, params, step):
     for effect in effects:
         if effect.init is None:
             continue
-        own = effect.learning_rate(step)
-        # A single number is the rate of all its parameters.
-        each = own if isinstance(own, MotionParams) else MotionParams(own, own)
+        rate = effect.learning_rate(step)
+        # A single rate applies to all parameters of the component.
+        each = rate if isinstance(rate, MotionParams) else MotionParams(rate, rate)
         if effect.name in params.rows:
             rows[effect.name] = each.per_gaussian
         if effect.name in params.nets:

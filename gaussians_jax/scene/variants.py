@@ -1,4 +1,4 @@
-"""Trained Gaussians drawn otherwise: effects left out, faster, without what moves."""
+"""Variants of a trained scene: without components, faster, or without moving parts."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -13,43 +13,43 @@ from gaussians_jax.scene import scene
 from nerfies_jax.evaluation.representation import Parts, check_there
 from nerfies_jax.training.model import Model, Stages, TrainState
 
-REMOVABLE = ("motion", "carried", "exposure")  # what shows in a picture
-INSTANTS = 33  # at which rows are looked for that move
+REMOVABLE = ("motion", "carried", "exposure")  # components that affect a render
+INSTANTS = 33  # frame times at which moving Gaussians are detected
 
 
 def parts(spec, metadata) -> Parts:
-    """Return the parts of a scene that can be left out: those that show in an image."""
+    """Return the components that can be left out: those that affect a render."""
     del metadata
-    there = tuple(name for name in REMOVABLE if getattr(spec, name) is not None)
-    return Parts(there, appearance=spec.exposure is not None)
+    present = tuple(name for name in REMOVABLE if getattr(spec, name) is not None)
+    return Parts(present, appearance=spec.exposure is not None)
 
 
 def without_effects(spec, metadata, without: tuple[str, ...], blended: bool) -> Model:
-    """The model with some effects left out."""
+    """Build the model without some of its components."""
     if blended:
         raise ValueError(
-            "--appearance: splats have no appearance codes; reconstruct with a preset "
-            "that has them, as nerf-w or nerfies"
+            "splats have no appearance codes to blend; reconstruct with a preset that "
+            "has them, such as nerf-w or nerfies"
         )
     return scene.build(reduced(spec, metadata, without), metadata)
 
 
 def reduced(spec, metadata, without: tuple[str, ...]):
-    """Remove parts from the settings of a scene.
+    """Remove components from the settings of a scene.
 
     Raises:
       ValueError: If the scene cannot be rendered without one of them.
     """
     check_there(without, parts(spec, metadata).removable)
-    left: dict[str, Any] = {name: None for name in REMOVABLE if name in without}
-    if "motion" in left and isinstance(spec.motion, AnchorMotionSpec):
-        # Of the same features as the motion is what anchors carry at rest.
-        left["motion"] = dataclasses.replace(spec.motion, moves=False)
-    return dataclasses.replace(spec, **left)
+    replaced: dict[str, Any] = {name: None for name in REMOVABLE if name in without}
+    if "motion" in replaced and isinstance(spec.motion, AnchorMotionSpec):
+        # Static children of anchors are computed from the same features as the motion.
+        replaced["motion"] = dataclasses.replace(spec.motion, moves=False)
+    return dataclasses.replace(spec, **replaced)
 
 
 class Faster(NamedTuple):
-    """A model that is drawn faster, the state that it needs, and what was gained."""
+    """A model that renders faster, the state that it needs, and a summary."""
 
     model: Model
     state: TrainState
@@ -63,8 +63,22 @@ def from_knots(
     interpolation: str = "linear",
     static_threshold: float = 0.0,
 ) -> Faster:
-    """Return the model with its motion read from a table of `knots` times."""
-    stages = _stages(model, "--knots")
+    """Return the model with its motion interpolated from a table of knots.
+
+    Args:
+      model: The model.
+      state: State of the trained scene.
+      knots: Number of knots in time.
+      interpolation: "linear" or "cubic".
+      static_threshold: Gaussians that move less than this (scene units) are static.
+
+    Returns:
+      The faster model.
+
+    Raises:
+      ValueError: If the model has no motion that can be tabulated.
+    """
+    stages = _stages(model, "a table of knots")
     time_knots.check(knots, interpolation)
     params = state.params
     prepared = jax.jit(stages.prepare)(params)
@@ -82,12 +96,12 @@ def from_knots(
         state,
         table,
         Stages(
-            prepare=lambda both: (),
-            deform=lambda both, prepared, time: time_knots.at(
-                both[1], time, interpolation
+            prepare=lambda inputs: (),
+            deform=lambda inputs, prepared, time: time_knots.at(
+                inputs[1], time, interpolation
             ),
-            draw=lambda both, *rest: stages.draw(both[0], *rest),
-            rows=lambda both: stages.rows(both[0]),
+            draw=lambda inputs, *rest: stages.draw(inputs[0], *rest),
+            rows=lambda inputs: stages.rows(inputs[0]),
         ),
         summary,
     )
@@ -96,10 +110,19 @@ def from_knots(
 def without_static(model: Model, state: TrainState, static_threshold: float) -> Faster:
     """Return the model with the deformation evaluated for moving Gaussians only.
 
-    Those are the ones that move farther than `static_threshold` (scene units), or come
-    and go, over `INSTANTS` instants of [0, 1].
+    Args:
+      model: The model.
+      state: State of the trained scene.
+      static_threshold: Gaussians are static if they move less than this (scene units)
+        and keep their opacity at `INSTANTS` times in [0, 1].
+
+    Returns:
+      The faster model.
+
+    Raises:
+      ValueError: If the model has no motion, or nothing moves.
     """
-    stages = _stages(model, "--static-threshold")
+    stages = _stages(model, "the separation of static Gaussians")
 
     def deform_rows(params, time):
         return stages.deform(params, stages.prepare(params), time)
@@ -107,9 +130,9 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
     times = np.linspace(0, 1, INSTANTS)
     parts = static_rows.split(state.params, deform_rows, times, static_threshold)
 
-    def deform(both, prepared, time):
+    def deform(inputs, prepared, time):
         return static_rows.deform(
-            both[1], lambda rows, time: stages.deform(rows, prepared, time), time
+            inputs[1], lambda rows, time: stages.deform(rows, prepared, time), time
         )
 
     return _with(
@@ -117,10 +140,10 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
         state,
         parts,
         Stages(
-            prepare=lambda both: stages.prepare(both[1].dynamic),
+            prepare=lambda inputs: stages.prepare(inputs[1].dynamic),
             deform=deform,
-            draw=lambda both, *rest: stages.draw(both[0], *rest),
-            rows=lambda both: stages.rows(both[0]),
+            draw=lambda inputs, *rest: stages.draw(inputs[0], *rest),
+            rows=lambda inputs: stages.rows(inputs[0]),
         ),
         f"the deformation of {_moving(parts.row_index, static_threshold)}",
     )
@@ -129,13 +152,24 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
 def without_moving(
     model: Model, state: TrainState, farther_than: float
 ) -> tuple[TrainState, str]:
-    """Return the state without moving Gaussians, and a summary, on the host.
+    """Deactivate moving Gaussians, on the host.
 
-    Those are the ones of which a point moves farther than `farther_than` (scene units)
-    over `INSTANTS` instants of [0, 1]: what is left is the static scene. What was
-    never filmed behind what moves is a guess (`StartSpec.fill_hidden`) or a hole.
+    A background that was never observed behind moving objects is a guess
+    (`StartSpec.fill_hidden`) or a hole.
+
+    Args:
+      model: The model.
+      state: State of the trained scene.
+      farther_than: Gaussians are removed if any of their points moves farther than this
+        (scene units) at `INSTANTS` times in [0, 1].
+
+    Returns:
+      The static scene, and a summary.
+
+    Raises:
+      ValueError: If the model has no motion, or nothing would be left.
     """
-    stages = _stages(model, "--hide-moving")
+    stages = _stages(model, "the removal of moving Gaussians")
 
     def deform_rows(params, time):
         return stages.deform(params, stages.prepare(params), time)
@@ -149,40 +183,40 @@ def without_moving(
     active = int(splats.active_mask(rows["splats"]).sum())
     if int(moves.sum()) == active:
         raise ValueError(
-            f"--hide-moving {farther_than:g}: all {active} Gaussians move farther than "
-            "that, and nothing would be left; give a longer distance"
+            f"all {active} Gaussians move farther than {farther_than:g} scene units, "
+            "so nothing would be left; pass a longer distance"
         )
-    shown = rows | {"splats": splats.deactivate(rows["splats"], jnp.asarray(moves))}
-    params = state.params._replace(rows=shown)
+    static = rows | {"splats": splats.deactivate(rows["splats"], jnp.asarray(moves))}
+    params = state.params._replace(rows=static)
     summary = f"{int(moves.sum())} of {active} Gaussians move and are left out"
     return state._replace(params=params), summary
 
 
-def _stages(model, option):
+def _stages(model, feature):
     if model.stages is None:
         raise ValueError(
-            f"{option} is for runs of Gaussians; a radiance field has no table of "
-            "where its points are"
+            f"{feature} needs a run of Gaussians; a radiance field does not store the "
+            "motion of its points"
         )
     return model.stages
 
 
-def _moving(where, static_threshold):
-    moving, rows = int(where.moves.sum()), len(where.moves)
+def _moving(row_index, static_threshold):
+    moving, rows = int(row_index.moves.sum()), len(row_index.moves)
     if not moving:
         raise ValueError(
             f"nothing in this run moves farther than {static_threshold:g} scene units; "
-            "leave --knots and --static-threshold out, or lower the latter"
+            "render without knots and static_threshold, or lower the latter"
         )
-    return f"{moving} of {rows} rows that move"
+    return f"{moving} of {rows} moving Gaussians"
 
 
 def _with(model: Model, state: TrainState, extras: Any, stages: Stages, summary: str):
-    """The model on `(params, beside)`: what is beside is an argument, no constant."""
+    """Return the model on `(params, extras)`. Extras are inputs, not constants."""
 
-    def render(both, view, size, step):
-        deformed = stages.deform(both, stages.prepare(both), view.time)
-        return stages.draw(both, deformed, view, size, step)
+    def render(inputs, view, size, step):
+        deformed = stages.deform(inputs, stages.prepare(inputs), view.time)
+        return stages.draw(inputs, deformed, view, size, step)
 
     return Faster(
         model._replace(render=render, stages=stages),

@@ -1,8 +1,8 @@
 """Front-to-back compositing of sorted pairs, and its gradient, with tiles in lockstep.
 
-The state of a tile is one row of transmittance and one row per channel over its pixels,
-with pixels last. The transmittance of a saturated pixel is kept negative, so that no
-mask is needed. Both passes go front to back and recompute every alpha.
+The state of a tile has one row of transmittance and one row per channel, with pixels as
+last axis. The transmittance of a saturated pixel is stored as negative, so that no mask
+is needed. Both passes go front to back and recompute all alphas.
 """
 
 from typing import NamedTuple
@@ -56,7 +56,7 @@ def blend(
     def one_batch(carry):
         number, state, used = carry
         tiles = lax.dynamic_slice(order, (number * step.batch,), (step.batch,))
-        start, end, middle = _tile_rows(tiles, isects, grid, state.dtype)
+        start, end, center = _tile_rows(tiles, isects, grid, state.dtype)
         longest = jnp.max(end - start)
 
         def unfinished(inner):
@@ -66,7 +66,7 @@ def blend(
         def one_chunk(inner):
             position, transmittance, channels, _ = inner
             _, rows = _chunk(table, isects.ranks, start, end, position, step.chunk)
-            raw, alpha = _alphas(rows, middle, spec, grid)
+            raw, alpha = _alphas(rows, center, spec, grid)
             if through:
                 alpha = _straight_through(raw, alpha)
             transmittance, channels = _composite(
@@ -110,53 +110,72 @@ def blend_gradient(
     grid: Grid,
     step: Lockstep,
 ) -> tuple[Float[Array, "tiles rows pixels"], Float[Array, "gaussians columns"]]:
-    """Add a chunk's part of the gradient of every table entry.
+    """Add the gradient of a chunk to the gradient of the table.
 
-    `state` has two rows: the transmittance, and the part of the loss that is still to
-    come through this pixel, S = sum over the remaining Gaussians of w (color . g), plus
-    g_T times the final transmittance. Going front to back,
+    `state` has two rows: the transmittance, and the part S of the loss that depends on
+    the remaining Gaussians of the pixel: the sum of w (color . g), plus g_T times the
+    final transmittance. Going front to back,
 
         d loss / d alpha_i = T_i (color_i . g) - S_i / (1 - alpha_i),
 
     where S_i is the part behind Gaussian i. Only the final image is needed.
+
+    Args:
+      state: Transmittance and S of each tile.
+      gradient: Gradient of the table so far.
+      isects: Sorted pairs.
+      table: Columns of each Gaussian, the last one transparent.
+      cotangent: Gradient g of the loss with respect to the image.
+      spec: Thresholds.
+      grid: The tiles.
+      step: Numbers of tiles and Gaussians per iteration.
+
+    Returns:
+      The new state and gradient.
     """
     order, batches = _by_length(isects, step.batch)
 
     def one_batch(carry):
         number, state, gradient = carry
         tiles = lax.dynamic_slice(order, (number * step.batch,), (step.batch,))
-        start, end, middle = _tile_rows(tiles, isects, grid, state.dtype)
+        start, end, center = _tile_rows(tiles, isects, grid, state.dtype)
         longest = jnp.max(end - start)
-        toward = cotangent.at[tiles].get(mode="clip")
+        pixel_gradient = cotangent.at[tiles].get(mode="clip")
 
         def unfinished(inner):
             position, _, _, alive, _ = inner
             return (position < longest) & alive
 
         def one_chunk(inner):
-            position, transmittance, behind, _, gradient = inner
+            position, transmittance, remaining, _, gradient = inner
             rank, rows = _chunk(table, isects.ranks, start, end, position, step.chunk)
-            raw, alpha = _alphas(rows, middle, spec, grid)
-            transmittance, behind, weight, grad = _trace_back(
-                transmittance, behind, raw, alpha, rows, toward, spec
+            raw, alpha = _alphas(rows, center, spec, grid)
+            transmittance, remaining, weight, grad = _trace_back(
+                transmittance, remaining, raw, alpha, rows, pixel_gradient, spec
             )
-            update = _pair_gradients(rows, middle, weight, grad, toward, grid)
+            update = _pair_gradients(rows, center, weight, grad, pixel_gradient, grid)
             gradient = gradient.at[rank].add(update)
             return (
                 position + step.chunk,
                 transmittance,
-                behind,
+                remaining,
                 _any_open(transmittance),
                 gradient,
             )
 
-        transmittance, (behind,) = _parts(state.at[tiles].get(mode="clip"))
-        _, transmittance, behind, _, gradient = lax.while_loop(
+        transmittance, (remaining,) = _parts(state.at[tiles].get(mode="clip"))
+        _, transmittance, remaining, _, gradient = lax.while_loop(
             unfinished,
             one_chunk,
-            (jnp.int32(0), transmittance, behind, _any_open(transmittance), gradient),
+            (
+                jnp.int32(0),
+                transmittance,
+                remaining,
+                _any_open(transmittance),
+                gradient,
+            ),
         )
-        local = jnp.stack([transmittance, behind], axis=1)
+        local = jnp.stack([transmittance, remaining], axis=1)
         return number + 1, state.at[tiles].set(local, mode="drop"), gradient
 
     _, state, gradient = lax.while_loop(
@@ -168,25 +187,25 @@ def blend_gradient(
 def _parts(local):
     """Split the state of a batch of tiles into one array per row.
 
-    As one array, every iteration would take it apart and assemble it again.
+    With a single array, every iteration would split and concatenate it.
     """
     return local[:, 0], tuple(local[:, i] for i in range(1, local.shape[1]))
 
 
 def _any_open(transmittance):
     """Test if any pixel of any tile is unsaturated."""
-    # Halves with each other first, whole vectors at once: XLA:CPU reduces along an axis
-    # one number after the other.
-    most = transmittance.reshape(-1)
-    while most.size > 8 and most.size % 2 == 0:
-        most = jnp.maximum(*jnp.split(most, 2))
-    return jnp.max(most) > 0
+    # Combines halves first, as whole vectors, because XLA:CPU reduces along an axis
+    # element by element.
+    values = transmittance.reshape(-1)
+    while values.size > 8 and values.size % 2 == 0:
+        values = jnp.maximum(*jnp.split(values, 2))
+    return jnp.max(values) > 0
 
 
 def _by_length(isects, batch):
-    """Tiles from most to fewest pairs, padded to whole batches, and how many batches.
+    """Return tiles from most to fewest pairs in whole batches, and the number of these.
 
-    Tiles of one batch run in lockstep, so they should be about equally long.
+    Tiles of one batch run in lockstep, so their lengths should be similar.
     """
     length = isects.ends - isects.starts
     order = longest_first(length)
@@ -221,16 +240,16 @@ def _pixels(grid, dtype):
     return jnp.asarray(x.ravel(), dtype), jnp.asarray(y.ravel(), dtype)
 
 
-def _whitened(rows, middle):
+def _whitened(rows, center):
     """Return u and v at the tile centers, and their gradients p, r and -r k."""
     mean_x, mean_y, p, k, r = rows[:5]
-    dx, dy = middle[0] - mean_x, middle[1] - mean_y
+    dx, dy = center[0] - mean_x, center[1] - mean_y
     return p * dx, r * (dy - k * dx), p, r, -(r * k)
 
 
-def _alphas(rows, middle, spec, grid):
-    """opacity exp(-u^2 - v^2), and alpha with cut and clamp: [chunk, batch, pixels]."""
-    u0, v0, u_x, v_y, v_x = (c[..., None] for c in _whitened(rows, middle))
+def _alphas(rows, center, spec, grid):
+    """Compute opacity exp(-u^2 - v^2), and alpha: [chunk, batch, pixels]."""
+    u0, v0, u_x, v_y, v_x = (c[..., None] for c in _whitened(rows, center))
     x, y = _pixels(grid, u0.dtype)
     u = u0 + u_x * x
     v = v0 + v_x * x + v_y * y
@@ -242,7 +261,7 @@ def _alphas(rows, middle, spec, grid):
 
 @jax.custom_jvp
 def _straight_through(raw, alpha):
-    """Return `alpha` with the derivative of `raw` wherever something is rendered."""
+    """Return `alpha` with the derivative of `raw` wherever alpha is positive."""
     return alpha
 
 
@@ -254,19 +273,19 @@ def _straight_through_jvp(primals, tangents):
 
 def _pass_through(transmittance, alpha, spec):
     """Return the transmittance behind one Gaussian, and where it was rendered."""
-    # A product, not T - alpha T: two alphas of 0.99 leave 0.99999e-4, and rounding the
-    # difference could put that above the stop.
-    passed = transmittance * (1 - alpha)
-    drawn = passed > spec.transmittance_threshold
-    return jnp.where(drawn, passed, -jnp.abs(transmittance)), drawn
+    # A product, not T - alpha T: two alphas of 0.99 leave 0.99999e-4, and rounding of
+    # the difference could exceed the threshold.
+    remaining_light = transmittance * (1 - alpha)
+    is_rendered = remaining_light > spec.transmittance_threshold
+    return jnp.where(is_rendered, remaining_light, -jnp.abs(transmittance)), is_rendered
 
 
 def _composite(transmittance, channels, alpha, rows, spec):
-    """Transmittance and channels behind the Gaussians of a chunk."""
+    """Return transmittance and channels behind the Gaussians of a chunk."""
     for i in range(alpha.shape[0]):
         before = transmittance
-        transmittance, drawn = _pass_through(before, alpha[i], spec)
-        weight = jnp.where(drawn, before * alpha[i], 0)
+        transmittance, is_rendered = _pass_through(before, alpha[i], spec)
+        weight = jnp.where(is_rendered, before * alpha[i], 0)
         channels = tuple(
             channel + weight * rows[SHAPE_COLUMNS + c][i][:, None]
             for c, channel in enumerate(channels)
@@ -274,46 +293,49 @@ def _composite(transmittance, channels, alpha, rows, spec):
     return transmittance, channels
 
 
-def _trace_back(transmittance, behind, raw, alpha, rows, toward, spec):
-    """New state, compositing weights, and d loss / d exponent of every pair."""
+def _trace_back(transmittance, remaining, raw, alpha, rows, pixel_gradient, spec):
+    """Return the state, compositing weights, and d loss / d exponent of all pairs."""
     weights, grads = [], []
     for i in range(alpha.shape[0]):
         before = transmittance
-        transmittance, drawn = _pass_through(before, alpha[i], spec)
-        weight = jnp.where(drawn, before * alpha[i], 0)
-        along = sum(
-            rows[SHAPE_COLUMNS + c][i][:, None] * toward[:, c]
-            for c in range(toward.shape[1])
+        transmittance, is_rendered = _pass_through(before, alpha[i], spec)
+        weight = jnp.where(is_rendered, before * alpha[i], 0)
+        projected = sum(
+            rows[SHAPE_COLUMNS + c][i][:, None] * pixel_gradient[:, c]
+            for c in range(pixel_gradient.shape[1])
         )
-        behind = behind - weight * along
-        grad = before * along - behind / (1 - alpha[i])
-        # d alpha / d exponent is alpha itself, so below the cut it is zero already.
+        remaining = remaining - weight * projected
+        grad = before * projected - remaining / (1 - alpha[i])
+        # d alpha / d exponent is alpha itself, which is zero below the cutoff.
         if spec.clamp_gradient == "zero":
-            moves, along_exponent = drawn & (alpha[i] < spec.alpha_max), alpha[i]
+            has_gradient, along_exponent = (
+                is_rendered & (alpha[i] < spec.alpha_max),
+                alpha[i],
+            )
         else:
-            moves, along_exponent = drawn & (alpha[i] > 0), raw[i]
+            has_gradient, along_exponent = is_rendered & (alpha[i] > 0), raw[i]
         weights.append(weight)
-        grads.append(jnp.where(moves, grad * along_exponent, 0))
-    return transmittance, behind, jnp.stack(weights), jnp.stack(grads)
+        grads.append(jnp.where(has_gradient, grad * along_exponent, 0))
+    return transmittance, remaining, jnp.stack(weights), jnp.stack(grads)
 
 
-def _pair_gradients(rows, middle, weight, grad, toward, grid):
+def _pair_gradients(rows, center, weight, grad, pixel_gradient, grid):
     """Compute the gradient of the table's columns per pair: [chunk, batch, columns].
 
-    Moments are taken about the tile center, where u and v of a visible Gaussian are of
-    order one. About a mean 1e4 px away they would cancel in float32.
+    Moments are relative to the tile center, where u and v of a visible Gaussian are of
+    order one. Relative to a mean 1e4 px away they would cancel in float32.
     """
     moments = _moments(grad, grid)
     total, x, y, xx, xy, yy = moments
-    u0, v0, u_x, v_y, v_x = _whitened(rows, middle)
-    along, lean = u_x * x, v_y * y + v_x * x
-    sum_u = u0 * total + along
-    sum_v = v0 * total + lean
-    sum_uu = u0 * (sum_u + along) + u_x * u_x * xx
-    sum_vv = v0 * (sum_v + lean) + (
+    u0, v0, u_x, v_y, v_x = _whitened(rows, center)
+    u_moment, v_moment = u_x * x, v_y * y + v_x * x
+    sum_u = u0 * total + u_moment
+    sum_v = v0 * total + v_moment
+    sum_uu = u0 * (sum_u + u_moment) + u_x * u_x * xx
+    sum_vv = v0 * (sum_v + v_moment) + (
         v_y * v_y * yy + 2 * v_y * v_x * xy + v_x * v_x * xx
     )
-    sum_uv = u0 * sum_v + v0 * along + u_x * (v_y * xy + v_x * xx)
+    sum_uv = u0 * sum_v + v0 * u_moment + u_x * (v_y * xy + v_x * xx)
     columns = [
         2 * (u_x * sum_u + v_x * sum_v),
         2 * v_y * sum_v,
@@ -322,18 +344,19 @@ def _pair_gradients(rows, middle, weight, grad, toward, grid):
         -2 * sum_vv / v_y,
         total,
     ]
-    # A product of small matrices for each tile, not sums over pixels, takes a seventh
-    # off this pass, of 16 channels a third; tiles second ("kbc") lose half of that.
-    shades = exact_einsum("kbp,bcp->bkc", weight, toward).swapaxes(0, 1)
-    return jnp.concatenate([jnp.stack(columns, axis=-1), shades], axis=-1)
+    # Products of small matrices per tile make this pass a seventh faster than sums over
+    # pixels, and a third with 16 channels. Half of that is lost with tiles as second
+    # axis ("kbc").
+    color_gradient = exact_einsum("kbp,bcp->bkc", weight, pixel_gradient).swapaxes(0, 1)
+    return jnp.concatenate([jnp.stack(columns, axis=-1), color_gradient], axis=-1)
 
 
 def _moments(grad, grid):
     """Sum the gradient times 1, x, y, x^2, x y and y^2 over a tile's pixels."""
     x, y = _pixels(grid, grad.dtype)
     zero = jnp.zeros_like(x)
-    # One product with eight columns, two of them idle: 0.36 ns a pair and pixel against
-    # 0.51 for six columns and 1.1 for sums over rows, then columns.
+    # One product with eight columns, two of them unused: 0.36 ns per pair and pixel,
+    # compared with 0.51 for six columns and 1.1 for sums over rows, then columns.
     basis = jnp.stack([zero + 1, x, y, x * x, x * y, y * y, zero, zero], axis=1)
     sums = exact_product(grad.reshape(-1, x.shape[0]), basis)
     return tuple(sums[:, i].reshape(grad.shape[:-1]) for i in range(6))

@@ -21,7 +21,7 @@ MAX_DEGREE = 3
 
 
 def degree_of(coefficients: int) -> int:
-    """The degree that has this many coefficients: 1, 4, 9 or 16."""
+    """Return the degree that has this many coefficients: 1, 4, 9 or 16."""
     degree = math.isqrt(coefficients) - 1
     if not 0 <= degree <= MAX_DEGREE or (degree + 1) ** 2 != coefficients:
         raise ValueError(
@@ -31,10 +31,10 @@ def degree_of(coefficients: int) -> int:
 
 
 def unit_direction(offset: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Normalize vectors; +z without a gradient where a vector is zero or not finite.
+    """Normalize vectors. Zero and non-finite vectors give +z without a gradient.
 
-    A vector is scaled by its largest component first, so that 1e-30 and 3e38 keep their
-    direction in float32.
+    A vector is first scaled by its largest component, so that directions of 1e-30 and
+    3e38 are accurate in float32.
 
     Args:
       offset: Vectors of any length.
@@ -44,19 +44,26 @@ def unit_direction(offset: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """
     largest = jnp.max(jnp.abs(offset), axis=-1, keepdims=True)
     limits = jnp.finfo(offset.dtype)
-    known = (largest >= limits.tiny) & (largest <= limits.max)  # neither of NaN
+    is_valid = (largest >= limits.tiny) & (largest <= limits.max)  # False for NaN
     axis = jnp.asarray([0, 0, 1], offset.dtype)
-    scaled, _ = near_one(jnp.where(known, offset, axis), axis=-1)
+    scaled, _ = near_one(jnp.where(is_valid, offset, axis), axis=-1)
     return scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True)
 
 
 def basis(
     direction: Float[Array, "*n 3"], degree: int
 ) -> tuple[Float[Array, "*n"], ...]:
-    """The (degree + 1)^2 basis functions at unit `direction`, as separate arrays.
+    """Evaluate the (degree + 1)^2 basis functions, as separate arrays.
 
-    Signs and order of 3D Gaussian splatting (Condon-Shortley phase kept: the first
-    degree is -y, z, -x).
+    Signs and order are those of 3D Gaussian splatting (with the Condon-Shortley phase:
+    the first degree is -y, z, -x).
+
+    Args:
+      direction: Unit vectors.
+      degree: Degree of the harmonics, at most 3.
+
+    Returns:
+      Values of the basis functions.
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     terms = [jnp.full_like(x, _C0)]

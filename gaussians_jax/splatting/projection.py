@@ -27,8 +27,8 @@ from nerfies_jax.runtime.contract import checked
 
 # gsplat's MIN_COMPENSATION, squared: the antialiased opacity factor is at least 0.005.
 MIN_COMPENSATION_SQ = 0.005**2
-# px. Rows of the projected square root beyond this are treated as not finite: their
-# squares would overflow float32, and no camera sees such a Gaussian as a shape.
+# px. Larger entries of T (see `project`) are treated as not finite, because their
+# squares would overflow float32. Such a Gaussian has no visible shape.
 MAX_EXTENT_PX = 1e16
 
 
@@ -36,26 +36,35 @@ class Footprints(NamedTuple):
     """Projected Gaussians of one camera, in the order of the Gaussians.
 
     A Gaussian that cannot be rendered (outside the near and far planes, opacity below
-    the cut, a zero quaternion, any NaN or infinity) has `extent_px` zero, finite
+    the threshold, a zero quaternion, any NaN or infinity) has `extent_px` zero, finite
     placeholders in the other fields, and zero gradient.
     """
 
     mean_px: Float[Array, "gaussians 2"]  # x right, y down, pixel centers at +0.5
     whitening: Float[Array, "gaussians 3"]  # p 1/px, k px/px, r 1/px
-    opacity: Float[Array, " gaussians"]  # compensated where antialiased
+    opacity: Float[Array, " gaussians"]  # with compensation if antialiased
     depth: Float[Array, " gaussians"]  # z, scene units
-    extent_px: Float[Array, "gaussians 2"]  # half box of alpha >= cut, no gradient
+    extent_px: Float[
+        Array, "gaussians 2"
+    ]  # half box of alpha >= threshold, no gradient
 
     @property
     def visible(self) -> Bool[Array, " gaussians"]:
-        """Drawn by this camera if its box meets the image."""
+        """True for Gaussians that are rendered if their box overlaps the image."""
         return self.extent_px[:, 0] > 0
 
     def seen(self, size: tuple[int, int]) -> Bool[Array, " gaussians"]:
-        """Visible, and its box meets an image of `size` (width, height)."""
+        """Select visible Gaussians whose box overlaps an image.
+
+        Args:
+          size: (width, height) of the image in pixels.
+
+        Returns:
+          True for the selected Gaussians.
+        """
         low, high = self.mean_px - self.extent_px, self.mean_px + self.extent_px
-        meets = (high > 0) & (low < jnp.asarray(size, low.dtype))
-        return self.visible & jnp.all(meets, axis=1)
+        overlaps = (high > 0) & (low < jnp.asarray(size, low.dtype))
+        return self.visible & jnp.all(overlaps, axis=1)
 
 
 @checked
@@ -86,7 +95,7 @@ def project(
     def one(vectors, opacity):
         return _project_one(*vectors, opacity, camera, size, spec)
 
-    # By columns, which fill whole vectors.
+    # One array per component, so that operations use whole vectors.
     *vectors, opacity = gaussians
     columns = [components(rows) for rows in vectors]
     by_column = Footprints._make((1, 1, 0, 0, 1))
@@ -176,7 +185,7 @@ def _clamp_tangent(tangent, focal, center, pixels, spec):
 
 def _footprint_rows(rows, quaternion, scale):
     """Return the two rows of T = J W R diag(scale) as lists of components."""
-    # keeps lengths of 1e-30 and 3e38 apart from 0 and infinity
+    # Scaled first, so that lengths of 1e-30 and 3e38 do not become 0 and infinity.
     w, x, y, z = components(near_one(jnp.stack(quaternion))[0])
     double = 2 / (w * w + x * x + y * y + z * z)
     columns = (
@@ -203,7 +212,7 @@ def _whiten(first, second, spec):
     """Return (p, k, r) and the antialiasing factor from the rows of T.
 
     c - b^2/a is a sum of squares, |t1 x t2|^2/a + dilation (1 + |t2|^2/a). t1 is scaled
-    by 1/sqrt(a) beforehand so that nothing of fourth order in px is formed.
+    by 1/sqrt(a) first, to avoid products of fourth order in px.
     """
     dilation = spec.eps2d
     variance_x = dot(first, first) + dilation
@@ -217,7 +226,7 @@ def _whiten(first, second, spec):
     whitening = jnp.stack([half * inverse, shear, half * lax.rsqrt(blurred)])
     ratio = sharp / blurred
     small = ratio < MIN_COMPENSATION_SQ
-    # sqrt has no gradient at 0, so the unused branch gets a 1.
+    # The gradient of sqrt is infinite at 0, so the unused branch gets a 1.
     compensation = jnp.where(
         small, MIN_COMPENSATION_SQ**0.5, jnp.sqrt(jnp.where(small, 1, ratio))
     )
@@ -225,12 +234,12 @@ def _whiten(first, second, spec):
 
 
 def _extent(whitening, opacity, spec):
-    """Half width and height (px) of the box around alpha >= cut."""
+    """Return half width and height (px) of the box where alpha >= threshold."""
     p, k, r = whitening
     reach = jnp.sqrt(jnp.maximum(jnp.log(opacity / spec.alpha_threshold), 0))
     across = reach / p
     # c = (c - b^2/a) + k^2 a
     down = jnp.hypot(reach / r, k * across)
-    # At least a hair wide, so that "visible" does not depend on rounding at the cut.
+    # Not zero, so that `visible` does not depend on rounding at the threshold.
     tiny = jnp.finfo(whitening.dtype).tiny
     return jnp.maximum(jnp.stack([across, down]), tiny)

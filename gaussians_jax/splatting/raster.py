@@ -30,9 +30,9 @@ from gaussians_jax.splatting.raster_spec import RasterSpec
 from nerfies_jax.geometry.linear_call import linear_call
 from nerfies_jax.runtime.contract import checked
 
-# By backend: tiles in lockstep, Gaussians a step. On the CPU a step of 32 x 4 x 64
-# evaluations hides XLA's overhead of some 0.2 us an operation and stays in cache; on a
-# GPU, where each operation is a launch, as many tiles as there are (not yet timed).
+# Tiles and Gaussians per iteration, by backend. On a CPU 32 x 4 x 64 evaluations hide
+# XLA's overhead of about 0.2 us per operation and stay in the cache. On a GPU, where
+# each operation is a launch, all tiles run at once (not measured yet).
 LOCKSTEP = {"cpu": Lockstep(32, 4), "gpu": Lockstep(4096, 8)}
 SMALLEST_CAPACITY = 1 << 12
 LARGEST_CAPACITY = 1 << 19
@@ -41,7 +41,7 @@ PAIRS_PER_GAUSSIAN = 4
 
 
 class Layout(NamedTuple):
-    """Everything static about one call."""
+    """Static settings of one call."""
 
     spec: RasterSpec
     grid: Grid
@@ -53,7 +53,7 @@ class Residuals(NamedTuple):
     """Chunks sorted in the forward pass, for the backward pass."""
 
     chunks: Intersections  # leading axis: the first `kept_chunks` chunks
-    chunk_count: Int[Array, ""]  # chunks there were
+    chunk_count: Int[Array, ""]  # number of chunks in the forward pass
 
 
 @checked
@@ -65,18 +65,18 @@ def rasterize(
 ) -> tuple[Float[Array, "height width channels"], Float[Array, "height width"]]:
     """Composite per-Gaussian values front to back.
 
-    The function is differentiable in the mean, whitening and opacity of `footprints`
-    and in `values`: in reverse mode, in forward mode, and forward over reverse
-    (Hessian-vector products). A second reverse mode is not available. Depth is only
-    used for the order. The image is discontinuous where alpha crosses
+    The function is differentiable with respect to the mean, whitening and opacity of
+    `footprints` and to `values`: in reverse mode, in forward mode, and forward over
+    reverse (Hessian-vector products). A second reverse mode is not available. Depth is
+    only used for the order. The image is discontinuous where alpha crosses
     `spec.alpha_threshold` and where a pixel is saturated
     (`spec.transmittance_threshold`), and its gradient is discontinuous at
     `spec.alpha_max`. Derivatives are those between the discontinuities.
 
     Args:
       footprints: N projected Gaussians.
-      values: Any number of channels per Gaussian, [N, channels]. A NaN shows in every
-        tile that its Gaussian touches.
+      values: Any number of channels per Gaussian, [N, channels]. A NaN appears in every
+        tile that its Gaussian overlaps.
       size: (width, height) of the image in pixels.
       spec: Thresholds and tile sizes.
 
@@ -128,12 +128,13 @@ def _layout(footprints, size, spec):
     step = Lockstep(min(step.batch, grid.tiles), step.chunk)
     capacity = spec.capacity
     if capacity is None:
-        wanted = PAIRS_PER_GAUSSIAN * footprints.depth.shape[0]
-        capacity = min(max(wanted, SMALLEST_CAPACITY), LARGEST_CAPACITY)
+        pairs = PAIRS_PER_GAUSSIAN * footprints.depth.shape[0]
+        capacity = min(max(pairs, SMALLEST_CAPACITY), LARGEST_CAPACITY)
         capacity = 1 << math.ceil(math.log2(capacity))
-        # Tile and rank in one 32-bit word: the sort of two arrays takes ten times as
-        # long. Not at any price, because each chunk also passes over every tile: in
-        # two, not four, 200,000 Gaussians at 800x800 take 0.93 of the time.
+        # Tile and rank fit into one 32-bit word, because a sort of two arrays takes ten
+        # times as long. Chunks have a minimum size, because each also passes over all
+        # tiles: 200,000 Gaussians at 800x800 take 0.93 of the time in two chunks
+        # instead of four.
         packed = 1 << (32 - grid.tiles.bit_length())
         if footprints.depth.shape[0] > packed >= LEAST_PACKED_CAPACITY:
             capacity = min(capacity, packed)
@@ -142,20 +143,20 @@ def _layout(footprints, size, spec):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _raster(layout, rects, table):
-    """State [tiles, 1 + channels, pixels]: transmittance, then channels."""
-    return _shown(_forward(layout, rects, table)[0])
+    """Return the state [tiles, 1 + channels, pixels]: transmittance, then channels."""
+    return _without_marks(_forward(layout, rects, table)[0])
 
 
 @_raster.defjvp
 def _raster_jvp(layout, primals, tangents):
     rects, table = primals
-    state, kept = _forward(layout, rects, table)
-    residuals = rects, table, state, kept
-    change = linear_call(_tangent, _cotangent, layout, residuals, tangents[1])
-    return _shown(state), change
+    state, residuals = _forward(layout, rects, table)
+    residuals = rects, table, state, residuals
+    tangent = linear_call(_tangent, _cotangent, layout, residuals, tangents[1])
+    return _without_marks(state), tangent
 
 
-# One camera after another under vmap: lockstep over cameras would wait for all.
+# Cameras run one after another under vmap, because lockstep would wait for all of them.
 def _forward(layout, rects, table):
     @jax.custom_batching.sequential_vmap
     def forward(rects, table):
@@ -165,32 +166,32 @@ def _forward(layout, rects, table):
 
 
 def _tangent(layout, residuals, tangent):
-    """Change of the image with that of the table, by a second pass forward."""
+    """Compute the tangent of the image by a second forward pass."""
     through = layout.spec.clamp_gradient == "through"
 
     @jax.custom_batching.sequential_vmap
-    def along(rects, table, tangent):
-        def shown(table):
-            return _shown(_stream(layout, rects, table, through)[0])
+    def jvp(rects, table, tangent):
+        def image_of(table):
+            return _without_marks(_stream(layout, rects, table, through)[0])
 
-        return jax.jvp(shown, (table,), (tangent,))[1]
+        return jax.jvp(image_of, (table,), (tangent,))[1]
 
     rects, table, *_ = residuals
-    return along(rects, table, tangent)
+    return jvp(rects, table, tangent)
 
 
 def _cotangent(layout, residuals, cotangent):
-    """Gradient of the table with that of the image."""
+    """Compute the gradient of the table from that of the image."""
 
     @jax.custom_batching.sequential_vmap
-    def backward(rects, table, state, kept, cotangent):
-        return _stream_back(layout, rects, table, state, kept, cotangent)
+    def backward(rects, table, state, residuals, cotangent):
+        return _stream_back(layout, rects, table, state, residuals, cotangent)
 
     return backward(*residuals, cotangent)
 
 
-def _shown(state):
-    # Of the transmittance only, whose sign marks saturation. Channels may be negative.
+def _without_marks(state):
+    # Only the sign of the transmittance marks saturation. Channels may be negative.
     return jnp.concatenate([jnp.abs(state[:, :1]), state[:, 1:]], axis=1)
 
 
@@ -198,13 +199,13 @@ def _with_transparent_row(table):
     """Append a transparent Gaussian for the slots beyond a tile's last pair."""
     row = jnp.zeros((1, table.shape[1]), table.dtype)
     row = row.at[0, SHAPE_COLUMNS - 1].set(-jnp.inf)
-    # Not zero: the gradient divides by p and r.
+    # p and r are one, because the gradient divides by them.
     row = row.at[0, 2].set(1).at[0, 4].set(1)
     return jnp.concatenate([table, row])
 
 
 def _blank(layout, channels, dtype):
-    """Transmittance 1 inside the image and -1, which is "done", beyond its edge."""
+    """Return transmittance 1 inside the image and -1 (saturated) outside."""
     grid = layout.grid
     inside = jnp.full((grid.height, grid.width, 1), 1, dtype)
     transmittance = _to_tiles(inside, grid) * 2 - 1
@@ -220,13 +221,13 @@ def _next_intersections(layout, cursor, rects, table, state):
     )
 
 
-def _more(cursor, state, rects):
-    drawn = jnp.sum(rects.tiles > 0, dtype=jnp.int32)
-    return (cursor.rank < drawn) & (jnp.max(state[:, 0]) > 0)
+def _has_more(cursor, state, rects):
+    rendered_count = jnp.sum(rects.tiles > 0, dtype=jnp.int32)
+    return (cursor.rank < rendered_count) & (jnp.max(state[:, 0]) > 0)
 
 
 def _stream(layout, rects, table, through=False):
-    """Composite all chunks; with `through`, derivatives ignore the clamp of alpha."""
+    """Composite all chunks. With `through`, derivatives ignore the clamp of alpha."""
     channels = table.shape[1] - SHAPE_COLUMNS
     rows = _with_transparent_row(table)
     spec, grid, step = layout.spec, layout.grid, layout.step
@@ -235,7 +236,7 @@ def _stream(layout, rects, table, through=False):
         cursor, state, residuals = carry
         isects, cursor = _next_intersections(layout, cursor, rects, table, state)
         state, used = blending.blend(state, isects, rows, spec, grid, step, through)
-        # What early stopping left out is not looked at again in the backward pass.
+        # The backward pass skips the pairs that early stopping skipped.
         isects = isects._replace(ends=isects.starts + used)
         chunks = jax.tree.map(
             lambda all_, one: all_.at[residuals.chunk_count].set(one, mode="drop"),
@@ -260,21 +261,21 @@ def _stream(layout, rects, table, through=False):
         Residuals(chunks, jnp.int32(0)),
     )
     _, state, residuals = lax.while_loop(
-        lambda carry: _more(carry[0], carry[1], rects), body, start
+        lambda carry: _has_more(carry[0], carry[1], rects), body, start
     )
     return state, residuals
 
 
 def _stream_back(layout, rects, table, final, residuals, cotangent):
-    """Backpropagate through the same chunks, sorting those again that were not kept."""
+    """Backpropagate through the same chunks, sorting those that were not kept."""
     rows = _with_transparent_row(table)
     spec, grid, step = layout.spec, layout.grid, layout.step
-    toward = cotangent[:, 1:]
-    behind = jnp.abs(final[:, 0]) * cotangent[:, 0]
-    for c in range(toward.shape[1]):
-        behind += final[:, 1 + c] * toward[:, c]
+    channel_gradient = cotangent[:, 1:]
+    remaining = jnp.abs(final[:, 0]) * cotangent[:, 0]
+    for c in range(channel_gradient.shape[1]):
+        remaining += final[:, 1 + c] * channel_gradient[:, c]
     blank = _blank(layout, 0, table.dtype)
-    state = jnp.concatenate([blank, behind[:, None]], axis=1)
+    state = jnp.concatenate([blank, remaining[:, None]], axis=1)
     keep = spec.kept_chunks
 
     def body(carry):
@@ -285,7 +286,7 @@ def _stream_back(layout, rects, table, final, residuals, cotangent):
             lambda: _next_intersections(layout, cursor, rects, table, state),
         )
         state, gradient = blending.blend_gradient(
-            state, gradient, isects, rows, toward, spec, grid, step
+            state, gradient, isects, rows, channel_gradient, spec, grid, step
         )
         return number + 1, cursor, state, gradient
 
@@ -307,7 +308,7 @@ def _kept_intersections(layout, residuals, number, cursor, rects):
 
 
 def _to_tiles(image, grid):
-    """[height, width, c] to [tiles, c, pixels], zero beyond the edge."""
+    """Reshape [height, width, c] to [tiles, c, pixels], zero outside the image."""
     height, width = grid.rows * grid.tile, grid.columns * grid.tile
     image = jnp.pad(image, ((0, height - grid.height), (0, width - grid.width), (0, 0)))
     image = image.reshape(grid.rows, grid.tile, grid.columns, grid.tile, -1)
@@ -315,7 +316,7 @@ def _to_tiles(image, grid):
 
 
 def _to_image(tiles, grid):
-    """Back to [height, width, c]."""
+    """Reshape [tiles, c, pixels] to [height, width, c]."""
     tiles = tiles.reshape(grid.rows, grid.columns, -1, grid.tile, grid.tile)
     image = tiles.transpose(0, 3, 1, 4, 2)
     image = image.reshape(grid.rows * grid.tile, grid.columns * grid.tile, -1)

@@ -16,10 +16,10 @@ class RasterSpec:
     as its public rasterizer runs.
     """
 
-    alpha_threshold: float = 1 / 255  # a Gaussian adds nothing where its alpha is below
-    alpha_max: float = 0.99  # alpha is clamped here
-    clamp_gradient: Literal["zero", "through"] = "zero"  # above the clamp
-    transmittance_threshold: float = 1e-4  # a pixel is done before it falls below
+    alpha_threshold: float = 1 / 255  # smaller alphas are skipped
+    alpha_max: float = 0.99  # upper bound of alpha
+    clamp_gradient: Literal["zero", "through"] = "zero"  # above alpha_max
+    transmittance_threshold: float = 1e-4  # a pixel is saturated before it falls below
     eps2d: float = 0.3  # px^2, added to both variances of the footprint
     antialiased: bool = False  # opacity times sqrt(det before / after dilation)
     near: float = 0.01  # z-depth, scene units
@@ -41,7 +41,7 @@ class RasterSpec:
         if not 0 <= self.transmittance_threshold < 1:
             raise ValueError(
                 "need 0 <= transmittance_threshold < 1, got "
-                f"{self.transmittance_threshold}; 0 composites to the end"
+                f"{self.transmittance_threshold}; 0 composites all Gaussians"
             )
         if not 0 < self.near < self.far:
             raise ValueError(f"need 0 < near < far, got {self.near} and {self.far}")
@@ -54,7 +54,8 @@ class RasterSpec:
             raise ValueError(f"tangent_margin must be >= 0, got {self.tangent_margin}")
         if self.clamp_gradient not in ("zero", "through"):
             raise ValueError(
-                f'clamp_gradient is "zero" or "through", got {self.clamp_gradient!r}'
+                'clamp_gradient must be "zero" or "through", got '
+                f"{self.clamp_gradient!r}"
             )
         if self.tile not in TILE_SIZES:
             raise ValueError(f"tile must be one of {TILE_SIZES}, got {self.tile}")
@@ -67,6 +68,6 @@ class RasterSpec:
 
 
 GSPLAT = RasterSpec()
-# Its footprints end at a square of three sigma in whole tiles; ours reach
-# alpha_threshold.
+# Except that footprints there are squares of three sigma in whole tiles. Here they
+# extend to alpha_threshold.
 INRIA = RasterSpec(near=0.2, far=float("inf"), clamp_gradient="through")

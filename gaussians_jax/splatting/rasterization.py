@@ -20,7 +20,7 @@ from nerfies_jax.geometry.precision import exact_product
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
-# Radii are int32, as in gsplat. Footprints reach 1e16 px, of which 1e9 is as good.
+# Radii are int32, as in gsplat, so footprints of up to 1e16 px are clamped.
 MAX_RADIUS_PX = 1e9
 
 
@@ -35,7 +35,7 @@ class _Views(NamedTuple):
 
 
 class _Settings(NamedTuple):
-    """Everything static about one call."""
+    """Static settings of one call."""
 
     spec: RasterSpec
     size: tuple[int, int]
@@ -55,8 +55,8 @@ class _Settings(NamedTuple):
 class RasterizationInfo:
     """Intermediate results of `rasterization`, as a densification strategy needs them.
 
-    A pytree. The names are those of gsplat's `meta`. Gaussians that a camera does not
-    see have radii of zero. Their other entries are finite and have no meaning.
+    A pytree with the names of gsplat's `meta`. Gaussians that are not visible in a
+    camera have radii of zero. Their other entries are finite but meaningless.
 
     Attributes:
       means2d: Projected centers, [..., C, N, 2], pixels.
@@ -65,15 +65,15 @@ class RasterizationInfo:
       depths: Depths z in the camera, [..., C, N], scene units.
       conics: Inverse covariances xx, xy, yy of the projected Gaussians,
         [..., C, N, 3], per squared pixel.
-      opacities: [..., C, N], compensated where `rasterize_mode` is "antialiased".
-      tiles_per_gauss: Tiles that meet the box, [..., C, N], int32.
+      opacities: [..., C, N], with compensation if `rasterize_mode` is "antialiased".
+      tiles_per_gauss: Number of tiles that overlap the box, [..., C, N], int32.
       width: Width of the images, pixels.
       height: Height of the images, pixels.
       tile_size: Edge of a tile, pixels.
       n_cameras: Number of cameras C.
     """
 
-    # `Any`: transformations rebuild the pytree with leaves of other kinds and shapes.
+    # `Any`, because transformations rebuild the pytree with other types of leaves.
     means2d: Any
     radii: Any
     depths: Any
@@ -222,9 +222,7 @@ def _index(name, value):
 
 
 def _checked(arrays: dict[str, Any], sh_degree):
-    """Return Gaussians, colors that all cameras share, and views, after checking
-    shapes.
-    """
+    """Check shapes, and return Gaussians, colors shared by all cameras, and views."""
     arrays = {
         name: None if value is None else jnp.asarray(value)
         for name, value in arrays.items()
@@ -297,7 +295,7 @@ def _checked(arrays: dict[str, Any], sh_degree):
 
 
 def _color_axes(colors, sh_degree):
-    """Names of the axes of `colors` behind that of the Gaussians."""
+    """Return the names of the axes of `colors` after that of the Gaussians."""
     if sh_degree is None:
         if colors.ndim < 2 or colors.shape[-1] < 1:
             raise ValueError(
@@ -319,10 +317,10 @@ def _color_axes(colors, sh_degree):
     return ("K", "3")
 
 
-# Compiled here, so that a call outside `jit` traces and compiles once for its shapes.
+# Compiled, so that calls outside of `jit` trace and compile once per shape.
 @functools.partial(jax.jit, static_argnums=0)
 def _batch(settings, gaussians, colors, views):
-    """Images, alphas and the arrays of `RasterizationInfo`, with batch axes."""
+    """Render images, alphas and arrays of `RasterizationInfo`, with batch axes."""
     scene = functools.partial(_scene, settings)
     for _ in gaussians.mean.shape[:-2]:
         scene = jax.vmap(scene)
@@ -330,17 +328,17 @@ def _batch(settings, gaussians, colors, views):
 
 
 def _scene(settings, gaussians, colors, views):
-    """All cameras of one scene, one after another."""
+    """Render all cameras of one scene, one after another."""
 
-    def one(view):
-        own = colors if view.colors is None else view.colors
-        return _camera_image(settings, gaussians, own, view)
+    def render(view):
+        view_colors = colors if view.colors is None else view.colors
+        return _camera_image(settings, gaussians, view_colors, view)
 
-    return lax.map(one, views)
+    return lax.map(render, views)
 
 
 def _camera_image(settings, gaussians, colors, view):
-    """One image, its alpha and the arrays of `RasterizationInfo`."""
+    """Render one image, its alpha and the arrays of `RasterizationInfo`."""
     spec, size = settings.spec, settings.size
     footprints = projection.project(gaussians, _camera(view), size, spec)
     if view.means2d_offset is not None:
@@ -348,9 +346,9 @@ def _camera_image(settings, gaussians, colors, view):
         footprints = footprints._replace(mean_px=shifted)
     radii = _radii(footprints, size)
     if settings.radius_clip > 0:
-        kept = jnp.any(radii > int(settings.radius_clip), axis=1, keepdims=True)
-        radii = jnp.where(kept, radii, 0)
-        extent = jnp.where(kept, footprints.extent_px, 0)
+        is_large = jnp.any(radii > int(settings.radius_clip), axis=1, keepdims=True)
+        radii = jnp.where(is_large, radii, 0)
+        extent = jnp.where(is_large, footprints.extent_px, 0)
         footprints = footprints._replace(extent_px=extent)
 
     mode = settings.render_mode
@@ -389,8 +387,8 @@ def _camera_image(settings, gaussians, colors, view):
 def _camera(view):
     """Return the camera of a view, whose center the viewmat maps to zero."""
     rotation, shift = view.viewmat[:3, :3], view.viewmat[:3, 3]
-    # By cofactors: the exact inverse of any matrix, so that the gradient with respect
-    # to the viewmat is that of R x + t, not only along rotations.
+    # Cofactors give the exact inverse of any matrix, so the gradient with respect to
+    # the viewmat is that of R x + t, not only along rotations.
     cofactors = jnp.cross(
         jnp.roll(rotation, -1, axis=0), jnp.roll(rotation, -2, axis=0)
     )
@@ -411,25 +409,25 @@ def _camera(view):
 
 
 def _visible_colors(settings, gaussians, colors, view):
-    """Values of the channels, from harmonics where these are given."""
+    """Return the values of the channels, evaluating harmonics if there are any."""
     if settings.sh_degree is None:
         return colors
-    # -R^T t, as gsplat takes it here.
+    # -R^T t, as in gsplat.
     position = -exact_product(view.viewmat[:3, 3], view.viewmat[:3, :3])
     coefficients = colors[:, : (settings.sh_degree + 1) ** 2]
     return harmonics.color_toward(coefficients, gaussians.mean, position)
 
 
 def _radii(footprints, size):
-    """Return the integer radii where alpha >= cut, zero if not visible."""
+    """Return integer radii of the box where alpha >= threshold, zero if not visible."""
     reach = jnp.ceil(jnp.minimum(footprints.extent_px, MAX_RADIUS_PX))
-    # The box of whole pixels meets the image, as gsplat decides it.
+    # Visibility by the box of whole pixels, as in gsplat.
     whole = lax.stop_gradient(footprints)._replace(extent_px=reach)
     return jnp.where(whole.seen(size)[:, None], reach, 0).astype(jnp.int32)
 
 
 def _conics(whitening):
-    """xx, xy, yy of the inverse covariance: u^2 + v^2 is half its quadratic form."""
+    """Return xx, xy, yy of the inverse covariance. Its form is 2 (u^2 + v^2)."""
     p, k, r = whitening.T
     rr = 2 * r * r
     return jnp.stack([2 * p * p + k * k * rr, -k * rr, rr], axis=-1)

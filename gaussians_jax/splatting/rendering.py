@@ -1,4 +1,4 @@
-"""One frame of Gaussians from one camera: color, alpha, depth, features."""
+"""Rendering of one frame from one camera: color, alpha, depth, features."""
 
 from typing import NamedTuple
 
@@ -16,16 +16,17 @@ from nerfies_jax.geometry.precision import widened
 from nerfies_jax.runtime.contract import checked
 from nerfies_jax.training.model import Rendering
 
-# Expected depth is D / max(alpha, 1e-10), as gsplat: zero, not NaN, where nothing is.
+# Expected depth is D / max(alpha, 1e-10) as in gsplat, zero and not NaN without
+# Gaussians.
 LEAST_ALPHA = 1e-10
 
 
 class Frame(NamedTuple):
-    """All that one pass over the Gaussians gives."""
+    """Result of one pass over the Gaussians."""
 
     rendering: Rendering
     footprints: Footprints
-    features: Float[Array, "height width features"] | None  # no background added
+    features: Float[Array, "height width features"] | None  # without background
 
 
 @checked
@@ -101,7 +102,22 @@ def render_harmonics(
     mean2d_offset: Float[Array, "gaussians 2"] | None = None,
     depth: bool = True,
 ) -> Frame:
-    """`render` with view-dependent color from 1, 4, 9 or 16 SH coefficients."""
+    """Render Gaussians with colors from spherical harmonics.
+
+    Args:
+      gaussians: N Gaussians in world coordinates.
+      coefficients: 1, 4, 9 or 16 coefficients for each Gaussian and channel.
+      camera: One camera.
+      size: (width, height) of the image in pixels.
+      spec: Settings of the rasterizer.
+      background: Color behind the Gaussians, as in `render`.
+      features: Further values, as in `render`.
+      mean2d_offset: Shift of the projected means, as in `render`.
+      depth: Whether to render the expected depth.
+
+    Returns:
+      The rendering, the projected Gaussians, and the rendered features.
+    """
     colors = harmonics.color_toward(coefficients, gaussians.mean, camera.position)
     extras = background, features, mean2d_offset, depth
     return render(gaussians, colors, camera, size, spec, *extras)

@@ -30,7 +30,7 @@ from nerfies_jax.nn.adapters import Network
 from nerfies_jax.nn.planes import PlanesSpec
 from nerfies_jax.preprocessing import usable_paths
 from nerfies_jax.runtime import data_parallel
-from nerfies_jax.scene import path_fit
+from nerfies_jax.scene import warp_fit
 from nerfies_jax.training import loop, losses, schedules
 from nerfies_jax.training.effects import (
     FrameCondition,
@@ -115,8 +115,8 @@ def build(
         params = radiance.init(start_key)
         evidence = usable_paths.evidence_to_start_from(capture, spec.start)
         if evidence is not None:
-            paths = path_fit.film_paths(radiance, capture, evidence)
-            fit = path_fit.fit_flow if spec.warp is None else path_fit.fit
+            paths = warp_fit.film_paths(radiance, capture, evidence)
+            fit = warp_fit.fit_flow if spec.warp is None else warp_fit.fit
             params = fit(radiance, params, paths, start_key, spec.start).params
         return first_state(params, run_key)
 

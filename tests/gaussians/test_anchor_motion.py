@@ -161,13 +161,13 @@ def test_bits_are_those_of_the_law_and_the_file_says_bytes(float64):
     off = splats.deactivate(off, jnp.arange(ROWS) == 2)
     params = Params(params.rows | {"splats": off}, params.nets)
     *_, bits = kept_by_hand(host(params.rows[NAME]), host(params.nets[NAME].law))
-    features, others = anchor_motion.kept_bytes(params, SPEC)
+    features, others = anchor_motion.coded_bytes(params, SPEC)
     np.testing.assert_allclose(features, bits[[0, 1, 3]].sum() / 8, rtol=1e-9)
     nets = sum(leaf.size for leaf in jax.tree.leaves(params.nets))
     assert others == 4 * (3 * (3 + 3 + 4 + 1 + 3) + nets)
     plain = dataclasses.replace(SPEC, rate=None)
     bare = Params(params.rows, {NAME: params.nets[NAME]._replace(law=None)})
-    assert anchor_motion.kept_bytes(bare, plain)[0] == 4 * 3 * (3 + EACH * 4)
+    assert anchor_motion.coded_bytes(bare, plain)[0] == 4 * 3 * (3 + EACH * 4)
 
 
 def test_slopes_are_those_of_differences(float64):
@@ -260,7 +260,9 @@ def test_a_scene_of_anchors_grows_trains_and_stands_still_without_its_motion(tmp
         assert np.isfinite(leaf).all()
         assert np.any(np.asarray(leaf) != first)
     saved = representation.save(tmp_path, TINY, metadata, state)
-    assert saved.coded_bytes == sum(anchor_motion.kept_bytes(state.params, TINY.motion))
+    assert saved.coded_bytes == sum(
+        anchor_motion.coded_bytes(state.params, TINY.motion)
+    )
     assert saved.coded_bytes < saved.model_bytes
     still = variants.without_effects(TINY, metadata, ("motion",), False)
     where = [
@@ -279,7 +281,7 @@ def test_a_scene_of_anchors_grows_trains_and_stands_still_without_its_motion(tmp
         (AnchorMotionSpec, dict(count=0), "count=0 must be at least 1"),
         (AnchorMotionSpec, dict(spread=0.0), "positive and finite"),
         (RateSpec, dict(weight=-1.0), "weight=-1.0"),
-        (RateSpec, dict(step=0.0), "positive step"),
+        (RateSpec, dict(step=0.0), "step=0.0"),
     ],
 )
 def test_settings_of_anchors_that_cannot_work_are_refused(kind, changes, words):

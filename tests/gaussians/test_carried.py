@@ -110,9 +110,9 @@ def test_what_is_carried_follows_its_row_and_turns_by_itself(time, dtype):
 def test_rows_of_what_is_carried_are_what_is_drawn_at_rest(dtype):
     params = params_of(dtype)
     rows, own = params.rows["splats"], params.rows[NAME]
-    still = jitted(carried.at_rest)(rows, own)
+    still = jitted(carried.canonical_children)(rows, own)
     drawn = jitted(splats.activate)(still)
-    stood = jitted(carried.posed)(own, None, still, splats.activate(rows))
+    stood = jitted(carried.pose_children)(own, None, still, splats.activate(rows))
     for one, other in zip(drawn, stood, strict=True):
         np.testing.assert_allclose(one, other, rtol=EXACT[dtype], atol=EXACT[dtype])
     looks = np.asarray(rows.sh_rest)[:, None] + np.asarray(own.sh_rest)
@@ -158,7 +158,9 @@ def finite_slopes(own, rows, cores):
     """What is drawn, after a look at all slopes."""
 
     def run(own, rows, cores):
-        return carried.posed(own, None, carried.at_rest(rows, own), cores)
+        return carried.pose_children(
+            own, None, carried.canonical_children(rows, own), cores
+        )
 
     def total(*args):
         return sum(jnp.sum(leaf) for leaf in run(*args))
@@ -207,7 +209,7 @@ def test_an_inactive_row_carries_inactive_ones_without_a_slope(dtype):
     rows, own = rows_and_own(dtype)
     own = own._replace(opacity_logit=put(np.full((ROWS, EACH), 200.0), dtype))
     rows = splats.deactivate(rows, jnp.arange(ROWS) == 1)
-    still = jax.jit(carried.at_rest)(rows, own)
+    still = jax.jit(carried.canonical_children)(rows, own)
     active = splats.active_mask(still).reshape(ROWS, EACH)
     np.testing.assert_array_equal(active.all(axis=1), np.arange(ROWS) != 1)
     found, slopes = finite_slopes(own, rows, splats.activate(rows))
@@ -380,7 +382,7 @@ def test_scenes_that_cannot_carry_are_refused():
         raise AssertionError
 
     second = SplatRecord("second", derive=nothing, derive_rows=nothing)
-    with pytest.raises(ValueError, match="carried and second each say"):
+    with pytest.raises(ValueError, match="carried and second both define"):
         scene.build(TINY, metadata, (second,))
-    with pytest.raises(ValueError, match="'half' fills one of derive and derive_rows"):
+    with pytest.raises(ValueError, match="'half' has only one of derive and"):
         deformation.check_derived((SplatRecord("half", derive=nothing),))

@@ -95,7 +95,7 @@ def test_half_a_frame_tells_the_light_of_the_other_half(built):
     assert score(still, metadata, state, filmed, filmed.heldout) is None
     # Of a black picture nothing can be told but the offset.
     black = np.zeros((4, 5, 3))
-    change = exposure.fitted(black, black + 0.25, None)
+    change = exposure.fit(black, black + 0.25, None)
     np.testing.assert_allclose(change, [[0, 0, 0, 0.25]] * 3, atol=1e-5)
     with pytest.raises(ValueError, match="learning_rate"):
         ExposureSpec(learning_rate=1e-3, learning_rate_end=1e-2)

@@ -97,7 +97,7 @@ def test_world_units_place_and_size_gaussians_as_the_capture_does(swaying):
     )
     # In meters of a map float32 has steps of half a meter.
     far = dataclasses.replace(capture, center=(500_000.0, 4_649_776.0, 120.0))
-    with pytest.raises(ValueError, match=r"steps of 0\.5: .* scene \* 4 \+ \(500000, "):
+    with pytest.raises(ValueError, match=r"steps of 0\.5, .* scene \* 4 \+ \(500000, "):
         instants.in_world(rows, far)
 
 
@@ -127,9 +127,9 @@ def test_scales_that_a_motion_takes_below_zero_keep_their_size(swaying):
 
 def test_a_field_and_a_time_outside_have_no_gaussians(swaying):
     model, state = swaying
-    with pytest.raises(ValueError, match=r"time 1\.5: the capture runs from 0 to 1"):
+    with pytest.raises(ValueError, match=r"time=1\.5 must lie in"):
         instants.splats_at(model, state)(1.5)
-    with pytest.raises(ValueError, match="are for runs of Gaussians"):
+    with pytest.raises(ValueError, match="need a run of Gaussians"):
         instants.splats_at(model._replace(stages=None), state)
-    with pytest.raises(ValueError, match="no sequence"):
+    with pytest.raises(ValueError, match="not a sequence"):
         instants.save_sequence("nowhere", instants.splats_at(model, state), 1, ".ply")

@@ -94,7 +94,9 @@ def test_a_failed_save_leaves_the_file_that_was_there(trained, saved):
     with pytest.raises(ValueError, match=r"model\.npz: spec\.f holds a function"):
         model_file.save(saved, params, {"f": lambda: 0})
     logit = np.full_like(params.rows["splats"].opacity_logit, splats.INACTIVE_LOGIT)
-    with pytest.raises(ValueError, match=r"model\.npz: none of the .* rows is active"):
+    with pytest.raises(
+        ValueError, match=r"model\.npz: none of the .* Gaussians is active"
+    ):
         model_file.save(saved, with_rows(params, opacity_logit=put(logit)), about)
     assert saved.read_bytes() == before
     assert [path.name for path in saved.parent.iterdir()] == ["model.npz"]
@@ -122,7 +124,7 @@ def test_a_truncated_or_foreign_file_is_refused(saved):
     contents += [b"ply\nformat ascii 1.0\n", b"\x93NUMPY\x01\x00v\x00{}", b"\0" * 4096]
     for content in contents:
         saved.write_bytes(content)
-        refused(saved, "not the file of a model, or damaged")
+        refused(saved, "not a model file, or damaged")
     np.savez(saved, mean=np.zeros((3, 3)))
     refused(saved, r"it has no about\.json")
 
@@ -152,13 +154,16 @@ def edited(path, change, arrays=()):
     [
         (
             lambda a: a.update(version=1),
-            "of version 1, and this program reads version 2",
+            "has version 1, but this version of the library reads version 2",
         ),
-        (lambda a: a.update(format="something"), r"not that of a gaussians_jax model"),
+        (
+            lambda a: a.update(format="something"),
+            r"does not describe a gaussians_jax model",
+        ),
         (lambda a: a.pop("params"), "params"),
         (lambda a: a.pop("description"), "description"),
         (lambda a: a.update(params={"array": "nobody"}), "nobody"),
-        (lambda a: a.update(params={"dict": {}}), r"no Gaussians in it"),
+        (lambda a: a.update(params={"dict": {}}), r"holds no Gaussians"),
         (lambda a: a.update(params=3), "not iterable"),
         (lambda a: a["params"].update(record="os.system"), "'os.system', which is no"),
         (
@@ -188,9 +193,9 @@ def test_a_text_that_fits_no_model_is_refused(saved, change, words):
 @pytest.mark.parametrize(
     ("array", "words"),
     [
-        (np.zeros((3, 5), np.float32), r"shape \(3, 5\) among the rows of"),
+        (np.zeros((3, 5), np.float32), r"array of shape \(3, 5\)"),
         (np.array([{}], object), "Python objects"),
-        (np.zeros((), np.float32), r"shape \(\) among the rows"),
+        (np.zeros((), np.float32), r"array of shape \(\)"),
         (None, "not finite"),
     ],
 )
@@ -213,7 +218,7 @@ def test_a_record_of_another_program_does_not_come_back(trained, tmp_path):
     params, about = trained
     odd = Params(params.rows, {"beside": Beside(put(np.zeros(3)))})
     model_file.save(tmp_path / "model.npz", odd, about)
-    refused(tmp_path / "model.npz", "of another package, which runs code")
+    refused(tmp_path / "model.npz", "of another package, whose code")
 
 
 @pytest.mark.full

@@ -90,7 +90,7 @@ def by_hand(here, there, both):
     return flow / some[..., None], share, depth / some
 
 
-drawn_flow = jitted(motion_flow.drawn_flow, static_argnums=(3, 4))
+drawn_flow = jitted(motion_flow.render_flow, static_argnums=(3, 4))
 camera_flow = jitted(motion_flow.camera_flow)
 
 
@@ -178,7 +178,7 @@ HARD = {
 @jitted
 def error_and_slopes(here, there, both):
     def total(here, there):
-        drawn = motion_flow.drawn_flow(here, there, both, SIZE, GSPLAT)
+        drawn = motion_flow.render_flow(here, there, both, SIZE, GSPLAT)
         things = motion_flow.camera_flow(both, drawn.depth)
         return motion_flow.error(drawn.flow, things, drawn.share > 0.01)
 
@@ -220,7 +220,7 @@ def test_gradients_go_through_both_ends_and_no_weight(float64):
     assert gradients.directional_error(total, here, there) < 1e-5
 
     def blended(here, there):
-        drawn = motion_flow.drawn_flow(here, there, both, SIZE, GSPLAT)
+        drawn = motion_flow.render_flow(here, there, both, SIZE, GSPLAT)
         return jnp.sum(drawn.flow * weight)
 
     slopes = jitted(jax.grad(blended, (0, 1)))(here, there)
@@ -248,7 +248,7 @@ def test_flow_pulls_both_cameras_by_how_they_move_and_no_weight(float64):
     images, times = np.zeros((3, 9, 13, 3), np.uint8), np.array([0.0, 0.5, 1.0])
     frames = Frames(images, given, times, np.zeros(3, np.int32), None, flow=flow)
     refined = jax.jit(
-        functools.partial(pose_refinement.refined, cameras=given, depth=DEPTH)
+        functools.partial(pose_refinement.refine, cameras=given, depth=DEPTH)
     )
 
     def at_time(_, time):
@@ -260,7 +260,7 @@ def test_flow_pulls_both_cameras_by_how_they_move_and_no_weight(float64):
         context = PenaltyContext(
             None, None, None, None, observation=observation, at_time=at_time
         )
-        return motion_flow.compared(FlowSpec(), GSPLAT, None, context)
+        return motion_flow.flow_error(FlowSpec(), GSPLAT, None, context)
 
     screws = 0.02 * rng.normal(size=(3, 6))
     still = cameras.take(refined(screws), 0)
@@ -268,7 +268,7 @@ def test_flow_pulls_both_cameras_by_how_they_move_and_no_weight(float64):
     @jax.jit
     def held(screws):
         first, second = (cameras.take(refined(screws), row) for row in (0, 1))
-        drawn = motion_flow.drawn_flow(here, there, (still, second), SIZE, GSPLAT)
+        drawn = motion_flow.render_flow(here, there, (still, second), SIZE, GSPLAT)
         things = shift[0] - motion_flow.camera_flow((first, second), drawn.depth)
         return motion_flow.error(drawn.flow, things, drawn.share >= 0.5)
 

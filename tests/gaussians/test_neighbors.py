@@ -212,5 +212,7 @@ def test_the_effect_weighs_and_waits_for_its_start():
     np.testing.assert_allclose(linked_term, linked, rtol=1e-6)
     assert linked > 0.5
     absent = neighbors.Bound(NeighborSpec(), extent=1.0, of="kan_motion")
-    with pytest.raises(ValueError, match=r"no rows .kan_motion.*code"):
+    with pytest.raises(
+        ValueError, match=r"no per-Gaussian parameters .kan_motion.*code"
+    ):
         absent.state(params)

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from gaussians_jax.core import protocols, splats
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Params
-from gaussians_jax.init import path_fit
-from gaussians_jax.init.path_fit import Paths
+from gaussians_jax.init import motion_fit
+from gaussians_jax.init.motion_fit import Paths
 from gaussians_jax.motion import deformation, skinning
 from gaussians_jax.motion import nodes as node_motion
 from gaussians_jax.motion.nodes import MaskSpec, NodeMotionSpec
@@ -155,7 +155,7 @@ def carry(position, log_radius, moves, mean, dtype):
     near = jnp.arange(len(position), dtype=jnp.int32)[None]
 
     def run(position, log_radius, moves, still):
-        by = skinning.displaced(position, log_radius, moves, near, still.mean)
+        by = skinning.displace(position, log_radius, moves, near, still.mean)
         return skinning.apply(still, by)
 
     args = *put((position, log_radius), dtype), put(moves, dtype), still
@@ -345,7 +345,7 @@ def test_nodes_at_rest_stay_at_rest_when_others_are_fitted_to_paths():
     paths = Paths(time, position, np.ones((30, 12), bool), 1.0, still)
     small = dataclasses.replace(MOTION, nodes=16, depth=2, width=32)
     motion = bound.record(small, extent=EXTENT)
-    fitted = path_fit.fit(motion, paths, jax.random.key(0), steps=400)
+    fitted = motion_fit.fit(motion, paths, jax.random.key(0), steps=400)
     assert fitted.last < 0.02
     nodes = fitted.points.nets
     assert (np.asarray(nodes.position)[:8, 2] < 0.5).all()  # half of them move
@@ -433,10 +433,10 @@ def test_a_mask_that_is_decided_is_exact_and_has_finite_slopes(far, dtype):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"sparsity": -1.0}, "sparsity=-1.0 is finite"),
+        ({"sparsity": -1.0}, "sparsity=-1.0 must be finite"),
         ({"nodes": 0}, "nodes=0 must be at least 1"),
         ({"near": 0}, "near=0 must be at least 1"),
-        ({"rigidity": 0.0}, "None leaves it out"),
+        ({"rigidity": 0.0}, "None disables"),
         ({"moving_share": 0.0}, "must lie in"),
         ({"warm_up": -1}, "must not be negative"),
         ({"radius_rate": -1.0}, "finite and not negative"),

@@ -207,7 +207,7 @@ def test_a_state_that_both_groups_share_is_refused(optimizer):
     params = rows_and_nets(COUNT)
     state = Trained(params, jax.eval_shape(optimizer.init, params))
     turn = UpdateMask(*put((True, False)))
-    with pytest.raises(ValueError, match=r"count belongs to rows and networks alike"):
+    with pytest.raises(ValueError, match=r"count belongs to both"):
         phases.freeze(optimizer, turn, state, state)
 
 

@@ -128,7 +128,7 @@ def test_what_is_kept_smooth_is_what_the_weights_say(float64):
 
 def test_the_box_holds_what_was_filmed():
     capture = scenes.tiny_capture()
-    low, high = np.array(initialization.filmed_box(capture))
+    low, high = np.array(initialization.observed_box(capture))
     inside = (capture.points.position > low) & (capture.points.position < high)
     assert inside.all(axis=1).mean() > 0.8
     spread = np.ptp(capture.points.position, axis=0)
@@ -138,8 +138,8 @@ def test_the_box_holds_what_was_filmed():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"planes": PlanesSpec()}, "planes with moments"),
-        ({"planes": PlanesSpec(moments=3, combination="sum")}, "that are multiplied"),
+        ({"planes": PlanesSpec()}, "need moments and a product, got moments=None"),
+        ({"planes": PlanesSpec(moments=3, combination="sum")}, "combination='sum'"),
         ({"bend": -1.0}, "finite and not negative"),
         ({"warm_up": -1}, "must not be negative"),
         ({"plane_rate": 1e-9}, "the rate falls"),
@@ -153,5 +153,5 @@ def test_no_motion_of_nothing(changes, words):
 
 @pytest.mark.parametrize("box", [None, (BOX[1], BOX[0])])
 def test_planes_without_a_box_are_refused(box):
-    with pytest.raises(ValueError, match="its low and its high corner"):
+    with pytest.raises(ValueError, match="minimum and maximum corner"):
         bound.motion(MOTION, extent=EXTENT, box=box)

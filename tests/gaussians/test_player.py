@@ -39,7 +39,7 @@ def swing(params, gaussians, condition, ready):
     turn = jnp.where(right, jnp.asarray([0.3, -0.5, 1.0], time.dtype) * time, 0)
     return gaussians._replace(
         mean=gaussians.mean + jnp.where(right, rise, 0),
-        quaternion=splats.turned(gaussians, turn),
+        quaternion=splats.rotate(gaussians, turn),
         opacity=gaussians.opacity * jnp.where(right[:, 0], 1 - time / 2, 1),
     )
 

@@ -17,7 +17,7 @@ from nerfies_jax.training import loop
 from tests import gradients, scenes
 
 DEPTH = 0.8
-refined = jax.jit(pose_refinement.refined, static_argnums=2)
+refined = jax.jit(pose_refinement.refine, static_argnums=2)
 SPEC = dataclasses.replace(scenes.TINY_SPLATS, poses=PoseRefinementSpec(2e-3, 2e-4))
 EVEN = scenes.tiny_capture()
 
@@ -166,7 +166,7 @@ def test_frames_between_lie_between_and_other_cameras_stay():
     rng = np.random.default_rng(2)
     screws = (1e-2 * rng.normal(size=(5, 6))).astype(np.float32)
     screws = screws - screws.mean(axis=0)
-    found = pose_refinement.found(jnp.asarray(screws), one, DEPTH).cameras
+    found = pose_refinement.refine_capture(jnp.asarray(screws), one, DEPTH).cameras
     learned = refined(screws, cameras.take(EVEN.cameras, rows), DEPTH)
     np.testing.assert_allclose(found.position[rows], learned.position, atol=1e-6)
     between = (screws[2] + screws[3]) / 2  # times are even

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gaussians_jax.core.splats import Gaussians, Params
-from gaussians_jax.init import path_fit
-from gaussians_jax.init.path_fit import Paths, Points
+from gaussians_jax.init import motion_fit
+from gaussians_jax.init.motion_fit import Paths, Points
 from gaussians_jax.motion import polynomial as polynomial_motion
 from gaussians_jax.motion import splines as spline_motion
 from gaussians_jax.motion import time_basis
@@ -204,12 +204,12 @@ def test_paths_are_followed_by_least_squares_in_closed_form():
     position = rng.normal(5, 1, (6, frames, 3))
     position[~known] = np.nan
     paths = Paths(time, position, known, 1.0)
-    fitted = path_fit.combination(basis, paths)
+    fitted = motion_fit.combination(basis, paths)
     bend, drift = np.diff(basis, 2, axis=0), np.diff(basis, axis=0)
     for point in range(6):
         seen = known[point]
-        ridge = np.sqrt(path_fit.RIDGE * np.trace(basis.T @ basis)) * np.eye(4)
-        tall = [path_fit.BEND**0.5 * bend, path_fit.DRIFT**0.5 * drift, ridge]
+        ridge = np.sqrt(motion_fit.RIDGE * np.trace(basis.T @ basis)) * np.eye(4)
+        tall = [motion_fit.BEND**0.5 * bend, motion_fit.DRIFT**0.5 * drift, ridge]
         tall = np.concatenate([basis[seen], *tall])
         middle = position[point, seen].mean(axis=0)
         right = np.zeros((len(tall), 3))
@@ -230,7 +230,7 @@ def test_a_path_seen_once_stays_there_and_one_seen_never_is_finite():
             Paths(time, position, known, 1.0), jax.random.key(0)
         )
         start = Points(*guess.points)
-        there = path_fit.places(effect_of(name), start, put(0.9, "float32"))
+        there = motion_fit.positions_at(effect_of(name), start, put(0.9, "float32"))
         np.testing.assert_allclose(there[0], [1, 2, 3], atol=1e-5)
         assert np.isfinite(there).all()
 
@@ -239,11 +239,11 @@ def test_a_path_seen_once_stays_there_and_one_seen_never_is_finite():
     ("make", "words"),
     [
         (lambda: TimeBasisSpec(count=0), "at least one trajectory"),
-        (lambda: TimeBasisSpec(sparsity=0.0), "None leaves it out"),
+        (lambda: TimeBasisSpec(sparsity=0.0), "None disables"),
         (lambda: TimeBasisSpec(warm_up=-1), "must not be negative"),
         (lambda: TimeBasisSpec(coefficient_rate=1e-9), "the rate falls"),
         (lambda: TimeBasisSpec(width=0), "width >= 1"),
-        (lambda: PolynomialMotionSpec(degree=0), "takes a spline"),
+        (lambda: PolynomialMotionSpec(degree=0), "use a spline"),
         (lambda: PolynomialMotionSpec(warm_up=-1), "must not be negative"),
         (lambda: PolynomialMotionSpec(turn_rate=0.0), "positive and finite"),
         (lambda: FadingSpec(width=0.0), "width=0.0 must be positive"),

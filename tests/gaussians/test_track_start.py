@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.splats import Params
-from gaussians_jax.init import path_fit
+from gaussians_jax.init import motion_fit
 from gaussians_jax.init import tracks as track_start
-from gaussians_jax.init.path_fit import Depth, Paths, Points
+from gaussians_jax.init.motion_fit import Depth, Paths, Points
 from gaussians_jax.init.points import StartSpec
 from gaussians_jax.motion import se3_bases, temporal_opacity
 from gaussians_jax.motion.se3_bases import SE3BasesSpec
@@ -62,7 +62,7 @@ def places_of(effect, points, time):
     """Of one time, or [times, points, 3] of many: one program for all of them."""
 
     def places(points, time):
-        return path_fit.places(effect, points, time)
+        return motion_fit.positions_at(effect, points, time)
 
     many = jax.vmap(places, (None, 0)) if np.ndim(time) else places
     return jax.jit(many)(points, time)
@@ -86,7 +86,7 @@ def test_every_motion_can_be_fitted_to_paths(name):
     known = np.random.default_rng(1).uniform(size=position.shape[:2]) < 0.6
     effect = effect_of(MOTIONS[name])
     paths = Paths(time, position.astype(np.float32), known, 1.0)
-    fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=600)
+    fitted = motion_fit.fit(effect, paths, jax.random.key(0), steps=600)
     assert fitted.last < 0.02
     middle = places_of(effect, fitted.points, time[FRAMES // 2])
     off = np.linalg.norm(middle - position[:, FRAMES // 2], axis=-1)
@@ -103,7 +103,7 @@ def test_every_motion_can_be_fitted_to_paths(name):
 )
 def test_networks_that_are_fitted_leave_the_wall_where_it_is(name, monkeypatch):
     """Also where the fit has not looked: points drawn apart."""
-    monkeypatch.setattr(path_fit, "RESTING", 64)
+    monkeypatch.setattr(motion_fit, "RESTING", 64)
     position, time = turning_body()
     wall = np.random.default_rng(3).uniform(-1, 1, (400, 3)) * [1, 1, 0] + [0, 0, 2]
     effect = effect_of(MOTIONS[name])
@@ -111,14 +111,14 @@ def test_networks_that_are_fitted_leave_the_wall_where_it_is(name, monkeypatch):
     for still in (None, wall[:200].astype(np.float32)):
         known = np.ones(position.shape[:2], bool)
         paths = Paths(time, position.astype(np.float32), known, 1.0, still)
-        fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=400)
+        fitted = motion_fit.fit(effect, paths, jax.random.key(0), steps=400)
         assert fitted.last < 0.03
         rest = Points(jnp.asarray(wall[200:], jnp.float32), None, fitted.points.nets)
         if still is not None and fitted.points.rows is not None:
             own = track_start.rows_at_rest(fitted.points.resting, rest.canonical)
             rest = rest._replace(rows=own)
         elif fitted.points.rows is not None:
-            blank = path_fit.scene_of(effect, rest).rows["splats"]
+            blank = motion_fit.scene_of(effect, rest).rows["splats"]
             own = effect.init(jax.random.key(9), blank).per_gaussian
             rest = rest._replace(rows=own)
         now = places_of(effect, rest, time[3])
@@ -142,7 +142,7 @@ def test_wrong_paths_bend_nothing():
     known = np.ones(position.shape[:2], bool)
     effect = effect_of(MOTIONS["bases"])
     paths = Paths(time, position.astype(np.float32), known, 1.0)
-    fitted = path_fit.fit(effect, paths, jax.random.key(0), steps=400)
+    fitted = motion_fit.fit(effect, paths, jax.random.key(0), steps=400)
     places = places_of(effect, fitted.points, time[5])
     assert np.linalg.norm(places - position[:, 5], axis=-1)[3:].max() < 0.05
 
@@ -155,7 +155,7 @@ def test_slopes_of_carried_points_are_those_of_differences(float64):
     points = Points(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)), nets)
 
     def value(points):
-        return jnp.sum(path_fit.places(effect, points, jnp.float64(0.3)) ** 3)
+        return jnp.sum(motion_fit.positions_at(effect, points, jnp.float64(0.3)) ** 3)
 
     assert directional_error(value, points) < 1e-7
 
@@ -173,7 +173,7 @@ def test_a_thing_tells_its_depth_better_than_each_of_its_tracks(deviation):
     misses = []
     for depth in (None, Depth(ray, np.full(30, deviation))):
         paths = Paths(time, tracked, known, 1.0, depth=depth)
-        points = path_fit.fit(effect, paths, jax.random.key(0), steps=300).points
+        points = motion_fit.fit(effect, paths, jax.random.key(0), steps=300).points
         off = np.moveaxis(places_of(effect, points, time), 0, 1) - position
         off -= off.mean(axis=1, keepdims=True)
         misses.append(np.mean(np.linalg.norm(off, axis=-1)))
@@ -186,8 +186,8 @@ def test_a_thing_tells_its_depth_better_than_each_of_its_tracks(deviation):
 def test_nothing_known_is_refused_by_name():
     position, time = turning_body()
     paths = Paths(time, position, np.zeros(position.shape[:2], bool), 1.0)
-    with pytest.raises(ValueError, match="no path is known"):
-        path_fit.fit(effect_of(MOTIONS["bases"]), paths, jax.random.key(0))
+    with pytest.raises(ValueError, match="no path has a known"):
+        motion_fit.fit(effect_of(MOTIONS["bases"]), paths, jax.random.key(0))
 
 
 def test_gaussians_start_on_the_card_and_move_with_it():

@@ -111,7 +111,7 @@ def test_what_stands_still_may_be_left_out(swaying):
     variant = variants.without_static(*swaying, below)
     left = len(variant.state.params[1].dynamic.rows["splats"].mean)
     assert 0 < left < len(moved)
-    assert f"{left} of {len(active)} rows that move" in variant.summary
+    assert f"{left} of {len(active)} moving Gaussians" in variant.summary
     for left_out, deform in zip(
         deformed_rows(variant.model, variant.state), exact, strict=True
     ):
@@ -129,26 +129,26 @@ def drawn_still(model, *args):
     ("make", "words"),
     [
         (lambda *a: variants.from_knots(*a, 1), "reads 2 knots at once, got 1"),
-        (lambda *a: variants.from_knots(*a, 3, "cubic"), "take more, or linear"),
+        (lambda *a: variants.from_knots(*a, 3, "cubic"), "use more knots or linear"),
         (lambda *a: variants.from_knots(*a, 8, "linear", 1e9), "farther than 1e\\+09"),
         (lambda *a: drawn_still(*a, 8), "nothing in this run moves farther than 0 "),
         (lambda *a: variants.without_static(*a, 1e9), "nothing in this run moves"),
         (lambda *a: variants.without_static(*a, -1.0), "cannot be negative"),
         (lambda *a: variants.without_moving(*a, 0.0),
-         r"--hide-moving 0: all .* longer distance"),
+         r"move farther than 0 scene .* longer distance"),
         (lambda m, s: variants.from_knots(m._replace(stages=None), s, 8),
-         "--knots is for runs of Gaussians"),
+         "knots needs a run of Gaussians"),
         (lambda m, s: variants.without_static(m._replace(stages=None), s, 0.1),
-         "--static-threshold is for runs of Gaussians"),
+         "static Gaussians needs a run of Gaussians"),
         (lambda m, s: variants.without_moving(m._replace(stages=None), s, 0.1),
-         "--hide-moving is for runs of Gaussians"),
+         "moving Gaussians needs a run of Gaussians"),
         (lambda m, _: variants.without_effects(*m.spec, ("warp",), False),
          r"'warp' cannot be disabled .* that can be: motion"),
         (lambda m, _: variants.without_effects(
             scenes.TINY_SPLATS, m.spec[1], ("motion",), False),
          r"'motion' cannot be disabled .* that can be: none"),
         (lambda m, _: variants.without_effects(*m.spec, (), True),
-         r"--appearance: splats .* nerf-w"),
+         r"splats have no appearance .* nerf-w"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_drawn_otherwise_is_refused(swaying, make, words):

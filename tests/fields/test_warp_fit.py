@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from nerfies_jax.fields.effects import scene_flow
 from nerfies_jax.fields.effects.appearance import AppearanceSpec
 from nerfies_jax.fields.effects.records import FieldRecord
-from nerfies_jax.scene import path_fit, presets, scene
-from nerfies_jax.scene.path_fit import FilmPaths
+from nerfies_jax.scene import presets, scene, warp_fit
+from nerfies_jax.scene.warp_fit import FilmPaths
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
 from nerfies_jax.training.track_start import FieldStartSpec
@@ -25,8 +25,8 @@ TRACKS = FieldStartSpec("tracks", fit_steps=300, fit_rate=2e-3)
 @pytest.fixture(autouse=True)
 def few_points_a_step(monkeypatch):
     """One body and a wall ask for no more; a third of the time."""
-    monkeypatch.setattr(path_fit, "FRAMES_AT_ONCE", 8)
-    monkeypatch.setattr(path_fit, "STILL_AT_ONCE", 32)
+    monkeypatch.setattr(warp_fit, "FRAMES_AT_ONCE", 8)
+    monkeypatch.setattr(warp_fit, "STILL_AT_ONCE", 32)
 
 
 def turning_body(points=40):
@@ -84,7 +84,7 @@ def carried(field, params, time, points):
 def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
     field, paths = field_of(name), film()
     params = field.init(jax.random.key(0))
-    fitted = path_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
+    fitted = warp_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
     assert fitted.first > 0.1
     assert fitted.last < 0.03
     for frame in (3, 12):
@@ -114,7 +114,7 @@ def test_a_warp_into_one_point_has_finite_slopes(dtype):
         codes_at=lambda *_: {},
         displace=lambda params, point, _: -params["share"] * point,
     )
-    distances = path_fit._distances(field, {}, paths)
+    distances = warp_fit._distances(field, {}, paths)
     drawn = jnp.arange(4), jnp.arange(40), jnp.asarray(rest), jax.random.key(0)
 
     @jax.jit
@@ -123,12 +123,12 @@ def test_a_warp_into_one_point_has_finite_slopes(dtype):
         return distances({"share": share}, places, *drawn)[2]
 
     value, slope = jax.jit(jax.value_and_grad(stretch))(jnp.asarray(1.0, dtype))
-    expected = path_fit.STRETCH * (np.log(path_fit.LEAST_STRETCH) / 2) ** 2
+    expected = warp_fit.STRETCH * (np.log(warp_fit.LEAST_STRETCH) / 2) ** 2
     np.testing.assert_allclose(value, expected, rtol=1e-5)
     assert np.isfinite(slope)
     # What keeps its size costs nothing, half of it the square of its logarithm.
     assert stretch(jnp.asarray(0.0, dtype)) < 1e-6
-    half = path_fit.STRETCH * np.log(2) ** 2
+    half = warp_fit.STRETCH * np.log(2) ** 2
     np.testing.assert_allclose(stretch(jnp.asarray(0.5, dtype)), half, rtol=1e-4)
 
 
@@ -160,7 +160,7 @@ def test_a_motion_of_one_s_own_may_have_no_parameters():
     rates = scene.learning_rates(field.spec, field.effects, params, jnp.int32(0))
     assert rates.keys() == params.keys()
     start = dataclasses.replace(TRACKS, fit_steps=2)
-    fitted = path_fit.fit(field, params, film(), jax.random.key(0), start)
+    fitted = warp_fit.fit(field, params, film(), jax.random.key(0), start)
     assert fitted.params.keys() == params.keys()
 
 
@@ -215,7 +215,7 @@ def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
         known=paths.known[:, kept],
     )
     params = field.init(jax.random.key(0))
-    fitted = path_fit.fit_flow(field, params, paths, jax.random.key(0), TRACKS)
+    fitted = warp_fit.fit_flow(field, params, paths, jax.random.key(0), TRACKS)
     path, time = turning_body()
     assert fitted.last < 0.3 * fitted.first
     medium = fitted.params["scene_flow"]
@@ -244,7 +244,7 @@ def test_points_seen_once_leave_everything_where_it_is(still):
     known[np.arange(40), np.arange(40) % FRAMES] = True
     field, paths = field_of("nerfies-small"), film(known, still)
     params = field.init(jax.random.key(0))
-    fitted = path_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
+    fitted = warp_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
     assert fitted.last < 5e-3
     places = paths.position[known]
     assert np.abs(carried(field, fitted.params, 0.5, places) - places).max() < 0.03
@@ -254,13 +254,13 @@ def test_what_cannot_be_fitted_is_refused_by_name():
     field = field_of("nerfies-small")
     params = field.init(jax.random.key(0))
     with pytest.raises(ValueError, match="no path is known"):
-        path_fit.fit(
+        warp_fit.fit(
             field, params, film(np.zeros((40, FRAMES), bool)), jax.random.key(0), TRACKS
         )
     alone = np.zeros((40, FRAMES), bool)
     alone[:, 4] = True
     with pytest.raises(ValueError, match="in two frames that follow each other"):
-        path_fit.fit_flow(
+        warp_fit.fit_flow(
             field_of("nsff-small"), params, film(alone), jax.random.key(0), TRACKS
         )
     with pytest.raises(ValueError, match=r'start\.motion="tracks" fits a warp'):

@@ -10,7 +10,7 @@ import pytest
 import scipy.spatial.transform
 
 from gaussians_jax.core.splats import Gaussians, Params, deactivate
-from gaussians_jax.scene import point_tracks
+from gaussians_jax.scene import gaussian_tracks
 from gaussians_jax.scene import scene as splat_scene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.evaluation import protocol
@@ -49,7 +49,7 @@ def follow_moved(monkeypatch, filmed, rows, moved):
     effects = (types.SimpleNamespace(deform=deform),)
     monkeypatch.setattr(splat_scene, "all_effects", lambda *_: effects)
     state = types.SimpleNamespace(params=Params({"splats": rows}, {}))
-    return point_tracks.follow(None, None, state, capture, known)
+    return gaussian_tracks.follow(None, None, state, capture, known)
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
 def test_the_weights_of_neighbors_are_a_slow_sum(rng):
     distance = np.sort(rng.uniform(size=(4, 8)), axis=1)
     opacity = rng.uniform(0.1, 1, size=(4, 8))
-    weights = point_tracks.neighbor_weights(distance, opacity)
+    weights = gaussian_tracks.neighbor_weights(distance, opacity)
     for row in range(4):
         expected = [
             opacity[row, k] / np.exp(2 * (distance[row, k] / distance[row, 7]) ** 2)
@@ -143,7 +143,7 @@ def test_the_weights_of_neighbors_are_a_slow_sum(rng):
             weights[row], expected / np.sum(expected), rtol=1e-12
         )
     # All at the point itself: by opacity alone.
-    weights = point_tracks.neighbor_weights(np.zeros((1, 2)), np.array([[0.3, 0.1]]))
+    weights = gaussian_tracks.neighbor_weights(np.zeros((1, 2)), np.array([[0.3, 0.1]]))
     np.testing.assert_allclose(weights, [[0.75, 0.25]], rtol=1e-12)
 
 
@@ -151,10 +151,10 @@ def test_the_weights_of_neighbors_are_a_slow_sum(rng):
 def test_splats_without_motion_follow_nothing_and_untrained_motion_stays(filmed):
     capture, _, known = filmed
     metadata, spec = splat_scene.metadata_of(capture), scenes.TINY_DEFORMABLE
-    still = point_tracks.follow(scenes.TINY_SPLATS, metadata, None, capture, known)
+    still = gaussian_tracks.follow(scenes.TINY_SPLATS, metadata, None, capture, known)
     assert still is None
     state = splat_scene.build(spec, metadata).init(capture, jax.random.key(0))
-    followed = point_tracks.follow(spec, metadata, state, capture, known)
+    followed = gaussian_tracks.follow(spec, metadata, state, capture, known)
     # The heads begin near zero.
     np.testing.assert_allclose(
         followed.path,

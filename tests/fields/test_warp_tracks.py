@@ -14,7 +14,7 @@ from nerfies_jax.capture import synthetic
 from nerfies_jax.evaluation import protocol
 from nerfies_jax.fields.effects.effect import Medium
 from nerfies_jax.fields.effects.records import FieldRecord
-from nerfies_jax.scene import point_tracks, presets, scene
+from nerfies_jax.scene import presets, scene, warp_tracks
 from tests import scenes
 
 
@@ -48,7 +48,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
     )
     monkeypatch.setattr(scene, "field", lambda *_, **__: stub)
     state = types.SimpleNamespace(params=velocity, step=jnp.int32(5))
-    followed = point_tracks.follow(None, metadata, state, capture, known)
+    followed = warp_tracks.follow(None, metadata, state, capture, known)
 
     start = 4.0 * (known.path[:, 3] - np.float32(metadata.center))
     template = start / (1 + times[3]) - np.asarray(velocity) * times[3]
@@ -108,7 +108,7 @@ def test_points_are_followed_along_a_flow_in_closed_form(
     shapes = jax.eval_shape(field.init, jax.random.key(0))
     params = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
     state = types.SimpleNamespace(params=params, step=jnp.int32(0))
-    followed = point_tracks.follow(spec, metadata, state, capture, known)
+    followed = warp_tracks.follow(spec, metadata, state, capture, known)
     center = np.asarray(metadata.center)
     for column, row in enumerate(chosen):
         hops = int(row) - int(chosen[known.start])
@@ -126,4 +126,4 @@ def test_a_field_without_a_motion_follows_nothing(filmed):
     capture, _, known = filmed
     spec = presets.PRESETS["t-nerf-small"]
     metadata = scene.metadata_of(capture, spec)
-    assert point_tracks.follow(spec, metadata, None, capture, known) is None
+    assert warp_tracks.follow(spec, metadata, None, capture, known) is None
