@@ -93,8 +93,6 @@ def _headed(name: str) -> tuple:
 
 
 Source = Annotated[(NamedSource, *_headed("capture"))]
-# Here what other tools found keeps its prefix: --tracks is something else.
-SourceOptions = Annotated[CaptureSource, tyro.conf.arg(name="")]
 More = Annotated[(MoreMetrics, *_headed("scoring"))]
 
 

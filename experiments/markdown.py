@@ -1,7 +1,6 @@
 """Markdown of measured numbers."""
 
 import math
-import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -19,12 +18,6 @@ def with_spread(mean: float, spread: float, digits: int) -> str:
     """
     cell = number(mean, digits)
     return f"{cell} ± {number(spread, digits)}" if cell and spread == spread else cell
-
-
-def over_seeds(values: Sequence[float], digits: int) -> str:
-    """Format the mean, and the standard deviation if there are several values."""
-    spread = statistics.stdev(values) if len(values) > 1 else math.nan
-    return with_spread(statistics.fmean(values), spread, digits)
 
 
 def short(value: float | int | None) -> str:
@@ -55,13 +48,6 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -
 def bullets(lines: Iterable[str]) -> str:
     """Format a list."""
     return "\n".join(f"- {line.strip()}" for line in lines)
-
-
-def outline(lines: Iterable[str]) -> str:
-    """Format a list of two levels, from lines that are indented or not."""
-    return "\n".join(
-        f"  - {line.strip()}" if line.startswith(" ") else f"- {line}" for line in lines
-    )
 
 
 def title_and_text(docstring: str | None) -> tuple[str, str]:
