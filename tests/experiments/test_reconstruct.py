@@ -123,7 +123,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
         assert words in page
         assert words in printed
     assert "player could not be created" not in page
-    assert "plan: 2 steps for 250 s of training" in printed
+    assert "plan: 2 steps in 250 s of training" in printed
     assert "motion:     +0.00 dB compared with" in printed
     told = runs.read_events(out)
     names = event_checks.ended_stages(told)

@@ -60,7 +60,7 @@ def test_error_is_linear_up_to_its_largest():
     for column, index in ((0, 0), (1, 128), (2, 255)):
         np.testing.assert_array_equal(picture[column], mapped("inferno", index))
     assert tuple(picture[3]) == GRAY
-    with pytest.raises(ValueError, match="positive, got 0"):
+    with pytest.raises(ValueError, match="largest=0 must be positive"):
         panels.color_error(render, truth, 0)
 
 
@@ -103,7 +103,7 @@ def test_small_frames_are_enlarged_by_whole_pixels(rng):
 
 def test_a_comparison_refuses_unpaired_rows():
     frames = np.zeros((2, 5, 5, 3))
-    with pytest.raises(ValueError, match="2 true, 2 rendered, 2 depths and 1 captions"):
+    with pytest.raises(ValueError, match="for each row, got 2, 2, 2 and 1"):
         panels.comparison(frames, frames, frames[..., 0], ["one"])
 
 
@@ -117,7 +117,7 @@ def test_a_contact_sheet_fills_rows_and_leaves_paper(rng):
         top, left = gap + i // 3 * step, gap + i % 3 * (240 + gap)
         np.testing.assert_array_equal(sheet[top : top + 20, left : left + 240], cell)
     assert np.all(sheet[gap + step :, gap + 2 * (240 + gap) :] == 255)
-    with pytest.raises(ValueError, match="5 pictures and 1 captions"):
+    with pytest.raises(ValueError, match="5 images and 1 captions"):
         panels.contact_sheet(cells, ["a"])
 
 
