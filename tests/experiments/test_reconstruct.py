@@ -137,6 +137,11 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     scores = [one["metrics"] for one in told if one["kind"] == "evaluation"]
     assert [row["psnr"] for row in curve["evaluations"]] == [x["psnr"] for x in scores]
     assert curve["training"][-1]["step"] == 2
+    # While another process is at work in it, it is not resumed.
+    with run_folder.owned(out):
+        assert ended("--out", out, "--resume") == 2
+    refusal = f"process {os.getpid()} on .* is at work in this run folder"
+    assert re.search(refusal, capsys.readouterr().err)
 
 
 @pytest.mark.full
@@ -175,7 +180,7 @@ def test_runs_are_drawn_beside_each_other(run, tmp_path, monkeypatch, capsys):
         laid.update(panels=panels, captions=captions, columns=columns)
         return sheet(panels, captions, columns)
 
-    monkeypatch.setattr(pictures, "contact_sheet", caught)
+    monkeypatch.setattr(panels, "contact_sheet", caught)
     out = tmp_path / "beside"
     folders = [str(run), str(tmp_path / "again")]
     compare.main([*folders, "--frames", "1", "--out", str(out)])
@@ -336,15 +341,6 @@ def test_a_killed_run_resumes_to_the_same_bits(left, run, tmp_path, capsys):
     for key in ("train.steps", "heldout.psnr", "gaussians"):
         assert resumed[key] == whole[key]
     assert (folder / "model.npz").is_file()
-
-
-def test_a_run_that_is_alive_is_not_resumed(run, tmp_path, capsys):
-    folder = tmp_path / "run"
-    shutil.copytree(run, folder)
-    with run_folder.owned(folder):
-        assert ended("--out", folder, "--resume") == 2
-    refusal = f"process {os.getpid()} on .* is using this run folder"
-    assert re.search(refusal, capsys.readouterr().err)
 
 
 @pytest.mark.slow

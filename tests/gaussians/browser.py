@@ -30,7 +30,7 @@ ARGUMENTS = (
     "--no-sandbox",
     "--disable-dev-shm-usage",
 )
-DESKTOP = {"viewport": {"width": 1280, "height": 800}}
+DESKTOP = {"viewport": {"width": 800, "height": 600}}  # software draws every pixel
 PHONE = {
     "viewport": {"width": 390, "height": 844},
     "has_touch": True,

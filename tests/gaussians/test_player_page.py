@@ -79,7 +79,7 @@ def test_a_drag_passes_the_limits_a_little_and_returns(opened):
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(*middle)
     page.mouse.down()
-    page.mouse.move(middle[0] + 600, middle[1], steps=6)
+    page.mouse.move(middle[0] + 390, middle[1], steps=6)
     settle(page)
     around = "(view) => Math.atan2(view.position[0], view.position[2])"
     held = page.evaluate(f"() => ({around})(player.view)")

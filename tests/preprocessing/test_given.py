@@ -135,16 +135,23 @@ def test_depths_of_any_scale_are_brought_to_the_points_at_rest(inverse):
     assert given_depth.aligned(noise, tracks, RestPoints(None, None, depth))[1] > 0.1
 
 
-@pytest.mark.parametrize("kind", ["exr", "png"])
-def test_paths_lean_on_depths_given(tmp_path, kind):
-    capture = films.film(**MOVES, frames=24)
-    for row, name in enumerate(capture.ids):
-        depth, path = (7 + 0.1 * row) * capture.depths[row], tmp_path / f"{name}.{kind}"
-        if kind == "exr":
-            OpenEXR.File({}, {"Z": depth}).write(str(path))
-        else:  # as depth cameras write it: millimeters, far below the whole of 16 bits
-            PIL.Image.fromarray(np.round(100 * depth).astype(np.uint16)).save(path)
-    evidence = record.gather(with_files(capture, depths=tmp_path))
+def test_paths_lean_on_depths_given(tmp_path):
+    film, folders = films.film(**MOVES, frames=24), {}
+    for kind in ("exr", "png"):
+        folders[kind] = tmp_path / kind
+        folders[kind].mkdir()
+        for row, name in enumerate(film.ids):
+            depth = (7 + 0.1 * row) * film.depths[row]
+            path = folders[kind] / f"{name}.{kind}"
+            if kind == "exr":
+                OpenEXR.File({}, {"Z": depth}).write(str(path))
+            else:  # as depth cameras write it: millimeters, far below 16 bits
+                stored = np.round(100 * depth).astype(np.uint16)
+                PIL.Image.fromarray(stored).save(path)
+    captures_of = {kind: with_files(film, depths=folders[kind]) for kind in folders}
+    exr, png = (captures_of[kind].given.depth for kind in folders)
+    np.testing.assert_allclose(png / png.max(), exr / exr.max(), atol=1e-3)
+    evidence = record.gather(captures_of["png"])
     own = gathered()[1]
     off, without = (
         np.abs(one.paths.depth[one.paths.known] - films.NEAR).mean()

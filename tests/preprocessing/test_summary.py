@@ -73,12 +73,11 @@ def test_words_say_what_there_is_and_what_cannot_be_told():
     assert "gives no parallax, so no depth can be told" in text
     assert counted.paths > 20
     assert "the film does not tell their depth" in text
-    still, evidence = gathered(card=lambda time: (0.1, 0.0))
     none = evidence._replace(
         moved=np.zeros(0, int),
         paths=type(evidence.paths)(*(p[:0] for p in evidence.paths)),
     )
-    text = summary.lines(summary.of(views_of(still), none), none)
+    text = summary.lines(summary.of(views_of(held), none), none)
     assert text[-1].startswith("nothing to follow: no track")
 
 
