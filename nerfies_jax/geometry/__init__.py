@@ -2,7 +2,7 @@
 
 import lazy_loader
 
-# Modules that `nerfies_jax` shows; each is loaded when it is used.
+# Modules of the public API, imported on first use.
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     __name__, ["matrix3", "quaternion", "se3", "so3"]
 )

@@ -1,8 +1,9 @@
-"""Barriers against fusion by XLA:CPU, for values that are read several times.
+"""Barriers against fusion by XLA:CPU for values with several consumers.
 
-XLA:CPU fuses the producer of an array into each of its readers and then computes it
-anew for each of them, often element by element instead of in vector registers. It fuses
-nothing into a call that must not be inlined. Other compilers are not affected.
+XLA:CPU fuses the producer of an array into each of its consumers. The array is then
+recomputed for each of them, often element by element instead of in vector registers.
+XLA:CPU does not fuse into a call that must not be inlined. Other compilers are not
+affected.
 """
 
 from collections.abc import Sequence
@@ -22,10 +23,10 @@ COMPONENTS.multiple_results = True
 
 
 def materialized(array: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Compute an array, and its cotangent, once before anything reads it.
+    """Compute an array and its cotangent once, before they are used.
 
-    With the image and the ground truth of D-SSIM passed through it, a step of
-    `splats-tracked-small` takes 20.5 ms instead of 21.5.
+    Applied to the image and the ground truth of D-SSIM, it shortens a step of
+    `splats-tracked-small` from 21.5 to 20.5 ms.
 
     Args:
       array: An array of any shape.
@@ -41,9 +42,9 @@ def components(
 ) -> tuple[Float[Array, "*batch"], ...]:
     """Split vectors into their components.
 
-    Derivatives of any order exist. JAX's own gradient of indexing is a sum of padded
-    vectors, here it is `stacked`. The gradient of projecting 10,000 Gaussians takes 0.9
-    ms instead of 7.6.
+    Derivatives of any order exist. The gradient of indexing in JAX is a sum of padded
+    vectors. Here it is one stack (`stacked`), so that the gradient of projecting 10,000
+    Gaussians takes 0.9 ms instead of 7.6.
 
     Args:
       vectors: Vectors along the last axis, [..., n].
@@ -69,21 +70,21 @@ def stacked(parts: Sequence[Float[Array, "*batch"]]) -> Float[Array, "*batch par
     return jnp.stack([materialized(part) for part in parts], axis=-1)
 
 
-def _same(array):
+def _identity(array):
     return array
 
 
-def _called(array):
-    # Without the barrier there were nothing to call.
+def _identity_in_call(array):
+    # Without the barrier the call would be empty.
     with set_xla_metadata(inlineable="false"):
         return jax.jit(lax.optimization_barrier)(array)
 
 
-def _same_batched(operands, axes):
+def _batch_identity(operands, axes):
     return MATERIALIZED.bind(*operands), axes[0]
 
 
-def _same_back(cotangent, array):
+def _transpose_identity(cotangent, array):
     return [MATERIALIZED.bind(cotangent)]
 
 
@@ -94,31 +95,33 @@ def _split(vectors):
 def _split_types(vectors):
     if not vectors.ndim:
         raise ValueError(
-            "a number has no components; give vectors, with them along the last axis"
+            "a scalar has no components; pass vectors with them along the last axis"
         )
     return [ShapedArray(vectors.shape[:-1], vectors.dtype)] * vectors.shape[-1]
 
 
-def _split_batched(operands, axes):
+def _batch_split(operands, axes):
     parts = COMPONENTS.bind(jnp.moveaxis(operands[0], axes[0], 0))
     return parts, [0] * len(parts)
 
 
-def _split_back(cotangents, vectors):
+def _transpose_split(cotangents, vectors):
     return [stacked(list(map(ad.instantiate_zeros, cotangents)))]
 
 
-MATERIALIZED.def_impl(_same)
-MATERIALIZED.def_abstract_eval(_same)
-mlir.register_lowering(MATERIALIZED, mlir.lower_fun(_same, multiple_results=False))
+MATERIALIZED.def_impl(_identity)
+MATERIALIZED.def_abstract_eval(_identity)
+mlir.register_lowering(MATERIALIZED, mlir.lower_fun(_identity, multiple_results=False))
 mlir.register_lowering(
-    MATERIALIZED, mlir.lower_fun(_called, multiple_results=False), platform="cpu"
+    MATERIALIZED,
+    mlir.lower_fun(_identity_in_call, multiple_results=False),
+    platform="cpu",
 )
-batching.primitive_batchers[MATERIALIZED] = _same_batched
-ad.deflinear2(MATERIALIZED, _same_back)
+batching.primitive_batchers[MATERIALIZED] = _batch_identity
+ad.deflinear2(MATERIALIZED, _transpose_identity)
 
 COMPONENTS.def_impl(jax.jit(_split))
 COMPONENTS.def_abstract_eval(_split_types)
 mlir.register_lowering(COMPONENTS, mlir.lower_fun(_split, multiple_results=True))
-batching.primitive_batchers[COMPONENTS] = _split_batched
-ad.deflinear2(COMPONENTS, _split_back)
+batching.primitive_batchers[COMPONENTS] = _batch_split
+ad.deflinear2(COMPONENTS, _transpose_split)

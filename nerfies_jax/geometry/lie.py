@@ -3,7 +3,7 @@
 A twist is `angular` (axis × angle, rad) and `linear` (scene units), the (w, v) of
 Nerfies (Park et al. 2021, arXiv:2011.12948, equations 9 and 11). `linear` is not the
 translation, which is `left_jacobian(angular) @ linear`. Coefficients are Stumpff
-functions of |w|², smooth at 0, so a zero-initialized head is no special case.
+functions of |w|², which are smooth at 0, where zero-initialized networks start.
 
 The error of a rotation is that of its angle: 6e-8 |w| rad in float32, which is 6e-4 at
 1e4 rad. Angles above 1e19 rad overflow float32.
@@ -28,7 +28,7 @@ Matrix = Float[Array, "3 3"]
 def transform_point(angular: Vector, linear: Vector, point: Vector) -> Vector:
     """Move one point by the exponential of a twist, without forming a matrix.
 
-    It is written as w × (...) throughout. Formed as (1 + G W) x it would lose θ ulps.
+    All terms are cross products w × (...). Computing (1 + G W) x would lose θ ulps.
 
     Args:
       angular: Rotation vector w in radians, [3].
@@ -102,8 +102,8 @@ def exp_so3(angular: Vector) -> Matrix:
 def log_so3(rotation: Matrix) -> Vector:
     """Compute the rotation vector of a rotation matrix.
 
-    It goes through the quaternion with the largest pivot. The arccosine of the trace is
-    NaN for rotations below 1e-4 rad in float32 and 0.1 rad off at π - 1e-3.
+    It is computed from the quaternion. The arccosine of the trace is NaN for rotations
+    below 1e-4 rad in float32 and off by 0.1 rad at π - 1e-3.
 
     Args:
       rotation: Rotation matrix, [3, 3].
@@ -173,7 +173,7 @@ def inverse_left_jacobian(angular: Vector) -> Matrix:
       The inverse matrix, [3, 3].
     """
     angle_sq = jnp.sum(angular**2)
-    # (1 - θ/2 cot(θ/2)) / θ², which cancels; as a quotient of sums it does not.
+    # The coefficient (1 - θ/2 cot(θ/2)) / θ² cancels. This quotient of sums does not.
     c2, c3, c4 = (stumpff(k, angle_sq) for k in (2, 3, 4))
     return _polynomial(angular, -jnp.full_like(c2, 0.5), (c3 - 2 * c4) / (2 * c2))
 
@@ -215,12 +215,12 @@ def hat(vector: Vector) -> Matrix:
 
 
 def _cross(a, b):
-    # jnp.cross moves axes and concatenates; this fuses.
+    # `jnp.cross` moves axes and concatenates, which does not fuse.
     return jnp.stack(cross(a, b))
 
 
 def _polynomial(angular, first, second):
-    """1 + first [w] + second [w]²."""
+    """Compute 1 + first [w] + second [w]²."""
     turn = hat(angular)
     square = jnp.outer(angular, angular) - jnp.sum(angular**2) * jnp.eye(
         3, dtype=angular.dtype
@@ -229,6 +229,7 @@ def _polynomial(angular, first, second):
 
 
 def _coupling(angular, linear):
+    """Compute the block Q of `left_jacobian_se3`."""
     angle_sq = jnp.sum(angular**2)
     c3, c4, c5 = (stumpff(k, angle_sq) for k in (3, 4, 5))
     w, v = hat(angular), hat(linear)

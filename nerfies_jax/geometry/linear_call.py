@@ -1,4 +1,4 @@
-"""Linear functions that bring their transpose, for forward and reverse mode alike.
+"""Linear functions with a custom transpose, differentiable in forward and reverse mode.
 
 `jax.custom_vjp` refuses forward mode, and the rule of a `jax.custom_jvp` has to be
 transposed by JAX, which cannot transpose a `while_loop`.
@@ -60,7 +60,7 @@ class _Pair:
     transpose: Linear
     settings: Hashable
     tree: Any
-    # For each batch axis, innermost first, which residuals have it, in front.
+    # For each batch axis, innermost first: which residuals have it as first axis.
     batched: tuple[tuple[bool, ...], ...] = ()
 
     def __call__(self, *arrays):
@@ -68,8 +68,8 @@ class _Pair:
             residuals = jax.tree.unflatten(self.tree, leaves)
             return self.function(self.settings, residuals, argument)
 
-        for which in self.batched:
-            call = jax.vmap(call, ([0 if axis else None for axis in which], 0))
+        for mask in self.batched:
+            call = jax.vmap(call, ([0 if batched else None for batched in mask], 0))
         *leaves, argument = arrays
         return call(leaves, argument)
 
@@ -98,13 +98,13 @@ def _shape(*arrays, pair):
 
 
 def _jvp(primals, tangents, *, pair):
-    *fixed, moving = tangents
-    if any(type(tangent) is not ad.Zero for tangent in fixed):
-        every = tuple(ad.instantiate_zeros(tangent) for tangent in tangents)
-        return jax.jvp(pair, tuple(primals), every)
+    *residual_tangents, argument_tangent = tangents
+    if any(type(tangent) is not ad.Zero for tangent in residual_tangents):
+        dense = tuple(ad.instantiate_zeros(tangent) for tangent in tangents)
+        return jax.jvp(pair, tuple(primals), dense)
     result = _linear_call.bind(*primals, pair=pair)
-    change = ad.instantiate_zeros(moving)
-    return result, _linear_call.bind(*primals[:-1], change, pair=pair)
+    tangent = ad.instantiate_zeros(argument_tangent)
+    return result, _linear_call.bind(*primals[:-1], tangent, pair=pair)
 
 
 def _transpose(cotangent, *arrays, pair):
@@ -121,10 +121,10 @@ def _batch(arrays, axes, *, pair):
         for x, axis in zip(arrays, axes, strict=True)
     ]
     if axes[-1] is None:
-        # So that the transpose need not sum over an axis that only residuals have.
+        # Otherwise the transpose would sum over an axis that only residuals have.
         first[-1] = jnp.broadcast_to(first[-1], (size, *first[-1].shape))
-    which = tuple(axis is not None for axis in axes[:-1])
-    pair = dataclasses.replace(pair, batched=(*pair.batched, which))
+    mask = tuple(axis is not None for axis in axes[:-1])
+    pair = dataclasses.replace(pair, batched=(*pair.batched, mask))
     return _linear_call.bind(*first, pair=pair), 0
 
 

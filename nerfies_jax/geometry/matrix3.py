@@ -1,11 +1,11 @@
 """Spectral functions of a 3×3 matrix, with derivatives that exist everywhere.
 
 Σ log²σ of a warp's Jacobian is the elastic energy of Nerfies (Park et al. 2021,
-arXiv:2011.12948, section 3.3). Everything is written in scalars, so that a `vmap` runs
-over long rows. On a CPU this is 20 times as fast as LAPACK's batched SVD, and 10 times
-with its gradient. Sweeps are a loop. Unrolled, energies with gradients took 1.3 times
-as long to run and 1.4 times as long to compile. A value and its derivatives come from
-one decomposition.
+arXiv:2011.12948, section 3.3). The computation is written in scalars, so that `vmap`
+turns each operation into one over a long array. On a CPU this is 20 times as fast as
+LAPACK's batched SVD, and 10 times with its gradient. The Jacobi sweeps are a loop.
+Unrolled, energies with gradients took 1.3 times as long to run and 1.4 times as long to
+compile. A value and its derivatives share one decomposition.
 """
 
 import functools
@@ -24,14 +24,15 @@ from nerfies_jax.runtime.contract import checked
 Matrix = Float[Array, "3 3"]
 Scalar = Float[Array, ""]
 
-# Below this stretch the logarithm continues as its tangent: a collapsed or folded
-# direction has finite energy and a gradient that opens it again. A clamp,
-# log max(σ, ε), has gradient zero there, and nothing ever un-collapses.
+# Below this singular value the logarithm is continued by its tangent. A collapsed or
+# folded direction then has finite energy and a gradient that restores it. A clamp,
+# log max(σ, ε), has zero gradient there, and the direction would stay collapsed.
 COLLAPSED = 1e-2
-# The unsigned energy has a cone at σ = 0, whose curvature 1/σ no optimizer can use.
+# The unsigned energy has a kink at σ = 0. Its curvature 1/σ is computed with at least
+# this σ.
 CONE = 1e-6
-# |J - 1| (Frobenius): below, strains are resolved to 1e-8 from J - 1; above, the form
-# through JᵀJ loses more by squaring than J itself does by rounding.
+# Bound of the Frobenius norm |J - 1|. Below it strains are computed from J - 1, which
+# resolves 1e-8. Above it squaring loses more digits than rounding J does.
 SMALL_DISPLACEMENT = 0.1
 
 
@@ -61,8 +62,8 @@ def log_energy(matrix: Matrix) -> Scalar:
 def signed_log_energy(matrix: Matrix) -> Scalar:
     """Compute Σ log²σ with the determinant's sign on the smallest singular value.
 
-    A fold then costs more than a collapse, and gradient descent undoes it by moving
-    back through the collapse.
+    A fold then has a larger energy than a collapse, so that gradient descent undoes it
+    by way of the collapse.
 
     Args:
       matrix: Matrices, [..., 3, 3].
@@ -78,10 +79,10 @@ def signed_log_energy(matrix: Matrix) -> Scalar:
 def displacement_log_energy(
     displacement: Matrix, otherwise: Callable[[Matrix], Scalar] = log_energy
 ) -> Scalar:
-    """Compute `log_energy` of 1 + D, exact for strains far below one ulp of one.
+    """Compute `log_energy` of 1 + D, also for strains far below one ulp of one.
 
-    Pass the Jacobian of the *displacement* field. The Jacobian of `warp(x) - x` would
-    already be rounded.
+    Pass the Jacobian of the *displacement* field. The Jacobian of `warp(x) - x` is
+    already rounded.
 
     Args:
       displacement: Jacobians D of the displacement, [..., 3, 3].
@@ -99,10 +100,12 @@ def displacement_log_energy(
 
 
 def _strain(displacement):
-    """JᵀJ - 1 of J = 1 + D, without the one."""
+    """Compute JᵀJ - 1 of J = 1 + D as D + Dᵀ + DᵀD, without rounding 1 + D."""
     d = _entries(displacement)
     return _stacked(
-        _each(lambda i, j: d[i][j] + d[j][i] + sum(row[i] * row[j] for row in d))
+        _from_entries(
+            lambda i, j: d[i][j] + d[j][i] + sum(row[i] * row[j] for row in d)
+        )
     )
 
 
@@ -130,8 +133,8 @@ def _singular_values(matrix):
 @_singular_values.defjvp
 def _singular_values_jvp(primals, tangents):
     left, values, right = _oriented(False, primals[0])
-    turned = _between(left, _entries(tangents[0]), right)
-    return jnp.stack(values), jnp.stack([turned[k][k] for k in range(3)])
+    rotated = _between(left, _entries(tangents[0]), right)
+    return jnp.stack(values), jnp.stack([rotated[k][k] for k in range(3)])
 
 
 @checked(broadcast=True)
@@ -152,60 +155,60 @@ def svd(matrix: Matrix) -> tuple[Matrix, Float[Array, "3"], Matrix]:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _energy(signed, matrix):
-    return _energy_and_slope(signed, matrix)[0]
+    return _energy_and_gradient(signed, matrix)[0]
 
 
 @_energy.defjvp
 def _energy_jvp(signed, primals, tangents):
-    energy, grad = _energy_and_slope(signed, primals[0])
+    energy, grad = _energy_and_gradient(signed, primals[0])
     return energy, jnp.sum(grad * tangents[0])
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _energy_and_slope(signed, matrix):
+def _energy_and_gradient(signed, matrix):
     return _energy_of(*_oriented(signed, matrix))
 
 
 def _energy_of(left, values, right):
-    """Σ f(σ) and U diag(f'(σ)) Vᵀ."""
-    grad = _diagonal([_log_sq_slope(value) for value in values])
+    """Compute Σ f(σ) and its gradient U diag(f'(σ)) Vᵀ."""
+    grad = _diagonal([_log_sq_derivative(value) for value in values])
     energy = sum(_log(value) ** 2 for value in values)
     return energy, _stacked(_outer(left, grad, right))
 
 
-@_energy_and_slope.defjvp
-def _energy_and_slope_jvp(signed, primals, tangents):
-    """Divided differences of f' for the symmetric part, sums for the twisting part.
+@_energy_and_gradient.defjvp
+def _energy_and_gradient_jvp(signed, primals, tangents):
+    """Use divided differences of f' for the symmetric part, sums for the antisymmetric.
 
-    Smith, De Goes and Kim 2019, "Analytic eigensystems for isotropic distortion
-    energies": the same for any isotropic energy.
+    This holds for any isotropic energy. See Smith, De Goes and Kim 2019, "Analytic
+    eigensystems for isotropic distortion energies".
     """
     left, values, right = _oriented(signed, primals[0])
-    turned = _stacked(_between(left, _entries(tangents[0]), right))
     one, other = jnp.stack(values)[:, None], jnp.stack(values)
     total = jnp.where(jnp.abs(one + other) < CONE, CONE, one + other)
-    twist = (_log_sq_slope(one) + _log_sq_slope(other)) / total
-    flip = _slope_difference(one, other)
-    bent = (flip * (turned + turned.T) + twist * (turned - turned.T)) / 2
+    twist = (_log_sq_derivative(one) + _log_sq_derivative(other)) / total
+    stretch = _derivative_difference(one, other)
+    rotated = _stacked(_between(left, _entries(tangents[0]), right))
+    change = (stretch * (rotated + rotated.T) + twist * (rotated - rotated.T)) / 2
     energy, grad = _energy_of(left, values, right)
-    change = _stacked(_outer(left, _entries(bent), right))
-    return (energy, grad), (jnp.sum(grad * tangents[0]), change)
+    grad_dot = _stacked(_outer(left, _entries(change), right))
+    return (energy, grad), (jnp.sum(grad * tangents[0]), grad_dot)
 
 
 @jax.custom_jvp
 def _strain_energy(strain):
-    """¼ Σ log²(1 + μ) over the eigenvalues of JᵀJ - 1."""
-    return _strain_energy_and_slope(strain)[0]
+    """Compute ¼ Σ log²(1 + μ) over the eigenvalues μ of JᵀJ - 1."""
+    return _strain_energy_and_gradient(strain)[0]
 
 
 @_strain_energy.defjvp
 def _strain_energy_jvp(primals, tangents):
-    energy, grad = _strain_energy_and_slope(primals[0])
+    energy, grad = _strain_energy_and_gradient(primals[0])
     return energy, jnp.sum(grad * tangents[0])
 
 
 @jax.custom_jvp
-def _strain_energy_and_slope(strain):
+def _strain_energy_and_gradient(strain):
     return _strain_energy_of(*jacobi.eigen(strain))
 
 
@@ -215,69 +218,72 @@ def _strain_energy_of(values, basis):
     return energy, _stacked(_outer(basis, grad, basis))
 
 
-@_strain_energy_and_slope.defjvp
-def _strain_energy_and_slope_jvp(primals, tangents):
+@_strain_energy_and_gradient.defjvp
+def _strain_energy_and_gradient_jvp(primals, tangents):
     values, basis = jacobi.eigen(primals[0])
-    turned = _stacked(_between(basis, _entries(tangents[0]), basis))
+    rotated = _stacked(_between(basis, _entries(tangents[0]), basis))
     one, other = jnp.stack(values)[:, None], jnp.stack(values)
-    less = jnp.minimum(one, other)
-    bent = turned * _log_quotient_difference(
-        jnp.abs(one - other) / (1 + less), jnp.log1p(less), (1 + one) * (1 + other)
+    smaller = jnp.minimum(one, other)
+    change = rotated * _log_quotient_difference(
+        jnp.abs(one - other) / (1 + smaller),
+        jnp.log1p(smaller),
+        (1 + one) * (1 + other),
     )
     energy, grad = _strain_energy_of(values, basis)
-    change = _stacked(_outer(basis, _entries(bent / 2), basis))
-    return (energy, grad), (jnp.sum(grad * tangents[0]), change)
+    grad_dot = _stacked(_outer(basis, _entries(change / 2), basis))
+    return (energy, grad), (jnp.sum(grad * tangents[0]), grad_dot)
 
 
 def _log(stretch):
-    """log σ, and its tangent below `COLLAPSED`, through zero and beyond."""
+    """Compute log σ, continued by its tangent below `COLLAPSED`, also for σ <= 0."""
     below = math.log(COLLAPSED) + (stretch - COLLAPSED) / COLLAPSED
     return jnp.where(
         stretch < COLLAPSED, below, jnp.log(jnp.maximum(stretch, COLLAPSED))
     )
 
 
-def _log_sq_slope(stretch):
-    """d(log²σ)/dσ of the continued logarithm."""
+def _log_sq_derivative(stretch):
+    """Compute d(log²σ)/dσ of the continued logarithm."""
     return 2 * _log(stretch) / jnp.maximum(stretch, COLLAPSED)
 
 
-def _slope_difference(one, other):
-    """Divided difference of `_log_sq_slope`, or its derivative where the two are equal.
+def _derivative_difference(one, other):
+    """Compute the divided difference of `_log_sq_derivative` between two values.
 
-    The interval is split at `COLLAPSED`. The shares of it above and below are computed
-    without cancellation, and so is the difference on either side.
+    For equal values it is the derivative. The interval is split at `COLLAPSED`. Its
+    fractions above and below and the differences over both parts do not cancel.
     """
     high, low = jnp.maximum(one, COLLAPSED), jnp.maximum(other, COLLAPSED)
     gap = one - other
     equal = gap == 0
     divisor = jnp.where(equal, 1, gap)
     above = (high - low) / divisor
-    # Not 1 - above: that is 3e-3 off for stretches of 1e5 and -1 in float32.
+    # 1 - above would be off by 3e-3 for singular values of 1e5 and -1 in float32.
     edge = jnp.asarray(COLLAPSED, gap.dtype)
     below = (jnp.minimum(one, edge) - jnp.minimum(other, edge)) / divisor
     above = jnp.where(equal, jnp.where(one < COLLAPSED, 0, 1), above)
     below = jnp.where(equal, jnp.where(one < COLLAPSED, 1, 0), below)
-    less = jnp.minimum(high, low)
-    # finite, also from 3e38 down to `COLLAPSED`
-    excess = jnp.minimum(jnp.abs(high - low) / less, jnp.finfo(less.dtype).max)
-    logarithm = _log_quotient_difference(excess, jnp.log(less), high * low)
+    smaller = jnp.minimum(high, low)
+    # Finite, also between 3e38 and `COLLAPSED`.
+    largest = jnp.finfo(smaller.dtype).max
+    excess = jnp.minimum(jnp.abs(high - low) / smaller, largest)
+    logarithm = _log_quotient_difference(excess, jnp.log(smaller), high * low)
     return above * 2 * logarithm + below * (2 / COLLAPSED**2)
 
 
-def _log_quotient_difference(excess, log_less, product):
-    """Divided difference of log x / x between y and (1 + `excess`) y, uncanceled.
+def _log_quotient_difference(excess, log_smaller, product):
+    """Compute the divided difference of log x / x between y and (1 + `excess`) y.
 
-    From the smaller one up: down from the larger, log1p nears log 0. In float32 the
-    result was 4e-4 off at a ratio of 5e4 and NaN at 5e7.
+    y is the smaller value. Starting from the larger one, the argument of log1p would be
+    near -1: in float32 the result was off by 4e-4 at a ratio of 5e4 and NaN at 5e7.
     """
     equal = excess == 0
     quotient = jnp.where(equal, 1, jnp.log1p(excess) / jnp.where(equal, 1, excess))
-    return (quotient - log_less) / product
+    return (quotient - log_smaller) / product
 
 
 def _oriented(signed, matrix):
-    """U, σ, V. Unsigned, a negative σ3 goes into U, which then is a reflection."""
+    """Compute U, σ and V. If not `signed`, U is a reflection for a negative σ3."""
     left, values, right = jacobi.svd(matrix)
     if signed:
         return left, values, right
@@ -290,8 +296,8 @@ def _matrix(columns):
     return _stacked([[column[i] for column in columns] for i in range(3)])
 
 
-# Products of rows of scalars: batched 3×3 `matmul`s are slower on a CPU, and on a GPU
-# would round their factors to ten bits.
+# Matrix products are written in scalars, because batched 3×3 `matmul`s are slower on a
+# CPU and round their factors to ten bits on a GPU.
 
 
 def _entries(matrix):
@@ -299,27 +305,27 @@ def _entries(matrix):
 
 
 def _stacked(rows):
-    # In one piece: stacks of stacks take 25 times as long under `vmap` on XLA:CPU,
-    # which then computes all nine entries anew for each of them.
+    # One stack: nested stacks take 25 times as long under `vmap` on XLA:CPU, which then
+    # recomputes all nine entries for each of them.
     return jnp.stack([entry for row in rows for entry in row]).reshape(3, 3)
 
 
-def _each(entry):
+def _from_entries(entry):
     return [[entry(i, j) for j in range(3)] for i in range(3)]
 
 
 def _diagonal(values):
     zero = jnp.zeros_like(values[0])
-    return _each(lambda i, j: values[i] if i == j else zero)
+    return _from_entries(lambda i, j: values[i] if i == j else zero)
 
 
 def _between(left, rows, right):
-    """Uᵀ M V from columns of U and V."""
-    moved = [[dot(row, column) for column in right] for row in rows]  # M V
-    return _each(lambda i, j: sum(left[i][k] * moved[k][j] for k in range(3)))
+    """Compute Uᵀ M V from columns of U and V."""
+    mv = [[dot(row, column) for column in right] for row in rows]
+    return _from_entries(lambda i, j: sum(left[i][k] * mv[k][j] for k in range(3)))
 
 
 def _outer(left, rows, right):
-    """U M Vᵀ from columns of U and V."""
-    moved = _each(lambda i, j: sum(left[k][i] * rows[k][j] for k in range(3)))  # U M
-    return _each(lambda i, j: sum(moved[i][k] * right[k][j] for k in range(3)))
+    """Compute U M Vᵀ from columns of U and V."""
+    um = _from_entries(lambda i, j: sum(left[k][i] * rows[k][j] for k in range(3)))
+    return _from_entries(lambda i, j: sum(um[i][k] * right[k][j] for k in range(3)))

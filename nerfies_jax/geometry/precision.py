@@ -1,13 +1,12 @@
 """Precision rules of geometry: half-precision inputs and matrix products.
 
-Functions that move a point or measure a strain compute in float32 and round once at the
-end. In bfloat16 arithmetic a twist is 3e-2 off. Half-precision cameras are refused,
-because the inputs themselves are too coarse.
+Functions that transform points or compute strains work in float32 and round once at the
+end. In bfloat16 arithmetic a twist has an error of 3e-2. Half-precision cameras are
+refused, because their values are too coarse.
 
 By default a TPU rounds the factors of float32 matrix products to 8 bits and a GPU to
 11. On a CPU, where XLA supports it, JAX's configuration decides. Networks may use the
-default. Code that places, moves, sorts or measures goes through `exact_product` and
-`exact_einsum`.
+default. Geometry, sorting and metrics use `exact_product` and `exact_einsum`.
 """
 
 import functools
@@ -55,7 +54,7 @@ def exact_einsum(formula: str, *factors: Float[Array, "..."]) -> Float[Array, ".
 def at_least_float32(function: F) -> F:
     """Compute a function in float32 if any array argument is bfloat16 or float16.
 
-    Derivatives follow: float32 inside, rounded once.
+    Derivatives are treated the same way.
 
     Args:
       function: A function of arrays.
@@ -66,27 +65,27 @@ def at_least_float32(function: F) -> F:
     """
 
     @functools.wraps(function)
-    def wide(*args, **kwargs):
-        every = (*args, *kwargs.values())
-        kinds = {arg.dtype for arg in every if hasattr(arg, "dtype")}
-        if not kinds.intersection(_HALVES):
+    def in_float32(*args, **kwargs):
+        values = (*args, *kwargs.values())
+        dtypes = {value.dtype for value in values if hasattr(value, "dtype")}
+        if not dtypes.intersection(_HALVES):
             return function(*args, **kwargs)
-        wider = {name: _wide(arg) for name, arg in kwargs.items()}
-        results = function(*(_wide(arg) for arg in args), **wider)
-        if len(kinds) > 1:
+        wide_kwargs = {name: _wide(arg) for name, arg in kwargs.items()}
+        results = function(*(_wide(arg) for arg in args), **wide_kwargs)
+        if len(dtypes) > 1:
             return results
-        return jax.tree.map(lambda leaf: leaf.astype(*kinds), results)
+        return jax.tree.map(lambda leaf: leaf.astype(*dtypes), results)
 
-    return cast(F, wide)
+    return cast(F, in_float32)
 
 
 def widened(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Convert half-precision values to float32.
 
-    Narrower types miscount pixels and lose variances. A masked mean over 200x180 pixels
-    in bfloat16 gives 0.064 instead of 0.039, because a count stops at 256, and SSIM of
-    equal images gives -0.68. In float16 a count of 65504 pixels or more is infinite,
-    which makes an error zero. Gradients come back in the caller's type.
+    Narrower types cannot count pixels or resolve variances. A masked mean over 200x180
+    pixels in bfloat16 is 0.064 instead of 0.039, because the count stops at 256, and
+    SSIM of equal images is -0.68. In float16 a count of 65504 pixels or more is
+    infinite, which makes a mean error zero. Gradients have the type of the argument.
 
     Args:
       values: Array of any floating-point type.
@@ -100,16 +99,16 @@ def widened(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def near_one(
     values: Float[Array, "*shape"], axis: int | None = None
 ) -> tuple[Float[Array, "*shape"], Float[Array, "..."]]:
-    """Divide values by the power of two next to their largest magnitude.
+    """Divide values by the power of two nearest to their largest magnitude.
 
-    The largest magnitude then lies between 2/3 and 4, so that sums of squares stay in
-    range, and no digit changes. Use it where the result does not depend on the scale,
-    such as directions and ratios, because the scale carries no derivative. Values that
+    The largest magnitude is then between 2/3 and 4, so that sums of squares stay in
+    range. The division is exact. Use it for results that do not depend on the scale,
+    such as directions and ratios, because the scale has no derivative. Values that
     XLA flushes to zero (below 1.2e-38 in float32) stay zero.
 
     Args:
       values: Array of any shape.
-      axis: Axis along which the largest is taken. None takes all of them together.
+      axis: Axis along which the maximum is taken, None for the maximum of all values.
 
     Returns:
       The scaled values, and the scale. The axis is kept with length one.
@@ -120,10 +119,10 @@ def near_one(
 
 
 def power_of_two(size: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return the power of two next to a value, with a normal reciprocal.
+    """Return the power of two nearest to a value whose reciprocal is a normal number.
 
-    XLA:CPU divides by x by multiplying with 1 / x, which it flushes to zero from 8.5e37
-    in float32 on.
+    XLA:CPU divides by x by multiplying with 1 / x, which in float32 it flushes to zero
+    if x is 8.5e37 or more.
 
     Args:
       size: Non-negative values.

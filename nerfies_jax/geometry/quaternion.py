@@ -16,8 +16,8 @@ from nerfies_jax.runtime.contract import checked
 
 Quaternion = Float[Array, "4"]
 
-# tan²(θ/2), that is θ < 0.4 rad: below, the series of arctan. Fourteen terms leave
-# 3e-21.
+# The series of arctan is used below this tan²(θ/2), which is at θ = 0.4 rad. Its error
+# after 14 terms is 3e-21.
 SERIES_BELOW = 0.04
 _ARCTAN = tuple((-1) ** n / (2 * n + 1) for n in range(14))
 
@@ -28,9 +28,9 @@ def normalize(quaternion: Quaternion) -> Quaternion:
     """Scale quaternions to unit length.
 
     Zero (in float32 also values below 1.2e-38, which XLA flushes to zero) and infinity
-    give the identity with zero gradient. 0/0 would poison the whole batch, and q / (|q|
-    + small) would return something that is no rotation. Gradients are as large as 1 /
-    |q|, and second derivatives overflow below a length of 1e-19 in float32.
+    give the identity with zero gradient. Otherwise 0/0 would make the gradients of a
+    whole batch NaN, and q / (|q| + eps) is no unit quaternion. Gradients are as large
+    as 1 / |q|, and second derivatives overflow below a length of 1e-19 in float32.
 
     Args:
       quaternion: Quaternions of any length, [..., 4].
@@ -41,8 +41,9 @@ def normalize(quaternion: Quaternion) -> Quaternion:
     largest = jnp.max(jnp.abs(quaternion))
     # NaN is neither small nor infinite and passes through.
     unusable = (largest < jnp.finfo(quaternion.dtype).tiny) | (largest == jnp.inf)
-    # The whole quaternion is replaced, not its length: inf times the zero of the branch
-    # not taken is NaN. Scaled first: |q|³ in its curvature underflows from 1e-13 down.
+    # The whole quaternion is replaced and not its length, because inf times the zero
+    # gradient of the unused branch is NaN. It is scaled first, because |q|³ in the
+    # second derivative underflows below 1e-13.
     usable = jnp.where(unusable, identity(quaternion.dtype), quaternion)
     parts = components(near_one(usable)[0])
     length = jnp.sqrt(sum(part * part for part in parts))
@@ -115,8 +116,8 @@ def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3
 def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
     """Compute rotation matrices.
 
-    The quaternion is normalized first. The polynomial in an unnormalized q is no
-    rotation: |q| = 1.01 distorts it by 0.057.
+    The quaternion is normalized first. The polynomial of an unnormalized q is
+    not a rotation: |q| = 1.01 distorts it by 0.057.
 
     Args:
       quaternion: Quaternions of any length, [..., 4].
@@ -125,7 +126,7 @@ def to_matrix(quaternion: Quaternion) -> Float[Array, "3 3"]:
       Rotation matrices, [..., 3, 3].
     """
     w, x, y, z = normalize(quaternion)
-    # One stack: nested ones are slow under `vmap` (see matrix3).
+    # One stack, because nested stacks are slow under `vmap` (see matrix3).
     entries = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -169,7 +170,7 @@ def from_matrix(rotation: Float[Array, "3 3"]) -> Quaternion:
         *(w[2], xz, yz, diagonal[3]),
     ]
     matrix = jnp.stack(rows).reshape(4, 4)
-    return _upper(normalize(matrix[jnp.argmax(diagonal)]))
+    return _with_positive_w(normalize(matrix[jnp.argmax(diagonal)]))
 
 
 @checked(broadcast=True)
@@ -201,9 +202,10 @@ def log(quaternion: Quaternion) -> Float[Array, "3"]:
       Axis × angle [..., 3], with angles of at most π rad. Zero and infinite quaternions
       give zero, as in `normalize`.
     """
-    # The quotients below need no unit length, but their squares have half the range.
-    upper = _upper(normalize(quaternion))
-    scalar, vector = upper[0], upper[1:]
+    # The quotients below do not need unit length, but squares of an unnormalized
+    # quaternion could overflow or underflow.
+    unit = _with_positive_w(normalize(quaternion))
+    scalar, vector = unit[0], unit[1:]
     sine_sq = jnp.sum(vector**2)
     near = sine_sq < SERIES_BELOW * scalar**2
     divisor = jnp.where(near, scalar, 1)
@@ -212,7 +214,7 @@ def log(quaternion: Quaternion) -> Float[Array, "3"]:
     for coefficient in reversed(_ARCTAN):
         series = series * tangent_sq + coefficient
     sine = jnp.sqrt(jnp.where(near, 1, sine_sq))
-    far = jnp.arctan2(sine, scalar) / sine  # right up to π, where an arccos is not
+    far = jnp.arctan2(sine, scalar) / sine  # accurate up to π, unlike arccos
     return 2 * jnp.where(near, series / divisor, far) * vector
 
 
@@ -233,6 +235,6 @@ def slerp(start: Quaternion, end: Quaternion, fraction: Float[Array, ""]) -> Qua
     return multiply(exp(fraction * turn), start)
 
 
-def _upper(quaternion: Quaternion) -> Quaternion:
-    """Return q or -q, the one with w not negative, whose angle is at most π."""
+def _with_positive_w(quaternion: Quaternion) -> Quaternion:
+    """Return q or -q, whichever has w >= 0 and so an angle of at most π."""
     return jnp.where(quaternion[0] < 0, -quaternion, quaternion)

@@ -16,8 +16,9 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.runtime.contract import checked
 
-# Component of a unit direction below which the ray runs along the face. With 1e-20
-# quotients would be finite, but gradients, over 1e-40, would not be in float32.
+# A ray counts as parallel to a face if this component of its unit direction is smaller.
+# With 1e-20 the distances would be finite in float32, but not their gradients, which
+# divide by its square.
 PARALLEL = 1e-12
 
 
@@ -95,7 +96,7 @@ def point_at(
 
 
 def across_ray(unit: Float[np.ndarray, "*rays 3"]) -> Float[np.ndarray, "*rays 3 3"]:
-    """Return projectors onto the planes across rays, 1 - u uᵀ. On the host.
+    """Return projectors onto the planes perpendicular to rays, 1 - u uᵀ, on the host.
 
     Args:
       unit: Unit directions u, [..., 3].
@@ -174,12 +175,14 @@ def intersect_aabb(
     References:
       The slab test of Kay and Kajiya 1986.
     """
-    # A component of 0 never crosses its two planes; a quotient by 0 would be 0/0 where
-    # the origin lies in one of them.
-    moving = jnp.abs(direction) > PARALLEL
-    divisor = jnp.where(moving, direction, 1)
+    # A parallel ray crosses neither of the two planes. The quotient would be 0/0 if the
+    # origin lies in one of them.
+    crosses = jnp.abs(direction) > PARALLEL
+    divisor = jnp.where(crosses, direction, 1)
     first, second = (low - origin) / divisor, (high - origin) / divisor
     inside = (origin >= low) & (origin <= high)
-    enter = jnp.where(moving, jnp.minimum(first, second), jnp.where(inside, 0, jnp.inf))
-    leave = jnp.where(moving, jnp.maximum(first, second), jnp.inf)
+    enter = jnp.where(
+        crosses, jnp.minimum(first, second), jnp.where(inside, 0, jnp.inf)
+    )
+    leave = jnp.where(crosses, jnp.maximum(first, second), jnp.inf)
     return jnp.maximum(jnp.max(enter), 0), jnp.min(leave)

@@ -9,10 +9,11 @@ from jaxtyping import Array, Float
 
 from nerfies_jax.geometry.precision import at_least_float32
 
-# rad²: below, the series; above, the closed form. At 3 rad the closed forms of the
-# orders used here (up to 7, in second derivatives of a screw) have stopped canceling.
+# In rad². The series is used below this bound and the closed form above it. From 3 rad
+# on the closed forms of the orders used here do not cancel (up to 7, in second
+# derivatives of a screw).
 SERIES_BELOW = 9.0
-_TERMS = {"float32": 9, "float64": 15}  # leave 3e-9 and 3e-20 of the first at 9 rad²
+_TERMS = {"float32": 9, "float64": 15}  # relative errors 3e-9 and 3e-20 at 9 rad²
 
 
 @at_least_float32
@@ -34,7 +35,7 @@ def stumpff(order: int, angle_sq: Float[Array, "*batch"]) -> Float[Array, "*batc
       Stumpff 1947.
     """
     near = angle_sq < SERIES_BELOW
-    # `where` differentiates both branches, so the one not taken must stay finite.
+    # `where` differentiates both branches, so the unused one must stay finite.
     series = _series(order, jnp.where(near, angle_sq, 0))
     closed = _closed(order, jnp.where(near, SERIES_BELOW, angle_sq))
     return jnp.where(near, series, closed)
@@ -51,7 +52,7 @@ def _series(order, angle_sq):
 
 @_series.defjvp
 def _series_jvp(order, primals, tangents):
-    """c_k' = (k c_{k+2} - c_{k+1}) / 2: shared between orders, never short a term."""
+    """Evaluate c_k' = (k c_{k+2} - c_{k+1}) / 2 with as many terms as c_k."""
     (angle_sq,), (angle_sq_dot,) = primals, tangents
     grad = -_series(order + 1, angle_sq) / 2
     if order:
@@ -60,14 +61,14 @@ def _series_jvp(order, primals, tangents):
 
 
 def _closed(order, angle_sq):
-    """From cos θ or sin θ / θ upwards: c_k = (1/(k-2)! - c_{k-2}) / s."""
+    """Evaluate c_k = (1/(k-2)! - c_{k-2}) / s, starting from cos θ or sin θ / θ."""
     angle = jnp.sqrt(angle_sq)
     if order % 2:
         value, start = jnp.sin(angle) / angle, 3
     elif order == 0:
         return jnp.cos(angle)
     else:
-        # 2 sin²(θ/2) = 1 - cos θ, uncanceled at whole turns
+        # 2 sin²(θ/2) = 1 - cos θ, without cancellation near multiples of 2π
         value, start = 2 * jnp.sin(angle / 2) ** 2 / angle_sq, 4
     for k in range(start, order + 1, 2):
         value = (1 / math.factorial(k - 2) - value) / angle_sq

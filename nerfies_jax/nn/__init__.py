@@ -1,6 +1,6 @@
-"""Small differentiable functions with explicit parameters."""
+"""Network modules as pure functions with explicit parameters."""
 
 import lazy_loader
 
-# Modules that `nerfies_jax` shows; each is loaded when it is used.
+# Modules of the public API, imported on first use.
 __getattr__, __dir__, __all__ = lazy_loader.attach(__name__, ["adapters", "kan"])

@@ -1,7 +1,7 @@
 """Modules of flax and equinox as explicit parameters and a pure function.
 
-An adapted module is a `Network` of two functions, so its parameters are a pytree like
-all others here: optax, checkpoints and `jax.tree` work on them.
+An adapted module is a `Network` of two functions. Its parameters are a pytree, so that
+optax, checkpoints and `jax.tree` work on them.
 """
 
 import importlib
@@ -16,8 +16,8 @@ PyTree = Any
 class Network(NamedTuple):
     """A network with explicit parameters."""
 
-    init: Callable[[jax.Array], PyTree]  # of a key: the parameters
-    apply: Callable[..., Any]  # of the parameters and inputs: the outputs
+    init: Callable[[jax.Array], PyTree]  # (key) -> parameters
+    apply: Callable[..., Any]  # (parameters, *inputs) -> outputs
 
 
 def linen(module: Any, *example: Any) -> Network:
@@ -25,20 +25,19 @@ def linen(module: Any, *example: Any) -> Network:
 
     Args:
       module: The module, without parameters.
-      *example: Inputs of the shapes and types that it will get, which flax needs to
-        make the parameters.
+      *example: Example inputs, from whose shapes and types flax makes the parameters.
 
     Returns:
       The network. Its parameters are the variables that `module.init` makes.
 
     Raises:
-      TypeError: Where `module` is no `flax.linen.Module`.
+      TypeError: If `module` is not a `flax.linen.Module`.
     """
-    kind = _library("flax.linen").Module
-    if not isinstance(module, kind):
+    module_type = _import_library("flax.linen").Module
+    if not isinstance(module, module_type):
         raise TypeError(
             f"adapters.linen: `module` must be a flax.linen.Module, got a "
-            f"{type(module).__name__}; modules of flax.nnx go to adapters.nnx"
+            f"{type(module).__name__}; use adapters.nnx for modules of flax.nnx"
         )
     return Network(lambda key: module.init(key, *example), module.apply)
 
@@ -51,10 +50,10 @@ def nnx(make: Callable[[Any], Any]) -> Network:
         nnx.Linear(3, 4, rngs=rngs)`.
 
     Returns:
-      The network. Its parameters are the state that `nnx.split` gives. Changes that a
-      call makes in the module are not kept.
+      The network. Its parameters are the state that `nnx.split` returns. Changes that a
+      call makes to the module are lost.
     """
-    library = _library("flax.nnx")
+    library = _import_library("flax.nnx")
 
     def split(key):
         return library.split(make(library.Rngs(key)))
@@ -77,17 +76,17 @@ def equinox(make: Callable[[jax.Array], Any]) -> Network:
       The network. Its parameters are the module's arrays, in a module whose other
       fields are None. As in equinox, it takes one item; map it with `jax.vmap`.
     """
-    library = _library("equinox")
+    library = _import_library("equinox")
 
     def apply(params, *inputs):
         shapes = library.filter_eval_shape(make, jax.random.key(0))
-        rest = library.filter(shapes, lambda leaf: not hasattr(leaf, "dtype"))
-        return library.combine(params, rest)(*inputs)
+        static = library.filter(shapes, lambda leaf: not hasattr(leaf, "dtype"))
+        return library.combine(params, static)(*inputs)
 
     return Network(lambda key: library.filter(make(key), library.is_array), apply)
 
 
-def _library(name: str) -> Any:
+def _import_library(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:

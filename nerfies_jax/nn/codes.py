@@ -15,8 +15,8 @@ def init(
 ) -> Table:
     """Initialize codes uniformly in [-scale, scale].
 
-    Nerfies draws from [0, 0.05). With centered codes the mean code serves an unseen
-    timestamp.
+    Nerfies uses [0, 0.05). Codes centered on zero allow the mean code to be used for a
+    timestamp without its own code.
 
     Args:
       key: PRNG key.
@@ -35,14 +35,14 @@ def init(
         raise ValueError(
             f"a code table needs ids >= 1 and width >= 1, got ids={ids}, width={width}"
         )
-    drawn = jax.random.uniform(key, (ids, width), jnp.float32, -1, 1)
-    return scale * drawn.astype(dtype)
+    uniform = jax.random.uniform(key, (ids, width), jnp.float32, -1, 1)
+    return scale * uniform.astype(dtype)
 
 
 def check_ids(ids: Any, count: int, name: str = "ids") -> None:
-    """Check that ids have a row in a table, on the host.
+    """Check on the host that ids are row indices of a table.
 
-    Call it once, where a capture meets a model. Under `jit` an invalid id cannot raise.
+    Call it once for the capture and the model. Under `jit` an invalid id cannot raise.
 
     Args:
       ids: Integers of any shape.
@@ -59,8 +59,8 @@ def check_ids(ids: Any, count: int, name: str = "ids") -> None:
     if outside.any():
         row = int(np.flatnonzero(outside.ravel())[0])
         raise ValueError(
-            f"{name}[{row}] = {values.ravel()[row]} is not in 0 .. {count - 1}; give "
-            f"the table {int(values.max()) + 1} rows, or number the ids from 0"
+            f"{name}[{row}] = {values.ravel()[row]} is not in 0 .. {count - 1}; use a "
+            f"table of {int(values.max()) + 1} rows, or number the ids from 0"
         )
 
 
@@ -98,12 +98,12 @@ def blend(
       The code, [code].
     """
     start, end = look_up(table, left), look_up(table, right)
-    # Not start + progress (end - start), which does not quite arrive at 1.
+    # start + progress (end - start) would not be exact at progress 1.
     return (1 - progress) * start + progress * end
 
 
 def at_time(table: Table, time: Float[Array, ""]) -> Float[Array, " code"]:
-    """Interpolate a table along time, whose rows are frame times in order.
+    """Interpolate linearly in time between the codes of a table.
 
     Args:
       table: Codes at evenly spaced times from 0 to 1, [ids, code].
@@ -123,12 +123,12 @@ def at_time_of(
 ) -> Float[Array, " code"]:
     """Interpolate a table along time after resampling it to fewer rows.
 
-    The number of rows may be traced: no array of that size is made.
+    The number of rows may be traced, because no array of that size is made.
 
     Args:
       table: Codes at evenly spaced times from 0 to 1, [ids, code].
-      rows: Number of rows to resample to, at least 2. The first and last row stay. At
-        the number of rows of the table or above, nothing is resampled.
+      rows: Number of rows to resample to, at least 2. The first and last row do not
+        change. With the number of rows of the table or more, nothing is resampled.
       time: Time, clamped to [0, 1].
 
     Returns:

@@ -1,4 +1,4 @@
-"""Fourier features of positions and times, and their coarse-to-fine window."""
+"""Positional encoding of points and times, and its coarse-to-fine window."""
 
 import dataclasses
 import math
@@ -18,9 +18,8 @@ class EncodingSpec:
     """Settings of a positional encoding with frequencies 2^k, k = 0 .. bands-1.
 
     `times_pi` multiplies frequencies by π, as in Mildenhall et al. 2020, equation 4,
-    for coordinates in [-1, 1]. The published code of NeRF and Nerfies leaves π out, and
-    its captures fill a box of diagonal one. `identity` puts the coordinates themselves
-    in front.
+    for coordinates in [-1, 1]. The published code of NeRF and Nerfies omits π, and its
+    scenes fill a box of diagonal one. `identity` prepends the coordinates.
     """
 
     bands: int
@@ -28,7 +27,7 @@ class EncodingSpec:
     times_pi: bool = False
 
     def __post_init__(self):
-        # 2^24 and above would turn neighboring float32 coordinates into noise
+        # From 2^24 on, neighboring float32 coordinates give unrelated features.
         if not 0 <= self.bands <= 24:
             raise ValueError(
                 f"an encoding has 0 to 24 bands, got bands={self.bands}; ten resolve a "
@@ -65,10 +64,10 @@ def encode(
     point: Float[Array, " dim"],
     window: Float[Array, " bands"] | None,
 ) -> Float[Array, " features"]:
-    """Encode one point: [x,] then for each band the sines and the cosines of all axes.
+    """Encode one point as [x,] and, band by band, sines and cosines of all axes.
 
-    The layout is that of Nerfies, whose weights can therefore be read. Coordinates
-    narrower than float32 are encoded in float32 and the features rounded.
+    The layout is that of Nerfies, so that its weights can be loaded. Coordinates in
+    half precision are encoded in float32, and the features are rounded.
 
     Args:
       spec: Settings of the encoding.
@@ -87,13 +86,13 @@ def encode(
     if window is not None and window.shape != (spec.bands,):
         raise ValueError(
             f"a window of {window.shape[0]} weights does not fit {spec.bands} bands; "
-            "make it with as many bands as the encoding has"
+            "use the same number of bands for both"
         )
     powers = jnp.asarray([2.0**k for k in range(spec.bands)], point.dtype)
-    scaled = powers[:, None] * point  # a power of two: exact; float16 would overflow
-    # Half turns are reduced before π is rounded in: `sin(2^k π x)` in float32 is 1e-4
-    # off at k = 9 and noise at |x| = 1e4. Without π the product is exact, and so is the
-    # sine at any argument.
+    scaled = powers[:, None] * point  # exact; float16 would overflow
+    # The argument is reduced before the multiplication by π. Computed as sin(2^k π x)
+    # in float32, the error is 1e-4 at k = 9, and the result is noise at |x| = 1e4.
+    # Without π the product is exact.
     sine, cosine = sincospi(scaled) if spec.times_pi else sincos(scaled)
     waves = jnp.stack([sine, cosine], axis=1)
     if window is not None:
@@ -107,9 +106,9 @@ def encode(
 def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
     """Compute the coarse-to-fine window (1 - cos(π clip(α - k, 0, 1))) / 2.
 
-    It is written as sin². The difference is 20 % off in float32 where a band begins to
-    open. At `alpha` = 0 all bands are zero and only the identity passes. Without the
-    identity all features are then zero.
+    It is computed as sin², because the difference has an error of 20 % in float32 where
+    a band begins to open. At `alpha` = 0 all bands are zero. Only the coordinates
+    remain then, if `identity` is set.
 
     Args:
       bands: Number of bands.
@@ -122,7 +121,7 @@ def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
       Park et al. 2021 (Nerfies), arXiv:2011.12948, equation 8.
     """
     opened = jnp.clip(alpha - jnp.arange(bands, dtype=alpha.dtype), 0, 1)
-    # The polynomial's ends are exact: a shut band is 0 and an open one is 1.
+    # The polynomial is exact at its ends: closed bands are 0 and open bands are 1.
     return sincospi(opened / 2)[0] ** 2
 
 
@@ -141,17 +140,17 @@ def positional_encoding(
       points: Coordinates [..., dim]. Leading axes of `points` and `window` broadcast.
       num_frequencies: Number of frequency bands, 1, 2, 4, ... in that order, 0 to 24.
       window: Weight of each band, [..., num_frequencies], as `coarse_to_fine_window`
-        makes them. None leaves all bands on. The coordinates are not weighed.
+        makes them. None enables all bands. The coordinates are not weighted.
       include_input: True to put the coordinates themselves first.
       times_pi: True to multiply frequencies by pi, as in the paper of NeRF. The
-        code of NeRF and Nerfies leaves it out.
+        code of NeRF and Nerfies omits it.
 
     Returns:
       Features [..., dim * (2 * num_frequencies + include_input)]: the coordinates, then
       for each band the sines and then the cosines of all coordinates.
 
     Raises:
-      ValueError: Where the number of bands is out of range or does not fit the window.
+      ValueError: If the number of bands is out of range or does not fit the window.
 
     References:
       Mildenhall et al. 2020, arXiv:2003.08934, equation 4.
@@ -166,7 +165,7 @@ def coarse_to_fine_window(
 ) -> Float[Array, "*batch num_frequencies"]:
     """Compute the weights of an encoding's bands during coarse-to-fine training.
 
-    Band k opens while `alpha` goes from k to k + 1: at 0 all bands are off, at
+    Band k opens while `alpha` goes from k to k + 1. At 0 all bands are off, and at
     `num_frequencies` all are on.
 
     Args:

@@ -1,10 +1,9 @@
 """Multi-resolution feature grids, dense or hashed.
 
-Functions take one point, and callers `jax.vmap` them. A network that reads features of
-its own for each place learns a scene in a tenth of the steps of one that reads a
-positional encoding. On a CPU the cost is that of XLA's gather and scatter: rows of 2
-floats take 3.9 and 2.4 ns each, rows of 16 floats 19 and 66, so rows are narrow and
-levels many.
+Functions take one point. Use `jax.vmap` for several. A network on grid features learns
+a scene in a tenth of the steps that it needs on a positional encoding. On a CPU, XLA's
+gather and scatter dominate the cost. They take 3.9 and 2.4 ns for a row of 2 floats and
+19 and 66 ns for a row of 16, so the default is many levels of few features.
 """
 
 import dataclasses
@@ -20,10 +19,10 @@ from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.geometry.precision import exact_product
 
-# Multipliers of the coordinates of a vertex (Müller et al. 2022, equation 4).
+# Factors of the coordinates of a vertex in the hash (Müller et al. 2022, equation 4).
 PRIMES = (1, 2654435761, 805459861)
-FIRST = 1e-4  # half-width of the first features, as published
-MAX_CELLS = 2**20  # along an axis: float32 places a point in a cell of that to 1/8
+FIRST = 1e-4  # half-width of the initial features, as published
+MAX_CELLS = 2**20  # along an axis, where float32 resolves 1/8 of a cell
 
 Tables = tuple[Float[Array, "_ features"], ...]
 
@@ -32,20 +31,20 @@ Tables = tuple[Float[Array, "_ features"], ...]
 class HashGridSpec:
     """Settings of a multi-resolution hash grid over a box.
 
-    Müller et al. 2022, arXiv:2201.05989, section 3. Each level is finer than the last
-    by the same factor. A level whose vertices fit into `rows` has a row for each. Finer
-    ones share rows by a hash of the vertex, and the network resolves collisions. The
-    box is [-half_side, half_side] in units of the field. Space outside is contracted
-    into twice the box (Barron et al. 2022, arXiv:2111.12077, equation 10, in the
-    maximum norm). If `contract` is false, a point there has the features of the nearest
-    point in the box.
+    Müller et al. 2022, arXiv:2201.05989, section 3. Each level is finer than the
+    previous one by the same factor. A level with at most `rows` vertices has a row for
+    each. Vertices of finer levels share rows by a hash, and the network resolves
+    collisions. The box is [-half_side, half_side]^3 in units of the field. Space
+    outside is contracted into twice the box (Barron et al. 2022, arXiv:2111.12077,
+    equation 10, in the maximum norm). If `contract` is false, a point outside has the
+    features of the nearest point of the box.
     """
 
     levels: int = 7
-    features: int = 2  # floats of a row
+    features: int = 2  # floats per row
     coarsest: int = 16  # cells along an axis of the first level
-    finest: int = 256  # of the last
-    rows: int = 2**16  # at most, of each level
+    finest: int = 256  # cells along an axis of the last level
+    rows: int = 2**16  # maximum per level
     half_side: float = 1.0
     contract: bool = True
 
@@ -76,7 +75,9 @@ class HashGridSpec:
           ValueError: If `dimensions` is not 3.
         """
         if dimensions != 3:
-            raise ValueError(f"a hash grid is of 3 dimensions, not of {dimensions}")
+            raise ValueError(
+                f"a hash grid has 3 dimensions, but the points have {dimensions}"
+            )
         return self.levels * self.features
 
     def cells(self) -> tuple[int, ...]:
@@ -130,13 +131,13 @@ def encode(
       Features, [levels * features].
     """
     place = unit_place(point, spec.half_side, spec.contract)
-    found = [
+    by_level = [
         level_features(table, place, cells)
         for table, cells in zip(tables, spec.cells(), strict=True)
     ]
     if window is not None:
-        found = [part * window[level] for level, part in enumerate(found)]
-    return jnp.concatenate(found)
+        by_level = [part * window[level] for level, part in enumerate(by_level)]
+    return jnp.concatenate(by_level)
 
 
 def unit_place(
@@ -161,9 +162,9 @@ def unit_place(
 def contract(point: Float[Array, "3"]) -> Float[Array, "3"]:
     """Contract all of space into the cube [-2, 2]^3. The cube [-1, 1]^3 is unchanged.
 
-    This is (2 - 1/|x|) x/|x| beyond a norm of one, with the maximum norm, so that cubes
-    stay cubes. Its gradient is continuous along a ray from the center. A point at
-    infinity has none.
+    This is (2 - 1/|x|) x/|x| for |x| > 1 in the maximum norm, which maps cubes to
+    cubes. Its gradient is continuous along a ray from the center, and undefined at
+    infinity.
 
     Args:
       point: Point in units of the half side of the box, [3].
@@ -174,10 +175,10 @@ def contract(point: Float[Array, "3"]) -> Float[Array, "3"]:
     References:
       Barron et al. 2022 (mip-NeRF 360), arXiv:2111.12077, equation 10.
     """
-    # The norm is held out of the branch that is not taken, where it may be zero.
-    size = jnp.max(jnp.abs(point))
-    beyond = jnp.maximum(size, 1)
-    return jnp.where(size > 1, (2 - 1 / beyond) * (point / beyond), point)
+    # Clamped, so that the unused branch does not divide by zero.
+    norm = jnp.max(jnp.abs(point))
+    divisor = jnp.maximum(norm, 1)
+    return jnp.where(norm > 1, (2 - 1 / divisor) * (point / divisor), point)
 
 
 def level_features(
@@ -209,70 +210,71 @@ def _between_vertices(table, place, cells, stride):
     return sum(weight * table[row] for row, weight in zip(rows, weights, strict=True))
 
 
-def _slope_between_vertices(cells, stride, primals, tangents):
-    # One sum is fast to evaluate, one product to derive. ns a point of one core in a
-    # loop of steps, 24,576 points, 7 levels of 2 features:
-    #                               sum   product
-    #   features                     72       229
-    #   their slope by tables       514       499
-    #   by places                  1610       386
-    #   by both                    2124       651
-    # An operation of its own over all points, its gradients by tables scattered corner
-    # after corner, takes 195 for 480 of these by itself; whole steps and frames of
-    # `d-nerf-grid-small` then take a tenth more.
-    moved = [not isinstance(tangent, SymbolicZero) for tangent in tangents]
+def _between_vertices_jvp(cells, stride, primals, tangents):
+    # Values are computed as a sum and derivatives as a matrix product. Measured on one
+    # core in a loop of steps, in ns per point, with 24,576 points and 7 levels of 2
+    # features:
+    #                                     sum   product
+    #   features                           72       229
+    #   gradient by tables                514       499
+    #   gradient by positions            1610       386
+    #   gradient by both                 2124       651
+    # A custom operation over all points, which scatters its gradient by tables corner
+    # after corner, takes 195 ns on its own instead of 480. But complete steps and
+    # frames of `d-nerf-grid-small` then take a tenth longer.
+    nonzero = [not isinstance(tangent, SymbolicZero) for tangent in tangents]
 
-    def product(*given):
-        given = iter(given)
+    def product(*differentiated):
+        arguments = iter(differentiated)
         table, place = (
-            next(given) if m else p for m, p in zip(moved, primals, strict=True)
+            next(arguments) if flag else primal
+            for flag, primal in zip(nonzero, primals, strict=True)
         )
         rows, weights = _vertices_around(place, cells, stride, len(table))
-        # By default a GPU may round factors to ten bits.
+        # At its default precision a GPU may round factors to ten bits.
         return exact_product(jnp.stack(weights), table[jnp.stack(rows)])
 
     return jax.jvp(
         product,
-        list(itertools.compress(primals, moved)),
-        list(itertools.compress(tangents, moved)),
+        list(itertools.compress(primals, nonzero)),
+        list(itertools.compress(tangents, nonzero)),
     )
 
 
-_between_vertices.defjvp(_slope_between_vertices, symbolic_zeros=True)
+_between_vertices.defjvp(_between_vertices_jvp, symbolic_zeros=True)
 
 
 def _vertices_around(place, cells, stride, rows):
-    """The rows of the eight vertices of a cell, and the weight of each at a place.
+    """Return rows and trilinear weights of the eight vertices around a position.
 
-    Coordinate by coordinate: a point in three lanes of a vector takes twice the time.
+    Coordinates are separate scalars, because arrays of three take twice the time.
     """
-    wide = cells // stride
-    scaled = [along * wide for along in place]
-    # A place at the far end belongs to the last cell.
-    low = [jnp.clip(jnp.floor(along), 0, wide - 1) for along in scaled]
-    above = [along - corner for along, corner in zip(scaled, low, strict=True)]
-    share = [(1 - along, along) for along in above]
-    corner = [along.astype(jnp.int32) for along in low]
-    found, weights = [], []
-    for x, y, z in itertools.product((0, 1), repeat=3):
-        vertex = [
-            stride * (along + up) for along, up in zip(corner, (x, y, z), strict=True)
-        ]
-        found.append(_row(vertex, cells, rows))
-        weights.append(share[0][x] * share[1][y] * share[2][z])
-    return found, weights
+    wide_cells = cells // stride
+    scaled = [x * wide_cells for x in place]
+    # The position 1 belongs to the last cell.
+    low = [jnp.clip(jnp.floor(x), 0, wide_cells - 1) for x in scaled]
+    fractions = [x - corner for x, corner in zip(scaled, low, strict=True)]
+    axis_weights = [(1 - fraction, fraction) for fraction in fractions]
+    corner = [x.astype(jnp.int32) for x in low]
+    vertex_rows, weights = [], []
+    for offset in itertools.product((0, 1), repeat=3):
+        vertex = [stride * (x + step) for x, step in zip(corner, offset, strict=True)]
+        vertex_rows.append(_row(vertex, cells, rows))
+        x, y, z = offset
+        weights.append(axis_weights[0][x] * axis_weights[1][y] * axis_weights[2][z])
+    return vertex_rows, weights
 
 
 def vertex_row(
     vertex: Int[Array, "*batch 3"], cells: int, rows: int
 ) -> Int[Array, "*batch"]:
-    """Return the table row of vertices: their own if there are enough, else by a hash.
+    """Return the table rows of vertices, by index if there are enough rows or by hash.
 
     Args:
       vertex: Indices of vertices, [..., 3].
       cells: Number of cells along an axis.
-      rows: Number of rows of the table. It need not be a power of two, unlike in the
-        paper.
+      rows: Number of rows of the table. Unlike in the paper it need not be a power of
+        two.
 
     Returns:
       Row indices, [...].
@@ -284,7 +286,7 @@ def vertex_row(
 
 
 def _row(vertex, cells, rows):
-    """Same as `vertex_row`, with the three coordinates of a vertex as a list."""
+    """Return the row of a vertex, given as a list of three coordinates."""
     vertices = cells + 1
     if rows >= vertices**3:
         x, y, z = vertex
@@ -301,9 +303,9 @@ def variation_at_random(
 ) -> Float[Array, ""]:
     """Estimate the mean of `total_variation` over levels from random vertices.
 
-    The estimate is unbiased. A hashed level counts as well, with the rows of
-    neighboring vertices, whatever else shares them. It sums squares, not norms, so
-    constant features have gradient zero and not NaN.
+    The estimate is unbiased. Hashed levels contribute as well, by the rows of
+    neighboring vertices, whether or not other vertices share them. Squares are summed
+    instead of norms, so that the gradient of constant features is zero and not NaN.
 
     Args:
       spec: Settings of the grid.
@@ -317,13 +319,13 @@ def variation_at_random(
 
     def of_level(key, table, cells):
         vertex = jax.random.randint(key, (count, 1, 3), 0, cells + 1, jnp.int32)
-        # From the far end there is no next one: it is held against itself, and so many
-        # of the differences are none.
-        beyond = jnp.minimum(vertex + np.eye(3, dtype=np.int32), cells)
-        here, there = (
-            table[vertex_row(v, cells, len(table))] for v in (vertex, beyond)
+        # The last vertex along an axis is compared with itself. The factor corrects the
+        # mean for these zeros.
+        neighbor = jnp.minimum(vertex + np.eye(3, dtype=np.int32), cells)
+        first, second = (
+            table[vertex_row(v, cells, len(table))] for v in (vertex, neighbor)
         )
-        return jnp.mean((there - here) ** 2) * ((cells + 1) / cells)
+        return jnp.mean((second - first) ** 2) * ((cells + 1) / cells)
 
     keys = jax.random.split(key, spec.levels)
     levels = zip(keys, tables, spec.cells(), strict=True)
@@ -348,13 +350,12 @@ def total_variation(
     vertices = cells + 1
     if len(table) != vertices**3:
         raise ValueError(
-            f"{len(table)} rows are not the {vertices}^3 vertices of {cells} cells: "
-            "a hashed level has no neighbors"
+            f"a table of {len(table)} rows is not dense for {cells} cells, which have "
+            f"{vertices}^3 vertices; use variation_at_random for hashed levels"
         )
     grid = table.reshape(vertices, vertices, vertices, -1)
-    # XLA:CPU adds floats to one sum one after the other, and squares them at that pace:
-    # the squares of 97^3 rows of four take 35 ms, brought to one shape and summed by a
-    # product 3 (27 and 14 with the gradient).
+    # XLA:CPU does not vectorize the sum of all squares. With 97^3 rows of four it takes
+    # 35 ms. This product takes 3 ms (27 and 14 with the gradient).
     squares = sum(_squared_differences(grid, axis) for axis in range(3))
     lines = squares.reshape(vertices**2, -1)
     total = jnp.sum(exact_product(lines, jnp.ones(lines.shape[1], lines.dtype)))
@@ -362,7 +363,7 @@ def total_variation(
 
 
 def _squared_differences(grid, axis):
-    """Squared differences of each vertex and the next, with zeros at the end."""
+    """Return squared differences of neighboring vertices, with zeros at the end."""
     end = jnp.zeros_like(jax.lax.slice_in_dim(grid, 0, 1, axis=axis))
     squares = jnp.square(jnp.diff(grid, axis=axis))
     return jnp.concatenate([squares, end], axis)

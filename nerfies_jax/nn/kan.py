@@ -4,14 +4,14 @@
 spec)`, `y = apply(spec, params, x)` with any leading axes.
 
 One layer is y_o = sum over inputs i of f_io(x_i) + bias_o, where each function of one
-variable is a sum of Gaussians on a uniform grid and, beside it, a weighted SiLU:
+variable is a sum of Gaussians on a uniform grid plus a weighted SiLU:
 
     f_io(x) = sum_g C_gio exp(-((x - mu_g) / w)^2) + B_io silu(x)
 
 Li 2024, "Kolmogorov-Arnold networks are radial basis function networks",
 arXiv:2405.06721 (FastKAN), which is equation 5 of Sonata with w = sqrt(2) sigma. With
-`basis="bspline"` the Gaussians are cubic B-splines instead (its equation 4; Liu et al.
-2024, arXiv:2404.19756), as many, on the same grid.
+`basis="bspline"` the Gaussians are replaced by as many cubic B-splines on the same grid
+(equation 4 of Sonata; Liu et al. 2024, arXiv:2404.19756).
 """
 
 import dataclasses
@@ -29,18 +29,18 @@ from nerfies_jax.nn.mlp import HeadSpec
 from nerfies_jax.runtime.contract import checked
 
 BASES = ("rbf", "bspline")
-OUTPUT = "output"  # name of the only head where a spec has `out_features`
-DEGREE = 3  # of the B-splines, of which there are so many more than intervals
+OUTPUT = "output"  # name of the only head of a spec with `out_features`
+DEGREE = 3  # of the B-splines, whose number is that of the intervals plus DEGREE
 HEAD_INITIALIZERS = ("glorot", "small", "zero")
-# Narrower kernels leave gaps between the centers, wider ones are so alike that their
-# weights cannot be told apart: the Gram matrix of 16 kernels has condition 5.7 at
+# Narrower kernels leave gaps between the centers, and wider ones are nearly linearly
+# dependent: the condition number of the Gram matrix of 16 kernels is 5.7 at
 # sigma / h = 0.5, 58 at 0.707, 4.5e3 at 1 and 2e7 at 1.5.
 WIDTH_RATIOS = (0.25, 1.5)
-# Added to the variance of a hidden layer's features. Features that spread by less than
-# 1e-3 are left small instead of being amplified to one.
+# Added to the variance of a hidden layer's features, so that features with a standard
+# deviation below 1e-3 are not amplified to one.
 NORM_VARIANCE = 1e-6
-# Trained log-widths may leave their start by this much, a factor of 2e4 either way;
-# 1 / width overflows float32 beyond 88.
+# Trained log-widths are clipped to this distance from their initial value, a factor of
+# 2e4 in either direction. 1 / width overflows float32 beyond 88.
 LOG_WIDTH_RANGE = 10.0
 
 
@@ -49,15 +49,15 @@ class KANSpec:
     """Settings of a KAN: layer widths, kernels and their grids.
 
     Layers lead from `in_features` through the `hidden` widths to `out_features`, or to
-    several named `heads` in their place, which all read the last hidden layer.
+    several named `heads` instead, which all read the last hidden layer.
 
-    The centers of the first layer's `kernels` lie on `grid`, where raw inputs are
-    expected. Those of the others lie on `hidden_grid`, in front of which `norm`
-    standardizes the features of each point. The norm has no trained scale, which would
-    be a trained width under another name, and the first layer has none: it would turn
-    one or two coordinates into signs. `width_ratio` is sigma / h, the kernels' standard
-    deviation over the distance of their centers. The grid resolves half a period per h
-    in any case.
+    The centers of the first layer's `kernels` lie on `grid`, the expected range of the
+    inputs. Those of the other layers lie on `hidden_grid`, and `norm` standardizes the
+    features of each point before these layers. The norm has no trained scale, which
+    would be equivalent to a trained width. The inputs of the first layer are not
+    standardized, which would reduce one or two coordinates to signs. `width_ratio` is
+    sigma / h, the kernels' standard deviation over the distance of their centers. For
+    any ratio the grid resolves half a period per h.
 
     `trainable_kernels` makes every input's centers and log-widths parameters (Sonata,
     equations 9 and 10). It requires `basis="rbf"`. The paper argues against it
@@ -74,7 +74,7 @@ class KANSpec:
     grid: tuple[float, float] = (-1.0, 1.0)
     hidden_grid: tuple[float, float] = (-2.0, 2.0)
     width_ratio: float = math.sqrt(0.5)
-    base: bool = True  # the SiLU beside the kernels
+    base: bool = True  # adds the SiLU term
     norm: bool = True
     trainable_kernels: bool = False
     basis: str = "rbf"
@@ -89,14 +89,14 @@ class KANSpec:
         if (self.out_features is None) == (not self.heads):
             raise ValueError(
                 "a KAN has either out_features or heads, got out_features="
-                f"{self.out_features} and {len(self.heads)} heads; give one of them"
+                f"{self.out_features} and {len(self.heads)} heads; set one of them"
             )
         if self.out_features is not None and self.out_features < 1:
             raise ValueError(f"out_features={self.out_features} must be at least 1")
         if self.kernels < 2:
             raise ValueError(
-                f"kernels={self.kernels}: a grid has at least two centers, one at each "
-                "end"
+                f"kernels={self.kernels}: a grid needs at least two centers, one at "
+                "each end"
             )
         for name in ("grid", "hidden_grid"):
             low, high = getattr(self, name)
@@ -105,13 +105,13 @@ class KANSpec:
         if not WIDTH_RATIOS[0] <= self.width_ratio <= WIDTH_RATIOS[1]:
             raise ValueError(
                 f"width_ratio={self.width_ratio} is not within {WIDTH_RATIOS}: "
-                "narrower kernels leave gaps, wider ones cannot be told apart; 0.5 to "
-                "0.75 is sound"
+                "narrower kernels leave gaps and wider ones are nearly linearly "
+                "dependent; use 0.5 to 0.75"
             )
         if self.norm and any(width < 3 for width in self.hidden):
             raise ValueError(
-                f"hidden={self.hidden}: standardizing one feature leaves 0 and two "
-                "leaves signs; take widths of at least 3, or norm=False"
+                f"hidden={self.hidden}: standardizing reduces one feature to 0 and two "
+                "features to signs; use widths of at least 3, or norm=False"
             )
         names = [name for name, _ in self.heads]
         if len(set(names)) < len(names):
@@ -128,23 +128,24 @@ class KANSpec:
             raise ValueError(f"unknown basis {self.basis!r}; choose from {BASES}")
         if self.basis == "bspline" and self.kernels <= DEGREE:
             raise ValueError(
-                f"kernels={self.kernels}: cubic B-splines on one interval are four; "
-                f"take at least {DEGREE + 1}"
+                f"kernels={self.kernels} must be at least {DEGREE + 1}, the number of "
+                "cubic B-splines on a grid of one interval"
             )
         if self.basis == "bspline" and self.trainable_kernels:
             raise ValueError(
-                "trainable_kernels move Gaussians; B-splines lie on an even grid"
+                'trainable_kernels=True requires basis="rbf": B-spline knots are fixed '
+                "and uniform"
             )
 
     @property
     def read_outs(self) -> tuple[tuple[str, HeadSpec], ...]:
-        """The heads, or the one head that `out_features` stands for."""
+        """The heads. `out_features` is one head named "output"."""
         if self.out_features is None:
             return self.heads
         return ((OUTPUT, HeadSpec(self.out_features)),)
 
     def widths(self) -> tuple[int, ...]:
-        """Return the number of inputs of each layer. The last are those of the heads.
+        """Return the number of inputs of each layer, including the heads as the last.
 
         Returns:
           One integer for each layer.
@@ -166,13 +167,13 @@ class KANSpec:
 class KANLayer(NamedTuple):
     """Trained parameters of one layer."""
 
-    kernel: Float[Array, "kernels inputs outputs"]  # C, a weight for each Gaussian
-    base: Float[Array, "inputs outputs"] | None  # B, of the SiLU
+    kernel: Float[Array, "kernels inputs outputs"]  # C, weights of the kernels
+    base: Float[Array, "inputs outputs"] | None  # B, weights of the SiLU
     bias: Float[Array, " outputs"]
 
 
 class Kernels(NamedTuple):
-    """Centers and log(sqrt(2) sigma) of one layer's Gaussians, if they are trained."""
+    """Trained centers and log(sqrt(2) sigma) of the Gaussians of one layer."""
 
     center: Float[Array, "kernels inputs"]
     log_width: Float[Array, "kernels inputs"]
@@ -204,8 +205,8 @@ def spacing(spec: KANSpec, layer: int) -> float:
 def centers(spec: KANSpec, layer: int, dtype=jnp.float32) -> Float[Array, " kernels"]:
     """Return the fixed centers of a layer, or the initial ones if they are trained.
 
-    B-splines begin and end one interval outside the grid, on which they then sum to
-    one.
+    The centers of B-splines begin and end one interval outside the grid, so that the
+    splines sum to one on the grid.
 
     Args:
       spec: The network's settings.
@@ -238,12 +239,12 @@ def width(spec: KANSpec, layer: int) -> float:
 
 @checked
 def init(key: Key[Array, ""], spec: KANSpec, dtype=jnp.float32) -> KAN:
-    """Draw the parameters of a network.
+    """Initialize the parameters of a network.
 
-    Hidden layers and `out_features` are drawn as "glorot": the weights of the Gaussians
-    such that inputs spread over the grid give outputs of variance one. The initializers
-    "zero" and "small" of a head hold for kernel and base weights alike. Biases are
-    zero. All precisions draw the same numbers.
+    Hidden layers and `out_features` are initialized as "glorot": inputs that cover the
+    grid give outputs of variance one. The initializers "zero" and "small" of a head
+    apply to kernel and base weights. Biases are zero. All types start from the same
+    numbers.
 
     Args:
       key: A typed key, `jax.random.key(seed)`.
@@ -279,19 +280,19 @@ def init(key: Key[Array, ""], spec: KANSpec, dtype=jnp.float32) -> KAN:
 
 def _init_layer(spec, key, inputs, outputs, init, dtype):
     # Far from the ends, sum_g exp(-((x - mu_g) / w)^2)^2 is sqrt(pi) sigma / h on
-    # average over x: 1.25 at the default. FastKAN draws 0.1 whatever the inputs.
-    # The squares of cubic B-splines integrate to 151/315.
-    each = math.sqrt(math.pi) * spec.width_ratio
-    power = inputs * (151 / 315 if spec.basis == "bspline" else each)
+    # average over x: 1.25 at the default. FastKAN uses 0.1 for any number of inputs.
+    # The square of a cubic B-spline integrates to 151/315.
+    gaussian_power = math.sqrt(math.pi) * spec.width_ratio
+    power = inputs * (151 / 315 if spec.basis == "bspline" else gaussian_power)
     kernel_bound, base_bound = {
         "glorot": (math.sqrt(3 / power), math.sqrt(6 / (inputs + outputs))),
         "small": (mlp.SMALL, mlp.SMALL),
         "zero": (0.0, 0.0),
     }[init]
     shape = spec.kernels + 1, inputs, outputs
-    drawn = jax.random.uniform(key, shape, jnp.float32, -1, 1).astype(dtype)
-    base = base_bound * drawn[-1] if spec.base else None
-    return KANLayer(kernel_bound * drawn[:-1], base, jnp.zeros(outputs, dtype))
+    uniform = jax.random.uniform(key, shape, jnp.float32, -1, 1).astype(dtype)
+    base = base_bound * uniform[-1] if spec.base else None
+    return KANLayer(kernel_bound * uniform[:-1], base, jnp.zeros(outputs, dtype))
 
 
 @checked
@@ -304,13 +305,13 @@ def apply(
       spec: The network's settings.
       params: Parameters from `init`, of the type of `x`.
       x: Inputs with any leading axes, [..., in_features]. The first layer expects them
-        on `spec.grid`, and `hold` brings those outside near it.
+        on `spec.grid`. `hold` pulls inputs outside toward it.
 
     Returns:
       Outputs [..., out_features].
 
     Raises:
-      ValueError: Where `x` has another number of features, or the spec has heads.
+      ValueError: If `x` has another number of features, or the spec has heads.
     """
     if spec.out_features is None:
         raise ValueError(
@@ -334,17 +335,17 @@ def apply_heads(
       The output [..., width] of each head, by its name.
 
     Raises:
-      ValueError: Where `x` has another number of features.
+      ValueError: If `x` has another number of features.
     """
     if x.shape[-1] != spec.in_features:
         raise ValueError(
             f"kan.apply: `x` has shape {list(x.shape)}, expected [..., "
             f"{spec.in_features}] for in_features={spec.in_features}"
         )
-    kind = next(iter(params.heads.values())).kernel.dtype
-    if x.dtype != kind:
+    dtype = next(iter(params.heads.values())).kernel.dtype
+    if x.dtype != dtype:
         raise ValueError(
-            f"kan.apply: `x` is {x.dtype} but the parameters are {kind}; "
+            f"kan.apply: `x` is {x.dtype} but the parameters are {dtype}; "
             "cast one of them"
         )
     return after_first_layer(spec, params, first_layer_part(spec, params, x, 0))
@@ -356,9 +357,9 @@ def first_layer_part(
 ) -> Float[Array, "*batch outputs"]:
     """Compute the contribution of some inputs to the first layer, without bias.
 
-    A layer is a sum over its inputs, so parts that are equal for many evaluations (the
-    time for all points, a point's code for all times) are evaluated once. Pass the sum
-    of the parts to `after_first_layer`.
+    A layer is a sum over its inputs. Inputs that are equal in many evaluations (the
+    time for all points, the code of a point for all times) need to be evaluated only
+    once. Pass the sum of the contributions to `after_first_layer`.
 
     Args:
       spec: The network's settings.
@@ -392,7 +393,7 @@ def first_layer_part(
 def after_first_layer(
     spec: KANSpec, params: KAN, first: Float[Array, "*batch features"]
 ) -> dict[str, Float[Array, "*batch outputs"]]:
-    """Evaluate the heads from the sum of the first layer's parts.
+    """Evaluate the heads from the sum of the contributions to the first layer.
 
     Args:
       spec: The network's settings.
@@ -427,11 +428,12 @@ def standardize(
       features: Features, [..., features].
 
     Returns:
-      Features of the same shape. Their variance is one unless they spread by less than
-      1e-3.
+      Features of the same shape. Their variance is one, or less if their standard
+      deviation was below about 1e-3.
     """
-    # Features of 1e20 have a variance that float32 cannot hold, and would all become 0.
-    # A power of two changes no digit; below one, `NORM_VARIANCE` would overflow.
+    # The variance of features of 1e20 overflows float32, and they would all become 0.
+    # Dividing by a power of two is exact. It is at least one, because `NORM_VARIANCE`
+    # over its square would overflow otherwise.
     largest = jnp.max(jnp.abs(features), axis=-1, keepdims=True)
     scale = jnp.maximum(power_of_two(jax.lax.stop_gradient(largest)), 1)
     scaled = features / scale
@@ -445,16 +447,16 @@ def standardize(
 def hold(
     x: Float[Array, "*batch inputs"], grid: tuple[float, float], margin: float
 ) -> Float[Array, "*batch inputs"]:
-    """Pull inputs outside the grid toward it, smoothly.
+    """Clamp inputs smoothly to a neighborhood of the grid.
 
     Inside the grid `x` is unchanged. Outside the result tends to `margin` beyond the
     nearer end. The first two derivatives are continuous.
 
-    A Gaussian is 5e-2 of its height a quarter of a grid beyond the grid's end and 1e-12
-    three quarters beyond, so an input that strays there stops learning, and SiLU helps
-    on one side only. Codes that start 50 grids away fit a signal of 1 to 0.81 without a
-    remedy, to 0.65 with tanh and to 0.41 with this function, whose gradient falls from
-    1 like 0.6 (margin / distance)^2.
+    The outermost Gaussian has fallen to 5e-2 a quarter of a grid beyond the grid's end
+    and to 1e-12 three quarters beyond. An input there has almost no gradient, and SiLU
+    helps on one side only. Trained codes that start 50 grids away fit a signal of
+    amplitude 1 with an error of 0.81 if they are not clamped, of 0.65 with tanh and of
+    0.41 with this function, whose gradient decays as 0.6 (margin / distance)^2.
 
     Args:
       x: Inputs, [..., inputs].
@@ -469,24 +471,24 @@ def hold(
     offset = x - middle
     outside = jnp.abs(offset) > half
     distance = jnp.where(outside, jnp.abs(offset) - half, 0)
-    # Its slope is (1 + 3 e) (1 + 2 e + 3 e^2)^(-3/2), which nothing cancels in; that of
-    # e / sqrt(1 + e^2), a difference of equals, is noise in float32 from e = 3000. Far
-    # out in 1 / e: the square of e would overflow, and the gradient be 0 from 1e15 on.
+    # The derivative is (1 + 3 e) (1 + 2 e + 3 e^2)^(-3/2), which does not cancel. That
+    # of e / sqrt(1 + e^2) cancels and is noise in float32 from e = 3000 on. Far from
+    # the grid the formula is in 1 / e, because the square of e would overflow and the
+    # gradient would be 0 from 1e15 on.
     far = distance > margin
     excess = jnp.where(far, 0, distance) / margin
     inverse = margin / jnp.where(far, distance, margin)
-    left = jnp.where(
+    remainder = jnp.where(
         far,
         inverse * jax.lax.rsqrt(3 + (2 + inverse) * inverse),
         jax.lax.rsqrt(1 + (2 + 3 * excess) * excess),
     )
-    risen = 1 - left
-    beyond = middle + jnp.sign(offset) * (half + margin * risen)
-    return jnp.where(outside, beyond, x)
+    clamped = middle + jnp.sign(offset) * (half + margin * (1 - remainder))
+    return jnp.where(outside, clamped, x)
 
 
 def _layer(spec, params, index):
-    """Return one layer and its kernels. The heads, side by side, are the last layer."""
+    """Return one layer and its kernels. The concatenated heads are the last layer."""
     kernels = None if params.kernels is None else params.kernels[index]
     if index < len(params.hidden):
         return params.hidden[index], kernels
@@ -496,46 +498,49 @@ def _layer(spec, params, index):
 
 
 def _sum_over_inputs(spec, index, layer, kernels, inputs):
-    """A layer without its bias."""
+    """Evaluate a layer without its bias."""
     dtype = inputs.dtype
-    # One standard deviation beyond the end the outermost Gaussian is steepest. The
-    # last B-spline has its center one interval beyond: all gradients are there still.
+    # The outermost Gaussian is steepest one standard deviation beyond the end. The
+    # last B-spline has its center one interval beyond, where all gradients exist.
     margin = width(spec, index)
     if spec.basis == "rbf":
         margin /= math.sqrt(2)
-    held = hold(inputs, spec.grid_of(index), margin)
+    clamped = hold(inputs, spec.grid_of(index), margin)
     if kernels is None:
         center = centers(spec, index, dtype)
         per_width = jnp.full_like(center, 1 / width(spec, index))
     else:
         center = kernels.center
-        start = math.log(width(spec, index))
-        bounds = start - LOG_WIDTH_RANGE, start + LOG_WIDTH_RANGE
+        initial = math.log(width(spec, index))
+        bounds = initial - LOG_WIDTH_RANGE, initial + LOG_WIDTH_RANGE
         per_width = jnp.exp(-jnp.clip(kernels.log_width, *bounds))
 
     gaussian = spec.basis == "rbf"
 
-    # One kernel's Gaussians are made, used and forgotten. Forward and backward of one
-    # layer, 8192 x 64 -> 64, one core, ms for 8, 16, 32 kernels: einsum over a basis
-    # [n, in, kernels] 96, 200, 396 (117 to 470 MB); the basis flat for one product 72,
-    # 172, 356; kernel by kernel, kept for the backward pass, 24, 87, 196 (32 to
-    # 152 MB); with a hand-written derivative 24, 86, 205; a scan 26, 50, 106 (6 MB).
-    # With held inputs it is 32, 59, 115 (23 MB) where the einsum takes 113, 221, 421.
-    # Three layers 64, 64, 64 -> 9 of 10k points: einsum 284, flat 251, kept 187, this
-    # 92; in blocks of 512 that are recomputed 191, 126, 112, 112, so only memory asks
-    # for blocks. Four kernels at a time save a quarter at narrow widths. No custom
-    # derivative, so forward mode works.
-    # The scan already keeps XLA from merging the two passes.
+    # A scan over kernels evaluates the Gaussians of one kernel at a time and recomputes
+    # them in the backward pass. Forward and backward pass of one layer 8192 x 64 -> 64
+    # on one core, in ms for 8, 16 and 32 kernels:
+    #   einsum over a basis [n, in, kernels]         96  200  396   117 to 470 MB
+    #   one product with the flattened basis         72  172  356
+    #   kernel by kernel, stored for the backward    24   87  196   32 to 152 MB
+    #   the same with a hand-written derivative      24   86  205
+    #   scan                                         26   50  106   6 MB
+    # With clamped inputs the scan takes 32, 59, 115 (23 MB) and the einsum 113, 221,
+    # 421. Three layers 64, 64, 64 -> 9 of 10k points: einsum 284, flattened 251, stored
+    # 187, scan 92, and in recomputed blocks of 512 points 191, 126, 112, 112, so blocks
+    # save only memory. Unrolling by 4 saves a quarter at narrow widths. There is no
+    # custom derivative, so forward mode works. `prevent_cse` is not needed, because XLA
+    # does not merge the passes of a scan.
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def add_kernel(total, kernel):
         center, per_width, weight = kernel
-        distance = (held - center) * per_width
+        distance = (clamped - center) * per_width
         value = jnp.exp(-(distance**2)) if gaussian else bsplines.cubic(distance)
         return total + value @ weight, None
 
-    nothing = jnp.zeros((*inputs.shape[:-1], layer.bias.shape[0]), dtype)
+    zero = jnp.zeros((*inputs.shape[:-1], layer.bias.shape[0]), dtype)
     total, _ = jax.lax.scan(
-        add_kernel, nothing, (center, per_width, layer.kernel), unroll=4
+        add_kernel, zero, (center, per_width, layer.kernel), unroll=4
     )
     if layer.base is not None:
         total = total + jax.nn.silu(inputs) @ layer.base

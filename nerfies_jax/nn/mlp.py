@@ -19,8 +19,8 @@ ACTIVATIONS = {
     "none": lambda x: x,
 }
 INITIALIZERS = ("glorot", "he", "zero", "small")
-# Half-width of "small": displacements of 1e-4 scene units per unit of feature, as
-# Nerfies' heads, but two-sided; its one-sided draw pushes every point the same way.
+# Half-width of "small": displacements of 1e-4 scene units per unit of feature, as in
+# the heads of Nerfies. Its range is one-sided, which moves all points in one direction.
 SMALL = 1e-4
 
 
@@ -82,7 +82,7 @@ class MLPSpec:
         if outside:
             raise ValueError(
                 f"skips={self.skips}: layer {outside[0]} is not in 1 .. "
-                f"{self.depth - 1}; the first layer reads the input anyway"
+                f"{self.depth - 1}; the first layer always reads the input"
             )
         if self.activation not in ACTIVATIONS:
             raise ValueError(
@@ -103,7 +103,7 @@ class MLPSpec:
 def init(spec: MLPSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
     """Initialize the parameters, with zero biases.
 
-    All precisions draw the same numbers.
+    All types start from the same numbers.
 
     Args:
       spec: The network's settings.
@@ -146,8 +146,8 @@ def init_layer(
         "zero": 0.0,
         "small": SMALL,
     }
-    drawn = jax.random.uniform(key, (inputs, outputs), jnp.float32, -1, 1)
-    return Layer(bounds[init] * drawn.astype(dtype), jnp.zeros(outputs, dtype))
+    uniform = jax.random.uniform(key, (inputs, outputs), jnp.float32, -1, 1)
+    return Layer(bounds[init] * uniform.astype(dtype), jnp.zeros(outputs, dtype))
 
 
 def hidden_features(
@@ -223,8 +223,8 @@ def with_known(spec: MLPSpec, params: MLP, known: Float[Array, " known"]) -> MLP
     def fold(index, layer):
         if index != 0 and index not in spec.skips:
             return layer
-        read = layer.weight[-len(known) :]
-        return Layer(layer.weight[: -len(known)], layer.bias + known @ read)
+        weight = layer.weight[-len(known) :]
+        return Layer(layer.weight[: -len(known)], layer.bias + known @ weight)
 
     hidden = tuple(fold(*item) for item in enumerate(params.hidden))
     heads = params.heads

@@ -4,14 +4,14 @@ A box of space is represented by three planes (xy, xz, yz), and with time by thr
 (xt, yt, zt), so memory grows with the square of the side. Tri-planes are summed (Chan
 et al. 2022, arXiv:2112.07945). HexPlane (Cao and Johnson 2023, arXiv:2301.09632) and
 K-Planes (Fridovich-Keil et al. 2023, arXiv:2301.10241, equation 2) multiply. The
-equations here are those of K-Planes, since those of the others were not at hand.
-Functions take one point, and callers `jax.vmap` them.
+equations here are those of K-Planes, because those of the other papers were not
+available. Functions take one point. Use `jax.vmap` for several.
 
-A row holds all features of a vertex. On one core, 10,000 points in a plane of 64 x 64
-with 16 features take, forward and with the gradient, 0.43 and 3.2 ms as one row, 0.47
-and 5.0 as eight rows of two, and 0.57 and 2.3 as sixteen rows of one in as many tables.
-Features that all points read at one time are a line and take 0.12 and 0.48 ms
-(`at_time`).
+A table row holds all features of a vertex. On one core, 10,000 points in a plane of
+64 x 64 vertices with 16 features take 0.43 ms, and 3.2 ms with the gradient, in this
+layout. Eight tables of two features take 0.47 and 5.0 ms, and sixteen tables of one
+feature 0.57 and 2.3 ms. If all points share one time, the planes of time are first
+interpolated to lines (`at_time`), which take 0.12 and 0.48 ms.
 """
 
 import dataclasses
@@ -24,10 +24,10 @@ from jaxtyping import Array, Float, Int, Key
 
 COMBINATIONS = ("product", "sum")
 OUTSIDE = ("clamp", "refuse")
-MAX_VERTICES = 2**15 + 1  # along an axis: a row of a plane is counted in int32
+MAX_VERTICES = 2**15 + 1  # along an axis, so that row indices of a plane fit int32
 PAIRS = tuple(itertools.combinations(range(3), 2))  # xy, xz, yz
-# Features of space to start from, as published; those of time start where they change
-# nothing.
+# Ranges of the initial features of space, as published. Those of time start with the
+# neutral element.
 FIRST = {"product": (0.1, 0.5), "sum": (-0.1, 0.1)}
 
 
@@ -35,17 +35,17 @@ FIRST = {"product": (0.1, 0.5), "sum": (-0.1, 0.1)}
 class PlanesSpec:
     """Settings of feature planes over [0, 1]^3, or [0, 1]^4 if there are `moments`.
 
-    `vertices` counts those along an axis of space at the first level. Every level has
-    one of the `multiples` of it, and all levels have as many `moments`. "product"
+    Each level has `vertices` times one of `multiples` vertices along an axis of space.
+    All levels have `moments` vertices along time. The `combination` "product"
     multiplies the planes of a level, so that one plane can switch off the features of
-    another. "sum" adds them. Outside the box a point has the features of the nearest
-    point in it ("clamp"), or NaN ("refuse"), at which a run stops with the name of the
-    array.
+    another. "sum" adds them. A point `outside` the box has the features of the nearest
+    point of the box ("clamp") or NaN ("refuse"), which ends a run with an error that
+    names the array.
     """
 
     vertices: int = 64
     multiples: tuple[int, ...] = (1, 2, 4)
-    moments: int | None = None  # along time; None: three planes of space alone
+    moments: int | None = None  # vertices along time; None for planes of space only
     features: int = 16  # of each level
     combination: str = "product"
     outside: str = "clamp"
@@ -63,8 +63,8 @@ class PlanesSpec:
             )
         if self.moments is not None and not 2 <= self.moments <= MAX_VERTICES:
             raise ValueError(
-                f"moments={self.moments} must lie between 2 and {MAX_VERTICES}; None "
-                "leaves the time out"
+                f"moments={self.moments} must lie between 2 and {MAX_VERTICES}, or be "
+                "None for planes without time"
             )
         for name, options in (("combination", COMBINATIONS), ("outside", OUTSIDE)):
             if getattr(self, name) not in options:
@@ -74,7 +74,7 @@ class PlanesSpec:
 
     @property
     def levels(self) -> int:
-        """Number of levels, which open one by one from coarse to fine."""
+        """Number of levels. Training may enable them one by one from coarse to fine."""
         return len(self.multiples)
 
     def width(self, dimensions: int) -> int:
@@ -92,7 +92,8 @@ class PlanesSpec:
         wanted = 3 if self.moments is None else 4
         if dimensions != wanted:
             raise ValueError(
-                f"these planes are of {wanted} dimensions, not of {dimensions}"
+                f"planes with moments={self.moments} have {wanted} dimensions, but the "
+                f"points have {dimensions}"
             )
         return len(self.multiples) * self.features
 
@@ -109,7 +110,7 @@ Lines = tuple[tuple[Float[Array, "_ features"], ...], ...]
 
 
 def init(spec: PlanesSpec, key: Key[Array, ""], dtype=jnp.float32) -> tuple[Level, ...]:
-    """Initialize the planes: space uniformly, time to the neutral element.
+    """Initialize planes of space uniformly and planes of time to the neutral element.
 
     Args:
       spec: Settings of the planes.
@@ -127,21 +128,24 @@ def init(spec: PlanesSpec, key: Key[Array, ""], dtype=jnp.float32) -> tuple[Leve
         side = spec.vertices * multiple
         shape = side, side, spec.features
         space = tuple(
-            jax.random.uniform(one, shape, jnp.float32, low, high).astype(dtype)
-            for one in jax.random.split(level_key, len(PAIRS))
+            jax.random.uniform(plane_key, shape, jnp.float32, low, high).astype(dtype)
+            for plane_key in jax.random.split(level_key, len(PAIRS))
         )
-        rest = 1 if spec.combination == "product" else 0
-        still = jnp.full((spec.moments or 0, side, spec.features), rest, dtype)
-        levels.append(Level(space, () if spec.moments is None else (still,) * 3))
+        time = ()
+        if spec.moments is not None:
+            neutral = 1 if spec.combination == "product" else 0
+            plane = jnp.full((spec.moments, side, spec.features), neutral, dtype)
+            time = (plane,) * 3
+        levels.append(Level(space, time))
     return tuple(levels)
 
 
 def encode(
     spec: PlanesSpec, levels: tuple[Level, ...], place: Float[Array, " dimensions"]
 ) -> Float[Array, " encoded"]:
-    """Interpolate the features of one place, the first level first.
+    """Interpolate the features of one position, level by level from the first.
 
-    If many points share one time, `at_time` and `features` give the same faster.
+    If many points share one time, `at_time` and `features` compute the same faster.
 
     Args:
       spec: Settings of the planes.
@@ -152,23 +156,26 @@ def encode(
       Features, [levels * features].
     """
     spec.width(len(place))
-    found = space_features(spec, levels, place[:3])
+    encoded = space_features(spec, levels, place[:3])
     if spec.moments is not None:
-        moment, *axes = place[3], *place[:3]
-        time = [
-            [bilinear(plane, moment, x) for plane, x in zip(of.time, axes, strict=True)]
-            for of in levels
+        time, *axes = place[3], *place[:3]
+        by_level = [
+            [
+                bilinear(plane, time, x)
+                for plane, x in zip(level.time, axes, strict=True)
+            ]
+            for level in levels
         ]
-        now = jnp.stack([_combined(spec, level) for level in time])
-        inside = (moment >= 0) & (moment <= 1)
-        found = _held(spec, _combined(spec, [found, now]), inside)
-    return found.reshape(-1)
+        of_time = jnp.stack([_combined(spec, planes) for planes in by_level])
+        inside = (time >= 0) & (time <= 1)
+        encoded = _refuse_outside(spec, _combined(spec, [encoded, of_time]), inside)
+    return encoded.reshape(-1)
 
 
 def space_features(
     spec: PlanesSpec, levels: tuple[Level, ...], place: Float[Array, "3"]
 ) -> Float[Array, "levels features"]:
-    """Interpolate the planes of space alone, which are the same at all times.
+    """Interpolate the planes of space, whose features do not depend on time.
 
     Args:
       spec: Settings of the planes.
@@ -178,7 +185,7 @@ def space_features(
     Returns:
       Features, [levels, features].
     """
-    found = [
+    by_level = [
         [
             bilinear(plane, place[one], place[other])
             for (one, other), plane in zip(PAIRS, level.space, strict=True)
@@ -186,11 +193,12 @@ def space_features(
         for level in levels
     ]
     inside = jnp.all((place >= 0) & (place <= 1))
-    return _held(spec, jnp.stack([_combined(spec, one) for one in found]), inside)
+    encoded = jnp.stack([_combined(spec, planes) for planes in by_level])
+    return _refuse_outside(spec, encoded, inside)
 
 
 def at_time(levels: tuple[Level, ...], moment: Float[Array, ""]) -> Lines:
-    """Evaluate the planes of time at one time, which all points can share.
+    """Interpolate the planes of time to lines at one time, which points can share.
 
     Args:
       levels: The planes.
@@ -205,7 +213,7 @@ def at_time(levels: tuple[Level, ...], moment: Float[Array, ""]) -> Lines:
 def time_features(
     spec: PlanesSpec, lines: Lines, place: Float[Array, "3"]
 ) -> Float[Array, "levels features"]:
-    """Interpolate the planes of time at one place.
+    """Interpolate the planes of time at one position.
 
     Args:
       spec: Settings of the planes.
@@ -215,11 +223,11 @@ def time_features(
     Returns:
       Features, [levels, features].
     """
-    found = [
+    by_level = [
         [linear(line, x) for line, x in zip(level, place, strict=True)]
         for level in lines
     ]
-    return jnp.stack([_combined(spec, level) for level in found])
+    return jnp.stack([_combined(spec, level) for level in by_level])
 
 
 def features(
@@ -249,7 +257,7 @@ def bilinear(
 
     The result is exact at a vertex and continuous across the edges of a cell, where the
     gradient jumps. On an edge it is that of the cell above. A position outside is
-    clamped to the nearest inside, with zero gradient across the end.
+    clamped to the box, with zero gradient along the clamped axis.
 
     Args:
       plane: Features of the vertices, [first, second, features].
@@ -319,8 +327,8 @@ def time_smoothness(
       K-Planes, arXiv:2301.10241, equation 4.
     """
     if plane.shape[0] < 3:
-        return jnp.zeros((), plane.dtype)  # of nothing the mean is NaN
-    # Differences of differences: each of close values is exact, their sum is not.
+        return jnp.zeros((), plane.dtype)  # the mean of an empty array is NaN
+    # Differences of differences, because p₊ + p₋ - 2p rounds the sum of close values.
     return jnp.mean(jnp.square(jnp.diff(jnp.diff(plane, axis=0), axis=0)))
 
 
@@ -340,18 +348,18 @@ def l1_time_planes(
     References:
       K-Planes, arXiv:2301.10241, equation 5 (L1).
     """
-    off = plane - 1
-    # Not `abs`, whose gradient at zero is one: planes start at one, and all that rests
-    # would be pushed one way.
-    return jnp.mean(off * jnp.sign(off))
+    difference = plane - 1
+    # The gradient of `abs` at zero is one in JAX. Planes start at one, and all static
+    # features would be pushed in the same direction.
+    return jnp.mean(difference * jnp.sign(difference))
 
 
 def _cell(
     place: Float[Array, ""], vertices: int
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The vertex before a place in [0, 1], and how far beyond it the place is."""
+    """Return the vertex before a position in [0, 1], and the fraction to the next."""
     scaled = jnp.clip(place, 0, 1) * (vertices - 1)
-    # The far end belongs to the last cell.
+    # The position 1 belongs to the last cell.
     before = jnp.clip(jnp.floor(scaled), 0, vertices - 2)
     return before.astype(jnp.int32), scaled - before
 
@@ -363,7 +371,7 @@ def _combined(spec, parts):
     return total
 
 
-def _held(spec, found, inside):
+def _refuse_outside(spec, encoded, inside):
     if spec.outside == "clamp":
-        return found
-    return jnp.where(inside, found, jnp.full_like(found, jnp.nan))
+        return encoded
+    return jnp.where(inside, encoded, jnp.full_like(encoded, jnp.nan))

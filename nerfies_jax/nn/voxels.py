@@ -1,12 +1,12 @@
 """Dense voxel grid with multi-distance interpolation, as in TiNeuVox.
 
-Fang et al. 2022, arXiv:2205.15285. The text with its equations was not at hand, so its
-code (hustvl/TiNeuVox, `mult_dist_interp`) is followed. The grid is interpolated between
-its own vertices, between every second and between every fourth, so that one sample
-trains vertices far enough away to learn from points that a small network moves. The
-three share one table, which has the size of the finest from the first step. The
-published grid grows during training. Here strides may open one after the other
-(`encode`).
+Fang et al. 2022, arXiv:2205.15285. The implementation follows the published code
+(hustvl/TiNeuVox, `mult_dist_interp`), because the paper's equations were not available.
+The grid is interpolated between its own vertices, between every second and between
+every fourth, so that a sample also trains vertices farther away, from which points
+displaced by a small network can learn. The three strides share one table, which has its
+full size from the first step. The published grid grows during training. Here the
+weights of the strides may be annealed one after the other (`encode`).
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from nerfies_jax.nn import encoding, grids
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.nn.grids import Tables
 
-MOST_ROWS = 2**26  # 1.6 GB of six floats
+MOST_ROWS = 2**26  # 1.6 GB with six floats per row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,14 +27,14 @@ class VoxelGridSpec:
     """Settings of a dense grid over a box. The defaults are those of TiNeuVox-B.
 
     `strides` are from coarse to fine. Features are followed by their positional
-    encoding with `bands` bands, like coordinates. The box is that of
-    `grids.HashGridSpec`. A point outside has the features of the nearest point in the
-    box, where the paper drops it. With `contract` space is contracted, which leaves the
-    box half the vertices along a side.
+    encoding with `bands` bands, as coordinates are. The box is that of
+    `grids.HashGridSpec`. A point outside has the features of the nearest point of the
+    box. The paper ignores such points. With `contract` space is contracted, so that
+    half of the vertices along a side are inside the box.
     """
 
     cells: int = 160  # along an axis
-    features: int = 6  # floats of a row
+    features: int = 6  # floats per row
     strides: tuple[int, ...] = (4, 2, 1)
     bands: int = 2
     half_side: float = 1.0
@@ -50,16 +50,16 @@ class VoxelGridSpec:
         wrong = [s for s in self.strides if s < 1 or self.cells % s]
         if wrong or not self.strides:
             raise ValueError(
-                f"strides={self.strides} of {self.cells} cells: give at least one, and "
-                "each must divide the number of cells"
+                f"strides={self.strides} must not be empty, and each must divide "
+                f"cells={self.cells}"
             )
         if not 0 < self.half_side < math.inf:
             raise ValueError(f"half_side={self.half_side} must be positive and finite")
-        EncodingSpec(self.bands)  # refuses wrong bands
+        EncodingSpec(self.bands)  # checks the number of bands
 
     @property
     def levels(self) -> int:
-        """Number of strides, which open one by one from coarse to fine."""
+        """Number of strides. Training may enable them one after the other."""
         return len(self.strides)
 
     def width(self, dimensions: int) -> int:
@@ -75,7 +75,9 @@ class VoxelGridSpec:
           ValueError: If `dimensions` is not 3.
         """
         if dimensions != 3:
-            raise ValueError(f"a voxel grid is of 3 dimensions, not of {dimensions}")
+            raise ValueError(
+                f"a voxel grid has 3 dimensions, but the points have {dimensions}"
+            )
         return EncodingSpec(self.bands).width(self.levels * self.features)
 
 
@@ -113,10 +115,10 @@ def encode(
     """
     (table,) = tables
     place = grids.unit_place(point, spec.half_side, spec.contract)
-    found = [
+    by_stride = [
         grids.level_features(table, place, spec.cells, stride)
         for stride in spec.strides
     ]
     if window is not None:
-        found = [part * window[level] for level, part in enumerate(found)]
-    return encoding.encode(EncodingSpec(spec.bands), jnp.concatenate(found), None)
+        by_stride = [part * window[level] for level, part in enumerate(by_stride)]
+    return encoding.encode(EncodingSpec(spec.bands), jnp.concatenate(by_stride), None)

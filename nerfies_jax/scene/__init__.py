@@ -1,1 +1,1 @@
-"""A radiance field and its losses composed to a model, and presets."""
+"""Radiance-field models that combine a field, effects and losses, and presets."""

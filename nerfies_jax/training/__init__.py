@@ -2,5 +2,5 @@
 
 import lazy_loader
 
-# Modules that `nerfies_jax` shows; each is loaded when it is used.
+# Modules of the public API, imported on first use.
 __getattr__, __dir__, __all__ = lazy_loader.attach(__name__, ["losses"])

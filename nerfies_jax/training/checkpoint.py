@@ -1,4 +1,4 @@
-"""Save and restore runs as orbax directories with metadata about their origin."""
+"""Save and restore runs as orbax directories with metadata."""
 
 import concurrent.futures
 import contextlib
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import ml_dtypes  # noqa: F401  (NumPy's names for bfloat16 and its kin)
+import ml_dtypes  # noqa: F401  (registers bfloat16 and similar types with NumPy)
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -24,7 +24,7 @@ from nerfies_jax.training.specs import as_json, differences
 PyTree = Any
 
 FORMAT = 2
-SPARE_BYTES = 2**20  # for the notes beside the arrays
+SPARE_BYTES = 2**20  # for the metadata
 _UNFINISHED = ".unfinished"
 _STATE, _ABOUT = "state", "about.json"
 
@@ -34,8 +34,8 @@ class Restored(NamedTuple):
 
     state: PyTree
     step: int
-    record: Any  # what the loop keeps beside the state: its history, as JSON values
-    about: dict[str, Any]  # revision, versions, spec, checksums
+    record: Any  # further JSON values of the training loop, such as its history
+    about: dict[str, Any]  # metadata: revision, versions, spec, checksums
 
 
 class SaveError(ValueError):
@@ -45,9 +45,9 @@ class SaveError(ValueError):
 class Checkpoints:
     """Writer of the checkpoints of one run, which keeps the newest `keep`.
 
-    A directory appears under its final name only once everything in it is on disk, so a
+    A directory gets its final name only when all of its contents are on disk, so a
     killed process leaves the previous checkpoint intact. Saving copies the arrays and
-    writes in the background. A write that fails raises SaveError at the next `save`,
+    writes in the background. If writing fails, SaveError is raised at the next `save`,
     `wait` or `close`, unless `failure` has returned it.
     """
 
@@ -60,13 +60,14 @@ class Checkpoints:
         after: int | None = None,
         beside: pathlib.Path | None = None,
     ):
-        """`after` is the step the run goes on from, None for a new run.
+        """Prepare the folder.
 
-        Nothing is saved once the file `beside` is gone, without which the checkpoints
-        are of no use.
+        `after` is the step from which the run is resumed, None for a new run. `beside`
+        is a file without which checkpoints are useless: nothing is saved once it has
+        been deleted.
         """
         if keep < 1:
-            raise ValueError(f"at least one checkpoint must be kept, got keep={keep}")
+            raise ValueError(f"keep={keep} must be at least 1 checkpoint")
         self.folder = pathlib.Path(folder).absolute()
         self._keep, self._beside = keep, beside
         self._about = {"format": FORMAT, "spec": as_json(spec), **provenance()}
@@ -78,16 +79,15 @@ class Checkpoints:
                 "resume it, or choose another folder"
             )
         for step in present:
-            if (
-                after is not None and step > after
-            ):  # left behind by a fall-back, never to be continued
+            # Left over after falling back to an older checkpoint.
+            if after is not None and step > after:
                 shutil.rmtree(self.folder / str(step))
         self._remove_unfinished()
         self._writer = concurrent.futures.ThreadPoolExecutor(1, "checkpoints")
         self._writing: concurrent.futures.Future | None = None
 
     def save(self, state: PyTree, step: int, record: Any = None) -> None:
-        """Save the state after `step` completed steps, unless that is already saved.
+        """Save the state after `step` completed steps, unless it is already saved.
 
         Args:
           state: Training state, a pytree of arrays.
@@ -95,7 +95,7 @@ class Checkpoints:
           record: JSON values that are stored with the state, such as the history.
 
         Raises:
-          SaveError: If the save before this one failed.
+          SaveError: If the previous save failed.
         """
         self.wait()
         if latest(self.folder) == step and not self._is_orphaned():
@@ -150,30 +150,32 @@ class Checkpoints:
             partial.rename(self.folder / str(step))
             for old in steps(self.folder)[: -self._keep]:
                 shutil.rmtree(self.folder / str(old))
-        except Exception as error:  # orbax and tensorstore raise whatever they meet
+        except Exception as error:  # orbax and tensorstore raise many types
             self._remove_unfinished()
             reason = getattr(error, "strerror", None) or str(error) or repr(error)
-            whole = latest(self.folder)
-            left = (
-                "none is whole" if whole is None else f"that of step {whole} is whole"
+            last = latest(self.folder)
+            previous = (
+                "there is no earlier checkpoint"
+                if last is None
+                else f"the checkpoint of step {last} is intact"
             )
             raise SaveError(
                 f"cannot write checkpoints to {self.folder}: "
-                f"{reason.splitlines()[0]}; {left}"
+                f"{reason.splitlines()[0]}; {previous}"
             ) from error
 
     def _check_room(self, leaves):
-        """Raise OSError where a write is bound to fail, before orbax begins it."""
+        """Raise OSError if writing is bound to fail, before orbax starts."""
         if self._is_orphaned():
-            raise FileNotFoundError(f"{self._beside} is gone")
+            raise FileNotFoundError(f"{self._beside} no longer exists")
         with tempfile.TemporaryFile(dir=self.folder):
             pass
         needed = sum(array.nbytes for array in leaves.values()) + SPARE_BYTES
         free = shutil.disk_usage(self.folder).free
         if free < needed:
             raise OSError(
-                f"no space: it may take {needed / 1e6:.1f} MB and {free / 1e6:.1f} MB "
-                "are free"
+                f"no space: up to {needed / 1e6:.1f} MB are needed and "
+                f"{free / 1e6:.1f} MB are free"
             )
 
     def _is_orphaned(self):
@@ -189,38 +191,38 @@ class Checkpoints:
     def __exit__(self, kind, *_):
         if kind is None:
             self.close()
-        else:  # what ended the block is what to tell
+        else:  # do not replace the exception that ended the block
             self._writer.shutdown()
 
 
 def _write_arrays(folder, leaves):
-    """Through orbax's writer of arrays alone.
+    """Write arrays by orbax's handler for arrays only.
 
-    Its checkpointers and managers make their threads wait for each other by the wall
-    clock: after a failed write they keep the process for up to 300 s, and a clock that
-    is set ahead fails the save.
+    The threads of its checkpointers and managers wait for each other by the wall clock.
+    After a failed write they block the process for up to 300 s, and a save fails if the
+    clock is set forward.
     """
     folder.mkdir(parents=True)
-    filled = {name: array for name, array in leaves.items() if array.size}
-    with _quiet_orbax(), contextlib.closing(_array_files()) as files:
-        # orbax refuses empty arrays
-        files.save(folder, args=ocp.args.StandardSave(filled))
-        files.finalize(folder)
+    # orbax refuses empty arrays
+    nonempty = {name: array for name, array in leaves.items() if array.size}
+    with _quiet_orbax(), contextlib.closing(_array_handler()) as handler:
+        handler.save(folder, args=ocp.args.StandardSave(nonempty))
+        handler.finalize(folder)
 
 
 def _read_arrays(folder, expected):
-    with contextlib.closing(_array_files()) as files:
+    with contextlib.closing(_array_handler()) as handler:
         args = ocp.args.StandardRestore(expected)
-        return files.restore(folder, args=args)
+        return handler.restore(folder, args=args)
 
 
-def _array_files():
+def _array_handler():
     return ocp.StandardCheckpointHandler()
 
 
 @contextlib.contextmanager
 def _quiet_orbax():
-    """Without orbax's log: it prints a traceback for every array it cannot write."""
+    """Silence orbax's log, which prints a traceback for each array it cannot write."""
     logger = logging.getLogger("absl")
     before = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -249,7 +251,7 @@ def steps(folder) -> list[int]:
     folder = pathlib.Path(folder)
     if not folder.is_dir():
         return []
-    # A checkpoint being written has a suffix until it is whole.
+    # A checkpoint has a suffix until it is complete.
     names = (path.name for path in folder.iterdir())
     return sorted(int(name) for name in names if name.isascii() and name.isdigit())
 
@@ -290,11 +292,12 @@ def restore(folder, example: PyTree, spec, *, step: int | None = None) -> Restor
     present = steps(folder)
     if step is not None and step not in present:
         raise ValueError(
-            f"{folder} has no checkpoint of step {step}, only of {present}"
+            f"{folder} has no checkpoint of step {step}; choose from {present}"
         )
     if not present:
         raise ValueError(
-            f"{folder} holds no checkpoint; the run saves its first when it begins"
+            f"{folder} holds no checkpoint; a run saves the first one when training "
+            "begins"
         )
     for candidate in [step] if step is not None else reversed(present):
         try:
@@ -302,8 +305,8 @@ def restore(folder, example: PyTree, spec, *, step: int | None = None) -> Restor
         except _Damaged as error:
             message = f"checkpoint {folder / str(candidate)} cannot be read ({error})"
             if step is not None or candidate == present[0]:
-                raise ValueError(f"{message}; none that is older is left") from error
-            warnings.warn(f"{message}; trying the one before", RuntimeWarning, 2)
+                raise ValueError(f"{message}; there is no older one") from error
+            warnings.warn(f"{message}; trying an older one", RuntimeWarning, 2)
             continue
         changed = differences(about["spec"], as_json(spec))
         if changed:
@@ -317,15 +320,15 @@ def restore(folder, example: PyTree, spec, *, step: int | None = None) -> Restor
 
 
 class _Damaged(Exception):
-    """The contents of a checkpoint are not those that were written."""
+    """The contents of a checkpoint differ from those that were written."""
 
 
-class _Foreign(ValueError):
-    """A checkpoint that a newer version wrote."""
+class _NewerFormat(ValueError):
+    """A checkpoint was written by a newer version."""
 
 
 def _encode(state):
-    """Leaves by path as host arrays of their own, and what orbax does not keep."""
+    """Copy leaves to the host by path, with metadata that orbax does not store."""
     leaves, about = {}, {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]:
         name = jax.tree_util.keystr(path, simple=True, separator=".")
@@ -333,7 +336,7 @@ def _encode(state):
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             note["key"] = str(jax.random.key_impl(leaf))
             leaf = jax.random.key_data(leaf)
-        # A copy: the loop overwrites its arrays while orbax still writes.
+        # A copy, because the loop overwrites its arrays while orbax writes.
         leaves[name] = array = np.array(leaf, copy=True)
         about[name] = note | {"dtype": str(array.dtype), "shape": list(array.shape)}
     return leaves, about
@@ -344,25 +347,25 @@ def _checksum(array):
 
 
 def _text_checksum(about):
-    """Checksum of the metadata without its own entry, unchanged by JSON."""
-    rest = {key: value for key, value in about.items() if key != "crc32"}
-    return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
+    """Compute the checksum of the metadata without its own entry."""
+    content = {key: value for key, value in about.items() if key != "crc32"}
+    return zlib.crc32(json.dumps(content, sort_keys=True).encode())
 
 
 def _read_about(folder):
     about = json.loads((folder / _ABOUT).read_text())
     if isinstance(about.get("format"), int) and about["format"] > FORMAT:
-        raise _Foreign(
-            f"checkpoint {folder} is of format {about['format']} and this version "
-            f"reads up to {FORMAT}; resume it with the version that saved it"
+        raise _NewerFormat(
+            f"checkpoint {folder} has format {about['format']}, but this version reads "
+            f"formats up to {FORMAT}; resume the run with the version that saved it"
         )
     if about["crc32"] != _text_checksum(about):
-        raise _Damaged("its notes are not what was saved")
+        raise _Damaged("its metadata differ from what was saved")
     return about
 
 
 def _read(folder):
-    """Leaves and metadata of one checkpoint. Raises _Damaged if a byte has changed."""
+    """Read a checkpoint. Raise _Damaged if a byte has changed."""
     try:
         about = _read_about(folder)
         notes = about["leaves"]
@@ -372,9 +375,9 @@ def _read(folder):
             if 0 not in note["shape"]
         }
         leaves = _read_arrays(folder / _STATE, expected)
-    except (_Damaged, _Foreign):
+    except (_Damaged, _NewerFormat):
         raise
-    except Exception as error:  # orbax and tensorstore raise whatever they meet
+    except Exception as error:  # orbax and tensorstore raise many types
         raise _Damaged(
             f"{type(error).__name__}: {str(error).splitlines()[:1]}"
         ) from error
@@ -382,14 +385,14 @@ def _read(folder):
         empty = 0 in note["shape"]
         array = np.empty(note["shape"], note["dtype"]) if empty else leaves[name]
         leaves[name] = array = np.asarray(array)
-        # tensorstore fills a missing chunk with zeros and says nothing.
+        # tensorstore silently fills missing chunks with zeros.
         if _checksum(array) != note["crc32"]:
-            raise _Damaged(f"{name} is not what was saved")
+            raise _Damaged(f"{name} differs from what was saved")
     return leaves, about
 
 
 def _decode(leaves, notes, example, source):
-    """The leaves in the structure of `example`, on the device."""
+    """Arrange the leaves in the structure of `example`, on the device."""
     paths, structure = jax.tree_util.tree_flatten_with_path(example)
     wanted = {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
@@ -398,29 +401,29 @@ def _decode(leaves, notes, example, source):
     if wanted.keys() != notes.keys():
         missing, unknown = wanted.keys() - notes.keys(), notes.keys() - wanted.keys()
         raise ValueError(
-            f"checkpoint {source} has another structure: without {sorted(missing)}, "
-            f"with {sorted(unknown)} beside; it was saved by another version"
+            f"checkpoint {source} was saved by another version: it lacks "
+            f"{sorted(missing)} and has the unknown {sorted(unknown)}"
         )
     decoded = []
-    for name, like in wanted.items():
+    for name, template in wanted.items():
         array = leaves[name]
         if "key" in notes[name]:
             decoded.append(jax.random.wrap_key_data(array, impl=notes[name]["key"]))
             continue
-        same = array.dtype == like.dtype and array.ndim == like.ndim
-        if not same or array.shape[1:] != like.shape[1:]:
+        same = array.dtype == template.dtype and array.ndim == template.ndim
+        if not same or array.shape[1:] != template.shape[1:]:
             raise ValueError(
                 f"checkpoint {source} holds {name} as {array.dtype}"
-                f"{list(array.shape)}, this run needs {like.dtype}{list(like.shape)}; "
-                "only the first axis may differ; for another precision set "
-                "jax_enable_x64 as it was"
+                f"{list(array.shape)}, but this run needs "
+                f"{template.dtype}{list(template.shape)}; only the first axis may "
+                "differ; for another precision set jax_enable_x64 as in the saved run"
             )
         decoded.append(jnp.array(array))
     return jax.tree_util.tree_unflatten(structure, decoded)
 
 
 def _check_writable(folder):
-    """Refuse before the first step, not at the first save, what cannot be written."""
+    """Raise ValueError before the first step if checkpoints cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -428,5 +431,5 @@ def _check_writable(folder):
     except OSError as error:
         raise ValueError(
             f"cannot write checkpoints to {folder}: {error.strerror}; "
-            "choose a folder that can be written"
+            "choose a writable folder"
         ) from error

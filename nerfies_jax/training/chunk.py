@@ -15,21 +15,22 @@ from nerfies_jax.runtime import compiler, data_parallel, events
 from nerfies_jax.training import matrix_flops
 from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
-LENGTH = 10  # steps of a scan
-# A scan cannot be interrupted: it has less work than this (two seconds of a core), or
-# a single step. Each call asks the system for its memory anew, page by page: of single
-# steps of `d-nerf-small` that is 24 of 110 ms, of ten at once 2 of 87.
+LENGTH = 10  # steps per scan
+# A scan cannot be interrupted, so it has less work than this (two seconds of a core),
+# or one step. Longer scans are faster, because each call allocates its memory from the
+# system page by page. With `d-nerf-small` that takes 24 of 110 ms for a single step,
+# and 2 of 87 ms per step for ten.
 SCAN_FLOPS = 1e11
-SHORTER = 5, 2, 1  # lengths of scans of larger steps
-FEW_STEPS = 100  # a run of fewer has single steps
+SHORTER = 5, 2, 1  # steps per scan if the steps are larger
+FEW_STEPS = 100  # shorter runs use single steps
 
 
 class Outcome(NamedTuple):
-    """Scalars that a chunk of steps reports next to its state."""
+    """Scalars that a chunk of steps returns in addition to its state."""
 
-    done: Any  # steps run, the first with a non-finite metric included
-    metrics: Any  # means over the steps asked for
-    finite: Any  # whether every metric was, and the state is
+    done: Any  # number of steps, up to and with the first non-finite metric
+    metrics: Any  # means over the requested steps
+    finite: Any  # True if all metrics and the state are finite
     step: Any
 
 
@@ -41,7 +42,7 @@ def scan_steps(
 ) -> tuple[PyTree, dict[str, Array]]:
     """Run a number of steps as one scan.
 
-    It is pure if `step` is, and it can be differentiated.
+    The function is pure if `step` is, and can be differentiated.
 
     Args:
       step: Pure function `step(state, frames) -> (state, metrics)`.
@@ -67,11 +68,12 @@ def scan_steps(
 
 
 def _run_scan(step, length, state, frames):
-    """A scan and its outcome.
+    """Run a scan and compute its outcome.
 
-    The state is looked at as a whole, once: a second moment that overflows leaves the
-    parameters finite, and a row that never moves again. Of 200 000 x 59 rows it takes
-    40 ms, of the parameters alone 6.
+    The complete state is checked once per scan. If only the parameters were checked, an
+    overflowing second moment would go unnoticed: it leaves the parameters finite, but
+    they never change again. The check takes 40 ms for 200 000 x 59 parameters, and 6 ms
+    for the parameters alone.
     """
     state, metrics = scan_steps(step, state, frames, length)
     finite = functools.reduce(
@@ -81,14 +83,14 @@ def _run_scan(step, length, state, frames):
     )
     all_finite = jnp.all(finite)
     done = jnp.where(all_finite, length, 1 + jnp.argmin(finite))
-    # Means, not sums: a hundred large metrics must not overflow together.
+    # Divided before summing, so that the sum does not overflow.
     mean = {name: jnp.sum(x / length) for name, x in metrics.items()}
     return state, Outcome(done, mean, all_finite & _all_finite(state), state.step)
 
 
 def _all_finite(tree):
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.inexact)]
-    # Not isfinite(max(abs(x))), in 12 ms for 40: XLA:CPU's max passes over NaN.
+    # isfinite(max(abs(x))) takes 12 ms instead of 40, but max ignores NaN on XLA:CPU.
     return functools.reduce(
         jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in leaves], jnp.asarray(True)
     )
@@ -101,60 +103,60 @@ def _strong(leaf):
 
 
 def _check_same(before, after):
-    """Raise ValueError naming the array whose shape or dtype a step changes."""
+    """Raise ValueError if a step changes the shape or dtype of an array."""
     old, old_structure = jax.tree_util.tree_flatten_with_path(before)
     new, new_structure = jax.tree_util.tree_flatten_with_path(after)
     if old_structure != new_structure:
         raise ValueError(
-            f"Model.step returns a state of another structure, {new_structure}, than "
-            f"it was given, {old_structure}"
+            f"Model.step must return a state of structure {old_structure}, but "
+            f"returned {new_structure}"
         )
     for (path, x), (_, y) in zip(old, new, strict=True):
         if x.shape != y.shape or x.dtype != y.dtype:
             name = jax.tree_util.keystr(path, simple=True, separator=".")
             raise ValueError(
                 f"Model.step changes {name} from {x.dtype}{list(x.shape)} to "
-                f"{y.dtype}{list(y.shape)}; only an event may "
-                "change an array's shape, and nothing its dtype"
+                f"{y.dtype}{list(y.shape)}; only an event may change the shape of an "
+                "array, and dtypes must not change"
             )
 
 
 class Program:
     """Compiled training steps for arrays of fixed shapes: scans and single steps.
 
-    Two programs are compiled: one scan of `length` steps (LENGTH, or fewer for
-    expensive steps), and, only if there is a remainder, a single step. A step therefore
-    gives the same bits wherever chunks of LENGTH end. (A scan of each length would need
-    its own compilation, and one that skips steps copies the state for each.)
+    Two programs are compiled: a scan of `length` steps (LENGTH, or fewer for expensive
+    steps) and, only if there is a remainder, a single step. Results are therefore equal
+    bit for bit wherever chunks of LENGTH end. (Scans of other lengths would have to be
+    compiled, and a scan that skips steps copies the state for each of them.)
 
     Called with (state, frames, count) it returns the state and the `Outcome`. The state
-    passed in is overwritten. If a step works on several devices, state and outcome are
-    on the first of them and `frames` on all (`data_parallel.replicate`).
+    passed in is overwritten. If a step uses several devices, state and outcome are on
+    the first of them and `frames` on all (`data_parallel.replicate`).
     """
 
     def __init__(self, model: Model, state: TrainState, frames: Frames, steps: int):
-        # Traced once for both lengths, which takes most of the time to lower.
+        # Traced once for both lengths, because tracing takes most of the time.
         self._step = jax.jit(model.step, inline=True)
         self._devices, self._options = model.devices, model.compiler_options
-        self._shapes = jax.tree.map(_abstract, (self._on_all(state), frames))
+        self._shapes = jax.tree.map(_abstract, (self._replicate(state), frames))
         self._lowered: dict[int, jax.stages.Lowered] = {}  # by the number of steps
         self._programs: dict[int, jax.stages.Compiled] = {}
-        self.length = 1 if steps < FEW_STEPS else self._most_at_once()
+        self.length = 1 if steps < FEW_STEPS else self._longest_scan()
         self._lower(self.length)
 
-    def _most_at_once(self):
+    def _longest_scan(self):
         flops = self._flops()
-        fit = (n for n in (LENGTH, *SHORTER) if n * flops < SCAN_FLOPS)
-        return next(fit, 1)
+        lengths = (n for n in (LENGTH, *SHORTER) if n * flops < SCAN_FLOPS)
+        return next(lengths, 1)
 
     def _flops(self):
-        """Operations of a step: the larger of XLA's count and that of matrix products.
+        """Return the FLOPs of a step by XLA, or of its matrix products if larger.
 
-        A step in micro-batches, or in slabs of pixels, is split into parts.
+        XLA counts the body of a loop over micro-batches or slabs of pixels once.
         """
-        counted = self._lower(LENGTH).cost_analysis() or {}
+        xla_cost = self._lower(LENGTH).cost_analysis() or {}
         products = matrix_flops.count(self._step, *self._shapes).flops
-        return max(products, counted.get("flops", 0.0))
+        return max(products, xla_cost.get("flops", 0.0))
 
     def _lower(self, length):
         if length not in self._lowered:
@@ -163,7 +165,7 @@ class Program:
             self._lowered[length] = scan.lower(*self._shapes)
         return self._lowered[length]
 
-    def _on_all(self, state):
+    def _replicate(self, state):
         return data_parallel.replicate(state, self._devices)
 
     def prepare(self, count: int) -> float:
@@ -173,7 +175,7 @@ class Program:
           count: Number of steps.
 
         Returns:
-          Seconds of compilation, 0 if nothing was missing.
+          Seconds of compilation, 0 if all programs were compiled.
         """
         missing = set(self._lengths(count)) - self._programs.keys()
         if not missing:
@@ -189,9 +191,9 @@ class Program:
         return [self.length] * scans + [1] * singles
 
     def __call__(self, state: TrainState, frames: Frames, count: int):
-        """The state after `count` steps, or after one not finite, and the outcome."""
+        """Run `count` steps, or fewer if one is not finite."""
         self.prepare(count)
-        state = self._on_all(state)
+        state = self._replicate(state)
         total: dict[str, float] = {}
         done, outcome = 0, None
         for length in self._lengths(count):
@@ -249,17 +251,16 @@ def compiled(
       steps: Number of steps of the whole run.
 
     Returns:
-      The program, the frames as it takes them, and the seconds of tracing and
-      compiling.
+      The program, the frames on its devices, and the seconds of tracing and compiling.
     """
-    made, frames, seconds = _lowered(model, state, frames, steps)
-    return made, frames, seconds + made.prepare(made.length)
+    lowered, frames, seconds = _lower_program(model, state, frames, steps)
+    return lowered, frames, seconds + lowered.prepare(lowered.length)
 
 
 def compiling(
     model: Model, state: TrainState, frames: Frames, steps: int
 ) -> Future[float]:
-    """Compile the scan of a run in the background, for `compiled` or `program` to find.
+    """Compile the scan of a run in the background, for later use by `program`.
 
     Args:
       model: The model.
@@ -270,19 +271,19 @@ def compiling(
     Returns:
       A future of the seconds of tracing and compiling.
     """
-    made, _, seconds = _lowered(model, state, frames, steps)
-    return compiler.begun(lambda: seconds + made.prepare(made.length))
+    lowered, _, seconds = _lower_program(model, state, frames, steps)
+    return compiler.begun(lambda: seconds + lowered.prepare(lowered.length))
 
 
-def _lowered(model, state, frames, steps):
+def _lower_program(model, state, frames, steps):
     frames = jax.tree.map(jnp.asarray, frames)
     frames = data_parallel.shared(frames, model.devices)
-    made, seconds = program(model, state, frames, steps)
-    return made, frames, seconds
+    lowered, seconds = program(model, state, frames, steps)
+    return lowered, frames, seconds
 
 
-# Each model's programs hold 4,000 mappings of memory and more, and Linux lets a process
-# have 65,530.
+# Bounded, because the programs of a model hold 4,000 or more memory mappings, and Linux
+# limits a process to 65,530.
 @functools.lru_cache(maxsize=4)
 def _programs(step):
     return {}

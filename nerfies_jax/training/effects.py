@@ -1,10 +1,11 @@
-"""Internal records of the parts of a scene, and their terms, names and keys.
+"""Internal records of the components of a scene, and their loss terms and keys.
 
-Parts fill small protocols (`nerfies_jax.training.protocols` and its neighbors in both
-packages). `build` compiles each to a `Record` of hooks, which the step and the renderer
-read; `FieldRecord` and `SplatRecord` add those of their representation. A hook left
-`None` has no parameters, no state and no operations: the compiled step of a scene
-without parts is that of a static scene.
+Components implement small protocols (`nerfies_jax.training.protocols` and the
+`protocols` modules of both representations). `build` converts each to a `Record` of
+hooks, which the training step and the renderer call. `FieldRecord` and `SplatRecord`
+add the hooks of their representation. A hook that is None adds no parameters, no state
+and no compiled operations: the step of a scene without components is that of a static
+scene.
 """
 
 import dataclasses
@@ -25,13 +26,13 @@ Scalar = Float[Array, ""]
 Vector = Float[Array, "3"]
 Features = Float[Array, " features"]
 
-# What a table of codes has a row for: the distinct times that were learned from, or the
-# exposures ("appearance ids") of the capture.
+# A table of codes has one row for each distinct training timestamp, or one for each
+# exposure ("appearance id") of the capture.
 MOMENT, APPEARANCE = "moment", "appearance"
 
 
 class Table(NamedTuple):
-    """Table of latent codes. Parts that name the same one share its codes.
+    """Table of latent codes. Components that name the same table share its codes.
 
     Attributes:
       name: Name of the table, the key of `FrameCondition.codes`.
@@ -66,10 +67,10 @@ class Observation(NamedTuple):
     """Rendered and observed image of one frame.
 
     Attributes:
-      rendering: The rendered frame. None where a loss renders by itself.
+      rendering: The rendered frame. None if the loss renders by itself.
       truth: Observed colors, sRGB in [0, 1].
-      valid: Observed pixels. None: all.
-      depth: Known z-depth, scene units, 0 where it is unknown. None: nowhere.
+      valid: Mask of the observed pixels. None for all.
+      depth: Known z-depth in scene units, 0 where it is unknown. None without depths.
       frames: All training frames.
       row: Row of this frame among them.
     """
@@ -83,22 +84,23 @@ class Observation(NamedTuple):
 
 
 class PenaltyContext(NamedTuple):
-    """Inputs of a loss. None where the representation does not have them.
+    """Inputs of a loss. Attributes that the representation lacks are None.
 
     Attributes:
-      condition: Conditioning of the frame; on a field with a leading axis of rays.
+      condition: Conditioning of the frame. Of fields with a leading axis of rays.
       step: Number of completed steps.
-      key: PRNG key of this part in this step.
+      key: PRNG key of this component in this step.
       params: Parameters of the whole scene, `splats.Params` of Gaussians.
-      displace: On a field: displacement of a point by all warps together.
-      condition_of: On a field: conditioning of a training frame by its row.
-      batch: On a field: `effect.Batch` of the rays.
-      levels: On a field: `effect.RayOutput` of each level, coarse to fine.
-      frames: On a field: all training frames, in scene units.
-      box: On a field: `effect.Box`, from scene units to those of the field.
-      observation: On Gaussians: the frame of the step.
-      at_time: On Gaussians: (parameters as by `splats.take_rows`, time) -> `Gaussians`.
-      state: State of this part, where it has one.
+      displace: Fields only. Displacement of a point by the composition of all warps.
+      condition_of: Fields only. Conditioning of a training frame by its row.
+      batch: Fields only. `effect.Batch` of the rays.
+      levels: Fields only. `effect.RayOutput` of each level, coarse to fine.
+      frames: Fields only. All training frames, in scene units.
+      box: Fields only. `effect.Box`, from scene units to those of the field.
+      observation: Gaussians only. The frame of the step.
+      at_time: Gaussians only. (parameters from `splats.take_rows`, time) ->
+        `Gaussians`.
+      state: State of this component, if it has one.
     """
 
     condition: FrameCondition
@@ -120,8 +122,8 @@ class Term(NamedTuple):
     """One term of the loss.
 
     Attributes:
-      value: Value that is logged.
-      weight: Factor with which it is added to the loss. None: logged only.
+      value: Value, which is logged.
+      weight: Factor of the value in the loss. None to log it only.
     """
 
     value: Scalar
@@ -130,17 +132,17 @@ class Term(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """Hooks of a part that both representations have; None where a part has none.
+    """Hooks of a component in both representations. Unused hooks are None.
 
     Attributes:
       name: Key of its parameters, its state and its metrics.
-      init: Returns the initial parameters, of a key; of Gaussians of a key and
-        `splats.Splats`.
-      learning_rate: Returns the rate of what `init` returned, at a traced step. None:
-        the common rate of a field.
-      penalty: (own parameters, context) -> terms, logged as `name/term`.
-      required_data: What it reads of "depths", "points", "flow" and "moving" in
-        `Frames`, each None where a capture has none.
+      init: Returns the initial parameters, given a key (fields) or a key and
+        `splats.Splats` (Gaussians).
+      learning_rate: Returns the learning rate of these parameters at a traced step.
+        None for the common rate of a field.
+      penalty: (parameters of the component, context) -> terms, logged as `name/term`.
+      required_data: Fields of `Frames` that it reads, of "depths", "points", "flow" and
+        "moving". Each is None if the capture lacks it.
     """
 
     name: str
@@ -154,10 +156,10 @@ R = TypeVar("R", bound=Record)
 
 
 def stream(name: str) -> int:
-    """Return a number to fold into a key, for an effect or a table of some name.
+    """Return a number to fold into a key, for an effect or table by its name.
 
-    With consecutive numbers instead, everything after an effect would be drawn anew
-    when it is left out, and an ablation would compare two initializations as well.
+    With consecutive numbers, leaving out an effect would change the random numbers of
+    all later ones, and an ablation would also compare two initializations.
 
     Args:
       name: The name.
@@ -171,22 +173,25 @@ def stream(name: str) -> int:
 def joined(
     own: tuple[R, ...], more: tuple[R, ...], reserved: tuple[str, ...]
 ) -> tuple[R, ...]:
-    """Return the parts of a scene and further ones behind them.
+    """Concatenate the records of a spec and further ones, checking their names.
 
     Args:
-      own: Records of the parts of a spec.
+      own: Records of the components of a spec.
       more: Further records.
-      reserved: Names that the parameters of the scene have already.
+      reserved: Names that the parameters of the scene already use.
+
+    Returns:
+      All records.
 
     Raises:
-      ValueError: If two parts have one name.
+      ValueError: If two components have the same name.
     """
     names = list(reserved)
     for part in (*own, *more):
         if part.name in names:
             raise ValueError(
-                f"there is something named {part.name!r} already; the names taken are "
-                f"{', '.join(names)}; give the part another"
+                f"a component is named {part.name!r}, but this name is in use; choose "
+                f"another than {', '.join(names)}"
             )
         names.append(part.name)
     return (*own, *more)
@@ -198,34 +203,36 @@ def penalty_terms(
     context: PenaltyContext,
     states: Mapping[str, PyTree],
 ) -> dict[str, Term]:
-    """The terms of all effects by `effect/term`, each effect with a key of its own."""
+    """Compute the terms of all effects by `effect/term`, with a key for each effect."""
     terms: dict[str, Term] = {}
     for effect in effects:
         if effect.penalty is None:
             continue
-        own = context._replace(
+        effect_context = context._replace(
             key=jax.random.fold_in(context.key, stream(effect.name)),
             state=states.get(effect.name),
         )
-        own_terms = effect.penalty(own_params.get(effect.name), own)
-        terms |= {f"{effect.name}/{name}": term for name, term in own_terms.items()}
+        effect_terms = effect.penalty(own_params.get(effect.name), effect_context)
+        terms |= {f"{effect.name}/{name}": term for name, term in effect_terms.items()}
     return terms
 
 
 def from_step(
     first: int, step: Int[Array, ""] | None, terms: Mapping[str, Term]
 ) -> dict[str, Term]:
-    """Return the same terms, of no weight before step `first`.
+    """Return the terms with weights that are zero before step `first`.
 
     Before the warm-up of a motion ends, only the regularizers produce gradients, and
     Adam would drive the motion to zero.
     """
     if first == 0:
         return dict(terms)
-    assert step is not None  # a loss is of a step where it has a warm-up
-    begun = jnp.where(step < first, 0.0, 1.0)
+    assert step is not None  # losses with a warm-up are computed in training steps
+    factor = jnp.where(step < first, 0.0, 1.0)
     return {
-        name: term if term.weight is None else term._replace(weight=begun * term.weight)
+        name: term
+        if term.weight is None
+        else term._replace(weight=factor * term.weight)
         for name, term in terms.items()
     }
 
@@ -235,7 +242,7 @@ def weighted_sum(terms: Mapping[str, Term], first: Scalar | None = None) -> Scal
 
     Args:
       terms: Terms by name.
-      first: Value to start from.
+      first: Term to add in front, or None.
 
     Returns:
       The sum, in the order of the terms.

@@ -1,7 +1,7 @@
-"""Parts of a scene from other packages, named as MODULE:NAME.
+"""Components of a scene from other packages, named as MODULE:NAME.
 
-Loading one imports its module, which runs code. Only names that the user gave are
-loaded, never those that a file holds (`nerfies_jax.runs.trust`).
+Loading a component imports its module, which runs code. Only names from the user are
+loaded, never names in files (`nerfies_jax.runs.trust`).
 """
 
 import dataclasses
@@ -10,19 +10,19 @@ import importlib
 from collections.abc import Iterable
 from typing import Any, Protocol, runtime_checkable
 
-SEPARATOR = ":"  # between module and name; no name of this package has it
+SEPARATOR = ":"  # between module and name; names of this package do not contain it
 
 
 @runtime_checkable
 class Settings(Protocol):
-    """Settings of a part that depends on the length of a run or on the capture."""
+    """Settings of a component that depends on the length of a run or on the capture."""
 
     def bind(self, steps: int, metadata: Any, /) -> Any:
-        """Return the object with the functions of the part's protocol.
+        """Return the object that implements the protocol of the component.
 
         Args:
           steps: Length of the run.
-          metadata: Sizes of the capture, `SceneMetadata` of either package.
+          metadata: `SceneMetadata` of the representation.
         """
         ...
 
@@ -35,32 +35,31 @@ def is_name(text: str) -> bool:
 
 
 def load(name: str) -> Any:
-    """Import what a name stands for.
+    """Import a component by its name.
 
     Args:
-      name: MODULE:NAME. NAME is a frozen dataclass, a function without required
-        arguments that returns one, or an instance of one. MODULE is searched where
-        Python searches.
+      name: MODULE:NAME. MODULE is on the import path. NAME is a frozen dataclass, a
+        function without required arguments that returns one, or an instance of one.
 
     Returns:
-      The instance; a class or a function is called without arguments.
+      The instance. A class or a function is called without arguments.
 
     Raises:
-      ValueError: If there is no such module or name, or it is no frozen dataclass.
+      ValueError: If there is no such module or name, or it is not a frozen dataclass.
     """
-    found = _import(name)
-    part = found() if callable(found) and not _is_settings(found) else found
-    if not _is_settings(part):
+    value = _import(name)
+    component = value() if callable(value) and not _is_settings(value) else value
+    if not _is_settings(component):
         raise ValueError(
-            f"{name} is a {type(part).__name__}; a part of a scene is an instance of a "
-            "frozen dataclass, so that it can be compared and written "
+            f"{name} is a {type(component).__name__}; a component of a scene must be "
+            "an instance of a frozen dataclass, so that it can be compared and stored "
             "(docs/extending.md)"
         )
-    return part
+    return component
 
 
 def load_class(name: str) -> type:
-    """Import the dataclass or NamedTuple of this name, as files hold it.
+    """Import a dataclass or NamedTuple by the name that files store.
 
     Args:
       name: MODULE:NAME.
@@ -71,11 +70,11 @@ def load_class(name: str) -> type:
     Raises:
       ValueError: If there is no such module or name, or it is neither.
     """
-    found = _import(name)
-    record = dataclasses.is_dataclass(found) or hasattr(found, "_fields")
-    if not isinstance(found, type) or not record:
+    value = _import(name)
+    is_record = dataclasses.is_dataclass(value) or hasattr(value, "_fields")
+    if not isinstance(value, type) or not is_record:
         raise ValueError(f"{name} is neither a dataclass nor a NamedTuple")
-    return found
+    return value
 
 
 def _is_settings(value):
@@ -91,15 +90,15 @@ def _import(name):
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ValueError(
-            f"{name}: {module_name} cannot be imported ({error}); run where its file "
-            "is, or add the folder of the file to PYTHONPATH"
+            f"{name}: {module_name} cannot be imported ({error}); run in the folder of "
+            "its file, or add this folder to PYTHONPATH"
         ) from error
     try:
         return functools.reduce(getattr, attribute.split("."), module)
     except AttributeError as error:
-        place = getattr(module, "__file__", None) or "built into Python"
+        origin = getattr(module, "__file__", None) or "built into Python"
         raise ValueError(
-            f"{name}: {module_name} ({place}) has no {attribute!r}"
+            f"{name}: {module_name} ({origin}) has no {attribute!r}"
         ) from error
 
 
@@ -108,12 +107,12 @@ def names_in(stored: Any, key: str) -> tuple[str, ...]:
 
     Args:
       stored: JSON values of settings.
-      key: Key under which an object has the name of its class.
+      key: Key of the class name in a JSON object.
 
     Returns:
-      The names, each once, in their order.
+      The names without duplicates, in order.
     """
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
 
     def visit(value):
         if isinstance(value, list):
@@ -122,12 +121,12 @@ def names_in(stored: Any, key: str) -> tuple[str, ...]:
         elif isinstance(value, dict):
             kind = value.get(key)
             if isinstance(kind, str) and SEPARATOR in kind:
-                found[kind] = None
+                names[kind] = None
             for item in value.values():
                 visit(item)
 
     visit(stored)
-    return tuple(found)
+    return tuple(names)
 
 
 def names_in_assignments(assignments: Iterable[str]) -> tuple[str, ...]:
@@ -146,12 +145,15 @@ def members(protocol: type) -> list[str]:
 
 
 def check(field: str, part: Any, protocol: type) -> None:
-    """Raise ValueError unless a part fills its protocol.
+    """Check that a component implements its protocol.
 
     Args:
-      field: Name of the field or argument, for the message.
+      field: Name of the field or argument for the message.
       part: An object of the protocol, or settings with `bind`.
       protocol: `Regularizer`, or another protocol.
+
+    Raises:
+      ValueError: If members are missing.
     """
     if hasattr(part, "bind"):
         return

@@ -1,10 +1,9 @@
-"""Small optimization problems around a trained field: cameras and latent codes.
+"""Small optimization problems for a trained field: cameras and latent codes.
 
-Inverse warps are in `tracks`. Everything takes plain functions, runs under `jit`, and
-reports convergence by a flag, never by an exception. Flags are computed from the
-result, since a solver's own report is about its last step only. jaxopt is imported in
-this file and nowhere else. Both jaxopt and optimistix are imported only if one of their
-solvers is requested.
+Inverse warps are in `tracks`. The functions take plain functions, run under `jit`, and
+report convergence by a flag, never by an exception. The flag is computed from the
+result, because solvers report only on their last step. jaxopt is imported in this file
+only. jaxopt and optimistix are imported when one of their solvers is used.
 """
 
 import dataclasses
@@ -30,10 +29,10 @@ Scalar = Float[Array, ""]
 class Fit(NamedTuple):
     """Result of one solve, with leading axes if it was vmapped."""
 
-    value: PyTree  # finite where the start is, whether or not it converged
+    value: PyTree  # finite if the initial value is, also without convergence
     converged: Bool[Array, "*batch"]
     steps: Int[Array, "*batch"]
-    residual: Float[Array, "*batch"]  # what was to vanish, at `value`
+    residual: Float[Array, "*batch"]  # quantity to be made zero, at `value`
 
 
 def check_positive(**values):
@@ -51,7 +50,7 @@ def check_positive(**values):
 
 
 def counted(steps) -> Int[Array, "*batch"]:
-    """Convert step counts to int32, since solvers count in the default integer type.
+    """Convert step counts to int32. Solvers count in the default integer type.
 
     Args:
       steps: Step counts, [...].
@@ -67,15 +66,15 @@ class CameraSpec:
     """Settings of the refinement of a camera, and its convergence criteria.
 
     A fit has converged if one more Gauss-Newton step would rotate the camera by less
-    than `tolerance` (rad, and for other unknowns a step that changes the residuals as
-    much), if the residuals determine all unknowns, and if their root mean square is at
-    most `max_residual`. Set that bound wherever wrong minima exist: photometric
-    residuals are flat there too.
+    than `tolerance` (in rad, and for other unknowns by the equivalent change of the
+    residuals), if the residuals determine all unknowns, and if their root mean square
+    is at most `max_residual`. Set this bound wherever wrong local minima exist, because
+    the other criteria hold there too.
     """
 
     unknowns: tuple[str, ...] = ("angular", "linear")  # and "focal"
     tolerance: float = 1e-5  # rad
-    max_residual: float = math.inf  # in the residuals' own unit
+    max_residual: float = math.inf  # in units of the residuals
     max_steps: int = 64
 
     def __post_init__(self):
@@ -90,8 +89,9 @@ class CameraSpec:
 
 
 _WIDTHS = {"angular": 3, "linear": 3, "focal": 1}
-# Smallest over largest singular value of the Jacobian with columns of unit length. A
-# camera that sees a few degrees of a far scene has 1e-3; float32 alone makes 1e-6.
+# Bound on the smallest over the largest singular value of the Jacobian with columns of
+# unit length. A camera that sees a few degrees of a distant scene has 1e-3. Rounding in
+# float32 gives 1e-6.
 DETERMINED = 1e-4
 
 
@@ -102,7 +102,7 @@ def refine_camera(
 ) -> Fit:
     """Minimize the sum of squared residuals over a camera near the given one.
 
-    The solver is Levenberg-Marquardt. The result carries no derivatives.
+    The solver is Levenberg-Marquardt. The result has no derivatives.
 
     Args:
       residuals: Function from a camera to residuals of any shape.
@@ -122,16 +122,16 @@ def refine_camera(
     )
 
     def unscaled(step):
-        return residuals(_stepped(camera, step, spec.unknowns)).reshape(-1)
+        return residuals(_apply_step(camera, step, spec.unknowns)).reshape(-1)
 
     grads = jax.jacfwd(unscaled)(start)
     if grads.shape[0] < start.size:
         raise ValueError(
             f"{grads.shape[0]} residuals cannot determine {start.size} unknowns "
-            f"{spec.unknowns}; give more, or fewer unknowns"
+            f"{spec.unknowns}; use more residuals or fewer unknowns"
         )
-    # Damping treats all unknowns alike, so they get columns of equal length, and rad,
-    # scene units and logarithms of focal length become comparable.
+    # Damping treats all unknowns alike. Columns of equal length make rad, scene units
+    # and logarithms of focal length comparable.
     lengths = jnp.sqrt(jnp.sum(grads**2, axis=0))
     largest = jnp.max(lengths)
     unit = jnp.where(largest > 0, largest, 1)
@@ -151,10 +151,10 @@ def refine_camera(
     )
     step = lax.stop_gradient(solution.value)
     rms = jnp.sqrt(jnp.mean(unscaled(step * scale) ** 2))
-    settled = _settled(lambda y: scaled(y, None), step, spec.tolerance)
-    converged = settled & (rms <= spec.max_residual)
+    is_minimum = _is_minimum(lambda y: scaled(y, None), step, spec.tolerance)
+    converged = is_minimum & (rms <= spec.max_residual)
     step = jnp.where(jnp.all(jnp.isfinite(step)), step, start)
-    value = _stepped(camera, step * scale, spec.unknowns)
+    value = _apply_step(camera, step * scale, spec.unknowns)
     return Fit(value, converged, counted(solution.stats["num_steps"]), rms)
 
 
@@ -167,8 +167,8 @@ def fit_code(
 ) -> Fit:
     """Minimize a loss over a latent code.
 
-    The code returned is never worse than `start`, which is returned if the loss is not
-    finite there. The result carries no derivatives. docs/results/solver_table.md
+    The result is never worse than `start`, which is returned if the loss is not finite
+    there. The result has no derivatives. docs/results/solver_table.md
     compares the solvers.
 
     Args:
@@ -191,20 +191,23 @@ def fit_code(
             f"unknown solver {solver!r}; choose from {sorted(CODE_SOLVERS)}"
         )
     leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(start)]
-    kinds = {leaf.dtype.name for leaf in leaves}
-    if len(kinds) != 1 or not jnp.issubdtype(leaves[0].dtype, jnp.floating):
-        raise ValueError(f"a code is of one floating dtype, got {sorted(kinds)}")
+    dtypes = {leaf.dtype.name for leaf in leaves}
+    if len(dtypes) != 1 or not jnp.issubdtype(leaves[0].dtype, jnp.floating):
+        raise ValueError(
+            f"a code must have one floating-point dtype, got {sorted(dtypes)}"
+        )
     flat, rebuild = jax.flatten_util.ravel_pytree(lax.stop_gradient(start))
 
     def flat_loss(code):
         return loss(rebuild(code))
 
-    # jaxopt and optax add steps to floats; the loss is also traced outside, strictly.
+    # jaxopt and optax add integer steps to floats. The loss itself is also traced
+    # outside of this context, under strict promotion.
     with jax.numpy_dtype_promotion("standard"):
         minimum, steps = CODE_SOLVERS[solver](flat_loss, flat, max_steps, tolerance)
     minimum = lax.stop_gradient(minimum)
-    reached = flat_loss(minimum)
-    better = jnp.isfinite(reached) & (reached <= flat_loss(flat))
+    final_loss = flat_loss(minimum)
+    better = jnp.isfinite(final_loss) & (final_loss <= flat_loss(flat))
     code = jnp.where(better, minimum, flat)
     value, grad = jax.value_and_grad(flat_loss)(code)
     residual = _length(grad)
@@ -226,9 +229,9 @@ def _jaxopt_lbfgs(loss, start, max_steps, tolerance):
         loss,
         maxiter=max_steps,
         tol=tolerance,
-        # Without, a search that fails at the rounding floor is repeated to max_steps.
+        # Otherwise a line search that fails because of rounding is repeated to the end.
         stop_if_linesearch_fails=True,
-        # The loss closes over tracers, which its custom derivative refuses.
+        # jaxopt's custom derivative does not support losses that close over tracers.
         implicit_diff=False,
         unroll=False,
     )
@@ -236,14 +239,14 @@ def _jaxopt_lbfgs(loss, start, max_steps, tolerance):
     return code, state.iter_num
 
 
-def _optimistix(name):
+def _optimistix_solver(name):
     def solve(loss, start, max_steps, tolerance):
         import optimistix
 
         solver = getattr(optimistix, name)
-        # It stops on differences of code and loss, not on the gradient.
+        # The stopping criterion is the change of code and loss, not the gradient.
         ulps = 4 * float(jnp.finfo(start.dtype).eps)
-        # Its L-BFGS keeps its history in the default precision and takes no other.
+        # L-BFGS stores its history in the default precision and accepts no other.
         default = jnp.result_type(float)
         solution = optimistix.minimise(
             lambda code, _: loss(code.astype(start.dtype)).astype(default),
@@ -257,10 +260,8 @@ def _optimistix(name):
     return solve
 
 
-def _optax(transformation):
-    """Descent by an optax transformation. Returns the best code of all steps, not the
-    last.
-    """
+def _optax_solver(transformation):
+    """Make a solver from an optax transformation, which returns the best code."""
 
     def solve(loss, start, max_steps, tolerance):
         rule = optax.with_extra_args_support(transformation(max_steps))
@@ -276,7 +277,7 @@ def _optax(transformation):
             )
             code = optax.apply_updates(code, updates)
             value, grad = jax.value_and_grad(loss)(code)
-            # At the rounding floor the loss no longer tells which code is better.
+            # Close to the minimum, rounding hides which code has the smaller loss.
             better = (value < best[1]) | (_length(grad) <= tolerance)
             best = (
                 jnp.where(better, code, best[0]),
@@ -293,13 +294,16 @@ def _optax(transformation):
 
 
 CODE_SOLVERS: Mapping[str, CodeSolver] = {
-    "lbfgs": _optax(lambda steps: optax.lbfgs()),
-    "bfgs": _optimistix("BFGS"),
-    "optimistix-lbfgs": _optimistix("LBFGS"),
+    "lbfgs": _optax_solver(lambda steps: optax.lbfgs()),
+    "bfgs": _optimistix_solver("BFGS"),
+    "optimistix-lbfgs": _optimistix_solver("LBFGS"),
     "jaxopt-lbfgs": _jaxopt_lbfgs,
-    # Rates of 0.01, 0.03, 0.1, 0.3 end 200 steps 6e-4, 5e-5, 1e-6, 6e-10 above the
-    # least loss in docs/results/solver_table.md; beyond, 50 steps get worse.
-    "adam": _optax(lambda steps: optax.adam(optax.cosine_decay_schedule(0.2, steps))),
+    # With rates of 0.01, 0.03, 0.1 and 0.3 the loss after 200 steps is 6e-4, 5e-5, 1e-6
+    # and 6e-10 above the minimum of docs/results/solver_table.md. Larger rates are
+    # worse after 50 steps.
+    "adam": _optax_solver(
+        lambda steps: optax.adam(optax.cosine_decay_schedule(0.2, steps))
+    ),
 }
 
 
@@ -307,25 +311,25 @@ def _length(vector):
     return jnp.sqrt(jnp.sum(vector**2))
 
 
-def _stepped(camera, step, unknowns):
-    parts, at = {}, 0
+def _apply_step(camera, step, unknowns):
+    parts, start = {}, 0
     for name in unknowns:
-        parts[name] = step[at : at + _WIDTHS[name]]
-        at += _WIDTHS[name]
-    none = jnp.zeros(3, step.dtype)
-    camera = move(camera, parts.get("angular", none), parts.get("linear", none))
-    if "focal" in parts:  # its logarithm: stays positive
+        parts[name] = step[start : start + _WIDTHS[name]]
+        start += _WIDTHS[name]
+    zero = jnp.zeros(3, step.dtype)
+    camera = move(camera, parts.get("angular", zero), parts.get("linear", zero))
+    if "focal" in parts:  # as a logarithm, so that it stays positive
         camera = camera._replace(focal_px=camera.focal_px * jnp.exp(parts["focal"][0]))
     return camera
 
 
-def _settled(residuals, step, tolerance):
+def _is_minimum(residuals, step, tolerance):
     """Test if the next Gauss-Newton step is small and well determined."""
     grads = jax.jacfwd(residuals)(step)
     basis, triangle = jnp.linalg.qr(grads)
     values = jnp.linalg.svd(triangle, compute_uv=False)
     determined = values[-1] > DETERMINED * values[0]
-    onward = jax.scipy.linalg.solve_triangular(
+    next_step = jax.scipy.linalg.solve_triangular(
         triangle, exact_product(basis.T, residuals(step))
     )
-    return determined & (jnp.max(jnp.abs(onward)) <= tolerance)
+    return determined & (jnp.max(jnp.abs(next_step)) <= tolerance)

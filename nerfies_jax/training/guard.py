@@ -1,4 +1,4 @@
-"""Recovery of a run after a non-finite step: the last good state, and a diagnosis."""
+"""Recovery from a non-finite training step: the last finite state, and a diagnosis."""
 
 import time
 from collections.abc import Callable
@@ -10,20 +10,20 @@ import numpy as np
 from nerfies_jax.training.chunk import Outcome
 from nerfies_jax.training.model import Frames, TrainState
 
-RENEW_SECONDS = 0.5  # between copies
-RENEW_SHARE = 0.05  # of the time may go into copies
+RENEW_SECONDS = 0.5  # minimum time between copies
+RENEW_SHARE = 0.05  # maximum fraction of the time for copies
 
 
 class Snapshot:
-    """Last good state in host memory, so that the device holds it only once."""
+    """Copy of the last finite state in host memory, to save device memory."""
 
     def __init__(self, step: int, state: TrainState):
         began = time.monotonic()
         leaves, self._structure = jax.tree.flatten(state)
         self._leaves = [_to_host(leaf) for leaf in leaves]
         self.step = step
-        self.taken = time.monotonic()
-        self._cost = self.taken - began
+        self._copied_at = time.monotonic()
+        self._cost = self._copied_at - began
 
     def state(self) -> TrainState:
         """Return a copy of the state on the device.
@@ -36,10 +36,9 @@ class Snapshot:
         )
 
     def renewed(self, step: int, state: TrainState, after_event: bool) -> "Snapshot":
-        """Return a newer snapshot if it is cheap enough, and always after an event.
+        """Return a newer snapshot if its cost is acceptable, and always after an event.
 
-        A replay from a snapshot consists of steps alone, so no event may lie in
-        between.
+        A replay from a snapshot runs steps only, so it must not cross an event.
 
         Args:
           step: Number of completed steps.
@@ -51,7 +50,7 @@ class Snapshot:
         """
         if not after_event:
             wait = max(RENEW_SECONDS, self._cost / RENEW_SHARE)
-            if time.monotonic() - self.taken < wait:
+            if time.monotonic() - self._copied_at < wait:
                 return self
         return Snapshot(step, state)
 
@@ -65,7 +64,7 @@ def _to_host(leaf):
 
 
 def _to_device(array, sharding, key_impl):
-    # Never an alias of the host copy: a donated buffer is written to.
+    # Must not alias the host copy, because donated buffers are overwritten.
     placed = jax.device_put(array, sharding, may_alias=False)
     return (
         placed if key_impl is None else jax.random.wrap_key_data(placed, impl=key_impl)
@@ -79,11 +78,11 @@ def last_good(
     good_step: int,
     bad_step: int,
 ) -> tuple[TrainState, int, str]:
-    """Find the state before the first step that is not finite.
+    """Find the state before the first non-finite step.
 
-    Metrics are checked after every step and the state after every scan of steps, so the
-    first bad step is found by bisection. Steps are deterministic, and are repeated from
-    the last snapshot.
+    Metrics are checked after every step, but the state only after every scan of steps.
+    The first bad step is found by bisection. Steps are deterministic and are repeated
+    from the last snapshot.
 
     Args:
       program: A `chunk.Program`, `program(state, frames, count)`.
@@ -91,7 +90,7 @@ def last_good(
       frames: Training frames.
       good_step: Step at the end of the last good chunk, counted from the start of the
         run.
-      bad_step: Step at which something was not finite.
+      bad_step: Step after which a value was not finite.
 
     Returns:
       The last good state, its step, and a description of the values that were not
@@ -107,10 +106,10 @@ def last_good(
     good, bad = good_step, bad_step
     if replay(bad)[1]:
         detail = (
-            f"step {bad_step:,} or one before was not finite, but not so when repeated"
+            f"a step up to {bad_step:,} was not finite, but was when it was repeated"
         )
         state, finite, _ = replay(good)
-        return (state, good, detail) if finite else (*_kept(snapshot), detail)
+        return (state, good, detail) if finite else (*_contents(snapshot), detail)
     while bad - good > 1:
         middle = (good + bad) // 2
         if replay(middle)[1]:
@@ -123,18 +122,18 @@ def last_good(
     return replay(good)[0], good, detail
 
 
-def _kept(snapshot):
+def _contents(snapshot):
     return snapshot.state(), snapshot.step
 
 
 def listed(names):
-    """Join the first few of several names, the first to be computed first.
+    """Join the first few of several names.
 
     Args:
       names: Names.
 
     Returns:
-      Up to four names, and the number of the others.
+      Up to four names, and the number of further ones.
     """
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if names[4:] else "")
 

@@ -20,9 +20,9 @@ from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
 from nerfies_jax.training.model import Event, Frames, Model, TrainState
 
-CHUNK_STEPS = 100  # longer ones gain nothing
-CHUNK_SECONDS = 0.5  # a chunk cannot be interrupted: Ctrl-C acts within this time
-EVENT_SECONDS = 0.2  # between two `train` events; counting may wait for the device
+CHUNK_STEPS = 100  # longer chunks are not faster
+CHUNK_SECONDS = 0.5  # a chunk cannot be interrupted, so this bounds the delay of Ctrl-C
+EVENT_SECONDS = 0.2  # between `train` events, which may have to wait for the device
 
 
 class Hook(NamedTuple):
@@ -30,23 +30,23 @@ class Hook(NamedTuple):
 
     `call(state, step, metrics)` receives the state after `step` steps and the mean
     metrics of the last chunk, for example `{"loss": 0.01, "mse": 0.002}`. They are
-    empty if no step was taken. The numbers that it returns are kept in the history. Its
-    time does not count as training, and it must not keep the state: the next chunk
-    overwrites it. It also runs once when the run is complete.
+    empty if no step was made. The numbers that it returns are stored in the history.
+    Its time does not count as training. It must not keep a reference to the state,
+    which the next chunk overwrites. It is also called when the run is complete.
     """
 
     name: str
     call: Callable[[TrainState, int, dict[str, float]], dict[str, float] | None]
     every_steps: int | None = None
-    every_seconds: float | int | None = None  # of training
+    every_seconds: float | int | None = None  # training time
 
 
 class History(NamedTuple):
     """Metrics and times of a run so far, as JSON values saved with checkpoints."""
 
     rows: tuple[dict[str, float], ...] = ()  # per chunk: step, seconds, mean metrics
-    evaluations: tuple[dict[str, Any], ...] = ()  # hook, step, seconds, its numbers
-    seconds: float = 0.0  # training alone: chunks and events
+    evaluations: tuple[dict[str, Any], ...] = ()  # hook, step, seconds, numbers
+    seconds: float = 0.0  # training time, of chunks and events
     compile_seconds: float = 0.0
 
 
@@ -58,7 +58,7 @@ class FitResult(NamedTuple):
     steps: int  # completed
     stopped_by: str  # "steps", "seconds", "non-finite" or a signal's name
     message: str  # one line for the user
-    unsaved: str = ""  # why the last state could not be saved
+    unsaved: str = ""  # reason if the last state could not be saved
 
     @property
     def seconds(self) -> float:
@@ -67,12 +67,12 @@ class FitResult(NamedTuple):
 
     @property
     def training_share(self) -> float:
-        """Training time as a share of training and compilation.
+        """Training time as a fraction of training and compilation.
 
-        Processor time is measured only for both together.
+        Processor time is only measured for the sum of the two.
         """
-        both = self.seconds + self.compile_seconds
-        return self.seconds / both if both else 0.0
+        total = self.seconds + self.compile_seconds
+        return self.seconds / total if total else 0.0
 
     @property
     def compile_seconds(self) -> float:
@@ -106,33 +106,33 @@ def fit(
     history: History = History(),
     console: rich.console.Console | None = None,
 ) -> FitResult:
-    """Train a model until a number of steps is completed in all.
+    """Train a model until a total number of steps is completed.
 
-    Training also ends at Ctrl-C, SIGTERM, SIGHUP, or a number that is not finite in a
-    metric or anywhere in the state. In each case the last good state is saved to
-    `checkpoints` and returned. A save that fails is reported and retried with the next
-    one. It does not end the run.
+    Training also ends at Ctrl-C, SIGTERM, SIGHUP, or if a metric or any value of the
+    state is not finite. In each case the last finite state is saved to `checkpoints`
+    and returned. If saving fails, a warning is printed, training continues, and the
+    next checkpoint is tried.
 
-    An event happens when its step is completed, before a checkpoint of that step, so a
-    resumed run repeats the uninterrupted one bit for bit (on XLA:CPU with the same
-    PJRT_NPROC). Progress goes to the sinks of `nerfies_jax.runtime.events`: `train`
-    events, and `evaluation` events of hooks that return numbers.
+    Events are applied after their step and before a checkpoint of that step, so a
+    resumed run is equal to an uninterrupted one bit for bit (on XLA:CPU with the same
+    PJRT_NPROC). Progress goes to the sinks of `nerfies_jax.runtime.events`, as `train`
+    events and as `evaluation` events for hooks that return numbers.
 
-    Steps are scanned. One program serves all chunks of a shape, and a second one the
-    remainder where events or the end fall between them (`chunk.Program`).
+    Steps run in compiled scans. One program runs all chunks of the same shape, and a
+    second one the remaining steps before events and before the end (`chunk.Program`).
 
     Args:
       model: The model.
       state: Initial or restored state. It is overwritten.
       frames: Training frames on the device.
-      steps: Number of steps of the whole run, counted from its very beginning.
+      steps: Total number of steps of the run, including those of earlier sessions.
       events: Events in addition to those of the model.
       hooks: Callbacks that do not change the state.
-      seconds: Bound on the training time of this call, which counts chunks and events
+      seconds: Maximum training time of this call, which includes chunks and events
         but neither compilation nor hooks. None for no bound.
       checkpoints: Writer of checkpoints. None saves nothing.
       checkpoint_seconds: Training seconds between two checkpoints.
-      history: History of the run so far, which a restored run must pass on.
+      history: History of earlier sessions of the run, if it is resumed.
       console: Console that shows progress. None for the terminal.
 
     Returns:
@@ -147,7 +147,7 @@ def fit(
         event_stream.shown_on(console),
     ):
         with event_stream.stage("training", steps, run.step) as run.stage:
-            reason = run.go(requests)
+            reason = run.train(requests)
             run.evaluate(reason)
         return run.finish(reason)
 
@@ -157,7 +157,7 @@ class _Run:
 
     history: History
     checkpoints: Checkpoints | None
-    limits: tuple[float, float]  # seconds of training, and between two checkpoints
+    limits: tuple[float, float]  # seconds of training, and between checkpoints
     trained_before: float  # seconds
     stage: event_stream.Stage
 
@@ -166,93 +166,88 @@ class _Run:
         self.step = int(state.step)
         if steps < self.step:
             raise ValueError(
-                f"the run has {self.step} steps behind it and was asked for {steps} in "
-                "all; ask for more steps, or start anew"
+                f"the run has completed {self.step} steps, but steps={steps}; increase "
+                "steps, or start a new run"
             )
         self.events = _by_step(events)
         self.frames = jax.tree.map(jnp.asarray, frames)
-        self.spread_frames = data_parallel.shared(self.frames, model.devices)
+        self.device_frames = data_parallel.shared(self.frames, model.devices)
         self.saved_at = time.monotonic()
-        self.step_seconds = math.inf  # not known yet: the first chunk is one step
-        self.called = {hook.name: [self.step, None] for hook in hooks}
-        self.reported = -math.inf, self.step  # when, by the monotonic clock; the step
-        self.detail = ""
+        self.step_seconds = math.inf  # unknown
+        self.last_calls = {hook.name: [self.step, None] for hook in hooks}
+        self.last_report = -math.inf, self.step  # monotonic clock, step
+        self.failure_detail = ""
         bad = bad_arrays(state)
         if bad:
             raise ValueError(
-                f"the state to train from is not finite: {listed(bad)}; start from "
-                "another one"
+                f"the initial state is not finite: {listed(bad)}; start from another"
             )
-        # A copy: the first chunk overwrites its input, which is the caller's.
+        # A copy, because the first chunk overwrites its input, which is the caller's.
         self.snapshot = Snapshot(self.step, state)
         self.state = self.snapshot.state()
 
-    def go(self, requests: StopRequests) -> str:
-        """Chunk after chunk until there is a reason to stop."""
+    def train(self, requests: StopRequests) -> str:
+        """Run chunks until there is a reason to stop, and return the reason."""
         while self.step < self.steps:
             if requests.name is not None:
                 return requests.name
             program, lower_seconds = chunk.program(
-                self.model, self.state, self.spread_frames, self.steps
+                self.model, self.state, self.device_frames, self.steps
             )
-            if self._left() <= self._half_a_scan(program.length):
+            if self._seconds_left() <= self._half_scan_seconds(program.length):
                 return "seconds"
-            self._save_overdue()
+            self._save_if_due()
             count = self._count(program.length)
-            self._add(compile_seconds=lower_seconds + program.prepare(count))
-            requests.protect()  # from now on there is something to save
+            self._add_time(compile_seconds=lower_seconds + program.prepare(count))
+            requests.protect()  # from now on there are results to save
             if not self._chunk(program, count):
                 return "non-finite"
             self._after_chunk()
         return "steps"
 
     def _chunk(self, program, count) -> bool:
-        """Run one chunk and the events at its end. False if something became
-        non-finite.
-        """
+        """Run one chunk and the events after it. Return False if not all is finite."""
         began = time.perf_counter()
-        self.state, outcome = program(self.state, self.spread_frames, count)
+        self.state, outcome = program(self.state, self.device_frames, count)
         done = outcome.done
         if not outcome.finite:
-            self.state, self.step, self.detail = last_good(
-                program, self.snapshot, self.spread_frames, self.step, self.step + done
+            self.state, self.step, self.failure_detail = last_good(
+                program, self.snapshot, self.device_frames, self.step, self.step + done
             )
             return False
         if int(outcome.step) != self.step + done:
             raise ValueError(
-                f"Model.step left state.step at {int(outcome.step)} after step "
-                f"{self.step + done}; it must return it one higher each time"
+                f"Model.step returned state.step={int(outcome.step)} after step "
+                f"{self.step + done}; each step must increase it by one"
             )
         elapsed = time.perf_counter() - began
-        happening = self.events.get(self.step + done, ())
-        if not self._happen(happening, self.step + done):
-            # Before that step: a run that is resumed must not leave the event out.
+        due_events = self.events.get(self.step + done, ())
+        if not self._apply_events(due_events, self.step + done):
+            # Go back to before that step, so that a resumed run applies the event.
             count = self.step + done - 1 - self.snapshot.step
             self.state, self.step = self.snapshot.state(), self.step + done - 1
             if count:
-                self.state, _ = program(self.state, self.spread_frames, count)
+                self.state, _ = program(self.state, self.device_frames, count)
             return False
         self.step += done
         self.stage.done = self.step
         self.step_seconds = elapsed / done
-        self._add(seconds=time.perf_counter() - began)
+        self._add_time(seconds=time.perf_counter() - began)
         metrics = {name: float(x) for name, x in outcome.metrics.items()}
         row = {"step": self.step, "seconds": self.history.seconds, **metrics}
         self.history = self.history._replace(rows=(*self.history.rows, row))
-        self.snapshot = self.snapshot.renewed(self.step, self.state, bool(happening))
+        self.snapshot = self.snapshot.renewed(self.step, self.state, bool(due_events))
         return True
 
-    def _happen(self, happening, step) -> bool:
-        """Apply the events of a step. False if one made something non-finite."""
-        for event in happening:
+    def _apply_events(self, due_events, step) -> bool:
+        """Apply the events of a step. Return False if the state is not finite then."""
+        for event in due_events:
             self.state = _distinct(event.apply(self.state, self.frames))
             if int(self.state.step) != step:
-                raise ValueError(
-                    f"event {event.name!r} changed state.step; it must not"
-                )
+                raise ValueError(f"event {event.name!r} must not change state.step")
             bad = bad_arrays(self.state)
             if bad:
-                self.detail = (
+                self.failure_detail = (
                     f"event {event.name!r} after step {step:,} is not finite: "
                     f"{listed(bad)}"
                 )
@@ -260,49 +255,48 @@ class _Run:
         return True
 
     def _count(self, length: int) -> int:
-        """Steps of the next chunk: up to the next event, not too long to wait for.
+        """Choose the number of steps of the next chunk, at most up to the next event.
 
-        Of scans as many as there is time for, of single steps those that are left over.
+        It is as many whole scans as fit the time, or else the remaining single steps.
         """
         stops = [self.steps, self.step + CHUNK_STEPS]
         stops += [step for step in self.events if step > self.step]
         for hook in self.hooks:
             if hook.every_steps is not None:
                 stops.append((self.step // hook.every_steps + 1) * hook.every_steps)
-        affordable = min(CHUNK_SECONDS, self._left()) / self.step_seconds
+        affordable = min(CHUNK_SECONDS, self._seconds_left()) / self.step_seconds
         distance = min(stops) - self.step
         if distance < length:
             return distance
         return length * max(1, min(distance, int(affordable)) // length)
 
-    def _left(self) -> float:
-        """Seconds of training that this call may still take."""
+    def _seconds_left(self) -> float:
+        """Return the training time that is left of the bound."""
         return self.limits[0] - (self.history.seconds - self.trained_before)
 
-    def _half_a_scan(self, length: int) -> float:
-        """Seconds of half a scan. With less time left than this, no other scan
-        begins.
-        """
+    def _half_scan_seconds(self, length: int) -> float:
+        """Return half the time of a scan, the least time with which to start one."""
         return length * self.step_seconds / 2 if self.step_seconds < math.inf else 0.0
 
     def _after_chunk(self) -> None:
         """Run hooks and update the display, none of which is training time."""
         for hook in self.hooks:
-            if self._due(hook):
-                self._call(hook)
+            if self._is_due(hook):
+                self._call_hook(hook)
         if self.checkpoints is not None:
-            self._tell_failed_save(self.checkpoints.failure())
-        if time.monotonic() - self.reported[0] >= EVENT_SECONDS:
+            self._report_failed_save(self.checkpoints.failure())
+        if time.monotonic() - self.last_report[0] >= EVENT_SECONDS:
             self._report()
 
     def _report(self) -> None:
-        """Emit a `train` event, unless that of this step was emitted."""
-        if self.reported[1] == self.step:
+        """Emit a `train` event, unless one was emitted for this step."""
+        if self.last_report[1] == self.step:
             return
-        self.reported = time.monotonic(), self.step
+        self.last_report = time.monotonic(), self.step
         metrics = self._metrics()
         mse = metrics.get("mse", 0.0)
-        left = min((self.steps - self.step) * self.step_seconds, self._left())
+        remaining = (self.steps - self.step) * self.step_seconds
+        remaining = min(remaining, self._seconds_left())
         event_stream.emit(
             "train",
             step=self.step,
@@ -310,7 +304,7 @@ class _Run:
             seconds=self.history.seconds,
             compile_seconds=self.history.compile_seconds,
             steps_per_second=1 / self.step_seconds,
-            eta_seconds=max(left, 0.0),
+            eta_seconds=max(remaining, 0.0),
             psnr=-10 * math.log10(mse) if mse > 0 else None,
             metrics=metrics,
             counts=self.model.counts(self.state),
@@ -322,8 +316,8 @@ class _Run:
         row = self.history.rows[-1] if self.history.rows else {}
         return {k: v for k, v in row.items() if k not in ("step", "seconds")}
 
-    def _due(self, hook: Hook) -> bool:
-        last_step, last_seconds = self.called[hook.name]
+    def _is_due(self, hook: Hook) -> bool:
+        last_step, last_seconds = self.last_calls[hook.name]
         if hook.every_steps is not None and self.step % hook.every_steps == 0:
             return self.step != last_step
         if hook.every_seconds is None:
@@ -331,9 +325,9 @@ class _Run:
         passed = self.history.seconds - (last_seconds or 0.0)
         return last_seconds is None or passed >= hook.every_seconds
 
-    def _call(self, hook: Hook) -> None:
+    def _call_hook(self, hook: Hook) -> None:
         numbers = hook.call(self.state, self.step, self._metrics())
-        self.called[hook.name] = [self.step, self.history.seconds]
+        self.last_calls[hook.name] = [self.step, self.history.seconds]
         if numbers is not None:
             row = {
                 "hook": hook.name,
@@ -343,52 +337,52 @@ class _Run:
             values = {name: float(value) for name, value in numbers.items()}
             event_stream.emit("evaluation", **row, metrics=values)
             row |= values
-            # One row for a step: a complete run that is resumed calls its hooks again.
-            earlier = (
+            # One row per step, because resuming a complete run calls its hooks again.
+            other_rows = (
                 old
                 for old in self.history.evaluations
                 if (old["hook"], old["step"]) != (hook.name, self.step)
             )
-            self.history = self.history._replace(evaluations=(*earlier, row))
+            self.history = self.history._replace(evaluations=(*other_rows, row))
 
-    def _tell_failed_save(self, failure) -> None:
+    def _report_failed_save(self, failure) -> None:
         if failure is not None:
-            event_stream.message(f"{failure}; training goes on", "warning")
+            event_stream.message(f"{failure}; training continues", "warning")
 
-    def _save_overdue(self) -> None:
-        """Save only before another chunk, since `finish` saves the last state."""
-        trained = self.step_seconds < math.inf  # in this call: there is something new
-        if self.checkpoints is None or not trained:
+    def _save_if_due(self) -> None:
+        """Save before another chunk. `finish` saves the last state."""
+        has_trained = self.step_seconds < math.inf  # in this call
+        if self.checkpoints is None or not has_trained:
             return
         if time.monotonic() - self.saved_at >= self.limits[1]:
             self._save(self.checkpoints)
 
     def _save(self, checkpoints: Checkpoints) -> None:
-        self._tell_failed_save(checkpoints.failure(wait=True))
+        self._report_failed_save(checkpoints.failure(wait=True))
         checkpoints.save(self.state, self.step, self.history._asdict())
         self.saved_at = time.monotonic()
 
-    def _add(self, **more: float) -> None:
-        values = {name: getattr(self.history, name) + x for name, x in more.items()}
+    def _add_time(self, **seconds: float) -> None:
+        values = {name: getattr(self.history, name) + x for name, x in seconds.items()}
         self.history = self.history._replace(**values)
 
     def evaluate(self, reason: str) -> None:
-        """Report the last step, and call the hooks once more where the run is over."""
+        """Report the last step, and call the hooks if the run is complete."""
         self._report()
         if reason in ("steps", "seconds"):
             for hook in self.hooks:
-                if self.called[hook.name] != [self.step, self.history.seconds]:
-                    self._call(hook)
+                if self.last_calls[hook.name] != [self.step, self.history.seconds]:
+                    self._call_hook(hook)
 
     def finish(self, reason: str) -> FitResult:
-        """Save the last checkpoint, and say in a line how the run ended."""
+        """Save the last checkpoint, and report in one line how the run ended."""
         message = f"stopped at step {self.step:,} of {self.steps:,}"
         if reason == "steps":
             message = f"completed {self.step:,} steps"
         elif reason == "seconds":
-            message += f" by seconds: the {duration(self.limits[0])} given are over"
+            message += f" at the time limit of {duration(self.limits[0])}"
         elif reason == "non-finite":
-            message += f": {self.detail}"
+            message += f": {self.failure_detail}"
         else:
             message += f" by {reason}"
         failure = None
@@ -398,23 +392,23 @@ class _Run:
             if failure is None:
                 message += f"; saved in {self.checkpoints.folder}"
                 if reason not in ("steps", "non-finite"):
-                    message += ", resume from there to go on"
+                    message += ", from where it can be resumed"
         event_stream.message(message)
         unsaved = "" if failure is None else f"the last state is not saved: {failure}"
         return FitResult(self.state, self.history, self.step, reason, message, unsaved)
 
 
 def _distinct(state: TrainState) -> TrainState:
-    """Copies of arrays that stand in several places: one buffer is donated once."""
-    seen: set[int] = set()
+    """Copy arrays that occur several times, because buffers are donated only once."""
+    ids: set[int] = set()
 
-    def own(leaf):
-        if id(leaf) in seen:
+    def copy_duplicate(leaf):
+        if id(leaf) in ids:
             return jnp.copy(leaf)
-        seen.add(id(leaf))
+        ids.add(id(leaf))
         return leaf
 
-    return jax.tree.map(own, state)
+    return jax.tree.map(copy_duplicate, state)
 
 
 def _by_step(events: Sequence[Event]) -> dict[int, list[Event]]:
@@ -425,8 +419,8 @@ def _by_step(events: Sequence[Event]) -> dict[int, list[Event]]:
             or min(event.steps, default=1) < 1
         ):
             raise ValueError(
-                f"event {event.name!r} needs growing steps from 1 on, got "
-                f"{event.steps}; what comes before them belongs into Model.init"
+                f"event {event.name!r} needs ascending steps of at least 1, got "
+                f"{event.steps}; changes before the first step belong in Model.init"
             )
         for step in event.steps:
             schedule.setdefault(step, []).append(event)

@@ -18,7 +18,7 @@ from nerfies_jax.geometry.linear_call import linear_call
 from nerfies_jax.geometry.precision import at_least_float32, widened
 from nerfies_jax.runtime.contract import checked
 
-# PSNR is reported to 100 dB, where 8-bit images ended long ago (51 dB for one level).
+# Bounds PSNR at 100 dB, far above what 8-bit images resolve (51 dB for one level).
 LEAST_MSE = 1e-10
 
 
@@ -37,7 +37,7 @@ def psnr(
     """
     least = LEAST_MSE * value_range**2
     mse = widened(mse)
-    # max, not `mse + eps`: the sum would read 79.957 dB where 80 is right.
+    # A maximum, because `mse + eps` would give 79.957 dB instead of 80.
     return -10 * jnp.log10(jnp.maximum(mse, least) / value_range**2)
 
 
@@ -46,10 +46,10 @@ def _only_valid(
     target: Float[Array, "*pixels channels"],
     valid: Bool[Array, "*pixels"] | None,
 ) -> tuple[Float[Array, "*pixels channels"], Float[Array, "*pixels channels"]]:
-    """Both widened, with zeros where `valid` is false, so nothing there has a gradient.
+    """Widen both images and set invalid pixels to zero, where gradients are then zero.
 
-    On the input: selecting after the residual is squared would still multiply a zero
-    cotangent with the NaN that EXR and undistorted images carry in unfilmed pixels.
+    The inputs are masked, because EXR and undistorted images have NaN in unobserved
+    pixels. Masking the squared residual would multiply a zero cotangent with NaN.
     """
     image, target = widened(image), widened(target)
     if valid is None:
@@ -140,8 +140,8 @@ def charbonnier(
       Charbonnier et al. 1994, with the offset subtracted.
     """
     _positive(width)
-    # The difference of roots would be 0 below s = 1e-8 at width 1e-2 in float32, and
-    # the quotient is NaN where a square has become infinite.
+    # In float32 the difference of roots is 0 below s = 1e-8 at width 1e-2, and the
+    # quotient is NaN if s is infinite.
     near = residual_sq < 8 * width**2
     small = jnp.where(near, residual_sq, 0)
     quotient = small / (jnp.sqrt(small + width**2) + width)
@@ -182,10 +182,10 @@ def geman_mcclure(
 
     Args:
       residual_sq: Squared norms s, non-negative, [...].
-      width: Norm at which the loss leaves the parabola, positive.
-      scaling: "paper", or "official" to multiply with `width` as the published code
-        does. There the elastic weight acts as 0.03 of its value and the background
-        weight as 0.001.
+      width: Norm at which the loss stops being quadratic, positive.
+      scaling: "paper", or "official" to multiply by `width` as the published code does.
+        In that code the elastic weight is therefore scaled by 0.03 and the background
+        weight by 0.001.
 
     Returns:
       Losses [...], which saturate at two, or at 2 `width` for "official".
@@ -202,7 +202,7 @@ def geman_mcclure(
 
 
 def check_geman_mcclure(width: float, scaling: str) -> None:
-    """Check the settings of `geman_mcclure`, without JAX.
+    """Check the settings of `geman_mcclure` without running JAX.
 
     Args:
       width: As for `geman_mcclure`.
@@ -220,15 +220,16 @@ def check_geman_mcclure(width: float, scaling: str) -> None:
 
 @jax.custom_jvp
 def _saturating(ratio: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """u / (1 + u) for u >= 0, up to and with u = inf."""
+    """Compute u / (1 + u) for u >= 0, including u = inf."""
     large = 1 / (1 + 1 / jnp.maximum(ratio, 1))
     return jnp.where(ratio < 1, ratio / (1 + ratio), large)
 
 
 @_saturating.defjvp
 def _saturating_jvp(primals, tangents):
-    # Written out: the quotient rule is 1/(1+u) - u/(1+u)^2, which at u = 280 (a stretch
-    # of 2.7 under width 0.03) has lost three digits in float32 and at 1e5 has two left.
+    # The quotient rule gives 1/(1+u) - u/(1+u)^2, which cancels: in float32 it loses
+    # three digits at u = 280 (a stretch of 2.7 with width 0.03), and has two digits
+    # left at 1e5.
     (ratio,), (tangent,) = primals, tangents
     return _saturating(ratio), jnp.square(1 / (1 + ratio)) * tangent
 
@@ -236,8 +237,8 @@ def _saturating_jvp(primals, tangents):
 def _positive(width: float) -> None:
     if not 0 < width < math.inf:
         raise ValueError(
-            f"a robust penalty needs a finite width > 0, got {width}; "
-            "it is the residual at which the penalty stops being quadratic"
+            f"a robust penalty needs a finite width > 0, got {width}; the width is the "
+            "residual at which the penalty stops being quadratic"
         )
 
 
@@ -265,31 +266,31 @@ def dssim_map(
 
     With d = image - target and local means m and variances v, 1 - SSIM = a + b - ab, a
     = m_d² / (m_i² + m_t² + C1), b = v_d / (v_i + v_t + C2). This avoids differences of
-    nearly equal numbers, and takes four windows instead of five. Variances are taken
-    about the target's mean, which they do not depend on. Uncentered, a pair of constant
-    images at 0.9 gives 4e-5 too low in float32, and 1000 ± 1 is 2e-3 off.
+    nearly equal numbers, and needs four filtered maps instead of five. The mean of the
+    target is subtracted before variances are computed, which does not change them. In
+    float32, images of constant 0.9 otherwise have an error of 4e-5, and values of
+    1000 ± 1 one of 2e-3.
 
-    The window is eleven shifted sums along each axis with one of the four maps in
-    flight. Milliseconds of forward and backward on one CPU core at 160x120x3 and
-    480x270x3:
+    The window is applied as eleven shifted sums along each axis, to one of the four
+    maps at a time. Milliseconds of forward and backward pass on one CPU core for
+    160x120x3 and 480x270x3 pixels:
 
-        this form                               1.7    11
-        banded matrix products, in blocks       2.7    28
-        banded matrix products, whole           4.2    58
-        shifted sums, left to autodiff           15   173
+        this implementation                     1.7    11
+        banded matrix products in blocks        2.7    28
+        banded matrix products                  4.2    58
+        shifted sums with autodiff               15   173
         dm-pix                                   42   251
         XLA's depthwise convolution              75   443
 
-    The window is its own transpose, so the backward pass is the same code.
+    The window is symmetric, so the backward pass uses the same code.
 
     Args:
       image: Rendered image, [height, width, channels].
       target: Ground truth of the same shape.
-      padding: "zero" is the form that INRIA's 3DGS and its descendants train on and
-        report: the window reaches into zeros outside the frame. "valid" leaves those 5
-        border pixels out. It is scikit-image's Gaussian form (`gaussian_weights=True,
-        sigma=1.5, use_sample_covariance=False`), which is 0.002 to 0.011 lower on
-        photographs.
+      padding: "zero" pads images with zeros, as INRIA's 3DGS and its derivatives do
+        for training and evaluation. "valid" omits the 5 border pixels, as scikit-image
+        does (`gaussian_weights=True, sigma=1.5, use_sample_covariance=False`). Its SSIM
+        is 0.002 to 0.011 lower on photographs.
       value_range: Difference between the largest and the smallest possible value.
 
     Returns:
@@ -363,10 +364,10 @@ def photometric(
     Args:
       image: Rendered image, [height, width, channels].
       target: Ground truth of the same shape.
-      valid: True for pixels that count, [height, width]. The others are zero in both
-        images and have no gradient. Windows that overlap the edge of the mask see that
-        zero in both. None for all.
-      dssim_weight: Weight w in [0, 1]. At 0 no windows are computed.
+      valid: True for pixels that count, [height, width], or None for all. The others
+        are set to zero in both images, also in windows that overlap the edge of the
+        mask, and have no gradient.
+      dssim_weight: Weight w in [0, 1]. At 0 SSIM is not computed.
 
     Returns:
       The loss, a scalar.
@@ -378,9 +379,7 @@ def photometric(
       Kerbl et al. 2023, arXiv:2308.04079, equation 7.
     """
     if not 0 <= dssim_weight <= 1:
-        raise ValueError(
-            f"dssim_weight is a share of the loss in [0, 1], got {dssim_weight}"
-        )
+        raise ValueError(f"dssim_weight must be in [0, 1], got {dssim_weight}")
     absolute = l1(image, target, valid)
     if dssim_weight == 0:
         return absolute
@@ -391,13 +390,11 @@ def photometric(
 
 @checked
 def middle_level(target: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """Compute the mean, rounded to 12 bits, as a center for variances. Without
-    gradient.
+    """Compute the mean rounded to 12 bits, to center variances, without gradient.
 
-    The compiler may fuse x - sum * (1 / count) into one operation in one place and not
-    in another, and so compute E[x] and E[x²] about two centers that are half an ulp of
-    the level apart, which is 4e-5 of SSIM at level 1000 in float32. Rounding makes them
-    equal.
+    The compiler may fuse x - sum * (1 / count) in one place and not in another. E[x]
+    and E[x²] would then be computed with centers that differ by half an ulp, which
+    changes SSIM by 4e-5 at level 1000 in float32. Rounding makes the centers equal.
 
     Args:
       target: Values of any shape.
@@ -410,17 +407,17 @@ def middle_level(target: Float[Array, "*shape"]) -> Float[Array, ""]:
 
 
 def _comparable(image, target, padding):
-    """Both in float32 at least, of one shape that a window fits into."""
+    """Check that the images have one shape that fits a window, and widen them."""
     if image.shape != target.shape:
         raise ValueError(
-            f"SSIM of images of two shapes, {image.shape} and {target.shape}"
+            f"SSIM needs images of one shape, got {image.shape} and {target.shape}"
         )
     if padding not in ("zero", "valid"):
         raise ValueError(f"SSIM padding is 'zero' or 'valid', got {padding!r}")
     if padding == "valid" and min(image.shape[:2]) < len(WINDOW):
         raise ValueError(
-            f"an image of {image.shape[1]}x{image.shape[0]} pixels holds no 11x11 "
-            "window; use padding='zero' or a larger image"
+            f"an image of {image.shape[1]}x{image.shape[0]} pixels is smaller than the "
+            "11x11 window; use padding='zero' or a larger image"
         )
     return widened(image), widened(target)
 
@@ -431,28 +428,28 @@ def _blur(
     outside: Float[Array, " maps"],
     channels: int,
 ) -> Float[Array, "maps height columns"]:
-    """Filter every map with the window. Outside the frame each has its value of
-    `outside`.
+    """Filter each map with the window, padded with its value of `outside`.
 
     Channels are folded into the columns, so that every shift is contiguous. `outside`
-    gets no gradient.
+    has no gradient.
     """
 
-    def one(carried):
-        values, beyond = carried
-        rows = _window_sum(values, beyond, 0, 1)
-        return lax.optimization_barrier(_window_sum(rows, beyond, 1, channels))
+    def filter_map(map_and_padding):
+        values, padding = map_and_padding
+        rows = _window_sum(values, padding, 0, 1)
+        return lax.optimization_barrier(_window_sum(rows, padding, 1, channels))
 
-    # `map` keeps the four maps apart: fused, XLA evaluates all 88 shifts for each
-    # element it reduces, and the forward pass alone takes 45 instead of 4.8 ms.
-    return lax.map(one, (maps, outside))
+    # `lax.map` prevents fusion of the four maps. Fused, XLA evaluates all 88 shifts for
+    # each element of the sums, and the forward pass takes 45 ms instead of 4.8.
+    return lax.map(filter_map, (maps, outside))
 
 
-def _window_sum(values, beyond, axis, stride):
+def _window_sum(values, padding, axis, stride):
     pad = [(0, 0), (0, 0)]
     pad[axis] = (RADIUS * stride, RADIUS * stride)
-    padded = jnp.pad(values, pad, constant_values=beyond)
-    # Without the barrier XLA fuses the padding into each of the eleven reads: 2x.
+    padded = jnp.pad(values, pad, constant_values=padding)
+    # Without the barrier XLA fuses the padding into each of the eleven reads, which
+    # takes twice the time.
     padded = lax.optimization_barrier(padded)
     take = functools.partial(lax.slice_in_dim, padded, axis=axis)
     length = values.shape[axis]
@@ -464,11 +461,11 @@ def _window_sum(values, beyond, axis, stride):
 
 @_blur.defjvp
 def _blur_jvp(channels, primals, tangents):
-    # The window is symmetric, so the transpose is the function itself.
-    change = linear_call(_blur_inside, _blur_inside, channels, (), tangents[0])
-    return _blur(*primals, channels), change
+    # The window is symmetric, so the function is its own transpose.
+    tangent = linear_call(_blur_padded, _blur_padded, channels, (), tangents[0])
+    return _blur(*primals, channels), tangent
 
 
-def _blur_inside(channels, residuals, maps):
-    """Under the window with zeros beyond the frame."""
+def _blur_padded(channels, residuals, maps):
+    """Filter maps that are padded with zeros."""
     return _blur(maps, jnp.zeros_like(maps[:, 0, 0]), channels)

@@ -1,4 +1,4 @@
-"""Operations of the matrix products in a function, with loops counted in full."""
+"""FLOPs of the matrix products in a function, with all iterations of loops."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -11,20 +11,20 @@ from nerfies_jax.nn import dense
 
 
 class Counted(NamedTuple):
-    """Operations of one call."""
+    """FLOPs of one call."""
 
     flops: float  # two for each multiply-add
-    # True if some are in a loop whose number of iterations depends on data. Its body
-    # counts once.
+    # True if there is a loop whose number of iterations depends on data. Its body is
+    # counted once.
     at_least: bool
 
 
 def count(function: Callable, *args: Any) -> Counted:
     """Count the operations of the matrix products of a function, without running it.
 
-    XLA's own count contains a loop's body once, even if the number of iterations is
-    known, as in `lax.map` over blocks of Gaussians. Of the branches of a condition the
-    most expensive counts, and unused results do not count.
+    XLA counts the body of a loop once, even if the number of iterations is known, as in
+    `lax.map` over blocks of Gaussians. Of the branches of a conditional the most
+    expensive one is counted. Unused results are not counted.
 
     Args:
       function: The function.
@@ -78,7 +78,7 @@ def _dense(equation):
 
 
 def _inner(params) -> Iterator[Any]:
-    """The programs within an operation, of whatever kind it is."""
+    """Yield the programs within an operation of any kind."""
     leaves = jax.tree.leaves(
         list(params.values()),
         is_leaf=lambda x: isinstance(x, (core.Jaxpr, core.ClosedJaxpr)),

@@ -22,17 +22,17 @@ class Frames(NamedTuple):
     appearance: Int[Array, " frames"]
     valid: Any  # [frames, height, width] bool, or None
     # Data that a model reads only if its `required_data` says so:
-    depths: Any = (
-        None  # [frames, height, width] float32 z-depth, scene units; 0 unknown
-    )
+    # z-depth in scene units, 0 where unknown, [frames, height, width] float32
+    depths: Any = None
     points: Any = None  # [points, 3] float32 static scene points, scene units
-    flow: FrameFlow | None = None  # rows count the frames that are learned from
-    moving: Any = None  # [frames, height, width] bool: moves by itself
-    # Rows of `images` if it has all frames of the capture; None if it has these.
+    flow: FrameFlow | None = None  # its rows are training frames
+    moving: Any = None  # [frames, height, width] bool, True for moving objects
+    # Rows of the training frames in `images` if it has all frames of the capture. None
+    # if it has only the training frames.
     image_rows: Any = None
 
     def image_row(self, row: Any) -> Any:
-        """Return the row of `images` that a training frame has."""
+        """Return the row of `images` that holds a training frame."""
         return row if self.image_rows is None else self.image_rows[row]
 
 
@@ -49,29 +49,29 @@ class Rendering(NamedTuple):
 
     color: Float[Array, "height width 3"]  # sRGB; not clipped
     alpha: Float[Array, "height width"]
-    # Expected z-depth, scene units; None in a training step that nobody asks for it.
+    # Expected z-depth in scene units. None in a training step that does not use it.
     depth: Float[Array, "height width"] | None
 
 
 class TrainState(NamedTuple):
     """Everything needed to continue a run bit for bit, as finite arrays.
 
-    If an array would start at infinity, such as one that tracks a minimum, start it at
-    the largest number: the loop stops at anything that is not finite.
+    Training stops at any value that is not finite. An array that tracks a minimum has
+    to start at the largest number instead of infinity.
     """
 
     params: PyTree
     optimizer: PyTree
-    aux_state: PyTree  # what the representation carries beside: row statistics, ...
+    aux_state: PyTree  # further state, such as statistics for densification
     step: Int[Array, ""]
-    key: Key[Array, ""]  # of the run; step i uses fold_in(key, i)
+    key: Key[Array, ""]  # key of the run; step i uses fold_in(key, i)
 
 
 def in_default_precision(tree: PyTree) -> PyTree:
     """Move a pytree to the device, with floating-point arrays in default precision.
 
-    That is float32, or float64 if `jax_enable_x64` is on. Random numbers are drawn in
-    float32 first, so both precisions start alike.
+    That is float32, or float64 if `jax_enable_x64` is on. Initial random numbers are
+    generated in float32, so both precisions start from the same values.
 
     Args:
       tree: A pytree of arrays.
@@ -83,8 +83,8 @@ def in_default_precision(tree: PyTree) -> PyTree:
 
     def convert(leaf):
         leaf = jnp.asarray(leaf)
-        wrong = jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype != default
-        return leaf.astype(default) if wrong else leaf
+        is_float = jnp.issubdtype(leaf.dtype, jnp.floating)
+        return leaf.astype(default) if is_float else leaf
 
     return jax.tree.map(convert, tree)
 
@@ -96,7 +96,7 @@ class Event(NamedTuple):
     """
 
     name: str
-    steps: tuple[int, ...]  # after this many completed steps, sorted
+    steps: tuple[int, ...]  # numbers of completed steps, ascending
     apply: Callable[[TrainState, Frames], TrainState]
 
 
@@ -109,13 +109,13 @@ class Stages(NamedTuple):
     """
 
     prepare: Callable[[PyTree], PyTree]  # once for trained parameters
-    deform: Callable[[PyTree, PyTree, Float[Array, ""]], PyTree]  # once for an instant
+    deform: Callable[[PyTree, PyTree, Float[Array, ""]], PyTree]  # once per frame time
     draw: Callable[[PyTree, PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
     rows: Callable[[PyTree], PyTree] | None = None
 
 
 class Surveyed(NamedTuple):
-    """`Model.render` accelerated by a survey of space, without gradients.
+    """`Model.render` accelerated by precomputed occupancy, without gradients.
 
     `draw(params, survey(params, step), view, size, step)` equals `render` except for a
     small, tested difference.
@@ -131,20 +131,20 @@ class Model(NamedTuple):
     spec: Any  # hashable; written into the checkpoint
     init: Callable[[Any, Any], TrainState]  # (Capture, key) -> state; host
     step: Callable[[TrainState, Frames], tuple[TrainState, dict[str, Array]]]
-    # (params, view, size, step): `step` says how far the parameters are trained, since
-    # what is drawn follows its schedules (coarse-to-fine windows, harmonic degrees).
+    # (params, view, size, step). `step` is the number of completed training steps,
+    # which determines schedules such as coarse-to-fine windows and harmonic degrees.
     render: Callable[[PyTree, View, tuple[int, int], Int[Array, ""]], Rendering]
     events: tuple[Event, ...]
     counts: Callable[[TrainState], dict[str, int]]  # {"gaussians": n, ...}
-    # Subset of "depths", "points", "flow" and "moving" that it reads if available.
+    # Optional data that the model reads, of "depths", "points", "flow" and "moving".
     required_data: frozenset[str] = frozenset()
-    stages: Stages | None = None  # where rendering has parts worth keeping
-    surveyed: Surveyed | None = None  # where a survey makes images quicker
-    # Faster form of `init` with the same structure, which a checkpoint is read into.
+    stages: Stages | None = None  # if results of stages of rendering can be reused
+    surveyed: Surveyed | None = None  # if a survey accelerates rendering
+    # Faster form of `init` that only has to have the structure of a checkpoint.
     example: Callable[[Any, Any], TrainState] | None = None
-    devices: int = 1  # on which `step` works, by `data_parallel`
-    # (params, capture) -> the capture with its cameras as training found them; None
-    # where they stay those of the capture.
+    devices: int = 1  # that `step` uses (`data_parallel`)
+    # (params, capture) -> the capture with refined cameras. None if cameras are not
+    # trained.
     found: Callable[[PyTree, Any], Any] | None = None
     # Compiler options of steps and renders (`nerfies_jax.runtime.compiler`).
     compiler_options: Mapping[str, str] | None = None

@@ -1,4 +1,4 @@
-"""Extension points that radiance fields and Gaussians share."""
+"""Protocols of components for both radiance fields and Gaussians."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -20,16 +20,16 @@ class Regularizer(Protocol):
     """A term of the loss.
 
     Optional members: `weight` multiplies a scalar loss (default 1). `required_data` is
-    the set of what it reads of the capture, of "depths", "points", "flow" and "moving".
-    `state(params)` returns arrays, kept as `context.state` until the number of
-    Gaussians changes. `name` is the prefix of its metrics; the default is the class
-    name in snake case.
+    the set of data of the capture that it reads, of "depths", "points", "flow" and
+    "moving". `state(params)` returns arrays that are passed as `context.state` until
+    the number of Gaussians changes. `name` is the prefix of its metrics, by default the
+    class name in snake case.
     """
 
     def loss(
         self, params: PyTree, context: PenaltyContext
     ) -> Scalar | Mapping[str, Term]:
-        """Compute the loss of one step; traced.
+        """Compute the loss of one step. The function is traced.
 
         Args:
           params: Parameters of the whole scene.
@@ -44,25 +44,25 @@ class Regularizer(Protocol):
 
 @runtime_checkable
 class Optimizer(Protocol):
-    """Gradient transformation, as those of optax.
+    """Gradient transformation, as in optax.
 
-    Its updates are descent directions of unit scale, such as `optax.scale_by_adam()`
-    makes: the scene multiplies them by its learning rates and subtracts them.
+    Its updates have unit scale and are subtracted after multiplication by the learning
+    rates of the scene, so use `optax.scale_by_adam()` rather than `optax.adam(rate)`.
     """
 
     def init(self, params: PyTree) -> PyTree:
-        """Return the state of these parameters."""
+        """Return the initial state for parameters."""
         ...
 
     def update(
         self, updates: PyTree, state: PyTree, params: PyTree | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Return the updates of some gradients, and the new state."""
+        """Return the updates for gradients, and the new state."""
         ...
 
 
 def regularizer_hooks(regularizer: Regularizer) -> dict[str, Any]:
-    """Return the hooks of a regularizer, for the record of either representation."""
+    """Return the hooks of a regularizer for the records of both representations."""
     weight = getattr(regularizer, "weight", 1.0)
     return {
         "name": name_of(regularizer),
@@ -74,15 +74,15 @@ def regularizer_hooks(regularizer: Regularizer) -> dict[str, Any]:
 
 
 def name_of(part: Any) -> str:
-    """Return the name of a part of a scene: its `name`, or its class in snake case."""
-    own = getattr(part, "name", None)
-    if own is not None:
-        return own
+    """Return the name of a component: its `name`, or its class name in snake case."""
+    name = getattr(part, "name", None)
+    if name is not None:
+        return name
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(part).__name__).lower()
 
 
 def as_terms(loss: Scalar | Mapping[str, Term], weight: float = 1.0) -> dict[str, Term]:
-    """Return the terms of a loss; a scalar is the term "loss" of this weight."""
+    """Return the terms of a loss. A scalar becomes the term "loss" with the weight."""
     if isinstance(loss, Mapping):
         return dict(loss)
     return {"loss": Term(loss, weight)}

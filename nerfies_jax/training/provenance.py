@@ -1,4 +1,4 @@
-"""Origin of a file: the revision of this library and the environment that made it."""
+"""Provenance of a file: revision of this library, and environment."""
 
 import pathlib
 import subprocess
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def provenance() -> dict[str, Any]:
-    """Describe the environment on which the last bits of a checkpoint depend.
+    """Describe the environment that affects the exact bits of a result.
 
     Returns:
       Revision, versions of Python, JAX and NumPy, the device and the precision, as JSON
@@ -36,13 +36,13 @@ def revision(checkout: pathlib.Path | None = None) -> str:
     Returns:
       The revision, with "+changes" if files are modified, or "unknown" outside of Git.
     """
-    here = checkout or pathlib.Path(__file__).resolve().parents[2]
-    if not (here / ".git").exists():  # installed, perhaps inside another repository
+    root = checkout or pathlib.Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():  # installed, perhaps inside another repository
         return "unknown"
     command = "describe --always --exclude=* --dirty=+changes --abbrev=40"
     try:
         text = subprocess.run(
-            ["git", "-C", here, *command.split()],
+            ["git", "-C", root, *command.split()],
             capture_output=True,
             text=True,
             timeout=10,

@@ -10,12 +10,12 @@ import numpy as np
 from nerfies_jax.training import chunk
 from nerfies_jax.training.model import Frames, Model, TrainState
 
-# Shares of a run at which its step is timed: before a warm-up is over, a motion may
-# cost nothing, and a penalty that begins late is seen by the first steps alone never.
+# Fractions of a run at which a step is timed. A motion may cost nothing during its
+# warm-up, and a penalty may start late.
 PHASES = (1 / 8, 3 / 8, 5 / 8, 7 / 8)
-PHASE_SECONDS = 0.4  # of steps that are timed at each
+PHASE_SECONDS = 0.4  # duration of the timed steps of each phase
 MOST_STEPS = 200
-REPEATS, REPEAT_SECONDS = 5, 1.0  # of the scans that tell what a step takes
+REPEATS, REPEAT_SECONDS = 5, 1.0  # maximum number and duration of scans in `step_ms`
 
 
 class StepTime(NamedTuple):
@@ -26,10 +26,10 @@ class StepTime(NamedTuple):
 
 
 def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> StepTime:
-    """Measure the mean time of a step over a run, with the first state.
+    """Measure the mean time of a step over a run, using the initial state.
 
-    Steps are timed at several `PHASES` of the run, and the first of each is left out.
-    Growth of the state during the run is not accounted for.
+    Steps are timed at several `PHASES` of the run, after a first scan that is not
+    timed. Growth of the state during the run is not accounted for.
 
     Args:
       model: The model.
@@ -45,28 +45,28 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
 
     def timed(start, count):
         began = time.perf_counter()
-        left, outcome = program(start, frames, count)
-        done = max(outcome.done, 1)  # fewer where one is not finite
-        return left, (time.perf_counter() - began) / done
+        end, outcome = program(start, frames, count)
+        done = max(outcome.done, 1)  # less than `count` if a step is not finite
+        return end, (time.perf_counter() - began) / done
 
     seconds = []
-    for share in PHASES:
-        # The program overwrites what it is given.
+    for fraction in PHASES:
+        # A copy, because the program overwrites its input.
         start = jax.tree.map(jnp.copy, state)
-        start = start._replace(step=jnp.full_like(state.step, int(share * steps)))
+        start = start._replace(step=jnp.full_like(state.step, int(fraction * steps)))
         start, _ = timed(start, length)
-        start, guess = timed(start, length)
-        scans = round(PHASE_SECONDS / (length * guess))
+        start, estimate = timed(start, length)
+        scans = round(PHASE_SECONDS / (length * estimate))
         count = length * min(max(scans, 1), MOST_STEPS // length)
         seconds.append(timed(start, count)[1])
     return StepTime(float(np.mean(seconds)), compile_seconds)
 
 
 def step_ms(model: Model, state: TrainState, frames: Frames, steps: int) -> float:
-    """Measure the median time of a step from a state on.
+    """Measure the median time of a step, starting from a state.
 
-    The program is that of a run of `steps` steps, so nothing is compiled if it has
-    trained.
+    The program is that of a run of `steps` steps, so nothing is compiled if such a run
+    has trained.
 
     Args:
       model: The model.
@@ -78,10 +78,10 @@ def step_ms(model: Model, state: TrainState, frames: Frames, steps: int) -> floa
       Milliseconds per step.
     """
     program, frames, _ = chunk.compiled(model, state, frames, steps)
-    left = jax.tree.map(jnp.copy, state)
+    current = jax.tree.map(jnp.copy, state)
     seconds: list[float] = []
     while len(seconds) < REPEATS and sum(seconds) < REPEAT_SECONDS:
         began = time.perf_counter()
-        left, _ = program(left, frames, program.length)  # waits
+        current, _ = program(current, frames, program.length)  # blocks until done
         seconds.append(time.perf_counter() - began)
     return 1e3 * float(np.median(seconds)) / program.length

@@ -1,8 +1,8 @@
-"""Schedules of the traced step that the literature uses and optax does not have.
+"""Schedules from the literature that optax does not have.
 
-Use optax for constant, cosine decay, piecewise and joined schedules. All schedules here
+Use optax for constant, cosine decay, piecewise and joined schedules. The schedules here
 keep their last value after their last step, accept Python, NumPy and traced steps, and
-check their settings when they are built.
+check their settings when they are made.
 """
 
 import math
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from nerfies_jax.nn import encoding
 
-Schedule = Callable[..., Float[Array, "*steps"]]  # of an integer step
+Schedule = Callable[..., Float[Array, "*steps"]]  # (integer step) -> value
 
 
 def check_falling(learning_rate: float, learning_rate_end: float) -> None:
@@ -30,8 +30,8 @@ def check_falling(learning_rate: float, learning_rate_end: float) -> None:
     if not 0 < learning_rate_end <= learning_rate < math.inf:
         raise ValueError(
             f"the rate falls from learning_rate={learning_rate} to "
-            f"learning_rate_end={learning_rate_end}; both are positive and finite, "
-            "and the second is not larger"
+            f"learning_rate_end={learning_rate_end}; both must be positive and finite, "
+            "and the second must not be larger"
         )
 
 
@@ -56,8 +56,8 @@ def log_linear(
     Raises:
       ValueError: If a setting is out of range.
     """
-    _span("log_linear", steps)
-    _ends("log_linear", start=start, end=end)
+    _check_steps("log_linear", steps)
+    _check_positive("log_linear", start=start, end=end)
     if delay_steps < 0 or not 0 < delay <= 1:
         raise ValueError(
             "a delayed warm-up needs delay_steps >= 0 and a factor 0 < delay <= 1, got "
@@ -66,8 +66,8 @@ def log_linear(
     ratio = math.log(end / start)
 
     def schedule(step):
-        # exp of a small number times a constant: float32 keeps the rate to 2e-7, while
-        # interpolating log(start) and log(end) loses 1e-6 at rates of 1e-7.
+        # In float32 this has a relative error of 2e-7. Interpolating log(start) and
+        # log(end) has 1e-6 at rates of 1e-7.
         rate = start * jnp.exp(ratio * _share(step, steps))
         if delay_steps:
             warm = jnp.sin(0.5 * jnp.pi * _share(step, delay_steps))
@@ -94,8 +94,8 @@ def ramp(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
     Raises:
       ValueError: If a setting is out of range.
     """
-    _span("ramp", steps, after)
-    _finite("ramp", start=start, end=end)
+    _check_steps("ramp", steps, after)
+    _check_finite("ramp", start=start, end=end)
 
     def schedule(step):
         share = _share(step, steps, after)
@@ -107,11 +107,11 @@ def ramp(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
 def band_window(
     bands: int, steps: int, step: Int[Array, ""], dtype: DTypeLike, *, after: int = 0
 ) -> Float[Array, " bands"]:
-    """Compute the coarse-to-fine window of bands or levels that open one by one.
+    """Compute the coarse-to-fine window of bands or levels.
 
     Args:
       bands: Number of bands, at least one.
-      steps: Number of steps until all are open.
+      steps: Number of steps until all bands are open.
       step: Current step, traced.
       dtype: Floating-point type of the result.
       after: Step at which the first band begins to open.
@@ -130,7 +130,7 @@ def cosine(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
     """Make a schedule that follows half a cosine from one value to another.
 
     The elastic weight of Nerfies is `cosine(1e-2, 1e-8, 100_000, after=50_000)`. The
-    schedule of optax decays to a share of its first value and cannot increase.
+    schedule of optax decays to a fraction of its first value and cannot increase.
 
     Args:
       start: Value up to step `after`.
@@ -144,16 +144,16 @@ def cosine(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
     Raises:
       ValueError: If a setting is out of range.
     """
-    _span("cosine", steps, after)
-    _finite("cosine", start=start, end=end)
+    _check_steps("cosine", steps, after)
+    _check_finite("cosine", start=start, end=end)
 
     def schedule(step):
         share = _share(step, steps, after)
-        # Squares, not (1 + cos) / 2, which leaves 3e-8 of the start where none should
-        # be left: as much as a small end.
-        risen = jnp.sin(0.5 * jnp.pi * share) ** 2
-        left = jnp.cos(0.5 * jnp.pi * share) ** 2
-        return _with_ends(share, left * start + risen * end, start, end)
+        # Squares, because (1 + cos) / 2 does not reach zero: at the end it leaves 3e-8
+        # of the first value, which can be as large as the last value.
+        end_weight = jnp.sin(0.5 * jnp.pi * share) ** 2
+        start_weight = jnp.cos(0.5 * jnp.pi * share) ** 2
+        return _with_ends(share, start_weight * start + end_weight * end, start, end)
 
     return schedule
 
@@ -161,9 +161,9 @@ def cosine(start: float, end: float, steps: int, *, after: int = 0) -> Schedule:
 def time_noise(frames: int, steps: int = 20_000, scale: float = 0.1) -> Schedule:
     """Make the schedule of the noise on time of annealed smooth training.
 
-    It starts at `scale` of one frame interval and falls linearly to zero. The published
-    code divides by the images left in the epoch instead of `frames`, so that its noise
-    grows to the whole duration once per epoch. This is the form in the paper.
+    It starts at `scale` frame intervals and falls linearly to zero, as in the paper.
+    The published code divides by the number of images left in the epoch instead of by
+    `frames`, so that its noise grows to the whole duration in each epoch.
 
     Args:
       frames: Number of frames of the capture.
@@ -181,12 +181,10 @@ def time_noise(frames: int, steps: int = 20_000, scale: float = 0.1) -> Schedule
     """
     if frames < 1:
         raise ValueError(
-            f"time noise is a share of the interval between frames, got frames={frames}"
+            f"frames={frames} must be at least 1, to define the interval between frames"
         )
     if not (math.isfinite(scale) and scale >= 0):
-        raise ValueError(
-            f"time noise needs a scale that is not negative, got scale={scale}"
-        )
+        raise ValueError(f"time noise needs a finite scale >= 0, got scale={scale}")
     return ramp(scale / frames, 0.0, steps)
 
 
@@ -207,49 +205,48 @@ def staircase(steps: tuple[int, ...], start: int = 0) -> Schedule:
     """
     if list(steps) != sorted(set(steps)) or any(step < 0 for step in steps):
         raise ValueError(
-            f"a staircase rises at growing steps that are not negative, got {steps}"
+            f"a staircase needs ascending, non-negative steps, got {steps}"
         )
     edges = jnp.asarray(steps, jnp.int32)
 
     def schedule(step):
-        reached = jnp.asarray(step, jnp.int32)[..., None] >= edges
-        return start + jnp.sum(reached, axis=-1, dtype=jnp.int32)
+        passed = jnp.asarray(step, jnp.int32)[..., None] >= edges
+        return start + jnp.sum(passed, axis=-1, dtype=jnp.int32)
 
     return schedule
 
 
 def _share(step, steps, after=0):
-    """Share of the interval that has passed, from 0 to 1."""
-    # Subtracted as integers: float32 counts no further than 16.7 million steps.
+    """Compute the fraction of the interval that has passed, from 0 to 1."""
+    # Subtracted as integers, because float32 cannot count beyond 16.7 million steps.
     passed = jnp.clip(jnp.asarray(step, jnp.int32) - after, 0, steps)
     share = passed.astype(jnp.result_type(float)) / steps
-    # XLA multiplies with the rounded 1 / steps: at the end that is not quite one.
+    # XLA multiplies by the rounded 1 / steps, so the last value may differ from one.
     return jnp.where(passed == steps, 1.0, share)
 
 
 def _with_ends(share, between, start, end):
-    """Exact at both ends: XLA contracts (1 - share) * start, which then misses zero."""
+    """Make both ends exact. XLA contracts (1 - share) * start, which misses zero."""
     return jnp.where(share <= 0, start, jnp.where(share >= 1, end, between))
 
 
-def _span(name, steps, after=0):
+def _check_steps(name, steps, after=0):
     if steps < 1 or after < 0:
         raise ValueError(
-            f"{name} needs at least one step and a start that is not negative, got "
-            f"steps={steps}, after={after}"
+            f"{name} needs steps >= 1 and after >= 0, got steps={steps}, after={after}"
         )
 
 
-def _finite(name, **values):
+def _check_finite(name, **values):
     for key, value in values.items():
         if not math.isfinite(value):
             raise ValueError(f"{name} needs a finite {key}, got {value}")
 
 
-def _ends(name, **values):
+def _check_positive(name, **values):
     for key, value in values.items():
         if not (math.isfinite(value) and value > 0):
             raise ValueError(
-                f"{name} runs in the logarithm and needs a finite {key} > 0, got "
+                f"{name} interpolates logarithms and needs a finite {key} > 0, got "
                 f"{value}; use `ramp` to reach zero"
             )

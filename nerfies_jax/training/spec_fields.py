@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 class SpecField(NamedTuple):
     """One field of a spec, or of a spec nested in it."""
 
-    path: str  # from the outermost spec, with dots
-    value: str  # as `specs.override` reads it
-    default: str  # of the class, or of the field above it; "" where it has none
-    kind: str  # what it can be
-    about: str  # the words beside it in the source
-    holder: type  # the class that has the field
+    path: str  # dotted path from the outermost spec
+    value: str  # as parsed by `specs.override`
+    default: str  # default of the class, "" if it has none
+    kind: str  # type or choices, for users
+    about: str  # description from the source
+    holder: type  # class of the field
 
 
 def fields_of(spec: Any, prefix: str = "") -> Iterator[SpecField]:
@@ -33,7 +33,7 @@ def fields_of(spec: Any, prefix: str = "") -> Iterator[SpecField]:
       prefix: Path of `spec` in an outer spec, with a dot at the end.
 
     Yields:
-      The fields, each followed by those of the spec that it holds.
+      The fields, each followed by those of its nested spec.
     """
     kinds, words = typing.get_type_hints(type(spec)), field_words(type(spec))
     for field in dataclasses.fields(spec):
@@ -57,7 +57,7 @@ def as_text(value: Any) -> str:
       value: Value of a field.
 
     Returns:
-      The text. A spec gives the name of its class.
+      The text, for a spec the name of its class.
     """
     if value is None or isinstance(value, bool):
         return str(value).lower()
@@ -69,7 +69,7 @@ def as_text(value: Any) -> str:
 
 
 def _kind_text(kind):
-    """A type as a person reads it: `int or none`, `adam or radam`."""
+    """Format a type for users, such as `int or none` or `adam or radam`."""
     if typing.get_origin(kind) is typing.Literal:
         return " or ".join(map(str, typing.get_args(kind)))
     if typing.get_origin(kind) is tuple:
@@ -97,14 +97,14 @@ def field_words(kind: type) -> dict[str, str]:
       One line for each field, "" if it has no description.
     """
     words: dict[str, str] = {}
-    for each in reversed(kind.__mro__):
-        if dataclasses.is_dataclass(each):
-            words |= _own_words(each)
+    for base in reversed(kind.__mro__):
+        if dataclasses.is_dataclass(base):
+            words |= _words_of_class(base)
     return words
 
 
 @functools.cache
-def _own_words(kind):
+def _words_of_class(kind):
     source = textwrap.dedent(inspect.getsource(kind))
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
     comments = {
@@ -113,7 +113,7 @@ def _own_words(kind):
         if token.type == tokenize.COMMENT
     }
     rows = source.splitlines()
-    alone = {line for line in comments if rows[line - 1].lstrip().startswith("#")}
+    whole_lines = {line for line in comments if rows[line - 1].lstrip().startswith("#")}
     (tree,) = ast.parse(source).body
     words = {}
     for field, below in itertools.pairwise([*tree.body, None]):
@@ -124,11 +124,11 @@ def _own_words(kind):
             words[field.target.id] = " ".join(docstring.split())
             continue
         first = field.lineno
-        while first - 1 in alone:
+        while first - 1 in whole_lines:
             first -= 1
         lines = range(first, field.end_lineno + 1)
-        said = " ".join(comments[line] for line in lines if line in comments)
-        words[field.target.id] = said
+        description = " ".join(comments[line] for line in lines if line in comments)
+        words[field.target.id] = description
     return words
 
 
@@ -136,4 +136,4 @@ def _sentences_on(name, kind):
     """Return the sentences of a class's docstring that name a field in backticks."""
     text = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
     sentences = re.split(r'(?<=[^.\s][.:;])\s(?=[A-Z`"])', text)
-    return " ".join(one for one in sentences if f"`{name}`" in one).rstrip(";:")
+    return " ".join(text for text in sentences if f"`{name}`" in text).rstrip(";:")

@@ -1,8 +1,8 @@
 """Frozen settings ("specs") as plain JSON: conversion, overrides and comparison.
 
-One codec serves checkpoints, run folders, model files and results of studies. Nothing
-in a file is executed or imported. A name in it only selects among the settings that the
-reader expects.
+This codec is used for checkpoints, run folders, model files and results of studies.
+Nothing in a file is executed or imported. The names in a file only select among the
+types that the reader expects.
 """
 
 import contextlib
@@ -19,13 +19,13 @@ from typing import Any
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.training import extensions, spec_fields
 
-TYPE = "type"  # a spec's, in JSON; no field can have this name
-NUMBER = "number"  # around an infinity or NaN, which JSON does not have
-PACKAGES = ("gaussians_jax", "nerfies_jax")  # whose records of arrays a file may name
+TYPE = "type"  # JSON key of the type of a spec; no field can have this name
+NUMBER = "number"  # JSON key of an infinity or NaN, which JSON does not have
+PACKAGES = ("gaussians_jax", "nerfies_jax")  # packages of types that files may name
 
 
 class OverrideError(ValueError):
-    """An assignment names no field of a spec, or a value that it cannot have."""
+    """An assignment names an unknown field of a spec, or an invalid value."""
 
 
 # JSON -------------------------------------------------------------------------------
@@ -66,11 +66,11 @@ def _plain(value, path):
     if isinstance(value, tuple | list):
         return [_plain(item, f"{path}[{i}]") for i, item in enumerate(value)]
     if isinstance(value, frozenset) and all(isinstance(item, str) for item in value):
-        return sorted(value)  # in one order, whatever the hashes of this process
+        return sorted(value)  # because the order of a set depends on the process
     if isinstance(value, dict) and all(isinstance(key, str) for key in value):
         return _items(value, path)
     raise ValueError(
-        f"{path} holds a {type(value).__name__}, which cannot be written; settings are "
+        f"{path} is a {type(value).__name__}, which cannot be stored; settings are "
         "numbers, strings, tuples and frozen dataclasses"
     )
 
@@ -84,27 +84,27 @@ def from_json(stored: Any, *kinds: type) -> Any:
 
     Args:
       stored: JSON values.
-      *kinds: The settings and records that may be in it, outermost ones. Those that
-        their annotated fields can hold are allowed as well, and no others.
+      *kinds: Outermost types that are allowed. The types of their annotated fields are
+        allowed too, and no others.
 
     Returns:
       The value. Lists come back as tuples.
 
     Raises:
-      ValueError: A type is not among the allowed ones, or a field is unknown, missing
-        or out of its bounds. Nothing is imported to find that out.
+      ValueError: If a type is not allowed, or a field is unknown, missing or out of
+        range. Nothing is imported to check this.
     """
     return _revived(stored, allowed_names(*kinds))
 
 
 def allowed_names(*kinds: type) -> dict[str, type]:
-    """Return the settings and records that a value of some types can hold, by name.
+    """Return types of settings and those of their fields, by name.
 
     Args:
       *kinds: Types of settings.
 
     Returns:
-      These types, and those that their annotated fields can hold.
+      These types and, recursively, the types of their annotated fields.
     """
     return {type_name(kind): kind for kind in _allowed(kinds)}
 
@@ -129,15 +129,15 @@ def _revived(stored, allowed):
 
 
 def _allowed(kinds):
-    """The records among `kinds` and, by annotation, all that their fields can hold."""
-    found, waiting = set(), [*kinds]
-    while waiting:
-        kind = waiting.pop()
-        waiting += typing.get_args(kind)
-        if _is_record(kind) and kind not in found:
-            found.add(kind)
-            waiting += typing.get_type_hints(kind).values()
-    return found
+    """Collect the records among `kinds` and, recursively, in their fields."""
+    records, pending = set(), [*kinds]
+    while pending:
+        kind = pending.pop()
+        pending += typing.get_args(kind)
+        if _is_record(kind) and kind not in records:
+            records.add(kind)
+            pending += typing.get_type_hints(kind).values()
+    return records
 
 
 def _is_record(kind):
@@ -161,13 +161,13 @@ def build_record(kind: type[Any], fields: dict[str, Any]) -> Any:
       ValueError: If the fields are not those of this version.
     """
     if dataclasses.is_dataclass(kind):
-        wanted = {field.name for field in dataclasses.fields(kind)}
+        expected = {field.name for field in dataclasses.fields(kind)}
     else:
-        wanted = {*kind._fields}
-    if fields.keys() != wanted:
+        expected = {*kind._fields}
+    if fields.keys() != expected:
         raise ValueError(
             f"a stored {kind.__name__} with {', '.join(sorted(fields))} is none of "
-            f"this version, which has {', '.join(sorted(wanted))}; open it with the "
+            f"this version, which has {', '.join(sorted(expected))}; open it with the "
             "version that made it"
         )
     return kind(**fields)
@@ -191,8 +191,8 @@ def type_name(kind: type) -> str:
 def record_named(name: Any) -> type:
     """Find a NamedTuple of arrays of these packages by its full name.
 
-    Only public modules of `PACKAGES` are imported, and only a NamedTuple that such a
-    module defines is returned, so that no code of the file's choice runs.
+    Only public modules of `PACKAGES` are imported, and only a NamedTuple that is
+    defined in such a module is returned, so that a file cannot choose code to run.
 
     Args:
       name: Full name, as `type_name` gives it.
@@ -201,7 +201,7 @@ def record_named(name: Any) -> type:
       The type.
 
     Raises:
-      ValueError: If there is none of that name.
+      ValueError: If there is no such type.
     """
     module, _, attribute = str(name).rpartition(".")
     top, *parts = module.split(".")
@@ -241,7 +241,7 @@ def differences(saved: Any, wanted: Any) -> list[str]:
 
 
 def _leaves(value, path) -> Iterator[tuple[str, str]]:
-    """Leaves by dotted path, as text: 1 is not 1.0."""
+    """Yield the leaves by dotted path, as text, so that 1 and 1.0 differ."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield from _leaves(item, f"{path}.{key}")
@@ -259,21 +259,21 @@ def _leaves(value, path) -> Iterator[tuple[str, str]]:
 def override(spec: Any, assignments: Iterable[str]) -> Any:
     """Apply `path.to.field=value` assignments to a spec.
 
-    A field that holds another spec is set by a dotted path, which creates that spec
-    with its defaults if it is None, or is removed with `none` if its type allows it.
-    The name of a spec's class, as in `config.json`, selects one of several types.
+    Fields of a nested spec are set by a dotted path, which creates the nested spec with
+    its defaults if it is None. The value `none` removes it, if its type allows that. A
+    class name, as in `config.json`, selects one of several types of nested specs.
 
     Args:
       spec: A frozen dataclass.
-      assignments: Texts of the form `path.to.field=value`, where the type of the field
-        determines how the value is read.
+      assignments: Texts of the form `path.to.field=value`. The value is parsed by the
+        type of the field.
 
     Returns:
       The changed spec.
 
     Raises:
-      OverrideError: If a field is unknown or a value cannot be read.
-      ValueError: If the spec refuses a value.
+      OverrideError: If a field is unknown or a value cannot be parsed.
+      ValueError: If a value is out of range.
     """
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
@@ -285,38 +285,38 @@ def override(spec: Any, assignments: Iterable[str]) -> Any:
 
 def _assign(spec, names, text, path, outermost):
     fields = {field.name for field in dataclasses.fields(spec)}
-    name, rest = names[0], names[1:]
+    name, inner_names = names[0], names[1:]
     if name not in fields:
         raise OverrideError(
             f"{path}: {type(spec).__name__} has no field {name!r}; "
-            + _meant(names[-1], sorted(fields), outermost)
+            + _suggestion(names[-1], sorted(fields), outermost)
         )
-    if rest:
+    if inner_names:
         inner = getattr(spec, name)
         if inner is None:
-            inner = _absent(spec, name)
+            inner = _default_of_absent(spec, name)
         if not dataclasses.is_dataclass(inner):
             raise OverrideError(f"{path}: {name!r} is {inner!r} and has no fields")
         return dataclasses.replace(
-            spec, **{name: _assign(inner, rest, text, path, outermost)}
+            spec, **{name: _assign(inner, inner_names, text, path, outermost)}
         )
     kind = typing.get_type_hints(type(spec))[name]
     return dataclasses.replace(spec, **{name: _read(kind, text, path)})
 
 
-def _meant(name, fields, outermost):
-    """The fields there are, and where the one named last is, if it is elsewhere."""
+def _suggestion(name, fields, outermost):
+    """List the known fields, and the path of a similar field elsewhere."""
     paths = [field.path for field in spec_fields.fields_of(outermost)]
     last = [path.rpartition(".")[2] for path in paths]
-    near = difflib.get_close_matches(name, [*fields, *last], n=1)
-    if not near or near[0] in fields:
+    similar = difflib.get_close_matches(name, [*fields, *last], n=1)
+    if not similar or similar[0] in fields:
         return known_names(name, fields)
-    meant = [path for path, end in zip(paths, last, strict=True) if end == near[0]]
-    return f"did you mean {' or '.join(meant)}? here are {', '.join(fields)}"
+    matches = [path for path, end in zip(paths, last, strict=True) if end == similar[0]]
+    return f"did you mean {' or '.join(matches)}? its fields are {', '.join(fields)}"
 
 
 def _absent(spec, name):
-    """Default settings of an absent part, None unless there is exactly one choice."""
+    """Return the default settings of an absent component, if its type is unique."""
     options = typing.get_args(typing.get_type_hints(type(spec))[name])
     choices = [option for option in options if dataclasses.is_dataclass(option)]
     return _defaults(choices[0], name) if len(choices) == 1 else None
@@ -329,19 +329,19 @@ def _read(kind, text, path):
     if text in named:
         return _defaults(named[text], path)
     origin = typing.get_origin(kind)
-    several = typing.get_args(options[0]) if origin is tuple else ()
-    protocols = _protocols(several or options)
-    if protocols and several:
+    item_types = typing.get_args(options[0]) if origin is tuple else ()
+    protocols = _protocols(item_types or options)
+    if protocols and item_types:
         names = [part for part in text.split(",") if part]
-        return tuple(_loaded(name, protocols, path) for name in names)
+        return tuple(_load(name, protocols, path) for name in names)
     if protocols and extensions.SEPARATOR in text:
-        return _loaded(text, protocols, path)
+        return _load(text, protocols, path)
     if type(None) in options:
         if text.lower() == "none":
             return None
         kind = next(option for option in options if option is not type(None))
     if origin is not tuple:
-        kind = next((each for each in options if each in {int, float, str}), kind)
+        kind = next((x for x in options if x in {int, float, str}), kind)
     if kind is bool and text.lower() in {"true", "false"}:
         return text.lower() == "true"
     try:
@@ -360,30 +360,30 @@ def _read(kind, text, path):
 
 
 def _protocols(options):
-    """The protocols among the types that a field can hold."""
+    """Select the protocols among the types of a field."""
     return [kind for kind in options if getattr(kind, "_is_protocol", False)]
 
 
-def _loaded(name, protocols, path):
-    """The part of this name, which fills the first of the protocols or can be bound."""
+def _load(name, protocols, path):
+    """Load a component by name and check it against the first of the protocols."""
     try:
-        part = extensions.load(name)
-        extensions.check(path, part, protocols[0])
+        component = extensions.load(name)
+        extensions.check(path, component, protocols[0])
     except ValueError as error:
         raise OverrideError(f"{path}={name}: {error}") from error
-    return part
+    return component
 
 
 def _defaults(spec_class, path):
-    """A spec as it is where nothing is said of its fields."""
-    needed = [
+    """Make a spec with the defaults of all its fields."""
+    required = [
         field.name
         for field in dataclasses.fields(spec_class)
         if field.default is field.default_factory is dataclasses.MISSING
     ]
-    if needed:
+    if required:
         raise OverrideError(
             f"{path}: {spec_class.__name__} has no defaults for "
-            f"{' and '.join(needed)}; choose a preset that has it"
+            f"{' and '.join(required)}; choose a preset that has it"
         )
     return spec_class()

@@ -1,4 +1,4 @@
-"""Fields of a spec that count steps, so that a schedule can follow the run's length."""
+"""Step counts in specs, which are scaled with the length of a run."""
 
 import dataclasses
 from typing import Any
@@ -26,9 +26,9 @@ def stretched(spec: Any, share: float) -> Any:
       share: Factor.
 
     Returns:
-      The spec with scaled counts. A count is at least 1, and 0 and None, which mean
-      that there is none, stay. Multiples of ten from a hundred on stay multiples of
-      ten, as scans need them.
+      The spec with scaled counts of at least 1. Counts of 0 and None mean that there
+      are no such steps and do not change. Multiples of ten remain multiples of ten
+      from a hundred on, to fit the length of scans.
     """
     changes = {}
     for field in dataclasses.fields(spec):

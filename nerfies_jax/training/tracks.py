@@ -1,7 +1,8 @@
-"""Inverse warps, and the tracks of points through time that follow from them.
+"""Inverse warps, and tracks of points through time that are computed from them.
 
-A warp maps observed points to canonical ones, x + d(x) = c. It has no inverse in closed
-form, and where it folds it has several or none, which flags report.
+A warp maps observed points to canonical points, x + d(x) = c. Its inverse has no closed
+form. Where the warp folds, there are several solutions or none, which is reported by
+flags.
 """
 
 import dataclasses
@@ -27,16 +28,18 @@ class InverseSpec:
     """Settings of the inversion of a warp, and its convergence criteria.
 
     A solve has converged if |x + d(x) - c| <= atol + rtol max|c|, in units of the
-    field, and if the warp preserves orientation at x (det J > 0). With a `reach`, six
-    more solves start that far away along the axes, and the flag becomes False if one
-    ends at another root, since the point is then observed in several places. It is off
-    by default because of its cost.
+    field, and if the warp preserves orientation at x (det J > 0). If `reach` is
+    positive, six more solves start at this distance along the axes. If one of them ends
+    at another root, the point is observed at several positions, and the flag is False.
+    This check is off by default because of its cost.
     """
 
-    atol: float = 1e-5  # units of the field, as dycheck's Broyden iteration
+    atol: float = 1e-5  # units of the field, as in the Broyden iteration of dycheck
     rtol: float = 1e-6  # 8 ulps of a float32 coordinate
-    max_steps: int = 32  # of Newton
-    continuation: int = 8  # steps from the identity to the warp where no start is given
+    max_steps: int = 32  # of Newton's method
+    continuation: int = (
+        8  # steps from the identity to the warp without an initial guess
+    )
     reach: float = 0.0  # units of the field
 
     def __post_init__(self):
@@ -59,8 +62,8 @@ def inverse_warp(
     Without a `start`, x + s d(x) = c is followed from s = 0, where x = c, to s = 1.
     docs/numerics.md compares this with a solver that starts at c. Derivatives with
     respect to `params` and `canonical_point` are those of the implicit function, and
-    zero where the flag is False. Everything else that `displace` closes over is held
-    constant.
+    zero where the flag is False. Other values that `displace` closes over are treated
+    as constants.
 
     Args:
       displace: Displacement d, a function of parameters and a point [3].
@@ -74,21 +77,21 @@ def inverse_warp(
     """
     frozen = lax.stop_gradient((params, canonical_point))
     if start is None:
-        start = _continued(displace, *frozen, spec.continuation)
+        start = _continuation(displace, *frozen, spec.continuation)
     start = lax.stop_gradient(start)
     root, steps = _newton(displace, *frozen, start, spec)
-    converged = _solves(displace, *frozen, root, spec)
+    converged = _is_valid_root(displace, *frozen, root, spec)
     if spec.reach:
-        ways = jnp.concatenate([jnp.eye(3), -jnp.eye(3)]).astype(root.dtype)
+        directions = jnp.concatenate([jnp.eye(3), -jnp.eye(3)]).astype(root.dtype)
         others = jax.vmap(
-            lambda way: _newton(displace, *frozen, root + spec.reach * way, spec)[0]
-        )(ways)
+            lambda axis: _newton(displace, *frozen, root + spec.reach * axis, spec)[0]
+        )(directions)
         solved = jax.vmap(lambda x: _is_root(displace, *frozen, x, spec))(others)
-        apart = jnp.max(jnp.abs(others - root), axis=-1) > spec.reach / 100
-        converged &= ~jnp.any(solved & apart)
+        distinct = jnp.max(jnp.abs(others - root), axis=-1) > spec.reach / 100
+        converged &= ~jnp.any(solved & distinct)
     value = _implicit(displace, params, canonical_point, root, converged)
-    # Where there is no root the start is the better guess: Newton may have flown off.
-    # A root that is turned over or not the only one is told by its small residual.
+    # Without a root the initial guess is better, because Newton's method may have
+    # diverged. A root that is folded or not unique is kept. Its residual is small.
     root = jnp.where(_is_root(displace, *frozen, root, spec), root, start)
     value = jnp.where(converged, value, root)
     residual = _norm(_excess(displace, *frozen, lax.stop_gradient(value)))
@@ -110,11 +113,11 @@ def point_tracks(
     row: int | None = None,
     spec: InverseSpec = InverseSpec(),
 ) -> Tracks:
-    """Follow points through time by inverting a warp.
+    """Track points through time by inverting a warp.
 
-    Points are tracked outward from the time at which they are known, each from its last
-    position. If a point is lost, its flag is False and its position is the last one
-    known.
+    Points are tracked forward and backward from the time at which they are known. Each
+    solve starts at the previous position. If a point is lost, its flag is False and its
+    position is the last known one.
 
     Args:
       displace: Displacement, a function of parameters, a point [3] and the conditioning
@@ -135,36 +138,36 @@ def point_tracks(
     count = jax.tree.leaves(moments)[0].shape[0]
     if row is not None and not 0 <= row < count:
         raise ValueError(
-            f"row={row} is not in 0 .. {count - 1}; it is the moment at which the "
-            "points were observed, or None for canonical points"
+            f"row={row} is not in 0 .. {count - 1}; it is the index of the time at "
+            "which the points were observed, or None for canonical points"
         )
     first = row or 0
-    here = jax.tree.map(lambda leaf: leaf[first], moments)
+    reference = jax.tree.map(lambda leaf: leaf[first], moments)
     before = jax.tree.map(lambda leaf: leaf[:first][::-1], moments)
     after = jax.tree.map(lambda leaf: leaf[first + 1 :], moments)
 
-    def at_moment(inputs, point):
+    def displace_at(inputs, point):
         return displace(inputs[0], point, inputs[1])
 
     def track(point):
         if row is None:
             canonical = point
-            fit = inverse_warp(at_moment, (params, here), canonical, spec=spec)
+            fit = inverse_warp(displace_at, (params, reference), canonical, spec=spec)
             middle, known = fit.value, fit.converged
         else:
-            canonical = point + displace(params, point, here)
+            canonical = point + displace(params, point, reference)
             middle, known = point, jnp.all(jnp.isfinite(canonical))
 
-        def onward(place, moment):
-            fit = inverse_warp(at_moment, (params, moment), canonical, place, spec)
-            place = jnp.where(fit.converged, fit.value, place)
-            return place, (place, fit.converged)
+        def advance(position, moment):
+            fit = inverse_warp(displace_at, (params, moment), canonical, position, spec)
+            position = jnp.where(fit.converged, fit.value, position)
+            return position, (position, fit.converged)
 
-        _, (back, back_known) = lax.scan(onward, middle, before)
-        _, (ahead, ahead_known) = lax.scan(onward, middle, after)
+        _, (backward, backward_known) = lax.scan(advance, middle, before)
+        _, (forward, forward_known) = lax.scan(advance, middle, after)
         return Tracks(
-            jnp.concatenate([back[::-1], middle[None], ahead]),
-            jnp.concatenate([back_known[::-1], known[None], ahead_known]),
+            jnp.concatenate([backward[::-1], middle[None], forward]),
+            jnp.concatenate([backward_known[::-1], known[None], forward_known]),
         )
 
     return jax.vmap(track)(points)
@@ -179,20 +182,20 @@ def _norm(vector):
 
 
 def _is_root(displace, params, canonical_point, point, spec):
-    """False for NaN, as comparisons are."""
+    """Test if a point is a root. The result for NaN is False."""
     bound = spec.atol + spec.rtol * jnp.max(jnp.abs(canonical_point))
     return _norm(_excess(displace, params, canonical_point, point)) <= bound
 
 
-def _solves(displace, params, canonical_point, point, spec):
+def _is_valid_root(displace, params, canonical_point, point, spec):
     grads = jnp.eye(3, dtype=point.dtype) + jax.jacfwd(displace, 1)(params, point)
-    upright = exact_product(grads[0], jnp.cross(grads[1], grads[2])) > 0
-    return upright & _is_root(displace, params, canonical_point, point, spec)
+    unfolded = exact_product(grads[0], jnp.cross(grads[1], grads[2])) > 0
+    return unfolded & _is_root(displace, params, canonical_point, point, spec)
 
 
 def _newton(displace, params, canonical_point, start, spec):
-    # Newton rather than dogleg or Levenberg-Marquardt: from a start this near it finds
-    # as many roots in fewer steps, and its derivative is J⁻¹ without second ones.
+    # From a close initial guess, Newton's method finds as many roots as dogleg and
+    # Levenberg-Marquardt in fewer steps, and needs no second derivatives.
     solution = optimistix.root_find(
         lambda point, inputs: _excess(displace, *inputs, point),
         optimistix.Newton(rtol=spec.rtol, atol=spec.atol),
@@ -204,26 +207,26 @@ def _newton(displace, params, canonical_point, start, spec):
     return lax.stop_gradient(solution.value), counted(solution.stats["num_steps"])
 
 
-def _continued(displace, params, canonical_point, steps):
-    """One Newton step on x + s d(x) = c for each of `steps` values of s up to 1."""
+def _continuation(displace, params, canonical_point, steps):
+    """Make a Newton step on x + s d(x) = c for each of `steps` values of s up to 1."""
 
-    def step(point, share):
+    def step(point, s):
         move, grads = displace(params, point), jax.jacfwd(displace, 1)(params, point)
-        jacobian = jnp.eye(3, dtype=point.dtype) + share * grads
-        excess = point + share * move - canonical_point
-        moved = point - jnp.linalg.solve(jacobian, excess)
-        # Singular on the way, as a half turn is at s = 1/2, and regular after it.
-        return jnp.where(jnp.all(jnp.isfinite(moved)), moved, point), None
+        jacobian = jnp.eye(3, dtype=point.dtype) + s * grads
+        excess = point + s * move - canonical_point
+        new_point = point - jnp.linalg.solve(jacobian, excess)
+        # The Jacobian can be singular on the way, as for a half turn at s = 1/2.
+        return jnp.where(jnp.all(jnp.isfinite(new_point)), new_point, point), None
 
-    shares = jnp.arange(1, steps + 1, dtype=canonical_point.dtype) / max(steps, 1)
-    return lax.scan(step, canonical_point, shares)[0]
+    factors = jnp.arange(1, steps + 1, dtype=canonical_point.dtype) / max(steps, 1)
+    return lax.scan(step, canonical_point, factors)[0]
 
 
 def _implicit(displace, params, canonical_point, root, converged):
-    """`root` after one more Newton step, with the derivatives of the inverse.
+    """Make one more Newton step from `root`, with the derivatives of the inverse.
 
-    Where it did not converge the equation is replaced by x = root, whose Jacobian is
-    the identity, so that no singular matrix is ever inverted.
+    Without convergence the equation is replaced by x = root, whose Jacobian is the
+    identity, so that no singular matrix is inverted.
     """
     root = jnp.where(jnp.all(jnp.isfinite(root)), root, 0)
 

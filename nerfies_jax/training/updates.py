@@ -1,4 +1,4 @@
-"""Gradient descent steps with a learning rate for each part of the parameters."""
+"""Gradient descent steps with learning rates per group of parameters."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,29 +9,29 @@ import optax
 from jaxtyping import Array, Key
 
 PyTree = Any
-LAST_RATE = 0.02  # of a descent's first
+LAST_RATE = 0.02  # last over first learning rate in `descended`
 
 
 def apply_updates(params: PyTree, updates: PyTree, learning_rates: PyTree) -> PyTree:
-    """Return `params - learning_rate * update`, each leaf in its own precision.
+    """Return `params - learning_rate * update`, computed in the precision of each leaf.
 
     Args:
       params: A pytree of arrays.
       updates: Updates of the same structure.
-      learning_rates: A prefix of `params`, whose rates apply to everything below them.
+      learning_rates: A tree prefix of `params`.
 
     Returns:
       The updated parameters.
     """
 
-    def below(learning_rate, part, part_updates):
-        def move(parameter, update):
-            here = jnp.asarray(learning_rate, parameter.dtype)
-            return parameter - here * update.astype(parameter.dtype)
+    def update_group(learning_rate, group, group_updates):
+        def subtract(parameter, update):
+            rate = jnp.asarray(learning_rate, parameter.dtype)
+            return parameter - rate * update.astype(parameter.dtype)
 
-        return jax.tree.map(move, part, part_updates)
+        return jax.tree.map(subtract, group, group_updates)
 
-    return jax.tree.map(below, learning_rates, params, updates)
+    return jax.tree.map(update_group, learning_rates, params, updates)
 
 
 def descended(
@@ -46,8 +46,8 @@ def descended(
     Args:
       loss: Function of parameters and a PRNG key.
       start: Initial parameters.
-      rates: First learning rates, a prefix of `start`. They decay exponentially to
-        `LAST_RATE` of these.
+      rates: Initial learning rates, a tree prefix of `start`. They decay exponentially
+        by the factor `LAST_RATE`.
       key: PRNG key, split into one for each step.
       steps: Number of steps.
 
@@ -61,9 +61,9 @@ def descended(
         key, count = key_and_count
         grads = jax.grad(loss)(params, key)
         updates, moments = adam.update(grads, moments)
-        share = LAST_RATE ** (count.astype(jnp.result_type(float)) / steps)
-        now = jax.tree.map(lambda rate: rate * share, rates)
-        return (apply_updates(params, updates, now), moments), None
+        decay = LAST_RATE ** (count.astype(jnp.result_type(float)) / steps)
+        step_rates = jax.tree.map(lambda rate: rate * decay, rates)
+        return (apply_updates(params, updates, step_rates), moments), None
 
     @jax.jit
     def run(params):
@@ -71,6 +71,6 @@ def descended(
         (params, _), _ = jax.lax.scan(step, (params, adam.init(params)), keys)
         return params
 
-    # optax raises floats to a whole number of steps.
+    # optax raises floats to an integer number of steps.
     with jax.numpy_dtype_promotion("standard"):
         return run(start)

@@ -88,5 +88,5 @@ def test_a_compiled_program_computes_the_parts_before_the_stack():
 
 
 def test_a_number_has_no_components():
-    with pytest.raises(ValueError, match="a number has no components"):
+    with pytest.raises(ValueError, match="a scalar has no components"):
         jax.jit(fusion.COMPONENTS.bind)(1.0)

@@ -80,7 +80,7 @@ def test_gradients_reach_the_two_rows_only(float64, rng):
 @pytest.mark.parametrize(
     ("ids", "message"),
     [
-        ([0, 3, 4, 9], r"warp_ids\[2\] = 4 is not in 0 .. 3; give the table 10 rows"),
+        ([0, 3, 4, 9], r"warp_ids\[2\] = 4 is not in 0 .. 3; use a table of 10 rows"),
         ([0, -1], r"warp_ids\[1\] = -1"),
         ([0.0, 1.0], "whole numbers"),
     ],

@@ -130,7 +130,7 @@ def test_total_variation_is_the_mean_over_neighbors(float64, rng):
     ]
     found = jax.jit(grids.total_variation, static_argnums=1)(table, 2)
     np.testing.assert_allclose(found, np.mean(pairs), rtol=1e-14)
-    with pytest.raises(ValueError, match="a hashed level has no neighbors"):
+    with pytest.raises(ValueError, match="use variation_at_random for hashed levels"):
         grids.total_variation(jnp.asarray(table[:20]), 2)
 
 

@@ -200,7 +200,7 @@ def test_two_moments_change_evenly():
         ({"features": 0}, "features >= 1"),
         ({"multiples": ()}, "a positive multiple"),
         ({"vertices": 1}, "must lie between 2"),
-        ({"moments": 1}, "None leaves the time out"),
+        ({"moments": 1}, "None for planes without time"),
         ({"combination": "mean"}, "unknown combination"),
         ({"outside": "wrap"}, "unknown outside"),
     ],
@@ -208,5 +208,5 @@ def test_two_moments_change_evenly():
 def test_no_planes_of_nothing(changes, words):
     with pytest.raises(ValueError, match=words):
         PlanesSpec(**changes)
-    with pytest.raises(ValueError, match="of 4 dimensions, not of 3"):
+    with pytest.raises(ValueError, match="4 dimensions, but the points have 3"):
         SPECS["hexplane"].width(3)

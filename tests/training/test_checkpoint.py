@@ -193,7 +193,7 @@ def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(damage, tmp_pa
     save(tmp_path, (older, 4), (newer, 8))
     damage(tmp_path / "8")
     with pytest.warns(
-        RuntimeWarning, match=r"8 cannot be read .* trying the one before"
+        RuntimeWarning, match=r"8 cannot be read .* trying an older one"
     ):
         restored = checkpoint.restore(tmp_path, start(), SPEC)
     assert restored.step == 4
@@ -217,7 +217,7 @@ def test_an_unfinished_checkpoint_is_none(tmp_path):
 def test_a_checkpoint_of_a_newer_format_is_refused_and_stays(tmp_path):
     save(tmp_path, (start(), 4), (start(), 8))
     edit_notes(tmp_path / "8", format=99)
-    with pytest.raises(ValueError, match="is of format 99 and this version reads up"):
+    with pytest.raises(ValueError, match="has format 99, but this version reads"):
         checkpoint.restore(tmp_path, start(), SPEC)
 
 
@@ -346,7 +346,7 @@ def test_killed_runs_resume_from_a_whole_checkpoint_bit_for_bit(tmp_path):
         time.sleep(rng.uniform(0, 1.5))
         process.kill()
         process.communicate()
-        restored = checkpoint.restore(folder, start(), SPEC)  # no warning: it is whole
+        restored = checkpoint.restore(folder, start(), SPEC)  # no warning: it is intact
         assert restored.step >= furthest
         furthest = restored.step
     assert furthest > 0

@@ -45,13 +45,13 @@ def make_read_only(folder, patch):
 @pytest.mark.parametrize(
     ("harm", "words", "whole"),
     [
-        (fill_disk, "no space: it may take 1.0 MB and 0.0 MB are", "step 10 is whole"),
+        (fill_disk, "no space: up to 1.0 MB are needed", "step 10 is intact"),
         *(
             pytest.param(*rest, marks=pytest.mark.full)
             for rest in (
-                (lose_folder, "No such file", "none is whole"),
-                (lose_settings, "config.json is gone", "step 10 is whole"),
-                (make_read_only, "Read-only file system", "step 10 is whole"),
+                (lose_folder, "No such file", "no earlier checkpoint"),
+                (lose_settings, "config.json no longer exists", "step 10 is intact"),
+                (make_read_only, "Read-only file system", "step 10 is intact"),
             )
         ),
     ],
@@ -93,7 +93,7 @@ def test_training_goes_on_where_saving_fails_and_says_so(
         warned = f"warning: cannot write checkpoints to {folder}: "
         assert warned in printed.getvalue()
         assert words in printed.getvalue()
-        assert f"{whole}; training goes on" in printed.getvalue()
+        assert f"{whole}; training continues" in printed.getvalue()
         if passes:
             assert result.unsaved == ""
             assert checkpoint.latest(folder) == 20

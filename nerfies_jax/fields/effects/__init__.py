@@ -1,6 +1,6 @@
-"""Parts of a radiance field beyond a static scene, one file each."""
+"""Optional components that extend a static radiance field, one file each."""
 
 import lazy_loader
 
-# Modules that `nerfies_jax` shows; each is loaded when it is used.
+# Modules of the public API, imported on first use.
 __getattr__, __dir__, __all__ = lazy_loader.attach(__name__, ["protocols"])
