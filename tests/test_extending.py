@@ -92,7 +92,7 @@ def test_a_scene_takes_parts_by_name_and_remembers_them(page):
     [
         ("motion=nowhere_at_all:Drift", "nowhere_at_all cannot be imported"),
         ("motion=extending_page:Absent", "has no 'Absent'"),
-        ("motion=extending_page:jnp", "a module; a part of a scene"),
+        ("motion=extending_page:jnp", "a module; a component of a scene"),
         ("motion=extending_page:SlowMotion", "no Motion: it has no apply and no init"),
         ("strategy=extending_page:Drift", "no Strategy: it has no cap_max"),
         ("regularizers=extending_page:Drift", "no Regularizer: it has no loss"),
@@ -177,8 +177,8 @@ def test_a_medium_brings_its_own_least_uncertainty():
     ("medium", "words"),
     [
         (Fog(beta_min=None), "'fog' has a beta, and the effect no beta_min"),
-        (Fog(name="codes"), "named 'codes' already"),
-        (Fog(name="template"), "named 'template' already"),
+        (Fog(name="codes"), "named 'codes', but this name is in use"),
+        (Fog(name="template"), "named 'template', but this name is in use"),
     ],
 )
 def test_a_field_refuses_what_it_cannot_serve(medium, words):
@@ -234,7 +234,7 @@ def test_two_parts_of_one_name_are_refused(name):
             return jnp.zeros(())
 
     spec = dataclasses.replace(scenes.TINY_DEFORMABLE, regularizers=(Other(name),))
-    with pytest.raises(ValueError, match=f"named '{name}' already"):
+    with pytest.raises(ValueError, match=f"named '{name}', but this name is in use"):
         gj.build(spec, gj.metadata_of(scenes.tiny_capture()))
 
 

@@ -315,7 +315,7 @@ def _suggestion(name, fields, outermost):
     return f"did you mean {' or '.join(matches)}? its fields are {', '.join(fields)}"
 
 
-def _absent(spec, name):
+def _default_of_absent(spec, name):
     """Return the default settings of an absent component, if its type is unique."""
     options = typing.get_args(typing.get_type_hints(type(spec))[name])
     choices = [option for option in options if dataclasses.is_dataclass(option)]

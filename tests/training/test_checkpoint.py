@@ -232,7 +232,7 @@ def test_arrays_that_do_not_fit_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"this run needs float16\[6\]"):
         checkpoint.restore(tmp_path, half, SPEC)
     more = state._replace(aux_state=state.aux_state | {"new": np.zeros(6, np.float32)})
-    with pytest.raises(ValueError, match=r"without \['aux_state.new'\]"):
+    with pytest.raises(ValueError, match=r"lacks \['aux_state.new'\]"):
         checkpoint.restore(tmp_path, more, SPEC)
 
 
@@ -256,7 +256,7 @@ def test_nothing_to_restore_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="holds no checkpoint"):
         checkpoint.restore(tmp_path / "absent", start(), SPEC)
     save(tmp_path, (start(), 4))
-    with pytest.raises(ValueError, match=r"no checkpoint of step 3, only of \[4\]"):
+    with pytest.raises(ValueError, match=r"no checkpoint of step 3; choose from \[4\]"):
         checkpoint.restore(tmp_path, start(), SPEC, step=3)
 
 
@@ -289,7 +289,7 @@ def test_a_set_of_names_becomes_text_in_one_order():
 
 
 def test_a_spec_that_is_no_text_is_refused():
-    with pytest.raises(ValueError, match=r"spec\.inner holds a function"):
+    with pytest.raises(ValueError, match=r"spec\.inner is a function"):
         as_json(Outer(inner=lambda: 1))
 
 

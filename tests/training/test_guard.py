@@ -172,7 +172,7 @@ def test_an_event_that_blows_up_is_named_and_undone(where, at, frames, tmp_path)
 
 @pytest.mark.parametrize("where", [name for name in NAMES if name != "metric"])
 def test_a_start_that_is_not_finite_is_refused(where, frames):
-    with pytest.raises(ValueError, match=f"train from is not finite: {NAMES[where]}"):
+    with pytest.raises(ValueError, match=f"state is not finite: {NAMES[where]}"):
         fit(frames, spoilt_at(start(), where, np.nan), steps=STEPS)
 
 

@@ -349,9 +349,9 @@ def test_what_a_step_gets_wrong_is_named(frames):
         ValueError, match=r"aux_state.hits from float32\[6\] to float32\[7\]"
     ):
         fit(frames, model=toy.model(change=wider), steps=2)
-    with pytest.raises(ValueError, match=r"left state\.step at 0 after step 1"):
+    with pytest.raises(ValueError, match=r"returned state\.step=0 after step 1"):
         fit(frames, model=toy.model(change=standing), steps=2)
-    with pytest.raises(ValueError, match=r"event 'odd' changed state\.step"):
+    with pytest.raises(ValueError, match=r"event 'odd' must not change state\.step"):
         fit(frames, steps=2, events=[Event("odd", (1,), lambda s, f: stepping(s, f))])
 
 
