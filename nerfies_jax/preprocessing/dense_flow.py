@@ -1,9 +1,10 @@
-"""Dense optical flow between frames that are neighbors in time, in both directions.
+"""Dense optical flow between consecutive frames, in both directions.
 
-It is OpenCV's DIS (Kroeger et al. 2016, arXiv:1603.03590) on images normalized to one
-mean and contrast. Only neighbors are compared, since repetitive patterns are confused
-over longer intervals. An area that is nevertheless lost, or jumps, is searched for
-again at the position that its last motion predicts.
+It is computed by DIS of OpenCV (Kroeger et al. 2016, arXiv:1603.03590) on images
+normalized to one mean and contrast. Only consecutive frames are compared, because
+repetitive patterns are confused over longer intervals. Areas that are nevertheless lost
+or change their motion abruptly are searched for again at the position predicted by
+constant motion.
 """
 
 import threading
@@ -18,30 +19,30 @@ from nerfies_jax.preprocessing import wide_steps
 from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.runtime import events
 
-# Small images are enlarged first: 0.06 px of median error for 0.10 at 176x132, where
-# the built-in scenes' flow is known.
+# Small images are enlarged first. This reduces the median error at 176x132 from 0.10 px
+# to 0.06 px in built-in scenes, whose flow is known.
 ENLARGED_BELOW_PX, ENLARGED = 320, 2
-# Forward and back must meet: within half a pixel and a fiftieth of the way.
+# Forward and backward flow are consistent within half a pixel plus 2 % of their length.
 CLOSED_PX, CLOSED_SHARE = 0.5, 0.02
 
-# Searches that a second look at a wide step takes: one for each plane, and comparing.
+# Cost of a second search in searches: one for each plane, and the comparison.
 SECOND_LOOK = 8
-# Share of the width: the side of an area whose flow is searched for again if it leads
-# to a frame and is lost there. Repetitive patterns are confused in some
-# frames: the turning cube of the built-in scenes lost all its tracks in one of them.
+# Side, relative to the width, of an area whose flow is searched for again if it is lost
+# in a frame. Repetitive patterns are confused in some frames: the rotating cube of the
+# built-in scenes lost all its tracks in one of them.
 LOST_SHARE = 0.06
-# Share of the width, from one frame to the next: flow that changes so abruptly is
-# tested against constant motion, which wins if it matches as well. A checker of the
-# fast cube is 0.06.
+# Change of flow between frames, relative to the width, above which flow is compared
+# with constant motion, which is used if its matching error is at most this multiple. A
+# square on the fast cube has a side of 0.06.
 JUMP_SHARE, AS_ALIKE = 0.03, 1.1
 
 
 class NeighborFlow(NamedTuple):
     """Flow of each frame to the next and to the previous one in time.
 
-    It starts at pixel centers and is in pixels right and down. `seen` marks where
-    forward and backward flow are consistent. The last frame has no next one, the first
-    no previous one: zero, and not seen.
+    It starts at pixel centers and is in pixels right and down. `seen` is True if
+    forward and backward flow are consistent. The forward flow of the last frame and the
+    backward flow of the first are zero and not seen.
     """
 
     forward: np.ndarray  # [frames, height, width, 2] float32
@@ -65,7 +66,7 @@ def enlarged(views: Views) -> int:
 def leveled(views: Views, times: int | None = None) -> np.ndarray:
     """Normalize gray images to one mean and standard deviation, and enlarge them.
 
-    Without it a video of varying exposure has 79 % of its pixels marked as moving.
+    Otherwise 79 % of the pixels of a video with varying exposure are marked as moving.
 
     Args:
       views: The frames.
@@ -88,7 +89,7 @@ def searched_pixels(views: Views, pictures: np.ndarray) -> int:
 
     Args:
       views: The frames.
-      pictures: Their images, as made by `leveled`.
+      pictures: Their images from `leveled`.
 
     Returns:
       The number of pixels.
@@ -149,7 +150,7 @@ def _smaller(picture, times):
 
 
 def dis(times: int) -> Callable[..., np.ndarray]:
-    """Make a search for optical flow between enlarged images.
+    """Return a function that computes optical flow between enlarged images.
 
     Args:
       times: Integer factor of the enlargement.
@@ -157,7 +158,8 @@ def dis(times: int) -> Callable[..., np.ndarray]:
     Returns:
       A function of two images and, optionally, an initial flow, all enlarged.
     """
-    # Two: after a search from a guess, OpenCV 4.x finds something else without one.
+    # Two instances, because in OpenCV 4.x a search with an initial flow affects the
+    # results of later ones without.
     plain, guided = (
         cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) for _ in range(2)
     )
@@ -180,19 +182,18 @@ def between_neighbors(
 
     Args:
       views: The frames.
-      pictures: Their images, as made by `leveled`.
-      span: Nearest and farthest z-depth of the scene in scene units. Large
-        displacements are then searched for again from the flow that a static scene
-        would have.
-      room_for: Function of the number of such searches, which returns how many of them
-        are done.
+      pictures: Their images from `leveled`.
+      span: Nearest and farthest z-depth of the scene in scene units. If given, large
+        displacements are searched for again, starting from the flow of a static scene.
+      room_for: Function of the number of such searches, which returns the number of
+        searches to do.
 
     Returns:
       The flow.
     """
     (width, height), frames = views.size, len(views.row)
     times = pictures.shape[2] // width
-    searches = threading.local()  # one for each thread: it works in its own memory
+    searches = threading.local()  # one for each thread, because they have a state
 
     def search(*pair_and_guess):
         if not hasattr(searches, "own"):
@@ -222,7 +223,8 @@ def between_neighbors(
 
     ahead = [(frame, frame + 1) for frame in range(frames - 1)]
     steps = ahead + [(after, before) for before, after in ahead]
-    # 118 flows of 176x132: 8.5 s on one core; 4.9 on two, 6.1 by OpenCV's own threads.
+    # 118 flows of 176x132 take 8.5 s on one core, 4.9 s on two, and 6.1 s with the
+    # threads of OpenCV.
     with ThreadPoolExecutor(cv2.getNumThreads()) as threads:
 
         def search_all(name, steps, look):
@@ -255,7 +257,7 @@ def checked(forward: np.ndarray, backward: np.ndarray) -> NeighborFlow:
       backward: Flow to the previous frame, [frames, height, width, 2].
 
     Returns:
-      The flow with the pixels where it is consistent.
+      The flow, with masks of consistent pixels.
     """
     forward_seen, backward_seen = np.zeros((2, *forward.shape[:3]), bool)
     for frame in range(len(forward) - 1):
@@ -279,7 +281,7 @@ def _jumps(flow, frame):
 
 def _covers_patch(area):
     side = 2 * round(LOST_SHARE * area.shape[1] / 2) + 1
-    # Nothing lies outside: strips at the border leave the image.
+    # Areas at the border do not count, because they leave the image.
     outside = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
     return cv2.erode(np.uint8(area), np.ones((side, side)), **outside).any()
 
@@ -317,13 +319,13 @@ def closed(there: np.ndarray, back: np.ndarray) -> np.ndarray:
       back: Flow in the opposite direction, [height, width, 2].
 
     Returns:
-      Booleans [height, width], True where `back` leads from the end of `there` to its
+      Booleans [height, width], True if `back` leads from the end of `there` to its
       start.
     """
     height, width = there.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     to = (x + there[..., 0], y.astype(np.float32) + there[..., 1])
-    # Outside nothing leads back.
+    # Positions outside of the image are never consistent.
     back_there = cv2.remap(
         back, *to, cv2.INTER_LINEAR, borderValue=(1e3, 1e3, 1e3, 1e3)
     )

@@ -10,27 +10,28 @@ from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
 from nerfies_jax.preprocessing.view_set import Views
 
-# Half a pixel off a point at rest counts as half certain.
+# A track has a score of one half at this reprojection error of its static point.
 HALF_CERTAIN_PX, STEEPNESS = 0.5, 3.0
-# Cameras of real videos are off by a pixel themselves: at least so many times what the
-# stillest quarter of the tracks is off. Without it 21 % of a video of a hand before
-# books counts as moving, with it 7 %: the hand.
+# Cameras of real videos have errors of about a pixel, so the error above is at least
+# this multiple of the error of the best quarter of the tracks. Without it, 21 % of a
+# video of a hand in front of books are classified as moving, with it 7 % (the hand).
 STILLEST, OVER_NOISE = 0.25, 3.0
-# Tracks near each other in shared frames move alike.
+# Tracks that are near each other in common frames have similar scores.
 NEIGHBORS, EVERY_FRAMES, NEAR_PX, NEIGHBOR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10
-# A pixel takes after the tracks around it, by place and color. What none is near to
-# may have come too quickly to be followed: a still scene's colors have the last word.
+# The score of a pixel is that of tracks at similar positions and colors. Pixels far
+# from all tracks may belong to objects that are too fast, so colors of the static scene
+# decide.
 VOTES, VOTE_PX, VOTE_COLOR, REACH_PX = 8, 4.0, 20.0, 8.0
-VOTE_STEP = 2  # pixels of a side that vote as one does; the sum is smoothed anyway
+VOTE_STEP = 2  # side of blocks of pixels with a common vote, which is smoothed later
 FAR_FROM_TRACKS = 0.3
-# Pixels that may move are left out of the static scene that images are compared with.
+# Pixels that may move are excluded from the static scene that images are compared with.
 OPEN, RIM_PX = 0.3, 8
-SUREST = 0.02  # votes are no surer than that
+SUREST = 0.02  # lower bound of the distance of votes from 0 and 1
 SMOOTH_REACH, SMOOTH_PX, SMOOTH_COLOR = 4, 3.0, 15.0
 
 
 def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
-    """Estimate how certainly each track moves.
+    """Estimate the confidence that each track moves.
 
     Args:
       tracks: The tracks.
@@ -57,7 +58,7 @@ def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
 
 
 def _neighborhood(tracks):
-    """[tracks, tracks] sparse: how near tracks are in frames that see both."""
+    """Return the proximity of tracks in common frames, sparse [tracks, tracks]."""
     rows, columns, weights = [], [], []
     for frame in range(0, tracks.seen.shape[1], EVERY_FRAMES):
         here = np.flatnonzero(tracks.seen[:, frame])
@@ -132,7 +133,7 @@ def may_move(share: np.ndarray) -> np.ndarray:
 
 
 def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
-    """Combine votes and colors to a mask, smoothed where colors are similar.
+    """Combine votes and colors to a mask, smoothed over pixels of similar color.
 
     Args:
       views: The frames.
@@ -154,8 +155,8 @@ def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
 def settled(tracks: Tracks, score: np.ndarray, moving: np.ndarray) -> np.ndarray:
     """Limit the scores of tracks to the share of their frames on moving pixels.
 
-    Flow drags static pixels along moving edges. In the built-in scenes they are up to a
-    fifth of the supposedly moving tracks, and hardly any after this step.
+    Flow moves static pixels along with moving edges. In the built-in scenes these are
+    up to a fifth of the tracks classified as moving, and hardly any after this step.
 
     Args:
       tracks: The tracks.
@@ -184,7 +185,7 @@ def share_on(tracks: Tracks, moving: np.ndarray) -> np.ndarray:
 
 
 def _smooth(values, color):
-    """[height, width] mean over pixels near and of like color (a bilateral filter)."""
+    """Apply a bilateral filter: average nearby pixels of similar color."""
     height, width = values.shape
     values, color = (
         cv2.copyMakeBorder(one, *(SMOOTH_REACH,) * 4, cv2.BORDER_REFLECT)

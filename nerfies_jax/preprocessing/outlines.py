@@ -1,8 +1,8 @@
-"""Outlines before a plain background, to test for one static object.
+"""Silhouettes in front of a plain background, to test if an object is static.
 
-If neighboring times are far apart there is no flow, but a static object has one visual
-hull (Laurentini 1994): the volume inside all of its outlines fills each of them. Moving
-parts are cut away by the outlines of other times.
+If consecutive images differ too much, there is no flow, but a static object has one
+visual hull (Laurentini 1994): the volume inside all of its silhouettes fills each of
+them. Moving parts are cut away by silhouettes at other times.
 """
 
 import numpy as np
@@ -14,20 +14,20 @@ from nerfies_jax.preprocessing.findings import LIKELY, Finding, cannot_tell, jud
 from nerfies_jax.preprocessing.findings import MOTION as EFFECT
 from nerfies_jax.preprocessing.view_set import Views
 
-MIN_VIEWS = 8  # fewer cut little away, at rest or not
+MIN_VIEWS = 8  # a visual hull of fewer views is too large
 PLAIN_SHARE = 0.2  # of the pixels in the median view
 SIDE = 96  # cells along the longest side of the box
-# Pixels that an outline is widened by: rims are half background, and a cell of the grid
-# is about a pixel wide.
+# Pixels by which a silhouette is widened: edge pixels are half background, and a cell
+# of the grid is about a pixel wide.
 SLACK_PX = 1
-# Share of the outlines' pixels that no cell fills. At rest it is none: 0.00 % of Lego's
-# in 50 views of 200x200 and of 100x100, before white and before black; a part of a
-# hundredth of the thing that moves is the least that is worth a motion.
+# Share of the pixels of silhouettes that the hull does not fill. For static objects it
+# is zero: 0.00 % for Lego in 50 views of 200x200 and of 100x100, in front of white and
+# black. Smaller moving parts are not worth a motion model.
 BARE_SHARE = 0.01
 
 
 def outlines(views: Views) -> np.ndarray | None:
-    """Segment the object before a plain background, with holes filled.
+    """Segment the object in front of a plain background, with holes filled.
 
     Args:
       views: The frames.
@@ -39,33 +39,34 @@ def outlines(views: Views) -> np.ndarray | None:
     if len(views.row) < MIN_VIEWS or np.median(shares) < PLAIN_SHARE:
         return None
     if shares.min() < PLAIN_SHARE / 4:
-        return None  # some view is filled by the scene: no outline there
+        return None  # some view has no background
     return np.stack([nd.binary_fill_holes(one) for one in views.valid])
 
 
 def motion(views: Views, shapes: np.ndarray) -> Finding:
-    """Decide whether anything moves, by the parts of outlines outside the visual hull.
+    """Decide if anything moves, by the parts of silhouettes outside the visual hull.
 
     Args:
       views: The frames.
-      shapes: Outlines, [frames, height, width].
+      shapes: Silhouettes, [frames, height, width].
 
     Returns:
       The finding.
     """
-    threshold = f"{BARE_SHARE:.0%} of the outlines' pixels that no still thing fills"
+    threshold = f"{BARE_SHARE:.0%} of the outlines not explained by a static object"
     box = _box(views, shapes)
     bare = np.array([]) if box is None else uncovered(views, shapes, box)
     if not bare.size:
-        return cannot_tell(EFFECT, "the views' outlines have no room in common", "")
+        return cannot_tell(EFFECT, "the outlines have no common volume", "")
     value = float(bare.mean())
     error = float(bare.std() / np.sqrt(len(bare)))
     wanted, confidence = judge(value, BARE_SHARE, error)
     if wanted is False:
-        confidence = LIKELY  # what moves inside the outlines does not show
+        confidence = LIKELY  # motion inside the silhouettes is not visible
     evidence = (
-        f"{value:.1%} of the outlines before the plain background (up to "
-        f"{bare.max():.1%} in a view) are filled by nothing that fits all views"
+        f"{value:.1%} of the outlines in front of the plain background (up to "
+        f"{bare.max():.1%} in a view) are not explained by an object that fits all "
+        "views"
     )
     numbers = {"bare_share": value, "bare_share_most": float(bare.max())}
     return Finding(EFFECT, evidence, threshold, wanted, confidence, numbers)
@@ -74,14 +75,14 @@ def motion(views: Views, shapes: np.ndarray) -> Finding:
 def uncovered(
     views: Views, shapes: np.ndarray, box: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """Compute the share of each outline that the visual hull does not fill.
+    """Compute the share of each silhouette that the visual hull does not fill.
 
-    The hull is made of outlines widened by `SLACK_PX`. The outlines that it must fill
-    are narrowed by as much. Cells outside of an image are not cut by it.
+    The hull is computed from silhouettes dilated by `SLACK_PX`, and must fill those
+    eroded by `SLACK_PX`. Cells outside of an image are not cut by it.
 
     Args:
       views: The frames.
-      shapes: Outlines, [frames, height, width].
+      shapes: Silhouettes, [frames, height, width].
       box: Lower and upper corner of the volume in scene units.
 
     Returns:
@@ -103,7 +104,7 @@ def uncovered(
         place, inside = _pixels(views, index, cells)
         filled = np.zeros_like(shape)
         filled[tuple(place[inside, ::-1].T)] = True
-        # A cell covers its neighbors: it is as wide as that in the nearest view.
+        # Dilated by the width of a cell in pixels.
         depth = np.linalg.norm(views.position[index] - (low + high) / 2)
         width = side * views.intrinsics[index][0, 0] / depth
         filled = nd.binary_dilation(
@@ -122,9 +123,9 @@ def _pixels(views, index, points):
 
 
 def _box(views, shapes):
-    """The box that all outlines leave: a sphere about the point all cameras look at.
+    """Return the bounding box of the visual hull of a coarse grid, None if it is empty.
 
-    A coarse grid is cut first; None where nothing is left.
+    The grid is centered at the point that all cameras look at.
     """
     axes = views.rotation[:, 2]
     across = across_ray(axes)

@@ -1,10 +1,10 @@
-"""Paths of moving points in space, from their tracks in the images.
+"""3D paths of moving points, from their tracks in the images.
 
-The path has the least acceleration along the rays of a track: trajectory triangulation
-(Park et al. 2010, "3D reconstruction of a moving point from a series of 2D
-projections") with a penalty in place of a basis. Depth is determined if the camera
-moves at another pace than the objects. If it does not, the cost is flat along the rays,
-and the paths follow the depth of the surroundings.
+A path minimizes acceleration along the rays of a track: trajectory triangulation (Park
+et al. 2010, "3D reconstruction of a moving point from a series of 2D projections") with
+a penalty in place of a basis. Depth is determined if the motion of the camera differs
+from that of the objects. Otherwise the cost is constant along the rays, and the paths
+follow the depth of the surroundings.
 """
 
 from typing import NamedTuple
@@ -18,33 +18,32 @@ from nerfies_jax.preprocessing.rest_points import RestPoints, track_rays
 from nerfies_jax.preprocessing.tracks import TRACK_PX, Tracks
 from nerfies_jax.preprocessing.view_set import Views
 
-# On squared acceleration, in units per frame squared, beside squared distances to rays:
-# the least, and the most of a video of many frames in which little happens from one to
-# the next. From 1 to 30 errors are the same in built-in scenes of 60 frames (0.6 %); at
-# five times the frames 10 gives 4 %, 1,000 and more give 0.6 % again.
+# Range of the weight of squared acceleration (in units per squared frame) relative to
+# squared distances to rays. Videos with many frames and slow motion need large weights:
+# in built-in scenes of 60 frames errors are the same from 1 to 30 (0.6 %). With five
+# times as many frames they are 4 % at 10, and 0.6 % at 1000 and more.
 LEAST_PENALTY, MOST_PENALTY = 10.0, 1e5
-TRIED = 300  # tracks, by which a video's penalty is chosen
-# The depth around is right but for this factor. With `TRACK_PX` it weighs 1e-5 of a ray
-# at a focal length of 200 px: enough for things that drive past, and built-in scenes
-# keep their errors.
+TRIED = 300  # tracks for choosing the penalty of a video
+# Relative deviation of the depth of the surroundings. With `TRACK_PX` its weight is
+# 1e-5 of that of a ray at a focal length of 200 px. This suffices for passing vehicles,
+# and does not change the errors in built-in scenes.
 AROUND_DEVIATION = 0.5
-MEASURED_DEVIATION = 0.03  # of depths that come with the capture
-AROUND = 8  # tracks at rest whose depth is that of what stands around
-AT_REST = 0.3  # tracks of a lower score stand still
-NO_DEPTH = 1e-9  # scene units: a path that nothing holds ends in the camera
-SHORTEST_STEP = 0.1  # of the median time between frames: two at once are no jump
+MEASURED_DEVIATION = 0.03  # of depths stored with the capture
+AROUND = 8  # static tracks that determine the depth of the surroundings
+AT_REST = 0.3  # tracks with a lower score are static
+NO_DEPTH = 1e-9  # scene units, because unconstrained paths end in the camera
+SHORTEST_STEP = 0.1  # of the median time between frames, for frames at the same time
 
 
 class Paths(NamedTuple):
     """Positions of moving points over time."""
 
-    position: (
-        np.ndarray
-    )  # [tracks, frames, 3] scene units; NaN before and after a track
-    known: np.ndarray  # [tracks, frames] bool: seen there, and in front of the camera
-    depth: np.ndarray  # [tracks, frames] z-depth; NaN before and after a track
-    # [tracks]: deviation of a common factor of the depths that the video alone leaves;
-    # above about 0.3 the depths are those of what stands around.
+    # [tracks, frames, 3] scene units, NaN before and after a track
+    position: np.ndarray
+    known: np.ndarray  # [tracks, frames] bool: visible and in front of the camera
+    depth: np.ndarray  # [tracks, frames] z-depth, NaN before and after a track
+    # [tracks] relative deviation of a common factor of the depths, from the video
+    # alone. Above about 0.3 the depths are those of the surroundings.
     depth_deviation: np.ndarray
 
 
@@ -57,18 +56,17 @@ def least_acceleration(
 ) -> Paths:
     """Fit paths along the rays of tracks, with one banded linear system each.
 
-    The paths are as smooth as the tracks allow. The penalty is the largest with which
-    half of the paths are within the error of a track, in powers of ten (Morozov's
-    discrepancy principle), since the time between frames is not known otherwise.
+    The paths are as smooth as the tracks allow: the penalty is the largest power of ten
+    with which half of the paths are within the error of a track (Morozov's discrepancy
+    principle), because the real time between frames is unknown.
 
     Args:
       views: The frames.
       tracks: The tracks.
-      near: Least z-depth in scene units. Path positions closer than that are not known.
-      around: z-depths of the surroundings, [tracks, frames], NaN where unknown, or
-        None.
-      measured: z-depths of the points if the capture has depth, [tracks, frames], NaN
-        where unknown, or None.
+      near: Least z-depth in scene units. Closer positions are not known.
+      around: z-depths of the surroundings, [tracks, frames], NaN if unknown, or None.
+      measured: z-depths of the points from depth maps, [tracks, frames], NaN if
+        unknown, or None.
 
     Returns:
       The paths.
@@ -92,7 +90,7 @@ def least_acceleration(
 
 
 def certain(views: Views, tracks: Tracks, position: np.ndarray, near: float) -> Paths:
-    """Make paths of tracks whose positions are known.
+    """Create paths from tracks with known positions.
 
     Args:
       views: The frames.
@@ -111,14 +109,14 @@ def certain(views: Views, tracks: Tracks, position: np.ndarray, near: float) -> 
 class _Wanted(NamedTuple):
     """Rays and depths that paths should pass through."""
 
-    ray: np.ndarray  # [tracks, frames, 3] of z-depth one
+    ray: np.ndarray  # [tracks, frames, 3] with z-depth one
     seen: np.ndarray  # [tracks, frames] bool
-    pull: np.ndarray  # [tracks, frames] weight of the depth, beside one of the ray
-    depth: np.ndarray  # [tracks, frames] z-depth to lean on
+    pull: np.ndarray  # [tracks, frames] weight of the depth relative to the ray
+    depth: np.ndarray  # [tracks, frames] target z-depth
 
 
 def _penalty(views, wanted, noise):
-    """The largest with which half of the paths miss by no more than the noise."""
+    """Return the largest penalty with which half of the paths fit within the noise."""
     penalty = LEAST_PENALTY
     while 10 * penalty <= MOST_PENALTY and len(wanted.ray):
         position, _ = _fitted(views, wanted, 10 * penalty, noise)
@@ -133,7 +131,7 @@ def _penalty(views, wanted, noise):
 
 
 def _fitted(views, wanted, penalty, noise):
-    """Positions and deviations of their depths."""
+    """Return positions, and deviations of their depths."""
     length = np.linalg.norm(wanted.ray, axis=-1)
     unit = wanted.ray / length[..., None]
     position = np.full((*wanted.seen.shape, 3), np.nan)
@@ -153,7 +151,7 @@ def _fitted(views, wanted, penalty, noise):
         right += pulled[:, None] * np.einsum("fij,fj->fi", onto, there)
         path = _solved(blocks, _bands(stencils, len(along)), right)
         position[row, span] = path
-        # Not along the rays: where a track is not seen there is none.
+        # Offsets from the cameras replace rays, which invisible frames do not have.
         offset = path - camera
         far = np.median(np.linalg.norm(offset, axis=-1)[seen[span]])
         flatness[row] = _deviation(stencils, path, offset, noise * far)
@@ -161,13 +159,13 @@ def _fitted(views, wanted, penalty, noise):
 
 
 def _deviation(stencils, path, offset, miss):
-    """Standard deviation of a common factor of the depths, from the video alone.
+    """Estimate the standard deviation of a common factor of the depths.
 
-    A factor bends the path as the offsets from the camera bend. The curvature of the
-    path itself, and a track's error `miss` in scene units, hide it. Errors of
-    neighboring frames are not independent, so the mean over the path counts, not the
-    sum. In the built-in scenes that gives 2 to 4 %, where the true errors are 0.6 to
-    1.1 %.
+    A factor adds the curvature of the offsets from the camera to the path. It is
+    indistinguishable from the curvature of the path itself and from the error `miss` of
+    a track in scene units. Errors of neighboring frames are not independent, so the
+    mean over the path is used instead of the sum. In the built-in scenes the estimate
+    is 2 to 4 %, and the true errors are 0.6 to 1.1 %.
     """
     if not len(stencils):
         return np.inf
@@ -183,9 +181,9 @@ def _deviation(stencils, path, offset, miss):
 
 
 def _second_differences(time):
-    """[frames - 2, 3]: weights of a frame and the two after it in the acceleration.
+    """Return weights [frames - 2, 3] of three frames for their acceleration.
 
-    Units per squared median step.
+    The unit is one per squared median step.
     """
     if len(time) < 3:
         return np.zeros((0, 3))
@@ -198,7 +196,7 @@ def _second_differences(time):
 
 
 def _bands(stencils, frames):
-    """[3, frames]: diagonals 0, 1 and 2 of the penalty, padded on the right."""
+    """Return diagonals 0, 1 and 2 of the penalty, padded on the right, [3, frames]."""
     count = len(stencils)
     bands = np.zeros((3, frames))
     for off in range(3):
@@ -208,15 +206,15 @@ def _bands(stencils, frames):
 
 
 def _solved(blocks, bands, right):
-    """The 3 x 3 blocks plus the penalty on each coordinate, solved for all frames."""
+    """Solve the system of 3 x 3 blocks plus the penalty on each coordinate."""
     frames = len(blocks)
     lower = np.zeros((7, 3 * frames))
     for off in range(3):
         lower[3 * off] = np.repeat(bands[off], 3)
         for column in range(3 - off):
             lower[off, column::3] += blocks[:, column + off, column]
-    # Scale-free: a track without any parallax has no depth of its own. This draws it to
-    # the origin, at the largest penalty by 0.2 % against the pull of what is around.
+    # For tracks without any parallax, whose depth is undetermined. It pulls them to the
+    # origin, at the largest penalty by 0.2 % against the depth of the surroundings.
     lower[0] += 1e-14 * max(lower[0].max(), 1e-30)
     return scipy.linalg.solveh_banded(lower, right.ravel(), lower=True).reshape(-1, 3)
 

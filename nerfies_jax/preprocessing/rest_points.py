@@ -9,19 +9,19 @@ from nerfies_jax.preprocessing import view_set
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 
-ROUNDS = 4  # of weights: distances to a ray become pixels by the depth
-FAR_AWAY = 10.0  # times the cameras' spread: depth of what shows no parallax at all
-BEHIND_PX = 1e4  # misses a point that would lie behind the camera
-QUANTILE = 0.7  # of a track's frames, by how far it misses its point there
-LEAST_DEPTH = 1e-3  # scene units, for weights alone
-AT_ONCE = 2048  # tracks: 200 bytes for each and frame
+ROUNDS = 4  # of reweighting, because the error in pixels depends on the depth
+FAR_AWAY = 10.0  # depth without parallax, as a multiple of the extent of the cameras
+BEHIND_PX = 1e4  # error of a point behind the camera
+QUANTILE = 0.7  # of the reprojection errors of a track over its frames
+LEAST_DEPTH = 1e-3  # scene units, only for weights
+AT_ONCE = 2048  # tracks, at 200 bytes for each track and frame
 
 
 class RestPoints(NamedTuple):
     """One static point for each track."""
 
     position: np.ndarray  # [tracks, 3] scene units
-    residual: np.ndarray  # [tracks, frames] px; NaN where the track is not seen
+    residual: np.ndarray  # [tracks, frames] px, NaN if the track is not visible
     depth: np.ndarray  # [tracks, frames] z-depth of the point
 
     def take(self, which: np.ndarray) -> "RestPoints":
@@ -76,7 +76,7 @@ def _fit(views, tracks):
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     across = across_ray(unit)
     weight = tracks.seen.astype(np.float64)
-    # Where rays are parallel any depth will do, in front of the cameras.
+    # For parallel rays, any depth in front of the cameras fits.
     apart = np.linalg.norm(np.ptp(views.position, axis=0))
     ahead = views.position + (FAR_AWAY * apart if apart > 0 else 1.0) * unit
     seen = np.maximum(tracks.seen.sum(1), 1)[:, None]
@@ -109,8 +109,8 @@ def miss(rest: RestPoints) -> np.ndarray:
     Returns:
       Errors in pixels, [tracks].
     """
-    # NumPy's nanquantile takes each row by itself: 2 s of a video of 60 frames.
-    order = np.sort(rest.residual, axis=1)  # NaN come last
+    # Faster than nanquantile of NumPy, which takes 2 s for a video of 60 frames.
+    order = np.sort(rest.residual, axis=1)  # NaN is last
     place = QUANTILE * (np.isfinite(rest.residual).sum(1) - 1)
     low = np.maximum(np.floor(place).astype(int), 0)
     high = np.minimum(low + 1, np.maximum(np.ceil(place).astype(int), 0))

@@ -12,11 +12,11 @@ from nerfies_jax.preprocessing.tracks import TRACK_PX, Tracks
 from nerfies_jax.preprocessing.view_set import Views
 
 REACH = 8  # frames before and after
-CENTERS = 12  # frames whose pixels are placed
+CENTERS = 12  # frames whose pixels are triangulated
 EVERY_PX = 2
 LEAST_FRAMES = 4
-MISS_PX = 0.5  # at most, in seven frames of ten
-DEPTH_DEVIATION = 0.05  # at most, as a share of the depth
+MISS_PX = 0.5  # maximum reprojection error in 70 % of the frames
+DEPTH_DEVIATION = 0.05  # maximum relative deviation of the depth
 
 
 def work(views: Views) -> int:
@@ -34,12 +34,12 @@ def work(views: Views) -> int:
 
 
 def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
-    """Triangulate static pixels of some frames where flow determines their depth.
+    """Triangulate static pixels of some frames whose depth is determined by flow.
 
     Args:
       views: The frames.
       flow: Their flow.
-      moving: True for pixels to leave out, [frames, height, width].
+      moving: True for pixels to exclude, [frames, height, width].
 
     Returns:
       Positions and colors.
@@ -108,7 +108,7 @@ def without(tracks: Tracks, moving: np.ndarray) -> Tracks:
 
 
 def placed(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
-    """Select tracks that their point explains, with a well-determined depth.
+    """Select tracks that fit their static point and determine its depth.
 
     Args:
       views: The frames.
@@ -131,7 +131,7 @@ def depth_deviation(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarra
       rest: Their static points.
 
     Returns:
-      Deviations as a share of the distance [tracks], inf without parallax.
+      Deviations relative to the distance [tracks], inf without parallax.
     """
     offset = rest.position[:, None] - views.position
     distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)

@@ -1,4 +1,4 @@
-"""Point tracks through a video, realigned with the frames in which they began."""
+"""Point tracks through a video, realigned with the frames in which they begin."""
 
 import math
 from typing import NamedTuple
@@ -9,25 +9,25 @@ import numpy as np
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
 from nerfies_jax.preprocessing.view_set import Views
 
-# Starts: every so many pixels in every third frame, about 10,000 tracks of 60 frames of
-# 176x132; larger images get as many.
-GRID_STEPS, EVERY_FRAMES = 29, 3  # across the image's width
-MOST_PLACES = 30_000_000  # tracks times frames, about 30 bytes each
-SHORTEST = 8  # frames: fewer say little of how a point moves
-# Flow's errors add up along a track. Each point is looked up again in the frame where
-# it began: the 95 % quantile of the drift of points at rest falls by half.
+# Starting points: columns of a grid over the width of an image, and interval between
+# frames with a grid. These are about 10,000 tracks for 60 frames of any size.
+GRID_STEPS, EVERY_FRAMES = 29, 3
+MOST_PLACES = 30_000_000  # tracks times frames, at about 30 bytes each
+SHORTEST = 8  # minimum number of frames
+# Errors of flow accumulate along a track, so each point is aligned with the frame in
+# which it began. This halves the 95 % quantile of the drift of static points.
 WINDOW_PX, FARTHEST_PX = 9, 1.5
 TRACK_PX = 0.3  # error of a track, for weights
-ROUNDS, PRECISION_PX = 20, 0.01  # of Lucas-Kanade's search, enlarged pixels
-LEAST_EIGENVALUE = 1e-4  # of the window's structure: below it there is nothing to align
+ROUNDS, PRECISION_PX = 20, 0.01  # of Lucas-Kanade, in enlarged pixels
+LEAST_EIGENVALUE = 1e-4  # minimum for the structure tensor of the window
 
 
 class Tracks(NamedTuple):
     """Positions of points in each frame."""
 
-    start: np.ndarray  # [tracks] frame in which each began
-    pixel: np.ndarray  # [tracks, frames, 2] float32; 0 where not seen
-    seen: np.ndarray  # [tracks, frames] bool
+    start: np.ndarray  # [tracks] frame in which each begins
+    pixel: np.ndarray  # [tracks, frames, 2] float32, 0 if not visible
+    seen: np.ndarray  # [tracks, frames] bool, True if visible
 
     def take(self, which: np.ndarray) -> "Tracks":
         """Select tracks.
@@ -44,7 +44,7 @@ class Tracks(NamedTuple):
 def pixel_of(
     place: np.ndarray, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixel in which each position lies, or the nearest in the image.
+    """Return the pixel that contains each position, clamped to the image.
 
     Args:
       place: Positions (x, y) with centers at +0.5, [..., 2].
@@ -58,15 +58,15 @@ def pixel_of(
 
 
 def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
-    """Make starting points of tracks: a shifted grid in every third frame.
+    """Return starting points of tracks: a shifted grid in every third frame.
 
-    Points on a plain background or on unobserved pixels are left out. A long video uses
-    fewer frames, such that tracks have at most `MOST_PLACES` positions in all frames
-    together.
+    Points on a plain background or on unobserved pixels are excluded. For long videos
+    fewer frames are used, so that tracks have at most `MOST_PLACES` positions in all
+    frames together.
 
     Args:
       views: The frames.
-      sparser: Factor by which fewer frames are used.
+      sparser: Factor by which the number of frames is reduced.
       seed: Seed of the shifts.
 
     Returns:
@@ -104,7 +104,7 @@ def work(views: Views, sparser: int = 1) -> int:
 
 
 def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
-    """Follow points from frame to frame in both directions until flow is inconsistent.
+    """Track points from frame to frame in both directions until flow is inconsistent.
 
     Args:
       flow: Flow between neighboring frames.
@@ -125,7 +125,7 @@ def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
             there = here + sign
             if not 0 <= there < frames:
                 continue
-            # Only what began on this side: the other direction carries the rest.
+            # Only tracks that began earlier in this direction.
             goes = np.flatnonzero(seen[:, here] & (sign * (here - start) >= 0))
             moved, kept = _step(pixel[goes, here], shift[here], usable[here])
             pixel[goes[kept], there], seen[goes[kept], there] = moved[kept], True
@@ -133,7 +133,7 @@ def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
 
 
 def _step(pixel, shift, usable):
-    """Move pixels by the bilinear mean of usable flow. Also returns validity."""
+    """Move pixels by bilinearly interpolated flow, and return their validity."""
     height, width = usable.shape
     bound = np.array([width, height])
     kept = usable[pixel_of(pixel, usable.shape)]
@@ -179,10 +179,10 @@ def is_long(tracks: Tracks) -> np.ndarray:
 
 
 def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tracks:
-    """Align each point with the image in which it began, by Lucas-Kanade.
+    """Align each point with the image in which it begins, by Lucas-Kanade.
 
-    The search starts from the chained position, without a pyramid. Points that move too
-    far become invisible.
+    The search starts at the position from flow, without a pyramid. Observations that
+    move too far are marked as invisible.
 
     Args:
       tracks: The tracks.
@@ -222,7 +222,7 @@ def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tr
 
 
 def _enlarged(pixel, times):
-    # OpenCV counts from the center of the first pixel, here centers lie at +0.5.
+    # In OpenCV the first pixel has its center at 0, here centers are at +0.5.
     return np.ascontiguousarray(pixel * times - 0.5, np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Frames of a capture for preprocessing: reduced, in order of time, in NumPy."""
+"""Frames of a capture for preprocessing: reduced, in temporal order, in NumPy."""
 
 import math
 from typing import NamedTuple
@@ -9,17 +9,18 @@ import scipy.ndimage as nd
 
 from nerfies_jax.capture.capture import Capture
 
-LONGEST_SIDE_PX = 256  # of images in which what need not be sharp is looked for
-PLAIN_SHARE = 0.9  # of the border's pixels: then what lies behind has one color
-PLAIN_LEVELS = 3  # gray levels of 255: JPEG and rounding, not an image
-MIN_POINTS = 300  # that say where the scene is
-MOST_POINTS = 4000  # that are looked at
-OUTSIDE = 0.02  # share of points on either side taken for outliers
-# Slope in gray levels a pixel, and over what noise alone gives (a Gaussian derivative
-# of 1 px passes a fifth of it); flow over less is a guess of its regularizer.
+LONGEST_SIDE_PX = 256  # of reduced images, for results that need no full resolution
+PLAIN_SHARE = 0.9  # minimum share of border pixels of a uniform background
+PLAIN_LEVELS = 3  # of 255, the noise of a uniform color due to JPEG and rounding
+MIN_POINTS = 300  # for the depth range of a scene
+MOST_POINTS = 4000  # that are used
+OUTSIDE = 0.02  # share of outliers at each end of the depth range
+# Minimum gradient in gray levels per pixel, its minimum ratio to that of noise, and the
+# share of noise that a Gaussian derivative of 1 px passes. For smaller gradients, flow
+# is determined by its regularizer.
 LEAST_GRADIENT, LEAST_OVER_NOISE, NOISE_PASSED = 0.4, 3.0, 0.2
-# Gray levels. A lawn has detail in every corner, and all of it would pass for noise:
-# 12 to 15 levels in scikit-image's grass and gravel, made four times smaller.
+# Gray levels. Detail of a lawn, which is everywhere, would otherwise be considered as
+# noise: 12 to 15 levels in grass and gravel of scikit-image, downsampled four times.
 MOST_NOISE = 6.0
 
 
@@ -34,8 +35,8 @@ class Views(NamedTuple):
     time: np.ndarray  # [frames] in [0, 1]
     image: np.ndarray  # [frames, height, width, 3] uint8 sRGB
     gray: np.ndarray  # [frames, height, width] float32 in [0, 1]
-    valid: np.ndarray  # [frames, height, width] bool: neither black border nor plain
-    textured: np.ndarray  # [frames, height, width] bool: flow can be seen there
+    valid: np.ndarray  # [frames, height, width] bool: no black border or plain color
+    textured: np.ndarray  # [frames, height, width] bool: flow can be determined
     intrinsics: np.ndarray  # [frames, 3, 3]: pixel ~ K @ point in camera
     rotation: np.ndarray  # [frames, 3, 3] camera_from_world
     position: np.ndarray  # [frames, 3] scene units
@@ -59,7 +60,7 @@ class Views(NamedTuple):
 
 
 def in_time_order(capture: Capture, rows: np.ndarray | None = None) -> Views:
-    """Return training frames in order of time, of all cameras together.
+    """Return training frames of all cameras in temporal order.
 
     Args:
       capture: The capture.
@@ -99,7 +100,7 @@ def without_cameras(images: np.ndarray) -> Views:
 
 
 def _gray(images):
-    """Mean of the channels in [0, 1], float32; one image at a time, to spare memory."""
+    """Return the mean of the channels in [0, 1], float32, one image at a time."""
     gray = np.empty(images.shape[:3], np.float32)
     for row, image in enumerate(images):
         gray[row] = image.mean(-1) / 255
@@ -111,7 +112,7 @@ def _views(capture, rows):
     gray = _gray(image)
     valid = ~plain(capture, rows)
     if capture.valid is not None:
-        # Pixels sampled at the rim of a black corner are half black.
+        # Resampled pixels at the edge of a black corner are half black.
         valid &= nd.binary_erosion(
             capture.valid[rows], np.ones((1, 5, 5)), border_value=1
         )
@@ -177,8 +178,8 @@ def times_smaller(views: Views) -> int:
 def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
     """Find pixels that show a uniform background color.
 
-    It is the median of the border, if nearly all of the border has it. A plain wall
-    that fills only part of the border counts as scene.
+    It is the median color of the border, if nearly all of the border has this color. A
+    plain wall in a part of the border belongs to the scene.
 
     Args:
       capture: The capture.
@@ -199,7 +200,7 @@ def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
     if near(border).mean() < PLAIN_SHARE:
         return np.zeros(images.shape[:3], bool)
     behind = near(images.astype(np.float32))
-    # Only what hangs together with the border: a black spot of the object stays.
+    # Only regions connected to the border, not black spots of an object.
     kept = np.zeros_like(behind)
     for row, one in enumerate(behind):
         seeds = np.zeros_like(one)
@@ -248,7 +249,7 @@ def project(
 def in_picture(
     views: Views, pixel: np.ndarray, depth: np.ndarray, rim: float | int = 1.0
 ):
-    """Find the pixels that lie in front of the camera and inside the image.
+    """Find the positions in front of the camera and inside the image.
 
     Args:
       views: The frames.
@@ -334,9 +335,9 @@ def _matrix(cameras, row):
 
 
 def _textured(gray):
-    """Find where an image varies in every direction and has no aperture problem.
+    """Find pixels that vary in every direction, so that there is no aperture problem.
 
-    The lesser eigenvalue of the structure tensor over 2 px, as a slope in gray levels.
+    The criterion is the smaller eigenvalue of the structure tensor over 2 px.
     """
     down, across = (nd.gaussian_filter(gray, 1, order) for order in ((1, 0), (0, 1)))
     xx, yy, xy = (
@@ -345,9 +346,9 @@ def _textured(gray):
     )
     half = (xx + yy) / 2
     least = half - np.sqrt(np.maximum(half**2 - (xx * yy - xy**2), 0))
-    # Immerkaer 1996: the Laplacian of an image that has no curvature is noise alone.
+    # Immerkaer 1996: the Laplacian of an image without curvature contains only noise.
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
-    # Its lower quarter (0.3186 deviations): where there is least detail.
+    # The lower quartile (0.3186 deviations), which is affected least by detail.
     noise = np.quantile(np.abs(nd.convolve(gray, mask)), 0.25) / (6 * 0.3186)
     noise = min(noise, MOST_NOISE / 255)
     bound = max(LEAST_GRADIENT / 255, LEAST_OVER_NOISE * NOISE_PASSED * noise)
