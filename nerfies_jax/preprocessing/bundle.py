@@ -1,9 +1,9 @@
 """Bundle adjustment of one rigid object with known cameras.
 
-It finds the points of the object and its pose in each frame (Triggs et al. 2000,
+It optimizes the points of the object and its pose in each frame (Triggs et al. 2000,
 "Bundle adjustment - a modern synthesis") by Levenberg-Marquardt, with points eliminated
 by the Schur complement. The result is determined up to one factor of all distances to
-the cameras, which stays nearly as initialized.
+the cameras, which hardly changes from its initialization.
 """
 
 import math
@@ -17,14 +17,14 @@ from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 
 ROUNDS = 40
-SOFT_PX = 0.5  # misses beyond it count less and less (Cauchy)
+SOFT_PX = 0.5  # scale of the Cauchy loss
 # Penalty on second differences of the poses, in pixels over the distance: negligible,
 # but sufficient in frames that do not show the object.
 BEND_PX = 0.1
-POINT_PRIOR = 1e-3  # of what the observations of a typical point say
+POINT_PRIOR = 1e-3  # relative to the information of a typical point
 DAMPING, LEAST_DAMPING, TRIES = 1e-4, 1e-8, 8
-CONVERGED = 1e-5  # share of the cost that a round still gains
-NEAR = 1e-6  # z-depth over the typical one: what comes nearer is held there
+CONVERGED = 1e-5  # relative reduction of the cost in a round
+NEAR = 1e-6  # lower bound of the z-depth, relative to a typical one
 
 
 class Body(NamedTuple):

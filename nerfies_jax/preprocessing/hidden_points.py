@@ -1,9 +1,9 @@
-"""Guessed static points behind moving objects, where no image shows any.
+"""Extrapolated static points behind moving objects, which are visible in no image.
 
-Regions occluded in every frame are black holes from other viewpoints, or without the
-object. The surrounding surfaces are continued behind it: inverse depth that is linear
-in the pixels is a plane, fitted to the known points around, except for those in front
-of it, as at an edge of the foreground.
+Regions occluded in every frame would be black holes from other viewpoints, or without
+the object. The surrounding surfaces are continued behind it: inverse depth that is
+linear in the pixels is a plane, which is fitted to known points around, except for
+those in front of it, such as at an edge of the foreground.
 """
 
 import numpy as np
@@ -13,15 +13,16 @@ from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import view_set
 from nerfies_jax.preprocessing.view_set import Views
 
-FRAMES = 12  # that are looked from, evenly over the video
-# Pixels of images made small; more of larger ones.
+FRAMES = 12  # used frames, evenly spaced over the video
+# In pixels of reduced images, more in larger images.
 EVERY_PX = 2
-# A pixel nearer than that to a known point shows it. `still_points` has one for every
-# second pixel of each of twelve frames, fewer where little texture tells depth.
+# A pixel nearer to a known point shows this point. `still_points` has one for every
+# second pixel of each of twelve frames, fewer in regions with little texture.
 KNOWN_PX = 6.0
 AROUND = 32  # cells of that size with known points, around a pixel
-BEFORE, ROUNDS = 0.03, 8  # share of a depth by which a point lies before the plane
-# The slopes' ridge, beside squared pixels: points along one rim tell one slope alone.
+BEFORE, ROUNDS = 0.03, 8  # relative depth by which points in front are excluded
+# Ridge of the slopes relative to squared pixels, because points along one edge
+# determine only one slope.
 RIDGE_PX = 4.0
 
 

@@ -1,9 +1,9 @@
 """Paths of rigidly moving objects, refined by bundle adjustment.
 
-The path of least acceleration treats each track separately. An object that accelerates
-more than the camera comes out too near in one frame and too far in another. Its size in
-the images determines its distance better, up to one factor for the whole video. That
-factor is taken from the paths, whose errors have either sign.
+Paths of least acceleration treat each track separately. For an object that accelerates
+more than the camera, they are too near in some frames and too far in others. The size
+of the object in the images determines its distance better, up to one factor for the
+whole video. This factor is computed from the paths, whose errors have either sign.
 """
 
 from collections.abc import Callable
@@ -19,17 +19,17 @@ from nerfies_jax.preprocessing.view_set import Views
 
 GROUPS = 12
 FEWEST = 20  # tracks of a body
-MOST = 300  # tracks that are adjusted; the others are placed afterwards
-# Frames in which a thing is adjusted: of longer videos every second, every third, ...;
-# its work grows with the cube of them.
+MOST = 300  # tracks in the adjustment. Points of other tracks are fitted afterwards.
+# Frames in the adjustment, whose work grows with their third power. Longer videos are
+# subsampled.
 MOST_FRAMES = 80
-LEAST_SHARE = 0.5  # of a group's tracks that a body must explain
-WITHIN_PX = 2 * TRACK_PX  # of a track that is on a body; half of them within one
-# Deviation of depths: 0.075 of the built-in fast cube, 0.03 of the slower one, whose
-# paths are as good as its body.
+LEAST_SHARE = 0.5  # of the tracks of a group that a body must explain
+WITHIN_PX = 2 * TRACK_PX  # maximum error of a track of a body, half of it in the median
+# Relative deviation of depths above which bodies are refined. It is 0.075 for the fast
+# cube of the built-in scenes, and 0.03 for the slower one, which needs no refinement.
 BADLY_TOLD = 0.05
-FEWEST_SEEN = 6  # tracks in a frame in which a body's place is known
-GROWTHS = 5  # rounds in which a body is followed into more frames
+FEWEST_SEEN = 6  # visible tracks that determine the pose of a body in a frame
+GROWTHS = 5  # rounds in which a body is extended to more frames
 LEAST_KNOWN = 6  # frames in which a path is known
 
 
@@ -41,16 +41,16 @@ def refined(
 ) -> Paths:
     """Refine the paths on rigid objects. Other paths do not change.
 
-    Only objects whose depth is badly determined by the paths are refined. Where it is
-    well determined, a nearly rigid cloth would come out four times worse. A track is no
-    longer known in frames that show too little of its object.
+    Only objects with inaccurate depth are refined. Otherwise the errors of a nearly
+    rigid cloth would become four times larger. A track is no longer known in frames
+    that show too little of its object.
 
     Args:
       views: The frames.
       tracks: The tracks.
       paths: Their paths.
-      has_room: Called before each object and each round of its growth with the work of
-        it, the number of tracks times the square of the number of frames. False stops.
+      has_room: Called before each object and each round of its growth with its work,
+        the number of tracks times the squared number of frames. False ends refinement.
 
     Returns:
       The paths.
@@ -88,7 +88,7 @@ def _work(own, paths):
 
 
 def _some_frames(views, tracks, paths, every):
-    """Views, tracks and paths of every `every`-th frame."""
+    """Select views, tracks and paths of every `every`-th frame."""
     if every == 1:
         return views, tracks, paths
     kept = slice(None, None, every)
@@ -103,7 +103,7 @@ def _some_frames(views, tracks, paths, every):
 
 
 def _in_all_frames(views, tracks, paths, own, body, every):
-    """A body of every so many frames, posed by what was seen of it in the others."""
+    """Extend a body of every `every`-th frame to all frames."""
     frames = np.arange(len(views.time))
     kept = frames[::every]
     within = np.minimum(frames, kept[-1])  # it stays where it was last
@@ -116,10 +116,9 @@ def _in_all_frames(views, tracks, paths, own, body, every):
 
 
 def _grown(views, tracks, paths, own, rows, has_room):
-    """Paths on the rigid object that `own` are on, and the object, or None.
+    """Return the paths on the rigid object of `own`, and the object, or None.
 
-    From the frames in which it is known, the object is followed into others by the
-    tracks that they share.
+    The object is extended to more frames by tracks that are visible there.
     """
     body = None
     for _ in range(GROWTHS):
@@ -142,9 +141,9 @@ def _grown(views, tracks, paths, own, rows, has_room):
 
 
 def _body(views, tracks, paths, own):
-    """Rigid object that most of the tracks are on, and those tracks, or None."""
+    """Return tracks on one rigid object, and the object, or None."""
     own = _fewer(paths, own)
-    for _ in range(2):  # once more without those that are on something else
+    for _ in range(2):  # a second time without the outliers
         body = _first(paths, own)
         seen = bundle.sight(views, tracks.take(own), paths.known[own])
         body = bundle.adjusted(views, seen, body)
@@ -159,13 +158,13 @@ def _body(views, tracks, paths, own):
 
 
 def _fewer(paths, own):
-    """At most `MOST`, those first that are seen where few are."""
+    """Select at most `MOST` tracks, first those visible in frames with few tracks."""
     rare = paths.known[own] / np.maximum(paths.known[own].sum(0), 1)
     return own[np.argsort(-rare.sum(1), kind="stable")[:MOST]]
 
 
 def _first(paths, own):
-    """A body by the paths alone."""
+    """Initialize a body from the paths."""
     position, known = paths.position[own], paths.known[own]
     canonical = position.shape[1] // 2
     motion = rigid_groups.motion(position, known, np.zeros(len(own), int), canonical)
@@ -175,9 +174,10 @@ def _first(paths, own):
 
 
 def _on(views, tracks, paths, body, rows, there):
-    """The body with a point for each of the paths, and by how much they miss, px.
+    """Return the body with a point for each path, and reprojection errors in px.
 
-    By the frames that are `there`; infinite where a path is known in too few of them.
+    Only the frames `there` are used. The error is infinite if a path is known in too
+    few of them.
     """
     known = paths.known[rows] & there
     local = paths.position[rows] - body.shift
@@ -193,7 +193,7 @@ def _on(views, tracks, paths, body, rows, there):
 
 
 def _at_paths_scale(views, paths, own, body):
-    """Places of the body's points over time, in the median as far as their paths."""
+    """Return positions of a body over time, scaled to the median depth of its paths."""
     enough = paths.known[own].sum(0) >= FEWEST_SEEN
     known = paths.known[own] & enough
     depth = views.depth_of(body.world())

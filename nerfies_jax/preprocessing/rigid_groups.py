@@ -1,8 +1,8 @@
 """Rigid motion groups: tracks with constant distances, and the motion of each group.
 
-No track needs to span the video. Tracks whose distance stays constant while both are
-visible belong together, and a group is propagated over time by the points that it
-shares with a frame 8, 4 or 1 earlier.
+No track needs to span the video. Tracks whose distance is constant while both are
+visible belong together, and the motion of a group is propagated over time by points
+that are also visible 8, 4 or 1 frames earlier.
 """
 
 from collections.abc import Sequence
@@ -17,20 +17,20 @@ from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-# Pairs are neighbors in space in some frame, and seen together in some.
+# Pairs are spatial neighbors in at least one frame, and both visible in some frames.
 NEIGHBORS, EVERY_FRAMES, SHARED_FRAMES = 12, 3, 5
-HOPS = (8, 4)  # frames at once where enough points are shared, against drift
+HOPS = (8, 4)  # larger steps, if enough points are common, reduce drift
 SHARED_POINTS, SHARED_SHARE = 10, 0.6
-FEWEST = 6  # points that tell a turn; fewer tell a shift
-SMOOTHED_FRAMES = 1.0  # deviation, of poses over time
-LANCZOS = 40  # vectors; with 20 it takes ten times as long
+FEWEST = 6  # points that determine a rotation. With fewer only the shift is estimated.
+SMOOTHED_FRAMES = 1.0  # standard deviation of the filter of poses over time
+LANCZOS = 40  # vectors. With 20 it takes ten times as long.
 ROUNDS = 3  # of robust Procrustes
 
 
 class RigidMotion(NamedTuple):
     """Motion of groups from their positions in one frame: x(t) = rotation x + shift."""
 
-    label: np.ndarray  # [paths] which group
+    label: np.ndarray  # [paths] index of the group
     rotation: np.ndarray  # [groups, frames, 3, 3]
     shift: np.ndarray  # [groups, frames, 3] scene units
 
@@ -40,7 +40,7 @@ def labels(position: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
 
     Args:
       position: Positions, [paths, frames, 3].
-      known: True where they are known, [paths, frames].
+      known: True for known positions, [paths, frames].
       count: Number of groups. At most half the number of paths is used.
 
     Returns:
@@ -69,13 +69,13 @@ def labels(position: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
 
 
 def _leading(matrix, count):
-    """[rows, count] eigenvectors of the largest eigenvalues of a sparse matrix."""
+    """Return eigenvectors [rows, count] of the largest eigenvalues."""
     rows = matrix.shape[0]
     start, width = np.ones(rows), min(rows, max(2 * count + 1, LANCZOS))
     try:
         return eigsh(matrix, count, which="LA", v0=start, ncv=width, maxiter=100)[1]
     except ArpackNoConvergence:
-        # Where one body is all there is, eigenvalues lie too close together.
+        # For a single body the eigenvalues are nearly equal.
         last = rows - count, rows - 1
         return scipy.linalg.eigh(matrix.toarray(), subset_by_index=last)[1]
 
@@ -107,7 +107,7 @@ def motion(
 
     Args:
       position: Positions in scene units, [paths, frames, 3].
-      known: True where they are known, [paths, frames].
+      known: True for known positions, [paths, frames].
       label: Group of each path, [paths].
       canonical: Index of the canonical frame.
 
@@ -122,7 +122,7 @@ def motion(
         member = np.flatnonzero(label == group)
         if not len(member):
             continue
-        # From where most of it is seen.
+        # From the frame in which most of the group is visible.
         start = int(np.argmax(known[member].sum(0)))
         for sign in (1, -1):
             for frame in range(start + sign, frames if sign > 0 else -1, sign):
@@ -138,7 +138,7 @@ def motion(
 
 
 def _carried(position, known, member, frame, sign, start):
-    """The frame from which the group is carried to `frame`, and how it moves."""
+    """Return the frame that the motion to `frame` is estimated from, and the motion."""
     before = frame - sign
     shared = member[known[member, before] & known[member, frame]]
     for hop in HOPS:
@@ -157,7 +157,7 @@ def _carried(position, known, member, frame, sign, start):
 
 
 def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the rigid motion that aligns points with others, robustly.
+    """Find the rigid motion that aligns points with others by robust least squares.
 
     Args:
       source: Points, [points, 3].
@@ -192,7 +192,7 @@ def centers(
 
     Args:
       position: Positions in scene units, [paths, frames, 3].
-      known: True where they are known, [paths, frames].
+      known: True for known positions, [paths, frames].
       bodies: Motion of the groups.
 
     Returns:
@@ -215,7 +215,7 @@ def miss(position: np.ndarray, known: np.ndarray, count: int) -> float:
 
     Args:
       position: Positions in scene units, [paths, frames, 3].
-      known: True where they are known, [paths, frames].
+      known: True for known positions, [paths, frames].
       count: Number of groups.
 
     Returns:
@@ -236,7 +236,7 @@ def fewest(
 
     Args:
       position: Positions in scene units, [paths, frames, 3].
-      known: True where they are known, [paths, frames].
+      known: True for known positions, [paths, frames].
       within: Median error in scene units that is small enough.
       most: Largest number of groups, returned if none is enough.
 
@@ -253,14 +253,14 @@ def fewest(
 def enough(
     position: np.ndarray, known: np.ndarray, counts: Sequence[int], share: float
 ) -> int:
-    """Find the first number of groups beyond which more groups hardly help.
+    """Find the number of groups beyond which more groups hardly reduce the error.
 
-    It reduces the median error by at least `share` of the difference between one group
-    and the last of `counts`.
+    The result reduces the median error by at least `share` of the difference between
+    one group and the last of `counts`.
 
     Args:
       position: Positions in scene units, [paths, frames, 3].
-      known: True where they are known, [paths, frames].
+      known: True for known positions, [paths, frames].
       counts: Numbers of groups in ascending order.
       share: Share of the reduction, in [0, 1].
 

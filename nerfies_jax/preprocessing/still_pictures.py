@@ -1,8 +1,8 @@
-"""Dissimilarity of each pixel to the static scene as other frames show it.
+"""Dissimilarity of each pixel to the static scene in other frames.
 
-The depth of static regions is known from static points, and behind moving objects from
-the points around. A static pixel finds its own color in most other frames, even if its
-neighbors move. A moving pixel does not.
+The depth of static regions is computed from static points, and behind moving objects
+from the points around. A static pixel has the same color in most other frames, even if
+its neighbors move. A moving pixel does not.
 """
 
 import cv2
@@ -13,17 +13,18 @@ from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import view_set
 from nerfies_jax.preprocessing.view_set import Views
 
-OTHERS = (3, 6, 10, 15, 22, 30)  # frames before and after
-# Three of ten of the other frames agree better: what moves hides the rest.
+OTHERS = (3, 6, 10, 15, 22, 30)  # distances to other frames, before and after
+# Quantile of the differences over other frames. In the frames with larger differences
+# the point may be occluded by moving objects.
 QUANTILE, LEAST_FRAMES = 0.3, 3
 BLUR_PX = 0.7
-CELL = 2  # pixels of a side that share a depth
-NEARER = 0.9  # of the depth of a cell: a neighbor so near hides what shows through
-HIDDEN = 0.93  # of the depth: in the other frame something nearer stands there
-# Difference that speaks neither way, as a share of the video's spread of colors, and of
-# its slope: places are not exact.
+CELL = 2  # side in pixels of cells with one depth
+NEARER = 0.9  # relative depth of a neighbor that fills gaps in a surface
+HIDDEN = 0.93  # relative depth in the other frame below which the point is occluded
+# Difference with even odds, relative to the spread of colors of the video, plus the
+# gradient of the image, because positions are not exact.
 EVEN, EVEN_SLOPE = 0.5, 0.25
-STEEPNESS, MOST = 2.0, 3.0  # of the logarithm of odds
+STEEPNESS, MOST = 2.0, 3.0  # of log odds
 OUTSIDE = (np.nan,) * 3
 
 
@@ -35,7 +36,7 @@ def log_odds(views: Views, still: PointCloud) -> np.ndarray:
       still: Static points, none of them near pixels that may move.
 
     Returns:
-      Log odds [frames, height, width], 0 where nothing is known.
+      Log odds [frames, height, width], 0 if unknown.
     """
     frames = len(views.row)
     if not len(still.position):
@@ -56,7 +57,7 @@ def log_odds(views: Views, still: PointCloud) -> np.ndarray:
 
 
 def _leveled(views):
-    """Blurred images with one mean and spread for each channel, and that spread."""
+    """Return blurred images normalized to one mean and spread, and that spread."""
     image = views.image.astype(np.float32)
     mean, spread = image.mean((1, 2)), np.maximum(image.std((1, 2)), 1e-3)
     typical = np.median(spread, axis=0)
@@ -67,7 +68,7 @@ def _leveled(views):
 
 
 def _slope(color):
-    """[height, width] gray levels a pixel, the steepest around."""
+    """Return the maximum gradient around each pixel, in gray levels per pixel."""
     gray = color.mean(-1)
     across, down = (
         cv2.Sobel(gray, cv2.CV_32F, *by, scale=1 / 8) for by in ((1, 0), (0, 1))
@@ -76,9 +77,9 @@ def _slope(color):
 
 
 def _depth(views, frame, position):
-    """z-depth [height, width] of the static scene, with gaps filled.
+    """Return the z-depth [height, width] of the static scene, with gaps filled.
 
-    None if no point lies in the image.
+    It is None if no point is in the image.
     """
     width, height = views.size
     columns, rows = -(-width // CELL), -(-height // CELL)
@@ -101,7 +102,7 @@ def _depth(views, frame, position):
 
 
 def _unlike(views, color, depth, frame):
-    """Dissimilarity [height, width] in gray levels, NaN if unknown."""
+    """Return the dissimilarity [height, width] in gray levels, NaN if unknown."""
     width, height = views.size
     blank = np.full((height, width), np.nan, np.float32)
     if depth[frame] is None:
@@ -122,7 +123,7 @@ def _unlike(views, color, depth, frame):
         differences.append(unlike)
     if len(differences) < LEAST_FRAMES:
         return blank
-    order = np.sort(differences, axis=0)  # NaN come last
+    order = np.sort(differences, axis=0)  # NaN is last
     count = np.isfinite(order).sum(0)
     place = np.floor(QUANTILE * np.maximum(count - 1, 0)).astype(int)
     chosen = np.take_along_axis(order, place[None], axis=0)[0]
@@ -130,7 +131,7 @@ def _unlike(views, color, depth, frame):
 
 
 def _places(views, frame, other, pixel, depth):
-    """[3, pixels] where OpenCV finds them in another frame, and their z-depth there."""
+    """Return pixel positions for OpenCV in another frame and z-depths, [3, pixels]."""
     turn = views.intrinsics[other] @ views.rotation[other]
     back = views.rotation[frame].T @ np.linalg.inv(views.intrinsics[frame])
     shift = turn @ (views.position[frame] - views.position[other])
