@@ -166,18 +166,18 @@ def rows_to_write(splats: Splats, path: pathlib.Path) -> np.ndarray:
     return active
 
 
-def active_degree(step: Int[Array, ""], every: int, degree: int) -> Int[Array, ""]:
-    """Compute the harmonic degree in use: one more after every `every` steps.
+def active_degree(step: Int[Array, ""], interval: int, degree: int) -> Int[Array, ""]:
+    """Compute the harmonic degree in use: one more after every `interval` steps.
 
     Args:
       step: Number of updates so far.
-      every: Number of steps from one degree to the next.
+      interval: Number of steps from one degree to the next.
       degree: Largest degree.
 
     Returns:
       The degree.
     """
-    return jnp.minimum(step // every, degree)
+    return jnp.minimum(step // interval, degree)
 
 
 def active_harmonics(

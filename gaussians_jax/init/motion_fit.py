@@ -223,24 +223,24 @@ def guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
         return effect.fit_to_paths(paths, key)
     canonical = jnp.asarray(positions_at_middle(paths), jnp.float32)
     params = _initialized(effect, canonical, key)
-    still, still_rows = None, None
+    static, static_rows = None, None
     if params.shared is not None:
-        still = resting(paths)
-    if still is not None:
+        static = resting(paths)
+    if static is not None:
         # Parameters of all points from one initialization, static ones last.
-        all_points = jnp.concatenate([canonical, still])
+        all_points = jnp.concatenate([canonical, static])
         params, count = _initialized(effect, all_points, key), len(canonical)
-        still_rows = jax.tree.map(lambda leaf: leaf[count:], params.per_gaussian)
+        static_rows = jax.tree.map(lambda leaf: leaf[count:], params.per_gaussian)
         rows = jax.tree.map(lambda leaf: leaf[:count], params.per_gaussian)
         params = params._replace(per_gaussian=rows)
     rows, nets = params
     row_rate = None if rows is None else 1.0
     points = Points(canonical, rows, nets)
     rates = Points._make((paths.unit, row_rate, None if nets is None else 0.4, None))
-    if still is None:
+    if static is None:
         return Guess(points, rates)
     return Guess(
-        points._replace(resting=Resting(still, still_rows)),
+        points._replace(resting=Resting(static, static_rows)),
         rates._replace(resting=Resting._make((0.0, row_rate))),
         _unrest_of(effect, paths.unit),
     )
@@ -256,12 +256,12 @@ def _unrest_of(effect, unit):
     """Return the penalty (points, times) on the motion of static points."""
 
     def penalty(points, times):
-        still, rows = points.resting
-        deform = _deformer(effect, Points(still, rows, points.nets))
+        static, rows = points.resting
+        deform = _deformer(effect, Points(static, rows, points.nets))
 
         def motion(time):
             gaussians = deform(time)
-            return gaussians.quaternion[:, 1:], gaussians.mean - still
+            return gaussians.quaternion[:, 1:], gaussians.mean - static
 
         return rest_loss(motion, unit, times)
 

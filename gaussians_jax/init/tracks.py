@@ -73,14 +73,14 @@ def start(
     position, known, deviation = usable_paths.known_paths(evidence)
     times = capture.times[evidence.row].astype(np.float32)
     unit = usable_paths.scene_unit(evidence)
-    still = np.asarray(evidence.still.position, np.float32)
+    static_points = np.asarray(evidence.still.position, np.float32)
     views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
     ray = position - views.position
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     depth = Depth(ray, deviation)
     fitted = motion_fit.fit(
         effect,
-        Paths(times, position.astype(np.float32), known, unit, still, depth),
+        Paths(times, position.astype(np.float32), known, unit, static_points, depth),
         key,
         rate=spec.fit_rate,
         steps=spec.fit_steps,
@@ -207,7 +207,7 @@ def moving_depths(evidence: Evidence) -> np.ndarray:
     return depths
 
 
-def rows_at_rest(resting: Resting, places: Float[Array, "places 3"]) -> PyTree:
+def rows_at_rest(resting: Resting, positions: Float[Array, "places 3"]) -> PyTree:
     """Return the motion parameters of static points near each position, on the host.
 
     Newly initialized parameters would move static Gaussians at once: in the built-in
@@ -217,13 +217,13 @@ def rows_at_rest(resting: Resting, places: Float[Array, "places 3"]) -> PyTree:
 
     Args:
       resting: Static points of the fit, and their parameters.
-      places: Positions in scene units.
+      positions: Positions in scene units.
 
     Returns:
       Per-Gaussian parameters of the motion.
     """
     static, static_rows = jax.tree.map(np.asarray, resting)
-    _, neighbors, weights = _carriers(static, np.asarray(places))
+    _, neighbors, weights = _carriers(static, np.asarray(positions))
     return jax.tree.map(
         lambda leaf: jnp.asarray(_mixed(leaf, neighbors, weights)), static_rows
     )

@@ -73,7 +73,8 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
         )
     poses = [jax.device_get(at(float(time))) for time in np.linspace(0, 1, count)]
     mean, quaternion, scale, opacity = (
-        np.stack([leaf[visible] for leaf in each]) for each in zip(*poses, strict=True)
+        np.stack([leaf[visible] for leaf in leaves])
+        for leaves in zip(*poses, strict=True)
     )
     return Instants(
         mean=mean,

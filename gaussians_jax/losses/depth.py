@@ -172,8 +172,8 @@ def _median(depth, known):
     count = jnp.sum(known)
     fixed = jax.lax.stop_gradient(jnp.where(known, depth, 1))
     middle = nth_smallest(fixed, known, jnp.maximum(count - 1, 0) // 2)
-    place = jnp.argmax(known & (fixed == middle))
-    return jnp.where(count > 0, jnp.where(known, depth, 0)[place], 0)
+    index = jnp.argmax(known & (fixed == middle))
+    return jnp.where(count > 0, jnp.where(known, depth, 0)[index], 0)
 
 
 def nth_smallest(

@@ -130,11 +130,11 @@ def flow_error(
     assert frames is not None
     assert frames.flow is not None
     other = frames.flow.next_row[row]
-    here, there = (at_time(params, frames.times[at]) for at in (row, other))
+    start, end = (at_time(params, frames.times[at]) for at in (row, other))
     first, second = (cameras.take(frames.cameras, at) for at in (row, other))
     pair = first, second
     size = frames.images.shape[2], frames.images.shape[1]
-    rendered = render_flow(here, there, pair, size, raster_spec)
+    rendered = render_flow(start, end, pair, size, raster_spec)
     shift = frames.flow.forward[row].astype(rendered.flow.dtype)
     seen = frames.flow.forward_seen[row] & (rendered.share >= spec.opaque)
     if observation.valid is not None:

@@ -125,8 +125,8 @@ def _unit(spec, distance, extent):
     # Clones lie on their parents, so the nearest distance may be zero for most.
     farthest = float(np.median(distance[:, -1]))
     if farthest == 0:
-        apart = distance[distance > 0]
-        farthest = float(np.median(apart)) if apart.size else SPACING
+        positive = distance[distance > 0]
+        farthest = float(np.median(positive)) if positive.size else SPACING
     return farthest / SPACING
 
 

@@ -85,15 +85,17 @@ def coded_bytes(params: Params, spec: AnchorMotionSpec) -> tuple[float, float]:
     Returns:
       Bytes of the features, and of all other parameters at 32 bits each.
     """
-    own, net = params.rows[NAME], params.nets[NAME]
+    features, net = params.rows[NAME], params.nets[NAME]
     active = np.asarray(splats.active_mask(params.rows["splats"]))
     plain = sum(leaf[active].size for leaf in params.rows["splats"])
     plain += sum(leaf.size for leaf in jax.tree.leaves(params.nets))
     if net.law is None:
-        numbers = sum(leaf[active].size for leaf in own)
+        numbers = sum(leaf[active].size for leaf in features)
         return numbers * NUMBER_BITS / 8, plain * NUMBER_BITS / 8
-    each = bits(quantize(own, net.law, spec), net.law, spec)
-    total = sum(float(np.asarray(leaf, np.float64)[active].sum()) for leaf in each)
+    feature_bits = bits(quantize(features, net.law, spec), net.law, spec)
+    total = sum(
+        float(np.asarray(leaf, np.float64)[active].sum()) for leaf in feature_bits
+    )
     return total / 8, plain * NUMBER_BITS / 8
 
 
@@ -189,14 +191,16 @@ def fit_to_paths(
     """
     rows_key, nets_key, rest_key = jax.random.split(key, 3)
     points = jnp.asarray(motion_fit.positions_at_middle(paths), jnp.float32)
-    rest = init_features(rest_key, spec, RESTING)
+    static_features = init_features(rest_key, spec, RESTING)
 
     def penalty(points, times):
         net = points.nets
 
         def motion(time):
             code = codes.at_time(net.times, time)
-            residuals = offsets(net.coarse, coarse_spec(spec), rest.reference, code)
+            residuals = offsets(
+                net.coarse, coarse_spec(spec), static_features.reference, code
+            )
             return residuals.turn, residuals.position
 
         return motion_fit.rest_loss(motion, paths.unit, times)
@@ -220,18 +224,18 @@ def features_of(
     Returns:
       The features.
     """
-    own, net = params
+    features, net = params
     if spec.rate is None:
-        return own
+        return features
     if condition is None or condition.step is None:
-        return quantize(own, net.law, spec)
+        return quantize(features, net.law, spec)
     assert condition.key is not None
     key = jax.random.fold_in(condition.key, stream(NAME))
     return jax.lax.cond(
         condition.step < spec.rate.start,
-        lambda own, law: own,
-        lambda own, law: add_noise(key, own, law),
-        own,
+        lambda features, law: features,
+        lambda features, law: add_noise(key, features, law),
+        features,
         net.law,
     )
 
@@ -278,8 +282,8 @@ def penalty(spec: AnchorMotionSpec, context: PenaltyContext) -> dict[str, Term]:
     numbers = spec.reference + spec.count * residual_width(spec)
 
     def evaluate(scene):
-        own = MotionParams(scene.rows[NAME], scene.nets[NAME])
-        features = features_of(spec, own, context.condition)
+        motion_params = MotionParams(scene.rows[NAME], scene.nets[NAME])
+        features = features_of(spec, motion_params, context.condition)
         first, others = bits(features, scene.nets[NAME].law, spec)
         total = jnp.sum(first, axis=1) + jnp.sum(others, axis=(1, 2))
         count = jnp.maximum(jnp.sum(active), 1) * numbers

@@ -274,10 +274,10 @@ def base_displacement(
     """Compute D(p, t), equation 3, of one Gaussian from its cached first layer."""
     first, *others = base.hidden
     hidden = mlp.ACTIVATIONS[spec.activation](first_layer + first.bias)
-    rest = dataclasses.replace(
+    remaining = dataclasses.replace(
         base_spec(spec), inputs=spec.base_width, depth=spec.base_depth - 1
     )
-    return mlp.apply(rest, MLP(tuple(others), base.heads), hidden)["mean"]
+    return mlp.apply(remaining, MLP(tuple(others), base.heads), hidden)["mean"]
 
 
 def residual(

@@ -135,8 +135,8 @@ def init_times(
         scale = math.sqrt(3) * spec.spread  # bound of a uniform distribution
         return codes.init(key, count, spec.time_code, scale, dtype)
     # [-2, 2] has about the spread of the positions, whose mean square distance is one.
-    moment = jnp.linspace(-2, 2, count, dtype=dtype)[:, None]
-    return _random_waves(key, spec, moment, spec.time_code)
+    time = jnp.linspace(-2, 2, count, dtype=dtype)[:, None]
+    return _random_waves(key, spec, time, spec.time_code)
 
 
 def coarse_rows(spec: Codes, count: int) -> int:

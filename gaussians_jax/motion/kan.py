@@ -368,8 +368,8 @@ def _after_first_layer(spec, field, first):
         return kan.after_first_layer(network, field, first)
     layer, *others = field.hidden
     features = mlp.ACTIVATIONS[network.activation](first + layer.bias)
-    rest = dataclasses.replace(network, inputs=network.width, depth=len(others))
-    return mlp.apply(rest, MLP(tuple(others), field.heads), features)
+    remaining = dataclasses.replace(network, inputs=network.width, depth=len(others))
+    return mlp.apply(remaining, MLP(tuple(others), field.heads), features)
 
 
 def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:

@@ -380,13 +380,15 @@ def fit_to_paths(
       Initial guess of a fit.
     """
     unit, canonical = paths.unit, motion_fit.positions_at_middle(paths)
-    still = np.zeros((0, 3))
+    static_points = np.zeros((0, 3))
     if paths.still is not None:
-        still = np.asarray(paths.still, np.float64)
-    moving = spec.nodes if not len(still) else round(spec.moving_share * spec.nodes)
+        static_points = np.asarray(paths.still, np.float64)
+    moving = (
+        spec.nodes if not len(static_points) else round(spec.moving_share * spec.nodes)
+    )
     moving_nodes = canonical[skinning.farthest_points(canonical, max(moving, 1))]
-    static_nodes = still[
-        skinning.farthest_points(still, spec.nodes - len(moving_nodes))
+    static_nodes = static_points[
+        skinning.farthest_points(static_points, spec.nodes - len(moving_nodes))
     ]
     nodes = place_nodes(init(key, spec), np.concatenate([moving_nodes, static_nodes]))
     static_rows = slice(len(moving_nodes), len(moving_nodes) + len(static_nodes))
@@ -428,8 +430,11 @@ class Bound(BoundMotion):
         rate = self.rate(step)
         decay = rate / spec.learning_rate
         mask = None if spec.mask is None else spec.mask.rate * decay
-        place, radius = self.extent * spec.place_rate * decay, spec.radius_rate * decay
-        return MotionParams(shared=Nodes._make((place, radius, rate, mask)))
+        position, radius = (
+            self.extent * spec.place_rate * decay,
+            spec.radius_rate * decay,
+        )
+        return MotionParams(shared=Nodes._make((position, radius, rate, mask)))
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the network and nodes spread over the Gaussians, on the host."""

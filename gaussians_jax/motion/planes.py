@@ -138,29 +138,29 @@ def in_unit_cube(
 
 
 def prepare(
-    params: Motion, spec: PlaneMotionSpec, place: Float[Array, "gaussians 3"]
+    params: Motion, spec: PlaneMotionSpec, position: Float[Array, "gaussians 3"]
 ) -> Features:
     """Interpolate the spatial planes, which do not depend on the time."""
     return jax.vmap(
         lambda point: planes.space_features(spec.planes, params.planes, point)
-    )(place)
+    )(position)
 
 
 def offsets(
     params: Motion,
     spec: PlaneMotionSpec,
-    place: Float[Array, "gaussians 3"],
+    position: Float[Array, "gaussians 3"],
     time: Float[Array, ""],
-    ready: Features,
+    cached: Features,
 ) -> Offsets:
     """Evaluate the residuals of Gaussians at a time.
 
     Args:
       params: Shared parameters.
       spec: Settings.
-      place: Positions in the unit cube.
+      position: Positions in the unit cube.
       time: Normalized time.
-      ready: Result of `prepare` for the same positions.
+      cached: Result of `prepare` for the same positions.
 
     Returns:
       Residuals, those of means in scene extents.
@@ -171,7 +171,7 @@ def offsets(
         time_features = planes.time_features(spec.planes, lines, point)
         return planes.features(spec.planes, space, time_features)
 
-    encoded = jax.vmap(features)(place, ready)
+    encoded = jax.vmap(features)(position, cached)
     return Offsets(**mlp.apply(network_spec(spec), params.network, encoded))
 
 
@@ -249,8 +249,8 @@ class Bound(BoundMotion):
     ) -> Gaussians:
         """Move the Gaussians to their state at a time."""
         assert self.box is not None
-        place = in_unit_cube(self.box, gaussians.mean)
-        residuals = offsets(params.shared, self.spec, place, frame.time, cache)
+        position = in_unit_cube(self.box, gaussians.mean)
+        residuals = offsets(params.shared, self.spec, position, frame.time, cache)
         return apply(gaussians, residuals._replace(mean=self.extent * residuals.mean))
 
     def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:

@@ -148,8 +148,10 @@ def apply(gaussians: Gaussians, by: Displacement) -> Gaussians:
       Gaussians with normalized rotations.
     """
 
-    def rotate(extra, own):
-        return quaternions.normalize(own + quaternions.multiply(extra, own))
+    def rotate(extra, orientation):
+        return quaternions.normalize(
+            orientation + quaternions.multiply(extra, orientation)
+        )
 
     return gaussians._replace(
         mean=gaussians.mean + by.offset,

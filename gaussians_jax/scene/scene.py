@@ -169,12 +169,12 @@ def _finder(effects):
     """Return `Model.found` for these components."""
     finding = [effect for effect in effects if effect.found is not None]
 
-    def found(params, capture):
+    def refine(params, capture):
         for effect in finding:
             capture = effect.found(params.nets.get(effect.name), capture)
         return capture
 
-    return found if finding else None
+    return refine if finding else None
 
 
 def _stages(spec, metadata, effects):

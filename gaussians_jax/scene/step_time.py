@@ -52,8 +52,8 @@ def parts(
 
     def with_rest(timed):
         timed |= {name: views * timed[name] for name in per_view}
-        whole = rate.step_ms(model, state, frames, spec.steps)
-        return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
+        total = rate.step_ms(model, state, frames, spec.steps)
+        return timed | {"rest": max(total - sum(timed.values()), 0.0)}
 
     return StepParts(per_view | per_step, with_rest)
 
