@@ -30,6 +30,7 @@ from nerfies_jax.geometry.camera import Camera
 WHITE = (1.0, 1.0, 1.0)
 # Blender's and D-NeRF's cameras sit 4 from the origin, and their readers use 2 and 6.
 USUAL_RADIUS, USUAL_NEAR, USUAL_FAR = 4.0, 2.0, 6.0
+FAR_FROM_ORIGIN = 100.0  # extents of the cameras; Blender's stand around the origin
 
 
 @confines
@@ -70,6 +71,7 @@ def read(
     split = read_split(path, heldout, missing)
     entries = [*split.train, *split.heldout]
     where = str(split.file)
+    moved = _made_local(root, entries, split.transforms)
     files = [_picture(root, entry, split.file) for entry in entries]
     names = [_name(entry.file_path) for entry in entries]
     rows, lost = frames.keep_found(files, names, missing, where)
@@ -124,6 +126,7 @@ def read(
         path=path,
         notes=(
             *split.notes,
+            *moved,
             *lost,
             *notes,
             *more,
@@ -133,6 +136,18 @@ def read(
             *_unread_depths(entries),
         ),
     )
+
+
+def _made_local(root, entries, transforms):
+    """Replace paths of another machine by those of the same files in this folder."""
+    named = [(entry, key) for entry in entries for key in ("file_path", "mask_path")]
+    named.append((transforms, "ply_file_path"))
+    named = [(holder, key) for holder, key in named if getattr(holder, key)]
+    names = [getattr(holder, key) for holder, key in named]
+    local = [frames.local_name(root, name) for name in names]
+    for (holder, key), name in zip(named, local, strict=True):
+        setattr(holder, key, name)
+    return frames.moved_note(names, local)
 
 
 def _placed(points, placement):
@@ -190,6 +205,7 @@ def _pose(matrix, label):
         raise CaptureError(
             f"{label} has a transform_matrix of rows {rows}; expected 4x4 or 3x4"
         )
+    last = matrix[3:]
     matrix = np.array(matrix[:3], np.float64)
     axes = matrix[:, :3].T  # rows: right, up, back
     length = np.linalg.norm(axes, axis=1)
@@ -197,6 +213,11 @@ def _pose(matrix, label):
         raise CaptureError(
             f"{label} has axes of lengths {length.round(4).tolist()} in "
             "transform_matrix; it must be a rotation"
+        )
+    if last and np.abs(np.subtract(last[0], (0, 0, 0, 1))).max() > 1e-3:
+        raise CaptureError(
+            f"{label} has a transform_matrix with the last row {last[0]}; expected "
+            "0, 0, 0, 1, so transpose it if its last column is that"
         )
     # A uniform scale (a scaled parent in Blender) leaves the direction of the axes.
     return axes / length[:, None] * [[1.0], [-1.0], [-1.0]], matrix[:, 3]
@@ -215,6 +236,10 @@ def _place(cameras, points, transforms, size):
             return placed, ()
     if transforms.camera_angle_x is not None and transforms.fl_x is None:
         radius = float(np.median(np.linalg.norm(cameras.position, axis=1)))
+        spread = float(np.linalg.norm(np.ptp(cameras.position, axis=0)))
+        if 0 < spread < radius / FAR_FROM_ORIGIN:  # coordinates of a map
+            note = "no points: near and far are guessed from where the cameras look"
+            return place_by_cameras(cameras), (note,)
         usual = 0.75 * USUAL_RADIUS < radius < 1.25 * USUAL_RADIUS or radius == 0
         ratio = 1.0 if usual else radius / USUAL_RADIUS
         near, far = USUAL_NEAR * ratio, USUAL_FAR * ratio

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax.capture import colmap_models, frames, name_times
+from nerfies_jax.capture import colmap_models, frames, name_times, text_files
 from nerfies_jax.capture import images as pictures
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
@@ -65,8 +65,9 @@ def read(
     """
     path = pathlib.Path(path)
     folder, notes = _best_model(path)
-    model, more = _with_physical_cameras(read_model(folder))
-    notes += more
+    model, moved = _with_local_names(path, read_model(folder))
+    model, more = _with_physical_cameras(model)
+    notes += (*moved, *more)
     if isinstance(heldout, str):
         raise CaptureError(
             f"{path}: COLMAP has no split {heldout!r}; pass a number n to hold out "
@@ -121,6 +122,16 @@ def read(
         path=path,
         notes=(*notes, *lost),
     )
+
+
+def _with_local_names(path, model):
+    """Return the model with names of images in this folder, and a note of changes."""
+    for place in PICTURES:
+        local = [frames.local_name(path / place, name) for name in model.names]
+        note = frames.moved_note(model.names, local)
+        if note:
+            return model._replace(names=tuple(local)), note
+    return model, ()
 
 
 def _with_physical_cameras(model):
@@ -218,7 +229,8 @@ def read_model(folder: pathlib.Path) -> Model:
     camera_ids = [about["camera_ids"][row] for row in rows]
     depths = arrays["depths"]
     return Model(
-        names=tuple(names[row] for row in rows),
+        # Of models made on Windows, folders of images end in backslashes.
+        names=tuple(text_files.forward_slashes(names[row]) for row in rows),
         lenses=[cameras[str(number)] for number in camera_ids],
         camera_ids=np.array(camera_ids),
         rotations=arrays["rotations"][rows],
@@ -264,8 +276,7 @@ def _find_pictures(path, model):
     first = model.lenses[0]
     available, paths = {}, {}
     for place in PICTURES:
-        folder = path / place
-        files = [_find(folder, name, path) for name in model.names]
+        files = [_find(path, place, name) for name in model.names]
         present = next((file for file in files if file is not None), None)
         if present is None:
             continue
@@ -281,7 +292,7 @@ def _find_pictures(path, model):
                 "that"
             )
         if ratio not in available:
-            available[ratio], paths[ratio] = folder, files
+            available[ratio], paths[ratio] = path / place, files
     if not available:
         raise CaptureError(
             f"{path}: a COLMAP model but none of its pictures ({model.names[0]}, ...); "
@@ -290,13 +301,18 @@ def _find_pictures(path, model):
     return available, paths
 
 
-def _find(folder, name, path):
+def _find(path, place, name):
     """Find an image, also with another suffix, since reductions are often saved as
     PNG.
     """
-    inside(folder, name, path)
+    inside(path / place, name, path)
     stem = pathlib.PurePosixPath(name).with_suffix("").as_posix()
-    return frames.find_picture(folder, name) or frames.find_picture(folder, stem)
+    for each in (name, stem):
+        # From the capture's folder on: the case of `place` may differ as well.
+        found = frames.find_picture(path, f"{place}/{each}" if place else each)
+        if found is not None:
+            return found
+    return None
 
 
 def _take(model, rows):
@@ -314,7 +330,7 @@ def _masks(path, names, size, shrink_by):
     if not folder.is_dir():
         return None, ()
     paths = [
-        frames.find_picture(folder, f"{name}.png") or _find(folder, name, path)
+        frames.find_picture(folder, f"{name}.png") or _find(path, "masks", name)
         for name in names
     ]
     if not any(paths):

@@ -8,6 +8,7 @@ import contextlib
 import functools
 import json
 import os
+import pathlib
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -54,6 +55,31 @@ def _image(path):
     yield {}, {"pixels": images.decode(path)}
 
 
+def _mask(path):
+    from nerfies_jax.capture import masks
+
+    stored = masks.decode(path)
+    arrays = {"value": stored.value}
+    if stored.alpha is not None:
+        arrays["alpha"] = stored.alpha
+    yield {"full": stored.full, "colorful": stored.colorful}, arrays
+
+
+def _photograph(path, header_only):
+    from nerfies_jax.capture import photographs
+
+    photographs.heic_is_read()
+    file = pathlib.Path(path)
+    try:
+        if header_only:
+            yield photographs.decode_header(file)._asdict(), {}
+        else:
+            yield {}, {"pixels": photographs.decode_upright(file)}
+    # Which of the two it is decides whether a folder is read without the file.
+    except (photographs.Unreadable, photographs.TooLarge) as error:
+        yield {"refused": type(error).__name__, "message": str(error)}, {}
+
+
 _VIDEO = "nerfies_jax.capture.video_decoding"
 
 
@@ -71,6 +97,8 @@ OPERATIONS: dict[str, tuple[Callable[..., Iterable], str]] = {
     "video_notes": (functools.partial(_video, "notes"), _VIDEO),
     "video_transfer": (functools.partial(_video, "transfer"), _VIDEO),
     "image": (_image, "nerfies_jax.capture.images"),
+    "mask": (_mask, "nerfies_jax.capture.masks"),
+    "photograph": (_photograph, "nerfies_jax.capture.photographs"),
 }
 
 

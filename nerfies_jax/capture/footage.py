@@ -5,47 +5,30 @@ are any.
 """
 
 import collections
-import contextlib
-import importlib
 import math
-import numbers
 import os
 import pathlib
-import warnings
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import PIL.Image
-import PIL.ImageOps
 import scipy.ndimage
 
-from nerfies_jax.capture import decoder, frames
+from nerfies_jax.capture import decoder, frames, photographs
 from nerfies_jax.capture import masks as mask_files
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
 from nerfies_jax.capture.colmap_library import MIN_TRACK
 from nerfies_jax.capture.formats import VIDEOS
 from nerfies_jax.capture.images import MAX_PIXELS, write_png
+from nerfies_jax.capture.photographs import HEIC
 from nerfies_jax.capture.video import notes_of, read_video, transfer_of
 from nerfies_jax.runtime import events
 
 PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
-HEIC = (".heic", ".heif")  # read where pillow-heif is installed
 FRAMES = 100  # kept of a film
 OWN_TIMES = 0.9  # of the frames of a film must have a time that no other has
 BLURRED = 0.4  # of the usual sharpness around it; planted blurs came out below 0.2
 _BROKEN = "not readable, so copy them again"
 _LARGE = f"of more than {MAX_PIXELS:,} pixels, so make them smaller first"
-_ORIENTATION, _EXIF, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
-FULL_FRAME_MM = 36.0  # the longer side that the 35 mm equivalent refers to
-
-
-class _Unreadable(CaptureError):
-    """The file is not an image despite its name, or is damaged."""
-
-
-class _TooLarge(CaptureError):
-    """The image has more pixels than the limit, or a damaged header that says so."""
 
 
 class Taken(NamedTuple):
@@ -187,6 +170,7 @@ def _masks_of_film(folder, count):
     return files
 
 
+@decoder.session()
 def from_pictures(
     folder: pathlib.Path,
     out: pathlib.Path,
@@ -211,10 +195,11 @@ def from_pictures(
     Raises:
       CaptureError: If the images cannot be used.
     """
-    sizes, notes = _readable(folder)
-    usual = collections.Counter(sizes.values()).most_common(1)[0][0]
-    taken = [file for file in sizes if sizes[file] == usual]
-    others = [file.name for file in sizes if sizes[file] != usual]
+    headers, notes = _readable(folder)
+    sizes = collections.Counter(header.size for header in headers.values())
+    usual = sizes.most_common(1)[0][0]
+    taken = [file for file in headers if headers[file].size == usual]
+    others = [file.name for file in headers if headers[file].size != usual]
     notes += _left_out(others, f"not of {usual[0]}x{usual[1]} pixels like most")
     stems = collections.Counter(_spoken(file.stem) for file in taken)
     stem, times = stems.most_common(1)[0]
@@ -228,8 +213,8 @@ def from_pictures(
         for file in taken:
             stage.advance()
             try:
-                color = _upright(file)
-            except _Unreadable:  # behind its header
+                color = photographs.read_upright(file)
+            except photographs.Unreadable:  # behind its header
                 broken.append(file)
                 continue
             name = f"{_spoken(file.stem)}.png"
@@ -246,30 +231,32 @@ def from_pictures(
         note = mask_files.describe(used, len(taken), encoding, np.mean(white), "moving")
         notes += (note,)
     names = tuple(f"{_spoken(file.stem)}.png" for file in taken)
-    return Taken(names, notes, focal=_focal(taken))
+    focals = [headers[file].focal for file in taken]
+    stated = [focal for focal in focals if focal is not None]
+    return Taken(names, notes, focal=float(np.median(stated)) if stated else None)
 
 
 def _readable(folder):
-    """Return the upright sizes of readable images, and a note of the others."""
+    """Return the headers of readable images, and a note of the others."""
     files = pictures_in(folder)
-    photographs = [file.name for file in files if file.suffix.lower() in HEIC]
+    of_phones = [file.name for file in files if file.suffix.lower() in HEIC]
     notes = ()
-    if photographs and not _heif():
+    if of_phones and not photographs.heic_is_read():
         notes = _left_out(
-            photographs, "HEIC, which needs pip install 'nerfies-jax[heic]'"
+            of_phones, "HEIC, which needs pip install 'nerfies-jax[heic]'"
         )
-        files = [file for file in files if file.name not in photographs]
-    sizes, broken, large = {}, [], []
+        files = [file for file in files if file.name not in of_phones]
+    headers, broken, large = {}, [], []
     for file in files:
         try:
-            sizes[file] = _upright_size(file)
-        except _Unreadable:
+            headers[file] = photographs.read_header(file)
+        except photographs.Unreadable:
             broken.append(file.name)
-        except _TooLarge:
+        except photographs.TooLarge:
             large.append(file.name)
     notes += _left_out(broken, _BROKEN) + _left_out(large, _LARGE)
-    _check_enough(folder, len(sizes), notes)
-    return sizes, notes
+    _check_enough(folder, len(headers), notes)
+    return headers, notes
 
 
 def _check_enough(folder, count, notes):
@@ -294,80 +281,6 @@ def _spoken(name):
     except UnicodeEncodeError:
         return os.fsencode(name).decode("latin-1")
     return name
-
-
-def _heif():
-    """Test if HEIC can be read, and register its package with Pillow."""
-    try:
-        importlib.import_module("pillow_heif").register_heif_opener()
-    except ImportError:
-        return False
-    return True
-
-
-@contextlib.contextmanager
-def _opened(file):
-    """Open an image as stored, and raise a one-line error for any defect."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
-            with PIL.Image.open(file) as picture:
-                if picture.width * picture.height > MAX_PIXELS:
-                    raise PIL.Image.DecompressionBombError
-                yield picture
-    except CaptureError:
-        raise
-    except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
-        raise _TooLarge(
-            f"{file}: more than {MAX_PIXELS:,} pixels; make the picture smaller first"
-        ) from None
-    except (OSError, ValueError, SyntaxError, Warning) as error:
-        reason = " ".join(str(error).split())
-        raise _Unreadable(
-            f"{file}: not a readable picture ({reason}); copy it again or remove it"
-        ) from None
-
-
-def _upright_size(file):
-    with _opened(file) as picture:
-        turned = picture.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)  # by a quarter
-        return picture.size[::-1] if turned else picture.size
-
-
-def _upright(file):
-    with _opened(file) as picture:
-        picture = PIL.ImageOps.exif_transpose(picture)
-        if picture.mode == "F":
-            raise CaptureError(
-                f"{file}: a picture of 32-bit floats, whose white is not known; save "
-                "it with 8 or 16 bits"
-            )
-        if picture.mode.startswith("I"):  # 16 bits of gray
-            values = np.asarray(picture)
-            if not 0 <= values.min() <= values.max() <= 65535:
-                raise CaptureError(
-                    f"{file}: gray of 32 bits, up to {values.max()}, whose white is "
-                    "not known; save it with 8 or 16 bits"
-                )
-            values = values.astype(np.uint32) // 257
-            return np.repeat(values.astype(np.uint8)[..., None], 3, axis=2)
-        if picture.has_transparency_data:  # what is cut out must not be seen again
-            picture = picture.convert("RGBA")
-            black = PIL.Image.new("RGBA", picture.size, (0, 0, 0, 255))
-            picture = PIL.Image.alpha_composite(black, picture)
-        return np.asarray(picture.convert("RGB"))
-
-
-def _focal(files: Sequence[pathlib.Path]) -> float | None:
-    """Median focal length that the files state, in longest sides of the image."""
-    focals = []
-    for file in files:
-        with _opened(file) as picture:
-            value = picture.getexif().get_ifd(_EXIF).get(_FOCAL_35MM)
-        # Strangers' files hold anything here: several numbers, a word, 0 for unknown.
-        if isinstance(value, numbers.Real) and 0 < float(value) < math.inf:
-            focals.append(float(value) / FULL_FRAME_MM)
-    return float(np.median(focals)) if focals else None
 
 
 def _mask_of(folder, picture):

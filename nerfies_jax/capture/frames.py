@@ -29,8 +29,10 @@ from nerfies_jax.runtime import events
 MAX_FRAMES = 100_000
 MAX_BYTES = 16 * 2**30  # of decoded pictures
 HELD_OUT = 8  # every 8th frame where the files say nothing, as LLFF and Mip-NeRF 360
+OPAQUE = 128  # alpha from here on
 UNSEEN = 128  # gray of a point that no frame shows
 SUFFIXES = (".png", ".jpg", ".jpeg")  # in small letters; files may have others
+_ENDINGS = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
 
 
 def natural(name: str) -> tuple:
@@ -104,8 +106,42 @@ def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:
     Returns:
       Path of the file, or None.
     """
-    suffixes = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
-    return text_files.find(folder, name, suffixes)
+    return text_files.find(folder, name, _ENDINGS)
+
+
+def local_name(folder: pathlib.Path, name: str) -> str:
+    """Return the name of an image in this folder for a path of another machine.
+
+    Args:
+      folder: Folder of the capture.
+      name: Name from a file.
+
+    Returns:
+      The end of an absolute path, or of one that leads out of the folder, if an image
+      of that name is here. Else the name.
+    """
+    return text_files.find_local(folder, name, _ENDINGS) or name
+
+
+def moved_note(names: Sequence[str], local: Sequence[str]) -> tuple[str, ...]:
+    """Say which names `local_name` replaced.
+
+    Args:
+      names: Names from a file.
+      local: The same as `local_name` returned them.
+
+    Returns:
+      A note, or none.
+    """
+    pairs = zip(names, local, strict=True)
+    moved = [(name, end) for name, end in pairs if name != end]
+    if not moved:
+        return ()
+    name, end = moved[0]
+    return (
+        f"{len(moved)} names of files are paths of another folder ({name}, ...): read "
+        f"from this one ({end}, ...)",
+    )
 
 
 def pictures_in(
@@ -293,6 +329,11 @@ def read_frames(
     alpha = None
     if any_alpha:
         alpha = np.subtract(255, transparencies, out=transparencies)
+        if 0 < (most := int(alpha.max())) < OPAQUE:
+            raise CaptureError(
+                f"{paths[0].parent}: the alpha of all images is at most {most} of 255, "
+                "so no pixel is opaque; save it as 0 and 255, or the images without it"
+            )
     if not unknown:
         return Frames(colors, alpha, None, ())
     observed = np.ones(colors.shape[:3], bool)
@@ -316,7 +357,8 @@ def read_masks(
     Args:
         paths: One for each frame, at least one of them; None where there is no file.
         size: Width and height of the shrunk images.
-        shrink_by: Integer reduction of the masks.
+        shrink_by: Integer reduction of masks of the images' size. Others may be a
+          whole multiple of the shrunk images.
         black: Meaning of black pixels, for messages: "not observed" or "moving".
 
     Returns:
@@ -334,12 +376,18 @@ def read_masks(
         if path is None:
             continue
         mask = masks.read_mask(path, encoding)
-        if mask.shape[1] // shrink_by != width or mask.shape[0] // shrink_by != height:
+        tall, wide = mask.shape
+        # Masks are often kept at full size alone, next to smaller images.
+        for factor in (shrink_by, max(1, round(wide / width))):
+            if (wide // factor, tall // factor) == (width, height):
+                break
+        else:
             raise CaptureError(
-                f"{path}: a mask of {mask.shape[1]}x{mask.shape[0]} pixels for "
-                f"pictures of {width * shrink_by}x{height * shrink_by}; they must agree"
+                f"{path}: a mask of {wide}x{tall} pixels for pictures of "
+                f"{width * shrink_by}x{height * shrink_by}; they must agree, or the "
+                "mask be a whole multiple of them"
             )
-        share[row] = blocks(mask, shrink_by).mean((-3, -1))
+        share[row] = blocks(mask, factor).mean((-3, -1))
     white = share[[path is not None for path in paths]].mean()
     note = masks.describe(files, len(paths), encoding, float(white), black)
     return share, (note,)
@@ -399,7 +447,9 @@ def held_out_note(scored: np.ndarray | list[Any], every: int) -> str:
         return "no frame is held out: there are too few"
     if len(scored) == 1:
         return "one frame is held out"
-    return f"every {every}th frame is held out"
+    ending = {1: "st", 2: "nd", 3: "rd"}.get(every % 10, "th")
+    ending = "th" if every % 100 in (11, 12, 13) else ending
+    return f"every {every}{ending} frame is held out"
 
 
 def dense(values: ArrayLike) -> np.ndarray:

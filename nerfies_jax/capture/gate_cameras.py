@@ -16,6 +16,7 @@ DOUBTFUL_PX, WRONG_PX = 0.1, 2.0
 FOLDED, MOST_FOLDED = 1e-3, 0.5
 MOST_BENT = 0.6  # share by which a lens may move the corner of an image
 ON_STEPS = 0.99  # of the coordinates: they were float32 once
+MOST_ROUNDED = 10_000  # points; more say the same
 
 
 def findings(capture: Capture) -> list[Finding]:
@@ -104,13 +105,16 @@ def _principal_point(capture):
     row = int(off.argmax())
     ratio = 2 * share[row]
     larger = ratio.min() > 1.5 and np.ptp(ratio) <= ALIKE * ratio.max()
+    smaller = 0.05 < ratio.max() < 0.67 and np.ptp(ratio) <= ALIKE * ratio.max()
     # Points that fall into the images confirm a tile of a larger image, whose principal
     # point seldom lies as far out across as down.
-    if off.max() <= OFF_CENTER or (capture.points is not None and not larger):
+    if off.max() <= OFF_CENTER or (
+        capture.points is not None and not larger and not smaller
+    ):
         return Finding(subject, value)
     where = ", ".join(f"{each:.4g}" for each in capture.cameras.principal_point_px[row])
     reason = "unless the images are tiles, check the units of the principal point"
-    if larger:
+    if larger or smaller:
         reason = (
             f"the intrinsics seem to be of images {ratio.mean():.3g} times as large; "
             "scale them, unless the images are tiles"
@@ -184,12 +188,23 @@ def _precision(capture):
 
 def _rounded(capture):
     """Check if positions in the files were rounded to float32."""
-    world = np.float64(capture.cameras.position) / capture.scale + np.array(
-        capture.center
-    )
+    found = _rounded_positions(capture, capture.cameras.position, "camera positions")
+    if capture.points is not None and len(capture.points.position):
+        points = capture.points.position
+        points = points[:: max(1, len(points) // MOST_ROUNDED)]
+        # Points are where training begins, and cameras are what it is held against.
+        found += [
+            one._replace(refused=False)
+            for one in _rounded_positions(capture, points, "points")
+        ]
+    return found
+
+
+def _rounded_positions(capture, position, what):
+    world = np.float64(position) / capture.scale + np.array(capture.center)
     steps = np.spacing(np.abs(world).max(0).astype(np.float32)).astype(float)
     # Scene units are float32 themselves, which blurs what was rounded more finely.
-    own = units.float32_step(capture.cameras.position) / capture.scale
+    own = units.float32_step(position) / capture.scale
     rounded = []
     for axis in range(3):
         step = steps[axis] / 2  # of coordinates down to half of the largest
@@ -203,8 +218,8 @@ def _rounded(capture):
     if step_px < DOUBTFUL_PX or not np.ptp(world[:, rounded], axis=0).any():
         return []
     problem = (
-        f"camera positions are multiples of {step:.3g} world units, {step_px:.2g} px: "
+        f"{what} are multiples of {step:.3g} world units, {step_px:.2g} px: "
         f"coordinates of up to {np.abs(world).max():.4g} were rounded to float32; "
         "subtract an origin before exporting them"
     )
-    return [Finding("rounded positions", f"{step:.3g}", problem, step_px > WRONG_PX)]
+    return [Finding(f"rounded {what}", f"{step:.3g}", problem, step_px > WRONG_PX)]

@@ -84,6 +84,9 @@ def _depths(capture):
     value = f"median {median:.3g}, {beyond:.0%} outside near and far"
     if 1 / WRONG_UNITS < ratio < WRONG_UNITS:
         problem = f"{beyond:.0%} of depths: {stated}" if beyond > 0.5 else ""
+        scaled = abs(np.log(capture.scale)) > np.log(2)
+        if problem and scaled and abs(np.log(ratio / capture.scale)) < np.log(1.5):
+            problem += "; they seem to be in scene units, and world units are expected"
         return [Finding(subject, value, problem)]
     factor, reason = min(UNITS, key=lambda one: abs(np.log(ratio / one[0])))
     way_out = "convert the depths to the unit of the cameras or remove them"

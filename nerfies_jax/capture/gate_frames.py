@@ -7,6 +7,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.gate_finding import Finding
 
 LEAST_OBSERVED, MOST_MOVING = 0.02, 0.9
+DARK = 64  # as images of 12 bits, and fewer, in 16 bits are
 # A gap between times is named if it is so many times the usual one, and such a share
 # of the whole.
 GAP, GAP_SHARE = 10.0, 0.25
@@ -18,7 +19,7 @@ _MASKS = (
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check shares of observed and moving pixels, and times.
+    """Check brightness, shares of observed and moving pixels, and times.
 
     Args:
       capture: The capture.
@@ -26,7 +27,25 @@ def findings(capture: Capture) -> list[Finding]:
     Returns:
       The findings.
     """
-    return [*_observed(capture), *_moving(capture), *_times(capture)]
+    return [
+        _brightness(capture),
+        *_observed(capture),
+        *_moving(capture),
+        *_times(capture),
+    ]
+
+
+def _brightness(capture):
+    """Check if images use only the lowest of their values."""
+    least, most = int(capture.images.min()), int(capture.images.max())
+    value = f"{least} to {most}"
+    problem = ""
+    if most < DARK:
+        problem = (
+            f"no pixel of any image is brighter than {most} of 255: 16-bit files may "
+            "hold values of 8, 10 or 12 bits; scale them to their full range"
+        )
+    return Finding("brightness", value, problem)
 
 
 def _observed(capture):

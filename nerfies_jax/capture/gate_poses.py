@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerfies_jax.capture import gate_axes
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.gate_finding import Finding
 from nerfies_jax.geometry.camera import Camera
@@ -19,6 +20,9 @@ NONE = 0.005  # share of the points: as good as none
 # as many.
 BETTER, FAR_BETTER = 0.6, 2.5
 SEEN = 0.5  # of the points, by any frame: a survey shows few of them in each image
+# Focal lengths of larger images leave out so many of the points, and scaled ones are no
+# wider than usual, in degrees.
+MOST_UNSEEN, WIDE, CENTERED = 0.7, 90.0, 0.1
 SMALL = 0.03  # of the image, across and down, in which nearly all points lie
 MOST_FRAMES, MOST_POINTS, LEAST_POINTS = 1000, 1000, 10
 MOST_BEYOND = 0.3  # of the points in view, outside near and far
@@ -51,7 +55,7 @@ def findings(capture: Capture) -> list[Finding]:
       The findings, none if there are too few points.
     """
     if capture.points is None or len(capture.points.position) < LEAST_POINTS:
-        return []
+        return gate_axes.findings(capture)
     count = len(capture.ids)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).astype(int))
     cameras = Camera._make(np.asarray(leaf, float)[rows] for leaf in capture.cameras)
@@ -74,7 +78,11 @@ def findings(capture: Capture) -> list[Finding]:
         return [Finding(subject, value, problem, refused)]
     problem = ""
     if share < CONVINCING:
-        best, reason = _best_of(_others(capture, cameras, pose), capture, points)
+        others = _others(capture, cameras, pose)
+        if seen < MOST_UNSEEN:
+            others |= _smaller_images(capture, cameras, pose)
+        others |= _other_units(cameras, pose)
+        best, reason = _best_of(others, capture, points)
         if best >= max(BETTER, FAR_BETTER * share):
             problem = f"{share:.0%} of the points fall into the images, and " + reason
     found = [Finding(subject, value, problem)]
@@ -91,8 +99,12 @@ def _explained(capture, cameras, pose, points, share):
     if share < NONE:  # a tile or a survey shows some, and other units many
         others |= _other_units(cameras, pose)
     best, reason = _best_of(others, capture, points)
+    fall = f"{share:.0%} of the points fall into the images, and "
     if best >= CONVINCING:
-        return f"{share:.0%} of the points fall into the images, and {reason}", True
+        return fall + reason, True
+    best, reason = _best_of(_smaller_images(capture, cameras, pose), capture, points)
+    if best >= BETTER:
+        return fall + reason, False
     if share >= NONE:
         return "", False
     return (
@@ -111,6 +123,8 @@ def _best_of(others, capture, points):
         # From far enough away all points are seen, as a dot.
         dot = max(_extent(capture, shown), default=0.0) < SMALL
         shares[name] = 0.0 if dot else float(shown.inside.mean())
+    if not shares:
+        return 0.0, ""
     likely = max(shares, key=shares.get)
     return shares[likely], f"{shares[likely]:.0%} if {likely}"
 
@@ -166,6 +180,25 @@ def _others(capture, cameras, pose):
         )
         name = (
             f"the intrinsics are of images {times:.3g} times as large; state the size "
+            "that they refer to, or scale them"
+        )
+        others[name] = smaller, pose
+    return others
+
+
+def _smaller_images(capture, cameras, pose):
+    """Cameras whose focal lengths alone are of images times as large, by reason."""
+    off = np.abs(cameras.principal_point_px / np.array(capture.size) - 0.5).max()
+    if off > CENTERED:  # then the principal point says it
+        return {}
+    others = {}
+    for times in (2, 4, 8):
+        smaller = cameras._replace(focal_px=cameras.focal_px / times)
+        across = 2 * np.arctan2(capture.size[0] / 2, np.median(smaller.focal_px))
+        if np.degrees(across) > WIDE:
+            break
+        name = (
+            f"the focal lengths are of images {times} times as large; state the size "
             "that they refer to, or scale them"
         )
         others[name] = smaller, pose

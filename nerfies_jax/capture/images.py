@@ -122,7 +122,7 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
             "it and a camera file may or may not; turn the pixels and remove the tag"
         )
     if header.size[0] * header.size[1] > LARGE_PIXELS:
-        pixels = _decode_apart(path, header)
+        pixels = decode_apart("image", path, header).arrays["pixels"]
     else:
         pixels = decode(path, header)
     if pixels.dtype == np.bool_:
@@ -181,13 +181,25 @@ def decode(path: AnyPath, header: Header | None = None) -> np.ndarray:
     return pixels
 
 
-def _decode_apart(path, header):
-    """Decode a large image in a child process with limits."""
+def decode_apart(operation: str, path: pathlib.Path, header: Header) -> decoder.Answer:
+    """Decode a large image in a child process with limits.
+
+    Args:
+      operation: Operation of `decoder_child` that takes a path.
+      path: The file.
+      header: Its header.
+
+    Returns:
+      The answer of the child.
+
+    Raises:
+      CaptureError: If it cannot be decoded.
+    """
     count = header.size[0] * header.size[1]
     try:
         with decoder.session() as child:
-            answer = child.request(
-                "image",
+            return child.request(
+                operation,
                 cpu_seconds=count * SECONDS_PER_PIXEL,
                 memory_bytes=BYTES_PER_PIXEL * count,
                 path=str(path.absolute()),
@@ -196,7 +208,6 @@ def _decode_apart(path, header):
         if error.has_advice:  # and the path
             raise CaptureError(str(error)) from None
         raise _unreadable(path, error) from None
-    return answer.arrays["pixels"]
 
 
 @contextlib.contextmanager

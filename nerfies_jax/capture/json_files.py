@@ -70,9 +70,10 @@ def read_json(path: AnyPath, kind: Any = Any) -> Any:
                 "finite, so mend that entry or leave the frame out"
             ) from None
         reason = str(error).replace("\n", " ")
-        raise CaptureError(
-            f"{path}: {reason}; mend the file or export it again"
-        ) from None
+        way_out = "mend the file or export it again"
+        if "UTF-8" in reason:
+            way_out = "save the file as UTF-8"
+        raise CaptureError(f"{path}: {reason}; {way_out}") from None
 
 
 def write_json(path: AnyPath, value: Any):

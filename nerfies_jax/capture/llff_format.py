@@ -1,6 +1,7 @@
 """Reader of LLFF: `poses_bounds.npy` with images in `images`, `images_2`, and so on."""
 
 import pathlib
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -80,7 +81,7 @@ def read(
     names = tuple(file.stem for file in files)
     clock = name_times.clock(names)
     times = frames.spread(clock.times)
-    notes += clock.notes
+    notes += (*order_note(names), *clock.notes)
     camera_ids = np.zeros(len(files), np.int32)
     if clock.cameras is not None:
         camera_ids = clock.cameras
@@ -106,6 +107,25 @@ def read(
         up=frames.up_direction(cameras),
         path=path,
         notes=(*notes, frames.held_out_note(scored, every)),
+    )
+
+
+def order_note(names: Sequence[str]) -> tuple[str, ...]:
+    """Say in which order images or cameras belong to poses, if numbers say another.
+
+    Args:
+      names: Names in the order of the poses, letter by letter.
+
+    Returns:
+      A note, or none.
+    """
+    if list(names) == sorted(names, key=frames.natural):
+        return ()
+    listed = ", ".join(names[:3])
+    return (
+        f"the rows of {POSES} are taken to be in the order of the names letter by "
+        f"letter ({listed}, ...): if they are in that of the numbers, write those with "
+        "leading zeros",
     )
 
 

@@ -14,7 +14,7 @@ import PIL.Image
 import PIL.ImageOps
 
 from nerfies_jax.capture import images, safe_files
-from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.errors import CaptureError
 from nerfies_jax.capture.json_files import AnyPath
 
 ADVICE = "save the masks as 8-bit gray PNG of 0 and 255"
@@ -33,7 +33,7 @@ class Encoding(NamedTuple):
     text: str  # for a note
 
 
-class _Stored(NamedTuple):
+class Stored(NamedTuple):
     """One mask as it is stored."""
 
     value: np.ndarray  # [height, width]: the largest channel
@@ -237,6 +237,25 @@ def _read(path, orientation):
             f"{path}: the EXIF orientation of this mask is {header.orientation}; "
             "rotate its pixels and remove the tag"
         )
+    if header.size[0] * header.size[1] <= images.LARGE_PIXELS:
+        return decode(path)
+    answer = images.decode_apart("mask", path, header)
+    value, alpha = answer.arrays["value"], answer.arrays.get("alpha")
+    return Stored(value, alpha, answer.about["full"], answer.about["colorful"])
+
+
+def decode(path: AnyPath) -> Stored:
+    """Decode a mask with Pillow, upright.
+
+    Args:
+      path: The file, which may not be an EXR.
+
+    Returns:
+      The mask as stored.
+
+    Raises:
+      CaptureError: If it is not an image that may be a mask.
+    """
     with images.opened(path) as image:
         return _decoded(path, PIL.ImageOps.exif_transpose(image))
 
@@ -249,7 +268,7 @@ def _decoded(path, image):
                 f"{path}: a mask of values up to {value.max()}, more than 16 bits; "
                 f"{ADVICE}"
             )
-        return _Stored(value.astype(np.uint16), None, 65535, False)
+        return Stored(value.astype(np.uint16), None, 65535, False)
     if image.has_transparency_data:
         pixels = np.asarray(image.convert("RGBA"))
         return _from_channels(pixels[..., :3], pixels[..., 3] >= OPAQUE)
@@ -268,4 +287,4 @@ def _from_channels(pixels, alpha):
     value = pixels.max(-1)
     spread = value - pixels.min(-1)
     colorful = float((spread > COLORFUL).mean()) > 1e-3
-    return _Stored(value, alpha, 255, colorful)
+    return Stored(value, alpha, 255, colorful)

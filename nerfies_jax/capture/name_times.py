@@ -2,7 +2,6 @@
 
 import collections
 import datetime
-import pathlib
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,8 +11,14 @@ import numpy as np
 from nerfies_jax.capture import frames
 from nerfies_jax.capture.text_files import forward_slashes
 
-_NUMBER = re.compile(r"\d+\.\d+|\d+")
+_NUMBER = re.compile(r"\d+[.,]\d+|\d+")
 _CAMERA = re.compile(r"(cam|camera|view)[ _.-]?$", re.IGNORECASE)
+# A date and a time of day at the end of a name, with any separators or none.
+_DATE = re.compile(
+    r"(?<!\d)(\d{4})([-_.]?)(\d\d)\2(\d\d)(?:T| at |[ _-]{0,2})"
+    r"(\d\d)([-_.:]?)(\d\d)\6(\d\d)(?:[.,](\d{1,9})|[_-]?(\d{3}|\d{6}|\d{9}))?Z?$"
+)
+LEAST_DIGITS = 9  # of a number without a point that can only be a timestamp
 # Cameras are synchronized if so many of the numbers of each are those of another one.
 _SHARED = 0.5
 
@@ -29,10 +34,14 @@ class Clock(NamedTuple):
 def clock(names: Sequence[str]) -> Clock:
     """Read frame times from names without suffix, which may contain folders.
 
-    The time is the first of these that applies: - the date and time at the end of the
-    names, as those of phones, in ms; - the only number that differs, in seconds if it
-    has a decimal point, else a count; - that number, for several cameras with the same
-    numbers in otherwise different names; - the order of the names, with a note.
+    The time is the first of these that applies:
+
+    - the date and time at the end of the names, as those of phones, in microseconds;
+    - the only number that differs, in seconds if it has a decimal point or comma, else
+      a count;
+    - that number, for several cameras with the same numbers in otherwise different
+      names, or with timestamps of one clock;
+    - the order of the names, with a note.
 
     Args:
       names: Names of the frames.
@@ -41,7 +50,7 @@ def clock(names: Sequence[str]) -> Clock:
       The times, with cameras if the names tell several apart.
     """
     names = [forward_slashes(name) for name in names]
-    dates = [_milliseconds(name) for name in names]
+    dates = [_microseconds(name) for name in names]
     # Read as counts, minute and hour boundaries would be gaps of 41 and 4041 frames.
     if None not in dates and not _is_counter(names, dates):
         return Clock(dates, None, ())
@@ -58,6 +67,16 @@ def clock(names: Sequence[str]) -> Clock:
                 "as equal times"
             )
             return Clock(times, cameras, (note,))
+        if all(map(_is_timestamp, numbers)):
+            if len(set(groups)) == len(groups):  # another number counts the frames
+                return Clock(times, None, ())
+            if _overlap(groups, times):
+                cameras = np.unique(groups, return_inverse=True)[1].astype(np.int32)
+                note = (
+                    f"the numbers in the names of {len(set(groups))} cameras are taken "
+                    "as times of one clock"
+                )
+                return Clock(times, cameras, (note,))
     note = "times are the order of the pictures' names: those end in no common count"
     return Clock(order(names), None, (note,))
 
@@ -108,6 +127,7 @@ def _time_fields(names):
 
 def _values(groups, numbers):
     """Decimal seconds, or counts where there is no point or 1.1 and 1.10 both occur."""
+    numbers = [number.replace(",", ".") for number in numbers]
     if any("." in number for number in numbers):
         values = [float(number) for number in numbers]
         if len(set(zip(groups, values, strict=True))) == len(values):
@@ -129,22 +149,50 @@ def _are_synchronized(groups, times):
     )
 
 
-def _milliseconds(name):
-    """Milliseconds since 1970 from a name like IMG_20240131_235959, else None."""
-    match = re.search(r"(?<!\d)(\d{8})[_-]?(\d{6})(\d{3})?$", name)
+def _is_timestamp(number):
+    return not number.isdecimal() or len(number) >= LEAST_DIGITS
+
+
+def _overlap(groups, times):
+    """Test if each camera has frames while another one has."""
+    spans = collections.defaultdict(list)
+    for group, time in zip(groups, times, strict=True):
+        spans[group].append(time)
+    spans = {group: (min(own), max(own)) for group, own in spans.items()}
+    # In the order of their first times, a camera overlaps a neighbor or none.
+    last = None
+    alone = set(spans)
+    for group, (first, end) in sorted(spans.items(), key=lambda one: one[1]):
+        if last is not None and first <= spans[last][1]:
+            alone -= {group, last}
+        if last is None or end > spans[last][1]:
+            last = group
+    return not alone
+
+
+def _microseconds(name):
+    """Microseconds since 1970 from a name like IMG_20240131_235959, else None."""
+    match = _DATE.search(name)
     if match is None:
         return None
+    year, _, month, day, hour, _, minute, second, fraction, digits = match.groups()
     try:
-        moment = datetime.datetime.strptime(match[1] + match[2], "%Y%m%d%H%M%S")
+        moment = datetime.datetime(
+            *map(int, (year, month, day, hour, minute, second)), tzinfo=datetime.UTC
+        )
     except ValueError:
         return None
-    since = moment - datetime.datetime(1970, 1, 1)
-    return since // datetime.timedelta(milliseconds=1) + int(match[3] or 0)
+    since = moment - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+    part = (fraction or digits or "0")[:6].ljust(6, "0")
+    return since // datetime.timedelta(microseconds=1) + int(part)
 
 
 def _is_counter(names, dates):
     """Test if a supposed time of day after a date is a regular count instead."""
-    counts = [int(re.search(r"\d+$", pathlib.PurePath(name).name)[0]) for name in names]
+    ends = [re.search(r"\d{6,}$", name) for name in names]
+    if None in ends:  # a time of day with separators
+        return False
+    counts = [int(end[0]) for end in ends]
     steps, gaps = set(np.diff(np.sort(counts))), set(np.diff(np.sort(dates)))
     # An interval timer is even as well, but in time.
     return len(steps) == 1 and len(gaps) > 1

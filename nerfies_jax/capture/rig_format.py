@@ -93,7 +93,7 @@ def read(
         up=frames.up_direction(fixed),
         frames_per_second=recorded.rate,
         path=path,
-        notes=(*recorded.notes, note),
+        notes=(*llff_format.order_note(names), *recorded.notes, note),
     )
 
 

@@ -5,10 +5,13 @@ import functools
 import json
 import os
 import pathlib
+import re
 import time
 import unicodedata
 from collections.abc import Sequence
 
+MOST_FOLDERS = 8  # in front of a name that another machine wrote
+_ELSEWHERE = re.compile(r"(file://)?(/|[A-Za-z]:/|(\./)*\.\./)")
 # A folder that changed so recently may change again within one tick of its clock.
 _SETTLED_NS = 2 * 10**9
 
@@ -85,6 +88,33 @@ def find(
         path = _respelled(folder, plain + suffix)
         if path is not None and os.path.isfile(path):
             return path
+    return None
+
+
+def find_local(
+    folder: pathlib.Path, name: str, suffixes: Sequence[str] = ("",)
+) -> str | None:
+    """Find a file of another machine's absolute path, or of a path out of the folder.
+
+    Captures keep such paths when they are moved.
+
+    Args:
+      folder: Folder of the capture.
+      name: A path.
+      suffixes: As for `find`.
+
+    Returns:
+      The longest end of the path that is a file in the folder, relative to it. None for
+      relative paths within the folder, and where there is no such file.
+    """
+    plain = forward_slashes(name)
+    if _ELSEWHERE.match(plain) is None:
+        return None
+    parts = [part for part in plain.split("/") if part not in ("", ".", "..")]
+    for first in range(max(1, len(parts) - MOST_FOLDERS), len(parts)):
+        end = "/".join(parts[first:])
+        if find(folder, end, suffixes) is not None:
+            return end
     return None
 
 

@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+import datetime
 import pathlib
 import re
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from nerfies_jax.capture.json_files import AnyPath, read_json
 
 MAX_BYTES = 64 * 2**20
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")  # float() takes 0_1
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d) (?=\d\d:\d\d)")  # of ISO 8601, with a space
 _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 
 
@@ -27,9 +29,10 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
       capture: The capture.
       path: JSON, an object of frame names and times or a list of times; or text with
         one frame in each line, name and time separated by a comma, semicolon or space,
-        or the time alone. Times are numbers on any clock, such as seconds. Without
-        names there is one for each frame, in the natural order of their names. A line
-        without a number at its end before all others is a heading.
+        or the time alone. Times are numbers on any clock, such as seconds, or dates
+        of ISO 8601 with a time of day. Without names there is one for each frame, in
+        the natural order of their names. A line without a number at its end before all
+        others is a heading.
 
     Returns:
       The capture, with times from 0 to 1 and `warp_ids` by them.
@@ -75,8 +78,10 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
 def _read(path):
     """Times by name, or a list of times."""
     if path.suffix.lower() == ".json":
-        content = read_json(path, dict[str, float] | list[float])
-        return (content, None) if isinstance(content, dict) else (None, content)
+        content = read_json(path, dict[str, float | str] | list[float | str])
+        if isinstance(content, dict):
+            return {name: _value(time, path) for name, time in content.items()}, None
+        return None, [_value(time, path) for time in content]
     try:
         text = text_files.utf8(safe_files.read_bytes(path, MAX_BYTES)).decode()
     except UnicodeDecodeError as error:
@@ -85,7 +90,10 @@ def _read(path):
         ) from None
     lines = [line.strip() for line in text.splitlines()]
     rows = [
-        re.split(r"[,;\t]\s*|\s+(?=\S+$)", line)
+        [
+            part.strip("\"'")
+            for part in re.split(r"[,;\t]\s*|\s+(?=\S+$)", _DATE.sub(r"\1T", line))
+        ]
         for line in lines
         if line and not line.startswith("#")
     ]
@@ -103,20 +111,41 @@ def _read(path):
         if len(row) != width or width > 2 or value is None:
             raise CaptureError(
                 f"{path}: {' '.join(row)!r} is not a frame's name and time; write both "
-                "in each line, or the time alone in all"
+                "in each line, or the time alone in all, as a number or an ISO 8601 "
+                "date"
             )
     if width == 1:
-        return None, [float(row[0]) for row in rows]
+        return None, [_value(row[0], path) for row in rows]
     pairs = [tuple(reversed(row)) if time_first else tuple(row) for row in rows]
     named: dict[str, float] = {}
     for name, number in pairs:
-        if named.setdefault(name, float(number)) != float(number):
+        time = _value(number, path)
+        if named.setdefault(name, time) != time:
             raise CaptureError(f"{path}: frame {name!r} has two times; keep one")
     return named, None
 
 
 def _number(word):
-    return float(word) if _NUMBER.fullmatch(word) else None
+    """A time as a number, seconds since 1970 of a date, or None if it is neither."""
+    if _NUMBER.fullmatch(word):
+        return float(word)
+    try:
+        moment = datetime.datetime.fromisoformat(word)
+    except ValueError:
+        return None
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=datetime.UTC)
+    return moment.timestamp()
+
+
+def _value(time, path):
+    """The number of a time from a file, which may be text."""
+    value = _number(time) if isinstance(time, str) else time
+    if value is None:
+        raise CaptureError(
+            f"{path}: {time!r} is not a time; write a number or an ISO 8601 date"
+        )
+    return value
 
 
 def _by_name(capture, named, path):

@@ -29,6 +29,8 @@ class Lens(msgspec.Struct, kw_only=True):
     k2: float | None = None
     k3: float | None = None
     k4: float | None = None
+    k5: float | None = None
+    k6: float | None = None
     p1: float | None = None
     p2: float | None = None
     is_fisheye: bool | None = None  # instant-ngp's
@@ -38,7 +40,7 @@ class Lens(msgspec.Struct, kw_only=True):
 # Groups of keys. If a frame has any key of a group, none of the file's group is used.
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 CENTER, SIZE, MODEL = ("cx", "cy"), ("w", "h"), ("camera_model", "is_fisheye")
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 UNITS = (FOCAL, CENTER, SIZE, MODEL, DISTORTION)
 
 

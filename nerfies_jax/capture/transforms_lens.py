@@ -176,10 +176,11 @@ def _distortion(entry, transforms, label):
     # The file's coefficients belong to the file's model.
     level = entry if has_other_model else _level(entry, transforms, DISTORTION)
     values = {key: getattr(level, key) or 0.0 for key in DISTORTION}
-    if values["k4"] != 0:
-        raise CaptureError(
-            f"{label} has k4 = {values['k4']}; undistort the pictures first"
-        )
+    for key in ("k4", "k5", "k6"):
+        if values[key] != 0:
+            raise CaptureError(
+                f"{label} has {key} = {values[key]}; undistort the pictures first"
+            )
     return tuple(values[key] for key in ("k1", "k2", "k3", "p1", "p2"))
 
 

@@ -14,6 +14,7 @@ from nerfies_jax.capture.high_dynamic_range import CODES, TRANSFERS, tone_mapped
 MAX_PIXELS = 64_000_000  # of a frame
 HD_LINES = 720  # from here on players take BT.709 where a film does not say
 _UNSAID = 2  # ffmpeg's number of a color space that is not told
+COVERS = ("mjpeg", "png", "bmp", "gif", "webp", "tiff")  # image codecs
 SLACK = 3  # frames by which the stated length of a whole film may be wrong
 
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
@@ -143,6 +144,8 @@ def _main_stream(container):
         for stream in container.streams.video
         if not stream.disposition & stream.disposition.attached_pic
     ]
+    # Some programs store covers as ordinary streams.
+    videos = [each for each in videos if each.codec.name not in COVERS] or videos
     if not videos:
         raise FileError("holds no pictures that move, at most a cover; pass a film")
     default = [
@@ -181,7 +184,9 @@ def _shortfall(container, stream, count, last):
     elif container.duration is not None:  # of sound, too, which may go on longer
         start = (container.start_time or 0) / 1e6
         length = container.duration / 1e6
-        slack = max(slack, 1.0, 0.02 * length)
+        slack = max(slack, 0.02 * length)
+        if len(container.streams) > 1:
+            slack = max(slack, 1.0)
     else:
         return ()
     read = last - start + interval

@@ -398,6 +398,25 @@ def test_every_camera_is_held_against_the_images(tmp_path):
         room.load(tmp_path)
 
 
+def test_names_with_backslashes_and_another_case_of_images_are_found(tmp_path):
+    make(tmp_path, count=8)
+    (tmp_path / "Images/left").mkdir(parents=True)
+    (tmp_path / "Images/right").mkdir()
+    model = tmp_path / "sparse/0/images.txt"
+    text = model.read_text()
+    for row in range(8):
+        side, number = ("left", row) if row < 4 else ("right", row - 4)
+        text = text.replace(f"f_{row:03d}.png", f"{side}\\{number}.png")
+        image = tmp_path / f"images/f_{row:03d}.png"
+        image.rename(tmp_path / f"Images/{side}/{number}.png")
+    (tmp_path / "images").rmdir()
+    model.write_text(text)
+    capture = room.load(tmp_path)
+    assert capture.ids[:2] == ("left_0", "left_1")
+    assert capture.camera_ids.tolist() == [0] * 4 + [1] * 4
+    assert capture.warp_ids.tolist() == [0, 1, 2, 3] * 2
+
+
 def test_equal_numbers_of_two_folders_are_equal_times(tmp_path):
     make(tmp_path, count=8)
     model = tmp_path / "sparse/0/images.txt"

@@ -11,7 +11,14 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from nerfies_jax.capture import colmap, decoder, images
+from nerfies_jax.capture import (
+    colmap,
+    decoder,
+    footage,
+    images,
+    masks,
+    photographs,
+)
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
 from nerfies_jax.runtime import children
@@ -104,6 +111,44 @@ def test_large_images_are_decoded_in_the_child(tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
     with pytest.raises(CaptureError, match=r"a\.png: not a readable picture"):
         images.read_pixels(tmp_path / "a.png")
+
+
+def test_large_masks_are_decoded_in_the_child(tmp_path, monkeypatch):
+    mask = np.zeros((30, 40), np.uint8)
+    mask[5:9] = 1
+    pixels = np.full((30, 40, 4), 255, np.uint8)
+    pixels[..., 3] = 255 * mask
+    PIL.Image.fromarray(mask).save(tmp_path / "a.png")
+    PIL.Image.fromarray(pixels).save(tmp_path / "b.png")
+    monkeypatch.setattr(images, "LARGE_PIXELS", 1000)
+    monkeypatch.setattr(masks, "decode", None)  # here; the child has its own
+    for name in ("a.png", "b.png"):
+        np.testing.assert_array_equal(masks.read_mask(tmp_path / name), mask == 1)
+
+
+@pytest.mark.parametrize("ending", ["heic", "jpg"])
+def test_heic_and_large_photographs_are_decoded_in_the_child(
+    ending, tmp_path, monkeypatch, child
+):
+    if ending == "heic":
+        pytest.importorskip("pillow_heif").register_heif_opener()
+    monkeypatch.setattr(images, "LARGE_PIXELS", 1000)
+    monkeypatch.setattr(photographs, "decode_upright", None)
+    exif = PIL.Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 18
+    for row in range(4):
+        path = tmp_path / f"{row}.{ending}"
+        PIL.Image.new("RGB", (64, 48), (40 * row, 99, 9)).save(path, exif=exif)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) - 60])  # its header is whole
+    taken = footage.from_pictures(tmp_path, tmp_path / "out")
+    assert taken.names == ("0.png", "1.png", "2.png")
+    assert taken.focal == 0.5
+    assert f"1 pictures left out, not readable, so copy them again: 3.{ending}" in (
+        taken.notes
+    )
+    shown = images.read_pixels(tmp_path / "out/images/2.png")
+    np.testing.assert_allclose(shown.mean((0, 1)), (80, 99, 9), atol=3)
 
 
 def test_the_child_ends_with_its_parent():

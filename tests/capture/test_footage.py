@@ -16,6 +16,7 @@ from nerfies_jax.capture import (
     frames,
     images,
     masks,
+    photographs,
     video,
     video_decoding,
 )
@@ -183,7 +184,7 @@ def test_what_is_cut_out_of_a_picture_is_black(tmp_path):
 def test_photographs_come_upright_of_one_size_whatever_their_ending(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(footage, "_heif", lambda: False)
+    monkeypatch.setattr(photographs, "heic_is_read", lambda: False)
     rng = np.random.default_rng(0)
     upright = rng.integers(0, 256, (5, 8, 8, 3)).astype(np.uint8)
     upright = upright.repeat(4, 1).repeat(8, 2)  # 64 x 32, flat blocks

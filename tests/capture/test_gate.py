@@ -96,14 +96,18 @@ def test_masks_named_as_no_frame_are_said(tmp_path):
     assert "no file in resized_mask/1x is named as a frame" in notes
 
 
-def test_images_that_are_transparent_everywhere_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("alpha", "words"),
+    [(0, "are transparent"), (1, "at most 1 of 255, so no pixel is")],
+)
+def test_images_that_are_transparent_everywhere_are_refused(alpha, words, tmp_path):
     table = {"fl_x": 9.0, "frames": []}
     for row in range(3):
-        images.write_png(tmp_path / f"{row}.png", np.zeros((6, 8, 4), np.uint8))
+        images.write_png(tmp_path / f"{row}.png", np.full((6, 8, 4), alpha, np.uint8))
         pose = np.eye(4).tolist()
         table["frames"].append({"file_path": f"{row}.png", "transform_matrix": pose})
     (tmp_path / "transforms.json").write_text(json.dumps(table))
-    with pytest.raises(CaptureError, match="are transparent"):
+    with pytest.raises(CaptureError, match=words):
         formats.load(tmp_path)
 
 

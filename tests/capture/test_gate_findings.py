@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerfies_jax.capture import formats, gate
-from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.capture import CaptureError, select
 from tests.scenes import tiny_capture
 
 UTM = (500_000.0, 4_649_776.0, 120.0)
@@ -110,6 +110,16 @@ def test_intrinsics_of_larger_images_are_named(with_points):
         assert any(one.refused for one in found) == refused
 
 
+def test_intrinsics_of_smaller_images_are_named():
+    cameras = tiny_capture().cameras
+    smaller = with_cameras(
+        changed(depths=None),
+        focal_px=cameras.focal_px / 3,
+        principal_point_px=cameras.principal_point_px / 3,
+    )
+    assert any("0.333 times as large" in one for one in problems(smaller))
+
+
 def test_a_tile_of_a_larger_image_is_no_problem():
     """Of images of 360x270 one of 40x30, whose principal point lies outside of it."""
     cameras = tiny_capture().cameras
@@ -175,6 +185,57 @@ def test_positions_that_float32_cannot_hold_are_refused():
     assert problems(center) == []
     with pytest.raises(CaptureError, match=r"multiples of .* rounded to float32"):
         gate.checked(with_cameras(center, position=rounded.astype(np.float32)))
+
+
+def test_points_that_were_rounded_to_float32_are_said():
+    capture = changed(depths=None, center=UTM)
+    world = np.float64(capture.points.position) / capture.scale + np.array(UTM)
+    rounded = (world.astype(np.float32) - np.array(UTM)) * capture.scale
+    points = capture.points._replace(position=rounded.astype(np.float32))
+    assert problems(capture) == []
+    (problem,) = problems(dataclasses.replace(capture, points=points))
+    assert problem.startswith("points are multiples of 0.25 world units")
+
+
+@pytest.mark.parametrize(
+    "reason", ["axes are right, up, back", "poses are the inverse"]
+)
+def test_cameras_that_look_apart_are_said_without_points(reason):
+    """On an orbit around the scene, which has no points."""
+    rotations, positions = [], []
+    for angle in np.linspace(0, 2, 8):
+        turn = Rotation.from_euler("y", angle).as_matrix()
+        rotations.append(turn.T)
+        positions.append(turn @ (0.1 * angle, 0.2, -3.0))
+    rotation, position = np.float32(rotations), np.float32(positions)
+    capture = tiny_capture()
+    orbit = dataclasses.replace(
+        select(capture, np.arange(7)), points=None, depths=None, flow=None
+    )
+
+    def cameras(rotation, position):
+        return with_cameras(
+            orbit, camera_from_world=rotation[:7], position=position[:7]
+        )
+
+    assert problems(cameras(rotation, position)) == []
+    flipped = np.diag(np.float32([1, -1, -1])) @ rotation
+    wrong = flipped, position
+    if reason.startswith("poses"):
+        wrong = rotation.swapaxes(1, 2), -turned(rotation, position)
+    (problem,) = problems(cameras(*wrong))
+    assert reason in problem
+
+
+def test_focal_lengths_alone_of_larger_images_are_said():
+    cameras = tiny_capture().cameras
+    larger = with_cameras(changed(depths=None), focal_px=8 * cameras.focal_px)
+    assert any("of images 8 times as large" in one for one in problems(larger))
+
+
+def test_images_that_use_few_of_their_values_are_said():
+    dark = changed(images=tiny_capture().images // 16)
+    assert "16-bit files may hold values" in problems(dark)[0]
 
 
 def test_a_frame_that_sees_no_points_is_named():

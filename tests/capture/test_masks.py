@@ -156,6 +156,15 @@ def test_missing_and_white_masks_are_said(tmp_path):
     )
 
 
+def test_masks_may_be_a_whole_multiple_of_the_images(tmp_path):
+    paths = save_all(tmp_path, gray(0, 255))
+    share, _ = frames.read_masks(paths, (5, 4), 1, "moving")
+    blocks = WHITE.reshape(-1, 4, 2, 5, 2).mean((2, 4))
+    np.testing.assert_allclose(share, blocks)
+    with pytest.raises(CaptureError, match="they must agree, or the mask be a whole"):
+        frames.read_masks(paths, (7, 4), 1, "moving")
+
+
 def test_masks_are_turned_with_their_images(tmp_path):
     exif = PIL.Image.Exif()
     exif[0x0112] = 6

@@ -93,6 +93,21 @@ def test_other_spellings_lead_nowhere_outside(name, tmp_path):
         named_file(root, name, root / "transforms.json")
 
 
+@pytest.mark.parametrize("folder", ["/home/me/scene/", "C:\\me\\", "../scene/"])
+def test_paths_of_another_machine_are_those_of_this_folder(folder, tmp_path):
+    expected = room.load(test_blender_format.make(tmp_path, {"": 6}))
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    for entry in content["frames"]:
+        name = entry["file_path"].removeprefix("./")
+        entry["file_path"] = folder + name.replace("/", "\\" if "C" in folder else "/")
+    path.write_text(json.dumps(content))
+    read = room.load(tmp_path)
+    assert read.ids == expected.ids
+    np.testing.assert_array_equal(read.images, expected.images)
+    assert any("6 names of files are paths of another" in note for note in read.notes)
+
+
 def test_transforms_written_on_windows_are_read(tmp_path):
     """A byte order mark, backslashes, and images with other endings and case."""
     expected = room.load(test_blender_format.make(tmp_path, {"": 6}))

@@ -91,6 +91,17 @@ def test_intrinsics_that_cannot_be_are_refused(case, tmp_path):
         in_frame(top, frame)(tmp_path)
 
 
+def test_a_matrix_by_columns_is_refused(tmp_path):
+    make(tmp_path, {"": 6})
+    file = tmp_path / "transforms.json"
+    table = json.loads(file.read_text())
+    for entry in table["frames"]:
+        entry["transform_matrix"] = np.transpose(entry["transform_matrix"]).tolist()
+    dump(file, table)
+    with pytest.raises(CaptureError, match=r"last row .* transpose it"):
+        blender_format.read(tmp_path)
+
+
 def test_the_distortion_of_another_model_is_not_taken_over(tmp_path):
     top = {"fl_x": 20.0, "k1": 0.1, "k4": 0.2, "camera_model": "OPENCV_FISHEYE"}
     make(tmp_path, {"": 6}, top=top, camera_model="PINHOLE")

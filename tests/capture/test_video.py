@@ -352,6 +352,28 @@ def test_a_cover_is_no_video(tmp_path):
     assert len(list(video.read_video(path))) == 5
 
 
+def test_a_cover_stored_as_an_ordinary_stream_is_no_video(tmp_path):
+    """Larger than the video, and first in the file."""
+    video.write_video(tmp_path / "a.mp4", film(6), 10)
+    with (
+        av.open(str(tmp_path / "a.mp4")) as source,
+        av.open(str(tmp_path / "b.mkv"), "w") as target,
+    ):
+        cover = target.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = 96, 64, "yuvj420p"
+        copied = target.add_stream_from_template(source.streams.video[0])
+        pixels = np.zeros((64, 96, 3), np.uint8)
+        target.mux(cover.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        target.mux(cover.encode())
+        for packet in source.demux(source.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = copied
+                target.mux(packet)
+    shown = list(video.read_video(tmp_path / "b.mkv"))
+    assert len(shown) == 6
+    assert shown[0][1].shape == (32, 46, 3)
+
+
 def test_pixels_are_made_square(tmp_path):
     path = tmp_path / "a.mp4"
     with av.open(str(path), "w") as container:

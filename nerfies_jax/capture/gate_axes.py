@@ -1,0 +1,117 @@
+"""Check of camera poses by where the cameras look, for captures without points."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.gate_finding import Finding
+from nerfies_jax.geometry.rays import across_ray
+
+LEAST_FRAMES = 4
+# Cameras look at one point if nearly all have it in front of them, their axes pass it
+# within this share of its distance, and cross at more than a few degrees.
+AHEAD, PASSES, CROSSES = 0.95, 0.15, 0.02
+BEHIND, FAR_OFF = 0.1, 0.3  # otherwise not at all
+TURNS = 0.1  # in entries of the rotation: a camera on a tripod turns by less
+_FLIP = np.diag([1.0, -1.0, -1.0])  # between OpenGL and OpenCV axes of a camera
+
+
+class Look(NamedTuple):
+    """The point nearest to the axes of all cameras, and how well they look at it."""
+
+    ahead: float  # share of the cameras that have it in front
+    passes: float  # distance of the axes from it, in distances of the cameras
+    crosses: float  # 0 for parallel axes, up to 2/3
+
+
+def findings(capture: Capture) -> list[Finding]:
+    """Check if the cameras look at one point, or would under another convention.
+
+    Args:
+      capture: The capture, without points.
+
+    Returns:
+      The findings.
+    """
+    rotation = np.asarray(capture.cameras.camera_from_world, np.float64)
+    position = np.asarray(capture.cameras.position, np.float64) / capture.scale
+    position = position + np.array(capture.center)
+    few = len(np.unique(capture.cameras.position, axis=0)) < LEAST_FRAMES
+    turning = len(position) >= LEAST_FRAMES and np.ptp(rotation, axis=0).max() > TURNS
+    if few and not turning:
+        return []  # fixed cameras
+    look = look_of(rotation[:, 2], position)
+    subject = "common point"
+    value = f"{look.ahead:.0%} of the cameras look toward it"
+    if look.crosses < CROSSES:
+        value = "none, the axes of the cameras are nearly parallel"
+    if look.ahead > BEHIND and look.passes <= FAR_OFF:
+        return [Finding(subject, value)]
+    for reason, (turn, place) in _others(capture, rotation, position).items():
+        other = look_of(turn[:, 2], place)
+        if other.ahead >= AHEAD and other.passes <= PASSES and other.crosses >= CROSSES:
+            problem = (
+                f"{look.ahead:.0%} of the cameras look toward a common point, and "
+                f"{other.ahead:.0%} if {reason}; convert the poses, unless the cameras "
+                "were turned on the spot or look outwards"
+            )
+            return [Finding(subject, value, problem)]
+    return [Finding(subject, value)]
+
+
+def look_of(axes: np.ndarray, position: np.ndarray) -> Look:
+    """Find the point that cameras look at.
+
+    Args:
+      axes: Viewing directions, [frames, 3].
+      position: Positions, [frames, 3].
+
+    Returns:
+      How well they look at it.
+    """
+    across = across_ray(axes)
+    matrix, origin = across.sum(0), position.mean(0)
+    right = np.einsum("nij,nj->i", across, position - origin)
+    crosses = float(np.linalg.svd(matrix, compute_uv=False)[-1] / len(axes))
+    if crosses < 1e-6:
+        return Look(0.0, np.inf, crosses)
+    offset = np.linalg.solve(matrix, right) + origin - position
+    distance = float(np.linalg.norm(offset, axis=1).mean())
+    missed = np.linalg.norm(np.einsum("nij,nj->ni", across, offset), axis=1)
+    passes = float(np.sqrt((missed**2).mean()) / distance) if distance > 0 else np.inf
+    # As in rotations that were taken for those back: all cameras at one place.
+    if distance <= 1e-6 * np.abs(position).max(initial=1.0):
+        passes = np.inf
+    ahead = float(((axes * offset).sum(1) > 0).mean())
+    return Look(ahead, passes, crosses)
+
+
+def _others(capture, rotation, position):
+    """Rotations from the world and positions under other readings, by reason."""
+    back = rotation.swapaxes(1, 2)
+    if capture.source != "blender":
+        inverse = -np.einsum("nij,nj->ni", rotation, position)
+        return {
+            "the camera's axes are right, up, back (OpenGL)": (
+                _FLIP @ rotation,
+                position,
+            ),
+            "the poses are the inverse": (back, inverse),
+        }
+    matrix = back @ _FLIP  # as it stands in the file
+    inverse = -np.einsum("nij,nj->ni", matrix.swapaxes(1, 2), position)
+    return {
+        "transform_matrix is camera to world with axes right, down, forward (OpenCV)": (
+            _FLIP @ rotation,
+            position,
+        ),
+        "transform_matrix is world to camera with axes right, down, forward (OpenCV)": (
+            matrix,
+            inverse,
+        ),
+        "transform_matrix is world to camera with axes right, up, back (OpenGL)": (
+            _FLIP @ matrix,
+            inverse,
+        ),
+    }

@@ -1,0 +1,202 @@
+"""Photographs of phones and cameras, turned upright.
+
+HEIC and images of more than `images.LARGE_PIXELS` pixels are decoded in a child process
+with limits. `decoder_child` imports this module, so it imports no JAX.
+"""
+
+import contextlib
+import importlib
+import math
+import numbers
+import pathlib
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import PIL.Image
+import PIL.ImageOps
+
+from nerfies_jax.capture import decoder, images, safe_files
+from nerfies_jax.capture.errors import CaptureError
+
+HEIC = (".heic", ".heif")  # read where pillow-heif is installed
+FULL_FRAME_MM = 36.0  # the longer side that the 35 mm equivalent refers to
+_ORIENTATION, _EXIF, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
+
+
+class Unreadable(CaptureError):
+    """The file is not an image despite its name, or is damaged."""
+
+
+class TooLarge(CaptureError):
+    """The image has more pixels than the limit, or a damaged header that says so."""
+
+
+class Header(NamedTuple):
+    """Properties of a photograph from its header."""
+
+    size: tuple[int, int]  # width and height, upright
+    focal: float | None  # focal length in longest sides, where the file states it
+
+
+def heic_is_read() -> bool:
+    """Test if HEIC can be read, and register its package with Pillow."""
+    try:
+        importlib.import_module("pillow_heif").register_heif_opener()
+    except ImportError:
+        return False
+    return True
+
+
+def read_header(path: pathlib.Path) -> Header:
+    """Read the header of a photograph.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The header.
+
+    Raises:
+      Unreadable: If it is not an image.
+      TooLarge: If it has more than `images.MAX_PIXELS` pixels.
+    """
+    if path.suffix.lower() not in HEIC:
+        return decode_header(path)
+    about = _decoded_apart(path, 0, header_only=True).about
+    return Header(tuple(about["size"]), about["focal"])
+
+
+def read_upright(path: pathlib.Path) -> np.ndarray:
+    """Read a photograph, turned upright, with transparent parts over black.
+
+    Args:
+      path: The file.
+
+    Returns:
+      uint8 sRGB [height, width, 3].
+
+    Raises:
+      Unreadable: If it is damaged.
+      CaptureError: If its white is not known.
+    """
+    width, height = read_header(path).size
+    count = width * height
+    if path.suffix.lower() not in HEIC and count <= images.LARGE_PIXELS:
+        return decode_upright(path)
+    return _decoded_apart(path, count, header_only=False).arrays["pixels"]
+
+
+def _decoded_apart(path, count, header_only):
+    """Let a child process decode a file of `count` pixels."""
+    path = safe_files.check(path)
+    try:
+        with decoder.session() as child:
+            answer = child.request(
+                "photograph",
+                cpu_seconds=count * images.SECONDS_PER_PIXEL,
+                memory_bytes=count * images.BYTES_PER_PIXEL,
+                path=str(path.absolute()),
+                header_only=header_only,
+            )
+    except decoder.DecoderError as error:
+        if error.has_advice:  # and the path
+            raise CaptureError(str(error)) from None
+        raise _unreadable(path, error) from None
+    if "refused" in answer.about:
+        kind = TooLarge if answer.about["refused"] == TooLarge.__name__ else Unreadable
+        raise kind(answer.about["message"])
+    return answer
+
+
+def decode_header(path: pathlib.Path) -> Header:
+    """Read the header of a photograph in this process, for `read_header`.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The header.
+
+    Raises:
+      Unreadable: As for `read_header`.
+      TooLarge: As for `read_header`.
+    """
+    with _opened(path) as picture:
+        tags = picture.getexif()
+        turned = tags.get(_ORIENTATION, 1) in (5, 6, 7, 8)  # by a quarter
+        size = picture.size[::-1] if turned else picture.size
+        value = tags.get_ifd(_EXIF).get(_FOCAL_35MM)
+    focal = None
+    # Files of strangers hold anything here: several numbers, a word, 0 for unknown.
+    if isinstance(value, numbers.Real) and 0 < float(value) < math.inf:
+        focal = float(value) / FULL_FRAME_MM
+    return Header(size, focal)
+
+
+def decode_upright(path: pathlib.Path) -> np.ndarray:
+    """Decode a photograph in this process, for `read_upright`.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The pixels as of `read_upright`.
+
+    Raises:
+      CaptureError: As for `read_upright`.
+    """
+    with _opened(path) as picture:
+        picture = PIL.ImageOps.exif_transpose(picture)
+        if picture.mode == "F":
+            raise CaptureError(
+                f"{path}: a picture of 32-bit floats, whose white is not known; save "
+                "it with 8 or 16 bits"
+            )
+        if picture.mode.startswith("I"):  # 16 bits of gray
+            values = np.asarray(picture)
+            if not 0 <= values.min() <= values.max() <= 65535:
+                raise CaptureError(
+                    f"{path}: gray of 32 bits, up to {values.max()}, whose white is "
+                    "not known; save it with 8 or 16 bits"
+                )
+            values = values.astype(np.uint32) // 257
+            return np.repeat(values.astype(np.uint8)[..., None], 3, axis=2)
+        if picture.has_transparency_data:  # what is cut out must not be seen again
+            picture = picture.convert("RGBA")
+            black = PIL.Image.new("RGBA", picture.size, (0, 0, 0, 255))
+            picture = PIL.Image.alpha_composite(black, picture)
+        return np.asarray(picture.convert("RGB"))
+
+
+@contextlib.contextmanager
+def _opened(path):
+    """Open an image as stored, and raise a one-line error for any defect."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
+            with PIL.Image.open(path) as picture:
+                if picture.width * picture.height > images.MAX_PIXELS:
+                    raise PIL.Image.DecompressionBombError
+                yield picture
+    except CaptureError:
+        raise
+    except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
+        raise _too_large(path) from None
+    # Its parsers raise whatever they meet.
+    except Exception as error:
+        raise _unreadable(path, error) from None
+
+
+def _too_large(path):
+    return TooLarge(
+        f"{path}: more than {images.MAX_PIXELS:,} pixels; make the picture smaller "
+        "first"
+    )
+
+
+def _unreadable(path, error):
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return Unreadable(
+        f"{path}: not a readable picture ({reason}); copy it again or remove it"
+    )
