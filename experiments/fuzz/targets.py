@@ -165,6 +165,55 @@ def _llff(folder):
     np.save(folder / "poses_bounds.npy", table)
 
 
+def _rig(folder):
+    folder = folder / "capture"
+    for row in range(3):
+        _images(folder / f"cam{row:02d}", count=2)
+    table = np.zeros((3, 17))
+    table[:, :15] = np.c_[np.eye(3), np.zeros(3), [SIDE[1], SIDE[0], 11]].ravel()
+    table[:, 3], table[:, 15:] = np.arange(3), (1, 5)
+    np.save(folder / "poses_bounds.npy", table)
+
+
+def _photographs(folder):
+    color = np.random.default_rng(9).integers(0, 256, (*SIDE[::-1], 4), np.uint8)
+    exif = PIL.Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 28
+    PIL.Image.fromarray(color[..., :3]).save(folder / "a.jpg", exif=exif)
+    PIL.Image.fromarray(color).save(folder / "b.png", exif=exif)
+    PIL.Image.fromarray(color).save(folder / "c.webp", exif=exif)
+    PIL.Image.fromarray(color[..., 0].astype(np.uint16) * 257).save(folder / "d.tif")
+
+
+def _read_photographs(folder):
+    from nerfies_jax.capture import photographs
+
+    for path in sorted(folder.iterdir()):
+        photographs.read_upright(path)
+
+
+def _times(folder):
+    from nerfies_jax.capture.json_files import write_json
+
+    times = {name: 0.1 * row for row, name in enumerate(_capture().ids)}
+    write_json(folder / "a.json", times)
+    rows = [f"images/{name}.png, {time}\n" for name, time in times.items()]
+    (folder / "b.csv").write_text("name, seconds\n" + "".join(rows))
+    rows = [
+        f"2024-01-31 10:00:{10 * time:02.0f} {name}.png\n"
+        for name, time in times.items()
+    ]
+    (folder / "c.txt").write_text("".join(rows))
+
+
+def _read_times(folder):
+    from nerfies_jax.capture import times_file
+
+    for path in sorted(folder.iterdir()):
+        times_file.with_times(_capture(), path)
+
+
 def _pictures(folder):
     rng = np.random.default_rng(4)
     gray = rng.integers(0, 256, SIDE[::-1], np.uint8)
@@ -471,6 +520,9 @@ TARGETS = {
         _colmap_binary, lambda f: _load(f / "capture"), 10
     ),
     "LLFF capture": Target(_llff, lambda f: _load(f / "capture"), 10),
+    "rig of cameras": Target(_rig, lambda f: _load(f / "capture"), 10),
+    "frame times": Target(_times, _read_times, 200),
+    "photographs": Target(_photographs, _read_photographs, 100),
     "images": Target(_pictures, _read_pictures, 200),
     "masks": Target(_masks, _read_masks, 100),
     "EXR": Target(_exr, _read_exr, 50),
