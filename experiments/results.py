@@ -117,6 +117,18 @@ STUDIES = {
     ),
     "faults": _package("signals, full disks, closed pipes", "faults --trials 200"),
     "fuzz": _package("damaged files", "fuzz --mutations 1000000"),
+    "capture_checks": Study(
+        "consistency checks of good captures",
+        "capture_checks CAPTURES",
+        "capture_checks",
+        "capture_checks",
+    ),
+    "capture_cost": Study(
+        "memory of frames, cost of decoders",
+        "capture_cost",
+        "capture_cost",
+        "capture_cost",
+    ),
     "mutants": _package("faults that the tests detect", "mutants --count 44"),
     "mutants_unseen": _package("the same, other faults", "mutants --count 24 --seed 1"),
 }

@@ -192,9 +192,7 @@ def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(damage, tmp_pa
     older, newer = start(), start(6)
     save(tmp_path, (older, 4), (newer, 8))
     damage(tmp_path / "8")
-    with pytest.warns(
-        RuntimeWarning, match=r"8 cannot be read .* trying an older one"
-    ):
+    with pytest.warns(RuntimeWarning, match=r"8 cannot be read .* trying an older one"):
         restored = checkpoint.restore(tmp_path, start(), SPEC)
     assert restored.step == 4
     assert toy.same(restored.state, older)
