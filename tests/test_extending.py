@@ -176,7 +176,7 @@ def test_a_medium_brings_its_own_least_uncertainty():
 @pytest.mark.parametrize(
     ("medium", "words"),
     [
-        (Fog(beta_min=None), "'fog' has a beta, and the effect no beta_min"),
+        (Fog(beta_min=None), "'fog' has a beta, so the effect needs a beta_min"),
         (Fog(name="codes"), "named 'codes', but this name is in use"),
         (Fog(name="template"), "named 'template', but this name is in use"),
     ],

@@ -183,8 +183,13 @@ def feeds_networks(effect: FieldRecord) -> bool:
     Returns:
       True if it does.
     """
-    seams = (effect.lift, effect.condition, effect.mark, effect.surface)
-    return any(seam is not None for seam in seams)
+    hooks = (
+        effect.trunk_features,
+        effect.condition,
+        effect.point_codes,
+        effect.surface,
+    )
+    return any(hook is not None for hook in hooks)
 
 
 def _active(effects, without):
@@ -204,7 +209,7 @@ def _active(effects, without):
 
 
 def _init(spec, metadata, effects, key):
-    lifted = sum(effect.lift_width for effect in effects)
+    lifted = sum(effect.trunk_width for effect in effects)
     condition = sum(e.condition_width + e.surface_width for e in effects)
     nets = {}
     keys = jax.random.split(key, 3)

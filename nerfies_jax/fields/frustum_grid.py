@@ -38,9 +38,9 @@ Grid = Float[Array, "rows columns corners 3"]
 def resolves(bound: Bound) -> bool:
     """Return whether warps alone move a field, with wavelengths much larger than cells.
 
-    Fields with `lift` or `mark` hooks are excluded, since evaluating those at every
-    sample takes as long. Effects state their shortest wavelength
-    (`FieldRecord.shortest_wave`), otherwise it is unknown.
+    Fields with `trunk_features` or `point_codes` hooks are excluded, because evaluating
+    these at every sample takes as long. The wavelength of an effect is its
+    `FieldRecord.shortest_wave`, if known.
 
     Args:
       bound: The field with its parameters.
@@ -50,7 +50,7 @@ def resolves(bound: Bound) -> bool:
     """
     metadata = bound.metadata
     cell = (metadata.far - metadata.near) * metadata.scale / DEEP
-    if any((effect.lift, effect.mark) != (None, None) for effect in bound.effects):
+    if any(effect.trunk_features or effect.point_codes for effect in bound.effects):
         return False
     waves = [e.shortest_wave for e in bound.effects if e.displace is not None]
     known = [wave for wave in waves if wave is not None]

@@ -49,7 +49,7 @@ class Bound:
 
 
 def displacement(bound: Bound, point: Vector, condition: FrameCondition) -> Vector:
-    """Compute template point minus observed point, the sum of all warps in order.
+    """Compute the sum of the displacements of all warps, applied in order.
 
     Args:
       bound: The field with its parameters.
@@ -57,33 +57,33 @@ def displacement(bound: Bound, point: Vector, condition: FrameCondition) -> Vect
       condition: Conditioning of the frame.
 
     Returns:
-      The displacement in units of the field, [3].
+      Template point minus observed point in units of the field, [3].
     """
-    return _displaced(bound, point, _marked(bound, point, condition))
+    return _displacement(bound, point, _with_point_codes(bound, point, condition))
 
 
-def _marked(bound, point, condition):
+def _with_point_codes(bound, point, condition):
     """Add the codes of an observed point to those of the frame."""
-    marks = {}
+    codes = {}
     for effect in bound.effects:
-        if effect.mark is not None:
-            marks |= effect.mark(bound.own(effect), point, condition)
-    return condition._replace(codes=condition.codes | marks) if marks else condition
+        if effect.point_codes is not None:
+            codes |= effect.point_codes(bound.own(effect), point, condition)
+    return condition._replace(codes=condition.codes | codes) if codes else condition
 
 
-def _displaced(bound, point, condition):
+def _displacement(bound, point, condition):
     total = jnp.zeros_like(point)
     for effect in bound.effects:
         if effect.displace is not None:
-            moved = effect.displace(bound.own(effect), point + total, condition)
-            total = total + moved
+            params = bound.own(effect)
+            total = total + effect.displace(params, point + total, condition)
     return total
 
 
 def mean_flow(
     bound: Bound, point: Vector, condition: FrameCondition
 ) -> Float[Array, "2 3"]:
-    """Compute the scene flow at a point, to the next and the previous interval.
+    """Compute the scene flow at a point over the next and the previous interval.
 
     It is the mean of the flow of the medium and of the static scene, weighted by their
     opacity at the point.
@@ -99,16 +99,16 @@ def mean_flow(
     ray = Ray(point, jnp.asarray((0, 0, 1), point.dtype), *jnp.zeros(2, point.dtype))
     samples = _samples(bound, ray, condition, jnp.zeros(1, point.dtype))
     radiance, _ = _radiance(bound, "fine", ray, condition, samples, None)
-    flowing = [effect for effect in bound.effects if effect.name == scene_flow.NAME]
-    media = _media(bound, flowing, ray, condition, samples, radiance)
+    effects = [effect for effect in bound.effects if effect.name == scene_flow.NAME]
+    media = _media(bound, effects, ray, condition, samples, radiance)
     (medium,) = media.values()
-    assert medium.share is not None  # as that of a scene flow has
-    moving = (jax.nn.sigmoid(medium.share) * medium.density)[0]
+    assert medium.share is not None  # a scene flow has a blending weight
+    dynamic = (jax.nn.sigmoid(medium.share) * medium.density)[0]
     static = (jax.nn.sigmoid(-medium.share) * radiance.density)[0]
-    there = moving + static > 0
-    share = jnp.where(there, moving / jnp.where(there, moving + static, 1), 0)
+    occupied = dynamic + static > 0
+    weight = jnp.where(occupied, dynamic / jnp.where(occupied, dynamic + static, 1), 0)
     names = ("flow_forward", "flow_backward")
-    return share * jnp.stack([medium.extras[name][0] for name in names])
+    return weight * jnp.stack([medium.extras[name][0] for name in names])
 
 
 class _Samples(NamedTuple):
@@ -117,7 +117,7 @@ class _Samples(NamedTuple):
     distance: Float[Array, " samples"]
     point: Float[Array, "samples 3"]
     warped: Float[Array, "samples 3"]
-    lifted: tuple[Float[Array, "samples features"], ...]
+    trunk_features: tuple[Float[Array, "samples features"], ...]
 
 
 def is_moved(effects: tuple[FieldRecord, ...]) -> bool:
@@ -129,10 +129,13 @@ def is_moved(effects: tuple[FieldRecord, ...]) -> bool:
     Returns:
       True if any effect displaces points or adds coordinates.
     """
-    return any(e.displace is not None or e.lift is not None for e in effects)
+    return any(
+        effect.displace is not None or effect.trunk_features is not None
+        for effect in effects
+    )
 
 
-def asked_at(
+def template_coordinates(
     bound: Bound, point: Vector, condition: FrameCondition
 ) -> tuple[Vector, tuple[Features, ...]]:
     """Return the coordinates at which the template is evaluated for an observed point.
@@ -145,21 +148,21 @@ def asked_at(
     Returns:
       The displaced point [3], and the features of each effect that adds coordinates.
     """
-    warped, condition = point, _marked(bound, point, condition)
+    warped, condition = point, _with_point_codes(bound, point, condition)
     if any(effect.displace is not None for effect in bound.effects):
-        warped = point + _displaced(bound, point, condition)
-    lifted = tuple(
-        effect.lift(bound.own(effect), point, condition)
+        warped = point + _displacement(bound, point, condition)
+    features = tuple(
+        effect.trunk_features(bound.own(effect), point, condition)
         for effect in bound.effects
-        if effect.lift is not None
+        if effect.trunk_features is not None
     )
-    return warped, lifted
+    return warped, features
 
 
 def _samples(bound, ray, condition, distance):
     def one(distance):
         point = rays.point_at(ray.origin, ray.direction, distance)
-        return _Samples(distance, point, *asked_at(bound, point, condition))
+        return _Samples(distance, point, *template_coordinates(bound, point, condition))
 
     return jax.vmap(one)(distance)
 
@@ -174,8 +177,8 @@ def render_ray(
     """Render all levels of one ray.
 
     Warps and ambient coordinates are evaluated once per sample. The fine level reuses
-    those of the coarse samples, which the published code computes again (a third of its
-    warps).
+    those of the coarse samples. The published code evaluates them again, which is a
+    third of its warps.
 
     Args:
       bound: The field with its parameters.
@@ -197,35 +200,39 @@ def render_ray(
     def level(name, samples, media_of, number):
         noise = None
         if noise_key is not None and spec.density_noise > 0:
-            drawn = jax.random.normal(
+            normal = jax.random.normal(
                 jax.random.fold_in(noise_key, number),
                 samples.distance.shape,
                 samples.distance.dtype,
             )
-            noise = spec.density_noise * drawn
-        radiance, looks = _radiance(bound, name, ray, condition, samples, noise)
+            noise = spec.density_noise * normal
+        radiance, surfaces = _radiance(bound, name, ray, condition, samples, noise)
         media = _media(bound, media_of, ray, condition, samples, radiance)
-        seen = _composite(bound, ray, samples, radiance, media)
-        return seen._replace(looks=looks)
+        output = _composite(bound, ray, samples, radiance, media)
+        return output._replace(surfaces=surfaces)
 
-    # Media are on the last level only: one that guides the samples needs no more.
-    last = [effect for effect in bound.effects if effect.medium is not None]
+    # The coarse level only guides the samples, for which the static field suffices.
+    with_media = [effect for effect in bound.effects if effect.medium is not None]
     if plan.fine == 0:
-        return (level("fine", samples, last, 0),)
+        return (level("fine", samples, with_media, 0),)
     first = "fine" if plan.shared else "coarse"
     coarse = level(first, samples, (), 0)
-    drawn = sampling.refine(
+    new = sampling.refine(
         fine_key if plan.jitter else None, distance, coarse.weight, plan.fine
     )
     if not (plan.union and is_moved(bound.effects)):
-        every = fine_distances(spec, bound.metadata, distance, drawn)
-        both = _samples(bound, ray, condition, every)
+        fine_distance = fine_distances(spec, bound.metadata, distance, new)
+        fine_samples = _samples(bound, ray, condition, fine_distance)
     else:
-        more = _samples(bound, ray, condition, drawn)
-        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), samples, more)
-        place = sampling.merged_places(distance, drawn)
-        both = jax.tree.map(lambda x: jnp.zeros_like(x).at[place].set(x), both)
-    return coarse, level("fine", both, last, 1)
+        new_samples = _samples(bound, ray, condition, new)
+        position = sampling.merged_places(distance, new)
+
+        def merge(coarse_leaf, new_leaf):
+            leaf = jnp.concatenate([coarse_leaf, new_leaf])
+            return jnp.zeros_like(leaf).at[position].set(leaf)
+
+        fine_samples = jax.tree.map(merge, samples, new_samples)
+    return coarse, level("fine", fine_samples, with_media, 1)
 
 
 def color_offset(
@@ -243,19 +250,19 @@ def color_offset(
       The contribution, as of `template.color_offset`. With a template of another
       package, the direction and the features of the ray.
     """
-    one, net = template_of(bound.spec, name), bound.params["template"][name]
+    spec, params = template_of(bound.spec, name), bound.params["template"][name]
     inputs = []
-    if isinstance(one, TemplateSpec) and one.direction is not None:
-        inputs.append(encoding.encode(one.direction, direction, None))
+    if isinstance(spec, TemplateSpec) and spec.direction is not None:
+        inputs.append(encoding.encode(spec.direction, direction, None))
     inputs += [
         effect.condition(bound.own(effect), condition)
         for effect in bound.effects
         if effect.condition is not None
     ]
-    read = jnp.concatenate([*inputs, jnp.zeros(0, direction.dtype)])
-    if not isinstance(one, TemplateSpec):
-        return jnp.concatenate([direction, read])
-    return template.color_offset(one, net, read)
+    features = jnp.concatenate([*inputs, jnp.zeros(0, direction.dtype)])
+    if not isinstance(spec, TemplateSpec):
+        return jnp.concatenate([direction, features])
+    return template.color_offset(spec, params, features)
 
 
 def radiance_at(
@@ -271,7 +278,7 @@ def radiance_at(
     Args:
       bound: The field with its parameters.
       name: Name of the level.
-      place: Coordinates from `asked_at`.
+      place: Coordinates from `template_coordinates`.
       offset: `color_offset` of the ray.
       condition: Conditioning of the frame.
       noise: Noise added to the raw density, or None.
@@ -279,108 +286,116 @@ def radiance_at(
     Returns:
       Density and color.
     """
-    warped, lifted = place
-    one, net = template_of(bound.spec, name), bound.params["template"][name]
-    if not isinstance(one, TemplateSpec):
-        features = jnp.concatenate([*lifted, jnp.zeros(0, warped.dtype)])
-        given = warped, offset[:3], features, offset[3:], condition.step
-        density, color = one.apply(net, TemplateInputs(*given))
+    warped, extra = place
+    spec, params = template_of(bound.spec, name), bound.params["template"][name]
+    if not isinstance(spec, TemplateSpec):
+        features = jnp.concatenate([*extra, jnp.zeros(0, warped.dtype)])
+        inputs = TemplateInputs(
+            warped, offset[:3], features, offset[3:], condition.step
+        )
+        density, color = spec.apply(params, inputs)
         return template.Radiance(density, color, jnp.zeros(0, warped.dtype))
-    encoded = template.encode(one, net, warped, condition.step)
-    features = jnp.concatenate([encoded, *lifted])
-    raw, hidden = template.raw_density(one, net, features)
+    encoded = template.encode(spec, params, warped, condition.step)
+    features = jnp.concatenate([encoded, *extra])
+    raw, hidden = template.raw_density(spec, params, features)
     raw = raw if noise is None else raw + noise
-    return template.colored(one, net, raw, hidden, offset)
+    return template.colored(spec, params, raw, hidden, offset)
 
 
 def _radiance(bound, name, ray, condition, samples, noise):
-    """Template of one level at the samples of a ray, and surface features."""
+    """Evaluate the template of one level and surface effects at samples of a ray."""
     offset = color_offset(bound, name, ray.direction, condition)
     surfaces = [effect for effect in bound.effects if effect.surface is not None]
 
-    def ask(point, warped, lifted, noise):
-        place = warped, lifted
+    def evaluate(point, warped, extra, noise):
+        place = warped, extra
         if surfaces:
-            seen = point, place, offset
-            return _surface_at(bound, name, surfaces, seen, condition, noise)
+            sample = point, place, offset
+            return _surface_at(bound, name, surfaces, sample, condition, noise)
         return radiance_at(bound, name, place, offset, condition, noise), {}
 
-    return jax.vmap(ask, (0, 0, 0, None if noise is None else 0))(
-        samples.point, samples.warped, samples.lifted, noise
+    return jax.vmap(evaluate, (0, 0, 0, None if noise is None else 0))(
+        samples.point, samples.warped, samples.trunk_features, noise
     )
 
 
-def _surface_at(bound, name, surfaces, seen, condition, noise):
-    """Same as `radiance_at`, with the surface features of these effects."""
-    point, (warped, lifted), offset = seen
-    one, net = template_of(bound.spec, name), bound.params["template"][name]
+def _surface_at(bound, name, surfaces, sample, condition, noise):
+    """Evaluate `radiance_at` with the outputs of surface effects as inputs of color."""
+    point, (warped, extra), offset = sample
+    spec, params = template_of(bound.spec, name), bound.params["template"][name]
 
-    def density(net, warped, lifted):
-        encoded = template.encode(one, net, warped, condition.step)
-        return template.raw_density(one, net, jnp.concatenate([encoded, *lifted]))
+    def density(params, warped, extra):
+        encoded = template.encode(spec, params, warped, condition.step)
+        return template.raw_density(spec, params, jnp.concatenate([encoded, *extra]))
 
-    raw, hidden = density(net, warped, lifted)
-    fixed = dataclasses.replace(bound, params=jax.lax.stop_gradient(bound.params))
-    still = jax.lax.stop_gradient((net, warped, lifted))
+    raw, hidden = density(params, warped, extra)
+    frozen = dataclasses.replace(bound, params=jax.lax.stop_gradient(bound.params))
+    frozen_params, frozen_warped, frozen_extra, frozen_point = jax.lax.stop_gradient(
+        (params, warped, extra, point)
+    )
 
-    def turned(normal):
-        def moved(point):
-            return point + displacement(fixed, point, jax.lax.stop_gradient(condition))
+    def observed_normal(normal):
+        def warp(point):
+            return point + displacement(frozen, point, jax.lax.stop_gradient(condition))
 
         # The density in the observation is f(x) = F(x + d(x)), with the gradient JᵀF'.
-        return jax.vjp(moved, still_point)[1](normal)[0]
+        return jax.vjp(warp, frozen_point)[1](normal)[0]
 
-    def outward():
-        return -jax.grad(lambda place: density(still[0], place, still[2])[0])(still[1])
+    def template_normal():
+        def raw_at(position):
+            return density(frozen_params, position, frozen_extra)[0]
 
-    still_point = jax.lax.stop_gradient(point)
-    surface = Surface(point, hidden, turned, outward)
-    looks = {
+        return -jax.grad(raw_at)(frozen_warped)
+
+    surface = Surface(point, hidden, observed_normal, template_normal)
+    outputs = {
         effect.name: effect.surface(bound.own(effect), name, surface, condition)
         for effect in surfaces
     }
-    more = jnp.concatenate([look.features for look in looks.values()])
+    more = jnp.concatenate([output.features for output in outputs.values()])
     raw = raw if noise is None else raw + noise
-    radiance = template.colored(one, net, raw, hidden, offset, more)
-    return radiance, {name: look.found for name, look in looks.items()}
+    radiance = template.colored(spec, params, raw, hidden, offset, more)
+    return radiance, {name: output.values for name, output in outputs.items()}
 
 
 def _media(bound, effects, ray, condition, samples, radiance) -> dict[str, Medium]:
-    """Media that these effects put on the ray, by name."""
+    """Evaluate the media of effects at the samples of a ray, by name."""
     media = {}
     for effect in effects:
 
-        def at(point, features, effect=effect):
+        def evaluate(point, features, effect=effect):
             sample = Sample(point, ray.direction, features)
             return effect.medium(bound.own(effect), sample, condition)
 
-        media[effect.name] = jax.vmap(at)(samples.point, radiance.features)
+        media[effect.name] = jax.vmap(evaluate)(samples.point, radiance.features)
     return media
 
 
 def _composite(bound, ray, samples, radiance, media):
     distance = samples.distance
-    behind = bound.metadata.background
-    end = compositing.AT_INFINITY
-    if behind is not None:
-        end = jnp.maximum(ray.far - distance[-1], 0)
-        behind = jnp.asarray(behind, distance.dtype)
-    spacing = compositing.intervals(distance, end)
-    static, others = radiance.density * spacing, []
+    background = bound.metadata.background
+    last_interval = compositing.AT_INFINITY
+    if background is not None:
+        last_interval = jnp.maximum(ray.far - distance[-1], 0)
+        background = jnp.asarray(background, distance.dtype)
+    spacing = compositing.intervals(distance, last_interval)
+    static, of_media = radiance.density * spacing, []
     for medium in media.values():
         depth = medium.density * spacing
         if medium.share is not None:
             depth = compositing.thinned(depth, medium.share)
             static = compositing.thinned(static, -medium.share)
-        others.append(depth)
+        of_media.append(depth)
     if media:
-        depths = jnp.stack([static, *others])
+        depths = jnp.stack([static, *of_media])
         colors = [radiance.color, *(medium.color for medium in media.values())]
         weights = compositing.media_weights(depths)
-        whole = compositing.composite_media(depths, jnp.stack(colors), distance, behind)
+        result = compositing.composite_media(
+            depths, jnp.stack(colors), distance, background
+        )
     else:
         weights = compositing.weights(static)[None]
-        whole = compositing.composite(weights[0], radiance.color, distance, behind)
+        result = compositing.composite(weights[0], radiance.color, distance, background)
     media_weight = dict(zip(media, weights[1:], strict=True))
     return RayOutput(
         distances=distance,
@@ -389,17 +404,17 @@ def _composite(bound, ray, samples, radiance, media):
         static_weight=weights[0],
         media=media,
         media_weight=media_weight,
-        color=whole.color,
-        alpha=whole.alpha,
-        distance=whole.distance,
-        median_distance=whole.median_distance,
+        color=result.color,
+        alpha=result.alpha,
+        distance=result.distance,
+        median_distance=result.median_distance,
         beta=_uncertainty(bound, media, media_weight),
         spacing=spacing,
-        background=behind,
+        background=background,
     )
 
 
-def says_beta(
+def uncertainty_effect(
     effects: tuple[FieldRecord, ...], media: Mapping[str, Medium]
 ) -> FieldRecord | None:
     """Find the effect whose medium provides the uncertainty of a ray's color.
@@ -414,29 +429,29 @@ def says_beta(
     Raises:
       ValueError: If two media provide it, or the effect has no `beta_min`.
     """
-    said_by = None
+    provider = None
     for effect in effects:
         medium = media.get(effect.name)
         if medium is None or medium.beta is None:
             continue
         if effect.beta_min is None:
             raise ValueError(
-                f"the medium of the effect {effect.name!r} has a beta, and the effect "
-                "no beta_min: without a least uncertainty the loss is unbounded below; "
-                "give the effect one, as 0.03"
+                f"the medium of the effect {effect.name!r} has a beta, so the effect "
+                "needs a beta_min, without which the loss is unbounded below; set it "
+                "to a positive number, such as 0.03"
             )
-        if said_by is not None:
+        if provider is not None:
             raise ValueError(
-                f"both {said_by.name!r} and {effect.name!r} say how uncertain a ray's "
-                "color is; leave the beta of one medium None"
+                f"{provider.name!r} and {effect.name!r} both provide the uncertainty "
+                "of the color of rays; set the beta of one medium to None"
             )
-        said_by = effect
-    return said_by
+        provider = effect
+    return provider
 
 
 def _uncertainty(bound, media, media_weight):
-    """Uncertainty of the ray's color, or None if no medium provides it."""
-    effect = says_beta(bound.effects, media)
+    """Compute the uncertainty of a ray's color, None if no medium provides it."""
+    effect = uncertainty_effect(bound.effects, media)
     if effect is None:
         return None
     weight, beta = media_weight[effect.name], media[effect.name].beta

@@ -25,10 +25,10 @@ from nerfies_jax.fields.field_ray import (
 )
 from nerfies_jax.fields.render_ray import (
     Bound,
-    asked_at,
     color_offset,
     is_moved,
     radiance_at,
+    template_coordinates,
 )
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
@@ -117,7 +117,7 @@ def survey(
         key = jax.random.fold_in(jax.random.key(0), number)
 
         def densities(point):
-            place = asked_at(bound, point, condition)
+            place = template_coordinates(bound, point, condition)
             return {
                 name: radiance_at(bound, name, place, offset[name], condition).density
                 for name in names
@@ -347,7 +347,7 @@ def _ask(
             row = index // width
             at = rays.point_at(ray.origin[row], ray.direction[row], distance[index])
             if moved is None:
-                return asked_at(bound, at, condition)
+                return template_coordinates(bound, at, condition)
             return at + moved[index], ()
 
         if before is None:

@@ -149,7 +149,7 @@ def build(
 
 def _check_guides(spec, effects):
     """Refuse what would end as a missing code where a warp or a slice is traced."""
-    there = tuple(effect.name for effect in effects if effect.mark is not None)
+    there = tuple(effect.name for effect in effects if effect.point_codes is not None)
     for part in ("warp", "ambient"):
         for guide in getattr(getattr(spec, part), "guides", ()):
             if guide not in there:
@@ -420,7 +420,7 @@ def _color_terms(
     mse = losses.mse(last.color, batch.color, batch.valid)
     terms = {"fine": Term(mse, 1.0)}
     coarse_weight = 1.0
-    uncertain = render_ray.says_beta(effects, last.media)
+    uncertain = render_ray.uncertainty_effect(effects, last.media)
     if uncertain is not None:
         assert last.beta is not None
         likelihood = transient.photometric(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from nerfies_jax.fields.effects import learned_moments, scene_flow
+from nerfies_jax.fields.effects import scene_flow, timestamps
 from nerfies_jax.fields.field import Field
 from nerfies_jax.preprocessing import usable_paths
 from nerfies_jax.preprocessing.record import Evidence
@@ -178,7 +178,7 @@ def fit_flow(
             "scene flow to"
         )
     moments = np.where(apart > 0, apart, 1)
-    moments = moments / learned_moments.interval(len(field.metadata.times))
+    moments = moments / timestamps.interval(len(field.metadata.times))
     shift = np.diff(paths.position, axis=1) / moments[:, None]
     unit = max(float(np.linalg.norm(shift, axis=-1)[both].mean()), 1e-12)
     away = _flow_distances(field, paths, shift, both)

@@ -8,7 +8,7 @@ from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTracks
-from nerfies_jax.fields.effects import learned_moments, scene_flow
+from nerfies_jax.fields.effects import scene_flow, timestamps
 from nerfies_jax.fields.render_ray import Bound, mean_flow
 from nerfies_jax.scene import scene
 from nerfies_jax.training import tracks
@@ -141,7 +141,7 @@ def _flow_mover(field) -> Move | None:
         return None
     metadata = field.metadata
     center = np.asarray(metadata.center, np.float32)
-    gap = learned_moments.interval(len(metadata.times))
+    gap = timestamps.interval(len(metadata.times))
 
     @jax.jit
     def hop(params, step, points, view, side, length):

@@ -1,9 +1,10 @@
 """Ambient slicing surfaces: the template has extra dimensions, and frames slice it.
 
-HyperNeRF (Park et al. 2021, arXiv:2106.13228, section 4): a topological change, such as
-a mouth that opens, is no warp of one template in space, but may be a slice of one in
-space and a few ambient dimensions. A *bent* surface gives each observed point its own
-ambient coordinates (equation 6). The axis-aligned *plane* has one for the frame.
+HyperNeRF (Park et al. 2021, arXiv:2106.13228, section 4). A topological change, such as
+a mouth that opens, is not a warp of one template in space, but can be a slice of a
+template with a few additional, ambient dimensions. A *bent* surface gives each observed
+point its own ambient coordinates (equation 6). On an axis-aligned *plane* all points of
+a frame share them.
 """
 
 import dataclasses
@@ -23,8 +24,8 @@ from nerfies_jax.training.step_counts import steps
 
 KINDS = ("bent", "plane")
 PLANE_TABLE = "ambient"
-# Standard deviation of the weights of the head, in ambient units per unit of feature:
-# the published code's. The surface starts as the plane through zero.
+# Standard deviation of the weights of the head in ambient units per unit of feature, as
+# in the published code. The surface starts as the plane through zero.
 HEAD_DEVIATION = 1e-5
 
 
@@ -32,14 +33,15 @@ HEAD_DEVIATION = 1e-5
 class AmbientSpec:
     """Settings of the slicing surface. The defaults are those of HyperNeRF.
 
-    `kind="bent"` is a network of the point, encoded by `position` with all bands open,
-    and of the frame's code in `table`, which the warp shares. `kind="plane"` has a code
-    of `dims` numbers for each frame, from its own table "ambient". (Under the same name
-    the published presets take the code of the warp, eight numbers.)
+    `kind="bent"` is a network that reads the point, encoded by `position` with all
+    bands open, and the code of the frame in `table`, which the warp shares.
+    `kind="plane"` has a code of `dims` numbers per frame in its own table "ambient".
+    (The published presets of this name use the code of the warp, which has eight
+    numbers.)
 
-    The template reads the ambient coordinates encoded by `encoding`, whose bands are
-    closed for `closed_steps` and open over the next `anneal_steps`. Without identity
-    the template has no ambient dimensions until then. `guides` are those of the warp.
+    The template reads the ambient coordinates encoded by `encoding`. Its bands are
+    closed for `closed_steps` and opened over the next `anneal_steps`. Without identity
+    the template does not depend on them before. `guides` are those of the warp.
     """
 
     kind: str = "bent"
@@ -58,24 +60,24 @@ class AmbientSpec:
     def __post_init__(self):
         if self.kind not in KINDS:
             raise ValueError(
-                f"unknown kind of slice {self.kind!r}; choose from {KINDS}"
+                f"unknown kind of slicing surface {self.kind!r}; choose from {KINDS}"
             )
         if self.dims < 1:
             raise ValueError(
-                f"dims={self.dims} must be at least 1; without ambient dimensions, set "
-                "the effect to none"
+                f"dims={self.dims} must be at least 1; set the effect to none for no "
+                "ambient dimensions"
             )
         if self.code_width < 1:
             raise ValueError(
-                f"code_width={self.code_width} must be at least 1: all frames would "
-                "share one slice"
+                f"code_width={self.code_width} must be at least 1; with 0 all frames "
+                "would share one slice"
             )
         if self.closed_steps < 0 or self.anneal_steps < 1:
             raise ValueError(
                 "the window needs closed_steps >= 0 and anneal_steps >= 1, got "
                 f"closed_steps={self.closed_steps}, anneal_steps={self.anneal_steps}"
             )
-        network(self)  # refuses wrong depths, widths and skips
+        network(self)  # checks depth, width and skips
 
     def bind(self, run_steps: int, metadata: Any) -> "Bound":
         """Return the conditioning of a scene with these settings."""
@@ -83,8 +85,7 @@ class AmbientSpec:
 
 
 def network(spec: AmbientSpec) -> MLPSpec:
-    """Return the settings of the network from [encoded point, code] to ambient
-    coordinates.
+    """Return the settings of the network of a bent surface.
 
     Args:
       spec: Settings of a bent surface.
@@ -103,9 +104,9 @@ def network(spec: AmbientSpec) -> MLPSpec:
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """The `Conditioning` of an `AmbientSpec`; of the observed point, before any warp.
+    """The `Conditioning` of an `AmbientSpec` with a plane, which has no network.
 
-    This is a slice that is a plane: it has no network.
+    It reads the observed point before any warp.
     """
 
     spec: AmbientSpec
@@ -115,7 +116,7 @@ class Bound:
 
     @property
     def features(self) -> int:
-        """Number of features that the trunk reads in addition."""
+        """Number of additional features that the trunk reads."""
         return self.spec.encoding.width(self.spec.dims)
 
     @property
@@ -132,7 +133,7 @@ class Bound:
 
 @dataclasses.dataclass(frozen=True)
 class BentBound(Bound):
-    """The `Conditioning` of an `AmbientSpec` whose slice is bent by a network."""
+    """The `Conditioning` of an `AmbientSpec` with a bent surface."""
 
     @property
     def tables(self) -> tuple[Table, ...]:
@@ -156,11 +157,11 @@ def init(spec: AmbientSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
       The parameters.
     """
     params = mlp.init(network(spec), key, dtype)
-    # mlp.SMALL is the half-width of a uniform draw: √3 of its standard deviation.
-    shrink = math.sqrt(3) * HEAD_DEVIATION / mlp.SMALL
+    # mlp.SMALL is the half-width of a uniform distribution, √3 standard deviations.
+    factor = math.sqrt(3) * HEAD_DEVIATION / mlp.SMALL
     head = params.heads["ambient"]
     return params._replace(
-        heads={"ambient": head._replace(weight=shrink * head.weight)}
+        heads={"ambient": head._replace(weight=factor * head.weight)}
     )
 
 
@@ -179,8 +180,8 @@ def features(
       Features [features], weighted by the coarse-to-fine window.
     """
     ambient = ambient_point(spec, params, point, condition)
-    opened = window(spec, condition.step, ambient)
-    return encoding.encode(spec.encoding, ambient, opened)
+    weights = window(spec, condition.step, ambient)
+    return encoding.encode(spec.encoding, ambient, weights)
 
 
 def ambient_point(
@@ -188,7 +189,7 @@ def ambient_point(
 ) -> Float[Array, " dims"]:
     """Compute the ambient coordinates of an observed point, without encoding.
 
-    They are for images of the slice, and for renders along a path in it.
+    They are used to visualize the slice, and to render along a path in it.
 
     Args:
       spec: Settings.
@@ -204,7 +205,7 @@ def ambient_point(
     encoded = encoding.encode(spec.position, point, None)
     guides = guides_of(spec.guides, condition)
     inputs = jnp.concatenate([encoded, condition.codes[spec.table], *guides])
-    assert params is not None  # as a bent slice has
+    assert params is not None  # a bent surface has parameters
     return mlp.apply(network(spec), params, inputs)["ambient"]
 
 

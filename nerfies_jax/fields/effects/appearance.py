@@ -1,12 +1,12 @@
-"""Learned appearance code for each exposure, which color reads and density does not.
+"""Learned appearance code for each exposure, on which color depends but not density.
 
-NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "latent appearance modeling")
-gives each photograph a code (GLO, Bojanowski et al. 2018) for light, exposure and white
-balance. Nerfies (Park et al. 2021, arXiv:2011.12948, section 3.1) uses it too. Geometry
-is the same under all codes, because only the color branch gets them.
+NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "latent appearance modeling") has
+a code (GLO, Bojanowski et al. 2018) for light, exposure and white balance of each
+photograph, and so does Nerfies (Park et al. 2021, arXiv:2011.12948, section 3.1). The
+geometry is the same for all codes, because only the color branch reads them.
 
-In the official Nerfies code the codes have no effect: its color branch asks for another
-switch, and under the published presets their gradient is exactly zero.
+In the official Nerfies code the codes have no effect. Its color branch depends on
+another switch, and with the published presets their gradient is exactly zero.
 """
 
 import dataclasses
@@ -32,13 +32,13 @@ class AppearanceSpec:
     def __post_init__(self):
         if self.width < 1:
             raise ValueError(
-                f"an appearance code needs width >= 1, got width={self.width}; without "
-                "codes, set the effect to none"
+                f"an appearance code needs width >= 1, got width={self.width}; set the "
+                "effect to none for no codes"
             )
 
     @property
     def features(self) -> int:
-        """Number of features that the color branch reads in addition."""
+        """Number of additional features that the color branch reads."""
         return self.width
 
     @property

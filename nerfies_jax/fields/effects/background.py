@@ -1,7 +1,7 @@
-"""Background regularization: static points must not be moved by the warp.
+"""Background regularization, which penalizes displacements of static points.
 
-Park et al. 2021 (Nerfies), arXiv:2011.12948. Without it the warp and the template may
-drift together, which images do not show.
+Park et al. 2021 (Nerfies), arXiv:2011.12948. Without it the warp and the template can
+drift together without any change of the images.
 """
 
 import dataclasses
@@ -17,17 +17,17 @@ from nerfies_jax.training.effects import PenaltyContext, PyTree, Term
 
 @dataclasses.dataclass(frozen=True)
 class BackgroundSpec:
-    """Settings of the background regularization: number and noise of points, and its
-    cost.
+    """Settings of the background regularization: points, noise and cost.
 
-    Each of a step's micro-batches draws as many `points`.
+    Each micro-batch of a step uses `points` points.
 
     `noise` (standard deviation) and `width` are in units of the field, whose box is the
-    captured volume. The official code's scenes are scaled to fill one of diagonal one.
-    `width` is the displacement at which ρ leaves the parabola. The official `scaling`
-    is the default. Its `weight` of one is 1e-3 of that of the paper's ρ (`losses`).
+    captured volume. In the official code the volume fills a box of diagonal one.
+    `width` is the displacement at which ρ stops being quadratic. `scaling` is that of
+    the official code by default, for which a `weight` of one corresponds to 1e-3 with
+    the ρ of the paper (`losses.geman_mcclure`).
 
-    A scene of a capture without static points is refused when it is built.
+    Building a scene fails if its capture has no static points.
     """
 
     points: int = 16_384
@@ -41,7 +41,7 @@ class BackgroundSpec:
 
     def __post_init__(self):
         if self.points < 1:
-            raise ValueError(f"points={self.points} of a step must be at least 1")
+            raise ValueError(f"points={self.points} per step must be at least 1")
         for name in ("noise", "weight"):
             value = getattr(self, name)
             if not 0 <= value < float("inf"):
@@ -49,15 +49,15 @@ class BackgroundSpec:
         losses.check_geman_mcclure(self.width, self.scaling)
 
     def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
-        """Compute how far random static points are moved in random frames."""
+        """Compute the cost of displacements of static points in random frames."""
         return {"background": Term(drift(self, context), self.weight)}
 
 
 def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:
     """Compute the mean over static points of ρ(|displacement|²).
 
-    All points are used if there are at most `spec.points`. Otherwise as many are drawn
-    with replacement. Each point is evaluated in a random frame, with noise.
+    All points are used if there are at most `spec.points`. Otherwise that many are
+    sampled with replacement. Each point is evaluated in a random frame, with noise.
 
     Args:
       spec: Settings.
@@ -66,7 +66,7 @@ def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:
     Returns:
       A scalar.
     """
-    # The official code draws frames and jitter with one key.
+    # The official code uses one key for frames and noise.
     choice_key, frame_key, noise_key = jax.random.split(context.key, 3)
     assert context.frames is not None
     point = context.frames.points
@@ -101,7 +101,8 @@ def mean_drift(
     assert context.condition_of is not None
     assert context.displace is not None
     conditions = jax.vmap(context.condition_of)(rows)
-    moved = jax.vmap(context.displace)(point, conditions)
-    # ρ takes the square: the length has no slope where nothing moves
-    costs = losses.geman_mcclure(jnp.sum(moved**2, axis=-1), spec.width, spec.scaling)
+    displacement = jax.vmap(context.displace)(point, conditions)
+    # The squared length, because the length has no gradient at zero.
+    squares = jnp.sum(displacement**2, axis=-1)
+    costs = losses.geman_mcclure(squares, spec.width, spec.scaling)
     return jnp.mean(costs)

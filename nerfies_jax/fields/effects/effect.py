@@ -1,9 +1,8 @@
-"""Inputs and outputs of the effects of a radiance field on a ray.
+"""Inputs and outputs of the effects of a radiance field.
 
-The hooks of effects are those of `nerfies_jax.training.effects`. Everything here is in
-field coordinates: `nerfies_jax.scene.scene` shifts and scales rays so that the captured
-volume fills a box around the origin. Functions of a point take one point, and the scene
-vmaps them.
+Everything is in field coordinates. `nerfies_jax.scene.scene` shifts and scales rays so
+that the captured volume fills a box around the origin. Functions take one point, and
+the scene vectorizes them.
 """
 
 from collections.abc import Callable
@@ -20,9 +19,9 @@ Scalar = Float[Array, ""]
 class Sample(NamedTuple):
     """One sample of one ray, as the input of a second medium."""
 
-    point: Vector  # where it was observed; no warp applied
-    direction: Vector  # of the ray, unit length
-    features: Float[Array, " width"]  # last hidden layer of the template's trunk there
+    point: Vector  # observed point, before any warp
+    direction: Vector  # unit direction of the ray
+    features: Float[Array, " width"]  # last hidden layer of the template's trunk
 
 
 class Medium(NamedTuple):
@@ -30,61 +29,65 @@ class Medium(NamedTuple):
 
     density: Scalar  # per unit of the field
     color: Vector  # in [0, 1]
-    # Logit of the share of this medium's opacity, the static one gets the rest (NSFF's
-    # blending); None gives both all of theirs (NeRF-W).
+    # Logit of the blending weight v of NSFF: the opacity of this medium is multiplied
+    # by v and that of the static field by 1 - v. None to multiply neither (NeRF-W).
     share: Scalar | None = None
-    beta: Scalar | None = None  # how uncertain the color is (NeRF-W)
-    extras: dict[str, Array] = {}  # noqa: RUF012  what the penalty needs again
+    beta: Scalar | None = None  # uncertainty of the color (NeRF-W)
+    extras: dict[str, Array] = {}  # noqa: RUF012  further values for the loss
 
 
 class Surface(NamedTuple):
-    """One sample of one ray, as the input of color. Gradients reach no parameters."""
+    """One sample of one ray, as the input of the color of surfaces.
 
-    point: Vector  # where it was observed
-    features: Float[Array, " width"]  # last hidden layer of the level's trunk there
-    # A normal in the template as one in the observation: by the transpose of the
-    # Jacobian of all warps, so of another length.
-    turned: Callable[[Vector], Vector]
-    outward: Callable[[], Vector]  # against the gradient of the template's density
+    The functions have no gradient with respect to parameters.
+    """
+
+    point: Vector  # observed point
+    features: Float[Array, " width"]  # last hidden layer of the level's trunk
+    # Transforms a normal in the template to the observation, by the transpose of the
+    # Jacobian of all warps. The length changes.
+    observed_normal: Callable[[Vector], Vector]
+    # Negative gradient of the density in the template.
+    template_normal: Callable[[], Vector]
 
 
-class Look(NamedTuple):
+class SurfaceOutput(NamedTuple):
     """Output of an effect at a surface."""
 
-    features: Float[Array, " features"]  # that color reads
-    found: dict[str, Array] = {}  # noqa: RUF012  what the penalty needs again
+    features: Float[Array, " features"]  # inputs of the color branch
+    values: dict[str, Array] = {}  # noqa: RUF012  further values for the loss
 
 
 class RayOutput(NamedTuple):
     """Output of one level of sampling for one ray or a batch."""
 
     distances: Float[Array, "*rays samples"]
-    point: Float[Array, "*rays samples 3"]  # where it was observed
-    warped: Float[Array, "*rays samples 3"]  # where the template was asked
+    point: Float[Array, "*rays samples 3"]  # observed points
+    warped: Float[Array, "*rays samples 3"]  # points in the template
     static_weight: Float[Array, "*rays samples"]
-    media: dict[str, Medium]  # by effect, leaves with leading axes rays and samples
+    media: dict[str, Medium]  # by effect, leaves [rays, samples, ...]
     media_weight: dict[str, Float[Array, "*rays samples"]]
     color: Float[Array, "*rays 3"]
     alpha: Float[Array, "*rays"]
-    distance: Float[Array, "*rays"]  # expected, units of the field
+    distance: Float[Array, "*rays"]  # expected distance, units of the field
     median_distance: Float[Array, "*rays"]
     beta: Float[Array, "*rays"] | None  # standard deviation of the color, or None
-    spacing: Float[Array, "*rays samples"]  # what length each sample stands for
-    # Known to be behind the samples; None: the last one stands for all behind it.
+    spacing: Float[Array, "*rays samples"]  # length of the interval of each sample
+    # Known color behind the ray. None if the last sample represents everything behind.
     background: Float[Array, "*rays 3"] | None
-    # Outputs at surfaces by effect, with leaves [rays, samples, ...].
-    looks: dict[str, dict[str, Array]] = {}  # noqa: RUF012
+    # `SurfaceOutput.values` by effect, with leaves [rays, samples, ...].
+    surfaces: dict[str, dict[str, Array]] = {}  # noqa: RUF012
 
     @property
     def weight(self) -> Float[Array, "*rays samples"]:
-        """Rendering weight of each sample, for all media together."""
+        """Rendering weight of each sample, summed over all media."""
         return sum(self.media_weight.values(), self.static_weight)
 
 
 class Batch(NamedTuple):
     """Rays of one step and their observed colors, with rays along the leading axis."""
 
-    row: Int[Array, " rays"]  # of the frames learned from
+    row: Int[Array, " rays"]  # training frame
     pixel: Float[Array, "rays 2"]
     origin: Float[Array, "rays 3"]
     direction: Float[Array, "rays 3"]
@@ -118,7 +121,7 @@ def guides_of(
     missing = [name for name in names if name not in condition.codes]
     if missing:
         raise ValueError(
-            f"guides name {missing[0]!r}, which no effect says of a point; there are "
-            f"{', '.join(sorted(condition.codes))}"
+            f"no effect provides the per-point code {missing[0]!r} in guides; choose "
+            f"from {', '.join(sorted(condition.codes))}"
         )
     return [condition.codes[name] for name in names]

@@ -1,8 +1,8 @@
-"""Elastic regularization: rigid motion of surfaces is free, stretching has a cost.
+"""Elastic regularization, which penalizes deviations of a warp from rigid motion.
 
-Park et al. 2021 (Nerfies), arXiv:2011.12948, "elastic regularization": Σ log²σ over the
-singular values of the warp's Jacobian, made robust, summed along each ray with the
-weights it is rendered with.
+Park et al. 2021 (Nerfies), arXiv:2011.12948, "elastic regularization": a robust
+function of Σ log²σ over the singular values of the warp's Jacobian, summed along each
+ray with the rendering weights.
 """
 
 import dataclasses
@@ -28,21 +28,21 @@ class ElasticSpec:
     """Settings of the elastic regularization: strength, form and sampling.
 
     It is evaluated on the coarse samples. `weight` is constant for `hold_steps` and
-    then falls along a cosine to `last_weight` over `decay_steps` (None: it stays). The
-    first official preset has 1e-3 throughout, the others 1e-2 for 50_000 steps and
-    100_000 down to 1e-8.
+    then decays to `last_weight` along a cosine over `decay_steps` (None for a constant
+    weight). The first official preset has a constant 1e-3. The others have 1e-2 for
+    50_000 steps and decay to 1e-8 over 100_000.
 
-    `points` samples of each ray are drawn by their weights before anything is
-    differentiated (None: all of them, as in the official code). `robust_width` is the
-    logarithmic strain at which ρ leaves the parabola (None: E itself). `scaling` is
-    that of `losses.geman_mcclure`.
+    `points` samples of each ray are chosen at random by their weights, and only these
+    are differentiated (None for all samples, as in the official code). `robust_width`
+    is the logarithmic strain at which ρ stops being quadratic (None for the energy E
+    itself). `scaling` is that of `losses.geman_mcclure`.
 
-    One step of `every` evaluates the penalty, with its weight multiplied by as much
-    (lazy regularization, Karras et al. 2020, arXiv:1912.04958, section 3.1). Its logged
-    value is correct as a mean over so many steps.
+    The penalty is evaluated in one of `every` steps, with its weight multiplied by
+    `every` (lazy regularization, Karras et al. 2020, arXiv:1912.04958, section 3.1).
+    Its logged value is correct as a mean over that many steps.
 
     `fold_cost` is the cost of mirroring a unit volume, in addition to ρ. With 0 mirror
-    images are free, as in the official code. See `displacement_cost`.
+    images have no cost, as in the official code. See `displacement_cost`.
     """
 
     weight: float = 1e-3
@@ -60,23 +60,24 @@ class ElasticSpec:
     def __post_init__(self):
         if self.points is not None and self.points < 1:
             raise ValueError(
-                f"points={self.points} of each ray must be at least 1; None takes all"
+                f"points={self.points} per ray must be at least 1, or None for all"
             )
         if self.every < 1:
-            raise ValueError(f"every={self.every}: at least 1, which is each step")
+            raise ValueError(f"every={self.every} must be at least 1, for every step")
         for name in ("weight", "last_weight", "fold_cost"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name}={value} must be finite and not negative")
-        schedule(self)  # refuses impossible steps
-        if self.robust_width is not None:  # refuses wrong widths and scalings
+        schedule(self)  # checks the steps
+        if self.robust_width is not None:
             losses.check_geman_mcclure(self.robust_width, self.scaling)
 
     def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
         """Compute the elastic energy of the warp at the coarse samples of a step."""
         value, folded = energy_of_step(self, context)
-        planned = schedule(self)
-        weight = planned(context.step) if callable(planned) else planned
+        weight = schedule(self)
+        if callable(weight):
+            weight = weight(context.step)
         return {"elastic": Term(value, weight), "folded": Term(folded, None)}
 
 
@@ -99,26 +100,24 @@ def schedule(spec: ElasticSpec) -> schedules.Schedule | float:
 def energy_of_step(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
     """Compute `spec.every` times `energy` every `spec.every` steps, and zero otherwise.
 
-    The mean over steps, and that of gradients, is then that of `energy`.
+    The means of values and gradients over steps are then those of `energy`.
 
     Args:
       spec: Settings.
       context: Context of the step.
 
     Returns:
-      The energy and the share of folds, scalars.
+      The energy and the fraction of folds, scalars.
     """
     if spec.every == 1:
         return energy(spec, context)
-    nothing = jnp.zeros((), context.levels[0].point.dtype)
+    zero = jnp.zeros((), context.levels[0].point.dtype)
 
-    def asked():
+    def evaluate():
         value, folded = energy(spec, context)
         return spec.every * value, spec.every * folded
 
-    return jax.lax.cond(
-        context.step % spec.every == 0, asked, lambda: (nothing, nothing)
-    )
+    return jax.lax.cond(context.step % spec.every == 0, evaluate, lambda: (zero, zero))
 
 
 @checked
@@ -126,10 +125,10 @@ def displacement_cost(spec: ElasticSpec, displacement: Matrix) -> Scalar:
     """Compute the cost of one Jacobian of a displacement field, not of a warp.
 
     It is ρ(E) + `fold_cost` max(0, -det J), with J = 1 + `displacement` and E its log
-    energy. Two things are needed where J folds. E must be signed, since unsigned a
-    mirror image has no energy. And ρ alone is not enough: it saturates, and at diag(1,
-    1, -1) has a gradient of 1e-6, so nothing would unfold. The determinant has a
-    gradient of one. Without folds the second term is zero and E is that of Nerfies.
+    energy. Folds, where det J < 0, need two changes. E is signed, because the unsigned
+    energy of a mirror image is zero. The determinant is added, because ρ saturates: at
+    diag(1, 1, -1) its gradient is 1e-6, which would not undo a fold, and that of the
+    determinant is one. Without folds the second term is zero and E is that of Nerfies.
 
     Args:
       spec: Settings.
@@ -160,38 +159,36 @@ def displacement_determinant(displacement: Matrix) -> Scalar:
     Returns:
       The determinant.
     """
-    # Broadcast products: `jnp.linalg.det` is LU, whose slope at rank one is NaN.
+    # `jnp.linalg.det` uses LU, whose gradient at rank one is NaN.
     x, y, z = displacement + jnp.eye(3, dtype=displacement.dtype)
     return dot(x, cross(y, z))
 
 
 def energy(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
-    """Compute the mean over rays of Σ w cost on the coarse level, and the share of
-    folds.
+    """Compute the mean over rays of Σ w cost on the coarse level.
 
-    The weights are those of the static medium, which the warp deforms, and have no
-    gradient: space should become stiff, not empty. The share is also by weight: the
-    visible part that lies in folds.
+    The weights are those of the static medium, which the warp deforms. They have no
+    gradient, because the penalty should stiffen space and not empty it.
 
     Args:
       spec: Settings.
       context: Context of the step.
 
     Returns:
-      The energy and the share of folds, scalars.
+      The energy, and the fraction of the weight that lies in folds, scalars.
     """
     level = context.levels[0]
     point, weight = draw(spec.points, level, context.key)
 
-    def at(point, condition):
+    def cost_at(point, condition):
         jacobian = jax.jacfwd(lambda x: context.displace(x, condition))(point)
         folded = displacement_determinant(jax.lax.stop_gradient(jacobian)) < 0
         return displacement_cost(spec, jacobian), folded.astype(point.dtype)
 
-    costs, folded = jax.vmap(jax.vmap(at, (0, None)))(point, context.condition)
-    seen = jnp.sum(weight)
-    share = jnp.sum(weight * folded) / jnp.where(seen > 0, seen, 1)
-    return jnp.mean(jnp.sum(weight * costs, axis=-1)), share
+    costs, folded = jax.vmap(jax.vmap(cost_at, (0, None)))(point, context.condition)
+    total = jnp.sum(weight)
+    folded_fraction = jnp.sum(weight * folded) / jnp.where(total > 0, total, 1)
+    return jnp.mean(jnp.sum(weight * costs, axis=-1)), folded_fraction
 
 
 def draw(
@@ -199,13 +196,14 @@ def draw(
 ) -> tuple[Float[Array, "rays points 3"], Float[Array, "rays points"]]:
     """Sample points of each ray, with weights under which their sum is unbiased.
 
-    A sample is drawn with a probability proportional to its weight, and all draws share
-    the total of the ray. The deviation of the gradient of 24 rays of 16 samples through
-    surfaces, relative to its norm, is 0.67 for one draw, 0.21 for four, and 1.6 for
-    four evenly spaced samples (docs/results/elastic_points.md).
+    Samples are chosen with probabilities proportional to their weights, and each
+    represents an equal part of the ray's total weight. The standard deviation of the
+    gradient, relative to its norm, is 0.67 for one sample, 0.21 for four, and 1.6 for
+    four evenly spaced samples (24 rays of 16 samples through surfaces,
+    docs/results/elastic_points.md).
 
     Args:
-      points: Number of draws per ray. None for all samples.
+      points: Number of samples per ray. None for all.
       level: Output of the level.
       key: PRNG key.
 
@@ -216,32 +214,32 @@ def draw(
     if points is None or points >= weight.shape[-1]:
         return level.point, weight
     start = jax.random.uniform(key, weight.shape[:1], weight.dtype)
-    chosen, share = jax.vmap(systematic, (0, 0, None))(weight, start, points)
-    return jnp.take_along_axis(level.point, chosen[..., None], axis=1), share
+    index, weight = jax.vmap(systematic, (0, 0, None))(weight, start, points)
+    return jnp.take_along_axis(level.point, index[..., None], axis=1), weight
 
 
 def systematic(
     weight: Float[Array, " samples"], start: Scalar, draws: int
 ) -> tuple[Int[Array, " draws"], Float[Array, " draws"]]:
-    """Draw samples with a probability proportional to their weights (systematic
-    sampling).
+    """Choose samples by systematic sampling, in proportion to their weights.
 
-    A sample without weight is not drawn, except on an empty ray.
+    A sample of weight zero is not chosen, except on an empty ray.
 
     Args:
       weight: Non-negative weights, [samples].
-      start: Uniform number in [0, 1), the offset of equidistant marks on the cumulative
-        weight.
-      draws: Number of draws.
+      start: Random number in [0, 1), the offset of equidistant positions on the
+        cumulative weight.
+      draws: Number of samples to choose.
 
     Returns:
       Indices of samples and the weight that each represents, [draws].
     """
     cumulated = jnp.cumsum(weight)
     total = cumulated[-1]
-    marks = (start + jnp.arange(draws, dtype=weight.dtype)) * (total / draws)
-    # "right": a mark at zero passes the samples of no weight in front
-    chosen = jnp.searchsorted(cumulated, marks, side="right", method="compare_all")
-    # and one that rounding put at the end does not pass into the empty space behind
-    chosen = jnp.minimum(chosen, jnp.sum(cumulated < total, dtype=chosen.dtype))
-    return chosen, jnp.full(draws, total / draws, weight.dtype)
+    positions = (start + jnp.arange(draws, dtype=weight.dtype)) * (total / draws)
+    # With side="right" a position of zero skips leading samples of weight zero.
+    index = jnp.searchsorted(cumulated, positions, side="right", method="compare_all")
+    # A position that was rounded up to the total must not choose a trailing sample of
+    # weight zero.
+    index = jnp.minimum(index, jnp.sum(cumulated < total, dtype=index.dtype))
+    return index, jnp.full(draws, total / draws, weight.dtype)

@@ -1,4 +1,4 @@
-"""Elastic energy of an arbitrary warp, for use outside of presets."""
+"""Elastic energy of any warp, for use without a preset."""
 
 from collections.abc import Callable
 
@@ -31,21 +31,21 @@ def elastic_loss(
       warp: The deformation, from one point [3] to one point [3]. It may close over
         traced parameters.
       points: Points in scene units, [..., 3].
-      weights: Weights of the points, [...], non-negative; the result is then the
-        weighted mean, and zero where all weights are. None weighs all alike.
+      weights: Non-negative weights of the points, [...], for a weighted mean, which is
+        zero if all weights are zero. None for equal weights.
       robust_width: Logarithmic strain at which the Geman-McClure loss of the paper
-        leaves the parabola; the paper takes 0.03. None leaves the energy as it is.
-      scaling: "paper" for that loss as printed, "official" for that of the published
-        code, which multiplies it with `robust_width`.
-      fold_cost: Cost of mirroring a unit volume. With 0, as in the published code, a
-        mirror image costs nothing.
+        stops being quadratic, 0.03 in the paper. None to use the energy itself.
+      scaling: "paper" for this loss as printed, "official" for that of the published
+        code, which multiplies it by `robust_width`.
+      fold_cost: Cost of mirroring a unit volume. With 0, as in the published code,
+        mirror images have no cost.
 
     Returns:
       The mean energy, a scalar. Strains are resolved to the rounding of the Jacobian,
       1e-7 in float32.
 
     Raises:
-      ValueError: Where a shape or type is wrong, or the warp does not return [3].
+      ValueError: If a shape or type is wrong, or the warp does not return [3].
 
     References:
       Park et al. 2021 (Nerfies), arXiv:2011.12948, section 3.3.
@@ -60,13 +60,13 @@ def elastic_loss(
     )
 
     def displacement(point):
-        moved = warp(point)
-        if jnp.shape(moved) != (3,):
+        warped = warp(point)
+        if jnp.shape(warped) != (3,):
             raise ValueError(
-                f"elastic_loss: `warp` returns {list(jnp.shape(moved))} for one point "
-                "[3], expected [3]; it is mapped over the points here"
+                f"elastic_loss: `warp` returns {list(jnp.shape(warped))} for one point "
+                "[3], expected [3]; `warp` must take a single point"
             )
-        return moved - point
+        return warped - point
 
     def energy(point):
         return elastic.displacement_cost(spec, jax.jacfwd(displacement)(point))

@@ -1,11 +1,11 @@
 """A learned mask of moving points, which guides the warp and the ambient surface.
 
 Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, mask guided deformation field. The
-text with its equations was not at hand, so its code (JokerYan/NeRF-DS) is followed.
-Where colors change with the motion of a specular surface, they do not show
-correspondence. A network predicts for each observed point and time how certainly it
-moves. The warp and the ambient surface read that next to their code, and masks of the
-images supervise it.
+implementation follows the published code (JokerYan/NeRF-DS), because the paper's
+equations were not available. The colors of a moving specular surface change, so they do
+not determine correspondence. A network predicts for each observed point and time the
+probability that it moves. The warp and the ambient surface read it next to their codes,
+and masks of the images supervise it.
 """
 
 import dataclasses
@@ -36,12 +36,12 @@ NAME = "mask"
 class MovingMaskSpec:
     """Settings of the mask network and its loss. The defaults are those of the code.
 
-    `position` and `skips` are those of the warp there, since its network of masks could
-    not be read. Its output is a ReLU, which can be zero for all points and then never
-    learns. Here it is a sigmoid, which starts undecided. Bands are open, where there
-    they open with the warp's. `code_width` is that of the codes in `table`. These are
-    the codes of the warp, or separate ones, as in the code, under a name that no other
-    effect has.
+    `position` and `skips` are those of the published warp, because the code of the mask
+    network was not available. Its output is a ReLU, which can be zero for all points
+    and then has no gradient. Here it is a sigmoid, which starts at one half. All bands
+    are open from the start. In the published code they open with those of the warp.
+    `code_width` is the width of the codes in `table`, which are those of the warp. Use
+    another table name for separate codes, as in the published code.
     """
 
     position: EncodingSpec = EncodingSpec(4)
@@ -60,14 +60,14 @@ class MovingMaskSpec:
     def __post_init__(self):
         if self.code_width < 1:
             raise ValueError(
-                f"code_width={self.code_width} must be at least 1: all frames would "
-                "share one mask"
+                f"code_width={self.code_width} must be at least 1; with 0 all frames "
+                "would share one mask"
             )
         if not (math.isfinite(self.weight) and self.weight >= 0):
             raise ValueError(
                 f"weight={self.weight} of the mask must be finite and not negative"
             )
-        network(self)  # refuses wrong depths, widths and skips
+        network(self)  # checks depth, width and skips
 
     @property
     def tables(self) -> tuple[Table, ...]:
@@ -81,11 +81,11 @@ class MovingMaskSpec:
     def apply(
         self, params: MLP, point: Vector, frame: FrameCondition
     ) -> Float[Array, "1"]:
-        """Compute how surely an observed point moves."""
+        """Compute the probability that an observed point moves."""
         return share(self, params, point, frame)[None]
 
     def loss(self, params: MLP, context: PenaltyContext) -> dict[str, Term]:
-        """Compute the difference from the masks of a capture, if it has any."""
+        """Compute the error of the mask, if the capture has masks."""
         return penalty(self, params, context)
 
 
@@ -108,7 +108,7 @@ def network(spec: MovingMaskSpec) -> MLPSpec:
 
 
 def init(spec: MovingMaskSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
-    """Initialize the network, with undecided masks.
+    """Initialize the network with probabilities of one half.
 
     Args:
       spec: Settings.
@@ -124,7 +124,7 @@ def init(spec: MovingMaskSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
 def share(
     spec: MovingMaskSpec, params: MLP, point: Vector, condition: FrameCondition
 ) -> Scalar:
-    """Predict how certainly an observed point moves.
+    """Predict the probability that an observed point moves.
 
     Args:
       spec: Settings.
@@ -138,11 +138,11 @@ def share(
     encoded = encoding.encode(spec.position, point, None)
     inputs = jnp.concatenate([encoded, condition.codes[spec.table]])
     logit = mlp.apply(network(spec), params, inputs)["logit"][0]
-    # By what is left to one: the slope of a sigmoid near one rounds to zero, and what
-    # is wrong for sure would stay so.
-    moves = logit > 0
-    rest = jax.nn.sigmoid(jnp.where(moves, -logit, logit))
-    return jnp.where(moves, 1 - rest, rest)
+    # Near one the gradient of a sigmoid rounds to zero, and a certain but wrong
+    # prediction could not be corrected. The complement keeps its gradient.
+    is_positive = logit > 0
+    smaller = jax.nn.sigmoid(jnp.where(is_positive, -logit, logit))
+    return jnp.where(is_positive, 1 - smaller, smaller)
 
 
 def penalty(
@@ -165,9 +165,9 @@ def penalty(
     batch = context.batch
     column, line = jnp.floor(batch.pixel).astype(jnp.int32).T
     moves = frames.moving[batch.row, line, column]
-    asked = jax.vmap(jax.vmap(functools.partial(share, spec, params), (0, None)))
+    predict = jax.vmap(jax.vmap(functools.partial(share, spec, params), (0, None)))
     error = total(
-        difference(asked(level.point, context.condition), level, moves, batch.valid)
+        difference(predict(level.point, context.condition), level, moves, batch.valid)
         for level in context.levels
     )
     return {"error": Term(error, spec.weight)}
@@ -181,7 +181,7 @@ def difference(
 ) -> Scalar:
     """Compute the mean over valid rays of Σ w |share - mask|, as in the published code.
 
-    The rendering weights get no gradient.
+    The rendering weights have no gradient.
 
     Args:
       shares: Predictions at the samples, [rays, samples].
@@ -193,7 +193,7 @@ def difference(
       A scalar.
     """
     weight = jax.lax.stop_gradient(level.weight)
-    off = jnp.abs(shares - moves[:, None].astype(shares.dtype))
-    error = jnp.sum(weight * off, axis=-1)
+    errors = jnp.abs(shares - moves[:, None].astype(shares.dtype))
+    error = jnp.sum(weight * errors, axis=-1)
     count = jnp.sum(valid, dtype=error.dtype)
     return jnp.sum(jnp.where(valid, error, 0)) / jnp.maximum(count, 1)

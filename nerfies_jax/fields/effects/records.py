@@ -1,4 +1,4 @@
-"""Internal records of the parts of a field, which `render_ray` and the step read."""
+"""Internal records of the components of a field, for rendering and training."""
 
 import dataclasses
 import functools
@@ -19,54 +19,58 @@ from nerfies_jax.training.protocols import (
 
 Vector = Float[Array, "3"]
 Features = Float[Array, " features"]
-TARGETS = ("trunk", "color", "warp")  # readers of a conditioning
+TARGETS = ("trunk", "color", "warp")  # networks that can read a conditioning
 
 
 @dataclasses.dataclass(frozen=True)
 class FieldRecord(Record):
-    """Hooks of a part of a radiance field; None where a part has none.
+    """Hooks of a component of a radiance field. Unused hooks are None.
 
-    All are of one point of one ray, in units of the field. `params` is what the part's
-    `init` returned, None without one.
+    They are functions of one point of one ray, in units of the field. `params` is the
+    result of `init`, or None without `init`.
     """
 
     tables: tuple[Table, ...] = ()
-    # (params, condition) -> what the color branch reads beside the view direction
+    # (params, condition) -> inputs of the color branch, besides the view direction
     condition: Callable[[PyTree, FrameCondition], Features] | None = None
     condition_width: int = 0
     # (params, point, condition) -> displacement: template point minus observed point
     displace: Callable[[PyTree, Vector, FrameCondition], Vector] | None = None
-    # Of that along space: of long ones pictures ask on a grid (`frustum_grid`).
-    # None: not known, and all samples ask.
+    # Shortest wavelength of the displacement in space. If it is long enough, frames are
+    # rendered with displacements on a grid (`frustum_grid`). None if unknown.
     shortest_wave: float | None = None
-    # (params, observed point, condition) -> features the trunk reads beside the point's
-    lift: Callable[[PyTree, Vector, FrameCondition], Features] | None = None
-    lift_width: int = 0
-    # (params, observed point, condition) -> codes of the point by name, which join
-    # those of the frame for every `displace` and `lift`
-    mark: Callable[[PyTree, Vector, FrameCondition], dict[str, Features]] | None = None
-    # (params, level, `effect.Surface`, condition) -> `effect.Look`: what color reads
-    # of each sample, so many features
+    # (params, observed point, condition) -> inputs of the trunk, besides the point,
+    # such as ambient coordinates
+    trunk_features: Callable[[PyTree, Vector, FrameCondition], Features] | None = None
+    trunk_width: int = 0
+    # (params, observed point, condition) -> codes of the point by name, which are added
+    # to those of the frame for all `displace` and `trunk_features` hooks
+    point_codes: (
+        Callable[[PyTree, Vector, FrameCondition], dict[str, Features]] | None
+    ) = None
+    # (params, level, `effect.Surface`, condition) -> `effect.SurfaceOutput`, with
+    # `surface_width` inputs of the color branch for each sample
     surface: Callable[[PyTree, str, Any, FrameCondition], Any] | None = None
     surface_width: int = 0
-    # (params, `effect.Sample`, condition) -> `effect.Medium`; on the last level only
+    # (params, `effect.Sample`, condition) -> `effect.Medium`, on the last level only
     medium: Callable[[PyTree, Any, FrameCondition], Any] | None = None
-    # Least standard deviation of a ray's color, where the medium has a `beta`.
+    # Minimum standard deviation of a ray's color, if the medium has a `beta`.
     beta_min: float | None = None
-    beta_power: float = 0.0  # `transient.photometric`; zero is the likelihood
+    beta_power: float = 0.0  # of `transient.photometric`; zero is the likelihood
 
 
 def compile_warp(warp: Warp) -> FieldRecord:
-    """Compile a warp to the internal record that a field is built from."""
+    """Convert a warp to the internal record."""
     hooks = _hooks(warp, "warp")
-    if hasattr(warp, "lift"):
-        hooks |= {"lift": warp.lift, "lift_width": getattr(warp, "features", 0)}
+    if hasattr(warp, "trunk_features"):
+        hooks["trunk_features"] = warp.trunk_features
+        hooks["trunk_width"] = getattr(warp, "features", 0)
     wave = getattr(warp, "shortest_wave", None)
     return FieldRecord(**hooks, displace=warp.apply, shortest_wave=wave)
 
 
 def compile_conditioning(conditioning: Conditioning) -> FieldRecord:
-    """Compile a conditioning to the internal record."""
+    """Convert a conditioning to the internal record."""
     hooks, target = _hooks(conditioning), conditioning.target
     name, apply, width = hooks["name"], conditioning.apply, conditioning.features
     if target == "color":
@@ -76,16 +80,16 @@ def compile_conditioning(conditioning: Conditioning) -> FieldRecord:
             condition_width=width,
         )
     if target == "trunk":
-        return FieldRecord(**hooks, lift=apply, lift_width=width)
+        return FieldRecord(**hooks, trunk_features=apply, trunk_width=width)
     if target == "warp":
-        return FieldRecord(**hooks, mark=lambda *given: {name: apply(*given)})
+        return FieldRecord(**hooks, point_codes=lambda *args: {name: apply(*args)})
     raise ValueError(
         f"target={target!r} of {name!r} must be one of {', '.join(TARGETS)}"
     )
 
 
 def compile_medium(medium: Medium, features: int) -> FieldRecord:
-    """Compile a medium, for a trunk with so many features, to the internal record."""
+    """Convert a medium to the internal record, for a trunk of `features` features."""
     hooks = _hooks(medium) | {"init": functools.partial(medium.init, features=features)}
     return FieldRecord(
         **hooks,
@@ -96,20 +100,20 @@ def compile_medium(medium: Medium, features: int) -> FieldRecord:
 
 
 def compile_regularizer(regularizer: Regularizer) -> FieldRecord:
-    """Compile a regularizer to the internal record."""
+    """Convert a regularizer to the internal record."""
     return FieldRecord(**regularizer_hooks(regularizer))
 
 
-def _hooks(part, name=None):
-    """The hooks that all parts may have."""
-    rate, penalty = getattr(part, "learning_rate", None), None
-    if hasattr(part, "loss"):
-        penalty = lambda own, context: as_terms(part.loss(own, context))  # noqa: E731
+def _hooks(component, name=None):
+    """Return the hooks that all components can have."""
+    rate, penalty = getattr(component, "learning_rate", None), None
+    if hasattr(component, "loss"):
+        penalty = lambda own, context: as_terms(component.loss(own, context))  # noqa: E731
     return {
-        "name": name or name_of(part),
-        "init": getattr(part, "init", None),
+        "name": name or name_of(component),
+        "init": getattr(component, "init", None),
         "learning_rate": None if rate is None else functools.partial(rate_at, rate),
         "penalty": penalty,
-        "required_data": frozenset(getattr(part, "required_data", ())),
-        "tables": tuple(getattr(part, "tables", ())),
+        "required_data": frozenset(getattr(component, "required_data", ())),
+        "tables": tuple(getattr(component, "tables", ())),
     }

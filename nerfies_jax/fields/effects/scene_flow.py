@@ -1,11 +1,11 @@
 """A time-dependent medium with scene flow (NSFF).
 
-Li et al. 2021, arXiv:2011.13084: no canonical scene and no warp, but a second field of
-point and time, blended with the static one, which predicts its own flow to the next and
-previous timestamps. The field of the next timestamp, evaluated where the flow leads,
-must look like the current one. Weights and sizes are those of the public code. Chains
-over two timestamps (its last stage) and extra rays on moving regions (its first) are
-left out.
+Li et al. 2021, arXiv:2011.13084. There is no canonical scene and no warp. A second
+field of point and time is blended with the static field and predicts its flow to the
+next and previous timestamps. The field at the next timestamp, evaluated at the points
+to which the flow leads, is supervised by the current image. Weights and sizes are those
+of the public code. Chains over two timestamps (its last stage) and extra rays on moving
+regions (its first) are not implemented.
 """
 
 import dataclasses
@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.fields import compositing, template
-from nerfies_jax.fields.effects import learned_moments
 from nerfies_jax.fields.effects import scene_flow_losses as flow_losses
+from nerfies_jax.fields.effects import timestamps
 from nerfies_jax.fields.effects.effect import Medium, RayOutput, Sample, Scalar, Vector
 from nerfies_jax.fields.template import Template, TemplateSpec
 from nerfies_jax.geometry import camera as cameras
@@ -28,7 +28,7 @@ from nerfies_jax.training.effects import FrameCondition, PenaltyContext, Term, t
 from nerfies_jax.training.step_counts import steps
 
 NAME = "scene_flow"
-FORWARD, BACKWARD = 0, 1  # places in everything that has a side
+FORWARD, BACKWARD = 0, 1  # indices of the two directions in time
 SIGNS = (1, -1)
 
 
@@ -36,20 +36,20 @@ SIGNS = (1, -1)
 class FlowWeights:
     """Weights of the loss terms. A term of weight zero is not computed.
 
-    The last two need depth and optical flow of the capture, and decay tenfold every
-    `SceneFlowSpec.decay_steps`.
+    The last two need depth and optical flow of the capture. They decay by a factor of
+    ten every `SceneFlowSpec.decay_steps` steps.
     """
 
-    dynamic: float = 1.0  # squared error of the medium alone
-    warped: float = 1.0  # of the neighboring moments, brought here along the flow
+    dynamic: float = 1.0  # squared error of the medium without the static field
+    warped: float = 1.0  # squared error of neighboring timestamps, warped by the flow
     disocclusion: float = 0.1
-    cycle: float = 1.0  # 0.1 in the code, 1 in its configurations
+    cycle: float = 1.0  # 0.1 in the code, 1 in its configuration files
     magnitude: float = 0.1
     smoothness: float = 0.1
     kinetic: float = 0.1  # the code adds it twice
-    entropy: float = 1e-3  # of the blending
+    entropy: float = 1e-3  # of the blending weight
     depth: float = 0.04
-    flow: float = 0.02  # per pixel
+    flow: float = 0.02  # per pixel of error
 
     def __post_init__(self):
         for name, value in dataclasses.asdict(self).items():
@@ -63,13 +63,13 @@ class FlowWeights:
 class SceneFlowSpec:
     """Settings of the medium and its losses. The defaults are those of the public code.
 
-    `flow_bound` is the largest motion of a point along each axis between two
-    timestamps, in units of the field. After `decay_steps` the medium need no longer
-    explain the whole image by itself, only its share of the blend. `flow_trunk` gives
-    the flow a trunk of its own, of the same size, where the public code reads it from
-    the medium's. Flow initialized from tracks then survives the first steps of the
-    medium. A network on planes of `moments` (HexPlane) reads features of a point at a
-    time instead of a positional encoding.
+    `flow_bound` bounds the motion of a point along each axis between two timestamps, in
+    units of the field. Up to `decay_steps` the medium alone has to explain the whole
+    image, afterwards only its part of the blend. With `flow_trunk` the flow has its own
+    trunk of the same size, which preserves a flow that was initialized from tracks
+    during the first steps of the medium. In the public code flow shares the trunk of
+    the medium. A network on planes with `moments` (HexPlane) reads features of point
+    and time instead of a positional encoding.
     """
 
     network: TemplateSpec = TemplateSpec()
@@ -82,24 +82,25 @@ class SceneFlowSpec:
     def __post_init__(self):
         if not (math.isfinite(self.flow_bound) and self.flow_bound > 0):
             raise ValueError(
-                f"flow_bound={self.flow_bound} must be positive and finite; the box of "
-                "a scene has sides of two"
+                f"flow_bound={self.flow_bound} must be positive and finite; the sides "
+                "of the box of a scene are 2"
             )
         if self.decay_steps < 1:
             raise ValueError(f"decay_steps={self.decay_steps} must be at least 1")
         if self.network.anneal_steps is not None:
             raise ValueError(
-                f"network.anneal_steps={self.network.anneal_steps}: all bands of a "
-                "medium are open from the first step; leave it out (none)"
+                f"network.anneal_steps={self.network.anneal_steps} is not supported by "
+                "a medium, whose bands are always open; set it to none"
             )
         if self.network.reads_time and self.network.position.outside == "refuse":
             raise ValueError(
-                'network.position.outside="refuse": the moments before the first and '
-                'after the last are asked for as well; set "clamp"'
+                'network.position.outside="refuse" is not supported: the medium is '
+                "also evaluated before the first and after the last timestamp; set "
+                '"clamp"'
             )
 
     def bind(self, run_steps: int, metadata: Any) -> "Bound":
-        """Return the medium of a field of this capture."""
+        """Return the medium for a capture."""
         return Bound(self, metadata.times)
 
 
@@ -107,10 +108,10 @@ class SceneFlow(NamedTuple):
     """Parameters."""
 
     network: Template
-    flow: mlp.Layer  # to forward xyz, backward xyz, before the bound
-    disocclusion: mlp.Layer  # to two logits
-    blend: mlp.Layer  # from the static template's features to the logit of the share
-    flow_trunk: mlp.MLP | None = None  # without heads; None where it is the network's
+    flow: mlp.Layer  # output: forward xyz, backward xyz, before the bound
+    disocclusion: mlp.Layer  # output: two logits
+    blend: mlp.Layer  # from features of the static template to the blending logit
+    flow_trunk: mlp.MLP | None = None  # without heads; None to share the network
 
 
 class Dynamic(NamedTuple):
@@ -118,29 +119,29 @@ class Dynamic(NamedTuple):
 
     density: Scalar  # per unit of the field
     color: Vector
-    flow: Float[Array, "2 3"]  # to the next moment and the previous one, field units
-    # Logits of how likely what is there then was hidden or not there now.
+    flow: Float[Array, "2 3"]  # to the next and previous timestamp, field units
+    # Logits of the probability that the point at that timestamp is not visible now.
     disocclusion: Float[Array, "2"]
 
 
 class Neighbor(NamedTuple):
     """Samples of the rays, followed to the next or the previous timestamp."""
 
-    point: Float[Array, "rays samples 3"]  # where the flow leads
-    flow: Float[Array, "rays samples 3"]  # that led there, over one interval
-    back: Float[Array, "rays samples 3"]  # the flow from there to here, likewise
+    point: Float[Array, "rays samples 3"]  # at the other timestamp
+    flow: Float[Array, "rays samples 3"]  # from now to there, over one interval
+    back: Float[Array, "rays samples 3"]  # from there to now, over one interval
     visible: Float[Array, "rays samples"]  # 1 - disocclusion
     disocclusion: Float[Array, "rays samples"]
-    color: Float[Array, "rays 3"]  # of that moment along these rays
-    weight: Float[Array, "rays samples"]  # that it was composited with
-    present: Bool[Array, " rays"]  # whether the capture has that moment
+    color: Float[Array, "rays 3"]  # of the medium at the other timestamp
+    weight: Float[Array, "rays samples"]  # rendering weights of this color
+    present: Bool[Array, " rays"]  # True if the capture has the other timestamp
 
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """The `Medium` of a `SceneFlowSpec` for a capture with these rising times.
+    """The `Medium` of a `SceneFlowSpec` for a capture with these ascending times.
 
-    They need not be even: frames are held out.
+    The times need not be evenly spaced, because frames are held out.
     """
 
     spec: SceneFlowSpec
@@ -149,17 +150,17 @@ class Bound:
     name = NAME
 
     def __post_init__(self):
-        learned_moments.interval(len(self.times))  # refuses none
+        timestamps.interval(len(self.times))  # checks that there are any
 
     @property
     def required_data(self) -> frozenset[str]:
         """Data of the capture that its losses read."""
         weights = self.spec.weights
-        read = {"depths": weights.depth, "flow": weights.flow}
-        return frozenset(name for name, weight in read.items() if weight > 0)
+        weight_of = {"depths": weights.depth, "flow": weights.flow}
+        return frozenset(name for name, weight in weight_of.items() if weight > 0)
 
     def init(self, key: Key[Array, ""], features: int) -> "SceneFlow":
-        """Initialize the networks, for a trunk with so many features."""
+        """Initialize the networks, for a trunk of `features` features."""
         return init(self.spec, key, features)
 
     def apply(
@@ -176,7 +177,7 @@ class Bound:
 def init(
     spec: SceneFlowSpec, key: Key[Array, ""], features: int, dtype=jnp.float32
 ) -> SceneFlow:
-    """Initialize the parameters: small flow, undecided disocclusion and blending.
+    """Initialize the parameters: small flow, logits of disocclusion and blend near 0.
 
     Args:
       spec: Settings.
@@ -188,20 +189,21 @@ def init(
       The parameters.
     """
     network_key, flow_key, disocclusion_key, blend_key = jax.random.split(key, 4)
-    one = spec.network
-    inputs = one.encoded_width + spec.time.width(1)
-    condition = 0 if one.direction is None else one.direction.width(3)
-    flow = mlp.init_layer(flow_key, one.width, 6, "small", dtype)
+    network = spec.network
+    inputs = network.encoded_width + spec.time.width(1)
+    condition = 0 if network.direction is None else network.direction.width(3)
+    flow = mlp.init_layer(flow_key, network.width, 6, "small", dtype)
     trunk = None
     if spec.flow_trunk:
-        trunk_key = jax.random.fold_in(key, 4)  # the others are as without
-        trunk = mlp.init(template.trunk_spec(one, inputs), trunk_key, dtype)
+        # A separate key, so that the other parameters are the same as without it.
+        trunk_key = jax.random.fold_in(key, 4)
+        trunk = mlp.init(template.trunk_spec(network, inputs), trunk_key, dtype)
         trunk = trunk._replace(heads={})
     return SceneFlow(
-        template.init(one, network_key, inputs, condition, dtype),
-        # mlp.SMALL bounds what one feature adds; `width` of them have random signs
-        flow._replace(weight=flow.weight / math.sqrt(one.width)),
-        mlp.init_layer(disocclusion_key, one.width, 2, "small", dtype),
+        template.init(network, network_key, inputs, condition, dtype),
+        # mlp.SMALL bounds the contribution of one feature. They have random signs.
+        flow._replace(weight=flow.weight / math.sqrt(network.width)),
+        mlp.init_layer(disocclusion_key, network.width, 2, "small", dtype),
         mlp.init_layer(blend_key, features, 1, "small", dtype),
         trunk,
     )
@@ -226,20 +228,20 @@ def dynamic(
     Returns:
       Density, color, flow and disocclusion logits.
     """
-    one = spec.network
+    network = spec.network
     features = [
-        template.encode(one, params.network, point, None, time),
-        # time runs from -1 to 1 like the axes of the box
+        template.encode(network, params.network, point, None, time),
+        # The time is scaled to [-1, 1], as the axes of the box.
         encoding.encode(spec.time, 2 * time[None] - 1, None),
     ]
     condition = jnp.zeros(0, point.dtype)
-    if one.direction is not None:
-        condition = encoding.encode(one.direction, direction, None)
+    if network.direction is not None:
+        condition = encoding.encode(network.direction, direction, None)
     inputs = jnp.concatenate(features)
-    sample = template.apply(one, params.network, inputs, condition)
+    sample = template.apply(network, params.network, inputs, condition)
     hidden = sample.features
     if params.flow_trunk is not None:
-        trunk = template.trunk_spec(one, len(inputs))
+        trunk = template.trunk_spec(network, len(inputs))
         hidden = mlp.hidden_features(trunk, params.flow_trunk, inputs)
     flow = spec.flow_bound * jnp.tanh(mlp.affine(params.flow, hidden))
     logits = mlp.affine(params.disocclusion, sample.features)
@@ -249,7 +251,7 @@ def dynamic(
 def medium(
     spec: SceneFlowSpec, params: SceneFlow, sample: Sample, condition: FrameCondition
 ) -> Medium:
-    """Evaluate the medium at one sample, with its share of the opacity.
+    """Evaluate the medium at one sample, with its blending weight.
 
     Args:
       spec: Settings.
@@ -266,17 +268,17 @@ def medium(
     width = params.blend.weight.shape[0]
     if sample.features.shape != (width,):
         raise ValueError(
-            f"the blending reads {width} features of the template, whose trunk has "
-            f"{sample.features.shape[0]}; build the effect with the trunk's width"
+            f"the blending layer reads {width} features, but the trunk of the template "
+            f"has {sample.features.shape[0]}; initialize the effect with this number"
         )
-    own = dynamic(spec, params, sample.point, sample.direction, condition.time)
+    result = dynamic(spec, params, sample.point, sample.direction, condition.time)
     share = mlp.affine(params.blend, sample.features)[0]
     extras = {
-        "flow_forward": own.flow[FORWARD],
-        "flow_backward": own.flow[BACKWARD],
-        "disocclusion": own.disocclusion,
+        "flow_forward": result.flow[FORWARD],
+        "flow_backward": result.flow[BACKWARD],
+        "disocclusion": result.disocclusion,
     }
-    return Medium(own.density, own.color, share=share, extras=extras)
+    return Medium(result.density, result.color, share=share, extras=extras)
 
 
 def neighbor(
@@ -288,8 +290,8 @@ def neighbor(
 ) -> Neighbor:
     """Follow the samples of the last level to the next or previous timestamp.
 
-    If that is more or less than one interval away, because frames are held out, points
-    continue at constant velocity, since only observed frames can be compared.
+    If frames are held out, it may be more than one interval away. Points are then
+    extrapolated at constant velocity, because only observed frames can be compared.
 
     Args:
       spec: Settings.
@@ -305,26 +307,26 @@ def neighbor(
     extras = level.media[NAME].extras
     flow = extras[("flow_forward", "flow_backward")[side]]
     now = context.condition.time
-    time, present = learned_moments.beside(times, now, SIGNS[side])
-    intervals = jnp.abs(time - now) / learned_moments.interval(len(times))
+    time, present = timestamps.neighbor(times, now, SIGNS[side])
+    intervals = jnp.abs(time - now) / timestamps.interval(len(times))
     point = level.point + intervals[:, None, None] * flow
 
-    def ask(point, direction, time):
+    def evaluate(point, direction, time):
         return dynamic(spec, params, point, direction, time)
 
-    # A ray is asked for its samples, whose direction and time are one.
-    there = jax.vmap(jax.vmap(ask, (0, None, None)))(
+    # Nested, because the samples of a ray share its direction and time.
+    neighbor_medium = jax.vmap(jax.vmap(evaluate, (0, None, None)))(
         point, context.batch.direction, time
     )
-    weight = flow_losses.dynamic_weights(level.spacing, there.density)
+    weight = flow_losses.dynamic_weights(level.spacing, neighbor_medium.density)
     logit = extras["disocclusion"][..., side]
     return Neighbor(
         point=point,
         flow=flow,
-        back=there.flow[..., 1 - side, :],
-        visible=jax.nn.sigmoid(-logit),  # 1 - sigmoid(logit) would round to 0
+        back=neighbor_medium.flow[..., 1 - side, :],
+        visible=jax.nn.sigmoid(-logit),  # 1 - sigmoid(logit) rounds to 0
         disocclusion=jax.nn.sigmoid(logit),
-        color=_alone(level, weight, there.color),
+        color=_medium_color(level, weight, neighbor_medium.color),
         weight=weight,
         present=present,
     )
@@ -348,13 +350,13 @@ def penalty(
       Terms by name.
     """
     batch, level = context.batch, context.levels[-1]
-    own = level.media[NAME]
-    weight = flow_losses.dynamic_weights(level.spacing, own.density)
+    medium = level.media[NAME]
+    weight = flow_losses.dynamic_weights(level.spacing, medium.density)
     sides = [neighbor(spec, times, params, context, side) for side in (0, 1)]
-    mask = jnp.where(batch.valid, picture_mask(spec, level, context.step), 0)
+    mask = jnp.where(batch.valid, image_mask(spec, level, context.step), 0)
     values = {
         "dynamic": lambda: flow_losses.weighted_mean(
-            jnp.square(_alone(level, weight, own.color) - batch.color), mask
+            jnp.square(_medium_color(level, weight, medium.color) - batch.color), mask
         ),
         "warped": lambda: total(
             flow_losses.warped(
@@ -382,7 +384,7 @@ def penalty(
         "kinetic": lambda: flow_losses.kinetic(
             sides[0].flow, sides[1].flow, sides[0].present & sides[1].present
         ),
-        "entropy": lambda: flow_losses.entropy(own.share),
+        "entropy": lambda: flow_losses.entropy(medium.share),
     }
     fade = flow_losses.fading(spec.decay_steps, context.step)
     terms = {}
@@ -395,24 +397,24 @@ def penalty(
         error = depth_term(context, weight)
         terms["depth"] = Term(error, spec.weights.depth * fade)
     if spec.weights.flow > 0 and frames.flow is not None:
-        error = flow_term(context, learned_moments.interval(len(times)), weight, sides)
+        error = flow_term(context, timestamps.interval(len(times)), weight, sides)
         terms["flow"] = Term(error, spec.weights.flow * fade)
     return terms
 
 
-def _alone(level, weight, color):
-    """Colors of rays through the medium alone, before what is known to be behind."""
+def _medium_color(level, weight, color):
+    """Composite the medium alone, in front of the known background if there is one."""
     composite = jax.vmap(compositing.composite)
     return composite(weight, color, level.distances, level.background).color
 
 
-def picture_mask(
+def image_mask(
     spec: SceneFlowSpec, level: RayOutput, step: Int[Array, ""]
 ) -> Float[Array, " rays"]:
     """Compute the weight of rays in the loss of the medium alone, without gradient.
 
-    It is one up to `decay_steps`, so that the medium finds geometry to move, and then
-    the opacity of the medium in the blend.
+    It is one up to `decay_steps`, so that the medium learns geometry, and then the
+    opacity of the medium in the blend.
 
     Args:
       spec: Settings.
@@ -427,7 +429,7 @@ def picture_mask(
 
 
 def depth_term(context: PenaltyContext, weight: Float[Array, "rays samples"]) -> Scalar:
-    """Compare the medium's own depth with that of the capture, both normalized.
+    """Compare the depth of the medium alone with that of the capture, normalized.
 
     Args:
       context: Context of the step.
@@ -439,7 +441,7 @@ def depth_term(context: PenaltyContext, weight: Float[Array, "rays samples"]) ->
     batch, level = context.batch, context.levels[-1]
     assert context.frames is not None
     known = _pixels(context.frames.depths, batch.row, batch.pixel)
-    distance = flow_losses.settle(weight, level.distances[..., None])[..., 0]
+    distance = flow_losses.expected_value(weight, level.distances[..., None])[..., 0]
     predicted = distance * batch.cosine / context.box.scale
     return flow_losses.normalized_depth(
         predicted, known.astype(predicted.dtype), batch.valid & (known > 0)
@@ -454,8 +456,8 @@ def flow_term(
 ) -> Scalar:
     """Compare the projected scene flow with the optical flow of the capture.
 
-    The neighboring frame may be more or less than one interval away, if frames are held
-    out. The flow is then scaled for motion at constant velocity.
+    If frames are held out, the neighboring frame may be more than one interval away.
+    The flow is then scaled, which assumes motion at constant velocity.
 
     Args:
       context: Context of the step.
@@ -479,9 +481,9 @@ def flow_term(
         other = rows[batch.row].astype(batch.row.dtype)
         elapsed = sign * (frames.times[other] - context.condition.time) / gap
         point = level.point + elapsed[:, None, None] * one.flow
-        place = flow_losses.settle(weight, point) / context.box.scale
+        expected = flow_losses.expected_value(weight, point) / context.box.scale
         camera = cameras.take(frames.cameras, other)
-        pixel, depth = jax.vmap(cameras.project)(camera, place + context.box.center)
+        pixel, depth = jax.vmap(cameras.project)(camera, expected + context.box.center)
         target = batch.pixel + _pixels(shift, batch.row, batch.pixel).astype(
             pixel.dtype
         )
@@ -492,14 +494,14 @@ def flow_term(
             & one.present
             & (depth > 0)
         )
-        off = jnp.where(counted[:, None], pixel - target, 0)
-        total = total + flow_losses.mean_where(jnp.abs(off), counted)
+        error = jnp.where(counted[:, None], pixel - target, 0)
+        total = total + flow_losses.mean_where(jnp.abs(error), counted)
     return total
 
 
 def _pixels(
-    pictures: Array, row: Int[Array, " rays"], pixel: Float[Array, "rays 2"]
+    images: Array, row: Int[Array, " rays"], pixel: Float[Array, "rays 2"]
 ) -> Array:
-    """Value of an image at the pixel of each ray."""
+    """Return the value of an image at the pixel of each ray."""
     column, line = jnp.floor(pixel).astype(jnp.int32).T
-    return pictures[row, line, column]
+    return images[row, line, column]

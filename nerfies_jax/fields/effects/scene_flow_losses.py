@@ -1,7 +1,7 @@
-"""Loss terms of neural scene flow fields, as functions of arrays alone.
+"""Loss terms of neural scene flow fields, as functions of arrays.
 
 Li et al. 2021, arXiv:2011.13084, with details from the public code. Rays without a
-neighboring timestamp are excluded by `present`. A mean over nothing is zero.
+neighboring timestamp are excluded by `present`. A mean over no rays is zero.
 """
 
 import math
@@ -14,19 +14,19 @@ from nerfies_jax.fields import compositing
 from nerfies_jax.geometry.precision import near_one
 
 Scalar = Float[Array, ""]
-# Mean deviation of the depths of a batch, as a share of their median, below which they
-# count as flat: bounds the normalized depth by a thousand and its gradient.
+# Minimum of the mean deviation of the depths of a batch as a fraction of their median.
+# It bounds normalized depths by a thousand, and their gradients.
 FLATTEST = 1e-3
-# Weights below count as none: the slope of a mean in a weight is up to the values over
-# the largest weight, and float32 holds 3e38.
+# Weights up to this value count as zero. The gradient of a mean by a weight is up to
+# the values over the largest weight, which must not overflow float32.
 FAINTEST = 1e-30
 
 
 def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
-    """Compute the decay of the weight of depth and flow, a factor of ten every so many
-    steps.
+    """Compute the decay of the weights of depth and flow by factors of ten.
 
-    In NSFF these are predictions of other networks, used only for initialization.
+    In NSFF, depth and flow are predictions of other networks, which serve only as
+    initialization.
 
     Args:
       decay_steps: Number of steps for a factor of ten.
@@ -51,14 +51,14 @@ def weighted_mean(
     Returns:
       The mean, and 0 without gradient if no weight exceeds `FAINTEST`.
     """
-    # Selected, not `total + eps`, which fades all weights that are small together. And
-    # of weights near one: a quotient's gradient has the divisor's square, which is 0
-    # in float32 where all weights are below 1e-19, and the gradient then 0 · inf.
-    none = jnp.max(weight) <= FAINTEST
-    scaled, _ = near_one(jnp.where(none, 1, weight))
-    share = jnp.where(none, 0, scaled)
-    total = jnp.where(none, 1, jnp.sum(share))
-    return jnp.sum(share * jnp.mean(values, axis=-1)) / total
+    # Dividing by `total + eps` would reduce the mean if all weights are small. Weights
+    # are scaled to about one, because the gradient of a quotient has the square of the
+    # divisor. In float32 it is 0 if all weights are below 1e-19.
+    is_zero = jnp.max(weight) <= FAINTEST
+    scaled, _ = near_one(jnp.where(is_zero, 1, weight))
+    scaled = jnp.where(is_zero, 0, scaled)
+    total = jnp.where(is_zero, 1, jnp.sum(scaled))
+    return jnp.sum(scaled * jnp.mean(values, axis=-1)) / total
 
 
 def mean_where(
@@ -86,8 +86,8 @@ def warped(
     """Compute the squared error of a neighbor's colors, warped to this timestamp.
 
     Rays are weighted by their composited `visible`, 1 - disocclusion. The rendering
-    weights get no gradient there: density should explain color, not reduce the weight
-    of rays.
+    weights have no gradient in this weight, so that density explains color and does not
+    reduce the weight of rays.
 
     Args:
       color: Rendered colors of the neighbor along the warped rays, [rays, 3].
@@ -100,8 +100,8 @@ def warped(
     Returns:
       The error, a scalar.
     """
-    seen = jnp.sum(jax.lax.stop_gradient(weight) * visible, axis=-1)
-    return weighted_mean(jnp.square(color - target), mask * seen)
+    ray_visible = jnp.sum(jax.lax.stop_gradient(weight) * visible, axis=-1)
+    return weighted_mean(jnp.square(color - target), mask * ray_visible)
 
 
 def cycle(
@@ -132,8 +132,8 @@ def magnitude(
 ) -> Scalar:
     """Compute the mean of |Σ w f| per axis, which prefers a static scene.
 
-    The public code sums over x, y and z where the samples are meant. The rendering
-    weights get no gradient, so that moving regions do not become transparent.
+    The public code sums over x, y and z instead of over samples. The rendering weights
+    have no gradient, so that moving regions do not become transparent.
 
     Args:
       flow: Flow f, [rays, samples, 3].
@@ -150,11 +150,10 @@ def magnitude(
 def smoothness(
     flow: Float[Array, "rays samples 3"], present: Bool[Array, " rays"]
 ) -> Scalar:
-    """Compute the mean difference of the flow of neighboring samples on a ray, per
-    axis.
+    """Compute the mean difference of the flow of neighboring samples, per axis.
 
-    It covers whole rays. The public code leaves out the last 5 %, where its coordinates
-    diverge.
+    It is computed along whole rays. The public code omits the last 5 %, where its
+    coordinates diverge.
 
     Args:
       flow: Flow, [rays, samples, 3].
@@ -186,8 +185,7 @@ def kinetic(
 
 
 def entropy(share_logit: Float[Array, "rays samples"]) -> Scalar:
-    """Compute the mean of -v log v of the blending weight, which prefers 0 or 1 to a
-    half.
+    """Compute the mean of -v log v of the blending weight, which favors 0 and 1.
 
     Args:
       share_logit: Logits of v, [rays, samples].
@@ -195,7 +193,7 @@ def entropy(share_logit: Float[Array, "rays samples"]) -> Scalar:
     Returns:
       A scalar.
     """
-    # log_sigmoid: log(v + 1e-8) has no gradient left where v is small.
+    # log(v + 1e-8) would have almost no gradient for small v.
     share = jax.nn.sigmoid(share_logit)
     return -jnp.mean(share * jax.nn.log_sigmoid(share_logit))
 
@@ -215,11 +213,12 @@ def dynamic_weights(
     return jax.vmap(compositing.weights)(density * spacing)
 
 
-def settle(
+def expected_value(
     weight: Float[Array, "rays samples"], values: Float[Array, "rays samples axes"]
 ) -> Float[Array, "rays axes"]:
-    """Compute the expected value along a ray. Light that passes all samples ends at the
-    last.
+    """Compute the expected value along a ray.
+
+    Light that passes all samples gets the value of the last one.
 
     Args:
       weight: Rendering weights, [rays, samples].
@@ -237,10 +236,9 @@ def normalized_depth(
     target: Float[Array, " rays"],
     known: Bool[Array, " rays"],
 ) -> Scalar:
-    """Compute the squared difference of depths after normalization by median and
-    deviation.
+    """Compute the squared difference of depths normalized by median and deviation.
 
-    It is invariant to scale and offset, like the depth of a single image.
+    It is invariant to scale and offset, like monocular depth.
 
     Args:
       predicted: Rendered depths, [rays].
@@ -260,7 +258,7 @@ def normalized_depth(
 
 
 def _normalize(depth, known):
-    """Zero where unknown. The slopes of median and deviation are kept."""
+    """Normalize by median and mean deviation, with gradients. Unknown depths give 0."""
     count = jnp.sum(known)
     ordered = jnp.sort(jnp.where(known, depth, jnp.inf))
     median = ordered[jnp.maximum((count - 1) // 2, 0)]

@@ -1,10 +1,10 @@
-"""Smooth grids and planes: total variation of neighboring features.
+"""Total variation of grids and planes, a smoothness regularizer.
 
-It is the regularizer that Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, use on their
-voxel grid for real captures. Their text was not at hand. Their code (hustvl/TiNeuVox)
-minimizes a Huber cost of every difference. Here it is the mean of their squares, as in
-K-Planes (arXiv:2301.10241, equation 3). In a hashed grid some vertices are drawn in
-every step.
+Fang et al. 2022 (TiNeuVox), arXiv:2205.15285, use it on their voxel grid for real
+captures. The paper was not available. The published code (hustvl/TiNeuVox) minimizes a
+Huber cost of each difference. Here it is the mean of their squares, as in K-Planes
+(arXiv:2301.10241, equation 3). For a hashed grid it is estimated from random vertices
+in each step.
 """
 
 import dataclasses
@@ -24,15 +24,15 @@ from nerfies_jax.nn.voxels import VoxelGridSpec
 from nerfies_jax.training.effects import PenaltyContext, PyTree, Term, total
 from nerfies_jax.training.step_counts import steps
 
-VARIED = 1024  # vertices of each level of a hashed grid that are drawn in a step
+VARIED = 1024  # random vertices per level of a hashed grid and step
 
 
 @dataclasses.dataclass(frozen=True)
 class SmoothnessSpec:
-    """Weight of the mean squared difference, up to the step `until`."""
+    """Weight of the mean squared difference, which is zero from step `until` on."""
 
     weight: float = 1e-2
-    until: int | None = steps(10_000)  # None: to the end
+    until: int | None = steps(10_000)  # None for the whole run
 
     def __post_init__(self):
         if not (math.isfinite(self.weight) and self.weight >= 0):
@@ -41,8 +41,8 @@ class SmoothnessSpec:
             )
         if self.until is not None and self.until < 1:
             raise ValueError(
-                f"until={self.until} must be at least 1; without smoothness, set the "
-                "effect to none"
+                f"until={self.until} must be at least 1; set the effect to none for no "
+                "smoothness"
             )
 
 
@@ -51,36 +51,36 @@ class Bound:
     """The `Regularizer` of a `SmoothnessSpec` on the templates of a field, by level."""
 
     spec: SmoothnessSpec
-    templates: Mapping[str, object]  # of others than `TemplateSpec` nothing is known
+    templates: Mapping[str, object]  # only `TemplateSpec`s are regularized
 
     name = "smoothness"
 
     def __post_init__(self):
         if not any(map(has_tables, self.templates.values())):
             raise ValueError(
-                "smoothness is of grids and planes, and no template has one; set "
-                "smoothness=none, or choose a preset on a grid"
+                "smoothness regularizes grids and planes, but no template has one; set "
+                "smoothness=none, or choose a preset with a grid"
             )
 
     def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
         """Compute the variation of the tables."""
-        tabled = {
-            name: one
-            for name, one in self.templates.items()
-            if isinstance(one, TemplateSpec) and has_tables(one)
+        with_tables = {
+            name: template
+            for name, template in self.templates.items()
+            if isinstance(template, TemplateSpec) and has_tables(template)
         }
-        found = []
-        for number, (name, one) in enumerate(tabled.items()):
+        variations = []
+        for number, (name, template) in enumerate(with_tables.items()):
             key = jax.random.fold_in(context.key, number)
-            found.append(variation(one, params["template"][name], key))
+            variations.append(variation(template, params["template"][name], key))
         weight: Scalar | float = self.spec.weight
         if self.spec.until is not None:
             weight = jnp.where(context.step < self.spec.until, weight, 0)
-        return {"variation": Term(total(found), weight)}
+        return {"variation": Term(total(variations), weight)}
 
 
 def has_tables(spec: object) -> bool:
-    """Return True if the template reads a point from tables."""
+    """Return True if the template encodes points by tables."""
     return isinstance(spec, TemplateSpec) and not isinstance(
         spec.position, EncodingSpec
     )
@@ -105,5 +105,7 @@ def variation(spec: TemplateSpec, params: Template, key: Key[Array, ""]) -> Scal
         return grids.total_variation(tables[0], position.cells)
     if isinstance(position, HashGridSpec):
         return grids.variation_at_random(position, tables, key, VARIED)
-    every = [planes.total_variation(plane) for level in tables for plane in level.space]
-    return total(every) / (2 * len(every))  # the mean over both axes as well
+    variations = [
+        planes.total_variation(plane) for level in tables for plane in level.space
+    ]
+    return total(variations) / (2 * len(variations))  # mean over planes and axes

@@ -1,11 +1,12 @@
-"""Surface-aware color: color reads the observed position and normal of its surface.
+"""Surface-aware color, which depends on the observed position and normal of a surface.
 
-Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, surface-aware NeRF. The text with its
-equations was not at hand, so its code (JokerYan/NeRF-DS) is followed. A moving specular
-surface shows changing reflections, so color reads the observed point and the normal
-there, next to the view direction. A head of the template predicts the normal in the
-template, and the warp rotates it to where it is observed. It is supervised by the
-gradient of the density, and must not face away from the camera.
+Yan, Li and Lee 2023 (NeRF-DS), arXiv:2303.14435, surface-aware NeRF. The implementation
+follows the published code (JokerYan/NeRF-DS), because the paper's equations were not
+available. The reflections of a moving specular surface change, so color reads the
+observed point and normal in addition to the view direction. A head of the template
+predicts the normal in the template, and the warp rotates it to the observation. It is
+supervised by the gradient of the density and penalized if it faces away from the
+camera.
 """
 
 import dataclasses
@@ -16,7 +17,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from nerfies_jax.fields.effects.effect import Look, RayOutput, Scalar, Surface, Vector
+from nerfies_jax.fields.effects.effect import (
+    RayOutput,
+    Scalar,
+    Surface,
+    SurfaceOutput,
+    Vector,
+)
 from nerfies_jax.fields.effects.records import FieldRecord
 from nerfies_jax.geometry.precision import exact_einsum
 from nerfies_jax.nn import encoding, mlp
@@ -33,17 +40,17 @@ NAME = "surface"
 class SurfaceSpec:
     """Encodings that color reads, and weights of the losses of normals.
 
-    Bands of both encodings are closed for `closed_steps` and open one by one over the
-    next `anneal_steps`, as those of the point in the paper's code. Those of the normal
-    open there from step 10,000 to 12,000. Both weights are those of the code.
+    Bands of both encodings are closed for `closed_steps` and opened one by one over the
+    next `anneal_steps`, as those of the point in the published code. Those of the
+    normal open there from step 10,000 to 12,000. Both weights are those of the code.
 
-    Both losses are weighted by the samples' weights, as a mean over samples, as in the
-    code. The differences are: the normal that must not face away is the observed one,
-    of unit length, and not the output of the head in the template. A normal is rotated
-    by the transpose of the warp's Jacobian, which is exact for every warp and the
-    paper's rotation for a rigid one. It is supervised by the gradient of the template's
-    density, which gets no gradient from it, nor does the trunk. Squares of differences
-    replace their norms, which have no gradient at zero.
+    Both losses are means over samples, weighted by the rendering weights, as in the
+    code. There are these differences. The loss on back-facing normals uses the observed
+    unit normal instead of the output of the head in the template. Normals are rotated
+    by the transpose of the warp's Jacobian, which is exact for all warps, and equal to
+    the rotation of the paper for rigid ones. Normals are supervised by the gradient of
+    the template's density, but neither the density nor the trunk has a gradient from
+    this. Squares of differences replace norms, which have no gradient at zero.
     """
 
     position: EncodingSpec = EncodingSpec(4)
@@ -68,11 +75,11 @@ class SurfaceSpec:
 
 
 def effect(spec: SurfaceSpec, widths: dict[str, int]) -> FieldRecord:
-    """The seams of `spec` on levels whose trunks are so wide."""
+    """Return the hooks of `spec`, for levels with trunks of these widths."""
     return FieldRecord(
         NAME,
         init=lambda key: init(widths, key),
-        surface=functools.partial(look, spec),
+        surface=functools.partial(evaluate, spec),
         surface_width=spec.position.width(3) + spec.normal.width(3),
         penalty=functools.partial(penalty, spec),
     )
@@ -93,19 +100,19 @@ def init(
     """
     keys = jax.random.split(key, len(widths))
     return {
-        name: mlp.init_layer(one, width, 3, "glorot", dtype)
-        for one, (name, width) in zip(keys, widths.items(), strict=True)
+        name: mlp.init_layer(head_key, width, 3, "glorot", dtype)
+        for head_key, (name, width) in zip(keys, widths.items(), strict=True)
     }
 
 
-def look(
+def evaluate(
     spec: SurfaceSpec,
     params: dict[str, Layer],
     level: str,
     surface: Surface,
     condition: FrameCondition,
-) -> Look:
-    """Compute the features of one sample that color reads, and its normals.
+) -> SurfaceOutput:
+    """Compute the inputs of color for one sample, and its normals.
 
     Args:
       spec: Settings.
@@ -115,23 +122,30 @@ def look(
       condition: Conditioning of the frame.
 
     Returns:
-      The features. `found` holds "head", the output of the head, of any length, in the
-      template, "observed", its direction rotated to the observation, and "slope", the
-      direction in which density decreases fastest in the template. The latter two are
-      unit vectors, or zero if there is no direction.
+      The features. `values` contains "head", the output of the head in the template, of
+      any length, "observed", the unit normal in the observation, and "slope", the unit
+      vector along the negative gradient of density in the template. The latter two are
+      zero if there is no direction.
     """
-    # Normals may not bend the density to theirs: within 60 steps of a small run their
-    # slopes through the trunk emptied the scene.
+    # No gradient to the trunk: the gradients of the normal losses emptied the scene
+    # within 60 steps of a small run.
     head = mlp.affine(params[level], jax.lax.stop_gradient(surface.features))
-    observed = unit(surface.turned(unit(head)))
-    # Color may not bend the normals to its liking.
-    seen = jax.lax.stop_gradient(observed)
-    read = [
-        encoding.encode(one, value, window(spec, one, condition.step, value))
-        for one, value in ((spec.position, surface.point), (spec.normal, seen))
+    observed = unit(surface.observed_normal(unit(head)))
+    # No gradient from color to normals, which would otherwise fit color.
+    fixed_normal = jax.lax.stop_gradient(observed)
+    encoded = [
+        encoding.encode(spec_, value, window(spec, spec_, condition.step, value))
+        for spec_, value in (
+            (spec.position, surface.point),
+            (spec.normal, fixed_normal),
+        )
     ]
-    found = {"head": head, "observed": observed, "slope": unit(surface.outward())}
-    return Look(jnp.concatenate(read), found)
+    values = {
+        "head": head,
+        "observed": observed,
+        "slope": unit(surface.template_normal()),
+    }
+    return SurfaceOutput(jnp.concatenate(encoded), values)
 
 
 def window(
@@ -162,8 +176,8 @@ def window(
 def unit(vector: Vector) -> Vector:
     """Normalize a vector. Zero stays zero, with zero gradient.
 
-    It is divided by its largest entry first, since the square of 1e-20, and of 1e20, is
-    outside of the range of float32.
+    It is divided by its largest entry first, because the squares of 1e-20 and 1e20 are
+    out of the range of float32.
 
     Args:
       vector: A vector, [3].
@@ -172,12 +186,12 @@ def unit(vector: Vector) -> Vector:
       The unit vector, [3].
     """
     largest = jnp.max(jnp.abs(vector))
-    there = largest > 0
-    # Its own slope would cancel.
-    largest = jax.lax.stop_gradient(jnp.where(there, largest, 1))
-    scaled = jnp.where(there, vector, 1) / largest
+    nonzero = largest > 0
+    # The gradient with respect to the scale is zero, so it need not be computed.
+    largest = jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
+    scaled = jnp.where(nonzero, vector, 1) / largest
     length = jnp.sqrt(jnp.sum(scaled**2))
-    return jnp.where(there, scaled / length, 0)
+    return jnp.where(nonzero, scaled / length, 0)
 
 
 def penalty(spec: SurfaceSpec, _, context: PenaltyContext) -> dict[str, Term]:
@@ -209,8 +223,8 @@ def costs_of(
 ) -> tuple[Scalar, Scalar]:
     """Compute the means over samples of w |head - slope|² and of w max(0, n·d)².
 
-    The rendering weights get no gradient, nor do the gradients of the density. Samples
-    without a gradient of the density do not count in the first.
+    The rendering weights and the gradients of the density are constants. The first loss
+    ignores samples where the density has no gradient.
 
     Args:
       level: Output of the level.
@@ -220,13 +234,13 @@ def costs_of(
     Returns:
       The two losses, scalars.
     """
-    found = level.looks[NAME]
+    values = level.surfaces[NAME]
     weight = jnp.where(valid[:, None], jax.lax.stop_gradient(level.weight), 0)
-    slope = jax.lax.stop_gradient(found["slope"])
+    slope = jax.lax.stop_gradient(values["slope"])
     known = jnp.any(slope != 0, axis=-1)
-    off = jnp.sum((found["head"] - slope) ** 2, axis=-1)
-    facing = exact_einsum("rsk,rk->rs", found["observed"], direction)
+    error = jnp.sum((values["head"] - slope) ** 2, axis=-1)
+    facing = exact_einsum("rsk,rk->rs", values["observed"], direction)
     return (
-        jnp.mean(jnp.where(known, weight * off, 0)),
+        jnp.mean(jnp.where(known, weight * error, 0)),
         jnp.mean(weight * jnp.maximum(facing, 0) ** 2),
     )

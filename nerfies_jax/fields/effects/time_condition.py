@@ -1,9 +1,9 @@
-"""T-NeRF: the template reads the time, and nothing is warped.
+"""T-NeRF: a template that reads the time, without a warp.
 
-It is the baseline of D-NeRF (Pumarola et al. 2020, arXiv:2011.13961: a network of
-position, direction and time) and of DyCheck (Gao et al. 2022, arXiv:2210.13445), where
-the time is a code of the frame. On DyCheck's captures by one moving camera it has a
-higher PSNR than Nerfies. It provides no correspondence between times.
+It is the baseline of D-NeRF (Pumarola et al. 2020, arXiv:2011.13961, a network of
+position, direction and time) and of DyCheck (Gao et al. 2022, arXiv:2210.13445, with a
+code of the frame instead of the time). On the monocular captures of DyCheck its PSNR is
+higher than that of Nerfies. It provides no correspondence between times.
 """
 
 import dataclasses
@@ -21,8 +21,8 @@ CONDITIONS = ("time", "code")
 class TimeSpec:
     """Settings of the time features that the template reads.
 
-    `condition="time"` is the time in [0, 1] under `encoding`, and "code" is the code of
-    the frame from the table `table`, which warps may share.
+    `condition="time"` is the time in [0, 1], encoded by `encoding`. "code" is the code
+    of the frame from the table `table`, which warps may share.
     """
 
     encoding: EncodingSpec = EncodingSpec(4)
@@ -41,13 +41,13 @@ class TimeSpec:
             )
         if self.code_width < 1:
             raise ValueError(
-                f"code_width={self.code_width} must be at least 1: all frames would be "
-                "alike"
+                f"code_width={self.code_width} must be at least 1; with 0 all frames "
+                "would be equal"
             )
 
     @property
     def features(self) -> int:
-        """Number of features that the trunk reads in addition."""
+        """Number of additional features that the trunk reads."""
         by_code = self.condition == "code"
         return self.code_width if by_code else self.encoding.width(1)
 
@@ -61,7 +61,7 @@ class TimeSpec:
     def apply(
         self, params: None, point: Vector | None, frame: FrameCondition
     ) -> Float[Array, " features"]:
-        """Compute the features of a frame, the same at all points."""
+        """Compute the features of a frame, which are the same at all points."""
         return features(self, frame)
 
 

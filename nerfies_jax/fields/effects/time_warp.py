@@ -1,11 +1,12 @@
-"""Motion of TiNeuVox: a small network shifts points by an embedding of the time.
+"""Motion of TiNeuVox: a small network shifts points, given an embedding of the time.
 
 Fang et al. 2022, arXiv:2205.15285, "coordinate deformation" and "radiance network". The
-text with its equations was not at hand, so its code (hustvl/TiNeuVox) is followed. One
-network embeds the encoded time. A second, small one reads the embedding and the encoded
-point and returns the shift to the template. The radiance network reads the embedding
-and the encoded observed point as well, and so corrects errors of such a small
-deformation. Time 0 is not special.
+implementation follows the published code (hustvl/TiNeuVox), because the paper's
+equations were not available. One network embeds the encoded time. A second small
+network maps the embedding and the encoded point to the shift into the template. The
+radiance network also reads the embedding and the encoded observed point, which
+compensates for errors of the small deformation network. The shift at time 0 is not zero
+by construction.
 """
 
 import dataclasses
@@ -25,11 +26,11 @@ from nerfies_jax.training.effects import FrameCondition
 
 @dataclasses.dataclass(frozen=True)
 class TimeWarpSpec:
-    """Sizes of the networks. The defaults are those of the code's larger model.
+    """Sizes of the networks. The defaults are those of the larger published model.
 
-    `embedding` is the width of the time embedding, computed with one hidden layer of
-    `width`. The shift has `depth` of them. It starts near zero, where that of the code
-    starts like any layer.
+    `embedding` is the width of the time embedding, whose network has one hidden layer
+    of `width`. The network of the shift has `depth` hidden layers of `width`. The shift
+    starts near zero. In the published code its layer is initialized like any other.
     """
 
     position: EncodingSpec = EncodingSpec(10)
@@ -41,14 +42,14 @@ class TimeWarpSpec:
     def __post_init__(self):
         if self.embedding < 1:
             raise ValueError(
-                f"embedding={self.embedding} must be at least 1: all times would be "
-                "alike"
+                f"embedding={self.embedding} must be at least 1; with 0 the scene "
+                "would not depend on time"
             )
-        shift_network(self)  # refuses wrong depths and widths
+        shift_network(self)  # checks depth and width
 
     @property
     def features(self) -> int:
-        """Number of features that the trunk reads in addition."""
+        """Number of additional features that the trunk reads."""
         return self.position.width(3) + self.embedding
 
     def init(self, key: Key[Array, ""]) -> "TimeWarp":
@@ -59,10 +60,10 @@ class TimeWarpSpec:
         """Compute the displacement of a point."""
         return displace(self, params, point, frame)
 
-    def lift(
+    def trunk_features(
         self, params: "TimeWarp", point: Vector, frame: FrameCondition
     ) -> Float[Array, " features"]:
-        """Compute what the trunk reads in addition."""
+        """Compute the additional features that the trunk reads."""
         return features(self, params, point, frame)
 
 
@@ -70,7 +71,7 @@ class TimeWarp(NamedTuple):
     """Parameters."""
 
     time: MLP  # head "embedding"
-    shift: MLP  # of [encoded point, embedding]; head "linear"
+    shift: MLP  # reads [encoded point, embedding]; head "linear"
 
 
 def time_network(spec: TimeWarpSpec) -> MLPSpec:
@@ -101,8 +102,7 @@ def shift_network(spec: TimeWarpSpec) -> MLPSpec:
 
 
 def init(spec: TimeWarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> TimeWarp:
-    """Initialize near the identity: in a box of side two no point moves by more than
-    1e-4.
+    """Initialize near the identity. In a box of side two, shifts are at most 1e-4.
 
     Args:
       spec: Settings.
@@ -116,7 +116,7 @@ def init(spec: TimeWarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> TimeWarp
     network = shift_network(spec)
     shift = mlp.init(network, shift_key, dtype)
     head = shift.heads["linear"]
-    # mlp.SMALL bounds what each feature adds; their sum has random signs.
+    # mlp.SMALL bounds the contribution of one feature. They add up with random signs.
     head = head._replace(weight=head.weight / math.sqrt(network.features))
     shift = shift._replace(heads={"linear": head})
     return TimeWarp(mlp.init(time_network(spec), time_key, dtype), shift)
@@ -154,9 +154,10 @@ def displace(
       Template point minus observed point in units of the field, [3].
     """
     network = shift_network(spec)
-    # Under vmap over the samples of a ray the time's product is made once.
-    known = embed(spec, params, condition.time)
-    at_time = mlp.with_known(network, params.shift, known)
+    # Under vmap over the samples of a ray, the contribution of the time is computed
+    # once.
+    embedding = embed(spec, params, condition.time)
+    at_time = mlp.with_known(network, params.shift, embedding)
     encoded = encoding.encode(spec.position, point, None)
     return mlp.apply(network, at_time, encoded)["linear"]
 

@@ -1,8 +1,8 @@
 """Warp from an observed point to its position in the template.
 
-Nerfies (Park et al. 2021, arXiv:2011.12948) moves each point by a rigid transform of
-its own, and D-NeRF (Pumarola et al. 2020, arXiv:2011.13961) translates it. Both map the
-observation to the template, and both are written here as the displacement of one point,
+Nerfies (Park et al. 2021, arXiv:2011.12948) moves each point by its own rigid
+transform, and D-NeRF (Pumarola et al. 2020, arXiv:2011.13961) translates it. Both map
+the observation to the template. Both are computed here as the displacement of a point,
 from which `matrix3.displacement_log_energy` computes an exact elastic energy.
 """
 
@@ -29,12 +29,13 @@ CONDITIONS = ("code", "time")
 class WarpSpec:
     """Form and size of the warp. The defaults are those of Nerfies (Park et al. 2021).
 
-    `condition="code"` reads a code of the frame, from the table `table`. "time" reads
-    the encoded time, and then time 0 is the template itself (D-NeRF). `anneal_steps`
-    opens the bands of `position` one by one over so many steps (coarse to fine), and
-    None has them open from the start. Without identity in `position`, step 0 of an
-    annealed warp moves all points of a frame alike. `guides` names per-point codes, one
-    number each, that it reads as well. A field with a mask of moving points adds it.
+    With `condition="code"` the warp reads a code of the frame from the table `table`.
+    With "time" it reads the encoded time, and the observation at time 0 is the template
+    (D-NeRF). `anneal_steps` is the number of steps over which the bands of `position`
+    are opened one by one (coarse to fine). None opens all from the start. Without
+    identity in `position`, an annealed warp moves all points of a frame alike at step
+    0. `guides` names scalar per-point codes that the warp also reads. A field with a
+    mask of moving points adds its code.
     """
 
     kind: str = "se3"
@@ -59,15 +60,15 @@ class WarpSpec:
             )
         if self.code_width < 1:
             raise ValueError(
-                f"code_width={self.code_width} must be at least 1: all frames would "
-                "share one warp"
+                f"code_width={self.code_width} must be at least 1; with 0 all frames "
+                "would share one warp"
             )
         if self.anneal_steps is not None and self.anneal_steps < 1:
             raise ValueError(
-                f"anneal_steps={self.anneal_steps} must be at least 1; None opens all "
-                "bands at once"
+                f"anneal_steps={self.anneal_steps} must be at least 1, or None to open "
+                "all bands from the start"
             )
-        network(self)  # refuses wrong depths, widths and skips
+        network(self)  # checks depth, width and skips
 
     @property
     def tables(self) -> tuple[Table, ...]:
@@ -91,8 +92,7 @@ class WarpSpec:
 
 
 def network(spec: WarpSpec) -> MLPSpec:
-    """Return the settings of the network from [encoded point, condition] to twist or
-    shift.
+    """Return the settings of the network from [encoded point, condition] to motion.
 
     Args:
       spec: Settings.
@@ -112,11 +112,10 @@ def network(spec: WarpSpec) -> MLPSpec:
 
 
 def init(spec: WarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
-    """Initialize near the identity: in a box of side two no point moves by more than
-    2e-4.
+    """Initialize near the identity. In a box of side two, shifts are at most 2e-4.
 
-    Weights that read an annealed band start at zero. They get no gradient until it
-    opens, and random ones would then deform a trained warp.
+    Weights of an annealed band start at zero. They have no gradient until the band
+    opens, and random weights would then deform a trained warp.
 
     Args:
       spec: Settings.
@@ -127,7 +126,7 @@ def init(spec: WarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
       The parameters.
     """
     params = mlp.init(network(spec), key, dtype)
-    # mlp.SMALL bounds what each feature adds; their sum has random signs.
+    # mlp.SMALL bounds the contribution of one feature. They add up with random signs.
     heads = {
         name: head._replace(weight=head.weight / math.sqrt(network(spec).features))
         for name, head in params.heads.items()
@@ -135,17 +134,17 @@ def init(spec: WarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
     hidden = list(params.hidden)
     if spec.anneal_steps is not None:
         for index in ({0} | set(spec.skips)) & set(range(spec.depth)):
-            above = spec.width if index else 0  # rows that read the layer before
-            hidden[index] = _closed(spec, hidden[index], above)
+            offset = spec.width if index else 0  # rows that read the previous layer
+            hidden[index] = _without_bands(spec, hidden[index], offset)
         if not hidden:
-            heads = {name: _closed(spec, head, 0) for name, head in heads.items()}
+            heads = {n: _without_bands(spec, head, 0) for n, head in heads.items()}
     return MLP(tuple(hidden), heads)
 
 
-def _closed(spec, layer, above):
-    """The layer, which reads the bands behind so many rows, without them."""
+def _without_bands(spec, layer, offset):
+    """Set the weights of the bands of the point, from row `offset` on, to zero."""
     first = 3 if spec.position.identity else 0
-    rows = slice(above + first, above + spec.position.width(3))
+    rows = slice(offset + first, offset + spec.position.width(3))
     return layer._replace(weight=layer.weight.at[rows].set(0))
 
 
@@ -169,8 +168,8 @@ def displace(
         code = jnp.concatenate([condition.codes[spec.table], *guides])
         return _move(spec, params, point, encoded, code)
     time = encoding.encode(spec.time, condition.time[None], None)
-    moved = _move(spec, params, point, encoded, jnp.concatenate([time, *guides]))
-    return jnp.where(condition.time == 0, 0, moved)
+    shift = _move(spec, params, point, encoded, jnp.concatenate([time, *guides]))
+    return jnp.where(condition.time == 0, 0, shift)
 
 
 def window(
@@ -202,10 +201,10 @@ def _move(spec, params, point, encoded, condition):
 
 
 def _features(spec, params, encoded, condition):
-    """`mlp.hidden_features` of [encoded, condition], the condition's product apart.
+    """Evaluate `mlp.hidden_features` of [encoded, condition].
 
-    Under vmap over the samples of a ray it is then computed once for the ray, and under
-    forward mode not at all.
+    The contribution of the condition is computed separately: once per ray under vmap
+    over samples, and without tangents in forward mode.
     """
     if not params.hidden:  # the heads read both
         return jnp.concatenate([encoded, condition])
@@ -215,9 +214,9 @@ def _features(spec, params, encoded, condition):
         if index in spec.skips:
             hidden = jnp.concatenate([hidden, encoded])
         if index == 0 or index in spec.skips:
-            ours, theirs = jnp.split(layer.weight, [hidden.shape[-1]])
-            offset = condition @ theirs + layer.bias
-            hidden = activation(dense.product(hidden, ours) + offset)
+            of_hidden, of_condition = jnp.split(layer.weight, [hidden.shape[-1]])
+            offset = condition @ of_condition + layer.bias
+            hidden = activation(dense.product(hidden, of_hidden) + offset)
         else:
             hidden = activation(mlp.affine(layer, hidden))
     return hidden

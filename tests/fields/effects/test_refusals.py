@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from nerfies_jax.fields.effects import learned_moments
+from nerfies_jax.fields.effects import timestamps
 from nerfies_jax.fields.effects.ambient import AmbientSpec
 from nerfies_jax.fields.effects.appearance import AppearanceSpec
 from nerfies_jax.fields.effects.background import BackgroundSpec
@@ -22,7 +22,7 @@ from nerfies_jax.nn.planes import PlanesSpec
 
 STRICT = TemplateSpec(PlanesSpec(moments=4, outside="refuse"))
 REFUSED = [
-    (AmbientSpec, {"kind": "curved"}, "unknown kind of slice 'curved'.*bent"),
+    (AmbientSpec, {"kind": "curved"}, "unknown kind of slicing surface 'curved'.*bent"),
     (AmbientSpec, {"dims": 0}, "dims=0 must be at least 1.*none"),
     (AmbientSpec, {"code_width": 0}, "code_width=0"),
     (AmbientSpec, {"anneal_steps": 0}, "anneal_steps=0"),
@@ -37,7 +37,7 @@ REFUSED = [
     (BackgroundSpec, {"width": math.inf}, "finite width > 0, got inf"),
     (BackgroundSpec, {"scaling": "twice"}, "'twice'"),
     (ElasticSpec, {"points": 0}, "points=0.*None"),
-    (ElasticSpec, {"every": 0}, "every=0.*each step"),
+    (ElasticSpec, {"every": 0}, "every=0.*every step"),
     (ElasticSpec, {"weight": -1.0}, "weight=-1"),
     (ElasticSpec, {"fold_cost": math.nan}, "fold_cost=nan"),
     (ElasticSpec, {"robust_width": 0.0}, "width > 0"),
@@ -53,10 +53,10 @@ REFUSED = [
     (SceneFlowSpec, {"flow_bound": math.nan}, "flow_bound=nan"),
     (SceneFlowSpec, {"decay_steps": 0}, "decay_steps=0"),
     (SceneFlowSpec, {"network": TemplateSpec(anneal_steps=9)}, "anneal_steps=9.*none"),
-    (SceneFlowSpec, {"network": STRICT}, "moments before the first.*clamp"),
+    (SceneFlowSpec, {"network": STRICT}, "before the first.*clamp"),
     (FlowWeights, {"cycle": -1.0}, "cycle=-1"),
     (FlowWeights, {"depth": math.inf}, "depth=inf"),
-    (learned_moments.interval, {"moments": 0}, "moments=0"),
+    (timestamps.interval, {"moments": 0}, "moments=0"),
     (SmoothnessSpec, {"weight": -1.0}, "weight=-1.0"),
     (SmoothnessSpec, {"until": 0}, "until=0.*none"),
     (TimeWarpSpec, {"embedding": 0}, "embedding=0"),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.fields.effects import learned_moments, scene_flow
+from nerfies_jax.fields.effects import scene_flow, timestamps
 from nerfies_jax.fields.effects.effect import Sample
 from nerfies_jax.fields.effects.scene_flow import FlowWeights
 from nerfies_jax.nn.planes import PlanesSpec
@@ -192,7 +192,7 @@ def test_neighbors_are_moments_that_were_filmed(held_out, dtype):
     filmed = np.arange(40) / 39
     learned = np.delete(filmed, np.arange(0, 40, held_out)).astype(np.float32)
     times = tuple(float(time) for time in learned)
-    beside = jax.jit(learned_moments.beside, static_argnums=(0, 2))
+    beside = jax.jit(timestamps.neighbor, static_argnums=(0, 2))
     now = jnp.asarray(learned, dtype)
     for sign in scene_flow.SIGNS:
         found, present = beside(times, now, sign)

@@ -10,7 +10,7 @@ from tests import gradients
 
 entropy = jax.jit(jax.value_and_grad(flow_losses.entropy))
 normalized_depth = jax.jit(jax.value_and_grad(flow_losses.normalized_depth))
-settle = jax.jit(flow_losses.settle)
+expected_value = jax.jit(flow_losses.expected_value)
 
 
 @jax.jit
@@ -66,8 +66,8 @@ def test_entropy_is_finite_however_sure_it_is(dtype, logit):
 def test_expected_values_are_weighed_and_what_passes_ends_at_the_last(float64):
     values = np.array([[[1.0], [2.0], [5.0]]])
     weight = np.array([[0.5, 0.2, 0.1]])
-    np.testing.assert_allclose(settle(weight, values), 0.9 + 0.5 + 1.0)
-    nothing = settle(np.zeros((1, 3)), values)
+    np.testing.assert_allclose(expected_value(weight, values), 0.9 + 0.5 + 1.0)
+    nothing = expected_value(np.zeros((1, 3)), values)
     np.testing.assert_array_equal(nothing, [[5.0]])
 
 
@@ -130,7 +130,7 @@ def test_slopes_are_those_of_differences(float64, rng):
             + flow_losses.smoothness(flow, present)
             + flow_losses.kinetic(flow, back, present)
             + 10 * flow_losses.entropy(4 * seen - 2)
-            + jnp.sum(flow_losses.settle(through, flow) ** 2)
+            + jnp.sum(flow_losses.expected_value(through, flow) ** 2)
             + flow_losses.normalized_depth(depth, other, present)
         )
 

@@ -144,7 +144,7 @@ def test_normals_and_colors_of_a_ray_are_those_written_out(number, float64):
     levels, direction, code = seen(params, "float64")
     level, name = levels[number], ("coarse", "fine")[number]
     by_hand = ByHand(params, code)
-    found = level.looks["surface"]
+    found = level.surfaces["surface"]
     for row, x in enumerate(np.asarray(level.point)):
         np.testing.assert_allclose(level.warped[row], by_hand.warped(x), atol=1e-12)
         expected = by_hand.normals(name, x)
@@ -165,7 +165,7 @@ def test_float32_normals_are_those_of_float64():
     for key, value in zip(
         ("head", "observed", "slope"), by_hand.normals("fine", x), strict=True
     ):
-        found = levels[-1].looks["surface"][key][2]
+        found = levels[-1].surfaces["surface"][key][2]
         assert found.dtype == jnp.float32
         np.testing.assert_allclose(found, value, rtol=0, atol=2e-4, err_msg=key)
 
@@ -185,7 +185,7 @@ def test_a_rigid_warp_turns_normals_as_it_turns_back(float64, rng):
     when = FrameCondition(jnp.asarray(0.3), {"motion": jnp.zeros(3)}, jnp.int32(0))
     ray = field_ray.Ray(*map(jnp.asarray, (np.zeros(3), np.eye(3)[2], 0.1, 0.9)))
     level = jax.jit(field_of(still).render_ray)(params, ray, when)[-1]
-    found = level.looks["surface"]
+    found = level.surfaces["surface"]
     unit = np.asarray(found["head"])
     unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
     turned = level.warped[1] - level.warped[0]
@@ -212,17 +212,19 @@ def level_of(weight, found, dtype):
     flat = jnp.zeros(len(weight), dtype)
     weight = jnp.asarray(weight, dtype)
     parts = (weight, zeros, zeros, weight, {}, {}, zeros[:, 0], flat, flat, flat)
-    return RayOutput(*parts, None, weight, None, looks={"surface": looks})
+    return RayOutput(*parts, None, weight, None, surfaces={"surface": looks})
 
 
 def test_costs_of_normals_are_those_of_a_loop(dtype):
     level, direction = looked(dtype)
-    slopes = level.looks["surface"]["slope"].at[1, 2].set(0)  # nothing is known there
-    level.looks["surface"]["slope"] = slopes
+    slopes = (
+        level.surfaces["surface"]["slope"].at[1, 2].set(0)
+    )  # nothing is known there
+    level.surfaces["surface"]["slope"] = slopes
     valid = jnp.asarray([True, True, False, True, True])
     slope, facing = jax.jit(surface.costs_of)(level, direction, valid)
     expected = np.zeros(2)
-    found, weight = networks.exact(level.looks["surface"]), np.asarray(level.weight)
+    found, weight = networks.exact(level.surfaces["surface"]), np.asarray(level.weight)
     for r in range(5):
         for s in range(4):
             if not valid[r]:
@@ -332,11 +334,11 @@ def test_gradients(float64):
     assert gradients.directional_error(mask_error, params["mask"], point) < 1e-6
 
     def normal_costs(head, observed):
-        found = level.looks["surface"] | {"head": head, "observed": observed}
-        one = level._replace(looks={"surface": found})
+        found = level.surfaces["surface"] | {"head": head, "observed": observed}
+        one = level._replace(surfaces={"surface": found})
         return sum(surface.costs_of(one, direction, jnp.ones(5, bool)))
 
-    found = {k: np.asarray(v) for k, v in level.looks["surface"].items()}
+    found = {k: np.asarray(v) for k, v in level.surfaces["surface"].items()}
     error = gradients.directional_error(normal_costs, found["head"], found["observed"])
     assert error < 1e-6
 

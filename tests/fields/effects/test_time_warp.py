@@ -38,7 +38,7 @@ def test_shift_and_features_are_those_of_the_layers(time, dtype, rng):
     @functools.partial(jax.vmap, in_axes=(None, 0))
     def both(params, point):
         when = at(time, dtype)
-        return SPEC.apply(params, point, when), SPEC.lift(params, point, when)
+        return SPEC.apply(params, point, when), SPEC.trunk_features(params, point, when)
 
     shifts, lifted = both(params, points)
     assert shifts.dtype == lifted.dtype == dtype

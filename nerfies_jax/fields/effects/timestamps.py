@@ -18,11 +18,11 @@ def interval(moments: int) -> float:
       ValueError: If there are none.
     """
     if moments < 1:
-        raise ValueError(f"a capture has at least one moment, got moments={moments}")
+        raise ValueError(f"moments={moments} must be at least 1 timestamp")
     return 1 / (moments - 1) if moments > 1 else 2.0
 
 
-def beside(
+def neighbor(
     times: tuple[float, ...], time: Float[Array, " rays"], sign: int
 ) -> tuple[Float[Array, " rays"], Bool[Array, " rays"]]:
     """Find the training timestamp after or before the one nearest to a time.
@@ -36,10 +36,10 @@ def beside(
       Timestamps [rays], one interval away if there is none, and booleans [rays] that
       are True if there is one.
     """
-    known = np.asarray(times)
-    between = jnp.asarray((known[1:] + known[:-1]) / 2, time.dtype)
-    place = jnp.searchsorted(between, time) + sign
-    present = (place >= 0) & (place < len(times))
-    beside = jnp.asarray(known, time.dtype)[jnp.clip(place, 0, len(times) - 1)]
-    away = time + sign * interval(len(times))
-    return jnp.where(present, beside, away), present
+    timestamps = np.asarray(times)
+    midpoints = jnp.asarray((timestamps[1:] + timestamps[:-1]) / 2, time.dtype)
+    index = jnp.searchsorted(midpoints, time) + sign
+    present = (index >= 0) & (index < len(times))
+    nearest = jnp.asarray(timestamps, time.dtype)[jnp.clip(index, 0, len(times) - 1)]
+    extrapolated = time + sign * interval(len(times))
+    return jnp.where(present, nearest, extrapolated), present
