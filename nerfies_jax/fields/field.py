@@ -1,4 +1,4 @@
-"""A radiance field as pure functions: rendering, warping and latent codes."""
+"""A radiance field as pure functions: rendering, displacement and latent codes."""
 
 import dataclasses
 import functools
@@ -43,19 +43,20 @@ class Field(NamedTuple):
     metadata: SceneMetadata
     effects: tuple[FieldRecord, ...]
     init: Callable[[Key[Array, ""]], PyTree]
-    codes_at: Callable[[PyTree, View], Codes]  # of a view, by table
-    # (params, ray, condition, key, guide) -> its levels, coarse to fine. Without a key
-    # nothing is random, without a guide (cells that are filled) samples are even.
+    codes_at: Callable[[PyTree, View], Codes]  # codes of a view by table
+    # (params, ray, condition, key, guide) -> outputs of the levels, coarse to fine.
+    # Without a key nothing is random. Without a guide (occupied cells) the first
+    # samples are evenly spaced.
     render_ray: Callable[..., tuple[RayOutput, ...]]
     # (params, point, condition) -> template point minus observed point, field units
     displace: Callable[[PyTree, Vector, FrameCondition], Vector]
     # (params, camera, time, codes, size, step) -> whole frame
     render: Callable[..., Rendering]
-    # (params, step) -> `skipping.Occupancy` at any time, of a field that warps move in
-    # template space: without a level where each frame is surveyed by itself; None where
-    # space cannot be skipped
+    # (params, step) -> `skipping.Occupancy` for all times, for fields with warps in the
+    # coordinates of the template. It is empty if each frame has to be surveyed by
+    # itself. None if empty space cannot be skipped.
     survey: Callable[..., Occupancy] | None
-    # `render` behind an occupancy, without slopes
+    # (params, occupancy, ...) -> the same frame as `render`, not differentiable
     render_occupied: Callable[..., Rendering]
 
 
@@ -65,10 +66,10 @@ def field(
     without: tuple[str, ...] = (),
     effects: tuple[FieldRecord, ...] = (),
 ) -> Field:
-    """Make the field of a spec and further effects, with some left out.
+    """Make the field of a spec and further effects, optionally without some of them.
 
-    Without "warp" it renders the canonical scene, and without "transient" or
-    "scene_flow" only the static scene. The parameters stay those of the whole field.
+    Without "warp" it renders the template, and without "transient" or "scene_flow" only
+    the static scene. The parameters are always those of the complete field.
 
     Args:
       spec: The scene.
@@ -104,7 +105,8 @@ def field(
     still = tuple(dataclasses.replace(effect, displace=None) for effect in active)
 
     def surveyed_once():
-        # Warps that a grid is read for say where the template is asked, at all times.
+        # With displacements on a grid, the template is surveyed, which is the same at
+        # all times.
         return not moves or frustum_grid.resolves(bind({}))
 
     def survey(params, step):
@@ -272,7 +274,7 @@ def look_up(
 
 
 def _place_in_time(metadata, time):
-    """Rows before and after a time, and the position in between."""
+    """Return the rows before and after a time, and the position in between."""
     times = jnp.asarray(metadata.times, time.dtype)
     last = max(len(metadata.times) - 2, 0)
     left = jnp.clip(jnp.searchsorted(times, time, side="right") - 1, 0, last)

@@ -14,7 +14,7 @@ from nerfies_jax.geometry.camera import Camera
 Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
 
-LOOKS = 64  # at the cells along a ray, as many as there are across
+LOOKS = 64  # points along a ray at which occupancy is read, as many as cells
 
 
 class Ray(NamedTuple):
@@ -31,7 +31,7 @@ def field_ray(
 ) -> Ray:
     """Convert a ray to the coordinates of the field, between the near and far planes.
 
-    The planes are z-depths, so an oblique ray extends further out.
+    The planes are at constant z-depth, so oblique rays have larger distances.
 
     Args:
       metadata: Scene metadata.
@@ -73,7 +73,7 @@ def field_ray_through(
 def filled_along(
     cells: occupancy.Cells, ray: Ray, half_side: float
 ) -> Bool[Array, " looks"]:
-    """Look up the occupancy of the middle of each of `LOOKS` even parts of a ray.
+    """Look up the occupancy at the middles of `LOOKS` equal parts of a ray.
 
     Args:
       cells: Occupied cells.
@@ -111,7 +111,7 @@ def first_distances(
         return sampling.stratified(key, ray.near, ray.far, plan.coarse, plan.spacing)
     assert spec.extent is not None
     assert plan.occupancy is not None
-    # Even parts whatever the spacing: cells are even.
+    # Equal parts for any spacing, because cells are of equal size.
     filled = filled_along(guide, ray, spec.extent)
     empty = plan.occupancy.empty
     return sampling.among(key, ray.near, ray.far, filled, plan.coarse, empty)
@@ -125,9 +125,9 @@ def fine_distances(
 ) -> Float[Array, " samples"]:
     """Combine the distances of the fine level.
 
-    They are all distances or only the new ones, depending on the spec. The last coarse
-    sample is always included if it stands for everything behind it. Otherwise the last
-    sample, on a surface, would contain the background behind it.
+    They are all distances or only the new ones, depending on the spec. If the last
+    coarse sample represents everything behind it, it is always included. Otherwise the
+    last new sample, which lies on a surface, would also represent the background.
 
     Args:
       spec: The scene.

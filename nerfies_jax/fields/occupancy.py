@@ -1,9 +1,9 @@
 """Occupancy grid: cells of space in which samples must not be skipped.
 
-Cells are uniform in contracted space (`nets.grids.contract`): uniform in the captured
-volume, and growing around it up to twice its half side. Space outside counts as
-occupied. The idea is that of Müller et al. 2022, arXiv:2201.05989, appendix E.2. Their
-grid is updated during training, this one is recomputed from the current field.
+Cells are uniform in contracted space (`nn.grids.contract`): they have equal sizes in
+the captured volume and grow outside of it, up to twice its half side. Space farther
+away counts as occupied. This follows Müller et al. 2022, arXiv:2201.05989, appendix
+E.2, except that the grid is recomputed from the current field instead of being updated.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
-REACH = 1.5  # of the cells, in contracted space: twice the half-side in the field
+REACH = 1.5  # extent of the grid in contracted space, twice the half side in the field
 
 Cells = Bool[Array, "cells cells cells"]
 
@@ -23,13 +23,13 @@ Cells = Bool[Array, "cells cells cells"]
 class OccupancySpec:
     """Settings of the occupancy grid, for static scenes.
 
-    No region of a dynamic scene stays empty. The grid is recomputed after `start` steps
-    and then at every multiple of `every`, for any length of the run, since it takes as
-    long as six steps of a small field on a grid. `candidates` rays are drawn for each
-    ray of a step. `anywhere` is the share of a step's rays that need not meet an
-    occupied cell, so that surfaces which appear in empty space are found. The first
-    samples of every ray are in occupied cells, except for `empty` of them to one, over
-    the same length.
+    Regions of a dynamic scene do not stay empty, so it is for static scenes only. The
+    grid is recomputed after `start` steps and then every `every` steps. This takes as
+    long as six steps of a small field on a grid. `candidates` is the number of
+    candidate rays for each ray of a step. `anywhere` is the fraction of a step's rays
+    that need not meet an occupied cell, so that surfaces can appear in empty space. The
+    first samples of a ray are mostly in occupied cells: `empty` is the density of
+    samples in empty cells relative to that in occupied cells.
     """
 
     start: int = 100
@@ -61,7 +61,7 @@ def random_points(
     half_side: float,
     dtype: DTypeLike,
 ) -> Float[Array, "*cells 3"]:
-    """Draw a random point in each of some cells.
+    """Sample a random point in each of some cells.
 
     Args:
       key: PRNG key.
@@ -96,16 +96,16 @@ def corners(
 
 
 def _placed(share, half_side):
-    """Places in units of the field, by their shares of the cells' width."""
+    """Convert positions in [0, 1] over the grid to units of the field."""
     contracted = REACH * (2 * share - 1)
     size = jnp.max(jnp.abs(contracted), axis=-1, keepdims=True)
-    # The inverse of (2 - 1 / |x|) x / |x|; REACH is below 2.
+    # Inverse of (2 - 1 / |x|) x / |x|, which exists because REACH is below 2.
     away = 1 / (jnp.maximum(size, 1) * (2 - jnp.maximum(size, 1)))
     return half_side * contracted * away
 
 
 def dilated(occupied: Cells) -> Cells:
-    """Add every cell that touches an occupied one, at a face, an edge or a corner.
+    """Add all cells that touch an occupied cell at a face, an edge or a corner.
 
     Args:
       occupied: Occupied cells, [cells, cells, cells].
@@ -133,7 +133,7 @@ def at(
       Booleans [...], True in an occupied cell or outside of the grid.
     """
     cells = occupied.shape[0]
-    # Coordinate by coordinate: a point in three lanes of a vector takes twice the time.
+    # Coordinates are separate arrays, because arrays of points take twice the time.
     scaled = [point[..., axis] / half_side for axis in range(3)]
     beyond = functools.reduce(jnp.maximum, [jnp.abs(along) for along in scaled])
     beyond = jnp.maximum(beyond, 1)

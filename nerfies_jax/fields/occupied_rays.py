@@ -1,11 +1,11 @@
-"""Selection of training rays by occupancy, since empty rays have little left to teach.
+"""Selection of training rays by occupancy, because empty rays are learned quickly.
 
-Of more candidate rays than a step has, those are used that meet an occupied cell, and a
-share of any (`OccupancySpec`). The grid is recomputed during training, and a cell that
-was found empty stays empty. Müller et al. 2022, arXiv:2201.05989, appendix E.2, skip
-samples in empty cells instead. A step then has as many rays as its samples pay for,
-whereas here it always has the same number of both. Rendering does not depend on the
-selection. The losses of a step are those of its rays, which are harder than the mean.
+From more candidates than a step uses, it selects rays that meet an occupied cell, and a
+fraction of arbitrary rays (`OccupancySpec`). The grid is recomputed during training,
+and an empty cell stays empty. Müller et al. 2022, arXiv:2201.05989, appendix E.2, skip
+samples in empty cells instead, and adapt the number of rays of a step. Here the numbers
+of rays and samples are constant. Rendering does not depend on the selection. The losses
+of a step are those of the selected rays, which are larger than the mean over all rays.
 """
 
 import functools
@@ -25,7 +25,7 @@ from nerfies_jax.training.model import Event, Frames, TrainState
 
 
 def first(field: Field) -> Cells | tuple[()]:
-    """Return the initial cells, all of which may be occupied.
+    """Return the initial cells, which all count as occupied.
 
     Args:
       field: The field.
@@ -67,9 +67,9 @@ def events(field: Field) -> tuple[Event, ...]:
 
     def apply(state: TrainState, frames: Frames) -> TrainState:
         del frames
-        # Surveyed alone, cells that no ray sees any more fill with what the tables of a
-        # hash grid happen to say there: after 2400 steps of Blender lego 10 in a
-        # hundred, and 25.6 dB for 25.9.
+        # A cell must have been occupied before. Otherwise cells that no ray trains any
+        # more become occupied by random content of hash tables: 10 % after 2400 steps
+        # of Blender lego, and 25.6 dB instead of 25.9.
         left = state.aux_state & survey(state.params, state.step)
         return state._replace(aux_state=left)
 
@@ -78,7 +78,7 @@ def events(field: Field) -> tuple[Event, ...]:
 
 
 def _survey(field: Field) -> Callable[[PyTree, Int[Array, ""]], Cells]:
-    """Cells that any level fills."""
+    """Return a function that finds the cells that are occupied in any level."""
     survey = field.survey
     assert survey is not None
     return lambda params, step: survey(params, step)[skipping.GUIDE]
@@ -103,7 +103,7 @@ def chosen(
 ) -> Int[Array, " count"]:
     """Choose the rays of a step: the first `anywhere`, then those that meet a cell.
 
-    Other candidates fill up if too few do.
+    If there are too few of them, other candidates are added.
 
     Args:
       meeting: True for candidates that meet an occupied cell, [candidates].

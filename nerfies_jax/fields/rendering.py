@@ -1,7 +1,7 @@
-"""Volume rendering with any network: sample points along rays, and composite.
+"""Volume rendering for any network: sample points along rays, and composite.
 
-`sample_along_rays` and `composite` take any leading axes and do not depend on the
-network between them.
+`sample_along_rays` and `composite` take any leading axes and are independent of the
+network that is evaluated between them.
 """
 
 from typing import NamedTuple
@@ -23,15 +23,15 @@ class RaySamples(NamedTuple):
 
     t: Float[Array, "*rays samples"]  # distance from the origin, in scene units
     points: Float[Array, "*rays samples 3"]  # positions in scene units
-    directions: Float[Array, "*rays samples 3"]  # of the sample's ray
+    directions: Float[Array, "*rays samples 3"]  # directions of the rays
 
 
 class Rendered(NamedTuple):
-    """Rays as they are rendered."""
+    """Rendered rays."""
 
     color: Float[Array, "*rays channels"]
     depth: Float[Array, "*rays"]  # expected distance along the ray, in scene units
-    weights: Float[Array, "*rays samples"]  # share of each sample in the color
+    weights: Float[Array, "*rays samples"]  # rendering weights
     alpha: Float[Array, "*rays"]  # opacity, the sum of the weights
 
 
@@ -46,28 +46,29 @@ def sample_along_rays(
     *,
     spacing: str = "linear",
 ) -> RaySamples:
-    """Place one sample in each of `num_samples` equal bins of every ray.
+    """Sample one distance in each of `num_samples` equal bins of every ray.
 
     Args:
-      key: Key of the random place of each sample in its bin, as `jax.random.key` makes
-        it. None puts every sample into the middle of its bin.
+      key: PRNG key from `jax.random.key` for a random position of each sample in its
+        bin. None for the middle of each bin.
       origins: Ray origins in scene units, [..., 3].
       directions: Ray directions of unit length, [..., 3].
       near: Distance at which the bins begin, a number or an array that broadcasts to
         the leading axes of `origins`.
-      far: Distance at which they end. A ray whose `far` is not beyond its `near` gets
-        `far` everywhere.
+      far: Distance at which the bins end. If it is not larger than `near`, all samples
+        of the ray are at `far`.
       num_samples: Number of samples per ray, at least 1.
-      spacing: "linear" makes bins equal in distance, "disparity" in inverse distance,
-        which needs `near > 0` and takes `far=inf`.
+      spacing: "linear" for bins equal in distance, "disparity" for bins equal in
+        inverse distance, which requires `near > 0` and supports `far=inf`.
 
     Returns:
       Distances t [..., num_samples] in ascending order, points [..., num_samples, 3]
       and directions [..., num_samples, 3]. Half-precision rays give float32 samples.
 
     Raises:
-      ValueError: Where a shape or type is wrong, `num_samples` or `spacing` is, or, as
-        far as `near` and `far` are known while tracing, a bound cannot be sampled.
+      ValueError: If a shape or type, `num_samples` or `spacing` is invalid, or if
+      `near`
+        or `far` is invalid, unless they are traced.
 
     References:
       Stratified sampling, Mildenhall et al. 2020, arXiv:2003.08934, section 4.
@@ -101,8 +102,8 @@ def sample_along_rays(
     if spacing == "linear":
         t = near + (far - near) * from_near
     else:
-        # Both shares are kept with all their digits: 1 - from_near would put the
-        # farthest samples off by a tenth where far is 1e6 times near.
+        # Computed separately, because 1 - from_near loses digits: the farthest samples
+        # would be off by a tenth if far is 1e6 times near.
         from_far = ((num_samples - place) - jitter) / num_samples
         t = 1 / (from_far / near + from_near / far)
     t = jnp.clip(t, near, far)
@@ -140,8 +141,8 @@ def composite(
 ) -> Rendered:
     """Composite colors along rays by volume rendering.
 
-    Sample i stands for the interval from t[i] to t[i + 1], the last one for
-    `last_interval`. Leading axes of all arguments broadcast.
+    Sample i represents the interval from t[i] to t[i + 1], and the last sample an
+    interval of length `last_interval`. Leading axes of all arguments broadcast.
 
     Args:
       density: Volume density at the samples per scene unit, non-negative,
@@ -151,27 +152,27 @@ def composite(
         units, [..., samples].
       background: Color behind the ray, [..., channels]. None is black.
       last_interval: Length of the last sample's interval in scene units, [...]. With
-        the default of 1e10, as in the code of NeRF, any density there is opaque; what
-        is left of the ray, far - t[-1], keeps the last sample as thin as the others.
+        the default of 1e10, as in the code of NeRF, any density there is opaque. Pass
+        far - t[-1] for a last sample like the others.
 
     Returns:
       Color [..., channels], expected depth [...], weights [..., samples] and opacity
       alpha [...]. Weights are non-negative and sum to at most one, up to rounding. The
-      depth is the mean of t by the weights; below an opacity of 1e-3 it goes to
-      the last t, so that value and gradient stay bounded down to empty rays. Arguments
-      in half precision are computed in float32 and rounded once.
+      depth is the mean of t by the weights. Below an opacity of 1e-3 it goes to the
+      last t, so that value and gradient are bounded also for empty rays. Arguments in
+      half precision are computed in float32 and rounded once.
 
     Raises:
-      ValueError: Where a shape or type is wrong.
+      ValueError: If a shape or type is wrong.
 
     References:
       Mildenhall et al. 2020, arXiv:2003.08934, equation 3.
     """
     interval = compositing.intervals(t, last_interval)
-    # inf * 0 is NaN, on an interval of no length and in the gradient by its length.
+    # An infinite density times an interval of length zero is NaN, also in the gradient.
     finite = jnp.minimum(density, jnp.finfo(density.dtype).max)
     weights = compositing.weights(finite * interval)
-    # Sums of products: a matrix product may be rounded to ten bits on a GPU.
+    # Sums of products, because a GPU may round matrix products to ten bits.
     rendered = jnp.sum(weights[:, None] * color, axis=0)
     alpha = jnp.sum(weights)
     if background is not None:

@@ -1,6 +1,6 @@
-"""Sampling along one ray: stratified samples, and finer ones where light stops.
+"""Sampling along one ray: stratified sampling and importance sampling.
 
-Everything is for one ray, and callers `jax.vmap` over rays and their keys.
+Functions take one ray. Use `jax.vmap` over rays and their keys.
 """
 
 import jax
@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from nerfies_jax.geometry.precision import near_one, widened
 
 SPACINGS = ("linear", "disparity")
-COUNTED = 65  # bins at most that are counted, not searched
-NERF_FLOOR = 1e-5  # what the published codes add to every weight before they invert
+COUNTED = 65  # maximum number of bins for counting instead of searching
+NERF_FLOOR = 1e-5  # added to every weight in the published codes
 
 
 def stratified(
@@ -23,10 +23,12 @@ def stratified(
 ) -> Float[Array, " count"]:
     """Sample distances in [near, far], evenly in distance or in inverse distance.
 
-    Bins meet halfway between the even distances, as in the published code of NeRF.
+    Bins are bounded by the midpoints of the even distances, as in the published code of
+    NeRF.
 
     Args:
-      key: PRNG key, to draw each sample from its own bin. None for even distances.
+      key: PRNG key for a random position of each sample in its bin. None for even
+        distances.
       near: Distance of the first sample. Positive for "disparity".
       far: Distance of the last sample. If it is not beyond `near`, all samples are at
         `far`.
@@ -48,20 +50,23 @@ def stratified(
         )
     if spacing not in SPACINGS:
         raise ValueError(f"unknown spacing {spacing!r}; choose from {SPACINGS}")
-    # start + (end - start) * share never decreases, however close the ends are, which
-    # start * (1 - share) + end * share does by an ulp; its own last ulp is clipped.
+    # start + (end - start) * share is monotonic, also if the ends are close, unlike
+    # start * (1 - share) + end * share. Its error at the end is clipped below.
     share = jnp.linspace(0, 1, count, dtype=near.dtype)
     if spacing == "linear":
         even = near + (far - near) * share
     else:
-        # Each half from its own end. All from the near one cancels: in float32 the last
-        # sample would be 0.04 % short of a far of 1e4 nears, 18 % of 1e7.
+        # Each half is computed from its own end, because far samples computed from the
+        # near end cancel: in float32 the last sample would be 0.04 % short of far if
+        # far = 1e4 near, and 18 % if far = 1e7 near.
         gap = 1 / near - 1 / far
-        middle = 1 / near - gap / 2  # the halves may miss each other by an ulp
+        middle = 1 / near - gap / 2  # rounding may shift the halves by an ulp
         nearer = jnp.maximum(1 / near - gap * share, middle)
         farther = jnp.minimum(1 / far + gap * (1 - share), middle)
         even = 1 / jnp.where(share < 0.5, nearer, farther)
-        even = jnp.where(share == 1, far, even)  # 1 / (1 / far) may be an ulp short
+        even = jnp.where(
+            share == 1, far, even
+        )  # 1 / (1 / far) may be less
     even = jnp.clip(even, near, far)
     if key is None:
         return even
@@ -82,14 +87,14 @@ def among(
 ) -> Float[Array, " count"]:
     """Sample distances in [near, far], with fewer samples in empty bins.
 
-    Samples are stratified as in `sample_pdf`. If no bin or every bin is occupied, they
-    are even.
+    Samples are stratified as in `sample_pdf`. If no bin or all bins are occupied, they
+    are evenly spaced.
 
     Args:
       key: PRNG key, or None.
       near: Distance at which the ray begins.
       far: Distance at which it ends.
-      filled: True for the occupied ones of even bins, [bins].
+      filled: True for occupied bins, which have equal lengths, [bins].
       count: Number of samples.
       empty: Density of samples in an empty bin, relative to an occupied one.
 
@@ -112,17 +117,17 @@ def sample_pdf(
     """Sample distances with a density proportional to weights, by inversion.
 
     The cumulative weights, linear within a bin, are inverted at evenly spaced values
-    from 0 to 1 (one sample: at a half), or with a key at one random value in each of
-    `count` equal parts of [0, 1] (the published codes draw independent values, which
-    cluster). No gradient flows through the samples.
+    from 0 to 1 (at 0.5 for one sample). With a key they are inverted at a random value
+    in each of `count` equal parts of [0, 1]. (The published codes use independent
+    random values, which cluster.) The samples have no gradient.
 
     Args:
       key: PRNG key, or None.
       edges: Sorted distances between bins, [bins + 1].
       weights: Non-negative weights, [bins]. If all are zero, bins are equally likely.
       count: Number of samples.
-      floor: Value added to every weight. None for one rounding unit of the largest.
-        `NERF_FLOOR` is that of the published codes.
+      floor: Value added to every weight. None for the machine epsilon times the largest
+        weight. `NERF_FLOOR` is that of the published codes.
 
     Returns:
       Sorted distances, [count].
@@ -142,15 +147,16 @@ def sample_pdf(
         raise ValueError(f"count={count} must be at least 1")
     dtype = edges.dtype
     edges, weights = jax.lax.stop_gradient((edges, weights))
-    # Here and below, for XLA finds weights and counts anew for each that reads of them.
+    # The barriers keep XLA from recomputing weights and counts for each consumer.
     weights = jax.lax.optimization_barrier(weights)
-    # A rounding unit of bfloat16 on each of 64 bins would be a third of all weight.
+    # In bfloat16 the floors of 64 bins would sum to a third of the weight.
     edges, weights = widened(edges), widened(weights)
     limits = jnp.finfo(weights.dtype)
     if floor is None:
-        # Absolute floors drown faint rays: weights that sum to 1e-30 under 1e-5 move
-        # samples by 0.84 of the range. Subnormal weights are none. Scaled before it is
-        # divided: in float32 1 / 9e37 is none either, and all bins would share alike.
+        # An absolute floor dominates on faint rays: with weights that sum to 1e-30, a
+        # floor of 1e-5 moves samples by 0.84 of the range. Subnormal weights count as
+        # zero. Weights are scaled before the division, because XLA flushes 1 / 9e37 to
+        # zero in float32, and all bins would be equally likely.
         faint = jnp.max(weights) < limits.tiny
         weights, _ = near_one(jnp.where(faint, 1, weights))
         weights = weights / jnp.max(weights)
@@ -158,11 +164,11 @@ def sample_pdf(
     cumulated = jnp.cumsum(weights + floor)
     cumulated = jnp.concatenate([jnp.zeros_like(cumulated[:1]), cumulated])
     cumulated = jax.lax.optimization_barrier(cumulated)
-    # The last sum is 1 only up to rounding, so shares are scaled rather than sums.
+    # The last sum is 1 only up to rounding, so the values to invert are scaled.
     reached = _shares(key, count, weights.dtype) * cumulated[-1]
     bin_ = jax.lax.optimization_barrier(_last_not_above(cumulated[:-1], reached))
     start, width = cumulated[bin_], cumulated[bin_ + 1] - cumulated[bin_]
-    # A bin whose floor vanished beside the sum before it has no width.
+    # If rounding absorbs a floor in the cumulative sum, the bin has no width.
     within = jnp.clip((reached - start) / jnp.where(width > 0, width, 1), 0, 1)
     left, right = edges[bin_], edges[bin_ + 1]
     return jnp.minimum(left + within * (right - left), right).astype(dtype)
@@ -171,7 +177,7 @@ def sample_pdf(
 def union(
     coarse: Float[Array, " coarse"], fine: Float[Array, " fine"]
 ) -> Float[Array, " samples"]:
-    """Merge sorted distances. Each keeps its own gradient.
+    """Merge sorted distances, with the gradient of each.
 
     Args:
       coarse: Sorted distances, [coarse].
@@ -194,11 +200,12 @@ def merged_places(
       fine: Sorted distances, [fine].
 
     Returns:
-      Positions of the coarse and then of the fine ones, [coarse + fine]. Of equal
-      distances the coarse one comes first.
+      Positions of the coarse and then of the fine distances, [coarse + fine]. If two
+      are equal, the coarse one comes first.
     """
-    # By counting, 24 x 24 comparisons a ray: 7 ms for 49,152 rays of one core, where
-    # `jnp.sort` of the 48 takes 114; with the gradient 40 for 168.
+    # Computed by counting, with 24 x 24 comparisons per ray: 7 ms for 49,152 rays on
+    # one core, compared with 114 ms for `jnp.sort` of the 48. With the gradient it is
+    # 40 ms compared with 168.
     before = jnp.sum(fine < coarse[:, None], axis=1, dtype=jnp.int32)
     behind = jnp.sum(coarse <= fine[:, None], axis=1, dtype=jnp.int32)
     own = [jnp.arange(x.shape[0], dtype=jnp.int32) for x in (coarse, fine)]
@@ -214,8 +221,9 @@ def refine(
 ) -> Float[Array, " refined"]:
     """Sample distances by the weights of a coarse pass.
 
-    Bins meet halfway between the distances. The first and the last sample, which own no
-    whole bin, get no samples. The last may stand for everything behind it.
+    Bins are bounded by the midpoints of the distances. The first and the last sample
+    have no complete bin and get no samples. The last one may represent everything
+    behind it.
 
     Args:
       key: PRNG key, or None.
@@ -239,21 +247,21 @@ def refine(
 
 
 def _last_not_above(edges, values):
-    """Index of the last of sorted edges up to each value, the first if none is."""
+    """Return the index of the last edge up to each value, or 0 if there is none."""
     if len(edges) > COUNTED:
-        # XLA sums in a tree: from 300 bins on neighboring float32 sums step back by an
-        # ulp, and a search needs them sorted.
+        # XLA sums in a tree, so from 300 bins on cumulative sums in float32 may
+        # decrease by an ulp. The search needs sorted values.
         edges = jax.lax.cummax(edges)
         return jnp.maximum(jnp.searchsorted(edges, values, side="right") - 1, 0)
-    # One comparison after the other for all values at once. 49,152 rays of 24 values
-    # among 22 or 64 bins: 0.7 and 3 ms of one core, 27 and 25 by searching.
+    # Compared edge by edge for all values at once. For 49,152 rays of 24 values with 22
+    # and 64 bins this takes 0.7 and 3 ms on one core, and a search 27 and 25 ms.
     below = jnp.zeros(values.shape, jnp.int32)
     return sum(((edge <= values).astype(jnp.int32) for edge in edges[1:]), below)
 
 
 def _shares(key, count, dtype):
     if key is None and count == 1:
-        return jnp.full(1, 0.5, dtype)  # `linspace` has its start: the ray's near end
+        return jnp.full(1, 0.5, dtype)  # `linspace` would return the start
     if key is None:
         return jnp.linspace(0, 1, count, dtype=dtype)
     parts = jnp.arange(count, dtype=dtype)
