@@ -1,10 +1,10 @@
 """Volume rendering along one ray.
 
-Everything is for one ray, from its origin outward, and callers `jax.vmap`. The *optical
-depth* of a sample is its density times the length of its interval. Light is transmitted
-through a depth d with probability exp(-d). Densities must be finite and non-negative,
-and distances sorted. Sums over a ray are made in float32 or float64. In bfloat16 the
-weights of a ray of 128 samples would be off by 1e-2.
+Functions take one ray, from its origin outward. Use `jax.vmap` for several. The
+*optical depth* of a sample is its density times the length of its interval. Light is
+transmitted through a depth d with probability exp(-d). Densities must be finite and
+non-negative, and distances sorted. Sums over a ray are computed in float32 or float64.
+In bfloat16 the weights of a ray of 128 samples would have errors of 1e-2.
 """
 
 from typing import NamedTuple
@@ -15,15 +15,16 @@ from jaxtyping import Array, Float, Int
 
 from nerfies_jax.geometry.precision import at_least_float32
 
-# The length of the last interval where the last sample stands for all behind it: any
+# Length of the last interval if the last sample represents everything behind it. Any
 # density of a trained field is opaque over it, and its square is finite in float32.
 AT_INFINITY = 1e10
-# Opacity below which a ray counts as going on to its far end: a quarter of a level of
-# an 8-bit image. Bounds the gradient of the expected distance by 1e3 of the ray's span.
+# Opacity, a quarter of a level of an 8-bit image, below which the expected distance
+# goes to the far end of the ray. Bounds its gradient by 1e3 times the length of the
+# ray.
 EMPTY_BELOW = 1e-3
-# Opacity up to which `thinned` takes log1p, and above it a sum of logarithms. Not 1/2:
-# from 0.3 to 0.42 XLA's log1p of float64 is off by up to 120 eps on the CPU, and by
-# less than one eps below.
+# Opacity up to which `thinned` uses log1p instead of a sum of logarithms. It is not
+# 1/2, because from 0.3 to 0.42 XLA's log1p of float64 has errors of up to 120 eps on a
+# CPU. Below they are less than one eps.
 THIN_BELOW = 0.25
 
 
@@ -31,9 +32,9 @@ class Composite(NamedTuple):
     """Color, opacity and distances of one ray."""
 
     color: Float[Array, "3"]
-    alpha: Float[Array, ""]  # share of the light that stops; may round to 1 + 1e-6
-    distance: Float[Array, ""]  # expected, of what stops it
-    median_distance: Float[Array, ""]  # by which half the light has stopped
+    alpha: Float[Array, ""]  # opacity; may round to 1 + 1e-6
+    distance: Float[Array, ""]  # expected distance at which light is absorbed
+    median_distance: Float[Array, ""]  # distance at which half of the light is absorbed
 
 
 def intervals(
@@ -43,7 +44,7 @@ def intervals(
 
     Args:
       distances: Sorted distances along a unit direction, [samples].
-      last: Length of the last interval: `AT_INFINITY`, or the rest of the ray.
+      last: Length of the last interval, `AT_INFINITY` or the remaining length.
 
     Returns:
       Lengths, [samples].
@@ -60,14 +61,15 @@ def weights(optical_depth: Float[Array, " samples"]) -> Float[Array, " samples"]
       optical_depth: Density times interval length, non-negative, [samples].
 
     Returns:
-      Share of the light that stops at each sample, [samples]. They sum to at most one
-      (up to 1e-6).
+      Fraction of the light that is absorbed at each sample, [samples]. The sum is at
+      most one (up to 1e-6).
 
     References:
       Mildenhall et al. 2020, arXiv:2003.08934, equation 3.
     """
-    # 1 - exp(-x) would round to 0 in thin air. (JAX's slope of expm1 is exp(-x) to 6e-8
-    # of one; with all its digits behind walls the gradient takes 1.8 times as long.)
+    # 1 - exp(-x) would round to 0 for small depths. (The gradient of expm1 in JAX has
+    # an absolute error of 6e-8. Computing it with full relative precision would take
+    # 1.8 times as long.)
     return _transmittance(optical_depth) * -jnp.expm1(-optical_depth)
 
 
@@ -77,11 +79,11 @@ def media_weights(
 ) -> Float[Array, "media samples"]:
     """Compute the weights of samples of several media on one ray.
 
-    Light reaches a sample through all the media before it, and at the sample each
-    medium counts as if it were alone, as for the transient objects of NeRF-W and, after
-    `thinned`, the blending of NSFF. Where media overlap in one sample, their weights
-    sum to more than `weights` of their joint depth, at most by the number of media.
-    Opacity and distances are therefore computed from the joint depth
+    Light reaches a sample through all media in front of it. At the sample each medium
+    is treated as if it were alone, as for the transient objects of NeRF-W and, after
+    `thinned`, the blending of NSFF. If media overlap in a sample, their weights sum to
+    more than `weights` of their joint depth, at most by a factor of the number of
+    media. Opacity and distances are therefore computed from the joint depth
     (`composite_media`).
 
     Args:
@@ -104,8 +106,8 @@ def thinned(
 ) -> Float[Array, "*samples"]:
     """Scale the opacity of samples: -log(1 - v (1 - exp(-d))) for v = sigmoid(l).
 
-    NSFF multiplies opacities by its blending weight v. As an optical depth it can share
-    the transmittance of other media.
+    NSFF multiplies opacities by its blending weight v. Expressed as an optical depth,
+    this can be combined with the transmittance of other media.
 
     Args:
       optical_depth: Optical depth d, non-negative, [...].
@@ -115,9 +117,9 @@ def thinned(
       Optical depths, [...].
     """
     share = jax.nn.sigmoid(share_logit)
-    # log1p keeps all digits of thin air but has 1 - v exp(..) → 0 for v → 1; the sum
-    # (1 - v) + v exp(-d) of the same terms in logarithms is right there and loses small
-    # depths to cancellation.
+    # log1p is accurate for small depths, but its argument approaches -1 for v → 1. The
+    # sum (1 - v) + v exp(-d) in logarithms is accurate there, and cancels for small
+    # depths.
     thin = share * -jnp.expm1(-optical_depth) < THIN_BELOW
     safe = jnp.where(thin, optical_depth, 0)
     near_clear = -jnp.log1p(share * jnp.expm1(-safe))
@@ -141,15 +143,14 @@ def composite(
       colors: Colors of the samples, [samples, 3].
       distances: Sorted distances of the samples, [samples].
       background: Color behind the ray, [3]. None if the last sample is the background,
-        with an interval of `AT_INFINITY`. Its color then counts, but `alpha`,
-        `distance` and `median_distance` leave it out, as `alpha` does in the Nerfies
-        code. (That code also adds white behind such a sample, where none can be
-        visible.)
+        with an interval of `AT_INFINITY`. It then contributes to the color, but not to
+        `alpha`, `distance` and `median_distance`, as in the `alpha` of the Nerfies
+        code. (That code also adds white behind such a sample, which cannot be visible.)
 
     Returns:
       The composited ray.
     """
-    # Sums of products: a matrix product may be rounded to ten bits on a GPU.
+    # Sums of products, because a GPU may round matrix products to ten bits.
     color = jnp.sum(weights[:, None] * colors, axis=0)
     return _composite(color, weights, distances, background)
 
@@ -184,8 +185,8 @@ def expected_distance(
 ) -> Float[Array, ""]:
     """Compute the mean distance by weights.
 
-    Rays with an opacity below `EMPTY_BELOW` get the rest of it at `far`, so that value
-    and gradient stay bounded down to weights of zero.
+    If the opacity of a ray is below `EMPTY_BELOW`, the difference is added at `far`, so
+    that value and gradient are bounded also for weights of zero.
 
     Args:
       weights: Weights of the samples, [samples].
@@ -201,13 +202,13 @@ def expected_distance(
 
 
 def median_index(weights: Float[Array, " samples"]) -> Int[Array, ""]:
-    """Find the first sample by which half of the light has stopped.
+    """Find the first sample by which half of the light is absorbed.
 
     Args:
       weights: Weights of the samples, [samples].
 
     Returns:
-      Index of the sample, the last one if less than half of the light stops.
+      Index of the sample, or of the last one if less than half is absorbed.
     """
     passed = _running_sum(weights) >= 0.5
     return jnp.where(jnp.any(passed), jnp.argmax(passed), weights.shape[0] - 1)
@@ -222,7 +223,7 @@ def _composite(color, weights, distances, background):
         alpha = jnp.sum(finite)
         color = color + (1 - alpha) * background
     distance = expected_distance(finite, distances[: finite.shape[0]], distances[-1])
-    # The median may read the sample at infinity: it falls back to it anyway.
+    # The median may include the sample at infinity, which is its fallback anyway.
     median = distances[median_index(weights)]
     return Composite(color, alpha, distance, median)
 
@@ -231,7 +232,8 @@ _running_sum = at_least_float32(jnp.cumsum)
 
 
 def _transmittance(optical_depth):
-    # Summed without the sample itself, not subtracted afterwards: in float32 an opaque
-    # sample would swallow the depth in front of it and the weights would sum to 1.6.
+    # The sum excludes the sample itself. Subtracting it from the inclusive sum would
+    # lose the depth in front of an opaque sample in float32, and weights would sum to
+    # 1.6.
     before = jnp.cumsum(optical_depth[:-1])
     return jnp.exp(-jnp.concatenate([jnp.zeros_like(optical_depth[:1]), before]))

@@ -1,11 +1,10 @@
 """Rendering of a frame of a radiance field with empty-space skipping.
 
 The samples are those of `render_ray`, so the image is that of the full quadrature
-except for the contributions of skipped samples. A sample is skipped in a cell that was
-found empty (`survey`) or behind an opaque region. The others are gathered into dense
-batches, and the networks are evaluated at these alone. Warps with long wavelengths are
-evaluated on a `frustum_grid` of the frame, and then the cells are those of the
-template, the same at all times.
+except for the contributions of skipped samples. Samples are skipped in empty cells
+(`survey`) and behind opaque regions. The others are gathered into dense batches for the
+networks. Warps with long wavelengths are evaluated on a `frustum_grid` of the frame.
+The cells are then those of the template, which are the same at all times.
 """
 
 import functools
@@ -37,36 +36,38 @@ from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import Rendering
 
 PyTree = Any
-# By level, "coarse" and "fine", and of all levels together what guides the samples.
+# Cells by level, "coarse" and "fine", and those that guide the first samples.
 Occupancy = dict[str, occupancy.Cells]
 GUIDE = "guide"
 
-# Optical depth that all samples skipped on a ray straight ahead have together at most,
-# as far as the survey saw the densest of each cell: 5 % of the light. Four frames of
-# Blender lego after 3000 steps: 67 to 72 dB from the whole quadrature, 27.515 dB from
-# the truth for 27.512, in 514 ms for 619 with 0.01, at which it was 69 to 78.
+# Maximum optical depth of all skipped samples of a ray along the viewing axis, as far
+# as the survey sampled the densest points: 5 % of the light. Four frames of Blender
+# lego after 3000 steps have a PSNR of 67 to 72 dB relative to full quadrature, and of
+# 27.515 dB instead of 27.512 relative to the ground truth. They take 514 ms. With 0.01
+# it is 69 to 78 dB in 619 ms.
 SKIPPED_DEPTH = 0.05
-# Optical depth from near to far above which a cell guides samples. Thinner cells are
-# haze that no ray has trained yet: with 0.01 two of three cells of Blender lego are
-# occupied after 1000 steps, with this 3 of a hundred.
+# Optical depth from near to far above which a cell guides samples. Cells of less
+# density are mostly untrained: with 0.01, two thirds of the cells of Blender lego are
+# occupied after 1000 steps, with this value 3 %.
 GUIDE_DEPTH = 3.0
 OPAQUE_DEPTH = 7.0  # e^-7 = 9e-4 of the light passes
-# Dynamic fields, unless their warps are read on a grid, are surveyed anew for every
-# frame, and each look costs a warp of every cell.
+# Dynamic fields are surveyed for every frame, unless their warps are on a grid, and
+# each point of each cell is warped.
 STILL_CELLS, MOVING_CELLS = 64, 40
-LOOKS = 2  # at each cell
-BATCH = 2048  # points asked at once
-# Rays drawn at once. Twice as many need more memory than an allocator keeps (32 MB with
-# glibc): a frame of `nerfies-grid-small` took 238 ms for 224, 13 of them the system's.
+LOOKS = 2  # random points per cell
+BATCH = 2048  # points per evaluation of the networks
+# Rays rendered at a time. Twice as many need more memory than the allocator retains (32
+# MB with glibc): a frame of `nerfies-grid-small` took 238 ms instead of 224, 13 of them
+# in the system.
 BLOCK = 8192
-STAGES = 4  # in which a ray is followed; behind what is opaque no further one is
+STAGES = 4  # parts of a ray; parts behind an opaque one are skipped
 
 
 def usable(spec, effects) -> bool:
-    """Return whether a field can be surveyed before its frames are rendered.
+    """Return whether empty space of a field can be skipped.
 
-    This is not possible if a second medium shares its rays, if color depends on
-    surfaces, or if the size of the captured volume is unknown.
+    This is not supported if there is a second medium, if color depends on surfaces, or
+    if the extent of the captured volume is unknown.
 
     Args:
       spec: The scene.
@@ -87,17 +88,18 @@ def survey(
     condition: FrameCondition,
     shown: occupancy.Cells | None = None,
 ) -> Occupancy:
-    """Find the cells that each level's density fills at the time of one frame.
+    """Find the occupied cells of each level at the time of one frame.
 
-    A cell is filled if a random point in it is so dense that light passing through
-    nothing else from near to far would meet an optical depth above `SKIPPED_DEPTH`.
-    Samples are guided (`OccupancySpec`) by the cells of any level above `GUIDE_DEPTH`.
+    A cell is occupied if the density of a random point in it, times the length of a ray
+    from near to far, exceeds `SKIPPED_DEPTH`. Samples are guided (`OccupancySpec`) by
+    the cells for which it exceeds `GUIDE_DEPTH` in any level.
 
     Args:
       bound: The field with its parameters.
       condition: Conditioning of the frame.
-      shown: Cells that the image can show. Cells that are neither shown nor adjacent to
-        such a cell are not evaluated and count as filled. None for all.
+      shown: Visible cells. Cells that are neither visible nor adjacent to a visible
+      cell
+        are not evaluated and count as occupied. None for all cells.
 
     Returns:
       Occupied cells by level.
@@ -110,7 +112,7 @@ def survey(
     span = (metadata.far - metadata.near) * metadata.scale
     names = tuple(bound.params["template"])
     dtype = jax.tree.leaves(bound.params["template"])[0].dtype
-    direction = jnp.zeros(3, dtype).at[2].set(1)  # no density depends on it
+    direction = jnp.zeros(3, dtype).at[2].set(1)  # density does not depend on it
     offset = {n: color_offset(bound, n, direction, condition) for n in names}
 
     def look(found, number):
@@ -156,10 +158,10 @@ def cells_across(bound: Bound) -> int:
 
 
 def shown_cells(bound: Bound, camera: Camera, size: tuple[int, int]) -> occupancy.Cells:
-    """Find the cells that rays of an image may meet between the near and far planes.
+    """Find the cells that rays of an image can meet between the near and far planes.
 
-    Cells are excluded if their eight corners lie beyond one of six planes: these two,
-    and four that bound the rays of the image's border.
+    Cells are excluded if all eight corners lie outside of one of six planes: these two,
+    and four that bound the rays of the border of the image.
 
     Args:
       bound: The field with its parameters.
@@ -206,7 +208,7 @@ def draw(
     condition: FrameCondition,
     size: tuple[int, int],
 ) -> Rendering:
-    """Render a whole frame. Not differentiable, since the number of evaluations varies.
+    """Render a whole frame. It is not differentiable, as it loops over dense batches.
 
     Args:
       bound: The field with its parameters.
@@ -244,7 +246,7 @@ def draw(
 
 
 def _block(bound, occupied, camera, condition, position, columns):
-    """Render the rays of some pixels, with `columns` of a grid if any."""
+    """Render the rays of some pixels, with columns of a displacement grid or None."""
     plan, behind = bound.spec.sampling, bound.metadata.background
     ray, cosine = jax.vmap(lambda p: field_ray_through(bound.metadata, camera, p))(
         position
@@ -306,11 +308,11 @@ class _Asked(NamedTuple):
 def _ask(
     bound, name, occupied, ray, condition, distance, spacing, values, before, moved
 ):
-    """Density, or density and color, [rays, samples, values], zero if skipped.
+    """Evaluate density, or density and color, [rays, samples, values], zero if skipped.
 
-    `moved` is the displacement of all samples, if warps are read on a grid. Otherwise
-    warps and ambient coordinates of the samples `before` are not computed again.
-    Without those the ones computed here are returned as well.
+    `moved` are the displacements of all samples, if they are on a grid. Otherwise the
+    template coordinates of the samples `before` are reused. Without `before` the
+    coordinates computed here are returned as well.
     """
     count, samples = distance.shape
     point = ray.origin[:, None] + distance[..., None] * ray.direction[:, None]
@@ -318,7 +320,7 @@ def _ask(
         point = point + moved
     wanted = occupancy.at(occupied, point, bound.spec.extent)
     if bound.metadata.background is None:
-        wanted = wanted.at[:, -1].set(True)  # it stands for all behind it
+        wanted = wanted.at[:, -1].set(True)  # it represents everything behind it
     offset = jax.vmap(lambda d: color_offset(bound, name, d, condition))(ray.direction)
     width = -(-samples // STAGES)  # samples of a stage
 
@@ -378,14 +380,14 @@ def _ask(
 def compacted(
     ask: Callable[[Int[Array, " batch"]], PyTree], wanted: Bool[Array, " places"]
 ) -> PyTree:
-    """Evaluate a function only where it is wanted, batch by batch.
+    """Evaluate a function at a subset of indices, batch by batch.
 
     Args:
       ask: Function of indices [batch], whose results have a leading axis [batch].
-      wanted: True for places to evaluate, [places].
+      wanted: True for indices to evaluate, [places].
 
     Returns:
-      Results with a leading axis [places], zero where not wanted.
+      Results with a leading axis [places], zero if not evaluated.
     """
     places = wanted.shape[0]
     order = jnp.cumsum(wanted, dtype=jnp.int32)

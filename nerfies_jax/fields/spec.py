@@ -38,11 +38,11 @@ PROTOCOLS = {"transient": Medium, "warp": Warp}
 class SamplingSpec:
     """Settings of the samples along a ray. The defaults are those of NeRF.
 
-    `fine` samples are drawn by the weights of the coarse level, and 0 leaves one level.
-    The fine level evaluates both, or only the new ones if `union` is false. Then half
-    as many samples are evaluated by the larger network, and few of them in empty space.
-    `block` rays are rendered at a time in a whole frame, so memory does not grow with
-    the image.
+    `fine` is the number of samples drawn by the weights of the coarse level. With 0
+    there is one level. If `union` is true, the fine level also evaluates the coarse
+    samples. Otherwise the larger network evaluates half as many samples, few of them in
+    empty space. `block` is the number of rays that are rendered at a time, which makes
+    memory independent of the image size.
     """
 
     coarse: int = 64
@@ -50,9 +50,9 @@ class SamplingSpec:
     spacing: str = "linear"  # or "disparity"
     jitter: bool = True  # while training
     shared: bool = False  # one network for both levels (D-NeRF)
-    union: bool = True  # the fine level sees the coarse samples too
+    union: bool = True  # the fine level also evaluates the coarse samples
     block: int = 1024
-    occupancy: OccupancySpec | None = None  # None: the rays of a step are any
+    occupancy: OccupancySpec | None = None  # None for random rays
 
     def __post_init__(self):
         if self.coarse < 3 or self.fine < 0 or self.block < 1:
@@ -74,7 +74,7 @@ class SamplingSpec:
 
 @dataclasses.dataclass(frozen=True)
 class RadianceScene:
-    """Settings of a radiance field and of its training. An effect of None is absent."""
+    """Settings of a radiance field and of its training. None disables an effect."""
 
     steps: int
     template: TemplateSpec | Template = TemplateSpec()
@@ -82,20 +82,20 @@ class RadianceScene:
         None  # of the coarse level; None is like the fine one
     )
     sampling: SamplingSpec = SamplingSpec()
-    rays: int = 1024  # in a step
-    # In so many equal parts, on as many devices or one after the other: less memory.
-    # A part's losses are means over its own valid rays.
+    rays: int = 1024  # per step
+    # Number of equal parts of a step, on several devices or one after the other to save
+    # memory. The losses of a part are means over its own valid rays.
     micro_batches: int = 1
-    # Longest half-side of the filmed volume in units of the field; None keeps the
-    # capture's own coordinates.
+    # Longest half side of the captured volume in units of the field. None to keep the
+    # coordinates of the capture.
     extent: float | None = 1.0
-    # Of Adam, falling to `learning_rate_end` along a line in the logarithm.
+    # Decays log-linearly to `learning_rate_end`.
     learning_rate: float = 5e-4
     learning_rate_end: float = 5e-5
-    template_rate: float = 1.0  # times that: of the template, for tables learn faster
-    table_rate: float = 1.0  # times that again: of the tables alone
+    template_rate: float = 1.0  # factor for the template
+    table_rate: float = 1.0  # additional factor for the tables of the template
     optimizer: str | Optimizer = "adam"
-    density_noise: float = 0.0  # standard deviation, while training
+    density_noise: float = 0.0  # standard deviation during training
     appearance: AppearanceSpec | None = None
     transient: TransientSpec | Medium | Settings | None = None
     time: TimeSpec | None = None
@@ -107,7 +107,7 @@ class RadianceScene:
     smoothness: SmoothnessSpec | None = None
     mask: MovingMaskSpec | None = None
     surface: SurfaceSpec | None = None
-    # Beside those with a field of their own.
+    # Further conditionings.
     conditioning: tuple[Conditioning | Settings, ...] = ()
     regularizers: tuple[Regularizer | Settings, ...] = ()
     start: FieldStartSpec = FieldStartSpec()
@@ -181,7 +181,7 @@ class RadianceScene:
 
 
 def _refuse_beside_other_template(spec):
-    """Raise ValueError for what only the built-in template can serve."""
+    """Raise ValueError for settings that need the built-in template."""
     alone = {
         "density_noise": spec.density_noise == 0,
         "table_rate": spec.table_rate == 1,
@@ -225,7 +225,7 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecor
         smooth = smoothness.Bound(spec.smoothness, templates_of(spec))
     bent, slice_ = spec.warp, spec.ambient
     if isinstance(bent, WarpSpec) and spec.start.motion == "tracks":
-        # Fitted with all bands open, and closing them would undo it.
+        # The warp is fitted with all bands open. Closing them would undo the fit.
         bent = dataclasses.replace(bent, anneal_steps=None)
     if spec.mask is not None and isinstance(bent, WarpSpec):
         bent = guided(bent)

@@ -1,4 +1,4 @@
-"""The template: a network from an encoded point to density and color."""
+"""Template network, from an encoded point to density and color."""
 
 import dataclasses
 import math
@@ -17,13 +17,13 @@ from nerfies_jax.nn.voxels import VoxelGridSpec
 from nerfies_jax.training import schedules
 from nerfies_jax.training.step_counts import steps
 
-# Logarithm of a density above which the exponential continues along its tangent, finite
-# and with a gradient that brings it back.
+# Log density above which the exponential is continued by its tangent, so that values
+# and gradients are finite.
 LARGEST_LOG = 15.0
 
 
 def exponential(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Compute exp(raw) up to e^15, and its tangent from there on.
+    """Compute exp(raw), continued by its tangent above raw = 15.
 
     Args:
       raw: Log densities, [...].
@@ -32,15 +32,14 @@ def exponential(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
       Densities per unit of the field, [...].
 
     References:
-      Müller et al. 2022, arXiv:2201.05989, whose code clips the gradient and not the
-      value.
+      Müller et al. 2022, arXiv:2201.05989, whose code clips the gradient instead.
     """
     beyond = jnp.maximum(raw - LARGEST_LOG, 0)
     return jnp.exp(jnp.minimum(raw, LARGEST_LOG)) * (1 + beyond)
 
 
 PyTree = Any
-# Encodings with tables of their own, by the module that reads them.
+# Modules of the encodings that have tables of parameters.
 GRIDS = {HashGridSpec: grids, VoxelGridSpec: voxels, PlanesSpec: planes}
 DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu, "exp": exponential}
 
@@ -49,17 +48,17 @@ DENSITIES = {"softplus": jax.nn.softplus, "relu": jax.nn.relu, "exp": exponentia
 class TemplateSpec:
     """Size and activations of the network. The defaults are those of NeRF.
 
-    `direction` is None if color does not depend on the view. "relu" densities are those
-    of the first paper. A ray that starts with none of them positive never learns, and
-    under an interval at infinity the gradient is 1e10 (softplus: at most 6e-3). "exp"
-    becomes opaque in the fewest steps, which suits a grid of features. `anneal_steps`
-    opens the bands of the position, or the levels of its tables, one by one, coarse to
-    fine, as Nerfies those of its warp. None has all open.
+    `direction` is None if color does not depend on the view. `density` is the
+    activation of the density. "relu" is that of the NeRF paper. With it a ray without
+    any positive density has no gradient, and with an interval at infinity the gradient
+    is 1e10, while that of "softplus" is at most 6e-3. "exp" becomes opaque in the
+    fewest steps and suits feature grids. `anneal_steps` is the number of steps over
+    which the bands of the position, or the levels of its tables, are opened one by one,
+    as for the warp of Nerfies. None opens all from the start.
 
-    A position may be read from tables of a grid or of planes, which span the cube [-1,
-    1]^3 of the field and, contracted, all space around it. With planes of `moments` the
-    network reads a point at a time, as the medium of a scene flow does. A template has
-    none.
+    The position may be encoded by a grid or by planes, which span the cube [-1, 1]^3 of
+    the field and, contracted, all space around it. Planes with `moments` also read the
+    time. They are for the medium of a scene flow and not for templates.
     """
 
     position: EncodingSpec | HashGridSpec | VoxelGridSpec | PlanesSpec = EncodingSpec(
@@ -68,10 +67,10 @@ class TemplateSpec:
     direction: EncodingSpec | None = EncodingSpec(4)
     depth: int = 8
     width: int = 256
-    skips: tuple[int, ...] = (5,)  # layers that read the input again; counted from 0
+    skips: tuple[int, ...] = (5,)  # layers that also read the input, counted from 0
     color_width: int = 128
     density: str = "softplus"
-    density_bias: float = 0.0  # added before the activation; negative starts emptier
+    density_bias: float = 0.0  # added before the activation; negative for less density
     anneal_steps: int | None = steps(None)
 
     def __post_init__(self):
@@ -101,12 +100,12 @@ class TemplateSpec:
 
     @property
     def reads_time(self) -> bool:
-        """True if its tables are those of a point at a time."""
+        """True if its tables depend on time."""
         return isinstance(self.position, PlanesSpec) and bool(self.position.moments)
 
     @property
     def encoded_width(self) -> int:
-        """Number of features of a point, and of its time if that is read."""
+        """Number of features of a point, and of the time if it is encoded too."""
         return self.position.width(4 if self.reads_time else 3)
 
 
@@ -177,7 +176,8 @@ def init(
     trunk_key, color_key = jax.random.split(key)
     tables, grid = None, GRIDS.get(type(spec.position))
     if grid is not None:
-        tables_key = jax.random.fold_in(key, 2)  # the others are as without
+        # A separate key, so that the other parameters do not depend on it.
+        tables_key = jax.random.fold_in(key, 2)
         tables = grid.init(spec.position, tables_key, dtype)
     return Template(
         mlp.init(trunk_spec(spec, inputs), trunk_key, dtype),
@@ -199,9 +199,9 @@ def encode(
       spec: Settings of the template.
       params: Parameters.
       point: Point in units of the field, [3].
-      step: Training step, which determines how far the bands or levels are open. None
-        opens all.
-      time: Time in [0, 1]. Needed if `spec.reads_time`.
+      step: Training step, which determines the window of the bands or levels. None to
+        open all.
+      time: Time in [0, 1], required if `spec.reads_time`.
 
     Returns:
       Features, [spec.encoded_width].
@@ -289,7 +289,7 @@ def apply(
 def color_offset(
     spec: TemplateSpec, params: Template, condition: Float[Array, " condition"]
 ) -> Float[Array, " color_width"]:
-    """Compute the contribution of a ray to the first layer of color, with its bias.
+    """Compute the contribution of a ray to the first color layer, including its bias.
 
     It is the same for all samples of a ray.
 
@@ -329,8 +329,8 @@ def colored(
       The density per unit of the field and the color.
     """
     bottleneck, first = params.trunk.heads["bottleneck"], params.color.hidden[0]
-    # Nothing bends between the bottleneck and this layer: all samples meet the product
-    # of both, and never the bottleneck itself.
+    # There is no activation between the bottleneck and this layer, so their matrices
+    # are multiplied once instead of computing the bottleneck for every sample.
     branch = dense.product(hidden, bottleneck.weight @ first.weight[: spec.width])
     if more is not None:
         branch = branch + dense.product(more, first.weight[-len(more) :])
