@@ -64,9 +64,7 @@ def stratified(
         nearer = jnp.maximum(1 / near - gap * share, middle)
         farther = jnp.minimum(1 / far + gap * (1 - share), middle)
         even = 1 / jnp.where(share < 0.5, nearer, farther)
-        even = jnp.where(
-            share == 1, far, even
-        )  # 1 / (1 / far) may be less
+        even = jnp.where(share == 1, far, even)  # 1 / (1 / far) may be less
     even = jnp.clip(even, near, far)
     if key is None:
         return even

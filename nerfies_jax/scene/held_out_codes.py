@@ -22,12 +22,12 @@ from nerfies_jax.training.model import (
     in_default_precision,
 )
 
-RAYS = 512  # of the left half that a code is fitted to
-# L-BFGS is as good as converged after some twenty steps, of about two evaluations each.
+RAYS = 512  # of the left half, to which a code is fitted
+# L-BFGS has nearly converged after some twenty steps of about two evaluations each.
 MOST_STEPS = 20
 EVALUATIONS = 2 * MOST_STEPS
-# Slope of the mean squared error, per unit of code: 1e-4 ends 30 dB short of what 1e-6
-# finds in the same number of steps.
+# Gradient of the mean squared error per unit of code. 1e-4 ends 30 dB below 1e-6, with
+# the same number of steps.
 TOLERANCE = 1e-6
 
 
@@ -40,8 +40,7 @@ def score(
 ) -> evaluation.Halves | None:
     """Evaluate the right halves of frames, with codes fitted to the left halves.
 
-    A transient medium is left out, since a transient object of one frame is in no
-    other.
+    A transient medium is left out, because transient objects are in one frame only.
 
     Args:
       spec: The scene.
@@ -66,7 +65,7 @@ def score(
 
     @jax.jit
     def solve(params, view, pixels, colors, step):
-        # Samples lie where those of the picture do.
+        # With the same samples as the rendered image.
         guide = field.survey(params, step)[skipping.GUIDE] if guided else None
         codes = field.codes_at(params, view)
 
@@ -90,9 +89,9 @@ def score(
 
     def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> Any:
         place = np.argwhere(np.ones(left.shape[:2], bool) if valid is None else valid)
-        if not len(place):  # nothing to go by
+        if not len(place):  # no valid pixels
             return field.codes_at(params, view)
-        # With repeats: one shape, however little of the half was filmed.
+        # With replacement, so that shapes do not depend on the number of valid pixels.
         line, column = place[np.random.default_rng(0).integers(len(place), size=RAYS)].T
         pixels = in_default_precision(np.stack([column, line], axis=1) + 0.5)
         colors = in_default_precision(left[line, column].astype(np.float32) / 255)

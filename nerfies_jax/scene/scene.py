@@ -1,4 +1,4 @@
-"""A radiance field put together: a spec becomes a `Model` the loop can train."""
+"""Models of radiance fields for the training loop, built from a spec."""
 
 import dataclasses
 import functools
@@ -80,17 +80,17 @@ def build(
     Args:
       spec: The scene.
       metadata: Scene metadata, as of `metadata_of`.
-      effects: Internal records of further effects, behind those of the spec.
-      template: Template in the place of the spec's: an object of the protocol
-        `Template`, or a network of `nets.adapters` that reads [point, features] and
+      effects: Internal records of further effects, after those of the spec.
+      template: Template that replaces that of the spec: an object of the protocol
+        `Template`, or a network of `nn.adapters` that reads [point, features] and
         [direction, condition] of a sample and returns its density and color.
 
     Returns:
-      What the training loop and the renderer need.
+      The model for the training loop and the renderer.
 
     Raises:
-      ValueError: If a part needs data that the capture does not have, or a guide that
-        no part provides.
+      ValueError: If a component needs data that the capture does not have, or a
+        per-point code that no component provides.
     """
     if isinstance(template, Network):
         template = NetworkTemplate(template)
@@ -134,7 +134,7 @@ def build(
 
     read = frozenset().union(*(effect.required_data for effect in radiance.effects))
     return Model(
-        # By name alone: a run with other effects of one's own is another run.
+        # Further effects are stored by name. A run with others is a different run.
         spec=(spec, metadata, *(effect.name for effect in effects)),
         init=init,
         step=_stepper(spec, radiance, devices),
@@ -148,7 +148,7 @@ def build(
 
 
 def _check_guides(spec, effects):
-    """Refuse what would end as a missing code where a warp or a slice is traced."""
+    """Raise ValueError for guides that no effect provides, before tracing."""
     there = tuple(effect.name for effect in effects if effect.point_codes is not None)
     for part in ("warp", "ambient"):
         for guide in getattr(getattr(spec, part), "guides", ()):
@@ -167,7 +167,7 @@ def drawing(radiance: Field, seen: Callable[..., tuple[View, Codes]]) -> dict[st
     Args:
       radiance: The field.
       seen: Function `seen(params, given)` that returns a view and the codes of its
-        frame for the object to be rendered.
+        frame, given the input of `render`.
 
     Returns:
       The fields of `Model` by name.
@@ -188,7 +188,7 @@ def drawing(radiance: Field, seen: Callable[..., tuple[View, Codes]]) -> dict[st
 
 
 def _stepper(spec, radiance, devices):
-    """One update from one batch of rays: (state, frames) -> (state, metrics), pure."""
+    """Make the function of a training step, (state, frames) -> (state, metrics)."""
 
     def part(index, state, frames):
         key = loop.step_key(state)
@@ -224,7 +224,7 @@ def _stepper(spec, radiance, devices):
 def micro_batch(
     radiance: Field, state: TrainState, frames: Frames, key: Key[Array, ""]
 ) -> tuple[Batch, Cells | None]:
-    """Draw the rays of a micro-batch.
+    """Sample the rays of a micro-batch.
 
     Args:
       radiance: The field.
@@ -251,7 +251,7 @@ def descend(
     state: TrainState,
     grads: PyTree,
 ) -> tuple[PyTree, optax.OptState]:
-    """The parameters and moments after one update along `grads`."""
+    """Return the parameters and the optimizer state after one update."""
     # optax counts in int32 and multiplies float32 by it.
     with jax.numpy_dtype_promotion("standard"):
         updates, moments = optimizer_of(spec).update(
@@ -266,10 +266,10 @@ def learning_rates(
 ) -> dict[str, PyTree]:
     """Compute the learning rate of each part of the parameters.
 
-    It is the effect's own, or that of the schedule. A warp that is initialized from
-    tracks, and the codes that it reads, begin with a share of it, as does a scene flow
-    with a trunk of its own if there is no warp to fit. A medium on tables has the rate
-    of the template.
+    It is that of the effect, or else the common schedule. For a warp that is
+    initialized from tracks and the codes that it reads, the rate is reduced at the
+    beginning (`FieldStartSpec`), as for a scene flow with its own trunk if there is no
+    warp. A medium with tables has the rate of the template.
 
     Args:
       spec: The scene.
@@ -300,7 +300,7 @@ def learning_rates(
     if isinstance(flow, scene_flow.SceneFlow):
         rate, apart = rates[scene_flow.NAME], flow.flow_trunk is not None
         on_tables = flow.network.tables is not None
-        # Beside a warp it was not fitted (`build`).
+        # With a warp, the flow is not initialized from tracks (`build`).
         of_flow = held * rate if apart and spec.warp is None else rate
         flow_rates: dict[str, PyTree] = dict(
             network=spec.template_rate * rate if on_tables else rate,
@@ -322,7 +322,7 @@ def learning_rates(
 
 
 def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
-    """Draw rays through random pixels of all frames, uniformly.
+    """Sample rays through random pixels of all frames, uniformly.
 
     Args:
       frames: Training frames.
@@ -344,8 +344,8 @@ def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
     valid = ray.valid
     if frames.valid is not None:
         valid = valid & frames.valid[row, line, column]
-    # Chosen here, once for all losses: what was not filmed may hold NaN, which stays
-    # NaN under a weight of zero.
+    # Masked here for all losses, because unobserved pixels may be NaN, which a weight
+    # of zero does not remove.
     color = jnp.where(valid[:, None], color, 0)
     cosine = jax.vmap(rays.depth_per_distance)(camera, ray.direction)
     return Batch(row, pixel, ray.origin, ray.direction, cosine, color, valid)
@@ -437,7 +437,7 @@ def _color_terms(
 def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     """Estimate the memory of the frames, the first state and a step.
 
-    Nothing is allocated. The capture's own memory is counted, too.
+    Nothing is allocated. The memory of the capture is included.
 
     Args:
       spec: The scene.
@@ -450,7 +450,7 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     last = plan.coarse if plan.fine == 0 else plan.union * plan.coarse + plan.fine
     samples = last if plan.fine == 0 else plan.coarse + last
     widths = samples * _width_of(spec.template)
-    # Of parts from other packages nothing is known.
+    # Components from other packages are not estimated.
     for net in (spec.warp, spec.ambient, spec.mask):
         widths += samples * getattr(net, "depth", 0) * getattr(net, "width", 0)
     fog = spec.transient
@@ -458,10 +458,11 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
     if spec.scene_flow is not None:
         medium = spec.scene_flow.network
         trunk = spec.scene_flow.flow_trunk * medium.depth * medium.width
-        # Asked for this moment and for those beside it.
+        # Evaluated at this timestamp and at the two neighboring ones.
         widths += 3 * last * (_width_of(medium) + trunk)
-    # Every layer's output is kept for the backward pass, beside its gradient. Of steps
-    # of 256 rays of the small presets XLA's temporaries are 0.57 to 1.02 of this.
+    # The output of every layer is stored for the backward pass, in addition to its
+    # gradient. For steps of 256 rays with the small presets, XLA's temporary memory is
+    # 0.57 to 1.02 times this estimate.
     rays_at_once = spec.rays // spec.micro_batches
     activations = 3 * rays_at_once * widths
     devices = data_parallel.device_count(spec.micro_batches)
@@ -469,12 +470,12 @@ def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:
 
 
 def _width_of(one: object) -> int:
-    """Floats that are kept of a sample: of its layers, and those read from planes."""
+    """Count the floats stored per sample: outputs of layers, and values of planes."""
     if not isinstance(one, TemplateSpec):
         return 0  # unknown
     width, position = one.depth * one.width + one.color_width, one.position
     if not isinstance(position, PlanesSpec):
-        return width  # of grids hardly any more: 0.77 to 1.02 of the estimate
+        return width  # grids add little: 0.77 to 1.02 times the estimate
     corners = 4 * (3 if position.moments is None else 6)
     return width + corners * position.levels * position.features
 

@@ -16,11 +16,11 @@ def parts(
     state: TrainState,
     frames: Frames,
 ) -> StepParts:
-    """Begin to compile the parts of one training step of a radiance field.
+    """Start to compile the parts of one training step of a radiance field.
 
-    Times are medians of warm calls in milliseconds. Each part is timed by itself on a
-    micro-batch of rays, and multiplied by the number of those that a device processes
-    in a step. "rest" is the remainder of the whole step.
+    Times are medians of warm calls in milliseconds. Each part is timed separately on a
+    micro-batch of rays and multiplied by the number of micro-batches per device and
+    step. "rest" is the difference to the time of the whole step.
 
     Args:
       spec: The scene.

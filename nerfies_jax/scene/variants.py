@@ -16,7 +16,7 @@ from nerfies_jax.training.model import Model, View
 class Between(NamedTuple):
     """A view whose appearance lies between those of two frames."""
 
-    view: View  # its own appearance is the one at share 0
+    view: View  # with the appearance at share 0
     toward: Int[Array, ""]  # appearance id at share 1
     share: Float[Array, ""]  # in [0, 1]
 
@@ -32,7 +32,8 @@ def parts(spec, metadata) -> Parts:
       The removable effects, and whether the field has appearance codes.
     """
     whole = scene.field(spec, metadata)
-    # Effects that feed the networks are part of them. A penalty renders nothing.
+    # Effects whose outputs are inputs of networks cannot be removed. Losses are not
+    # rendered.
     removable = tuple(
         effect.name
         for effect in whole.effects
@@ -83,7 +84,7 @@ def without_effects(
         view, share = between.view, between.share
         start = field.codes_at(params, view)
         end = field.codes_at(params, view._replace(appearance=between.toward))
-        # Codes of the moment are the same at both ends and stay as they are.
+        # Codes of the timestamp are the same at both ends and do not change.
         codes = {name: (1 - share) * start[name] + share * end[name] for name in start}
         return view, codes
 

@@ -15,7 +15,7 @@ from nerfies_jax.training import tracks
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import in_default_precision
 
-LEAST_STRETCH = 1e-6  # a collapsed direction has a logarithm, too
+LEAST_STRETCH = 1e-6  # bounds the logarithm of collapsed directions
 
 
 def follow(
@@ -25,11 +25,11 @@ def follow(
     capture: Capture,
     known: GroundTruth,
 ) -> PointTracks | None:
-    """Track points from the start to all other times, through the template of a field.
+    """Track points from the start to all other times through the template of a field.
 
-    A point is mapped to the template by the warp of the start, and from there by the
-    inverse warp of every other time. Without a warp, a scene flow takes it from each
-    time to the next, and the strain is not defined.
+    A point is mapped to the template by the warp at the start, and from there by the
+    inverse warp at every other time. Without a warp, points follow the scene flow from
+    each time to the next, and the strain is undefined.
 
     Args:
       spec: The scene.
@@ -100,7 +100,7 @@ def _static_points(capture):
 
 
 def _follow_flow(field, state, capture, known):
-    """Track outward from the start. None without a scene flow."""
+    """Track forward and backward by scene flow. Return None without a scene flow."""
     move = _flow_mover(field)
     if move is None:
         return None
@@ -131,11 +131,10 @@ def _follow_flow(field, state, capture, known):
 
 
 def _flow_mover(field) -> Move | None:
-    """Follow the scene flow, one interval of the capture after the other.
+    """Return a function that follows the scene flow interval by interval.
 
-    Between two views that are no whole number of intervals apart, each hop is that much
-    shorter or longer than what the flow says. A point that runs to no finite place is
-    lost.
+    If the time between two views is not a multiple of the interval, the flow of each
+    hop is scaled. A point whose position becomes non-finite is lost.
     """
     if all(effect.name != scene_flow.NAME for effect in field.effects):
         return None
@@ -174,7 +173,7 @@ def mover(spec, metadata) -> Move | None:
       metadata: Scene metadata.
 
     Returns:
-      The motion, or None if nothing in the scene moves points.
+      The motion, or None if no effect of the scene moves points.
     """
     field = scene.field(spec, metadata)
     if all(effect.displace is None for effect in field.effects):
