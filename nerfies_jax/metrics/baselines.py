@@ -26,15 +26,16 @@ def read(path: pathlib.Path, name: str) -> dict[str, Metric]:
         return clock.read_metrics(path)
     except OSError as error:
         raise ValueError(
-            f"{path}: cannot be read ({error.strerror}); name an earlier run's {name}"
+            f"{path}: cannot be read ({error.strerror}); pass the {name} of an earlier "
+            "run"
         ) from error
 
 
 def changes(metrics: Sequence[Metric], before: Mapping[str, Metric]) -> list[str]:
     """List the metrics that are worse than before by more than their tolerance.
 
-    Only metrics of both runs are compared. A metric that was not finite before never
-    counts as worse.
+    Only metrics of both runs are compared. Metrics that were not finite before are
+    skipped.
 
     Args:
       metrics: Metrics of the later run.

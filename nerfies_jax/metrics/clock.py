@@ -24,17 +24,13 @@ DIRECTIONS = ("lower", "higher", "equal")
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """A measured value that a later run can be compared with.
+    """A measured value that can be compared with the value of another run."""
 
-    `direction` is the better direction: "lower", "higher" or "equal". `tolerance` is
-    the decline that is accepted, in the unit of the metric.
-    """
-
-    key: str  # "heldout.psnr"
+    key: str  # such as "heldout.psnr"
     value: float | int
     unit: str  # "dB", "ms", "bytes", "" for a share
-    direction: str
-    tolerance: float = 0.0
+    direction: str  # better values: "lower", "higher", "equal" for none
+    tolerance: float = 0.0  # accepted decline, in the unit of the metric
 
     def __post_init__(self):
         if not self.key or self.key != self.key.strip():
@@ -43,23 +39,23 @@ class Metric:
             )
         if self.direction not in DIRECTIONS:
             raise ValueError(
-                f"metric {self.key}: direction is one of {', '.join(DIRECTIONS)}, got "
-                f"{self.direction!r}"
+                f"metric {self.key}: direction must be one of {', '.join(DIRECTIONS)}, "
+                f"got {self.direction!r}"
             )
         if not (math.isfinite(self.tolerance) and self.tolerance >= 0):
             raise ValueError(
-                f"metric {self.key}: tolerance is finite and not negative, got "
+                f"metric {self.key}: tolerance must be finite and not negative, got "
                 f"{self.tolerance}"
             )
 
     def holds(self, before: float) -> bool:
-        """Return whether the value is no worse than before, within the tolerance.
+        """Test if the value is no worse than an earlier one, within the tolerance.
 
         Args:
           before: The earlier value.
 
         Returns:
-          True if it holds. NaN never does.
+          True if it is no worse. False for NaN.
         """
         change = self.value - before
         if self.direction == "lower":
@@ -74,7 +70,7 @@ def write_metrics(
 ) -> None:
     """Write metrics as `{"about": ..., "metrics": {key: {value, unit, ...}}}`.
 
-    Values that are not finite are written as null, since JSON cannot represent them.
+    Values that are not finite are written as null, because JSON cannot represent them.
 
     Args:
       path: The file.
@@ -100,7 +96,7 @@ def metric_rows(metrics: Iterable[Metric]) -> dict[str, dict[str, Any]]:
     for metric in metrics:
         if metric.key in rows:
             raise ValueError(
-                f"metric {metric.key} is there twice; each key is one number"
+                f"metric {metric.key} occurs twice; each key must have one value"
             )
         row = dataclasses.asdict(metric)
         del row["key"]
@@ -137,7 +133,7 @@ def read_metrics(path) -> dict[str, Metric]:
         ArithmeticError,
     ) as error:
         raise FileError(
-            f"{path}: not a file of metrics ({error!r}); write it with write_metrics"
+            f"{path}: not a file of metrics ({error!r}); create it with write_metrics"
         ) from error
 
 
@@ -146,10 +142,10 @@ def _number(value):
 
 
 class Timing(NamedTuple):
-    """Repeated warm calls of one function, in seconds."""
+    """Times of repeated calls of a compiled function, in seconds."""
 
-    wall: np.ndarray  # [repeats]
-    cpu: np.ndarray  # [repeats] of all threads of this process
+    wall: np.ndarray  # [repeats] wall time
+    cpu: np.ndarray  # [repeats] processor time of all threads of this process
 
     @property
     def median(self) -> float:
@@ -158,12 +154,12 @@ class Timing(NamedTuple):
 
     @property
     def median_cpu(self) -> float:
-        """Median processor time, to compare on a machine shared with others."""
+        """Median processor time, for comparisons on a shared machine."""
         return float(np.median(self.cpu))
 
     @property
     def spread(self) -> float:
-        """Half the distance between the quartiles of the wall time."""
+        """Half of the interquartile range of the wall time."""
         low, high = np.percentile(self.wall, (25, 75))
         return float(high - low) / 2
 
@@ -171,12 +167,12 @@ class Timing(NamedTuple):
 def measure(
     function: Callable[[], Any], *, repeats: int = 10, warm_up: int = 2
 ) -> Timing:
-    """Time warm calls of a function, each until its results are ready.
+    """Time calls of a function, each until its results are ready.
 
     Args:
       function: The function.
       repeats: Number of timed calls.
-      warm_up: Number of calls before them.
+      warm_up: Number of preceding calls that are not timed.
 
     Returns:
       The times.
@@ -187,15 +183,15 @@ def measure(
 def compare(
     functions: Mapping[str, Callable[[], Any]], *, repeats: int = 10, warm_up: int = 2
 ) -> dict[str, Timing]:
-    """Time several functions in turn, so that load on the machine affects all of them.
+    """Time several functions in turn, so that other load affects all of them equally.
 
-    Compare `median_cpu` on a shared machine, and ratios within one run rather than
-    seconds of two runs, since absolute times vary by a quarter.
+    On a shared machine, compare `median_cpu`. Compare ratios within one run rather than
+    times of two runs, because absolute times vary by a quarter.
 
     Args:
       functions: Functions by name.
-      repeats: Number of timed calls of each.
-      warm_up: Number of calls before them.
+      repeats: Number of timed calls of each function.
+      warm_up: Number of preceding calls of each function that are not timed.
 
     Returns:
       Times by name.
@@ -206,7 +202,7 @@ def compare(
     if repeats < 1 or warm_up < 0:
         raise ValueError(
             f"timing needs repeats >= 1 and warm_up >= 0, got repeats={repeats}, "
-            f"warm_up={warm_up}; the first call compiles and should be warm-up"
+            f"warm_up={warm_up}; the first call compiles and should not be timed"
         )
     for function in functions.values():
         for _ in range(warm_up):
@@ -215,21 +211,21 @@ def compare(
     cpu: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(repeats):
         for name, function in functions.items():
-            wall_began, cpu_began = time.perf_counter(), time.process_time()
+            wall_start, cpu_start = time.perf_counter(), time.process_time()
             jax.block_until_ready(function())
-            cpu[name].append(time.process_time() - cpu_began)
-            wall[name].append(time.perf_counter() - wall_began)
+            cpu[name].append(time.process_time() - cpu_start)
+            wall[name].append(time.perf_counter() - wall_start)
     return {
         name: Timing(np.array(wall[name]), np.array(cpu[name])) for name in functions
     }
 
 
 class Cost(NamedTuple):
-    """Cost of one call of a program, as the compiler reports it."""
+    """Cost of one call of a program, as reported by the compiler."""
 
-    flops: float  # NaN where the backend does not count
-    bytes_accessed: float  # read and written; NaN where it does not count
-    temporary_bytes: int  # beside arguments and results
+    flops: float  # NaN if the backend does not report it
+    bytes_accessed: float  # read and written, NaN if the backend does not report it
+    temporary_bytes: int  # without arguments and results
     argument_bytes: int
     output_bytes: int
     compile_seconds: float
@@ -238,8 +234,8 @@ class Cost(NamedTuple):
 def cost(function: Callable, *args, **kwargs) -> Cost:
     """Compile a function for some arguments and return the cost of a call.
 
-    The body of a loop counts once, however often it runs, since XLA does not know how
-    often.
+    The body of a loop is counted once, because XLA does not know the number of
+    iterations.
 
     Args:
       function: The function, jitted or not.
@@ -249,10 +245,10 @@ def cost(function: Callable, *args, **kwargs) -> Cost:
     Returns:
       The cost.
     """
-    began = time.perf_counter()
+    start = time.perf_counter()
     lower = function.lower if hasattr(function, "lower") else jax.jit(function).lower
     compiled = lower(*args, **kwargs).compile()
-    return cost_of(compiled, time.perf_counter() - began)
+    return cost_of(compiled, time.perf_counter() - start)
 
 
 def cost_of(compiled: jax.stages.Compiled, compile_seconds: float) -> Cost:
@@ -260,20 +256,20 @@ def cost_of(compiled: jax.stages.Compiled, compile_seconds: float) -> Cost:
 
     Args:
       compiled: The program.
-      compile_seconds: Seconds that its compilation took.
+      compile_seconds: Time of its compilation.
 
     Returns:
       The cost.
     """
-    counted = compiled.cost_analysis() or {}
-    if isinstance(counted, list):  # one per computation on some backends
-        counted = counted[0] if counted else {}
+    analysis = compiled.cost_analysis() or {}
+    if isinstance(analysis, list):  # one per computation on some backends
+        analysis = analysis[0] if analysis else {}
     memory = compiled.memory_analysis()
     if memory is None:
         raise ValueError("this backend does not report the memory of its programs")
     return Cost(
-        float(counted.get("flops", math.nan)),
-        float(counted.get("bytes accessed", math.nan)),
+        float(analysis.get("flops", math.nan)),
+        float(analysis.get("bytes accessed", math.nan)),
         int(memory.temp_size_in_bytes),
         int(memory.argument_size_in_bytes),
         int(memory.output_size_in_bytes),
@@ -287,9 +283,8 @@ def peak_bytes() -> int:
     Returns:
       Number of bytes.
     """
-    # psutil knows the peak on Windows alone, and getrusage on Linux also remembers the
-    # process that started this one: a small program under a large one would read its
-    # parent's memory.
+    # psutil reports the peak only on Windows. On Linux getrusage is not used, because
+    # its peak includes the memory of the process that started this one.
     peak = getattr(psutil.Process().memory_info(), "peak_wset", None)
     if peak is not None:
         return peak
@@ -299,7 +294,7 @@ def peak_bytes() -> int:
                 return 1024 * int(line.split()[1])
     except OSError:
         pass
-    import resource  # not there on Windows
+    import resource  # does not exist on Windows
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes
@@ -340,14 +335,14 @@ def machine() -> dict[str, Any]:
 
 
 def beside(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
-    """Add the processors of an earlier description, for a file that keeps both timings.
+    """Add the processors of an earlier description, for a file with timings of both.
 
     Args:
       now: Description of this machine.
       before: Earlier description, which may be empty.
 
     Returns:
-      `now` with all processors, each once.
+      `now` with the names of all different processors.
     """
     names = [*filter(None, before.get("cpu", "").split("; ")), now["cpu"]]
     return now | {"cpu": "; ".join(dict.fromkeys(names))}

@@ -1,8 +1,8 @@
 """Metrics of depth, optical flow, point tracks and camera paths.
 
-Depth, flow and tracks are pure JAX, in float32 or float64. Camera paths are compared on
-the host in float64. The alignment decides by rank whether it is determined, and is not
-for training.
+Metrics of depth, flow and tracks are pure JAX, in float32 or float64. Camera paths are
+compared on the host in float64. Their alignment depends on a numerical rank and cannot
+be differentiated.
 """
 
 from typing import NamedTuple
@@ -13,12 +13,13 @@ from jaxtyping import Array, Bool, Float
 
 from nerfies_jax.geometry.precision import widened
 
-DELTA = 1.25  # ratio of depths that still counts as right, Eigen et al. 2014
-# KITTI 2015 calls a flow wrong beyond 3 px and 5 % of its length.
+DELTA = 1.25  # ratio of depths that is accepted as correct, Eigen et al. 2014
+# In KITTI 2015, the flow of a pixel is an outlier if its error exceeds 3 px and 5 % of
+# the true length.
 OUTLIER_PX = 3.0
 OUTLIER_SHARE = 0.05
-# A direction in which points spread less than this share of their largest spread is
-# rounding: float32 positions carry 6e-8 of their distance from the origin.
+# Directions in which the spread of points is smaller than this share of the largest
+# spread are due to rounding: float32 positions have a relative error of 6e-8.
 FLAT_BELOW = 1e-6
 
 
@@ -28,15 +29,15 @@ class DepthErrors(NamedTuple):
     abs_rel: Float[Array, ""]  # mean |d - truth| / truth
     rmse: Float[Array, ""]  # scene units
     within_delta: Float[Array, ""]  # share with max(d/truth, truth/d) < 1.25
-    pixels: Float[Array, ""]  # how many
+    pixels: Float[Array, ""]  # number of compared pixels
 
 
 class Line(NamedTuple):
-    """Alignment `scale * depth + shift`, with a scale of 0 if it is not determined."""
+    """Alignment `scale * depth + shift`."""
 
-    scale: Float[Array, ""]
+    scale: Float[Array, ""]  # 0 if it is not determined
     shift: Float[Array, ""]
-    determined: Bool[Array, ""]  # false where the depth does not vary
+    determined: Bool[Array, ""]  # False if the depth is constant
 
 
 def known_depth(
@@ -44,15 +45,15 @@ def known_depth(
     truth: Float[Array, "*pixels"],
     mask: Bool[Array, "*pixels"] | None = None,
 ) -> Bool[Array, "*pixels"]:
-    """Find the pixels where two depths can be compared.
+    """Find the pixels whose depths can be compared.
 
     Args:
       depth: Predicted depths, [...].
-      truth: True depths, 0 where unknown, [...].
+      truth: True depths, 0 if unknown, [...].
       mask: True for pixels to compare, [...]. None for all.
 
     Returns:
-      Booleans [...], True where both are finite and the truth is positive.
+      Booleans [...], True if both are finite and the truth is positive.
     """
     known = jnp.isfinite(depth) & jnp.isfinite(truth) & (truth > 0)
     return known if mask is None else known & mask
@@ -65,12 +66,12 @@ def depth_errors(
 ) -> DepthErrors:
     """Compute errors of z-depth.
 
-    A depth that is not positive counts in full in the first two metrics and as wrong in
-    the third. For monocular depth, pass the result of `align_depth`.
+    Depths that are not positive are included, and never within delta. Align monocular
+    depth with `align_depth` first.
 
     Args:
       depth: Predicted depths in scene units, [...].
-      truth: True depths, 0 where unknown, [...].
+      truth: True depths, 0 if unknown, [...].
       mask: True for pixels to compare, [...]. None for all.
 
     Returns:
@@ -102,12 +103,13 @@ def align_depth(
 ) -> Line:
     """Fit scale and shift by least squares over the known pixels.
 
-    The protocol of MiDaS aligns inverse depths, so pass those. The fit is solved about
-    the means. The normal equations of a depth of 1000 ± 1 would lose six digits.
+    The protocol of MiDaS aligns inverse depths, so pass inverse depths to follow it.
+    The means are subtracted first, because the normal equations for a depth of 1000 ± 1
+    would lose six digits.
 
     Args:
       depth: Predicted depths or inverse depths, [...].
-      truth: True values, 0 where unknown, [...].
+      truth: True values, 0 if unknown, [...].
       mask: True for pixels to use, [...]. None for all.
 
     Returns:
@@ -123,7 +125,7 @@ def align_depth(
     from_mean = jnp.where(known, depth - mean_depth, 0.0)
     variance = _mean(from_mean**2, known)
     covariance = _mean(from_mean * (truth - mean_truth), known)
-    # The mean is right to a few ulps, so a constant depth shows that much variance.
+    # The mean has an error of a few ulps, which is the variance of a constant depth.
     rounding = 4 * jnp.finfo(depth.dtype).eps * mean_depth
     determined = variance > rounding**2
     scale = jnp.where(
@@ -136,7 +138,7 @@ class FlowErrors(NamedTuple):
     """Errors over the pixels whose true flow is known, NaN if there are none."""
 
     endpoint: Float[Array, ""]  # mean distance, pixels
-    outliers: Float[Array, ""]  # share beyond 3 px and 5 % (KITTI's Fl)
+    outliers: Float[Array, ""]  # share with errors above 3 px and 5 % (Fl of KITTI)
     pixels: Float[Array, ""]
 
 
@@ -148,9 +150,9 @@ def flow_errors(
     """Compute the end-point error of optical flow.
 
     Args:
-      flow: Predicted flow in pixels, [..., 2]. If it is not finite where the truth is
-        known, the mean is infinite and the pixel counts as an outlier.
-      truth: True flow, not finite where unknown, [..., 2].
+      flow: Predicted flow in pixels, [..., 2]. If it is not finite for a pixel with a
+        known truth, the mean is infinite and the pixel is an outlier.
+      truth: True flow, not finite if unknown, [..., 2].
       mask: True for pixels to compare, [...]. None for all.
 
     Returns:
@@ -185,12 +187,12 @@ def track_errors(
 ) -> TrackErrors:
     """Compute the errors of point tracks.
 
-    DyCheck's PCK-T (arXiv:2210.13445) uses a threshold of 0.05 of the longer side of
-    the image in pixels. 3D tracks use a length in scene units.
+    PCK-T of DyCheck (arXiv:2210.13445) uses a threshold of 0.05 times the longer side
+    of the image in pixels. For 3D tracks the threshold is a length in scene units.
 
     Args:
-      tracks: Predicted positions, [..., axes], not finite for lost points, which count
-        as wrong.
+      tracks: Predicted positions, [..., axes]. Lost points are not finite, and never
+        correct.
       truth: True positions, [..., axes].
       visible: True for points to compare, [...].
       threshold: Distance below which a point is correct, in the unit of the positions.
@@ -202,9 +204,7 @@ def track_errors(
       ValueError: If the threshold is not positive.
     """
     if not threshold > 0:
-        raise ValueError(
-            f"the distance of a correct point is positive, got {threshold}"
-        )
+        raise ValueError(f"threshold={threshold} must be positive")
     tracks, truth = widened(tracks), widened(truth)
     distance = _distance(tracks, truth, visible)
     return TrackErrors(
@@ -215,7 +215,7 @@ def track_errors(
 
 
 def _mean(values, where):
-    """NaN over nothing: no answer rather than a perfect one."""
+    """Mean over a mask, NaN if it is empty."""
     count = jnp.sum(where).astype(values.dtype)
     return jnp.sum(jnp.where(where, values, 0.0)) / count
 
@@ -237,8 +237,8 @@ class Similarity(NamedTuple):
     scale: float
     rotation: np.ndarray  # [3, 3], determinant +1
     translation: np.ndarray  # [3]
-    rank: int  # directions the paired points spread in: 0 a point, 1 a line, 2 a plane
-    determined: bool  # false where another rotation fits as well
+    rank: int  # dimension of the points: 0 for a point, 1 for a line, 2 for a plane
+    determined: bool  # False if other rotations fit equally well
 
 
 class PathErrors(NamedTuple):
@@ -260,9 +260,9 @@ class RelativeErrors(NamedTuple):
 def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similarity:
     """Find the similarity or rigid motion that aligns points with their truth.
 
-    Points on a line leave a rotation undetermined, which the residual does not show but
-    `determined` does. The result is never a reflection. A planar or mirrored set gets
-    the best rotation.
+    The rotation is not determined by points on a line, which `determined` reports (the
+    residual does not show it). The result is never a reflection. For planar or mirrored
+    sets it is the best rotation.
 
     Args:
       points: Points, [points, 3].
@@ -281,9 +281,11 @@ def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similar
     points, truth = _positions(points, "points"), _positions(truth, "truth")
     if points.shape != truth.shape:
         raise ValueError(
-            f"an alignment pairs points, got {len(points)} and {len(truth)} of them"
+            "points and truth must have the same number of points, got "
+            f"{len(points)} and {len(truth)}"
         )
-    # In float64 about the centers: 1e6 away, float32 gets the scale 1e-3 wrong.
+    # In float64 relative to the centers: float32 points at a distance of 1e6 from the
+    # origin would lead to an error of 1e-3 of the scale.
     center, true_center = points.mean(0), truth.mean(0)
     offsets, true_offsets = points - center, truth - true_center
     left, spread, right = np.linalg.svd(true_offsets.T @ offsets / len(points))
@@ -295,7 +297,8 @@ def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similar
     spread_out = variance > (FLAT_BELOW * largest) ** 2
     rank = min(_rank(points), _rank(truth))
     scale = float(spread @ signs / variance) if scaled and spread_out else 1.0
-    # Two equal smallest spreads under a mirror leave the axis of the flip open.
+    # If the two smallest singular values of a mirrored set are equal, the axis of the
+    # flip is not determined.
     ambiguous = mirrored and spread[1] - spread[2] <= FLAT_BELOW * spread[0]
     return Similarity(
         scale=scale,
@@ -308,9 +311,9 @@ def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similar
 
 def _rank(points):
     spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    # Relative to the spread, and to the distance whose rounding the points carry.
-    floor = FLAT_BELOW * max(spread[0], np.abs(points).max())
-    return int(np.sum(spread > floor))
+    # Relative to the largest spread, and to the rounding errors of the coordinates.
+    threshold = FLAT_BELOW * max(spread[0], np.abs(points).max())
+    return int(np.sum(spread > threshold))
 
 
 def path_errors(
@@ -318,12 +321,12 @@ def path_errors(
 ) -> PathErrors:
     """Compute the absolute trajectory error of camera positions after alignment.
 
-    Check `alignment.determined` before trusting a small error.
+    A small error means nothing unless `alignment.determined` is true.
 
     Args:
       positions: Camera positions, [frames, 3].
       truth: True positions, [frames, 3].
-      scaled: True to align the scale too, since a path from images alone has none.
+      scaled: True to align the scale too, which images alone do not determine.
 
     Returns:
       The errors.
@@ -351,15 +354,15 @@ def relative_errors(
 ) -> RelativeErrors:
     """Compute the relative pose error between frames.
 
-    It does not depend on the origin of the world, but on its scale. Scale the positions
-    first (`align_points`).
+    It depends on the scale of the world, but not on its origin or orientation. Align
+    the scale first (`align_points`).
 
     Args:
       camera_from_world: Rotations, [frames, 3, 3].
       positions: Camera positions, [frames, 3].
       true_camera_from_world: True rotations, [frames, 3, 3].
       true_positions: True positions, [frames, 3].
-      stride: Distance of the compared frames.
+      stride: Distance between compared frames.
 
     Returns:
       The errors.
@@ -373,12 +376,12 @@ def relative_errors(
     frames = len(positions)
     if not 1 <= stride < frames:
         raise ValueError(
-            f"relative errors over {frames} frames need 1 <= stride < {frames}, "
-            f"got {stride}"
+            f"stride={stride} must be at least 1 and below the number of frames, "
+            f"{frames}"
         )
     step, turn = _motions(camera_from_world, positions, stride)
     true_step, true_turn = _motions(true_camera_from_world, true_positions, stride)
-    # The second camera as seen from the first, wrong by R_error = true^T found.
+    # R_error = R_true^T R, for the rotation of the second camera relative to the first.
     error = np.einsum("nji,njk->nik", true_turn, turn)
     distance_sq = np.sum((step - true_step) ** 2, axis=1)
     return RelativeErrors(
@@ -392,7 +395,8 @@ def _motions(camera_from_world, positions, stride):
     positions = _positions(positions, "positions")
     if rotation.shape != (len(positions), 3, 3):
         raise ValueError(
-            f"one rotation for each of {len(positions)} positions, got {rotation.shape}"
+            f"expected one rotation [3, 3] for each of {len(positions)} positions, got "
+            f"an array of shape {rotation.shape}"
         )
     step = positions[stride:] - positions[:-stride]
     turn = rotation[:-stride] @ rotation[stride:].swapaxes(-1, -2)
@@ -400,7 +404,7 @@ def _motions(camera_from_world, positions, stride):
 
 
 def _angle(rotation):
-    """Angles of rotation matrices in radians, exact near 0 and π, unlike arccos."""
+    """Return angles of rotations in radians, unlike arccos exact near 0 and π."""
     skew = rotation - rotation.swapaxes(-1, -2)
     axis = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1)
     trace = np.trace(rotation, axis1=-2, axis2=-1)
@@ -411,9 +415,11 @@ def _positions(points, name):
     points = np.asarray(points, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise ValueError(
-            f"{name} are [points, 3] with at least one, got {points.shape}"
+            f"{name} must be [points, 3] with at least one point, got {points.shape}"
         )
     if not np.all(np.isfinite(points)):
         row = int(np.argwhere(~np.isfinite(points))[0, 0])
-        raise ValueError(f"{name}[{row}] is {points[row]}; drop what was not found")
+        raise ValueError(
+            f"{name}[{row}]={points[row]} must be finite; remove unknown points"
+        )
     return points

@@ -4,10 +4,10 @@ Images are `[height, width, channels]` or gray `[height, width]`, in [0, 1] or a
 or uint16, which are divided by 255 and 65535. Leading axes are a batch, with one score
 for each image.
 
-Published numbers mix protocols, so each one has its name here. `padding="valid"` is
-scikit-image's Gaussian SSIM, and `padding="zero"` is INRIA's (0.002 to 0.011 higher on
-photographs). Apply `quantize` first to get the score of an image that was stored with 8
-bits. Images narrower than float32 are widened to it first.
+Published results use different protocols, which have separate names here. The SSIM with
+`padding="valid"` is the Gaussian SSIM of scikit-image, and `padding="zero"` is that of
+INRIA (0.002 to 0.011 higher for photographs). Apply `quantize` first to score an image
+as if it were stored with 8 bits. Dtypes below float32 are converted to float32.
 """
 
 from typing import Literal
@@ -23,29 +23,28 @@ from nerfies_jax.training import losses
 
 TAPS = len(losses.WINDOW)  # 11 pixels
 C1, C2 = losses.LUMINANCE, losses.CONTRAST
-# Wang, Simoncelli and Bovik 2003, "Multiscale structural similarity"; as printed they
-# sum to 1.0001.
+# Wang, Simoncelli and Bovik 2003, "Multiscale structural similarity". The published
+# weights sum to 1.0001.
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
-# More channels are a batch of gray images.
-MOST_CHANNELS = 16
+MAX_CHANNELS = 16  # a larger last axis means a batch of gray images
 
 Padding = Literal["valid", "zero"]
 
 
 def _refuse_stacks(image: Float[Array, "height width channels"]) -> None:
-    """A stack of gray images [n, height, width] is no image of many channels."""
-    if image.shape[-1] > MOST_CHANNELS:
+    """Refuse a stack of gray images [n, height, width], which looks like one image."""
+    if image.shape[-1] > MAX_CHANNELS:
         raise ValueError(
             f"an image {list(image.shape)} has {image.shape[-1]} channels, more than "
-            f"{MOST_CHANNELS}; images are [height, width, channels], and gray ones in "
-            "a batch have a last axis of 1"
+            f"{MAX_CHANNELS}; images are [height, width, channels], and a batch of "
+            "gray images needs a last axis of length 1"
         )
 
 
 @checked(images=("image",))
 def quantize(image: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Round an image as an 8-bit file does: clipped to [0, 1] and rounded to n/255.
+    """Clip an image to [0, 1] and round it to n/255, as an 8-bit file does.
 
     Args:
       image: Values of any shape.
@@ -63,9 +62,8 @@ def psnr(
 ) -> Float[Array, ""]:
     """Compute the peak signal-to-noise ratio for a peak of 1.
 
-    It is capped at 100 dB. The cap (`losses.LEAST_MSE`) is a maximum, not an offset:
-    adding 1e-10 would report 79.957 dB where 80 is true. Equal images have gradient
-    zero.
+    It is limited to 100 dB (`losses.LEAST_MSE`) by a maximum. Adding 1e-10 to the error
+    instead would change 80 dB to 79.957 dB. The gradient for equal images is zero.
 
     Args:
       image: Rendered images in [0, 1], [..., height, width, channels].
@@ -87,7 +85,7 @@ def masked_psnr(
 ) -> Float[Array, ""]:
     """Compute the PSNR of the masked pixels.
 
-    Pixels outside the mask do not matter and may be NaN.
+    Pixels outside the mask have no effect and may be NaN.
 
     Args:
       image: Rendered images in [0, 1], [..., height, width, channels].
@@ -103,8 +101,8 @@ def masked_psnr(
     _refuse_stacks(image)
     mask = mask[..., None]
     image, truth = widened(image), widened(truth)
-    # Both images are emptied before the difference: NaN * 0 is NaN, and so is the
-    # gradient of a `where` whose other branch is NaN.
+    # Pixels are masked before the difference: NaN * 0 is NaN, and so is the gradient of
+    # a `where` whose other branch is NaN.
     error = jnp.where(mask, image, 0.0) - jnp.where(mask, truth, 0.0)
     count = jnp.sum(mask).astype(image.dtype) * image.shape[-1]
     return losses.psnr(jnp.sum(error**2) / count)
@@ -119,9 +117,9 @@ def ssim(
     """Compute the structural similarity, averaged over windows and channels.
 
     The window is a Gaussian of 11 pixels with a sigma of 1.5. "valid" averages the
-    windows inside the image and equals scikit-image's `structural_similarity` with
+    windows inside the image and equals `structural_similarity` of scikit-image with
     `gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1`.
-    "zero" pads both images with black and averages all pixels, as INRIA does.
+    "zero" pads both images with zeros and averages all pixels, as INRIA does.
 
     Args:
       image: Rendered images in [0, 1], [..., height, width, channels].
@@ -146,13 +144,13 @@ def ms_ssim(
 ) -> Float[Array, ""]:
     """Compute the multi-scale structural similarity with valid windows.
 
-    It takes contrast and structure at every scale and luminance at the coarsest. Scales
-    are halved by 2x2 means, with an odd last row or column doubled. The means over
-    pixels are taken per channel and clipped at zero, and the score is averaged over
+    Contrast and structure are compared at every scale, and luminance at the coarsest.
+    Images are halved by 2x2 means, with an odd last row or column repeated. Means over
+    pixels are clipped at zero for each channel, and the score is averaged over
     channels, as in TensorFlow and pytorch-msssim.
 
     Five scales need more than 160 pixels on the shorter side. With fewer scales the
-    remaining weights are normalized to sum to one, which is another metric, so report
+    remaining weights are normalized to sum to one. This is another metric, so report
     the number of scales with the score.
 
     Args:
@@ -180,8 +178,8 @@ def ms_ssim(
         luminance, contrast = _terms(image, truth, _window_mean)
         last = scale == scales - 1
         term = jnp.mean(luminance * contrast if last else contrast, axis=(0, 1))
-        # A negative correlation has no real power, and the gradient of x^0.04 at 0 is
-        # infinite: such a scale scores 0 and passes no gradient.
+        # A negative number has no real power, and the gradient of x^0.04 at 0 is
+        # infinite. The score of such a scale is 0 and has no gradient.
         similar = term > 0
         score = score * jnp.where(similar, jnp.where(similar, term, 1.0) ** weight, 0.0)
         image, truth = _halve(image), _halve(truth)
@@ -202,7 +200,7 @@ def _check_scales(shape, scales):
             f"MS-SSIM with {scales} scales needs more than "
             f"{(TAPS - 1) * 2 ** (scales - 1)} pixels on the shorter side, got "
             f"{shape[1]}x{shape[0]}; "
-            + (f"pass scales={fit} and say so beside the score" if fit else "use psnr")
+            + (f"pass scales={fit} and report it with the score" if fit else "use psnr")
         )
 
 
@@ -221,9 +219,9 @@ def masked_ssim(
 ) -> Float[Array, ""]:
     """Compute the SSIM of the masked pixels.
 
-    The moments of every window are means over its pixels inside the mask (Gaussian
+    The moments of every window are means over its pixels inside the mask (with Gaussian
     weights divided by their sum), and windows centered on the mask are averaged. With a
-    full mask this is `ssim`. Pixels outside the mask never matter. `partial_ssim` is
+    full mask this is `ssim`. Pixels outside the mask have no effect. `partial_ssim` is
     the published protocol.
 
     Args:
@@ -265,12 +263,12 @@ def partial_ssim(
     truth: Float[Array, "height width channels"],
     mask: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
-    """Compute the mSSIM that DyCheck publishes, for comparison with its tables.
+    """Compute the mSSIM published by DyCheck, for comparison with its tables.
 
-    Each pass of the window is a partial convolution, rescaled by the share of *pixels*
-    in the mask and not by their weights, so a constant is not kept near the edge of the
-    mask. Variances are clipped, and windows without any pixel count as a perfect 1.
-    `masked_ssim` does none of that.
+    Each pass of the window is a partial convolution. It is rescaled by the share of
+    *pixels* in the mask instead of their weights, so that the mean of a constant is
+    wrong near the edge of the mask. Variances are clipped, and windows without masked
+    pixels have a score of 1. `masked_ssim` has none of these properties.
 
     Args:
       image: Rendered images in [0, 1], [..., height, width, channels].
@@ -290,12 +288,12 @@ def partial_ssim(
     image, truth = (jnp.where(mask[..., None], x, 0.0) for x in (image, truth))
 
     def mean(x):
-        # Columns first, each pass with the mask that the one before it left.
+        # Columns first. Each pass uses the mask that results from the previous one.
         remaining = inside
         for axis in (1, 0):
             slide = jax.vmap(_window_sum, (1 - axis, None), 1 - axis)
             share = slide(remaining, np.full(TAPS, 1 / TAPS))
-            met = share > 0.5 / TAPS  # one pixel of eleven, rounding aside
+            met = share > 0.5 / TAPS  # at least one of eleven pixels
             smooth = slide(x * remaining, np.array(losses.WINDOW))
             x = jnp.where(met, smooth / jnp.where(met, share, 1.0), 0.0)
             remaining = met.astype(x.dtype)
@@ -317,10 +315,10 @@ def partial_ssim(
 
 
 def _terms(image, truth, mean):
-    """Luminance and contrast-structure of SSIM, Wang et al. 2004.
+    """Compute the luminance and contrast-structure terms of SSIM, Wang et al. 2004.
 
-    The identity of `losses.dssim_map`, the terms apart and with any windowed `mean`:
-    2 cov(x, y) = var(x) + var(y) - var(x - y), variances about the truth's mean.
+    This is the identity of `losses.dssim_map` with separate terms and any windowed
+    `mean`: 2 cov(x, y) = var(x) + var(y) - var(x - y), about the mean of the truth.
     """
     center = losses.middle_level(truth)
     difference = image - truth
@@ -342,11 +340,12 @@ def _window_mean(image):
 
 
 def _window_sum(values, weights):
-    """Weighted sums of neighbors along the first axis, which gets shorter.
+    """Compute weighted sums of neighbors along the first axis, without padding.
 
-    A banded matrix product in blocks of 64, for any weights and any derivative: 26 ms
-    forward and backward at 480x270 where plain shifted slices take 1259, and the
-    self-adjoint form of `losses`, which needs symmetric weights and its padding, 9.
+    A product with a banded matrix in blocks of 64 supports any weights and derivatives.
+    Forward and backward passes take 26 ms at 480x270, compared with 1259 ms for sums of
+    shifted slices, and 9 ms for the self-adjoint form in `losses`, which needs
+    symmetric weights and zero padding.
     """
     taps = len(weights)
     outputs = values.shape[0] - taps + 1

@@ -1,4 +1,4 @@
-"""Name, unit, direction and meaning of the metrics in `metrics.json`."""
+"""Name, unit, better direction and explanation of the metrics in `metrics.json`."""
 
 from typing import NamedTuple
 
@@ -12,8 +12,8 @@ class Entry(NamedTuple):
 
     name: str
     group: str  # one of GROUPS
-    unit: str  # "dB", "ms", "bytes"; "" for a share or a count
-    direction: str  # which is better: "higher", "lower", or "equal" for neither
+    unit: str  # "dB", "ms", "bytes", or "" for a share or a count
+    direction: str  # better values: "higher", "lower", or "equal" for neither
     explanation: str  # one sentence
 
 
@@ -25,12 +25,13 @@ METRICS: dict[str, Entry] = {
     ),
     "heldout.ssim": Entry(
         *("SSIM", "Quality", "", "higher"),
-        "Mean structural similarity over the held-out frames; 1 means identical.",
+        "Mean structural similarity over the held-out frames. It is 1 for identical "
+        "images.",
     ),
     "heldout.ms_ssim": Entry(
         *("MS-SSIM", "Quality", "", "higher"),
-        "Mean structural similarity over five scales of the held-out frames; 1 means "
-        "identical.",
+        "Mean multi-scale structural similarity over the held-out frames. It is 1 for "
+        "identical images.",
     ),
     "heldout.lpips": Entry(
         *("LPIPS", "Quality", "", "lower"),
@@ -39,37 +40,37 @@ METRICS: dict[str, Entry] = {
     ),
     "heldout.moving_psnr": Entry(
         *("PSNR, dynamic regions", "Quality", "dB", "higher"),
-        "The PSNR of the pixels that show moving objects.",
+        "PSNR over the pixels of moving objects.",
     ),
     "heldout.moving_ssim": Entry(
         *("SSIM, dynamic regions", "Quality", "", "higher"),
-        "The SSIM of the pixels that show moving objects.",
+        "SSIM over the pixels of moving objects.",
     ),
     "heldout.static_psnr": Entry(
         *("PSNR, static regions", "Quality", "dB", "higher"),
-        "The PSNR of the pixels that show the static part of the scene.",
+        "PSNR over the pixels of the static part of the scene.",
     ),
     "heldout.fitted_psnr": Entry(
         *("PSNR, fitted codes", "Quality", "dB", "higher"),
-        "The PSNR of the right half of held-out frames, with their appearance code or "
-        "exposure fitted to the left half.",
+        "PSNR of the right halves of held-out frames, with appearance code or exposure "
+        "fitted to the left halves.",
     ),
     "heldout.fitted_ssim": Entry(
         *("SSIM, fitted codes", "Quality", "", "higher"),
-        "The SSIM of the right half of held-out frames, with their appearance code or "
-        "exposure fitted to the left half.",
+        "SSIM of the right halves of held-out frames, with appearance code or exposure "
+        "fitted to the left halves.",
     ),
     "heldout.camera_fitted_psnr": Entry(
         *("PSNR, fitted cameras", "Quality", "dB", "higher"),
-        "The PSNR of held-out frames whose cameras were fitted to the observed image.",
+        "PSNR of held-out frames whose cameras were optimized for the observed images.",
     ),
     "heldout.frames": Entry(
         *("Frames scored", "Quality", "", "equal"),
-        "Number of held-out frames that the scores are averaged over.",
+        "Number of held-out frames that the metrics are computed on.",
     ),
     "heldout.unscored": Entry(
         *("Pixels not scored", "Quality", "", "lower"),
-        "Share of the held-out pixels that were not observed, or that the model cannot "
+        "Share of the held-out pixels that are not valid, or that the model cannot "
         "render.",
     ),
     "heldout.depth_abs_rel": Entry(
@@ -91,11 +92,11 @@ METRICS: dict[str, Entry] = {
     ),
     "heldout.moving_depth_median": Entry(
         *("Median depth error, dynamic regions", "Geometry", "scene units", "lower"),
-        "The median depth error of the pixels that show moving objects.",
+        "Median depth error over the pixels of moving objects.",
     ),
     "heldout.moving_depth_rmse": Entry(
         *("RMS depth error, dynamic regions", "Geometry", "scene units", "lower"),
-        "The RMS depth error of the pixels that show moving objects.",
+        "RMS depth error over the pixels of moving objects.",
     ),
     "cameras.ate": Entry(
         *("Camera position error", "Geometry", "scene units", "lower"),
@@ -103,41 +104,40 @@ METRICS: dict[str, Entry] = {
     ),
     "cameras.rotation_error": Entry(
         *("Camera rotation error", "Geometry", "deg", "lower"),
-        "Mean error of the fitted rotation from each camera to the next.",
+        "Mean error of the relative rotation between consecutive fitted cameras.",
     ),
     "baseline.neighbor_mean": Entry(
         *("Baseline: mean of two neighbors", "Motion", "dB", "equal"),
-        "The PSNR of the mean of the two training frames nearest in time; a model that "
+        "PSNR of the mean of the two training frames nearest in time. A model that "
         "scores less has learned little.",
     ),
     "baseline.static": Entry(
         *("Baseline: static scene", "Motion", "dB", "higher"),
-        "The PSNR of the model's own renders averaged over time, which have no motion.",
+        "PSNR of renders of the model averaged over time, which show no motion.",
     ),
     "motion.gain": Entry(
         *("Gain from motion", "Motion", "dB", "higher"),
-        "The PSNR of the held-out frames minus that of the static baseline.",
+        "PSNR of the held-out frames minus that of the static baseline.",
     ),
     "motion.moving_gain": Entry(
         *("Gain from motion, dynamic regions", "Motion", "dB", "higher"),
-        "The gain from motion of the pixels that show moving objects.",
+        "Gain from motion over the pixels of moving objects.",
     ),
     "flow.epe": Entry(
         *("Optical flow error", "Motion", "px", "lower"),
-        "Mean end-point error of the model's flow to the next frame.",
+        "Mean end-point error of the rendered optical flow to the next frame.",
     ),
     "flow.moving_epe": Entry(
         *("Optical flow error, dynamic regions", "Motion", "px", "lower"),
-        "The flow error of the pixels that show moving objects.",
+        "Optical flow error over the pixels of moving objects.",
     ),
     "flow.outliers": Entry(
         *("Optical flow outliers", "Motion", "", "lower"),
-        "Share of the pixels whose flow is off by more than 3 px and more than 5 % of "
-        "its length.",
+        "Share of the pixels whose flow error exceeds 3 px and 5 % of the true length.",
     ),
     "flow.missing": Entry(
         *("Optical flow missing", "Motion", "", "lower"),
-        "Share of the pixels for which the model gives no flow.",
+        "Share of the pixels for which the model predicts no flow.",
     ),
     "tracks.epe": Entry(
         *("3D track error", "Motion", "scene units", "lower"),
@@ -145,7 +145,7 @@ METRICS: dict[str, Entry] = {
     ),
     "tracks.static_epe": Entry(
         *("Baseline: static 3D tracks", "Motion", "scene units", "equal"),
-        "The 3D track error of points that are assumed not to move.",
+        "3D track error of the prediction that no point moves.",
     ),
     "tracks.correct": Entry(
         *("3D track accuracy", "Motion", "", "higher"),
@@ -153,7 +153,7 @@ METRICS: dict[str, Entry] = {
     ),
     "tracks.lost": Entry(
         *("3D tracks lost", "Motion", "", "lower"),
-        "Share of the points that could not be followed through the model's motion.",
+        "Share of the points that the motion of the model does not determine.",
     ),
     "tracks.drift": Entry(
         *("Drift of static points", "Motion", "scene units", "lower"),
@@ -161,8 +161,8 @@ METRICS: dict[str, Entry] = {
     ),
     "tracks.strain": Entry(
         *("Strain of the deformation", "Motion", "", "lower"),
-        "Root mean square of the log singular values of the deformation's Jacobian; 0 "
-        "means rigid.",
+        "Root mean square of the log singular values of the Jacobian of the "
+        "deformation. It is 0 for a rigid motion.",
     ),
     "train.seconds": Entry(
         *("Training", "Time", "s", "lower"),
@@ -203,21 +203,21 @@ METRICS: dict[str, Entry] = {
     ),
     "rows": Entry(
         *("Anchors", "Size", "", "lower"),
-        "Active anchors, each of which carries several Gaussians.",
+        "Active anchors, each with several child Gaussians.",
     ),
     "parameters": Entry(
         *("Parameters", "Size", "", "lower"),
-        "Trained numbers of the model.",
+        "Number of trained parameters of the model.",
     ),
     "file.bytes": Entry(
         *("Model file", "Size", "bytes", "lower"),
-        "Size of model.npz, which holds the whole model.",
+        "Size of model.npz, which contains the complete model.",
     ),
 }
 
 
 def metric(key: str, value: float | int, tolerance: float = 0.0) -> Metric:
-    """Make a metric with the unit and direction of the table.
+    """Create a metric with the unit and direction of the table.
 
     Args:
       key: A key of `METRICS`.
@@ -231,6 +231,6 @@ def metric(key: str, value: float | int, tolerance: float = 0.0) -> Metric:
       ValueError: If the table has no such key.
     """
     if key not in METRICS:
-        raise ValueError(f"metric {key}: not in the table of metrics; add it there")
+        raise ValueError(f"metric {key}: not in metric_table.METRICS; add it there")
     entry = METRICS[key]
     return Metric(key, value, entry.unit, entry.direction, tolerance)

@@ -10,7 +10,7 @@ from nerfies_jax.metrics import clock
 from nerfies_jax.runtime import compiler
 
 REPEATS = 7
-PART_SECONDS = 5.0  # for the repeats of one part: a step of a large field takes longer
+PART_SECONDS = 5.0  # for repeated calls of one part. Steps of large fields take longer.
 
 
 class Part(NamedTuple):
@@ -24,14 +24,15 @@ class StepParts(NamedTuple):
     """The parts of one step, compiled in the background."""
 
     parts: dict[str, Part]
-    # Function of their milliseconds that times the whole step and adds the rest of it.
+    # From the milliseconds of the parts to the same with the remainder of a step, whose
+    # total time it measures.
     with_rest: Callable[[dict[str, float]], dict[str, float]]
 
     def ms(self) -> dict[str, float]:
         """Measure all parts.
 
         Returns:
-          Milliseconds of each part and of the rest of the step, by name.
+          Milliseconds of each part and of the remainder of the step, by name.
         """
         return self.with_rest(parts_ms(self.parts))
 
@@ -42,7 +43,7 @@ class StepParts(NamedTuple):
 
 
 def part(function: Callable[..., Any], *args: Any) -> Part:
-    """Compile a call in the background, with its arrays as inputs, not constants.
+    """Compile a call in the background. Its arrays are inputs, not constants.
 
     Args:
       function: The function.
@@ -55,13 +56,13 @@ def part(function: Callable[..., Any], *args: Any) -> Part:
 
 
 def parts_ms(parts: Mapping[str, Part]) -> dict[str, float]:
-    """Measure calls, once all of them are compiled.
+    """Measure calls after all of them have been compiled.
 
     Args:
       parts: Parts by name.
 
     Returns:
-      Median milliseconds of warm calls, by name.
+      Median milliseconds of a call, by name.
     """
     wait(one.compiled for one in parts.values())
     return {name: _median_ms(one) for name, one in parts.items()}

@@ -1,8 +1,7 @@
-"""LPIPS: distance of images in the features of a trained image classifier.
+"""LPIPS: distance of images in the feature space of a trained image classifier.
 
-Zhang et al. 2018, arXiv:1801.03924, version 0.1 of their code. The layers are here, the
-trained weights are not. Without weights `load` raises `WeightsMissing`, whose message
-says where they come from.
+Zhang et al. 2018, arXiv:1801.03924, version 0.1 of their code. The trained weights are
+not included. If they are missing, `load` raises `WeightsMissing` with their sources.
 """
 
 import dataclasses
@@ -23,25 +22,25 @@ from jaxtyping import Array, Bool, Float
 from nerfies_jax.geometry.precision import exact_einsum, widened
 from nerfies_jax.metrics import weight_files
 
-# The reference's ImageNet statistics, moved to images in [-1, 1].
+# ImageNet statistics of the reference implementation, for images in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
-# The reference adds 1e-10 to the length of a feature vector; a pixel where every
-# channel is dead has length 0 and counts as equal to itself.
+# Added to the length of a feature vector, as in the reference implementation, so that
+# a zero vector stays zero.
 LENGTH_OFFSET = 1e-10
 
 Scaling = Literal["standard", "unscaled"]
 
 
 class Convolution(NamedTuple):
-    """A convolution with bias, as `lax.conv_general_dilated` takes it (HWIO)."""
+    """A convolution with bias, for `lax.conv_general_dilated` (HWIO)."""
 
     kernel: Float[Array, "rows columns inputs outputs"]
     bias: Float[Array, " outputs"]
 
 
 class LpipsParams(NamedTuple):
-    """Trained weights: the classifier's convolutions and a head for each stage."""
+    """Trained weights: convolutions of the classifier, and a linear head per stage."""
 
     convolutions: tuple[Convolution, ...]
     heads: tuple[Float[Array, " channels"], ...]  # not negative in the released files
@@ -49,24 +48,24 @@ class LpipsParams(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """Convolutions up to one of the compared feature maps, after optional pooling.
+    """Optional pooling and convolutions up to one of the compared feature maps.
 
-    Each convolution is (index in torchvision's `features`, kernel width, output
+    Each convolution is (index in `features` of torchvision, kernel width, output
     channels, stride, padding) and is followed by a ReLU.
     """
 
     convolutions: tuple[tuple[int, int, int, int, int], ...]
-    pool: int | None = None  # width of the max pooling in front, stride 2
+    pool: int | None = None  # width of the preceding max pooling with stride 2
 
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """A classifier's feature layers, cut into the five stages LPIPS compares."""
+    """Feature layers of a classifier, divided into the five stages of LPIPS."""
 
     name: str
     stages: tuple[Stage, ...]
-    files: tuple[str, ...]  # what torchvision calls its weights in the torch hub cache
-    smallest: int  # pixels on the shorter side, or a stage comes out empty
+    files: tuple[str, ...]  # file names of its weights in the torch hub cache
+    smallest: int  # minimum of the shorter side in pixels, or a feature map is empty
 
     @property
     def channels(self) -> tuple[int, ...]:
@@ -101,7 +100,7 @@ VGG = Network(
 
 
 class WeightsMissing(ValueError):
-    """LPIPS cannot be computed. The message is one line with the reason."""
+    """The weights of LPIPS are missing or unusable. The message states the reason."""
 
 
 def lpips(
@@ -119,8 +118,8 @@ def lpips(
       image: Rendered image in [0, 1], [height, width, 3].
       truth: Ground truth of the same shape.
       scaling: "standard" maps [0, 1] to [-1, 1], on which LPIPS was trained. "unscaled"
-        passes [0, 1] unchanged, a mistake in the metrics of Deformable-3DGS, 4DGS and
-        E-D3DGS, and is only for comparison with their tables.
+        uses [0, 1] unchanged, as the metrics of Deformable-3DGS, 4DGS and E-D3DGS do by
+        mistake. Use it only for comparison with their tables.
 
     Returns:
       The distance, a scalar.
@@ -142,7 +141,7 @@ def lpips_map(
     truth: Float[Array, "height width 3"],
     scaling: Scaling = "standard",
 ) -> Float[Array, "height width"]:
-    """Compute the LPIPS of each pixel: the stages' maps resized bilinearly and added.
+    """Compute the LPIPS of each pixel: the bilinearly resized sum over all stages.
 
     Args:
       params: Trained weights.
@@ -184,7 +183,7 @@ def masked_lpips(
     """
     image, truth = (jnp.where(mask[..., None], x, 0.0) for x in (image, truth))
     distance = lpips_map(params, network, image, truth)
-    pixels = jnp.sum(mask).astype(distance.dtype)  # float16 counts to 65 504
+    pixels = jnp.sum(mask).astype(distance.dtype)  # in float16 at most 65504
     return jnp.sum(jnp.where(mask, distance, 0.0)) / pixels
 
 
@@ -231,7 +230,7 @@ def features(
                 (stride, stride),
                 ((padding, padding), (padding, padding)),
                 dimension_numbers=("NHWC", "HWIO", "NHWC"),
-                precision=lax.Precision.HIGHEST,  # TF32 moves LPIPS in its third digit
+                precision=lax.Precision.HIGHEST,  # TF32 changes its third digit
             )
             x = jax.nn.relu(x + bias)
         outputs.append(x[0])
@@ -259,7 +258,7 @@ def _stage_distances(params, network, image, truth, scaling):
 
 def _unit(x):
     length_sq = jnp.sum(x**2, axis=-1, keepdims=True)
-    # sqrt has no gradient at 0, where every channel of a pixel is dead.
+    # sqrt has no gradient at 0, which occurs if all channels of a pixel are 0.
     alive = length_sq > 0
     length = jnp.where(alive, jnp.sqrt(jnp.where(alive, length_sq, 1.0)), 0.0)
     return x / (length + LENGTH_OFFSET)
@@ -270,11 +269,11 @@ def load(network: Network, files: Iterable[str | pathlib.Path] = ()) -> LpipsPar
 
     Args:
       network: The network.
-      files: Files (`.pth`, `.safetensors`, `.npz`) that together hold torchvision's
-        classifier (`features.0.weight`) and the LPIPS heads (`lin0.model.1.weight`), or
-        a saved `lpips.LPIPS` module with both. Missing parts are looked for in the
-        torch hub cache (classifier) and in an installed `lpips` package (heads),
-        neither of which is imported.
+      files: Files (`.pth`, `.safetensors`, `.npz`) that together contain the classifier
+        of torchvision (`features.0.weight`) and the LPIPS heads
+        (`lin0.model.1.weight`), or a saved `lpips.LPIPS` module with both. Missing
+        parts are read from the torch hub cache (classifier) and from an installed
+        `lpips` package (heads), which need not be importable.
 
     Returns:
       The weights.
@@ -298,13 +297,14 @@ def load(network: Network, files: Iterable[str | pathlib.Path] = ()) -> LpipsPar
 
 
 def _missing(network, part, files):
-    where = {
-        "classifier": f"{network.files[0]} from https://download.pytorch.org/models/, "
-        f"given or in {_hub_folder()}",
-        "heads": f"v0.1/{network.name}.pth of the lpips package, given or installed",
+    source = {
+        "classifier": f"{network.files[0]} from https://download.pytorch.org/models/ "
+        f"as an argument or in {_hub_folder()}",
+        "heads": f"v0.1/{network.name}.pth of the lpips package as an argument, or "
+        "install that package",
     }[part]
-    read = ", ".join(map(str, files)) or "no file was named"
-    return f"no LPIPS {network.name} {part} weights ({read}); needed: {where}"
+    read = ", ".join(map(str, files)) or "no files were passed"
+    return f"no LPIPS {network.name} {part} weights ({read}); provide {source}"
 
 
 def _hub_folder():
@@ -327,7 +327,7 @@ def _installed_heads(network):
 
 
 def _classifier_names(network):
-    """For each convolution, what torchvision and a saved LPIPS module call it."""
+    """Return the names of each convolution in torchvision and in an LPIPS module."""
     return [
         (f"features.{index}", f"net.slice{number}.{index}")
         for number, stage in enumerate(network.stages, 1)
@@ -345,13 +345,14 @@ def _params(network, tensors):
         name = next((name for name in names if name in tensors), None)
         if name is None:
             raise WeightsMissing(
-                f"the LPIPS {network.name} weights lack {names[0]} (also looked for as "
-                f"{', '.join(names[1:])}); is this another network's file?"
+                f"the LPIPS {network.name} weights do not contain {names[0]} (or "
+                f"{', '.join(names[1:])}); check that the file is for this network"
             )
         if tensors[name].shape != shape or not np.all(np.isfinite(tensors[name])):
             raise WeightsMissing(
-                f"LPIPS {network.name} weight {name} should be finite and "
-                f"{shape}, is {tensors[name].shape}; is this another network's file?"
+                f"LPIPS {network.name} weight {name} must be finite and of shape "
+                f"{shape}, got {tensors[name].shape}; check that the file is for this "
+                "network"
             )
         return np.asarray(tensors[name], np.float32)
 

@@ -1,8 +1,8 @@
-"""Safe reading of weight files of other tools, without running anything in them.
+"""Safe reading of weight files of other tools, without executing any code in them.
 
-A `.pth` is a pickle, and unpickling may run code. Here the unpickler knows three names
-(an ordered dictionary, a tensor over a storage, a storage of numbers) and refuses every
-other, so PyTorch is not needed and nothing in the file is executed.
+A `.pth` file is a pickle, and unpickling may execute code. The unpickler of this module
+supports only three kinds of names (an ordered dictionary, a tensor over a storage, a
+storage of numbers) and refuses all others. PyTorch is not needed.
 """
 
 import collections
@@ -39,7 +39,7 @@ _STORAGES = {
     "IntStorage": np.int32,
     "ByteStorage": np.uint8,
 }
-_HEADER_LIMIT = 100_000_000  # bytes, safetensors' own
+_HEADER_LIMIT = 100_000_000  # bytes, the limit of safetensors
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 
 
@@ -65,7 +65,8 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
     }
     if path.suffix not in readers:
         raise FileError(
-            f"{path}: weights come as {', '.join(readers)}, not {path.suffix or 'this'}"
+            f"{path}: weights must be a {', '.join(readers)} file, got "
+            f"{path.suffix or 'no suffix'}"
         )
     try:
         return readers[path.suffix](path)
@@ -80,7 +81,7 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
         OSError,
     ) as error:
         raise FileError(
-            f"{path}: not a readable {path.suffix} of tensors ({error}); "
+            f"{path}: not a readable {path.suffix} file of tensors ({error}); "
             "download or export it again"
         ) from error
 
@@ -121,7 +122,7 @@ def _read_torch(path):
 def _read_torch_zip(path):
     with zipfile.ZipFile(path) as archive:
         total = sum(member.file_size for member in archive.infolist())
-        if total > path.stat().st_size:  # PyTorch compresses nothing
+        if total > path.stat().st_size:  # PyTorch does not compress
             raise ValueError(f"it unpacks to {total} bytes, more than it has")
         (index,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
         folder = index.removesuffix("data.pkl")
@@ -139,7 +140,7 @@ def _read_torch_zip(path):
 
 
 def _read_torch_legacy(path):
-    """Before PyTorch 1.6: five pickles, then each storage behind its element count."""
+    """Read the format before PyTorch 1.6: five pickles, then storages with counts."""
     with path.open("rb") as stream:
         storages = {}
         magic, _, system = (_Unpickler(stream, storages.get).load() for _ in range(3))
@@ -179,12 +180,12 @@ class _View:
         return view.copy()
 
 
-# The one in Python: a few bytes make the one in C allocate 16 GB for its memo.
+# The unpickler in Python, because a few bytes can make that in C allocate 16 GB.
 class _Unpickler(pickle._Unpickler):
-    """Builds dictionaries and tensors, and nothing else."""
+    """Builds only dictionaries and tensors."""
 
     def __init__(self, stream, read):
-        # latin1: state dicts of Python 2, and torchvision's VGG16 is one.
+        # latin1 for state dicts of Python 2, such as VGG16 of torchvision.
         super().__init__(stream, encoding="latin1")
         self._read, self.dtypes = read, {}
 

@@ -70,7 +70,7 @@ def test_nonsense_metrics_are_refused(settings, words):
 
 def test_a_key_twice_or_a_foreign_file_is_refused(tmp_path):
     metric = clock.Metric("x", 1.0, "", "lower")
-    with pytest.raises(ValueError, match="metric x is there twice"):
+    with pytest.raises(ValueError, match="metric x occurs twice"):
         clock.write_metrics(tmp_path / "a.json", [metric, metric])
     assert not list(tmp_path.iterdir())
     for text in (

@@ -252,7 +252,7 @@ def test_another_networks_file_is_refused(trained, tmp_path, monkeypatch):
     network, _, state, path = trained
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     other = perceptual.VGG if network is perceptual.ALEX else perceptual.ALEX
-    with pytest.raises(perceptual.WeightsMissing, match="another network's file"):
+    with pytest.raises(perceptual.WeightsMissing, match="check that the file"):
         perceptual.load(other, [path])
     broken = {**state, "lin2.model.1.weight": state["lin2.model.1.weight"] * np.nan}
     np.savez(tmp_path / "nan.npz", **broken)

@@ -128,7 +128,7 @@ def test_an_archive_with_any_byte_changed_is_read_or_named(tmp_path):
 
 
 def test_unknown_kinds_and_missing_files_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"w\.onnx: weights come as \.npz"):
+    with pytest.raises(ValueError, match=r"w\.onnx: weights must be a \.npz"):
         weight_files.read_tensors(tmp_path / "w.onnx")
     with pytest.raises(ValueError, match=r"w\.npz: No such file"):
         weight_files.read_tensors(tmp_path / "w.npz")

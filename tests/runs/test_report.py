@@ -262,5 +262,5 @@ def test_every_metric_has_a_name_and_a_sentence():
         assert f"`{key}`" in page, key
     assert len({entry.name for entry in METRICS.values()}) == len(METRICS)
     assert metric("train.steps", 7).direction == "equal"
-    with pytest.raises(ValueError, match=r"tracks\.size: not in the table"):
+    with pytest.raises(ValueError, match=r"tracks\.size: not in metric_table"):
         metric("tracks.size", 1)
