@@ -356,6 +356,9 @@ def test_a_path_is_edited_saved_loaded_and_rendered(tmp_path, capsys):
         np.testing.assert_allclose(path.cameras.position[ends], expected, atol=1e-5)
         page._tasks.put(lambda: page.path._load(None, None, None, saved.read_bytes()))
         until(lambda: page.path.keyframes[0].time == 0.25)
+        browser.press(page, "preview")
+        until(lambda: page._time.value == page.path.keyframes[-1].time)
+        until(lambda: page.path._preview is None)
         browser.press(page, "render")
         out = tmp_path / "renders" / "path-1"
         until(out.exists)
