@@ -132,7 +132,8 @@ def tables(metrics: Mapping[str, Metric]) -> list[str]:
     lines = []
     for preset, names in scenes.items():
         rows = [_row(metrics, preset, name) for name in names]
-        lines += [f"### `{preset}`", "", markdown.table(HEADS, rows), ""]
+        table = markdown.table(HEADS, rows)
+        lines += [f"### `{preset}`", "", *table.splitlines(), ""]
     return lines[:-1]
 
 
