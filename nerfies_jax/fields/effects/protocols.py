@@ -1,16 +1,17 @@
-"""Extension points of a radiance field.
+"""Protocols of the components of a radiance field.
 
-A value of a field of `RadianceScene` is either the object with the functions of its
-protocol, or settings with `bind(steps, metadata)`, which returns that object for a run
-of so many steps of a capture. Functions are of one point of one ray, in units of the
-field, and are vectorized by their caller.
+A component in `RadianceScene` is an object that implements one of these protocols, or
+settings with `bind(steps, metadata)`, which returns such an object for a run of this
+length on a capture. Functions take one point of one ray, in units of the field. The
+caller vectorizes them.
 
-Optional members of all parts: `init(key)` returns parameters, of which there are none
-without it. `learning_rate` is a float, a schedule of the traced step or a tree of
-these; without it the rate of the field is used. `tables` are the tables of latent codes
-that it reads in `frame.codes`. `loss(params, context)` adds terms to the loss, as
-`Regularizer.loss` does, but gets the part's own parameters; `required_data` names what
-it reads of the capture. `name` is the key of the parameters and metrics.
+Optional members of all components: `init(key)` returns parameters. Without it there are
+none. `learning_rate` is a float, a schedule of the traced step or a tree of these.
+Without it the rate of the field is used. `tables` are the tables of latent codes that
+the component reads from `frame.codes`. `loss(params, context)` adds terms to the loss,
+as `Regularizer.loss` does, but takes the parameters of the component. `required_data`
+names the data of the capture that it reads. `name` is the key of its parameters and
+metrics.
 """
 
 import dataclasses
@@ -35,7 +36,7 @@ class TemplateInputs(NamedTuple):
     """Inputs of a template at one sample of a ray.
 
     Attributes:
-      point: Point in the template, units of the field: where a warp puts the sample.
+      point: Warped point in the template, in units of the field.
       direction: Unit direction of the ray. Density must not depend on it.
       features: Features of the conditionings with the target "trunk".
       condition: Features of those with the target "color". Density must not depend on
@@ -71,7 +72,7 @@ class Template(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class NetworkTemplate:
-    """A network as `Template`, such as one of `nets.adapters`.
+    """A `Template` from a network, such as one of `nn.adapters`.
 
     Attributes:
       network: Reads [point, features] and [direction, condition] of one sample and
@@ -96,8 +97,8 @@ class Warp(Protocol):
     """Deformation from the observed scene to the template.
 
     Optional member: `shortest_wave`, the shortest wavelength of the displacement in
-    space. Warps that are smooth enough are evaluated on a grid when an image is
-    rendered; without it each sample is evaluated.
+    space. Warps that are smooth enough are evaluated on a grid to render an image.
+    Without it they are evaluated at every sample.
     """
 
     def init(self, key: Key[Array, ""]) -> PyTree:
@@ -120,13 +121,13 @@ class Warp(Protocol):
 
 @runtime_checkable
 class Conditioning(Protocol):
-    """Features of a frame, or of a point at its time, that networks of the field read.
+    """Features of a frame, or of a point and its time, as inputs of networks.
 
     Attributes:
       features: Number of features.
-      target: Reader of the features: "trunk" (density and color), "color", whose
-        features are those of a frame, or "warp", which finds them in `frame.codes` by
-        the name of the conditioning.
+      target: Network that reads the features: "trunk" (density and color), "color" (for
+        features of a frame), or "warp", which reads them from `frame.codes` by the name
+        of the conditioning.
     """
 
     @property
@@ -145,8 +146,8 @@ class Conditioning(Protocol):
         """Compute the features.
 
         Args:
-          params: Parameters of the conditioning; None without `init`.
-          point: The observed point; None where color is the target.
+          params: Parameters of the conditioning, None without `init`.
+          point: The observed point, None if the target is color.
           frame: Time, codes and training step of the frame.
         """
         ...
@@ -156,12 +157,12 @@ class Conditioning(Protocol):
 class Medium(Protocol):
     """Second medium along a ray, next to the static scene.
 
-    Optional members: `beta_min`, the least standard deviation of a ray's color, is
-    needed where the medium has a `beta`. `beta_power` weights the likelihood.
+    Optional members: `beta_min`, the minimum standard deviation of a ray's color, is
+    required if the medium has a `beta`. `beta_power` weights the likelihood.
     """
 
     def init(self, key: Key[Array, ""], features: int) -> PyTree:
-        """Initialize the parameters, for a trunk with so many features."""
+        """Initialize the parameters, for a trunk of `features` features."""
         ...
 
     def apply(

@@ -1,10 +1,11 @@
 """Transient objects of single exposures, and the uncertainty of their colors.
 
 NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "transient objects"): next to the
-static field each photograph has a medium of its own, with density, color and an
-uncertainty `beta`, which represents people and cars. Renders show it, held-out ones
-with codes between those of their neighbors in time, unless it is left out
-(`variants.without_effects`), as in the paper and in `held_out_codes.score`.
+static field each photograph has its own medium with density, color and an uncertainty
+`beta`, which represents people and cars. Renders include it. Held-out frames use codes
+interpolated between those of their neighbors in time. It is left out by
+`variants.without_effects`, and in the evaluation of `held_out_codes.score`, as in the
+paper.
 """
 
 import dataclasses
@@ -31,15 +32,14 @@ NAME = TABLE = "transient"
 
 @dataclasses.dataclass(frozen=True)
 class TransientSpec:
-    """Settings of the medium and its costs. Defaults of the paper and its
-    reimplementation.
+    """Settings of the medium and its losses.
 
-    `beta_min` is the least standard deviation of a ray's color, in units of color. It
-    bounds the loss from below. Without it a pixel that is matched exactly would have an
-    unbounded likelihood. `density_weight` is the paper's lambda_u, which keeps the
-    static scene out of the transient medium. `beta_power` is that of `photometric`.
-    Zero is the paper's loss, and one lets a short run learn regions that it called
-    uncertain.
+    The defaults are those of the paper and its public reimplementation. `beta_min` is
+    the minimum standard deviation of a ray's color, in units of color. It bounds the
+    loss from below. Without it an exactly matched pixel would have an unbounded
+    likelihood. `density_weight` is lambda_u of the paper, which keeps the static scene
+    out of the transient medium. `beta_power` is that of `photometric`. Zero is the loss
+    of the paper. With one, short runs also learn regions of high uncertainty.
     """
 
     code_width: int = 16
@@ -79,7 +79,7 @@ class TransientSpec:
         return (Table(TABLE, APPEARANCE, self.code_width),)
 
     def init(self, key: Key[Array, ""], features: int) -> MLP:
-        """Initialize the network, for a trunk with so many features."""
+        """Initialize the network, for a trunk of `features` features."""
         return init(self, key, features)
 
     def apply(self, params: MLP, sample: Sample, frame: FrameCondition) -> Medium:
@@ -114,8 +114,9 @@ def network(spec: TransientSpec, features: int) -> MLPSpec:
 def init(
     spec: TransientSpec, key: Key[Array, ""], features: int, dtype=jnp.float32
 ) -> MLP:
-    """Initialize with Glorot weights: the medium starts about as dense as the static
-    field.
+    """Initialize with Glorot weights.
+
+    The medium starts with about the density of the static field.
 
     Args:
       spec: Settings.
@@ -159,14 +160,13 @@ def uncertainty(
     weights: Float[Array, "*rays samples"],
     beta: Float[Array, "*rays samples"],
 ) -> Float[Array, "*rays"]:
-    """Compute the standard deviation of a ray's color, beta_min + Σ w β over its
-    samples.
+    """Compute the standard deviation of a ray's color, beta_min + Σ w β.
 
-    The paper has β_min inside the sum, so that a ray without a transient has a β of
-    zero and an infinite loss. Like the public reimplementation this adds it outside.
+    The paper has β_min inside the sum, so that a ray without transient objects has a β
+    of zero and an infinite loss. As in the public reimplementation it is added outside.
 
     Args:
-      beta_min: Least standard deviation.
+      beta_min: Minimum standard deviation.
       weights: Rendering weights of the transient medium, [..., samples].
       beta: Uncertainty of the samples, [..., samples].
 
@@ -185,17 +185,17 @@ def photometric(
 ) -> Float[Array, ""]:
     """Compute the mean over rays of (|color - truth|² / 2β² + log β) [β]^beta_power.
 
-    At a power of zero these are the first two terms of equation 13, where the second
-    reads log β² / 2. At a given residual the loss is least at β = |color - truth|, and
-    never less than log beta_min. It is negative for good fits. The public
-    reimplementation adds 3 so that curves stay above zero, which changes no gradient,
-    and takes the mean over the channels, which makes the first term a third.
+    With a power of zero these are the first two terms of equation 13, which has log
+    β² / 2 as the second term. For a given residual the minimum is at β = |color -
+    truth|. The loss is at least log beta_min and negative for good fits. The public
+    reimplementation adds 3 to keep it positive, which does not change gradients, and
+    takes the mean over the channels, which divides the first term by three.
 
-    [β] is β without a gradient. With a power of zero, colors learn at 1/β² of their
-    residuals: regions that a short run has not learned yet are called uncertain, and
-    uncertain regions are not learned, so that the pattern of a floor never appears.
-    With one they learn at 1/β, with two uniformly, and β still converges to |color -
-    truth|.
+    [β] is β without gradient. With a power of zero the gradient of colors is scaled by
+    1/β². Regions that a short run has not learned yet are assigned a high uncertainty
+    and are then not learned, such as the texture of a floor. With a power of one the
+    scale is 1/β, and with two it is uniform. In all cases β converges to
+    |color - truth|.
 
     Args:
       color: Rendered colors, [..., 3].
@@ -212,11 +212,12 @@ def photometric(
       (β-NLL, whose β is half of this power).
     """
     if valid is not None:
-        # Selected before anything is squared or divided: unfilmed pixels may hold NaN.
+        # Masked before the square and the division, because unobserved pixels may be
+        # NaN.
         color = jnp.where(valid[..., None], color, 0)
         truth = jnp.where(valid[..., None], truth, 0)
         beta = jnp.where(valid, beta, 1)
-    # Divided first: the square of a residual far below beta must not underflow alone.
+    # Divided first, so that the square of a residual far below beta does not underflow.
     scaled = (color - truth) / beta[..., None]
     each = jnp.sum(jnp.square(scaled), axis=-1) / 2 + jnp.log(beta)
     if beta_power:
@@ -228,7 +229,7 @@ def penalty(spec: TransientSpec, context: PenaltyContext) -> dict[str, Term]:
     """Compute the mean transient density of the finest samples of the valid rays.
 
     It is the last term of equation 13, in units of the field. If the box is scaled by
-    s, the same image has densities 1/s times as large.
+    s, densities of the same image scale by 1/s.
 
     Args:
       spec: Settings.
