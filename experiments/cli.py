@@ -49,6 +49,8 @@ Scene = Literal[
     "specular",
     "topology",
     "pose-error",
+    "barrel",
+    "fisheye",
 ]
 SCENES: tuple[str, ...] = typing.get_args(Scene)
 # Arguments of the library that have an option of the same name; "..." is any value.

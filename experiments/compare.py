@@ -293,7 +293,7 @@ def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
         state = runs.restore(each.folder, run).state
         run = runs.with_found_cameras(run, state)
         rows = evaluation.spread(run.filmed.heldout, count)
-        draw = runs.drawer(run, evaluation.Renderer(run.model, run.capture.size))
+        draw = evaluation.Renderer(run.model, run.capture.size)
         scored.append(evaluation.score(draw, state, run.filmed, rows))
         capture = run.filmed
     tiles, captions = [], []

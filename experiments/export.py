@@ -208,11 +208,21 @@ def _splatv(args: Export, run: Any) -> str:
 
 
 def _cameras(args: Export, run: Any) -> str:
-    """Write the capture as the run was trained on it: undistorted for splats."""
-    from nerfies_jax.capture import colmap_writer, nerfies_format, transforms_writer
+    """Write the capture of the run, undistorted for splats.
+
+    Viewers of Gaussians render pinhole cameras.
+    """
+    from nerfies_jax.capture import (
+        colmap_writer,
+        nerfies_format,
+        pinholes,
+        transforms_writer,
+    )
     from nerfies_jax.capture.json_files import replaced_folder
 
     capture = run.capture
+    if run.representation.products.splatting is not None:
+        capture = pinholes.as_pinholes(capture)
     if args.format == "nerfies":
         with replaced_folder(args.place, args.overwrite) as folder:
             nerfies_format.write(capture, folder)
@@ -238,7 +248,7 @@ def _planned(args: Export, run: Any) -> Any:
     from nerfies_jax.capture import camera_paths, path_files, pinholes
 
     planned = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)
-    if not run.representation.scoring.traces_lenses:
+    if not run.representation.scoring.models_lenses(run.metadata):
         planned = planned._replace(cameras=pinholes.pinhole(planned.cameras))
     if planned.times is None:
         count = len(planned.cameras.focal_px)

@@ -74,11 +74,14 @@ def main(args):
 
 def _errors(capture, evidence):
     """Compute the errors in a built-in scene, unless other tools made the result."""
+    from nerfies_jax.capture import pinholes
     from nerfies_jax.evaluation import protocol
     from nerfies_jax.preprocessing import against_truth
 
     truth = protocol.stored_truth(capture)
-    if truth is None or capture.given is not None:
+    # With a lens, the tracks are of undistorted pixels and the truth is not.
+    lens = pinholes.has_lens(capture.cameras)
+    if truth is None or capture.given is not None or lens:
         return None
     points = against_truth.true_points(capture, truth, evidence)
     return against_truth.errors(capture, evidence, points)

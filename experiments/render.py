@@ -261,7 +261,7 @@ def _views(args, run):
             views = [view._replace(time=time) for view in views]
         return names, views, run.capture.size
     path = path_files.named(args.path, run.capture, args.frames)
-    if not run.representation.scoring.traces_lenses:
+    if not run.representation.scoring.models_lenses(run.metadata):
         path = path._replace(cameras=pinholes.pinhole(path.cameras))
     count = len(path.cameras.focal_px)
     if args.freeze is not None:

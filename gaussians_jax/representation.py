@@ -272,6 +272,7 @@ GAUSSIANS = Representation(
         step_parts=step_time.parts,
     ),
     scoring=Scoring(
+        models_lenses=lambda metadata: metadata.distorted,
         score_halves=held_out_exposure.score,
         follow=gaussian_tracks.follow,
         mover=gaussian_tracks.mover,

@@ -105,7 +105,6 @@ RADIANCE = Representation(
         step_parts=step_time.parts,
     ),
     scoring=Scoring(
-        traces_lenses=True,
         score_halves=held_out_codes.score,
         fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
         follow=warp_tracks.follow,

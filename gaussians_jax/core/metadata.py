@@ -20,6 +20,7 @@ class SceneMetadata:
       near: Smallest z-depth of the observed volume in scene units.
       depth: z-depth in the middle of the observed volume in scene units.
       times: Number of distinct frame times. None if each frame has its own.
+      distorted: True if the cameras have lens distortion.
     """
 
     extent: float
@@ -30,6 +31,7 @@ class SceneMetadata:
     near: float = math.inf
     depth: float = 1.0
     times: int | None = None
+    distorted: bool = False
 
     @property
     def moments(self) -> int:

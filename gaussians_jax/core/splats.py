@@ -16,6 +16,7 @@ import numpy as np
 import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
+from nerfies_jax.geometry import lens
 from nerfies_jax.geometry import quaternion as quaternions
 from nerfies_jax.geometry.camera import Camera
 
@@ -391,8 +392,7 @@ def random_in_views(
     """Sample points that the cameras see, on the host.
 
     Camera, pixel and z-depth are uniform, so every image has the same density at every
-    depth. Samples uniform in the volume would mostly lie at its far end. Lens
-    distortion is ignored.
+    depth. Samples uniform in the volume would mostly lie at its far end.
 
     Args:
       rng: Random generator.
@@ -425,6 +425,15 @@ def random_in_views(
     offset = pixel - per_view(cameras.principal_point_px, 2)
     y = offset[:, 1] / (focal * per_view(cameras.pixel_aspect))
     x = (offset[:, 0] - per_view(cameras.skew_px) * y) / focal
+    distorted = np.any(cameras.radial) or np.any(cameras.tangential)
+    if distorted or cameras.fisheye is not None:
+        axes = np.ndim(cameras.focal_px)
+        own = jax.tree.map(
+            lambda leaf: jnp.float32(per_view(leaf, *np.shape(leaf)[axes:])), cameras
+        )
+        bent = jnp.float32(np.stack([x, y], axis=-1))
+        slopes, _ = jax.vmap(lens.undistort)(own, bent)
+        x, y = np.asarray(slopes, np.float64).T
     in_camera = np.stack([x, y, np.ones_like(x)], axis=-1) * z[:, None]
     rotation = per_view(cameras.camera_from_world, 3, 3)
     return np.einsum("nij,ni->nj", rotation, in_camera) + per_view(cameras.position, 3)

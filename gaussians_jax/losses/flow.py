@@ -28,7 +28,7 @@ from gaussians_jax.splatting import projection, raster
 from gaussians_jax.splatting.projection import Footprints
 from gaussians_jax.splatting.raster_spec import RasterSpec
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.geometry import rays
+from nerfies_jax.geometry import lens, rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.precision import exact_einsum, exact_product
 from nerfies_jax.training import losses
@@ -141,7 +141,7 @@ def flow_error(
         seen = seen & observation.valid
     if spec.moving_only and frames.moving is not None:
         seen = seen & frames.moving[row]
-    object_flow = shift - camera_flow(pair, rendered.depth)
+    object_flow = shift - camera_flow(pair, rendered.depth, raster_spec.distorted)
     return error(rendered.flow, object_flow, seen), jnp.mean(seen.astype(shift.dtype))
 
 
@@ -221,16 +221,20 @@ def _matrix(a, b, c, d):
 
 
 def camera_flow(
-    pair: tuple[Camera, Camera], depth: Float[Array, "height width"]
+    pair: tuple[Camera, Camera],
+    depth: Float[Array, "height width"],
+    distorted: bool = False,
 ) -> Float[Array, "height width 2"]:
     """Compute the optical flow of a static scene from one camera to another.
 
-    Equations 4 to 6, for cameras without distortion.
+    Equations 4 to 6.
 
     Args:
       pair: Both cameras.
       depth: z-depth in scene units. Where it is not positive, the flow is meaningless
         and finite.
+      distorted: True if the cameras have lens distortion. Without it that of the first
+        is ignored.
 
     Returns:
       Flow in pixels.
@@ -241,7 +245,11 @@ def camera_flow(
     offset = center - first.principal_point_px
     y = offset[..., 1] / (first.focal_px * first.pixel_aspect)
     x = (offset[..., 0] - first.skew_px * y) / first.focal_px
-    directions = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
+    slopes = jnp.stack([x, y], axis=-1)
+    if distorted:
+        straighten = jax.vmap(jax.vmap(lambda bent: lens.undistort(first, bent)[0]))
+        slopes = straighten(slopes)
+    directions = jnp.concatenate([slopes, jnp.ones_like(x)[..., None]], axis=-1)
     point = first.position + depth[..., None] * exact_product(
         directions, first.camera_from_world
     )

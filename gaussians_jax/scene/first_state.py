@@ -18,7 +18,6 @@ from gaussians_jax.init import tracks as track_start
 from gaussians_jax.motion import deformation
 from gaussians_jax.scene.growth import AuxState, states_of
 from gaussians_jax.scene.spec import SplatScene, carried_count, refuse_what_cannot_train
-from gaussians_jax.splatting import rendering
 from nerfies_jax.capture.capture import Capture, PointCloud
 from nerfies_jax.capture.frame_memory import frame_bytes
 from nerfies_jax.preprocessing import hidden_points, record, usable_paths, view_set
@@ -78,7 +77,6 @@ def first_state(
       ValueError: If settings contradict each other or the capture.
     """
     refuse_what_cannot_train(spec)
-    rendering.refuse_distortion(capture.cameras)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
     tracked, hidden, capture = _from_tracks(spec, effects, capture, start_key)

@@ -27,6 +27,7 @@ from gaussians_jax.scene.spec import (
 )
 from gaussians_jax.scene.update import ViewStatistics
 from gaussians_jax.splatting import rendering
+from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.scene_metadata import exposures
 from nerfies_jax.runtime import compiler, data_parallel
@@ -80,6 +81,7 @@ def metadata_of(capture: Capture) -> SceneMetadata:
         near=NEAREST * span[0],
         depth=2 / (1 / span[0] + 1 / span[1]),
         times=len(np.unique(capture.times[capture.train])),
+        distorted=pinholes.has_lens(capture.cameras),
     )
 
 

@@ -150,7 +150,10 @@ Scene = SplatScene  # the public name
 
 
 def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
-    """Move the near plane of the rasterizer in front of all observed surfaces.
+    """Adapt the settings of the rasterizer to a capture.
+
+    The near plane is in front of all observed surfaces, and lens distortion is modeled
+    if the cameras have any.
 
     Scenes with a distant background are small in the units of a box around all points.
     The default near plane of 0.01 would then be meters in front of the camera.
@@ -163,7 +166,8 @@ def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
       Settings of the rasterizer.
     """
     near = min(spec.raster.near, metadata.near)
-    return dataclasses.replace(spec.raster, near=near)
+    distorted = spec.raster.distorted or metadata.distorted
+    return dataclasses.replace(spec.raster, near=near, distorted=distorted)
 
 
 def optimizer_of(spec: SplatScene) -> Optimizer:

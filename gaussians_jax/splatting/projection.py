@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from gaussians_jax.core.splats import Gaussians, refuse_half
+from gaussians_jax.splatting import lens_jacobian
 from gaussians_jax.splatting.raster_spec import RasterSpec
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.fusion import components
@@ -71,15 +72,19 @@ class Footprints(NamedTuple):
 def project(
     gaussians: Gaussians, camera: Camera, size: tuple[int, int], spec: RasterSpec
 ) -> Footprints:
-    """Project Gaussians to the image of one undistorted camera.
+    """Project Gaussians to the image of one camera.
 
     Neither the 3D covariance nor its determinant is formed. The tangents x/z and y/z
     are clamped in J alone, to the image widened by `spec.tangent_margin` half images.
-    Lens distortion is not modeled: undistort the images first.
+
+    With `spec.distorted`, or for a fisheye, J is the Jacobian of the projection through
+    the lens. Gaussians centered where the lens has folded back, or less than 0.006
+    degrees in front of the camera's plane, are not rendered. Otherwise the coefficients
+    of the camera are not read.
 
     Args:
       gaussians: N Gaussians in world coordinates (scene units).
-      camera: The camera.
+      camera: The camera. A fisheye is not clamped: its J is bounded.
       size: (width, height) of the image in pixels.
       spec: Near and far planes, dilation and thresholds.
 
@@ -91,9 +96,12 @@ def project(
       + dilation with T = J W R diag(scale).
     """
     refuse_half(gaussians.mean.dtype)
+    bounds = None
+    if spec.distorted or camera.fisheye is not None:
+        bounds = lens_jacobian.bounds(camera, size, spec.tangent_margin)
 
     def one(vectors, opacity):
-        return _project_one(*vectors, opacity, camera, size, spec)
+        return _project_one(*vectors, opacity, camera, size, spec, bounds)
 
     # One array per component, so that operations use whole vectors.
     *vectors, opacity = gaussians
@@ -107,7 +115,7 @@ def project(
     )
 
 
-def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
+def _project_one(mean, quaternion, scale, opacity, camera, size, spec, bounds):
     """Project one Gaussian, whose vectors are given by their components."""
     # R (x - c), not R x + t: exact far from origin
     offset = [x - camera.position[i] for i, x in enumerate(mean)]
@@ -120,6 +128,9 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     largest = jnp.max(jnp.abs(jnp.stack(quaternion)))
     drawn &= largest >= jnp.finfo(largest.dtype).tiny
 
+    if bounds is not None:
+        drawn &= lens_jacobian.visible(offset, drawn, camera)
+
     # `where` differentiates both branches: what is not drawn becomes a unit sphere one
     # unit ahead before anything is divided.
     ahead = camera.camera_from_world[2]
@@ -128,7 +139,10 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec):
     scale = [jnp.where(drawn, x, 1) for x in scale]
     opacity = jnp.where(drawn, opacity, 0.5)
 
-    mean_px, depth, rows = _project_frame(offset, camera, size, spec)
+    if bounds is None:
+        mean_px, depth, rows = _project_frame(offset, camera, size, spec)
+    else:
+        mean_px, depth, rows = lens_jacobian.project(offset, camera, bounds)
     first, second = _footprint_rows(rows, quaternion, scale)
     widest = jnp.max(jnp.abs(jnp.stack(first + second)))
     drawn &= (widest < MAX_EXTENT_PX) & jnp.all(jnp.isfinite(mean_px))

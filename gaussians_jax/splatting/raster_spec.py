@@ -25,6 +25,9 @@ class RasterSpec:
     near: float = 0.01  # z-depth, scene units
     far: float = 1e10
     tangent_margin: float = 0.3  # clamp of x/z, y/z in the Jacobian, in half images
+    # Project through the radial and tangential distortion of the cameras. Without it,
+    # the compiled program is that of a pinhole. A fisheye is recognized by its camera.
+    distorted: bool = False
     tile: int = 8  # pixels along an edge
     capacity: int | None = None  # (tile, Gaussian) pairs per chunk; None: automatic
     batch: int | None = None  # tiles blended in lockstep; None: by backend

@@ -15,6 +15,7 @@ from gaussians_jax.core.splats import Gaussians
 from gaussians_jax.splatting import binning, harmonics, projection, raster
 from gaussians_jax.splatting.raster_spec import GSPLAT, TILE_SIZES, RasterSpec
 from gaussians_jax.splatting.rendering import LEAST_ALPHA
+from nerfies_jax.geometry import lens
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.precision import exact_product
 
@@ -31,6 +32,7 @@ class _Views(NamedTuple):
     K: Float[Array, "cameras 3 3"]
     colors: Float[Array, "cameras gaussians ..."] | None  # None: shared by all cameras
     background: Float[Array, "cameras channels"] | None
+    distortion: Float[Array, "cameras coefficients"] | None
     means2d_offset: Float[Array, "cameras gaussians 2"] | None
 
 
@@ -42,6 +44,7 @@ class _Settings(NamedTuple):
     sh_degree: int | None
     render_mode: str
     radius_clip: float
+    camera_model: str
 
 
 @functools.partial(
@@ -107,6 +110,8 @@ def rasterization(
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
     means2d_offset: ArrayLike | None = None,
+    distortion: ArrayLike | None = None,
+    camera_model: str = "pinhole",
 ) -> tuple[
     Float[Array, "*batch cameras height width channels"],
     Float[Array, "*batch cameras height width 1"],
@@ -127,8 +132,14 @@ def rasterization(
 
     `packed`, `sparse_grad`, `channel_chunk`, `segmented` and `distributed` of gsplat
     have no counterpart: nothing has to be packed, and any number of channels is
-    rasterized at once. `absgrad`, `covars`, `camera_model`, lens distortion and rolling
-    shutter are not available. Skew in `Ks` is respected, where gsplat ignores it.
+    rasterized at once. `absgrad`, `covars` and rolling shutter are not available. Skew
+    in `Ks` is respected, where gsplat ignores it.
+
+    Gaussians are projected through the lens of `distortion` and `camera_model` by the
+    Jacobian of the distorted projection. It takes the place of gsplat's
+    `radial_coeffs`, `tangential_coeffs` and `with_ut`. Without it the compiled program
+    is that of a pinhole. Gaussians centered where the lens has folded back, or 90
+    degrees or more off the axis, are not rendered.
 
     Args:
       means: Centers in world coordinates, [..., N, 3], scene units.
@@ -159,6 +170,10 @@ def rasterization(
       means2d_offset: Shift of the projected means in pixels, [..., C, N, 2]. Pass zeros
         and differentiate with respect to them for the gradient of `means2d`, which
         gsplat keeps with `retain_grad`.
+      distortion: Coefficients in OpenCV's order, [..., C, 4] or [..., C, 5]: k1, k2,
+        p1, p2 and k3 of radial and tangential distortion, or k1, k2, k3, k4 of a
+        fisheye. None is a lens without distortion.
+      camera_model: "pinhole", which may have distortion, or "fisheye", as in gsplat.
 
     Returns:
       The images [..., C, height, width, X], where X is D, 1 or D + 1 by `render_mode`,
@@ -182,6 +197,10 @@ def rasterization(
         raise ValueError(
             f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}"
         )
+    if camera_model not in lens.CAMERA_MODELS:
+        raise ValueError(
+            f"camera_model must be one of {lens.CAMERA_MODELS}, got {camera_model!r}"
+        )
     spec = dataclasses.replace(
         GSPLAT,
         near=near_plane,
@@ -189,6 +208,7 @@ def rasterization(
         eps2d=eps2d,
         tile=tile_size,
         antialiased=rasterize_mode == "antialiased",
+        distorted=distortion is not None,
     )
     gaussians, colors, views = _checked(
         {
@@ -200,11 +220,13 @@ def rasterization(
             "viewmats": viewmats,
             "Ks": Ks,
             "backgrounds": backgrounds,
+            "distortion": distortion,
             "means2d_offset": means2d_offset,
         },
         sh_degree,
+        lens.COEFFICIENTS[camera_model],
     )
-    settings = _Settings(spec, size, sh_degree, render_mode, radius_clip)
+    settings = _Settings(spec, size, sh_degree, render_mode, radius_clip, camera_model)
     fields: tuple[Array, Array, Array, Array, Array, Array]
     image, alpha, fields = _batch(settings, gaussians, colors, views)
     cameras = views.viewmat.shape[-3]
@@ -221,7 +243,7 @@ def _index(name, value):
     return number
 
 
-def _checked(arrays: dict[str, Any], sh_degree):
+def _checked(arrays: dict[str, Any], sh_degree, coefficients):
     """Check shapes, and return Gaussians, colors shared by all cameras, and views."""
     arrays = {
         name: None if value is None else jnp.asarray(value)
@@ -254,6 +276,10 @@ def _checked(arrays: dict[str, Any], sh_degree):
     if cameras < 1:
         raise ValueError("viewmats must hold at least one camera, got none")
     sizes = {"N": count, "C": cameras, "3": 3, "4": 4, "2": 2}
+    lenses = arrays["distortion"]
+    known = lenses is not None and lenses.shape[-1:] in ((n,) for n in coefficients)
+    numbers = str(lenses.shape[-1] if known else coefficients[-1])
+    sizes[numbers] = int(numbers)
     colors = arrays["colors"]
     last = _color_axes(colors, sh_degree)
     sizes |= dict(zip(last, colors.shape[-len(last) :], strict=False))
@@ -268,6 +294,7 @@ def _checked(arrays: dict[str, Any], sh_degree):
         "viewmats": "C 4 4",
         "Ks": "C 3 3",
         "backgrounds": f"C {last[-1]}",
+        "distortion": f"C {numbers}",
         "means2d_offset": "C N 2",
     }
     per_camera = colors.ndim == len(batch) + len(last) + 2
@@ -289,6 +316,7 @@ def _checked(arrays: dict[str, Any], sh_degree):
         arrays["Ks"],
         colors if per_camera else None,
         arrays["backgrounds"],
+        arrays["distortion"],
         arrays["means2d_offset"],
     )
     return gaussians, None if per_camera else colors, views
@@ -340,7 +368,8 @@ def _scene(settings, gaussians, colors, views):
 def _camera_image(settings, gaussians, colors, view):
     """Render one image, its alpha and the arrays of `RasterizationInfo`."""
     spec, size = settings.spec, settings.size
-    footprints = projection.project(gaussians, _camera(view), size, spec)
+    camera = _camera(view, settings.camera_model)
+    footprints = projection.project(gaussians, camera, size, spec)
     if view.means2d_offset is not None:
         shifted = footprints.mean_px + view.means2d_offset
         footprints = footprints._replace(mean_px=shifted)
@@ -384,7 +413,7 @@ def _camera_image(settings, gaussians, colors, view):
     return image, alpha, fields
 
 
-def _camera(view):
+def _camera(view, model):
     """Return the camera of a view, whose center the viewmat maps to zero."""
     rotation, shift = view.viewmat[:3, :3], view.viewmat[:3, 3]
     # Cofactors give the exact inverse of any matrix, so the gradient with respect to
@@ -394,7 +423,13 @@ def _camera(view):
     )
     determinant = jnp.sum(rotation[0] * cofactors[0])
     position = -exact_product(shift, cofactors) / determinant
-    zeros = jnp.zeros(3, rotation.dtype)
+    radial = tangential = jnp.zeros(3, rotation.dtype)
+    fisheye, terms = None, view.distortion
+    if model == "fisheye":
+        fisheye = jnp.zeros(4, rotation.dtype) if terms is None else terms
+    elif terms is not None:
+        tangential = terms[2:4]
+        radial = jnp.concatenate([terms[:2], terms[4:], radial])[:3]
     K = view.K
     return Camera(
         camera_from_world=rotation,
@@ -403,8 +438,9 @@ def _camera(view):
         principal_point_px=K[:2, 2],
         skew_px=K[0, 1],
         pixel_aspect=K[1, 1] / K[0, 0],
-        radial=zeros,
-        tangential=zeros[:2],
+        radial=radial,
+        tangential=tangential[:2],
+        fisheye=fisheye,
     )
 
 

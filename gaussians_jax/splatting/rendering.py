@@ -48,7 +48,8 @@ def render(
     Args:
       gaussians: N Gaussians in world coordinates.
       colors: Colors [N, 3].
-      camera: One camera without lens distortion.
+      camera: One camera. Its radial and tangential distortion is modeled with
+        `spec.distorted`.
       size: (width, height) of the image in pixels.
       spec: Thresholds and tile sizes.
       background: One color [3] or an image [height, width, 3] behind the Gaussians.
@@ -64,11 +65,11 @@ def render(
       The rendering, the projected Gaussians, and the rendered features.
 
     Raises:
-      ValueError: An array has another shape, or the camera has lens distortion. The
-        distortion of a traced camera cannot be checked (`refuse_distortion` on the
-        host).
+      ValueError: An array has another shape, or the camera has lens distortion without
+        `spec.distorted`. The distortion of a traced camera cannot be checked
+        (`refuse_distortion` on the host).
     """
-    if not isinstance(camera.radial, jax.core.Tracer):
+    if not (spec.distorted or isinstance(camera.radial, jax.core.Tracer)):
         refuse_distortion(camera)
     footprints = projection.project(gaussians, camera, size, spec)
     drawn = footprints
@@ -124,11 +125,12 @@ def render_harmonics(
 
 
 def refuse_distortion(camera: Camera) -> None:
-    """Raise where `camera` (host values) is distorted: EWA splatting is a pinhole's."""
+    """Raise where `camera` (host values) has radial or tangential distortion."""
     for name in ("radial", "tangential"):
         value = np.asarray(getattr(camera, name))
         if np.any(value != 0):
             raise ValueError(
-                f"Gaussian splatting needs a camera without lens distortion, got "
-                f"{name}={value.tolist()}; undistort the images first"
+                f"the camera has lens distortion, {name}={value.tolist()}, which "
+                "these settings ignore; set RasterSpec.distorted=True, or undistort "
+                "the images"
             )

@@ -192,9 +192,16 @@ def _cameras(entries, transforms, size, where):
             pixel_aspect=np.float32(lens.focal_px[1] / lens.focal_px[0]),
             radial=np.float32(lens.radial),
             tangential=np.float32(lens.tangential),
+            fisheye=None if lens.fisheye is None else np.float32(lens.fisheye),
         )
         cameras.append(one)
         lenses.append(lens)
+    fisheyes = sum(one.fisheye is not None for one in cameras)
+    if fisheyes not in (0, len(cameras)):
+        raise CaptureError(
+            f"{where}: {fisheyes} of {len(cameras)} frames are fisheyes; undistort "
+            "the images of those"
+        )
     return camera.stack(cameras), transforms_lens.notes(lenses, size)
 
 

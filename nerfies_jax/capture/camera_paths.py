@@ -162,6 +162,7 @@ def smoothed(captured: Camera, captured_times: np.ndarray, times: np.ndarray) ->
         skew_px=np.zeros_like(lens.skew_px),
         radial=np.zeros_like(lens.radial),
         tangential=np.zeros_like(lens.tangential),
+        fisheye=None,
     )
     return lens._replace(**leaves)
 

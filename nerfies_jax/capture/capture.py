@@ -5,6 +5,7 @@ import dataclasses
 import pathlib
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from nerfies_jax.capture import flow as flows
@@ -182,7 +183,8 @@ def check_cameras(
     Raises:
       CaptureError: If a camera cannot be used, with the name of its frame.
     """
-    leaf = next((leaf for leaf in cameras if leaf.shape[:1] != (len(ids),)), None)
+    leaves = jax.tree.leaves(cameras)
+    leaf = next((leaf for leaf in leaves if leaf.shape[:1] != (len(ids),)), None)
     if leaf is not None:
         raise CaptureError(
             f"{where}: {len(ids)} frames but cameras of shape {leaf.shape}; there must "

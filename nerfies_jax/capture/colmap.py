@@ -170,7 +170,8 @@ def _as_pinholes(path, model, files, stored, shrink_by):
     notes += masked
     full = pictures.read_header(files[0]).size
     lenses = [_scaled(lens, full, size, path) for lens in model.lenses]
-    if not all(map(_is_ours, lenses)):
+    fisheyes = {_is_fisheye(lens) for lens in lenses}
+    if not all(map(_is_ours, lenses)) or len(fisheyes) > 1:
         names = sorted({lens.model_name for lens in lenses})
         notes += (f"pictures undistorted from {' and '.join(names)} to a pinhole",)
         images, exists, (valid, moving), pinhole = undistort(
@@ -363,6 +364,10 @@ def _scaled(lens, stored, size, path):
     return copy
 
 
+def _is_fisheye(lens):
+    return lens.model_name == "OPENCV_FISHEYE"
+
+
 def _is_ours(lens):
     if lens.model_name == "FULL_OPENCV":
         return not np.any(lens.params[9:])  # k4 to k6 divide; ours does not
@@ -372,13 +377,17 @@ def _is_ours(lens):
         "SIMPLE_RADIAL",
         "RADIAL",
         "OPENCV",
+        "OPENCV_FISHEYE",
     }
 
 
 def _cameras(lenses, rotations, positions):
     radial = np.zeros((len(lenses), 3), np.float32)
     tangential = np.zeros((len(lenses), 2), np.float32)
-    for row, lens in enumerate(lenses):
+    fisheye = None
+    if _is_fisheye(lenses[0]):
+        fisheye = np.array([lens.params[4:8] for lens in lenses], np.float32)
+    for row, lens in enumerate(lenses if fisheye is None else ()):
         bent = np.asarray(lens.params)[2 + len(lens.focal_length_idxs()) :]
         radial[row, : min(2, len(bent))] = bent[:2]
         if len(bent) >= 4:
@@ -396,4 +405,5 @@ def _cameras(lenses, rotations, positions):
         pixel_aspect=(focal[:, 1] / focal[:, 0]).astype(np.float32),
         radial=radial,
         tangential=tangential,
+        fisheye=fisheye,
     )

@@ -91,7 +91,9 @@ def _lens(capture, row):
     k1, k2, k3 = cameras.radial[row]
     distortion = [k1, k2, *cameras.tangential[row]]
     model = "PINHOLE"
-    if k3 != 0:
+    if cameras.fisheye is not None:
+        model, parameters = "OPENCV_FISHEYE", [*parameters, *cameras.fisheye[row]]
+    elif k3 != 0:
         model, parameters = "FULL_OPENCV", [*parameters, *distortion, k3, 0, 0, 0]
     elif any(distortion):
         model, parameters = "OPENCV", [*parameters, *distortion]

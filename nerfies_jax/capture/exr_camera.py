@@ -40,6 +40,9 @@ def attributes(camera: Camera, size: tuple[int, int], time: float) -> dict[str, 
         # Contiguous, since OpenEXR reads the memory without regard to strides.
         return np.ascontiguousarray(matrix.T, np.float32)
 
+    fisheye = {}
+    if camera.fisheye is not None:
+        fisheye = {"fisheyeDistortion": np.asarray(camera.fisheye, np.float32)}
     return {
         "worldToCamera": row_vector_matrix(from_world),
         "worldToNDC": row_vector_matrix(ndc @ from_world),
@@ -50,4 +53,5 @@ def attributes(camera: Camera, size: tuple[int, int], time: float) -> dict[str, 
         "skewPx": float(camera.skew_px),
         "radialDistortion": np.asarray(camera.radial, np.float32),
         "tangentialDistortion": np.asarray(camera.tangential, np.float32),
+        **fisheye,
     }

@@ -1,11 +1,13 @@
 """Checks of intrinsics against the image size, and of positions against float32."""
 
+import jax
 import numpy as np
 
 from nerfies_jax.capture import units
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.gate_finding import Finding
 from nerfies_jax.capture.gate_poses import fold_radius
+from nerfies_jax.geometry.camera import unproject
 
 # Degrees across the image that a pinhole may have, and those that are usual.
 POSSIBLE, USUAL = (0.01, 165.0), (0.5, 140.0)
@@ -130,6 +132,8 @@ def _principal_point(capture):
 def _lens(capture):
     """Check that lens models do not fold back or move corners too far."""
     cameras = capture.cameras
+    if cameras.fisheye is not None:
+        return _fisheye(capture)
     if not np.any(cameras.radial):
         return Finding("lens distortion", "none")
     width, height = capture.size
@@ -165,6 +169,26 @@ def _lens(capture):
         problem = f"the lens distortion moves the corners by {shift:.0%}: "
         return Finding(subject, value, problem + reason)
     return Finding(subject, value)
+
+
+def _fisheye(capture):
+    """Check that a fisheye shows rays in most of its image."""
+    cameras = capture.cameras
+    corners = np.indices((17, 17))[::-1] / 16 * np.array(capture.size)[:, None, None]
+    shares = []
+    for row in np.unique(cameras.fisheye, axis=0, return_index=True)[1]:
+        one = jax.tree.map(lambda leaf, row=row: leaf[row], cameras)
+        rays = unproject(one, corners.reshape(2, -1).T.astype(np.float32))[1]
+        shares.append(1 - float(np.mean(rays)))
+    share = max(shares)
+    value = f"fisheye, without rays in {share:.1%} of the image"
+    problem = ""
+    if share > MOST_FOLDED:
+        problem = (
+            f"the fisheye has no rays in {share:.1%} of the image: the coefficients "
+            "may be of another model, or of another focal length"
+        )
+    return Finding("lens distortion", value, problem, share > MOST_FOLDED)
 
 
 def _precision(capture):

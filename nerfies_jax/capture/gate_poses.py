@@ -5,12 +5,12 @@ Everything is measured in float64 in NumPy: positions may be wrong by many order
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from nerfies_jax.capture import gate_axes
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.gate_finding import Finding
-from nerfies_jax.geometry.camera import Camera
 
 # Share of the points in an image, averaged over cameras. Below `DOUBTFUL`, another
 # convention is suggested if its share is at least `CONVINCING`.
@@ -58,7 +58,7 @@ def findings(capture: Capture) -> list[Finding]:
         return gate_axes.findings(capture)
     count = len(capture.ids)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).astype(int))
-    cameras = Camera._make(np.asarray(leaf, float)[rows] for leaf in capture.cameras)
+    cameras = jax.tree.map(lambda leaf: np.asarray(leaf, float)[rows], capture.cameras)
     places = capture.points.position
     some = np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)
     points = np.float64(places[some]) / capture.scale + np.array(capture.center)
@@ -317,12 +317,7 @@ def _project(cameras, pose, points, size):
     ahead = depth > 0
     slope = local[..., :2] / np.where(ahead, depth, 1.0)[..., None]
     x, y = slope[..., 0], slope[..., 1]
-    radius_sq = np.minimum(x * x + y * y, 1e8)
-    k1, k2, k3 = (cameras.radial[:, [i]] for i in range(3))
-    p1, p2 = (cameras.tangential[:, [i]] for i in range(2))
-    stretch = 1 + radius_sq * (k1 + radius_sq * (k2 + radius_sq * k3))
-    bent_x = x * stretch + 2 * p1 * x * y + p2 * (radius_sq + 2 * x * x)
-    bent_y = y * stretch + 2 * p2 * x * y + p1 * (radius_sq + 2 * y * y)
+    bent_x, bent_y, single = _distorted(cameras, x, y)
     focal = cameras.focal_px[:, None]
     pixel = np.stack(
         [
@@ -333,24 +328,45 @@ def _project(cameras, pose, points, size):
     )
     pixel = pixel + cameras.principal_point_px[:, None]
     within = ((pixel >= 0) & (pixel < np.array(size))).all(-1)
-    folds = fold_radius(cameras.radial)[:, None]
-    return Projected(pixel, depth, ahead & within & (radius_sq < folds**2))
+    return Projected(pixel, depth, ahead & within & single)
+
+
+def _distorted(cameras, x, y):
+    """Distorted slopes [frames, points], and whether the lens has not folded there."""
+    radius_sq = np.minimum(x * x + y * y, 1e8)
+    if cameras.fisheye is not None:
+        angle = np.arctan(np.sqrt(radius_sq))
+        powers = angle[..., None] ** np.arange(2, 9, 2)
+        stretch = 1 + np.einsum("fpk,fk->fp", powers, cameras.fisheye)
+        stretch = stretch * np.where(angle > 0, angle, 1)
+        stretch = stretch / np.where(angle > 0, np.sqrt(radius_sq), 1)
+        folds = np.tan(np.minimum(fold_radius(cameras.fisheye), np.pi / 2 - 1e-4))
+        return x * stretch, y * stretch, radius_sq < folds[:, None] ** 2
+    k1, k2, k3 = (cameras.radial[:, [i]] for i in range(3))
+    p1, p2 = (cameras.tangential[:, [i]] for i in range(2))
+    stretch = 1 + radius_sq * (k1 + radius_sq * (k2 + radius_sq * k3))
+    bent_x = x * stretch + 2 * p1 * x * y + p2 * (radius_sq + 2 * x * x)
+    bent_y = y * stretch + 2 * p2 * x * y + p1 * (radius_sq + 2 * y * y)
+    return bent_x, bent_y, radius_sq < fold_radius(cameras.radial)[:, None] ** 2
 
 
 def fold_radius(radial: np.ndarray) -> np.ndarray:
     """Compute the undistorted radius at which each lens folds back.
 
     Args:
-      radial: Coefficients k1, k2, k3 of each lens, [lenses, 3].
+      radial: Coefficients k1, k2, k3 of each lens, [lenses, 3], or those of a fisheye,
+        [lenses, 4].
 
     Returns:
-      Radii in the image plane [lenses], inf for lenses that never fold.
+      Radii in the image plane, of a fisheye angles in radians, [lenses]. inf for lenses
+      that never fold.
     """
     radii = {}
-    for k1, k2, k3 in np.unique(radial, axis=0).tolist():
+    for each in np.unique(radial, axis=0).tolist():
         # d/dr (r + k1 r^3 + k2 r^5 + k3 r^7), a polynomial in r^2
-        slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])
+        powers = np.arange(len(each), 0, -1)
+        slope = np.append((2 * powers + 1) * each[::-1], 1.0)
         roots = np.roots(np.trim_zeros(slope, "f"))
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-        radii[k1, k2, k3] = float(np.sqrt(real.min())) if real.size else np.inf
+        radii[tuple(each)] = float(np.sqrt(real.min())) if real.size else np.inf
     return np.array([radii[tuple(each)] for each in radial.tolist()])

@@ -38,6 +38,8 @@ class CameraFile(msgspec.Struct):
     tangential_distortion: Pair | None = None
     tangential: Pair | None = None  # the name that early files use
     time: float | None = None  # our extension for camera paths, in [0, 1]
+    # Our extension, k1 to k4 of OpenCV's fisheye model, which replaces the other two.
+    fisheye_distortion: tuple[float, float, float, float] | None = None
 
 
 class SceneFile(msgspec.Struct):
@@ -298,7 +300,21 @@ def cameras_of(
         pixel_aspect=column([file.pixel_aspect_ratio for file in files]),
         radial=column([file.radial_distortion for file in files]),
         tangential=column(tangential),
+        fisheye=_fisheye(files),
     )
+
+
+def _fisheye(files):
+    """Coefficients [files, 4] of fisheyes, None if no file has any."""
+    coefficients = [file.fisheye_distortion for file in files]
+    if not any(coefficients):
+        return None
+    if not all(coefficients):
+        raise CaptureError(
+            f"{coefficients.count(None)} of {len(files)} cameras have no "
+            "fisheye_distortion; cameras of one capture are all fisheyes or none is"
+        )
+    return np.array(coefficients, np.float32)
 
 
 def camera_entry(one: Camera, capture: Capture, size: tuple[int, int]) -> dict:
@@ -313,6 +329,7 @@ def camera_entry(one: Camera, capture: Capture, size: tuple[int, int]) -> dict:
       JSON values, in world units.
     """
     position = np.asarray(one.position, np.float64) / capture.scale + capture.center
+    ours = {} if one.fisheye is None else {"fisheye_distortion": one.fisheye.tolist()}
     return {
         "orientation": one.camera_from_world.tolist(),
         "position": position.tolist(),
@@ -323,6 +340,7 @@ def camera_entry(one: Camera, capture: Capture, size: tuple[int, int]) -> dict:
         "radial_distortion": one.radial.tolist(),
         "tangential_distortion": one.tangential.tolist(),
         "image_size": list(size),
+        **ours,
     }
 
 

@@ -1,8 +1,10 @@
-"""Undistortion of captures for renderers that support only pinhole cameras."""
+"""Undistortion of captures for preprocessing, and pixels with and without a lens."""
 
 import dataclasses
+import math
+import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -10,18 +12,32 @@ import numpy as np
 from nerfies_jax.capture import resampling
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.geometry import distortion, rays
+from nerfies_jax.geometry import lens, rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.runtime import events
+
+# Share of each side by which undistorted images grow at most, on both sides together.
+# Corners of a fisheye lie at any distance.
+MOST_GROWTH = 0.5
+MOST_KEPT_BYTES = 256_000_000  # of undistorted images that are kept for the next use
+
+
+class Canvas(NamedTuple):
+    """Undistorted images of a capture, in which all pinholes have the same size."""
+
+    size: tuple[int, int]  # width and height in pixels
+    left: int  # columns that are added at the left
+    top: int  # rows that are added at the top
 
 
 def as_pinholes(capture: Capture) -> Capture:
     """Undistort a capture to pinhole cameras.
 
-    Focal lengths, principal points and image sizes are unchanged. Pixels outside of the
-    distorted image are marked in `valid`. Color is sampled with a Lanczos filter, masks
-    and depth at the nearest pixel. The z-depth of a point does not depend on the lens.
-    Flow is dropped, since both of its ends would have to be resampled.
+    Focal lengths are unchanged. Images grow until they contain all observed pixels, at
+    most by `MOST_GROWTH` of their sides. Pixels that the lens did not observe are
+    marked in `valid`. Color is sampled with a Lanczos filter, masks and depth at the
+    nearest pixel. z-depth needs no change, since a ray keeps its points. Flow is
+    dropped, since both of its ends would move.
 
     Args:
       capture: The capture.
@@ -31,75 +47,168 @@ def as_pinholes(capture: Capture) -> Capture:
     """
     if not has_lens(capture.cameras):
         return capture
-    images = np.empty_like(capture.images)
-    valid = np.empty(images.shape[:3], bool)
+    wide = canvas(capture)
+    arrays = _last.arrays(capture)
+    if arrays is None:
+        arrays = _undistorted(capture, wide)
+        if arrays["images"].nbytes <= MOST_KEPT_BYTES:
+            _last.keep(capture, arrays)
+    filmed = arrays["valid"]
+    note = f"images undistorted; {1 - filmed.mean():.1%} of their pixels are unobserved"
+    return dataclasses.replace(
+        capture,
+        **arrays | {"valid": None if filmed.all() else filmed},
+        cameras=cameras.crop(pinhole(capture.cameras), -wide.left, -wide.top),
+        flow=None,
+        notes=(*capture.notes, note),
+    )
+
+
+class _Last:
+    """Undistorted arrays of the last capture, for as long as its images exist.
+
+    A run undistorts its capture for each part of preprocessing.
+    """
+
+    def __init__(self):
+        self._forget()
+
+    def _forget(self, _=None):
+        self._images: Any = lambda: None
+        self._others, self._arrays = (), None
+
+    def arrays(self, capture):
+        others = _others(capture)
+        same = self._images() is capture.images and len(others) == len(self._others)
+        if same and all(a is b for a, b in zip(others, self._others, strict=True)):
+            return self._arrays
+        return None
+
+    def keep(self, capture, arrays):
+        self._images = weakref.ref(capture.images, self._forget)
+        self._others, self._arrays = _others(capture), arrays
+
+
+def _others(capture):
+    leaves = jax.tree.leaves(capture.cameras)
+    return (capture.valid, capture.moving, capture.depths, *leaves)
+
+
+_last = _Last()
+
+
+def _undistorted(capture, wide):
+    """Images, masks and depths by name, with booleans of the observed pixels."""
+    shape = (len(capture.images), *wide.size[::-1])
+    images = np.empty((*shape, 3), capture.images.dtype)
+    filmed = np.empty(shape, bool)
     masks: dict[str, Any] = {
-        name: None if array is None else np.empty_like(array)
+        name: None if array is None else np.empty(shape, array.dtype)
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
     }
-    maps = Maps(_source_pixels, capture.size)
+
+    def places(camera, size):
+        return _source_pixels(camera, size, wide)
+
+    maps = Maps(places, capture.size)
     with events.stage("undistorting images", len(images)) as stage:
         for row in range(len(images)):
-            index, inside = maps.of(cameras.take(capture.cameras, row))
-            images[row] = resampling.lanczos(capture.images[row], index)
+            place, inside = maps.of(cameras.take(capture.cameras, row))
+            images[row] = resampling.lanczos(capture.images[row], place)
             images[row][~inside] = 0
-            valid[row] = inside
+            filmed[row] = inside
             if capture.valid is not None:
-                valid[row] &= resampling.nearest(capture.valid[row], index)
+                filmed[row] &= resampling.nearest(capture.valid[row], place)
             for name, array in masks.items():
                 if array is not None:
                     source = getattr(capture, name)[row]
-                    array[row] = np.where(inside, resampling.nearest(source, index), 0)
+                    array[row] = np.where(inside, resampling.nearest(source, place), 0)
             stage.advance()
-    note = f"images undistorted; {1 - valid.mean():.1%} of their pixels are unobserved"
-    return dataclasses.replace(
-        capture,
-        images=images,
-        valid=None if valid.all() else valid,
-        cameras=pinhole(capture.cameras),
-        flow=None,
-        notes=(*capture.notes, note),
-        **masks,
-    )
+    return {"images": images, "valid": filmed, **masks}
 
 
-def scorable(capture: Capture, traced: bool) -> Capture:
-    """Restrict the masks of a distorted capture to pixels that can be evaluated.
-
-    Images stay distorted. Pixels without a prediction are no longer `valid`, and their
-    depth becomes unknown. These are pixels for which the lens model has no ray and,
-    unless rays are traced through the lens, pixels outside of the rendered pinhole
-    image, which has the same focal length and size.
+def canvas(capture: Capture) -> Canvas:
+    """Find the size of the undistorted images of a capture.
 
     Args:
-      capture: The capture with its original images.
-      traced: True if the renderer traces rays through the lens.
+      capture: The capture.
 
     Returns:
-      The capture with its masks and depth restricted, or the same one if it has no
-      distortion.
+      The size, and the columns and rows that are added. Those of the capture itself if
+      it has no distortion.
     """
+    width, height = capture.size
     if not has_lens(capture.cameras):
-        return capture
-    maps = Maps(_rays_exist if traced else pinhole_places, capture.size)
-    predicted = np.stack(
+        return Canvas(capture.size, 0, 0)
+    low, high = np.zeros(2), np.array([width, height], float)
+    maps = Maps(_straight_pixels, capture.size)
+    for row in range(len(capture.ids)):
+        pixels, single = maps.of(cameras.take(capture.cameras, row))
+        if single.any():
+            low = np.minimum(low, pixels[single].min(axis=0) - 0.5)
+            high = np.maximum(high, pixels[single].max(axis=0) + 0.5)
+    # Equal growth on both sides, so that a strong lens loses as much on either.
+    most = np.floor(MOST_GROWTH / 2 * np.array([width, height]))
+    left, top = (math.ceil(x) for x in np.minimum(-low, most))
+    right, bottom = (math.ceil(x) for x in np.minimum(high - (width, height), most))
+    return Canvas((width + left + right, height + top + bottom), left, top)
+
+
+def as_filmed(
+    image: np.ndarray, camera: Camera, wide: Canvas, size: tuple[int, int]
+) -> np.ndarray:
+    """Distort a mask of undistorted pixels to those of a captured image.
+
+    Args:
+      image: Mask in an undistorted image, [canvas height, canvas width].
+      camera: One camera with its distortion.
+      wide: The canvas of its capture.
+      size: Width and height of the captured image in pixels.
+
+    Returns:
+      The mask [height, width], False where the undistorted image ends.
+    """
+    if not has_lens(camera):
+        return image
+    pixels, single = _straight_pixels(camera, size)
+    pixels = np.where(single[..., None], pixels, np.nan)
+    pixels = pixels + np.array([wide.left, wide.top])
+    place, inside = resampling.array_places(pixels, wide.size)
+    return inside & resampling.nearest(image, place)
+
+
+def scorable(filmed: Capture) -> Capture:
+    """Mark the pixels of a distorted capture for which its lens model has a ray.
+
+    The other pixels are no longer `valid`, and their depth is unknown.
+
+    Args:
+      filmed: The capture.
+
+    Returns:
+      The capture with its masks and depth restricted, or the same one if the lens model
+      has a ray for every pixel.
+    """
+    if not has_lens(filmed.cameras):
+        return filmed
+    maps = Maps(_straight_pixels, filmed.size)
+    drawn = np.stack(
         [
-            maps.of(cameras.take(capture.cameras, row))[1]
-            for row in range(len(capture.ids))
+            maps.of(cameras.take(filmed.cameras, row))[1]
+            for row in range(len(filmed.ids))
         ]
     )
-    depths = capture.depths
-    valid = predicted if capture.valid is None else capture.valid & predicted
-    share_before = 1.0 if capture.valid is None else capture.valid.mean()
-    if valid.mean() == share_before:
-        return capture
-    reason = "have no ray" if traced else "lie outside of the rendered pinhole image"
-    note = f"{share_before - valid.mean():.2%} of the pixels {reason}: not evaluated"
+    depths = filmed.depths
+    valid = drawn if filmed.valid is None else filmed.valid & drawn
+    before = 1.0 if filmed.valid is None else filmed.valid.mean()
+    if valid.mean() == before:
+        return filmed
+    note = f"{before - valid.mean():.2%} of the pixels have no ray, and are not scored"
     return dataclasses.replace(
-        capture,
+        filmed,
         valid=valid,
-        notes=(*capture.notes, note),
-        depths=None if depths is None else np.where(predicted, depths, np.float32(0)),
+        notes=(*filmed.notes, note),
+        depths=None if depths is None else np.where(drawn, depths, np.float32(0)),
     )
 
 
@@ -110,8 +219,10 @@ def has_lens(camera: Camera) -> bool:
       camera: A camera or a batch.
 
     Returns:
-      True if a coefficient is not zero.
+      True if a coefficient is not zero, or for a fisheye.
     """
+    if camera.fisheye is not None:
+        return True
     return bool(np.any(camera.radial) or np.any(camera.tangential))
 
 
@@ -124,96 +235,66 @@ def pinhole(camera: Camera) -> Camera:
     Returns:
       The cameras without distortion.
     """
-    return camera._replace(radial=0 * camera.radial, tangential=0 * camera.tangential)
+    return camera._replace(
+        radial=0 * camera.radial, tangential=0 * camera.tangential, fisheye=None
+    )
 
 
 class Maps:
-    """Resampling maps for cameras of one image size, cached by intrinsics.
+    """Positions of pixels for cameras of one image size, cached by intrinsics.
 
-    Frames of one physical camera share a map, since it does not depend on the pose.
-
-    Args:
-      places: Function that computes the map of a camera and an image size.
-      size: Width and height of the images in pixels.
+    Frames of one physical camera share them, since they do not depend on the pose.
     """
 
     def __init__(self, places: Callable, size: tuple[int, int]):
         self._places, self._size = places, size
-        self._cache: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+        self._kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def of(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the map of a camera.
-
-        Args:
-          camera: One camera.
-
-        Returns:
-          Array coordinates [2, height, width], and booleans of the pixels that have one
-          [height, width].
-        """
-        key = b"".join(np.asarray(leaf).tobytes() for leaf in camera[2:])
-        if key not in self._cache:
-            self._cache[key] = self._places(camera, self._size)
-        return self._cache[key]
+        """Return the positions of one camera, and booleans of those that exist."""
+        leaves = jax.tree.leaves(camera[2:])
+        key = b"".join(np.asarray(leaf).tobytes() for leaf in leaves)
+        if key not in self._kept:
+            self._kept[key] = self._places(camera, self._size)
+        return self._kept[key]
 
 
-def pinhole_places(
-    camera: Camera, size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Locate each pixel of a distorted image in the undistorted image.
-
-    The pinhole has the focal length, principal point and size of the distorted image.
-
-    Args:
-      camera: One camera with its distortion.
-      size: Width and height of the image in pixels.
-
-    Returns:
-      Array coordinates [2, height, width] as in `resampling.array_places`, and booleans
-      of the pixels inside the undistorted image [height, width].
-    """
-    plane, is_unique = _undistort(*_lens(camera), _pixel_grid(camera, size))
-    plane = np.where(np.asarray(is_unique)[:, None], np.asarray(plane), np.nan)
-    return resampling.array_places(_pixels(camera, plane, size), size)
+def _straight_pixels(camera, size):
+    """Undistorted positions [height, width, 2] of pixels, and whether they have any."""
+    slopes, single = _straight(_float32(camera), _slopes(camera, size))
+    single = np.asarray(single).reshape(size[::-1])
+    return _pixels(camera, np.asarray(slopes), size), single
 
 
-def _rays_exist(camera, size):
-    """The identity map, and booleans of the pixels for which the lens has a ray."""
-    _, is_unique = _undistort(*_lens(camera), _pixel_grid(camera, size))
-    index = np.indices(size[::-1], np.float32)
-    return index, np.asarray(is_unique).reshape(size[::-1])
-
-
-def _lens(camera):
-    return (np.asarray(part, np.float32) for part in (camera.radial, camera.tangential))
-
-
-@jax.jit
-def _undistort(radial, tangential, distorted):
-    """Undistorted image-plane positions, and booleans of those that exist."""
-    each = (None, None, 0)
-    return jax.vmap(distortion.undistort, each)(radial, tangential, distorted)
-
-
-@jax.jit
-def _distort(radial, tangential, plane):
-    """Distorted image-plane positions, and booleans where the lens is one-to-one."""
-    each = (None, None, 0)
-    distorted = jax.vmap(distortion.distort, each)(radial, tangential, plane)
-    return distorted, jax.vmap(distortion.one_to_one, each)(radial, tangential, plane)
-
-
-def _source_pixels(camera, size):
+def _source_pixels(camera, size, wide):
     """Locate each undistorted pixel in the distorted image, with booleans of success.
 
-    There is no such pixel where the lens model is not one-to-one.
+    Where the lens model folds back there is no pixel at all.
     """
-    plane, is_unique = _distort(*_lens(camera), _pixel_grid(camera, size))
-    plane = np.where(np.asarray(is_unique)[:, None], np.asarray(plane), np.nan)
-    return resampling.array_places(_pixels(camera, plane, size), size)
+    straight = cameras.crop(pinhole(camera), -wide.left, -wide.top)
+    bent, single = _bent(_float32(camera), _slopes(straight, wide.size))
+    bent = np.where(np.asarray(single)[:, None], np.asarray(bent), np.nan)
+    return resampling.array_places(_pixels(camera, bent, wide.size), size)
 
 
-def _pixel_grid(camera, size):
+def _float32(camera):
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), camera)
+
+
+@jax.jit
+def _straight(camera, bent):
+    """Slopes of the rays that the lens bends to these, and whether there are any."""
+    return jax.vmap(lens.undistort, (None, 0))(camera, bent)
+
+
+@jax.jit
+def _bent(camera, slopes):
+    """Distorted image-plane positions, and booleans where the lens is one-to-one."""
+    bent = jax.vmap(lens.distort, (None, 0))(camera, slopes)
+    return bent, jax.vmap(lens.one_to_one, (None, 0))(camera, slopes)
+
+
+def _slopes(camera, size):
     """Image-plane positions [pixels, 2] of the pixel centers, without distortion."""
     focal, skew = float(camera.focal_px), float(camera.skew_px)
     offset = np.asarray(rays.pixel_centers(size)) - np.asarray(
@@ -224,10 +305,10 @@ def _pixel_grid(camera, size):
     return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
 
 
-def _pixels(camera, plane, size):
+def _pixels(camera, slopes, size):
     """Pixel positions [height, width, 2] of image-plane positions [pixels, 2]."""
     focal, skew = float(camera.focal_px), float(camera.skew_px)
-    plane = plane.reshape(size[1], size[0], 2)
-    x = focal * plane[..., 0] + skew * plane[..., 1]
-    y = focal * float(camera.pixel_aspect) * plane[..., 1]
-    return np.stack([x, y], axis=-1) + np.asarray(camera.principal_point_px)
+    slopes = slopes.reshape(size[1], size[0], 2)
+    across = focal * slopes[..., 0] + skew * slopes[..., 1]
+    down = focal * float(camera.pixel_aspect) * slopes[..., 1]
+    return np.stack([across, down], axis=-1) + np.asarray(camera.principal_point_px)

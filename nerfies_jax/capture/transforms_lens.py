@@ -18,6 +18,7 @@ PINHOLES = {
     *("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"),
     "PERSPECTIVE",
 }
+FISHEYE = "OPENCV_FISHEYE"
 # Without a stated size, the ratio n of the sizes of the calibrated images and of these
 # images is that of the principal point to the image center, within this share. The
 # principal point of real lenses lies a few percent off the center.
@@ -33,6 +34,7 @@ class Intrinsics(NamedTuple):
     principal_point_px: tuple[float, float]
     radial: tuple[float, float, float]
     tangential: tuple[float, float]
+    fisheye: tuple[float, float, float, float] | None  # replaces the other two
     size: tuple[float, float]  # of the images that the file's intrinsics refer to
     larger: bool  # True if that size was derived from the principal point
 
@@ -88,8 +90,7 @@ def resolve(
         principal_point_px=tuple(
             c * size[0] / (times * center_size[0]) for c in center
         ),
-        radial=distortion[:3],
-        tangential=distortion[3:],
+        **distortion,
         size=(times * width, times * height),
         larger=times != 1,
     )
@@ -166,22 +167,32 @@ def _axis_focal(level, axis, side, label):
 
 
 def _distortion(entry, transforms, label):
-    """k1, k2, k3, p1, p2 of a supported camera model."""
+    """Fields of `Intrinsics` for OpenCV's lens models."""
     level = _level(entry, transforms, MODEL)
-    if (level.camera_model or "").upper() not in PINHOLES:
+    model = (level.camera_model or "").upper()
+    fisheye = model == FISHEYE or bool(level.is_fisheye)
+    if model not in PINHOLES | {FISHEYE}:
         raise _unsupported_model(label, f"camera_model {level.camera_model}")
-    if level.is_fisheye:
-        raise _unsupported_model(label, "is_fisheye")
     has_other_model = entry.camera_model not in (None, transforms.camera_model)
     # The file's coefficients belong to the file's model.
     level = entry if has_other_model else _level(entry, transforms, DISTORTION)
     values = {key: getattr(level, key) or 0.0 for key in DISTORTION}
-    for key in ("k4", "k5", "k6"):
+    for key in ("k5", "k6") if fisheye else ("k4", "k5", "k6"):
         if values[key] != 0:
             raise CaptureError(
                 f"{label} has {key} = {values[key]}; undistort the pictures first"
             )
-    return tuple(values[key] for key in ("k1", "k2", "k3", "p1", "p2"))
+    if fisheye:
+        return {
+            "radial": (0.0, 0.0, 0.0),
+            "tangential": (0.0, 0.0),
+            "fisheye": tuple(values[key] for key in ("k1", "k2", "k3", "k4")),
+        }
+    return {
+        "radial": tuple(values[key] for key in ("k1", "k2", "k3")),
+        "tangential": tuple(values[key] for key in ("p1", "p2")),
+        "fisheye": None,
+    }
 
 
 def _unsupported_model(label, model):

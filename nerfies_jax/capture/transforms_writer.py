@@ -132,8 +132,11 @@ def _transforms(capture, units):
     lenses = [_lens(cameras, row) for row in range(len(capture.ids))]
     same_lens = all(lens == lenses[0] for lens in lenses)
     distorted = np.any(cameras.radial != 0) or np.any(cameras.tangential != 0)
+    model = "OPENCV" if distorted else "PINHOLE"
+    if cameras.fisheye is not None:
+        model = "OPENCV_FISHEYE"
     table: dict[str, Any] = {
-        "camera_model": "OPENCV" if distorted else "PINHOLE",
+        "camera_model": model,
         "w": width,
         "h": height,
     }
@@ -171,11 +174,14 @@ def _transforms(capture, units):
 def _lens(cameras: Camera, row: int) -> dict[str, float]:
     """Intrinsics by nerfstudio's names, in pixels."""
     focal = float(cameras.focal_px[row])
-    names = ("cx", "cy", "k1", "k2", "k3", "p1", "p2")
+    names: tuple[str, ...] = ("cx", "cy", "k1", "k2", "k3", "p1", "p2")
     values = (
         *cameras.principal_point_px[row],
         *cameras.radial[row],
         *cameras.tangential[row],
     )
+    if cameras.fisheye is not None:
+        names = ("cx", "cy", "k1", "k2", "k3", "k4")
+        values = (*cameras.principal_point_px[row], *cameras.fisheye[row])
     lens = {"fl_x": focal, "fl_y": focal * float(cameras.pixel_aspect[row])}
     return lens | {n: float(v) for n, v in zip(names, values, strict=True)}

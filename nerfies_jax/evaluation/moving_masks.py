@@ -7,9 +7,7 @@ import pathlib
 import numpy as np
 
 from nerfies_jax.capture import capture as captures
-from nerfies_jax.capture import pinholes, resampling
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.preprocessing import frame_masks, record
 
 MAX_PIXELS = 4_000_000  # of all frames together, which take 45 s on one core
@@ -45,10 +43,8 @@ def with_masks(capture: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
             f"Dynamic regions are not evaluated separately, because the capture has no "
             f"masks and tracking failed: {unusable}."
         )
-    for row, mask in zip(rows[evidence.row], evidence.moving, strict=True):
-        scale = factor * evidence.factor
-        moving[row] = frame_masks.enlarged(mask, scale, capture.size)
-    moving = _distorted(moving, capture)
+    for row, mask in zip(rows, frame_masks.of_frames(evidence, video), strict=True):
+        moving[row] = frame_masks.enlarged(mask, factor, capture.size)
     share = moving[capture.heldout].mean()
     note = (
         f"Dynamic regions ({share:.1%} of the held-out pixels) are detected from point "
@@ -71,14 +67,3 @@ def _candidate_rows(capture):
     heldout_cameras = np.unique(capture.camera_ids[capture.heldout])
     same_cameras = used[np.isin(capture.camera_ids[used], heldout_cameras)]
     return (used,) if len(same_cameras) == len(used) else (used, same_cameras)
-
-
-def _distorted(moving, capture):
-    """Distort masks of pinhole images to the pixels of the captured images."""
-    if not pinholes.has_lens(capture.cameras):
-        return moving
-    maps = pinholes.Maps(pinholes.pinhole_places, capture.size)
-    for row in capture.heldout:
-        position, inside = maps.of(cameras.take(capture.cameras, row))
-        moving[row] = inside & resampling.nearest(moving[row], position)
-    return moving

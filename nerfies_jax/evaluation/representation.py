@@ -103,9 +103,9 @@ class Resources(NamedTuple):
 class Scoring(NamedTuple):
     """Evaluation of a trained scene beyond its renders."""
 
-    # True if rays are traced through the lens. Otherwise pinhole images are rendered,
-    # and distorted before held-out frames are evaluated.
-    traces_lenses: bool = False
+    # (metadata) -> True if lens distortion of any camera is modeled. That of the
+    # capture's cameras always is.
+    models_lenses: Callable[[Any], bool] = lambda metadata: True
     # (spec, metadata, state, capture, rows) -> metrics with codes fitted to half of
     # each frame, or None if the model has no per-frame codes
     score_halves: Callable[..., Halves | None] = lambda *args: None

@@ -1,4 +1,4 @@
-"""A pinhole camera with Brown-Conrady distortion: project and unproject.
+"""A camera with Brown-Conrady or fisheye distortion: project and unproject.
 
 Frames and axes (docs/conventions.md): camera x points right, y down, z forward; pixel
 centers lie at +0.5, so the center of the top-left pixel is (0.5, 0.5).
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.geometry import distortion, lie, matrices
+from nerfies_jax.geometry import lens, lie, matrices
 from nerfies_jax.geometry.precision import exact_product, refuse_half
 from nerfies_jax.runtime.contract import checked
 
@@ -30,10 +30,11 @@ Real = int | float | np.number
 
 
 class Camera(NamedTuple):
-    """Pinhole camera with Brown-Conrady distortion, or a batch along leading axes.
+    """Camera with Brown-Conrady or fisheye distortion, or a batch along leading axes.
 
     Leaves are NumPy or JAX arrays. The image size is not part of the camera. Functions
-    that need it take it as an argument.
+    that need it take it as an argument. Zeros in `radial` and `tangential` without
+    `fisheye` are a pinhole.
     """
 
     camera_from_world: Float[Array, "*batch 3 3"]  # rotation; rows right, down, forward
@@ -44,6 +45,8 @@ class Camera(NamedTuple):
     pixel_aspect: Float[Array, "*batch"]  # vertical over horizontal focal length
     radial: Float[Array, "*batch 3"]  # k1 k2 k3
     tangential: Float[Array, "*batch 2"]  # p1 p2
+    # k1 k2 k3 k4 of OpenCV's fisheye model, which then replaces the other two.
+    fisheye: Float[Array, "*batch 4"] | None = None
 
     @classmethod
     def from_K(
@@ -54,6 +57,7 @@ class Camera(NamedTuple):
         height: int,
         distortion: Any = None,
         dtype: Any = np.float32,
+        camera_model: str = "pinhole",
     ) -> "Camera":
         """Make a camera from an intrinsic matrix and a world-to-camera pose.
 
@@ -69,8 +73,10 @@ class Camera(NamedTuple):
           width: Image width in pixels.
           height: Image height in pixels.
           distortion: Coefficients (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) in OpenCV's
-            order, [..., 4] or [..., 5]. None for a pinhole.
+            order, [..., 4] or [..., 5]. Of a fisheye (k1, k2, k3, k4), [..., 4]. None
+            for zeros.
           dtype: Floating-point type of the result; conversions are made in float64.
+          camera_model: "pinhole", which may have distortion, or "fisheye".
 
         Returns:
           A camera with NumPy leaves, or a batch of them with the leading axes of the
@@ -80,8 +86,8 @@ class Camera(NamedTuple):
           ValueError: Where a shape is wrong, K is not an intrinsic matrix, the pose is
             not rigid, or the principal point lies far outside the image.
         """
-        fields = matrices.camera_fields(K, camera_from_world, distortion)
-        camera = cls._make(fields[name].astype(dtype) for name in cls._fields)
+        fields = matrices.camera_fields(K, camera_from_world, distortion, camera_model)
+        camera = cls(**{name: part.astype(dtype) for name, part in fields.items()})
         validate(camera, (width, height), "Camera.from_K")
         return camera
 
@@ -110,7 +116,7 @@ def project(
     # formed, so no 0 * inf reaches the gradient.
     reach = jnp.max(jnp.abs(lateral))
     divisor = jnp.maximum(depth, jnp.maximum(reach / MAX_SLOPE, MIN_DEPTH))
-    bent = distortion.distort(camera.radial, camera.tangential, lateral / divisor)
+    bent = lens.distort(camera, lateral / divisor)
     pixel = jnp.stack(
         [
             camera.focal_px * bent[0] + camera.skew_px * bent[1],
@@ -137,7 +143,7 @@ def projectable(camera: Camera, point: Float[Array, "3"]) -> Bool[Array, ""]:
     lateral, depth = _in_camera(camera, point)
     in_front = depth > jnp.maximum(jnp.max(jnp.abs(lateral)) / MAX_SLOPE, MIN_DEPTH)
     slopes = lateral / jnp.where(in_front, depth, 1)
-    return in_front & distortion.one_to_one(camera.radial, camera.tangential, slopes)
+    return in_front & lens.one_to_one(camera, slopes)
 
 
 @checked(broadcast=True)
@@ -162,9 +168,7 @@ def unproject(
     offset = pixel - camera.principal_point_px
     bent_y = offset[1] / (camera.focal_px * camera.pixel_aspect)
     bent_x = (offset[0] - camera.skew_px * bent_y) / camera.focal_px
-    slopes, converged = distortion.undistort(
-        camera.radial, camera.tangential, jnp.stack([bent_x, bent_y])
-    )
+    slopes, converged = lens.undistort(camera, jnp.stack([bent_x, bent_y]))
     in_camera = jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
     in_camera = in_camera / jnp.sqrt(jnp.sum(in_camera**2))  # at least 1: no zero here
     return exact_product(in_camera, camera.camera_from_world), converged
@@ -396,8 +400,10 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
       ValueError: If a shape is wrong, a value is not finite, the orientation is not a
         rotation, or the intrinsics cannot belong to an image of `size`.
     """
-    shapes: list[tuple[int, ...]] = [(3, 3), (3,), (), (2,), (), (), (3,), (2,)]
+    shapes: list[tuple[int, ...]] = [(3, 3), (3,), (), (2,), (), (), (3,), (2,), (4,)]
     for field, leaf, shape in zip(Camera._fields, camera, shapes, strict=True):
+        if leaf is None and field == "fisheye":
+            continue
         value = np.asarray(leaf)
         if value.shape[value.ndim - len(shape) :] != shape:
             raise ValueError(
@@ -449,13 +455,25 @@ def _check_range(camera, size, name):
     """Refuse numbers that no camera has and float32 cannot compute with."""
     focal = np.asarray(camera.focal_px, np.float64)
     side = max(size)
-    lens = np.concatenate([camera.radial, camera.tangential], axis=-1)
+    terms = np.concatenate([camera.radial, camera.tangential], axis=-1)
+    if camera.fisheye is not None:
+        if np.any(terms != 0):
+            raise ValueError(
+                f"{name}: a fisheye has no radial and tangential coefficients, got "
+                f"{terms.reshape(-1, 5)[0].tolist()}; leave one of the two out"
+            )
+        terms = camera.fisheye
     for what, value, least, most in (
         ("focal_px over the longer side of the image", focal / side, *FOCAL_RANGE),
         ("pixel_aspect", camera.pixel_aspect, 1 / MAX_ASPECT, MAX_ASPECT),
         ("|skew_px| over focal_px", np.abs(camera.skew_px) / focal, 0.0, MAX_SKEW),
         ("the largest of |position|", _largest(camera.position), 0.0, MAX_POSITION),
-        ("the largest distortion coefficient", _largest(lens), 0.0, MAX_DISTORTION),
+        (
+            "the largest distortion coefficient",
+            _largest(terms),
+            0.0,
+            MAX_DISTORTION,
+        ),
     ):
         value = np.asarray(value, np.float64)
         bad = (value < least) | (value > most)

@@ -27,21 +27,30 @@ DEGREE = 12  # of the determinant along the way
 RESIDUAL_ULPS = 32  # of 1 + |slopes|: 0.01 px in float32 at a focal length of 2700 px
 
 
-def _to_bernstein() -> np.ndarray:
-    """From coefficients of t^k to those of Bernstein on each piece of [0, 1]."""
+def to_bernstein(degree: int, pieces: int) -> np.ndarray:
+    """Convert coefficients of t^k to those of Bernstein on equal pieces of [0, 1].
+
+    Args:
+      degree: Degree of the polynomial.
+      pieces: Number of pieces.
+
+    Returns:
+      A matrix [pieces * (degree + 1), degree + 1]. A polynomial lies between the least
+      and the largest coefficient of each piece.
+    """
     rows = []
-    for piece in range(PIECES):
-        for j in range(DEGREE + 1):
-            row = np.zeros(DEGREE + 1)
-            for k in range(DEGREE + 1):  # (piece + u)^k / PIECES^k in powers of u
+    for piece in range(pieces):
+        for j in range(degree + 1):
+            row = np.zeros(degree + 1)
+            for k in range(degree + 1):  # (piece + u)^k / pieces^k in powers of u
                 for i in range(min(j, k) + 1):
-                    share = math.comb(j, i) / math.comb(DEGREE, i)
-                    row[k] += math.comb(k, i) * piece ** (k - i) * share / PIECES**k
+                    share = math.comb(j, i) / math.comb(degree, i)
+                    row[k] += math.comb(k, i) * piece ** (k - i) * share / pieces**k
             rows.append(row)
     return np.array(rows)
 
 
-_TO_BERNSTEIN = _to_bernstein()
+_TO_BERNSTEIN = to_bernstein(DEGREE, PIECES)
 
 
 def distort(

@@ -4,32 +4,42 @@ from typing import Any
 
 import numpy as np
 
+from nerfies_jax.geometry.lens import CAMERA_MODELS, COEFFICIENTS
+
 # Poses printed with four digits are orthonormal to 2e-4.
 RIGID_WITHIN = 1e-3
 
 
 def camera_fields(
-    K: Any, camera_from_world: Any, distortion: Any
+    K: Any, camera_from_world: Any, distortion: Any, camera_model: str = "pinhole"
 ) -> dict[str, np.ndarray]:
     """Split matrices into the fields of a `Camera`.
 
     Args:
       K: Intrinsic matrices in pixels, [..., 3, 3].
       camera_from_world: World-to-camera transforms, [..., 4, 4] or [..., 3, 4].
-      distortion: OpenCV's (k1, k2, p1, p2[, k3]), [..., 4] or [..., 5], or None.
+      distortion: OpenCV's (k1, k2, p1, p2[, k3]), [..., 4] or [..., 5], of a fisheye
+        (k1, k2, k3, k4), or None.
+      camera_model: One of `lens.CAMERA_MODELS`.
 
     Returns:
-      The fields by name, in float64, with the broadcast leading axes.
+      The fields by name, in float64, with the broadcast leading axes. Only a fisheye
+      has the field "fisheye".
 
     Raises:
-      ValueError: Where a shape is wrong, K is not an intrinsic matrix or the pose is
-        not rigid.
+      ValueError: Where a shape is wrong, K is not an intrinsic matrix, the pose is not
+        rigid or there is no such model.
     """
+    if camera_model not in CAMERA_MODELS:
+        raise ValueError(
+            f"camera_model must be one of {CAMERA_MODELS}, got {camera_model!r}"
+        )
     K = _numbers("K", K, ((3, 3),))
     pose = _numbers("camera_from_world", camera_from_world, ((4, 4), (3, 4)))
-    lens = np.zeros(5)
+    lens = np.zeros(4)
     if distortion is not None:
-        lens = _numbers("distortion", distortion, ((4,), (5,)))
+        endings = tuple((count,) for count in COEFFICIENTS[camera_model])
+        lens = _numbers("distortion", distortion, endings)
     try:
         batch = np.broadcast_shapes(K.shape[:-2], pose.shape[:-2], lens.shape[:-1])
     except ValueError:
@@ -40,6 +50,8 @@ def camera_fields(
     _check_intrinsics(K)
     _check_pose(pose)
     rotation, translation = pose[..., :3, :3], pose[..., :3, 3]
+    fisheye = {"fisheye": (lens, 1)} if camera_model == "fisheye" else {}
+    lens = np.zeros(4) if fisheye else lens
     k3 = lens[..., 4:] if lens.shape[-1] == 5 else np.zeros_like(lens[..., :1])
     fields = {
         "camera_from_world": (rotation, 2),
@@ -50,6 +62,7 @@ def camera_fields(
         "pixel_aspect": (K[..., 1, 1] / K[..., 0, 0], 0),
         "radial": (np.concatenate([lens[..., :2], k3], axis=-1), 1),
         "tangential": (lens[..., 2:4], 1),
+        **fisheye,
     }
     return {
         name: np.broadcast_to(value, batch + value.shape[value.ndim - own :]).copy()

@@ -2,11 +2,14 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
 import numpy as np
 
+from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.preprocessing import record
 
 
@@ -26,11 +29,28 @@ def with_masks(capture: Capture, folder: pathlib.Path = CACHE / "evidence") -> C
     if evidence.unusable:
         note = f"no masks of what moves could be made: {evidence.unusable}"
         return dataclasses.replace(capture, notes=(*capture.notes, note))
-    moving = np.zeros(capture.images.shape[:3], bool)
-    for row, mask in zip(evidence.row, evidence.moving, strict=True):
-        moving[row] = enlarged(mask, evidence.factor, capture.size)
+    moving = of_frames(evidence, capture)
     note = f"masks of what moves found in the pictures, {evidence.moving.mean():.1%}"
     return dataclasses.replace(capture, moving=moving, notes=(*capture.notes, note))
+
+
+def of_frames(evidence: Any, capture: Capture) -> np.ndarray:
+    """Return the masks of preprocessing in the pixels of the captured images.
+
+    Args:
+      evidence: Preprocessing of the capture (`record.Evidence`), undistorted.
+      capture: The capture.
+
+    Returns:
+      Booleans [frames, height, width], False in frames without masks.
+    """
+    moving = np.zeros(capture.images.shape[:3], bool)
+    canvas = pinholes.canvas(capture)
+    for row, mask in zip(evidence.row, evidence.moving, strict=True):
+        whole = enlarged(mask, evidence.factor, canvas.size)
+        camera = cameras.take(capture.cameras, row)
+        moving[row] = pinholes.as_filmed(whole, camera, canvas, capture.size)
+    return moving
 
 
 def enlarged(mask: np.ndarray, factor: int, size: tuple[int, int]) -> np.ndarray:

@@ -18,6 +18,7 @@ from nerfies_jax.capture import (
     images,
     masks,
     npz_files,
+    pinholes,
     safe_files,
 )
 from nerfies_jax.capture.capture import Capture, CaptureError
@@ -53,7 +54,7 @@ def attached(capture: Capture, files: GivenFiles) -> Capture:
     """
     if files == GivenFiles(times=files.times):  # those are read with the capture
         return capture
-    if capture.cameras.radial.any() or capture.cameras.tangential.any():
+    if pinholes.has_lens(capture.cameras):
         raise CaptureError(
             f"{capture.path or capture.name}: its lens bends the pictures, so files of "
             "other tools are of other pixels than those looked at; undistort the "

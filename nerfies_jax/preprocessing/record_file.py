@@ -4,6 +4,7 @@ import hashlib
 import pathlib
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from nerfies_jax.capture import cache_files
@@ -67,7 +68,7 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
         checksum.update(np.ascontiguousarray(images[row]).data)
     parts = [capture.times, capture.train]
     parts += [np.asarray([capture.near, capture.far])]
-    parts += map(np.asarray, capture.cameras)
+    parts += map(np.asarray, jax.tree.leaves(capture.cameras))
     if capture.points is not None:
         parts.append(capture.points.position)
     depths = capture.depths if use_depths else None

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.geometry import distortion
+from nerfies_jax.geometry import camera as camera_records
+from nerfies_jax.geometry import lens as lenses
 from nerfies_jax.preprocessing import still_points
 from nerfies_jax.preprocessing.findings import (
     CERTAIN,
@@ -136,23 +137,20 @@ def lens(capture: Capture) -> Finding:
         np.linspace(0, width, GRID), np.linspace(0, height, GRID)
     )
     pixel = np.stack([across, down], -1).reshape(-1, 2)
-    parameters = np.concatenate(
-        [cameras.radial, cameras.tangential, cameras.focal_px[:, None]], axis=1
-    )
+    parts = [cameras.radial, cameras.tangential, cameras.focal_px[:, None]]
+    if cameras.fisheye is not None:
+        parts.append(cameras.fisheye)
+    parameters = np.concatenate(parts, axis=1)
     worst = 0.0
     for row in np.unique(parameters, axis=0, return_index=True)[1]:
         focal = np.array([1, cameras.pixel_aspect[row]]) * cameras.focal_px[row]
         slope = ((pixel - cameras.principal_point_px[row]) / focal).astype(np.float32)
-        bend = jax.vmap(distortion.distort, (None, None, 0))
-        bent = bend(
-            jnp.asarray(cameras.radial[row], jnp.float32),
-            jnp.asarray(cameras.tangential[row], jnp.float32),
-            jnp.asarray(slope),
-        )
+        one = jax.tree.map(jnp.float32, camera_records.take(cameras, row))
+        bent = jax.vmap(lenses.distort, (None, 0))(one, jnp.asarray(slope))
         moved = np.linalg.norm((np.asarray(bent) - slope) * focal, axis=-1)
         worst = max(worst, float(moved.max()))
     wanted, confidence = judge(worst, LENS_PX, 0.0)
     measurement = f"the lens moves pixels by up to {worst:.2g} px"
     if wanted:
-        measurement += "; splats learn from pictures without it and are scored with it"
+        measurement += "; it is modeled in training and in what is scored"
     return Finding(LENS, measurement, threshold, wanted, confidence, {"most_px": worst})

@@ -24,7 +24,4 @@ def masks_of(capture: Capture) -> np.ndarray | None:
     evidence = record.gather(all_frames)
     if evidence.unusable or evidence.moving.mean() < MIN_MOVING_SHARE:
         return None
-    masks = np.zeros((len(rows), *capture.images.shape[1:3]), bool)
-    for row, mask in zip(evidence.row, evidence.moving, strict=True):
-        masks[row] = frame_masks.enlarged(mask, evidence.factor, capture.size)
-    return masks
+    return frame_masks.of_frames(evidence, capture)

@@ -18,10 +18,8 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.json_files import read_json, write_json
 from nerfies_jax.capture.nearest import known_names
-from nerfies_jax.evaluation import Renderer, as_found
-from nerfies_jax.evaluation.lens import ThroughLens
+from nerfies_jax.evaluation import as_found
 from nerfies_jax.evaluation.representation import Representation
-from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.preprocessing import frame_flow, frame_masks, given_files
 from nerfies_jax.runs import representations, same_capture, trust
 from nerfies_jax.runs.config import CaptureNotFound, CaptureSource, RunConfig
@@ -44,7 +42,7 @@ class Run(NamedTuple):
     """Capture, scene and model of a run."""
 
     config: RunConfig
-    # Training images. Undistorted if the representation renders only pinhole cameras.
+    # Training images, with data that was computed for the model.
     capture: Capture
     # Images that held-out frames are scored against (`pinholes.scorable`).
     filmed: Capture
@@ -102,12 +100,10 @@ def open_run(
       The run.
     """
     stored = stored or stored_capture(config.source, config.seed)
-    traces_lenses = representation.scoring.traces_lenses
-    filmed = pinholes.scorable(stored, traces_lenses)
-    capture = filmed if traces_lenses else pinholes.as_pinholes(stored)
-    run = _build(config, representation, spec, capture, filmed)
-    capture = _add_required(capture, run.model.required_data)
-    if capture is run.capture:
+    filmed = pinholes.scorable(stored)
+    run = _build(config, representation, spec, filmed, filmed)
+    capture = _add_required(filmed, run.model.required_data)
+    if capture is filmed:
         return run
     return _build(config, representation, spec, capture, filmed)
 
@@ -169,22 +165,6 @@ def with_found_cameras(run: Run, state: TrainState) -> Run:
     return run._replace(capture=capture, filmed=filmed)
 
 
-def drawer(run: Run, renderer: Renderer) -> Draw:
-    """Return a renderer of the original, possibly distorted frames.
-
-    Args:
-      run: The run.
-      renderer: Renderer of the model.
-
-    Returns:
-      A renderer of the views of `run.filmed`. It adds lens distortion if the model
-      renders only pinhole cameras.
-    """
-    if run.representation.scoring.traces_lenses or run.filmed is run.capture:
-        return renderer
-    return ThroughLens(renderer, run.filmed.size)
-
-
 def scene_spec(config: RunConfig) -> Any:
     """Return the spec of a preset with its steps and overrides.
 
@@ -212,7 +192,7 @@ def load_capture(
     max_side: int | None = None,
     heldout: int | str | None = None,
 ) -> Capture:
-    """Read a capture of any supported format, undistorted to pinhole cameras.
+    """Read a capture of any supported format, with its lens distortion.
 
     Args:
       folder: Folder of the capture.
@@ -254,7 +234,7 @@ def built_in_scene(name: str = "default", seed: int = 0) -> Capture:
 
 
 def read_capture(source: CaptureSource, seed: int = 0) -> Capture:
-    """Read a capture, undistorted to pinhole cameras.
+    """Read a capture, and mark the pixels for which its lens model has no ray.
 
     Args:
       source: The capture and the way to read it.
@@ -263,7 +243,7 @@ def read_capture(source: CaptureSource, seed: int = 0) -> Capture:
     Returns:
       The capture.
     """
-    return pinholes.as_pinholes(stored_capture(source, seed))
+    return pinholes.scorable(stored_capture(source, seed))
 
 
 def stored_capture(source: CaptureSource, seed: int = 0) -> Capture:

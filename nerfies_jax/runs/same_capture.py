@@ -69,7 +69,8 @@ def check(folder: pathlib.Path, capture: Capture) -> None:
 def _signature(capture):
     """Return arrays by name. Those that belong to frames have one row per frame."""
     ids = np.array(capture.ids)
-    cameras = {f"camera {k}": v for k, v in capture.cameras._asdict().items()}
+    fields = capture.cameras._asdict().items()
+    cameras = {f"camera {k}": v for k, v in fields if v is not None}
     bounds = np.array([capture.near, capture.far, capture.scale, *capture.center])
     return {
         "frames": ids,

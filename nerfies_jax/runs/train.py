@@ -10,7 +10,7 @@ from nerfies_jax import evaluation
 from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.runs import budget, run_folder
-from nerfies_jax.runs.run import Run, drawer
+from nerfies_jax.runs.run import Run
 from nerfies_jax.runtime import events
 from nerfies_jax.training import chunk, loop
 from nerfies_jax.training.checkpoint import Checkpoints
@@ -41,7 +41,7 @@ class Trained(NamedTuple):
 
     result: FitResult
     renderer: Renderer
-    draw: Draw  # renderer of the original, possibly distorted frames
+    draw: Draw  # renderer of the captured frames
     watched: np.ndarray  # rows of the held-out frames evaluated during training
 
 
@@ -89,7 +89,6 @@ def train(
       The result with the renderer.
     """
     renderer = Renderer(run.model, run.capture.size)
-    draw = drawer(run, renderer)
     rows, evaluate_every = run.capture.heldout, pace.evaluate_every
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     history = History() if record is None else History(**record)
@@ -105,7 +104,7 @@ def train(
     def held_out(state, step, metrics):
         del step, metrics
         capture = evaluation.as_found(run.model, state, run.filmed)
-        scored = evaluation.score(draw, state, capture, rows)
+        scored = evaluation.score(renderer, state, capture, rows)
         return {
             "psnr": evaluation.known_mean(scored.psnr),
             "ssim": evaluation.known_mean(scored.ssim),
@@ -126,7 +125,7 @@ def train(
         checkpoint_seconds=pace.checkpoint_every,
         history=history,
     )
-    return Trained(result, renderer, draw, rows)
+    return Trained(result, renderer, renderer, rows)
 
 
 def _compile(run, state, frames, renderer, view) -> float:

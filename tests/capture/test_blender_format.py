@@ -339,15 +339,8 @@ BAD = {
     "wide angle": (top_level(camera_angle_x=3.5), "camera_angle_x = 3.5"),
     "focal negative": (first_frame(fl_x=-5.0), "fl_x = -5"),
     "size not the camera's": (first_frame(w=8, h=10), "8x10"),
-    "fisheye": (top_level(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
-    "is fisheye": (
-        top_level(is_fisheye=True),
-        "is_fisheye is not supported; undistort",
-    ),
-    "fisheye of a frame": (
-        first_frame(is_fisheye=True),
-        "is_fisheye is not supported; undistort",
-    ),
+    "panorama": (top_level(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
+    "fisheye of a frame": (first_frame(is_fisheye=True), "frames are fisheyes"),
     "fourth radial": (first_frame(k4=0.1), "k4"),
     "frame twice": (first_frame(file_path="train/r_1"), "'train_r_1' appears 2 times"),
     "leak": (first_frame(file_path="test/r_1"), "'test_r_1' appears 2 times"),

@@ -111,6 +111,7 @@ LENSES = [
     "RADIAL 24 16 30 12 8 0.05 -0.02",
     "OPENCV 24 16 30 33 12.5 7.75 0.05 -0.02 0.003 0.004",
     "FULL_OPENCV 24 16 30 33 12.5 7.75 0.05 -0.02 0.003 0.004 0.01 0 0 0",
+    "OPENCV_FISHEYE 24 16 30 33 12.5 7.75 0.05 -0.02 0.003 0.004",
 ]
 
 
@@ -136,7 +137,7 @@ def test_our_cameras_project_as_colmap_does(tmp_path, lens):
 @pytest.mark.parametrize(
     "lens",
     [
-        "OPENCV_FISHEYE 96 64 60 60 48 32 0.05 0.01 0 0",
+        "RADIAL_FISHEYE 96 64 60 48 32 0.05 0.01",
         "FOV 96 64 60 60 48 32 0.7",
         "FULL_OPENCV 96 64 60 60 48 32 0.1 0.01 0 0 0 0.02 0 0",
     ],
@@ -178,13 +179,13 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
     )
     assert valid.mean() > 0.7
     error = capture.images[1][..., :2].astype(float) - color(grad)
-    # Rounding twice gives 1; the rest is bilinear interpolation of a slow function.
+    # Rounding twice gives 1; the rest is interpolation of a slow function.
     assert np.abs(error[valid]).max() < 1.6
 
 
 @pytest.mark.parametrize("in_alpha", [False, True])
 def test_masks_follow_their_pictures_through_undistortion(tmp_path, in_alpha):
-    lens = "OPENCV_FISHEYE 96 64 60 60 48 32 0.05 0.01 0 0"
+    lens = "RADIAL_FISHEYE 96 64 60 48 32 0.05 0.01"
     make(tmp_path, count=3, lens=lens, size=(96, 64))
     (tmp_path / "masks").mkdir()
     mask = np.full((64, 96), 255, np.uint8)

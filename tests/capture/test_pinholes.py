@@ -79,8 +79,46 @@ def test_pixels_the_lens_did_not_film_are_marked():
 
 def test_masks_and_depth_move_with_the_picture():
     capture = scenes.tiny_capture()
-    flat = pinholes.as_pinholes(through_a_lens(capture, (-0.1, 0.0, 0.0)))
-    assert flat.depths.shape == capture.depths.shape
+    bent = through_a_lens(capture, (-0.1, 0.0, 0.0))
+    flat, wide = pinholes.as_pinholes(bent), pinholes.canvas(bent)
+    assert flat.size == wide.size
+    assert flat.depths.shape[1:] == wide.size[::-1]
     assert flat.moving.dtype == bool
-    # The middle of the picture does not move.
-    np.testing.assert_array_equal(flat.depths[:, 15, 20], capture.depths[:, 15, 20])
+    # The center of the lens does not move.
+    center = flat.depths[:, 15 + wide.top, 20 + wide.left]
+    np.testing.assert_array_equal(center, capture.depths[:, 15, 20])
+
+
+def test_an_undistorted_image_contains_all_filmed_pixels_and_leads_back_to_them():
+    bent = through_a_lens(scenes.tiny_capture(), (-0.3, 0.0, 0.0))
+    flat, wide = pinholes.as_pinholes(bent), pinholes.canvas(bent)
+    assert pinholes.as_pinholes(bent).images is flat.images  # kept
+    other = dataclasses.replace(bent, moving=~bent.moving)
+    assert (pinholes.as_pinholes(other).moving != flat.moving).any()
+    width, height = bent.size
+    assert width < wide.size[0] < 1.5 * width
+    assert height < wide.size[1] < 1.5 * height
+    camera = cameras.take(bent.cameras, 0)
+    everywhere = np.ones(wide.size[::-1], bool)
+    assert pinholes.as_filmed(everywhere, camera, wide, bent.size).all()
+    left = np.zeros(wide.size[::-1], bool)
+    left[:, : round(float(flat.cameras.principal_point_px[0, 0]))] = True
+    back = pinholes.as_filmed(left, camera, wide, bent.size)
+    expected = np.arange(width) + 0.5 < float(camera.principal_point_px[0])
+    np.testing.assert_array_equal(back, np.tile(expected, (height, 1)))
+
+
+def test_a_fisheye_is_undistorted_up_to_a_bound():
+    capture = scenes.tiny_capture()
+    count = len(capture.ids)
+    # 80 degrees in the corners, where the tangent is 5.
+    lens = capture.cameras._replace(
+        focal_px=np.full(count, 18, np.float32),
+        fisheye=np.zeros((count, 4), np.float32),
+    )
+    bent = dataclasses.replace(capture, cameras=lens)
+    assert pinholes.scorable(bent) is bent
+    flat = pinholes.as_pinholes(bent)
+    assert flat.size[0] == capture.size[0] + 2 * (capture.size[0] // 4)
+    assert flat.cameras.fisheye is None
+    assert pinholes.as_pinholes(flat) is flat

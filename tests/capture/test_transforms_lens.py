@@ -78,7 +78,7 @@ def test_intrinsics_are_of_the_frame_or_of_the_file_as_units(case, tmp_path):
 
 
 LENS_OF_FRAME = {
-    "fisheye": ({"fl_x": 20.0}, {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+    "panorama": ({"fl_x": 20.0}, {"camera_model": "EQUIRECTANGULAR"}, "EQUIRECT"),
     "angle too large": (ANGLES, {"camera_angle_y": 4.0}, "camera_angle_y = 4"),
     "other size": ({"fl_x": 20.0, "cx": 8.0, "cy": 6.4}, {}, "1.6 times as large"),
 }

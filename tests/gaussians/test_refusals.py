@@ -265,7 +265,7 @@ CALLS = [
     (lambda: moba(motion=PolynomialMotionSpec(warm_up=5), alternation=None),
      "motion.warm_up=5 with motion.fading"),
     (lambda: raster.rasterize(*footprints((5, 0))), "at least one pixel"),
-    (lambda: through_a_lens(), "without lens distortion, got radial"),
+    (lambda: through_a_lens(), "lens distortion, radial=.*, which these"),
     (lambda: spectral.Bound(SpectralSpec(after=10), 10), "after=10"),
     (lambda: splats.pad_rows(some_rows(), 6),
      "7 Gaussians cannot be padded to a capacity of 6"),

@@ -10,6 +10,7 @@ import pytest
 from gaussians_jax.core import splats as rows
 from gaussians_jax.core.splats import Params, Splats
 from gaussians_jax.splatting import rendering
+from nerfies_jax.geometry import camera as lenses
 from nerfies_jax.geometry.camera import Camera
 from tests import gradients
 from tests.gaussians.shared import finite, full, jitted, put, same_bits
@@ -172,6 +173,24 @@ def test_random_points_lie_where_a_camera_sees_them(rng):
         inside = (u >= 0) & (u <= 64) & (v >= 0) & (v <= 48)
         seen |= inside & (z >= 1 - 1e-9) & (z <= 4 + 1e-9)
     assert seen.all()
+
+
+def test_random_points_fill_the_corners_that_a_lens_sees(rng):
+    cameras = ring_of_cameras(2)
+    cameras = cameras._replace(radial=np.tile([-0.3, 0.0, 0.0], (2, 1)))
+    points = rows.random_in_views(rng, cameras, (64, 48), 1.0, 4.0, 400)
+    first = lenses.take(jax.tree.map(np.float32, cameras), 0)
+    second = lenses.take(jax.tree.map(np.float32, cameras), 1)
+    seen, outside = np.zeros(400, bool), np.zeros(400, bool)
+    for camera in (first, second):
+        pixel, depth = lenses.project(camera, np.float32(points))
+        inside = (np.asarray(pixel) > -0.01) & (np.asarray(pixel) < (64.01, 48.01))
+        here = inside.all(axis=1) & (depth > 0.9)
+        seen |= here
+        x, y, z = camera.camera_from_world @ (points - camera.position).T
+        outside |= here & (80 * x / z + 4 * y / z + 30 < -1)
+    assert seen.all()
+    assert outside.any()
 
 
 def test_extent_is_the_reach_of_the_cameras():

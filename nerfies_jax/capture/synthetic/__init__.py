@@ -18,6 +18,7 @@ from nerfies_jax.capture.synthetic.record import (
 from nerfies_jax.capture.synthetic.spec import (
     Cameras,
     Exposure,
+    Lens,
     PoseError,
     SceneSpec,
     Specular,
@@ -34,6 +35,7 @@ __all__ = [
     "VERSION",
     "Cameras",
     "Exposure",
+    "Lens",
     "PoseError",
     "SceneSpec",
     "SceneTruth",

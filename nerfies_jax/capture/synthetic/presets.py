@@ -5,7 +5,9 @@ import dataclasses
 from nerfies_jax.capture.synthetic.motion import Arm, Glide, Hinge, Path
 from nerfies_jax.capture.synthetic.shapes import Box, Sheet, Sphere, Squash
 from nerfies_jax.capture.synthetic.spec import (
+    Cameras,
     Exposure,
+    Lens,
     PoseError,
     SceneSpec,
     Specular,
@@ -219,6 +221,14 @@ MISPLACED = dataclasses.replace(DEFAULT, name="pose error", pose_error=PoseError
 TOPOLOGY = SceneSpec(
     "lumps and shutter", (*STAGE, LEFT_LUMP, RIGHT_LUMP, LEFT_SHUTTER, RIGHT_SHUTTER)
 )
+BARREL = dataclasses.replace(DEFAULT, name="barrel lens", lens=Lens())
+# 61 degrees off the axis in the corners.
+FISHEYE = dataclasses.replace(
+    DEFAULT,
+    name="fisheye",
+    cameras=Cameras(field_of_view_rad=1.4),
+    lens=Lens("fisheye", (-0.02, 0.01, -0.003, 0.0005)),
+)
 
 PRESETS = {
     "default": DEFAULT,
@@ -232,4 +242,6 @@ PRESETS = {
     "specular": SHINY,
     "topology": TOPOLOGY,
     "pose-error": MISPLACED,
+    "barrel": BARREL,
+    "fisheye": FISHEYE,
 }

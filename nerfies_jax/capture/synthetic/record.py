@@ -1,6 +1,7 @@
 """Synthetic scenes as a `Capture`, in memory, as a directory, or from a cache."""
 
 import dataclasses
+import functools
 import hashlib
 import pathlib
 from concurrent.futures import ThreadPoolExecutor
@@ -148,6 +149,8 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
     text = f"{VERSION} {seed} {spec!r}"
     if spec.pose_error is not None:
         text += f" {spec.pose_error!r}"
+    if spec.lens is not None:
+        text += f" {spec.lens!r}"
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -175,7 +178,8 @@ def _points(spec, plan, images, hits, moving, seed):
     candidates = np.flatnonzero(static & plan.learn[:, None, None])
     sample = rng.choice(candidates, min(spec.points, len(candidates)), replace=False)
     row = sample // static[0].size
-    directions = jax.vmap(rendering.view_direction)(
+    direction = jax.vmap(functools.partial(rendering.view_direction, spec))
+    directions = direction(
         cameras.take(plan.cameras, row), _pixel_centers(sample, spec.size)
     )
     distance = hits.distance.reshape(-1)[sample]

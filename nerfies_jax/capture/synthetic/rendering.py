@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from nerfies_jax.capture.synthetic import texture, trace
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
-from nerfies_jax.geometry import rays
+from nerfies_jax.geometry import lens, rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.precision import exact_product
 
@@ -60,6 +60,7 @@ def schedule(spec: SceneSpec, seed: int) -> Schedule:
         learn &= instant % spec.skip_every != spec.skip_every // 2
     arcs = [_arc(spec, times, seed, is_second) for is_second in (False, True)]
     views = cameras.stack([arcs[c][i] for c, i in zip(camera_id, instant, strict=True)])
+    views = _through_lens(spec, views)
     frame_times = times[instant]
     transient_shown = np.zeros(len(instant), bool)
     if spec.transient is not None:
@@ -90,7 +91,7 @@ def render(
 
     Args:
       spec: The scene.
-      camera: The camera, without distortion.
+      camera: The camera.
       time: Time in [0, 1].
       light_gain: Gain of linear light for each channel, [3].
       transient_shown: True if the transient object is present.
@@ -111,7 +112,9 @@ def render(
 
     def tile(pixels):
         samples = pixels[:, None, :] + offsets
-        directions = jax.vmap(jax.vmap(lambda p: view_direction(camera, p)))(samples)
+        directions = jax.vmap(
+            jax.vmap(lambda pixel: view_direction(spec, camera, pixel))
+        )(samples)
         hits = jax.vmap(jax.vmap(hit))(directions)
         color_hits = jax.tree.map(lambda leaf: leaf[:, :-1], hits)
         light = jax.vmap(jax.vmap(color))(color_hits, directions[:, :-1])
@@ -125,21 +128,37 @@ def render(
     return Frame(image, depth, center)
 
 
-def view_direction(camera: Camera, pixel: Float[Array, "2"]) -> Float[Array, "3"]:
+def view_direction(
+    spec: SceneSpec, camera: Camera, pixel: Float[Array, "2"]
+) -> Float[Array, "3"]:
     """Return the world direction of a pixel, scaled to z-depth one.
 
-    Cameras have no distortion here, so no iterative undistortion is needed.
+    Without a lens there is no distortion, and no iterative undistortion is needed.
 
     Args:
-      camera: The camera, without distortion.
+      spec: The scene.
+      camera: The camera.
       pixel: Pixel position (x, y) with centers at +0.5, [2].
 
     Returns:
       The direction, [3].
     """
     plane = (pixel - camera.principal_point_px) / camera.focal_px
+    if spec.lens is not None:
+        plane, _ = lens.undistort(camera, plane)
     in_camera = jnp.concatenate([plane, jnp.ones_like(plane[:1])])
     return exact_product(in_camera, camera.camera_from_world)
+
+
+def _through_lens(spec, views):
+    """Cameras with the lens distortion of the scene."""
+    if spec.lens is None:
+        return views
+    terms = np.zeros((len(views.focal_px), 5), np.float32)
+    terms[:, : len(spec.lens.coefficients)] = spec.lens.coefficients
+    if spec.lens.model == "fisheye":
+        return views._replace(fisheye=terms[:, :4])
+    return views._replace(radial=terms[:, [0, 1, 4]], tangential=terms[:, 2:4])
 
 
 def recorded_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:

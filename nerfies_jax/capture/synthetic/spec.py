@@ -1,10 +1,12 @@
 """Settings of a synthetic scene: objects, cameras and effects. Frozen and hashable."""
 
 import dataclasses
+from typing import Literal
 
 from nerfies_jax.capture.synthetic.motion import Motion, Vector, unit_axis
 from nerfies_jax.capture.synthetic.shapes import Shape
 from nerfies_jax.capture.synthetic.texture import Texture
+from nerfies_jax.geometry.lens import COEFFICIENTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +61,23 @@ class Cameras:
             )
         if self.shake < 0:
             raise ValueError(f"shake={self.shake} must not be negative; 0 is steady")
+
+
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    """Lens distortion of both cameras."""
+
+    model: Literal["pinhole", "fisheye"] = "pinhole"
+    # In OpenCV's order: k1 k2 p1 p2 [k3], of a fisheye k1 k2 k3 k4.
+    coefficients: tuple[float, ...] = (-0.3, 0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        counts = COEFFICIENTS.get(self.model)
+        if counts is None or len(self.coefficients) not in counts:
+            raise ValueError(
+                f"a lens of model {self.model!r} with {len(self.coefficients)} "
+                f"coefficients; expected numbers of coefficients: {COEFFICIENTS}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,6 +159,7 @@ class SceneSpec:
     # Not in `repr`, which identifies cached scenes, so that scenes without it keep
     # their identity.
     pose_error: PoseError | None = dataclasses.field(default=None, repr=False)
+    lens: Lens | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self):
         unit_axis(self.light)

@@ -226,6 +226,8 @@ def visible(
     width, height = spec.size
     bounds = jnp.asarray((width, height), pixel.dtype)
     inside = jnp.all((pixel >= 0) & (pixel <= bounds)) & (depth > 0)
+    if spec.lens is not None:
+        inside = inside & cameras.projectable(camera, point)
     return pixel, inside & (hit.thing == thing) & (jnp.abs(gap) < OCCLUSION_DISTANCE)
 
 
