@@ -1,10 +1,10 @@
-"""Initialization of a field's motion from known paths of points, before ray tracing.
+"""Initialization of the motion of a field from point tracks, before training.
 
 A warp maps observed points back to the template. Tracked points determine it: positions
 of one point at all times map to one point of the template, and static points to
-themselves. A scene flow must lead from a point's position to its next and previous
-ones, and be zero at static points. Gradient descent on images does not find this for
-motion of more than a few pixels.
+themselves. A scene flow leads from the position of a point to its next and previous
+positions, and is zero at static points. Gradient descent on images does not find this
+for motion of more than a few pixels.
 """
 
 import functools
@@ -25,42 +25,42 @@ from nerfies_jax.training.track_start import TrackStartSpec
 from nerfies_jax.training.updates import descended
 
 PyTree = Any
-FRAMES_AT_ONCE, POINTS_AT_ONCE, STILL_AT_ONCE = 12, 256, 128  # of each step
-SOFT = 1e-3  # field units: distances below it count squared
-SOFT_FLOW = 0.05  # the same for flow, over the mean flow that is known
-# Weight of the squared logarithm of how much a warp stretches moving objects, compared
-# with distances in field units. Without it moving objects shrink in the template, where
-# their positions are then close together: ||log Σ|| of the Jacobian is 2.75 there, and
-# tracked points of the built-in scene are 0.0176 units off. With it they are 0.15 and
-# 0.0094 (0.0240 if nothing moves).
+FRAMES_AT_ONCE, POINTS_AT_ONCE, STILL_AT_ONCE = 12, 256, 128  # per step
+SOFT = 1e-3  # field units; the loss is quadratic in distances below it
+SOFT_FLOW = 0.05  # the same for flow, relative to the mean known flow
+# Weight of the squared logarithmic stretch of moving objects by the warp, relative to
+# distances in field units. Without it moving objects shrink in the template, which
+# reduces distances: ||log Σ|| of the Jacobian is 2.75 there, and the error of tracked
+# points of the built-in scene is 0.0176 units. With it they are 0.15 and 0.0094 (0.0240
+# for a static scene).
 STRETCH = 0.3
-LEAST_STRETCH = 1e-6  # squared: a collapsed direction has a logarithm, too
+LEAST_STRETCH = 1e-6  # squared; bounds the logarithm of collapsed directions
 
 
 class FilmPaths(NamedTuple):
     """Tracked points of a video, in units of the field."""
 
     time: Float[np.ndarray, " frames"]
-    appearance: np.ndarray  # [frames] ids, for codes that go by them
-    position: Float[np.ndarray, "points frames 3"]  # any value where not known
+    appearance: np.ndarray  # [frames] appearance ids
+    position: Float[np.ndarray, "points frames 3"]  # arbitrary if unknown
     known: Bool[np.ndarray, "points frames"]
-    still: Float[np.ndarray, "still 3"]  # points that nothing moves
+    still: Float[np.ndarray, "still 3"]  # static points
 
 
 class WarpFit(NamedTuple):
-    """Fitted warp, and the mean distance from one position before and after."""
+    """Fitted warp, and the mean distance in the template before and after the fit."""
 
     params: PyTree  # of the whole field
-    canonical: Float[Array, "points 3"]  # field units: places in the template
+    canonical: Float[Array, "points 3"]  # positions in the template, field units
     first: float  # field units
     last: float
 
 
 class FlowFit(NamedTuple):
-    """Fitted scene flow, and its mean error before and after."""
+    """Fitted scene flow, and its mean error before and after the fit."""
 
     params: PyTree  # of the whole field
-    first: float  # field units from one moment to the next
+    first: float  # field units per interval
     last: float
 
 
@@ -134,7 +134,7 @@ def fit(
         return distances(*free, *every, nothing, key)[0]
 
     names = {effect.name for effect in field.effects if effect.displace is not None}
-    names &= params.keys()  # an effect of one's own may have none
+    names &= params.keys()  # effects from other packages may have no parameters
     free = (
         {name: params[name] for name in (*sorted(names), "codes")},
         jnp.asarray(_first_places(paths)),
@@ -200,10 +200,11 @@ def fit_flow(
 
 
 def _flow_distances(field, paths, shift, both):
-    """(medium, frames, rows, points at rest, where distances count squared) ->
+    """Return a function of (medium, frames, rows, static points, soft).
 
-    mean distances of the rows' flow, to the next moment and back, from what they did,
-    and of the flow at rest from none; field units.
+    It computes the mean error of the flow of the rows, to the next timestamp and back,
+    and the mean flow of static points, in field units. `soft` is the distance below
+    which the error is quadratic.
     """
     spec, time = field.spec.scene_flow, jnp.asarray(paths.time)
     position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
@@ -231,11 +232,11 @@ def _flow_distances(field, paths, shift, both):
 
 
 def _distances(field, params, paths):
-    """(parts of params, places in the template, frames, rows, points at rest, key) ->
+    """Return a function of (params, template positions, frames, rows, static, key).
 
-    mean distances of the rows' points from their places, and of those at rest from
-    where they are, field units, and what it costs to stretch the rows' surroundings:
-    each in a direction that is drawn, an estimate of all of them.
+    It computes the mean distances of the warped points of the rows from their positions
+    in the template, and of static points from themselves, in field units, and the cost
+    of stretching at the points of the rows, estimated in one random direction each.
     """
     position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
     weight = jnp.asarray(paths.known.T, position.dtype)
@@ -272,7 +273,7 @@ def _distances(field, params, paths):
 
 
 def _directions(key, like):
-    """Unit vectors, all alike likely, as many as there are points."""
+    """Sample a uniformly distributed unit vector for each point."""
     drawn = jax.random.normal(key, like.shape, like.dtype)
     return drawn / jnp.linalg.norm(drawn, axis=-1, keepdims=True)
 
@@ -282,7 +283,7 @@ def _length(gap, soft=SOFT):
 
 
 def _drawn(paths, frames, key):
-    """Random frames, rows of points and static points of a step."""
+    """Sample frames, rows of points and static points for a step."""
     frame_key, row_key, still_key = jax.random.split(key, 3)
     together = min(FRAMES_AT_ONCE, frames)
     chosen = jax.random.choice(frame_key, frames, (together,), replace=False)
@@ -294,7 +295,7 @@ def _drawn(paths, frames, key):
 
 
 def _means(moving, resting, counted):
-    """Means of distances: of points where they are counted, and of those at rest."""
+    """Compute the mean distances of known points and of static points."""
     return _mean(moving, counted), jnp.sum(resting) / max(resting.size, 1)
 
 
@@ -303,7 +304,7 @@ def _mean(values, counted):
 
 
 def _first_places(paths):
-    """[points, 3]: each where it is known nearest to the middle of its own time."""
+    """Return the position of each point in the middle of its known times."""
     places = np.zeros((len(paths.known), 3), np.float32)
     for row, known in enumerate(paths.known):
         seen = np.flatnonzero(known)
