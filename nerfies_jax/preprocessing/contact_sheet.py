@@ -8,16 +8,17 @@ from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.visualization import panels
 
 MOVING = np.array([255, 40, 40])
-FOLLOWED, DRAWN_WIDTH, TAIL = 8, 352, 8  # frames, px at least, frames of a tail
-TRACKS = 250  # drawn in a frame: moving ones first
+# Number of frames, minimum width in px, and number of recent positions of a track.
+FOLLOWED, DRAWN_WIDTH, TAIL = 8, 352, 8
+TRACKS = 250  # maximum number of tracks in a frame
 AT_REST, BY_ITSELF = (150, 200, 255), (255, 230, 0)
 
 
 def followed(views: Views, evidence: Evidence) -> np.ndarray:
     """Show frames with moving pixels in red, and tracks with their recent positions.
 
-    Yellow tracks move, blue ones are static points, whose traces are the camera motion.
-    If preprocessing was not possible, the frames are shown alone.
+    Tracks of moving points are yellow. Tracks of static points are blue and show the
+    camera motion. If tracking failed, only the frames are shown.
 
     Args:
       views: The frames.
@@ -52,7 +53,7 @@ def _draw_tracks(picture, evidence, frame, times):
     for row in np.concatenate(chosen):
         color = BY_ITSELF if moves[row] else AT_REST
         tail = np.arange(max(0, frame - TAIL), frame + 1)
-        # From the last frame in which it was not seen.
+        # Only frames since the track was last invisible.
         gap = np.flatnonzero(~tracks.seen[row, tail])
         tail = tail[gap[-1] + 1 :] if len(gap) else tail
         line = np.round(tracks.pixel[row, tail] * times * 16).astype(np.int32)

@@ -1,46 +1,43 @@
-"""Findings of an inspection: one record for each effect, with its confidence."""
+"""Findings of an inspection: one for each effect, with a confidence."""
 
 import dataclasses
 import math
 from collections.abc import Mapping
 
 CERTAIN, LIKELY, CANNOT_TELL = "certain", "likely", "cannot tell"
-# Names of the effects, in all findings
+# Names of the effects in all findings.
 MOTION, LIGHT, TRANSIENT = "motion", "appearance codes", "transient objects"
 START, BACKGROUND = "start from points", "background points"
 DEPTH, MASKS, LENS = "depth", "masks of what moves", "lens distortion"
 TEXTURE = "more texture bands"
-# Factor by which a value must differ from its threshold. The gain of an effect is known
-# to a factor of two at best, so within a quarter of the threshold nothing is decided.
+# Factors by which a value must differ from its threshold. The gain of an effect is
+# known to a factor of two at best, so values within a quarter are undecided.
 CERTAIN_FACTOR, LIKELY_FACTOR = 2.0, 1.25
-DEVIATIONS = 2.0  # standard errors that evidence is moved toward its threshold first
+DEVIATIONS = 2.0  # standard errors by which a value is first moved to its threshold
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Observations about one effect, as plain values for a JSON file.
-
-    `wanted` is None if the observations are inconclusive, and then decides nothing.
-    `numbers` are the measured quantities by name, with the unit in the name.
-    """
+    """Observations about one effect, as plain values for a JSON file."""
 
     effect: str
-    evidence: str  # for a person: what was measured, with numbers and units
+    evidence: str  # text about the measurements, with numbers and units
     threshold: str
-    wanted: bool | None
+    wanted: bool | None  # whether the effect is needed, None if undecided
     confidence: str
+    # Measured quantities by name, with the unit in the name.
     numbers: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         if (self.wanted is None) != (self.confidence == CANNOT_TELL):
             raise ValueError(
-                f"{self.effect}: decision {self.wanted} with confidence "
-                f"{self.confidence!r}; what cannot be told decides nothing"
+                f"{self.effect}: wanted={self.wanted} does not match confidence="
+                f"{self.confidence!r}; it must be None if undecided, and only then"
             )
 
     @property
     def decision(self) -> str:
-        """ "yes", "no", or a dash."""
+        """Decision as text: yes, no, or a dash if undecided."""
         return {True: "yes", False: "no", None: "-"}[self.wanted]
 
 
@@ -49,9 +46,9 @@ def judge(
 ) -> tuple[bool | None, str]:
     """Decide whether a non-negative value exceeds its threshold, with a confidence.
 
-    The value is first moved toward the threshold by two standard errors. If it reaches
-    the threshold, or ends within a quarter of it, nothing is decided. From a factor of
-    two on the decision is certain.
+    The value is first moved toward the threshold by two standard errors. It is
+    undecided if it then reaches the threshold or is within a quarter of it. The
+    decision is certain from a factor of two on.
 
     Args:
       value: The value.
@@ -62,7 +59,7 @@ def judge(
       The decision or None, and its confidence.
     """
     if not (threshold > 0 and value >= 0 and error >= 0):
-        return None, CANNOT_TELL  # NaN included: something could not be measured
+        return None, CANNOT_TELL  # also for NaN, which means not measured
     above = bool(value > threshold)
     if above:
         factor = (value - DEVIATIONS * error) / threshold
@@ -75,7 +72,7 @@ def judge(
 
 
 def cannot_tell(effect: str, reason: str, threshold: str = "") -> Finding:
-    """Make a finding that decides nothing.
+    """Create an undecided finding.
 
     Args:
       effect: Name of the effect.
@@ -91,7 +88,7 @@ def cannot_tell(effect: str, reason: str, threshold: str = "") -> Finding:
 def table(
     findings: tuple[Finding, ...], costs: Mapping[str, str], width: int = 110
 ) -> list[str]:
-    """Format findings as a table for a terminal, with long texts folded.
+    """Format findings as a table for a terminal, with long texts wrapped.
 
     Args:
       findings: The findings.

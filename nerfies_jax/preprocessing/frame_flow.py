@@ -12,10 +12,9 @@ from nerfies_jax.preprocessing import dense_flow, view_set
 def with_flow(capture: Capture) -> Capture:
     """Compute flow to the next and the previous frame of the same camera.
 
-    Held-out frames neither have nor influence flow, since their contents are unknown
-    during training. Flow is computed by `dense_flow` in the images as they are. Large
-    displacements of a video are searched for again from the flow that a static scene
-    would have.
+    Held-out frames have no flow and do not affect it, because they are unknown during
+    training. Flow is computed by `dense_flow` at full resolution. Large displacements
+    of a video are searched for again, starting from the flow of a static scene.
 
     Args:
       capture: The capture.
@@ -34,7 +33,7 @@ def with_flow(capture: Capture) -> Capture:
         if len(mine) < 2:
             continue
         views = view_set.in_time_order(capture, mine)
-        # Images of one moment are no video: there is nothing to search twice for.
+        # Images with one timestamp are not a video and need no second search.
         film = np.ptp(views.time) > 0
         span = view_set.depth_span(capture, views) if film else None
         pictures = dense_flow.leveled(views)
@@ -45,10 +44,7 @@ def with_flow(capture: Capture) -> Capture:
         flow.backward[views.row] = neighbors.backward
         flow.backward_seen[views.row] = neighbors.backward_seen & views.valid
         flow.previous_row[views.row[1:]] = views.row[:-1]
-    note = "optical flow between neighboring frames found in the pictures"
+    note = "optical flow between neighboring frames was computed from the images"
     if (flow.next_row == own).all():
-        note = (
-            "no optical flow: no camera has two frames to learn from, so no two frames "
-            "are neighbors"
-        )
+        note = "no optical flow: no camera has two training frames"
     return dataclasses.replace(capture, flow=flow, notes=(*capture.notes, note))

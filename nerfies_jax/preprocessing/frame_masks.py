@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing import record
 def with_masks(capture: Capture, folder: pathlib.Path = CACHE / "evidence") -> Capture:
     """Compute masks of the training frames by preprocessing.
 
-    Held-out frames, which are not used, have none.
+    Held-out frames are not used and have no masks.
 
     Args:
       capture: The capture.
@@ -27,10 +27,13 @@ def with_masks(capture: Capture, folder: pathlib.Path = CACHE / "evidence") -> C
     """
     evidence = record.cached(capture, folder)
     if evidence.unusable:
-        note = f"no masks of what moves could be made: {evidence.unusable}"
+        note = f"masks of moving objects could not be computed: {evidence.unusable}"
         return dataclasses.replace(capture, notes=(*capture.notes, note))
     moving = of_frames(evidence, capture)
-    note = f"masks of what moves found in the pictures, {evidence.moving.mean():.1%}"
+    note = (
+        "masks of moving objects were computed from the images: "
+        f"{evidence.moving.mean():.1%} of the pixels"
+    )
     return dataclasses.replace(capture, moving=moving, notes=(*capture.notes, note))
 
 
@@ -54,7 +57,7 @@ def of_frames(evidence: Any, capture: Capture) -> np.ndarray:
 
 
 def enlarged(mask: np.ndarray, factor: int, size: tuple[int, int]) -> np.ndarray:
-    """Enlarge a mask by an integer factor, and pad it by its edge.
+    """Enlarge a mask by an integer factor, and extend it at the right and bottom.
 
     Args:
       mask: The mask, [lines, columns].

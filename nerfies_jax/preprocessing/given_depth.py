@@ -1,9 +1,9 @@
 """Alignment of external depth to scene units by static points.
 
-The depth of a network has a scale and an offset of its own for each image, or is
-inverse. The kind that fits the static points better is chosen. If a plane fills the
-image, neither the kind nor the offset can be determined, and it counts as depth without
-an offset.
+Networks predict depth or inverse depth with an unknown scale and offset for each image.
+The kind that fits the static points better is chosen. If a plane fills the image,
+neither the kind nor the offset can be determined, and depth without an offset is
+assumed.
 """
 
 import numpy as np
@@ -11,13 +11,13 @@ import numpy as np
 from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
 
-FEWEST = 12  # points at rest in an image
+FEWEST = 12  # static points in an image
 ROUNDS = 8  # of reweighting
-USABLE = 0.1  # median relative miss; a depth worse than that says little
-SAME = 0.002  # of the relative miss: so much better an inverse depth must fit
-# Penalty on the offset, relative to squared depth: it is zero if it is undetermined.
+USABLE = 0.1  # maximum of the median relative error
+SAME = 0.002  # by which the relative error of inverse depth must be smaller
+# Penalty on the offset relative to squared depth, so that an undetermined one is zero.
 OFFSET_PENALTY = 1e-3
-LEAST_TOLD = 0.1  # of the depth must come from what was given, not from the offset
+LEAST_TOLD = 0.1  # minimum share of the aligned depth that is not due to the offset
 
 
 def aligned(
@@ -61,7 +61,7 @@ def aligned(
 
 
 def _line(own, wanted):
-    """Scale and offset that take one to the other, robustly."""
+    """Fit scale and offset from one to the other by robust least squares."""
     size = np.median(np.abs(own)) + 1e-30
     columns = np.stack([own / size, np.ones_like(own)], axis=1)
     weight = np.ones(len(own))

@@ -1,7 +1,6 @@
 """External tracks, masks, depth and flow in files, checked against a capture.
 
-Each has as many frames as the capture, or as its training frames, in order of time.
-Errors name the file, the bound and the remedy.
+Each has as many frames as the capture, or as its training frames, in temporal order.
 """
 
 import dataclasses
@@ -25,15 +24,15 @@ from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.given import Given, GivenFiles
 
 MOST_NUMBERS = 2_000_000_000  # of one file
-# Names of tracks and of where they are seen, which axis counts the frames where the
-# shape leaves it open, and where the first pixel has its center: TAPIR, whose images
-# begin at 0, and CoTracker, which samples with corners aligned.
+# Names of the positions and visibilities of tracks, the axis of the frames if the shape
+# is ambiguous, and the coordinate of the center of the first pixel: for TAPIR, whose
+# images begin at 0, and for CoTracker, which aligns corners.
 TRACK_NAMES = (
     ("tracks", "visibles", 1, 0.5),
     ("pred_tracks", "pred_visibility", 0, 0.0),
 )
-LEAST_INSIDE = 0.5  # of what is seen must lie in the images
-SEEN = 0.5  # of a visibility between 0 and 1
+LEAST_INSIDE = 0.5  # minimum share of visible positions inside the images
+SEEN = 0.5  # threshold of visibilities in [0, 1]
 FLO_MAGIC = 202021.25  # of Middlebury's .flo
 PICTURES, DEPTHS = (".png",), (".exr", ".png", ".npy")
 
@@ -52,13 +51,13 @@ def attached(capture: Capture, files: GivenFiles) -> Capture:
     Raises:
       CaptureError: If a file does not fit.
     """
-    if files == GivenFiles(times=files.times):  # those are read with the capture
+    if files == GivenFiles(times=files.times):  # times are read with the capture
         return capture
     if pinholes.has_lens(capture.cameras):
         raise CaptureError(
-            f"{capture.path or capture.name}: its lens bends the pictures, so files of "
-            "other tools are of other pixels than those looked at; undistort the "
-            "capture first, as COLMAP's image_undistorter does"
+            f"{capture.path or capture.name}: files of other tools cannot be used for "
+            "images with lens distortion; undistort the capture first, for example "
+            "with image_undistorter of COLMAP"
         )
     parts: dict[str, Any] = {}
     notes = capture.notes
@@ -75,15 +74,15 @@ def attached(capture: Capture, files: GivenFiles) -> Capture:
 
 
 def _rows(count, capture, path, what):
-    """The capture's rows that so many frames are."""
+    """Return the rows of the capture that a number of frames refers to."""
     learned = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
     every = np.argsort(capture.times, kind="stable")
     for rows in (learned, every):
         if count == len(rows):
             return rows
     raise CaptureError(
-        f"{path}: {what} of {count} frames; the capture has {len(every)}, "
-        f"{len(learned)} of them to learn from: give one for each, in order of time"
+        f"{path}: {what} of {count} frames, but the capture has {len(every)} frames "
+        f"({len(learned)} training frames); provide one for each, in temporal order"
     )
 
 
@@ -139,9 +138,9 @@ def _tracks(path, capture):
     if not seen.any() or (inside & seen).sum() < LEAST_INSIDE * seen.sum():
         width, height = capture.size
         raise CaptureError(
-            f"{path}: {(inside & seen).sum()} of {seen.sum()} places that are seen lie "
-            f"in the pictures of {width}x{height}, at least half must; if other "
-            "pictures were tracked, save their width and height beside as size"
+            f"{path}: {(inside & seen).sum()} of {seen.sum()} visible positions are "
+            f"inside the images of {width}x{height}, at least half must be; if images "
+            "of another size were tracked, add their width and height as an array size"
         )
     seen &= inside
     pixels = np.zeros((len(capture.ids), pixel.shape[1], 2), np.float32)
@@ -151,7 +150,7 @@ def _tracks(path, capture):
 
 
 def _files(folder, suffixes, capture, what):
-    """Files of a folder and their rows: by the frames' names, or by their number."""
+    """Return the files of a folder and their rows, by frame names or by number."""
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of {what}; check the path")
     paths = [one for one in folder.iterdir() if one.suffix.lower() in suffixes]
@@ -162,7 +161,7 @@ def _files(folder, suffixes, capture, what):
         return [by_name[capture.ids[row]] for row in named], np.array(named)
     if not paths:
         raise CaptureError(
-            f"{folder}: no file that ends in {' or '.join(suffixes)}; export {what}"
+            f"{folder}: contains no {what} ({' or '.join(suffixes)} files)"
         )
     return paths, _rows(len(paths), capture, folder, what)
 
@@ -178,21 +177,21 @@ def _masks(folder, capture):
     if share in (0, 1):
         raise CaptureError(
             f"{folder}: no {'white' if share == 0 else 'black'} pixel in any mask "
-            f"({encoding.text}); white marks what moves and black what does not"
+            f"({encoding.text}); moving objects must be white, and the rest black"
         )
     note = f"{len(paths)} masks of {encoding.text}; {share:.1%} white: moving"
     return moving, (note,)
 
 
 def _fitted(array, capture, path, what):
-    """Nearest pixels of an array of the images' aspect, whatever its size."""
+    """Resample an array of the aspect of the images to their size (nearest pixel)."""
     width, height = capture.size
     tall, wide = array.shape[:2]
     # To within a pixel of the smaller of the two.
     if abs(wide * height - tall * width) > max(width, height, wide, tall):
         raise CaptureError(
-            f"{path}: a {what} of {wide}x{tall} pixels for pictures of "
-            f"{width}x{height}; their sides must have one ratio: export it uncropped"
+            f"{path}: a {what} of {wide}x{tall} pixels for images of "
+            f"{width}x{height}; their aspect ratios must match: export it uncropped"
         )
     row = ((np.arange(height) + 0.5) * tall / height).astype(int)
     column = ((np.arange(width) + 0.5) * wide / width).astype(int)
@@ -212,8 +211,8 @@ def _depths(path, capture):
         known = np.isfinite(picture) & (picture > 0)
         if not known.any():
             raise CaptureError(
-                f"{where}: no depth above zero for frame {capture.ids[row]!r}; leave "
-                "the frame's file as the tool wrote it"
+                f"{where}: no positive depth for frame {capture.ids[row]!r}; use the "
+                "depth map as the tool wrote it"
             )
         depth = np.where(known, picture, np.nan)
         depths[row] = _fitted(depth, capture, where, "depth")
@@ -231,7 +230,7 @@ def _depth_picture(path):
     else:
         picture = images.read_numbers(path)
     if picture is None or picture.ndim != 2:
-        raise CaptureError(f"{path}: no picture of depths; expected one channel")
+        raise CaptureError(f"{path}: not a depth map; expected one channel")
     return picture.astype(np.float32)
 
 
@@ -260,8 +259,8 @@ def _flow(path, capture):
         missing = {"forward", "backward"} - set(arrays)
         if missing:
             raise CaptureError(
-                f"{path}: no {sorted(missing)[0]!r}; flow is needed both ways, to tell "
-                "where it can be trusted"
+                f"{path}: no {sorted(missing)[0]!r} flow; both directions are needed "
+                "for the consistency check"
             )
         sides = {side: arrays[side] for side in ("forward", "backward")}
     width, height = capture.size
@@ -271,8 +270,8 @@ def _flow(path, capture):
         if array.shape != expected or not np.isfinite(array).all():
             raise CaptureError(
                 f"{path}: {side} flow of shape {array.shape}; expected {expected}, "
-                "finite: between neighbors of the frames to learn from, in order of "
-                "time, in pixels of the pictures as they are read"
+                "finite: between consecutive training frames in temporal order, in "
+                "pixels of the images as they are read"
             )
     forward, backward = np.zeros((2, len(capture.ids), height, width, 2), np.float32)
     forward[learned[:-1]], backward[learned[1:]] = sides["forward"], sides["backward"]
@@ -286,8 +285,8 @@ def _flo_stack(folder):
         if picture.shape != pictures[0].shape:
             (height, width), (tall, wide) = picture.shape[:2], pictures[0].shape[:2]
             raise CaptureError(
-                f"{path}: {width}x{height} pixels, but {paths[0].name} is of "
-                f"{wide}x{tall}; all must be of the pictures as they are read"
+                f"{path}: {width}x{height} pixels, but {paths[0].name} has "
+                f"{wide}x{tall}; all must have the size of the images as they are read"
             )
     return np.stack(pictures)
 
@@ -296,21 +295,21 @@ def _flo_files(folder) -> Sequence[pathlib.Path]:
     files = sorted(folder.glob("*.flo"), key=lambda one: frames.natural(one.name))
     if not files:
         raise CaptureError(
-            f"{folder}: no .flo file; flow is needed both ways, in folders forward and "
-            "backward"
+            f"{folder}: no .flo file; both directions are needed, in the folders "
+            "forward and backward"
         )
     return files
 
 
 def _flo(path):
-    """Middlebury's .flo: a magic number, width, height, and right, down by pixel."""
+    """Read a Middlebury .flo file: magic number, width, height, and flow by pixel."""
     raw = safe_files.read_bytes(path, 12 + 8 * images.MAX_PIXELS)
     head = np.frombuffer(raw[:12].ljust(12, b"\0"), "<i4")
     width, height = int(head[1]), int(head[2])
     right_magic = np.frombuffer(raw[:4].ljust(4, b"\0"), "<f4")[0] == FLO_MAGIC
     if not right_magic or len(raw) != 12 + 8 * width * height:
         raise CaptureError(
-            f"{path}: {len(raw)} bytes and no .flo file of {width}x{height}; write it "
-            "again"
+            f"{path}: not a .flo file of {width}x{height} ({len(raw)} bytes); export "
+            "it again"
         )
     return np.frombuffer(raw[12:], "<f4").reshape(height, width, 2)

@@ -1,4 +1,4 @@
-"""Inspection of a capture, to decide on effects. Runs on the host, without training."""
+"""Inspection of a capture without training, to recommend effects."""
 
 import dataclasses
 import pathlib
@@ -31,7 +31,7 @@ class Inspection:
 
     findings: tuple[Finding, ...]
     sheet: np.ndarray  # [height, width, 3] uint8
-    factor: int  # images were looked at this many times smaller
+    factor: int  # by which images were downsampled
     seconds: float
     views: Views
     evidence: Evidence
@@ -57,7 +57,7 @@ def inspect(
 
     Args:
       capture: The capture.
-      folder: Cache folder of preprocessing. None to keep nothing.
+      folder: Cache folder of preprocessing. None for no cache.
       tell: Called with the name of each part when it begins.
 
     Returns:
@@ -81,7 +81,7 @@ def inspect(
     return Inspection(findings, sheet, evidence.factor, seconds, views, evidence)
 
 
-@events.stage("judging effects")
+@events.stage("deciding on effects")
 def _findings(capture, looked, views, evidence, points, rest):
     return (
         motion.motion(views, evidence),

@@ -1,11 +1,11 @@
-"""Masks of moving pixels in a video whose cameras are not known yet.
+"""Masks of moving pixels in a video without known cameras.
 
-Structure from motion needs static points and is misled by large moving objects. The
-motion of most tracks over some frames is due to the camera: one epipolar geometry, or
-one homography without parallax. Tracks that it does not explain move. Motion along
-epipolar lines is not detected, nor is motion in front of a single plane, where it looks
-like a smaller depth. With the cameras that these masks lead to, `record.gather` detects
-more.
+Structure from motion needs static points and fails with large moving objects. The
+motion of most tracks over some frames is due to the camera, and is described by one
+epipolar geometry, or by one homography if there is no parallax. Other tracks are on
+moving objects. Motion along epipolar lines is not detected, nor is motion in front of a
+single plane, where it looks like a smaller depth. With the cameras estimated by use of
+these masks, `record.gather` detects more.
 """
 
 import pathlib
@@ -20,12 +20,13 @@ from nerfies_jax.preprocessing import tracks as tracking
 from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.runtime import events
 
-LATER = (6, 10, 15)  # frames after which a track is held against the rest
-WITHIN_SHARE = 0.004  # of the width, off its line or place: 0.7 px of 176
-FEWEST = 30  # tracks of a pair that tell a geometry
-# A homography has fewer ways to be wrong: taken where it explains nearly as much.
+LATER = (6, 10, 15)  # distances in frames over which tracks are compared
+WITHIN_SHARE = 0.004  # maximum error relative to the width: 0.7 px of 176
+FEWEST = 30  # tracks of a pair of frames for estimating a geometry
+# A homography, which has fewer degrees of freedom, is used if it explains at least this
+# share of the tracks that the fundamental matrix explains.
 AS_GOOD = 0.9
-RIM_SHARE = 0.02  # of the width that masks are widened by: features have a size
+RIM_SHARE = 0.02  # margin of masks relative to the width, because features have a size
 
 
 def moving_masks(images: np.ndarray) -> np.ndarray:
@@ -61,7 +62,7 @@ def moving_masks(images: np.ndarray) -> np.ndarray:
     return np.stack([cv2.dilate(one.astype(np.uint8), disc) > 0 for one in enlarged])
 
 
-@events.stage("finding what moves")
+@events.stage("detecting moving objects")
 def moving_in(pictures: pathlib.Path) -> dict[str, np.ndarray]:
     """Segment moving pixels of the images in a folder.
 
@@ -77,23 +78,23 @@ def moving_in(pictures: pathlib.Path) -> dict[str, np.ndarray]:
     names = [file.name for file in frames.pictures_in(pictures)]
     if len(names) <= min(LATER):
         raise ValueError(
-            f"{pictures}: {len(names)} pictures; what moves shows in more than "
-            f"{min(LATER)}, so film more of them"
+            f"{pictures}: {len(names)} images are too few to detect moving objects; "
+            f"use more than {min(LATER)}"
         )
     read = [pictures_of.read_image(pictures / name)[0] for name in names]
     sizes = {one.shape for one in read}
     if len(sizes) > 1:
         raise ValueError(
-            f"{pictures}: pictures of {len(sizes)} sizes; a film has one, so bring "
-            "them to it"
+            f"{pictures}: images of {len(sizes)} sizes; frames of a video must have "
+            "one size: resize them"
         )
     return dict(zip(names, moving_masks(np.stack(read)), strict=True))
 
 
 def _off_the_camera_motion(tracks, within):
-    """[tracks, frames] px that each is off what most others do, later and before.
+    """Return distances [tracks, frames] in px from the motion of most other tracks.
 
-    NaN where it is not seen, or too few are.
+    They are NaN if the track is not visible, or too few tracks are.
     """
     frames = tracks.seen.shape[1]
     off = np.zeros(tracks.seen.shape)
@@ -112,7 +113,7 @@ def _off_the_camera_motion(tracks, within):
 
 
 def _pair_misses(here, there, within):
-    """px by which each track of a pair of frames is off the camera's motion."""
+    """Return distances in px of tracks in a pair of frames from the camera motion."""
     settings = {"ransacReprojThreshold": within, "confidence": 0.999}
     plane, _ = cv2.findHomography(
         here, there, cv2.USAC_MAGSAC, within, confidence=0.999
@@ -136,7 +137,7 @@ def _homography_misses(plane, here, there):
 
 
 def _sampson(lines, here, there):
-    """px from the epipolar lines, to first order (Hartley and Zisserman, 11.4.3)."""
+    """Return Sampson distances in px (Hartley and Zisserman, 11.4.3)."""
     one, other = (np.c_[points, np.ones(len(points))] for points in (here, there))
     second, first = one @ lines.T, other @ lines
     slope_sq = (second[:, :2] ** 2).sum(1) + (first[:, :2] ** 2).sum(1)

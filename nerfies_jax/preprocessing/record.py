@@ -2,9 +2,9 @@
 
     evidence = record.gather(capture)
 
-It consists of flow between neighbors in time, tracks, the tracks and pixels that move,
-their paths in space, and static points. It runs on the host, on one core, without
-gradients.
+It consists of optical flow between neighboring frames, point tracks, masks and tracks
+of moving objects with their 3D paths, and static points. It runs on the host, on one
+core, without gradients.
 """
 
 import contextlib
@@ -49,24 +49,25 @@ from nerfies_jax.preprocessing.watch import (
 )
 from nerfies_jax.runtime import console
 
-# A path has as many frames at least, and a video as many; fewer say nothing of motion.
+# Minimum number of frames of a path and of a video.
 SHORTEST_PATH, SHORTEST_FILM = 10, 6
-MOVES = 0.5  # score from which a track counts as moving
+MOVES = 0.5  # score above which a track is considered as moving
 MOST_PATHS = 1500
-MOST_PIXELS = 16_000_000  # of all frames: 17 bytes each for the flow between them
-# Where less of the images can be carried to the next frame, tracks are chance: a
-# camera that jumps.
+MOST_PIXELS = 16_000_000  # of all frames together, at 17 bytes each for their flow
+# Minimum share of textured pixels with consistent flow. Below it the camera motion is
+# discontinuous, and tracks are arbitrary.
 LEAST_CARRIED = 0.4
-# Shares of the budget after which there is none left for a part.
+# Shares of the budget above which a part is skipped.
 FOR_WIDE_STEPS, FOR_TRACKS, FOR_COLORS = 0.4, 0.5, 0.6
 FOR_BODIES, FOR_POINTS = 0.7, 0.8
-# Share of the near plane, which is that of static points: a hand may be much closer.
+# Minimum depth of moving points as a share of the near plane, which is computed from
+# static points. Moving objects, such as a hand, may be much closer.
 AT_CAMERA = 0.1
-LEAST_TEXTURED = 0.05  # of the pixels: too little to tell anything by
-MOST_UNKEPT = 2  # records in memory: of frames to learn from, and of all
+LEAST_TEXTURED = 0.05  # minimum share of textured pixels
+MOST_UNKEPT = 2  # records in memory: of training frames, and of all frames
 
-_unkept: dict[pathlib.Path, "Evidence"] = {}  # what could not be written
-_told_of: dict[pathlib.Path, str] = {}  # a note for each record without some parts
+_unkept: dict[pathlib.Path, "Evidence"] = {}  # records that could not be written
+_told_of: dict[pathlib.Path, str] = {}  # notes on records with skipped parts
 
 
 def gather(
@@ -74,20 +75,19 @@ def gather(
     use_depths: bool = False,
     tell: Callable[[str], None] = lambda part: None,
 ) -> Evidence:
-    """Preprocess a capture, in about 0.25 s a frame of 176x132 or 480x270 on one core.
+    """Preprocess a capture, in about 0.25 s per frame of 176x132 or 480x270.
 
-    Parts beyond the budget of work (`capture.preprocessing`) are left out. The budget
-    counts work and not time, so the result depends on the capture alone and not on the
-    load of the machine.
+    Parts beyond the budget of work (`capture.preprocessing`) are skipped. The budget
+    counts work instead of time, so that the result does not depend on the machine.
 
     Args:
       capture: The capture. External results (`capture.given`) replace those computed
         here.
-      use_depths: True to constrain paths by the capture's own depth, if it has any.
-      tell: Called with each of `PARTS` when it begins, and with everything left out.
+      use_depths: True to constrain paths by the depth maps of the capture, if any.
+      tell: Called with the name of each part when it begins, and with skipped parts.
 
     Returns:
-      The results, with the names of the parts left out.
+      The results, with the names of skipped parts.
     """
     with contextlib.closing(Watch(tell, capture.preprocessing * ENOUGH_WORK)) as watch:
         return _gathered(capture, use_depths, watch)
@@ -134,7 +134,7 @@ def _gathered(capture, use_depths, watch):
     watch.begin("still")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     points_work = 1e-6 * A_POINT_FRAME * still_points.work(views)
-    if watch.has_room(FOR_POINTS, "dense points at rest", points_work):
+    if watch.has_room(FOR_POINTS, "dense static points", points_work):
         dense = still_points.dense(views, flow, mask)
     return Evidence(
         row=views.row,
@@ -160,14 +160,14 @@ def _flow(views, pictures, span, watch):
     watch.spend(2 * (len(views.row) - 1) * a_search)
 
     def room_for(count):
-        what, each = "a second look at wide steps", dense_flow.SECOND_LOOK * a_search
+        what, each = "a second search for flow", dense_flow.SECOND_LOOK * a_search
         return watch.room_for(count, FOR_WIDE_STEPS, what, each)
 
     return dense_flow.between_neighbors(views, pictures, span, room_for)
 
 
 def _rounded(flow):
-    """In half precision, as it is kept: gathered or read again, it is the same."""
+    """Round flow to half precision, in which it is cached, for identical results."""
     forward, backward = (
         side.astype(np.float16).astype(np.float32)
         for side in (flow.forward, flow.backward)
@@ -176,10 +176,10 @@ def _rounded(flow):
 
 
 def _tracks(given, views, flow, pictures, sparser):
-    """All tracks, and the first of those whose paths are wanted.
+    """Return all tracks, and the index of the first one whose path is computed.
 
-    Given ones stand behind our own, which still say what stands still: other tools may
-    have followed nothing but what moves.
+    External tracks follow the computed ones, which are still needed for static points:
+    other tools may have tracked only moving objects.
     """
     own = tracking.from_flow(views, flow, pictures, sparser)
     others = taken.tracks(given, views)
@@ -201,7 +201,7 @@ def _mask(views, flow, tracks, score, watch):
     odds = np.zeros(share.shape, np.float32)
     work = 1e-6 * A_POINT_FRAME * still_points.work(views)
     work += 1e-6 * A_COMPARED_PIXEL * views.valid.size
-    if watch.has_room(FOR_COLORS, "what colors say of what moves", work):
+    if watch.has_room(FOR_COLORS, "colors for detecting moving objects", work):
         still = still_points.dense(views, flow, open_to_doubt)
         odds = still_pictures.log_odds(small, still)
     masks = moving.mask(small, share, odds)
@@ -225,15 +225,15 @@ def _depths(capture, given, views, tracks, rest, score, use_depths):
     depth, miss = given_depth.aligned(depth, tracks.take(still), rest.take(still))
     if not np.isfinite(miss):
         raise ValueError(
-            f"{capture.path or capture.name}: in every frame the given depths, or "
-            "their inverse, miss the points at rest, or too few of those are seen; "
-            "leave the depths out"
+            f"{capture.path or capture.name}: the external depth maps fit the static "
+            "points in no frame, neither as depth nor as inverse depth; remove them"
         )
     if miss > given_depth.USABLE:
         raise ValueError(
-            f"{capture.path or capture.name}: the given depths, or their inverse, miss "
-            f"the points at rest by {miss:.0%} (median), more than "
-            f"{given_depth.USABLE:.0%}; give those of these frames, or leave them out"
+            f"{capture.path or capture.name}: the external depth maps differ from the "
+            f"static points by {miss:.0%} (median), more than "
+            f"{given_depth.USABLE:.0%}; check that they belong to these frames, or "
+            "remove them"
         )
     return depth
 
@@ -251,7 +251,7 @@ def _paths(capture, views, tracks, rest, score, which, depths, watch):
     alone = paths.least_acceleration(views, moved, least, around)
 
     def has_room(terms):
-        what = "depths of what moves as one rigid thing"
+        what = "depths of rigid bodies"
         return watch.has_room(FOR_BODIES, what, 1e-6 * A_BODY_TERM * terms)
 
     return rigid_bodies.refined(views, moved, alone, has_room)
@@ -278,17 +278,18 @@ def _factor(capture):
 def _unusable(views, flow):
     frames = len(views.row)
     if frames < SHORTEST_FILM:
-        return f"{frames} frames are too few to follow anything through"
+        return f"{frames} frames are too few for tracking"
     if np.ptp(views.time) == 0:
         return "all frames have the same time"
     textured = views.textured.mean()
     if textured < LEAST_TEXTURED:
-        return f"only {textured:.1%} of the pixels have texture to follow"
+        return f"only {textured:.1%} of the pixels have texture"
     share = carried(views, flow)
     if share < LEAST_CARRIED:
         return (
-            f"only {share:.0%} of the textured pixels can be carried to the next frame "
-            f"(at least {LEAST_CARRIED:.0%} are needed): the camera jumps"
+            f"only {share:.0%} of the textured pixels have consistent flow to the next "
+            f"frame (at least {LEAST_CARRIED:.0%} are needed): the camera motion is "
+            "discontinuous"
         )
     return ""
 
@@ -312,7 +313,7 @@ def _moved(tracks, score, first):
     wanted = np.arange(len(score)) >= first
     which = np.flatnonzero(long & wanted & (score > MOVES))
     if len(which) > MOST_PATHS:
-        # Long ones say most, but every place is to have some.
+        # Long tracks are preferred, but all regions should have some.
         chance = tracks.seen[which].sum(1).astype(float)
         rng = np.random.default_rng(0)
         which = rng.choice(which, MOST_PATHS, replace=False, p=chance / chance.sum())
@@ -320,7 +321,7 @@ def _moved(tracks, score, first):
 
 
 def _measured(depths, tracks):
-    """z-depths of the tracks where they are known and do not jump."""
+    """Return z-depths of tracks, NaN if unknown or at a depth discontinuity."""
     measured = np.full(tracks.seen.shape, np.nan)
     for frame, picture in enumerate(depths):
         here = np.flatnonzero(tracks.seen[:, frame])
@@ -331,14 +332,14 @@ def _measured(depths, tracks):
 
 
 def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
-    """Select z-depth that is known and does not jump to that of a neighbor.
+    """Select known z-depths that are not at a depth discontinuity.
 
     Args:
-      depth: z-depths, [height, width], 0 where unknown.
-      jump: Relative difference of a jump.
+      depth: z-depths, [height, width], 0 if unknown.
+      jump: Relative difference between neighbors at a discontinuity.
 
     Returns:
-      z-depths [height, width], NaN elsewhere.
+      z-depths [height, width], NaN for other pixels.
     """
     least, most = nd.minimum_filter(depth, 3), nd.maximum_filter(depth, 3)
     return np.where((least > 0) & (most - least < jump * depth), depth, np.nan)
@@ -352,9 +353,9 @@ def cached(
 ) -> Evidence:
     """Preprocess a capture, or read its results from a cache.
 
-    A distorted capture is undistorted first, so both share one record. If `folder`
-    cannot be written, which is reported, the record is kept in memory, so that no
-    command computes it twice. A warning lists the parts left out.
+    A distorted capture is undistorted first, so that both share one record. If `folder`
+    cannot be written, this is reported and the record is kept in memory. A warning
+    lists skipped parts.
 
     Args:
       capture: The capture.
@@ -373,7 +374,7 @@ def cached(
         try:
             save(path, evidence)
         except (OSError, CaptureError) as error:
-            tell(f"what the pictures say is not kept for the next time: {error}")
+            tell(f"results of preprocessing could not be cached: {error}")
             while len(_unkept) >= MOST_UNKEPT:
                 _unkept.pop(next(iter(_unkept)))
             _unkept[path] = evidence
@@ -384,24 +385,24 @@ def cached(
 
 
 def left_out_note(evidence: Evidence) -> str:
-    """Describe the parts of preprocessing left out, and the remedy.
+    """Describe the skipped parts of preprocessing, with advice.
 
     Args:
       evidence: Preprocessing.
 
     Returns:
-      The text, empty if nothing was left out.
+      The text, empty if nothing was skipped.
     """
     if not evidence.left_out:
         return ""
     return (
-        f"Preprocessing left out {evidence.left_out}: its budget of work was used up. "
-        "With a larger multiple of the default budget (preprocessing) nothing is."
+        f"Preprocessing skipped {evidence.left_out}, because its budget of work was "
+        "spent. Increase the budget (preprocessing) to include it."
     )
 
 
 def notes_on(capture: Capture, folder: pathlib.Path) -> list[str]:
-    """List the notes of `cached` in this process about parts left out for a capture.
+    """List the notes of `cached` in this process on parts skipped for a capture.
 
     Args:
       capture: The capture.

@@ -20,21 +20,21 @@ VERSION = 12
 
 
 class Evidence(NamedTuple):
-    """Preprocessing results of the training frames, in order of time."""
+    """Preprocessing results of the training frames, in temporal order."""
 
     row: np.ndarray  # [frames] row of the capture
     flow: NeighborFlow
     moving: np.ndarray  # [frames, height, width] bool
     tracks: Tracks
-    score: np.ndarray  # [tracks] in 0..1: how certainly it moves
-    rest: RestPoints  # of all tracks
-    moved: np.ndarray  # [paths] which tracks have a path
+    score: np.ndarray  # [tracks] in [0, 1], confidence that the point moves
+    rest: RestPoints  # static point that explains each track best
+    moved: np.ndarray  # [paths] tracks with a path
     paths: Paths
-    still: PointCloud
-    unusable: str  # why tracks say nothing of the motion; empty where they do
-    told: bool  # masks or tracks of what moves are the user's: no noise, however few
-    factor: int  # of the capture's pixels for one of these
-    left_out: str  # what is beyond the budget of work; empty if that was enough
+    still: PointCloud  # dense static points
+    unusable: str  # reason why tracking failed, or empty
+    told: bool  # masks or tracks are external, so that even few of them are trusted
+    factor: int  # by which images were downsampled
+    left_out: str  # parts skipped because of the budget, or empty
     seconds: Seconds
 
 
@@ -64,7 +64,7 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
     checksum.update(f"evidence {VERSION} {use_depths} {budget}".encode())
     images = capture.images
     checksum.update(f"{images.dtype}{(len(capture.train), *images.shape[1:])}".encode())
-    for row in capture.train:  # a copy of all of them could be most of the memory
+    for row in capture.train:  # one at a time, because a copy of all may be large
         checksum.update(np.ascontiguousarray(images[row]).data)
     parts = [capture.times, capture.train]
     parts += [np.asarray([capture.near, capture.far])]
@@ -96,13 +96,13 @@ def save(path: pathlib.Path, evidence: Evidence) -> None:
             arrays |= {f"{name}.{key}": value for key, value in part._asdict().items()}
         else:
             arrays[name] = np.asarray(part)
-    for side in ("forward", "backward"):  # exact: `gather` rounds to it
+    for side in ("forward", "backward"):  # exact, because `gather` rounds to float16
         arrays[f"flow.{side}"] = arrays[f"flow.{side}"].astype(np.float16)
     cache_files.write_arrays(path, arrays, _identity(path))
 
 
 def _identity(path):
-    """Identity of the record in a file, whose name differs for each capture."""
+    """Identity of a record, from the file name, which differs for each capture."""
     return f"evidence {VERSION} {path.stem}"
 
 

@@ -1,4 +1,4 @@
-"""Summary of preprocessing, in numbers and in words."""
+"""Summary of preprocessing, in numbers and as text."""
 
 from typing import NamedTuple
 
@@ -10,31 +10,32 @@ from nerfies_jax.preprocessing.usable_paths import scene_unit
 from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.preprocessing.watch import PARTS
 
-# Above it a path's depth is that of what stands around it; half of it is a good depth.
+# Relative deviation of the depth of a path above which its depth is that of its
+# surroundings. Below half of this the depth is accurate.
 UNCERTAIN = 0.3
-# Deviation of the depth of points at rest, as a share: the video has no parallax.
+# Relative deviation of the depth of static points above which there is no parallax.
 NO_PARALLAX = 0.3
-EXPLAINED = 0.01  # of the typical distance: a rigid group's paths are its motion
+EXPLAINED = 0.01  # error of the paths of a rigid group, relative to the scene distance
 
 
 class Summary(NamedTuple):
-    """Numbers about preprocessing, NaN where there is nothing to measure."""
+    """Numbers about preprocessing, NaN if there is nothing to measure."""
 
     frames: int
-    size: tuple[int, int]  # as looked at, px
+    size: tuple[int, int]  # after downsampling, px
     factor: int
-    carried: float  # share of the textured pixels whose flow can be trusted
+    carried: float  # share of the textured pixels with consistent flow
     moving: float  # share of the pixels
     tracks: int
     track_frames: float  # median length
     moving_tracks: int
     paths: int
-    path_deviation: float  # median, of a path's depth, as a share of it
-    rest_deviation: float  # median, of the depth of tracks at rest, as a share of it
-    points: int  # dense, at rest
+    path_deviation: float  # median relative deviation of the depth of paths
+    rest_deviation: float  # median relative deviation of the depth of static tracks
+    points: int  # dense static points
     groups: int  # of rigid motion
-    group_miss: float  # median, of the paths, as a share of the typical distance
-    seconds: float  # of the processor
+    group_miss: float  # median error of the paths, relative to the scene distance
+    seconds: float  # processor time
     unusable: str
 
 
@@ -80,7 +81,7 @@ def of(views: Views, evidence: Evidence) -> Summary:
 
 
 def lines(summary: Summary, evidence: Evidence) -> list[str]:
-    """Describe preprocessing in sentences.
+    """Describe preprocessing as text.
 
     Args:
       summary: The numbers.
@@ -90,56 +91,58 @@ def lines(summary: Summary, evidence: Evidence) -> list[str]:
       Lines of text.
     """
     width, height = summary.size
-    smaller = f", made {summary.factor} times smaller" if summary.factor > 1 else ""
+    smaller = f", downsampled {summary.factor} times" if summary.factor > 1 else ""
     parts = [
         f"{words} {seconds:.1f}"
         for words, seconds in zip(PARTS.values(), evidence.seconds, strict=True)
     ]
-    took = f"{summary.seconds:.0f} s of the processor: " + ", ".join(parts)
+    duration = f"{summary.seconds:.0f} s of processor time: " + ", ".join(parts)
     sentences = [
         f"{summary.frames} frames of {width}x{height}{smaller}",
-        f"{summary.carried:.0%} of the textured pixels can be carried to the next "
-        "frame",
+        f"{summary.carried:.0%} of the textured pixels have consistent flow to the "
+        "next frame",
     ]
     if evidence.left_out:
-        took += f"; left out, beyond the budget of work: {evidence.left_out}"
+        duration += f"; skipped, beyond the budget of work: {evidence.left_out}"
     if summary.unusable:
-        return [*sentences, took, f"nothing to follow: {summary.unusable}"]
+        return [*sentences, duration, f"motion is unknown: {summary.unusable}"]
     sentences += [
-        f"{summary.moving:.1%} of the pixels move by themselves",
-        f"{summary.tracks:,} tracks, seen in {summary.track_frames:.0f} frames "
-        f"(median); {summary.moving_tracks:,} of them move by themselves",
+        f"{summary.moving:.1%} of the pixels show moving objects",
+        f"{summary.tracks:,} tracks, visible in {summary.track_frames:.0f} frames "
+        f"(median); {summary.moving_tracks:,} of them on moving objects",
     ]
     if summary.paths:
-        sentences.append(f"{summary.paths:,} paths in space: {_depth_words(summary)}")
+        sentences.append(f"{summary.paths:,} 3D paths: {_depth_text(summary)}")
         sentences.append(
             f"{summary.groups} group(s) of rigid motion explain the paths to "
-            f"{summary.group_miss:.1%} of the distance"
+            f"{summary.group_miss:.1%} of the scene distance"
         )
-    sentences.append(f"{summary.points:,} dense points at rest{_rest_words(summary)}")
-    sentences.append(took)
+    sentences.append(f"{summary.points:,} dense static points{_static_text(summary)}")
+    sentences.append(duration)
     if not summary.paths:
-        sentences.append("nothing to follow: no track moves by itself for long enough")
+        sentences.append(
+            "motion is unknown: no track of a moving object is long enough"
+        )
     return sentences
 
 
-def _depth_words(summary):
+def _depth_text(summary):
     share = summary.path_deviation
     if share > UNCERTAIN:
         return (
-            "the film does not tell their depth (the camera gives no parallax, or "
-            "moves at the pace of the things); it is that of what stands around"
+            "their depth cannot be estimated (the camera has no parallax, or moves "
+            "like the objects), so the depth of their surroundings is used"
         )
-    sure = "certain" if share < UNCERTAIN / 2 else "rough"
-    return f"their depth is {sure}, to {share:.1%} (median)"
+    quality = "accurate" if share < UNCERTAIN / 2 else "rough"
+    return f"their depth is {quality}, to {share:.1%} (median)"
 
 
-def _rest_words(summary):
+def _static_text(summary):
     if summary.rest_deviation > NO_PARALLAX:
-        return ": the camera gives no parallax, so no depth can be told"
+        return ": their depth is unknown, because the camera has no parallax"
     if not np.isfinite(summary.rest_deviation):
-        return "; no track stands still"
-    return f"; the depth of tracks at rest is known to {summary.rest_deviation:.1%}"
+        return "; there are no static tracks"
+    return f"; the depth of static tracks is accurate to {summary.rest_deviation:.1%}"
 
 
 def _median(values):

@@ -92,7 +92,7 @@ def depth(given: Given, views: Views) -> np.ndarray | None:
       views: The frames.
 
     Returns:
-      Depth at its own scale [frames, height, width], NaN where unknown, None if there
+      Depth at its original scale [frames, height, width], NaN if unknown. None if there
       is none.
     """
     if given.depth is None:

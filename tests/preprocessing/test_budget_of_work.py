@@ -65,11 +65,11 @@ def test_a_busy_machine_finds_the_same(monkeypatch):
 def test_what_is_beyond_the_budget_is_kept_and_stated(tmp_path, once, capsys):
     capture, log = moving_film(preprocessing=LITTLE), []
     hasty = record.cached(capture, tmp_path, tell=log.append)
-    assert "left out, beyond the budget of work: dense points at rest" in log
+    assert "skipped, beyond the budget of work: dense static points" in log
     assert not len(hasty.still.position)
     assert "half of the tracks" in hasty.left_out
     said = capsys.readouterr().err
-    assert said.count("Preprocessing left out half of the tracks") == 1
+    assert said.count("Preprocessing skipped half of the tracks") == 1
     assert record.notes_on(capture, tmp_path) == [record.left_out_note(hasty)]
     true = capture.moving[hasty.row]
     assert (hasty.moving & true).sum() / (hasty.moving | true).sum() > 0.6
@@ -78,7 +78,7 @@ def test_what_is_beyond_the_budget_is_kept_and_stated(tmp_path, once, capsys):
     assert not capsys.readouterr().err
     record._told_of.clear()
     record.cached(capture, tmp_path)
-    assert "Preprocessing left out" in capsys.readouterr().err
+    assert "Preprocessing skipped" in capsys.readouterr().err
     assert len(once) == 1
     # A larger budget is another record, from which nothing is missing.
     whole = record.cached(moving_film(), tmp_path)
@@ -93,7 +93,7 @@ def test_a_run_records_what_was_left_out(tmp_path):
     kind = representations.named("gaussians")
     spec = kind.presets["splats-static"]
     opened = run.Run(RunConfig(), capture, capture, kind, spec, None, None)
-    for left_out in ((), ("Preprocessing left out half of the tracks.",)):
+    for left_out in ((), ("Preprocessing skipped half of the tracks.",)):
         run.save_config(tmp_path, opened, left_out)
         notes = [*products._capture_notes(opened, tmp_path)]
         assert notes == ["of the reader", *left_out]
@@ -104,7 +104,7 @@ def test_a_folder_that_cannot_be_written_costs_the_next_command_alone(tmp_path, 
     capture, log = moving_film(), []
     (tmp_path / "file").touch()
     first = record.cached(capture, tmp_path / "file", tell=log.append)
-    assert "not kept for the next time" in log[-1]
+    assert "could not be cached" in log[-1]
     same(record.cached(capture, tmp_path / "file"), first)
     assert len(once) == 1
 
@@ -141,8 +141,8 @@ def test_pieces_begin_while_their_share_of_the_budget_is_left():
     assert not budget.has_room(0.9, "another", 0.0)
     assert budget.left_out == "pieces, another"
     assert said == [
-        "left out, beyond the budget of work: pieces",
-        "left out, beyond the budget of work: another",
+        "skipped, beyond the budget of work: pieces",
+        "skipped, beyond the budget of work: another",
     ]
     with pytest.raises(ValueError, match=r"work=0\.0 must be positive"):
         watch.Watch(said.append, 0.0)

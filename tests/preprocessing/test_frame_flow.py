@@ -38,4 +38,4 @@ def test_cameras_of_one_frame_have_no_flow_and_a_note_says_so():
     capture = dataclasses.replace(capture, camera_ids=np.arange(3, dtype=np.int32))
     found = frame_flow.with_flow(capture)
     assert not found.flow.forward_seen.any()
-    assert found.notes[-1].startswith("no optical flow: no camera has two frames")
+    assert found.notes[-1].startswith("no optical flow: no camera has two training")

@@ -41,7 +41,7 @@ def test_masks_are_the_evidence_s_at_the_size_of_the_pictures(factor, monkeypatc
             expected = evidence.moving[(frame, *small)]
             assert capture.moving[row, line, column] == expected
     assert not capture.moving[bare.heldout].any()
-    assert "masks of what moves found in the pictures" in capture.notes[-1]
+    assert "masks of moving objects were computed from" in capture.notes[-1]
 
 
 def test_a_film_that_cannot_be_followed_stays_without_masks(monkeypatch):

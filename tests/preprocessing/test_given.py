@@ -185,9 +185,11 @@ def refused(refusal, **files):
 
 def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
     path, points = tapir(tmp_path / "t.npz", visibles=np.zeros((16, 24), bool))
-    refused(r"t\.npz: 0 of 0 places .* save their width and height", tracks=path)
+    refused(
+        r"t\.npz: 0 of 0 visible positions .* add their width and height", tracks=path
+    )
     tapir(path, tracks=points.pixel * 9)
-    refused(r"at least half must", tracks=path)
+    refused(r"at least half must be", tracks=path)
     tapir(path, tracks=points.pixel[:, :7], visibles=points.seen[:, :7])
     refused(r"tracks of 7 frames|tracks of 16 frames", tracks=path)
     np.savez(path, points=points.pixel)
@@ -195,19 +197,19 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
     path.write_bytes(b"cut short")
     refused(r"not a readable npz", tracks=path)
     refused(r"no such folder of masks", masks=tmp_path / "nowhere")
-    refused(r"no file that ends in \.png", masks=tmp_path)
+    refused(r"contains no masks \(\.png", masks=tmp_path)
     images.write_png(tmp_path / "0.png", np.zeros((72, 96), bool))
-    refused(r"masks of 1 frames; the capture has 24, 24 of them", masks=tmp_path)
+    refused(r"masks of 1 frames, but the capture has 24 frames", masks=tmp_path)
     for row in range(24):
         images.write_png(tmp_path / f"{row}.png", np.ones((72, 96), bool))
     refused(r"no black pixel in any mask \(the one value 255\)", masks=tmp_path)
     depths = tmp_path / "d.npz"
     np.savez(depths, depths=np.ones((24, 72, 72)))
-    refused(r"a depth of 72x72 pixels for pictures of 96x72", depths=depths)
+    refused(r"a depth of 72x72 pixels for images of 96x72", depths=depths)
     np.savez(depths, depths=np.zeros((24, 72, 96)))
-    refused(r"no depth above zero", depths=depths)
+    refused(r"no positive depth", depths=depths)
     np.savez(depths, forward=np.zeros((23, 72, 96, 2)))
-    refused(r"no 'backward'; flow is needed both ways", flow=depths)
+    refused(r"no 'backward' flow; both directions are needed", flow=depths)
     for side, sizes in (("forward", [(3, 2), (3, 4)]), ("backward", [(3, 2)] * 2)):
         (tmp_path / "flow" / side).mkdir(parents=True)
         for number, size in enumerate(sizes):
@@ -216,13 +218,13 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
             )
             pixels = np.zeros(2 * size[0] * size[1], np.float32).tobytes()
             (tmp_path / "flow" / side / f"{number}.flo").write_bytes(head + pixels)
-    refused(r"1\.flo: 3x4 pixels, but 0\.flo is of 3x2", flow=tmp_path / "flow")
+    refused(r"1\.flo: 3x4 pixels, but 0\.flo has 3x2", flow=tmp_path / "flow")
     bent = films.film(**MOVES, frames=24)
     bent.cameras.radial[:, 0] = 0.1
     refused(r"undistort the capture first", capture=bent, tracks=path)
     rng = np.random.default_rng(0)
     np.savez(depths, depths=rng.uniform(0.1, 9, (24, 72, 96)))
-    with pytest.raises(ValueError, match=r"miss the points at rest"):
+    with pytest.raises(ValueError, match=r"differ from the static points"):
         record.gather(with_files(depths=depths))
 
 

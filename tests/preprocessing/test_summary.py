@@ -64,21 +64,21 @@ def test_words_say_what_there_is_and_what_cannot_be_told():
     counted = summary.of(views_of(capture), evidence)
     text = "\n".join(summary.lines(counted, evidence))
     assert counted.groups == 1
-    assert "their depth is certain" in text
-    assert "nothing to follow" not in text
+    assert "their depth is accurate" in text
+    assert "motion is unknown" not in text
     held = films.film(card=MOVES["card"], camera=lambda t: (0.0, 0.0, 0.0), frames=24)
     evidence = record.gather(held)
     counted = summary.of(views_of(held), evidence)
     text = "\n".join(summary.lines(counted, evidence))
-    assert "gives no parallax, so no depth can be told" in text
+    assert "is unknown, because the camera has no parallax" in text
     assert counted.paths > 20
-    assert "the film does not tell their depth" in text
+    assert "their depth cannot be estimated" in text
     none = evidence._replace(
         moved=np.zeros(0, int),
         paths=type(evidence.paths)(*(p[:0] for p in evidence.paths)),
     )
     text = summary.lines(summary.of(views_of(held), none), none)
-    assert text[-1].startswith("nothing to follow: no track")
+    assert text[-1].startswith("motion is unknown: no track")
 
 
 def test_the_sheet_shows_what_moves_and_its_tracks():

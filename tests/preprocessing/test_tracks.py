@@ -442,5 +442,5 @@ def test_jumping_views_and_short_films_say_why_they_are_of_no_use():
     jumps = films.film(
         card=MOVES["card"], camera=lambda t: (3 * np.sin(400 * t), 0.0, 0.0), frames=12
     )
-    assert "the camera jumps" in record.gather(jumps).unusable
+    assert "the camera motion is discontinuous" in record.gather(jumps).unusable
     assert "too few" in record.gather(films.film(**MOVES, frames=4)).unusable
