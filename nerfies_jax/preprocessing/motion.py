@@ -14,23 +14,22 @@ from nerfies_jax.preprocessing.findings import MOTION as EFFECT
 from nerfies_jax.preprocessing.record import MOVES, Evidence
 from nerfies_jax.preprocessing.view_set import Views
 
-# Share of tracks over all frames. Static built-in scenes have 0.03 %, and those with
-# the least motion 4 %.
+# Share of moving tracks over all frames. Static built-in scenes have 0.03 %, and those
+# with the least motion 4 %.
 MOVING_SHARE = 0.005
-FALSE_SHARE = 0.001  # standard error: three times what still scenes leave
-# Where points at rest are missed by more than this, slow motion hides in it and "no"
-# cannot be said; and what cameras are off by passes for motion in some tracks, as the
-# square of it.
+FALSE_SHARE = 0.001  # standard error, three times the share in static scenes
+# Reprojection error of static points above which slow motion cannot be excluded. Camera
+# errors also make some static tracks look moving, proportional to their square.
 CALM_PX = 0.75
-# Pixels that could not be tracked may still differ from the static scene: "no" needs a
-# small mask. Static videos have up to 0.8 % (`static` at 112x84 and 40 frames).
+# "No" requires a small mask, because pixels that cannot be tracked may move. Static
+# videos have up to 0.8 % (`static` at 112x84 and 40 frames).
 MASKED_FOR_NO = 0.01
-# And nearly all of the textured pixels carried on, in videos of some length.
+# "No" also requires consistent flow for most textured pixels, and enough frames.
 CARRIED_FOR_NO, MIN_FOR_NO = 0.8, 9
 
 
 def motion(views: Views, evidence: Evidence) -> Finding:
-    """Decide whether anything moves.
+    """Decide if anything moves.
 
     Args:
       views: The frames.
@@ -42,8 +41,8 @@ def motion(views: Views, evidence: Evidence) -> Finding:
     if np.ptp(views.time) == 0:
         return Finding(
             EFFECT,
-            "all frames have the same time: a motion has nothing to depend on",
-            "two times",
+            "all frames have the same timestamp",
+            "two timestamps",
             False,
             CERTAIN,
         )
@@ -59,7 +58,7 @@ def motion(views: Views, evidence: Evidence) -> Finding:
 
 
 def _threshold():
-    return f"{MOVING_SHARE:.1%} of what tracks see"
+    return f"{MOVING_SHARE:.1%} of the tracks"
 
 
 def _by_tracks(views, evidence):
@@ -77,9 +76,9 @@ def _by_tracks(views, evidence):
         "noise_px": noise,
     }
     measurement = (
-        f"{share:.1%} of what tracks see (up to {shares.max():.1%} of a frame) and "
-        f"{masked:.1%} of the pixels move as no still point does; tracks at rest are "
-        f"explained to {noise:.2f} px"
+        f"{share:.1%} of the tracks (up to {shares.max():.1%} in a frame) and "
+        f"{masked:.1%} of the pixels are on moving objects; static tracks have a "
+        f"reprojection error of {noise:.2f} px"
     )
     if lost is not None:
         measurement += f"; {lost}"
@@ -87,8 +86,9 @@ def _by_tracks(views, evidence):
     if speed:
         numbers |= speed
         measurement += (
-            f"; {speed['speed_px']:.2g} px ({speed['speed_units']:.2g} scene units) a "
-            f"frame in the median, {speed['speed_px_fast']:.2g} px the fastest tenth"
+            f"; median speed {speed['speed_px']:.2g} px ({speed['speed_units']:.2g} "
+            f"scene units) per frame, {speed['speed_px_fast']:.2g} px for the fastest "
+            "tenth"
         )
     return Finding(EFFECT, measurement, _threshold(), wanted, confidence, numbers)
 
@@ -138,15 +138,15 @@ def rest_noise(evidence: Evidence) -> float:
 def _why_not_no(views, evidence, noise):
     """Reason why motion may exist undetected, or None if it would be detected."""
     if noise > CALM_PX:
-        return f"above {CALM_PX:g} px slow motion would not show"
+        return f"above {CALM_PX:g} px, slow motion cannot be detected"
     frames = len(views.row)
     if frames < MIN_FOR_NO:
-        return f"what moves far between {frames} frames cannot be followed"
+        return f"fast motion cannot be tracked in {frames} frames"
     kept = record.carried(views, evidence.flow)
     if kept < CARRIED_FOR_NO:
-        return f"what is fast may be among the {1 - kept:.0%} that cannot be followed"
+        return f"fast objects may be in the {1 - kept:.0%} of pixels without flow"
     if evidence.moving.mean() > MASKED_FOR_NO:
-        return "what looks unlike the still scene may be too fast to be followed"
+        return "pixels that differ from the static scene may be too fast for tracking"
     return None
 
 

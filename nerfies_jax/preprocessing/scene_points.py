@@ -19,14 +19,15 @@ from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.preprocessing.still_points import CENTERS, REACH
 from nerfies_jax.preprocessing.view_set import MIN_POINTS, Views
 
-CELLS = (8, 6)  # across and down: an image is covered where a cell holds a point
-COVERED = 0.5  # of the cells that show anything
-# A point that a following frame's flow misses by so much is not where it should be.
-# Pixels of images made small; more of larger ones.
+CELLS = (8, 6)  # columns and rows. A cell is covered if it contains a point.
+COVERED = 0.5  # share of the cells with observed pixels
+# Maximum distance of a static point from its track: pixels of reduced images, more in
+# larger images, and standard deviations.
 AGREES_PX, AGREES_DEVIATIONS = 3.0, 4.0
-LEAST_FOLLOWED = 4  # frames that a point is followed to; fewer in shorter videos
-LEAST_MOVING = 0.005  # of a frame's pixels: still scenes have up to 0.4 % marked
-DEPTH_KNOWN, DEPTH_AGREES = 0.05, 0.2  # shares of a depth: its deviation, its bound
+LEAST_FOLLOWED = 4  # frames that a point is tracked to, fewer in shorter videos
+LEAST_MOVING = 0.005  # of the pixels of a frame. Static scenes have up to 0.4 %.
+# Maximum relative deviation of a known depth, and bound of its relative difference.
+DEPTH_KNOWN, DEPTH_AGREES = 0.05, 0.2
 STILL_SHARE = 0.8  # of the points that can be checked
 
 
@@ -103,7 +104,7 @@ def _looked_from(views):
 def start(
     capture: Capture, views: Views, evidence: Evidence, points: np.ndarray
 ) -> Finding:
-    """Decide whether the capture's points are enough to initialize Gaussians.
+    """Decide if the points of the capture are sufficient to initialize Gaussians.
 
     Args:
       capture: The capture.
@@ -114,31 +115,31 @@ def start(
     Returns:
       The finding.
     """
-    threshold = f"{MIN_POINTS} points that cover {COVERED:.0%} of the pictures"
+    threshold = f"{MIN_POINTS} points that cover {COVERED:.0%} of the images"
     count = 0 if capture.points is None else len(capture.points.position)
     if count == 0:
-        measurement = "the capture has no points: Gaussians start at random"
+        measurement = "the capture has no points: Gaussians are initialized at random"
         return Finding(START, measurement, threshold, False, CERTAIN, {"points": 0.0})
     covered = coverage(views, points)
     inside = moving_coverage(views, evidence, points)
     enough = judge(count, MIN_POINTS, np.sqrt(count))
     spread = judge(covered, COVERED, 0.02)
-    # Both must hold; the less sure of two that agree, and whichever refuses.
+    # Both conditions must hold. The confidence is that of the less certain one.
     wanted, confidence = min(
         (enough, spread), key=lambda one: (one[0] is not False, one[1] == CERTAIN)
     )
     measurement = (
-        f"{count} points in {covered:.0%} of the pictures' {CELLS[0]}x{CELLS[1]} cells"
+        f"{count} points in {covered:.0%} of the {CELLS[0]}x{CELLS[1]} cells of images"
     )
     numbers = {"points": float(count), "covered_share": covered}
     if np.isfinite(inside):
         numbers["moving_covered_share"] = float(inside)
-        measurement += f", and on what moves in {inside:.0%} of its cells"
+        measurement += f", and in {inside:.0%} of the cells with moving objects"
     return Finding(START, measurement, threshold, wanted, confidence, numbers)
 
 
 def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
-    """Decide whether the capture's points are static, as the background prior needs.
+    """Decide if the points of the capture are static, as the background prior needs.
 
     Args:
       views: The frames.
@@ -148,7 +149,7 @@ def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
     Returns:
       The finding.
     """
-    threshold = f"{STILL_SHARE:.0%} of them within {AGREES_PX:g} px of the film's paths"
+    threshold = f"{STILL_SHARE:.0%} of the points within {AGREES_PX:g} px of tracks"
     if not len(points):
         measurement = "the capture has no points"
         return Finding(BACKGROUND, measurement, threshold, False, CERTAIN)
@@ -162,17 +163,17 @@ def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
     if count < MIN_POINTS:
         return cannot_tell(
             BACKGROUND,
-            f"{len(points)} points, but only {count} on pixels that can be followed",
+            f"{len(points)} points, but only {count} on pixels that can be tracked",
             threshold,
         )
-    # A point is where it should be if most frames say so: rims make single ones err.
+    # A point is static if most frames agree, because single frames may err at edges.
     share = float((agree[seen > 0] > 0.5 * seen[seen > 0]).mean())
-    # On what strays, not on what stays: 1 % and 2 % astray differ by a factor of two.
+    # Judged by the moving share, whose values 1 % and 2 % differ by a factor of two.
     moved, confidence = judge(
         1 - share, 1 - STILL_SHARE, np.sqrt(share * (1 - share) / count)
     )
     wanted = None if moved is None else not moved
-    measurement = f"{share:.1%} of {count} points stay with the film's paths"
+    measurement = f"{share:.1%} of {count} points agree with the tracks"
     numbers = {"still_share": share}
     return Finding(BACKGROUND, measurement, threshold, wanted, confidence, numbers)
 

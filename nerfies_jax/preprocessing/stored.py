@@ -1,4 +1,4 @@
-"""Findings about the data of a capture, and its usefulness: depth, masks, lens."""
+"""Findings about depth, masks and lens distortion stored with a capture."""
 
 import jax
 import jax.numpy as jnp
@@ -22,17 +22,17 @@ from nerfies_jax.preprocessing.record import MOVES, Evidence
 from nerfies_jax.preprocessing.tracks import pixel_of
 from nerfies_jax.preprocessing.view_set import MIN_POINTS, Views
 
-KNOWN_SHARE = 0.2  # of the pixels: fewer depths are points
-DEPTH_ERROR = 0.1  # median share that depth is off what parallax says
-DEPTH_SURE = 0.03  # deviation of a depth from parallax, to be compared with
-MISSED_SHARE = 0.3  # of what is seen to move may lie outside a mask
-MIN_MOVING = 200  # sightings of tracks, over all frames
-LENS_PX = 0.5  # half a pixel is what cameras are known to
-GRID = 9  # pixels across and down where a lens is asked
+KNOWN_SHARE = 0.2  # minimum share of pixels with depth
+DEPTH_ERROR = 0.1  # maximum of the median relative error compared with parallax
+DEPTH_SURE = 0.03  # maximum relative deviation of a depth from parallax for comparison
+MISSED_SHARE = 0.3  # maximum share of moving tracks outside the masks
+MIN_MOVING = 200  # observations of moving tracks, over all frames
+LENS_PX = 0.5  # typical accuracy of cameras
+GRID = 9  # pixels in each direction at which distortion is evaluated
 
 
 def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
-    """Decide whether the capture's depth agrees with parallax, up to one scale.
+    """Decide if the depth of the capture agrees with parallax, up to one scale.
 
     Args:
       capture: The capture.
@@ -42,27 +42,27 @@ def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
     Returns:
       The finding.
     """
-    threshold = f"{KNOWN_SHARE:.0%} of the pixels, off parallax by {DEPTH_ERROR:.0%}"
+    threshold = f"{KNOWN_SHARE:.0%} of the pixels, with an error of {DEPTH_ERROR:.0%}"
     if capture.depths is None:
         return Finding(DEPTH, "the capture has none", threshold, False, CERTAIN)
     pictures = capture.depths[views.row]
     share = float((pictures > 0).mean())
     if share < KNOWN_SHARE:
-        measurement = f"depth on {share:.1%} of the pixels"
+        measurement = f"depth for {share:.1%} of the pixels"
         return Finding(DEPTH, measurement, threshold, False, CERTAIN, {"share": share})
     ratio = _over_parallax(pictures, views, evidence)
     if len(ratio) < MIN_POINTS:
         return cannot_tell(
             DEPTH,
-            f"depth on {share:.1%} of the pixels, and no parallax to check it by",
+            f"depth for {share:.1%} of the pixels, but no parallax to check it",
             threshold,
         )
     scale = float(np.median(ratio))
     error = float(np.median(np.abs(ratio / scale - 1)))
     wrong, confidence = judge(error, DEPTH_ERROR, 0.0)
     measurement = (
-        f"depth on {share:.1%} of the pixels, {error:.1%} off parallax in the median "
-        f"once scaled by {1 / scale:.3g}"
+        f"depth for {share:.1%} of the pixels, with a median error of {error:.1%} "
+        f"compared with parallax, after scaling by {1 / scale:.3g}"
     )
     numbers = {"share": share, "error_share": error, "scale": 1 / scale}
     wanted = None if wrong is None else not wrong
@@ -70,7 +70,7 @@ def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
 
 
 def _over_parallax(pictures, views, evidence):
-    """[sightings] stored depth over that of the points of tracks at rest."""
+    """Return the ratios of stored depth to the depth of static tracks."""
     still = np.flatnonzero((evidence.score < AT_REST) & (not evidence.unusable))
     tracks, rest = evidence.tracks.take(still), evidence.rest.take(still)
     sure = still_points.depth_deviation(views, tracks, rest) < DEPTH_SURE
@@ -82,7 +82,7 @@ def _over_parallax(pictures, views, evidence):
 
 
 def masks(capture: Capture, evidence: Evidence) -> Finding:
-    """Decide whether the capture's masks contain the observed motion.
+    """Decide if the masks of the capture contain the observed motion.
 
     Args:
       capture: The capture.
@@ -91,7 +91,7 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
     Returns:
       The finding.
     """
-    threshold = f"at most {MISSED_SHARE:.0%} of what is seen to move outside them"
+    threshold = f"at most {MISSED_SHARE:.0%} of the moving tracks outside the masks"
     if capture.moving is None:
         return Finding(MASKS, "the capture has none", threshold, False, CERTAIN)
     moving = capture.moving[evidence.row]
@@ -105,7 +105,7 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
     if seen < MIN_MOVING:
         return cannot_tell(
             MASKS,
-            f"{measurement}, and too little seen to move to check them",
+            f"{measurement}, but too few moving tracks to check them",
             threshold,
         )
     row, column = pixel_of(tracks.pixel, moving.shape[1:])
@@ -115,7 +115,7 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
     error = np.sqrt(part * (1 - part) / frames)
     wrong, confidence = judge(part, MISSED_SHARE, float(error))
     wanted = None if wrong is None else not wrong
-    measurement += f"; {part:.1%} of what is seen to move lies outside"
+    measurement += f"; {part:.1%} of the moving tracks are outside"
     return Finding(
         MASKS, measurement, threshold, wanted, confidence, numbers | {"missed": part}
     )
@@ -150,7 +150,7 @@ def lens(capture: Capture) -> Finding:
         moved = np.linalg.norm((np.asarray(bent) - slope) * focal, axis=-1)
         worst = max(worst, float(moved.max()))
     wanted, confidence = judge(worst, LENS_PX, 0.0)
-    measurement = f"the lens moves pixels by up to {worst:.2g} px"
+    measurement = f"lens distortion displaces pixels by up to {worst:.2g} px"
     if wanted:
-        measurement += "; it is modeled in training and in what is scored"
+        measurement += "; training and evaluation model it"
     return Finding(LENS, measurement, threshold, wanted, confidence, {"most_px": worst})

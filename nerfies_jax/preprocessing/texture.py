@@ -1,4 +1,4 @@
-"""Detail of the texture, in bands of a positional encoding."""
+"""Detail of the texture, as a number of bands of a positional encoding."""
 
 import math
 
@@ -11,9 +11,9 @@ from nerfies_jax.preprocessing.findings import CERTAIN, LIKELY, Finding, cannot_
 from nerfies_jax.preprocessing.findings import TEXTURE as EFFECT
 from nerfies_jax.preprocessing.view_set import Views
 
-SMALL = 8  # of the fields' small presets
-ENERGY = 0.95  # of the slopes' energy lies in coarser detail than "the finest"
-SHOWN = 8  # frames whose spectrum is taken
+SMALL = 8  # bands of the small presets of radiance fields
+ENERGY = 0.95  # share of the gradient energy below the highest relevant frequency
+SHOWN = 8  # frames whose spectra are computed
 
 
 def bands_for(cycles_per_unit: float) -> int:
@@ -42,7 +42,7 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
     Returns:
       The finding.
     """
-    threshold = f"{SMALL} bands, as the fields' small presets have"
+    threshold = f"{SMALL} bands, as in the small presets of radiance fields"
     seen = [one for one in _shown(views) if views.valid[one].mean() > 0.5]
     if not seen:
         return cannot_tell(
@@ -56,7 +56,8 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
     bands = bands_for(per_unit)
     evidence = (
         f"{ENERGY:.0%} of the detail is coarser than {1 / cycles:.1f} px at 1/{factor} "
-        f"of the size, {1 / per_unit:.3g} of a field's half-side: {bands} bands"
+        f"of the size, which is {1 / per_unit:.3g} of the half-side of a field: "
+        f"{bands} bands"
     )
     numbers = {"finest_px": 1 / cycles * factor, "bands": float(bands)}
     sure = CERTAIN if abs(bands - SMALL) > 1 else LIKELY
@@ -68,9 +69,9 @@ def _shown(views):
 
 
 def _finest(gray):
-    """Cycles a pixel below which `ENERGY` of the slopes' energy lies, less the noise.
+    """Return the cycles per pixel below which `ENERGY` of the gradients lie.
 
-    Noise is white, and what there is at the highest frequencies is taken for it.
+    Noise, which is assumed to be white, is estimated at the highest frequencies.
     """
     height, width = gray.shape
     window = np.hanning(height)[:, None] * np.hanning(width)

@@ -39,7 +39,7 @@ LOCAL_PX = 12  # deviation of the local mean
 
 
 def transient(views: Views, evidence: Evidence) -> Finding:
-    """Decide whether large parts of images appear and disappear from frame to frame.
+    """Decide if large parts of images appear and disappear from frame to frame.
 
     Args:
       views: The frames.
@@ -49,8 +49,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
       The finding.
     """
     threshold = (
-        f"{GONE_SHARE:.0%} of a picture found nowhere near in the next, "
-        f"{MIN_TIMES} times"
+        f"{GONE_SHARE:.0%} of an image missing in the next frame, {MIN_TIMES} times"
     )
     if evidence.unusable:
         return cannot_tell(EFFECT, evidence.unusable, threshold)
@@ -59,8 +58,8 @@ def transient(views: Views, evidence: Evidence) -> Finding:
     if apart > MOST_APART:
         return cannot_tell(
             EFFECT,
-            f"{apart:.0%} of the neighboring frames are too far apart to tell what "
-            "goes from what is passed by",
+            f"{apart:.0%} of the neighboring frames are too different to detect "
+            "objects that disappear",
             threshold,
         )
     gone = gone[carried >= LEAST_CARRIED]
@@ -74,13 +73,13 @@ def transient(views: Views, evidence: Evidence) -> Finding:
     if wanted is False and not _always_there(evidence):
         return cannot_tell(
             EFFECT,
-            "nothing comes or goes at once, but what moves is there in less than half "
-            "of the frames",
+            "nothing appears or disappears abruptly, but moving objects are visible in "
+            "less than half of the frames",
             threshold,
         )
     measurement = (
-        f"between {times} of {len(gone)} pairs of frames parts of the picture come or "
-        f"go (most: {worst[0]:.1%} of the pixels; usual: {usual:.2%})"
+        f"parts of the image appear or disappear in {times} of {len(gone)} pairs of "
+        f"frames (at most {worst[0]:.1%} of the pixels, usually {usual:.2%})"
     )
     numbers = {
         "times": float(times),

@@ -1,4 +1,4 @@
-"""Paths for the initialization of motion: those that are known long enough."""
+"""Selection of 3D paths for the initialization of motion."""
 
 import warnings
 from typing import NamedTuple
@@ -11,18 +11,18 @@ from nerfies_jax.preprocessing import record
 from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.training.track_start import TrackStartSpec
 
-LEAST_SEEN = 6  # frames in which a path is known
+LEAST_SEEN = 6  # minimum number of frames in which a path is known
 LEAST_PATHS = 12
-LEAST_MOVING = 0.005  # of the pixels: videos of still scenes have up to 0.4 % marked
-MARKED = 0.01  # of the pixels: from here on something moves, followed or not
+LEAST_MOVING = 0.005  # of the pixels. In static videos, up to 0.4 % are marked.
+MARKED = 0.01  # of the pixels. Above this something moves, even if not tracked.
 
 
 class KnownPaths(NamedTuple):
     """Positions of moving points over the frames of preprocessing."""
 
-    position: np.ndarray  # [paths, frames, 3] scene units; any value where not known
+    position: np.ndarray  # [paths, frames, 3] scene units, arbitrary if not known
     known: np.ndarray  # [paths, frames] bool
-    depth_deviation: np.ndarray  # [paths] as a share of the depth
+    depth_deviation: np.ndarray  # [paths] relative to the depth
 
 
 def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence | None:
@@ -33,7 +33,7 @@ def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence 
       start: Settings of the initialization.
 
     Returns:
-      The results. None if `start` does not ask for tracks, or if they are unusable,
+      The results. None if `start` does not request tracks, or if they are unusable,
       which a warning reports.
     """
     if start.motion != "tracks":
@@ -43,10 +43,9 @@ def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence 
     if not reason:
         return evidence
     warnings.warn(
-        f"{capture.path or capture.name}: the motion starts from rest, for tracks are "
-        f"of no use here: {reason}; what moves by more than a few pixels will not be "
-        "found. It moves from the first step on, with all bands open, and a field's "
-        "warp learns slowly: start.motion=none gives the preset's own schedule back",
+        f"{capture.path or capture.name}: the motion is initialized as static, because "
+        f"tracks cannot be used: {reason}; motion of more than a few pixels may not be "
+        "learned. start.motion=none restores the schedule of the preset without tracks",
         RuntimeWarning,
         stacklevel=2,
     )
@@ -65,15 +64,15 @@ def unusable(evidence: Evidence) -> str:
     if evidence.unusable:
         return evidence.unusable
     if not evidence.told and evidence.moving.mean() < LEAST_MOVING:
-        return f"only {evidence.moving.mean():.1%} of the pixels move by themselves"
+        return f"only {evidence.moving.mean():.1%} of the pixels show moving objects"
     count = len(known_paths(evidence).known)
     if count < LEAST_PATHS:
-        return f"only {count} tracks of what moves are long enough to fit a motion to"
+        return f"only {count} tracks of moving objects are long enough to fit a motion"
     return ""
 
 
 def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
-    """Return whether nothing moves: a single time, or only static tracks.
+    """Test if the scene is static: it has a single time, or only static tracks.
 
     Args:
       evidence: Preprocessing.
@@ -84,7 +83,7 @@ def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
     """
     if np.ptp(times[evidence.row]) == 0:
         return True
-    # More that is marked and cannot be followed may be too fast for that.
+    # If more pixels are marked, objects may be too fast to be tracked.
     unmarked = not evidence.told and float(evidence.moving.mean()) < MARKED
     return bool(unmarked and not evidence.unusable and unusable(evidence))
 

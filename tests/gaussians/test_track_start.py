@@ -279,7 +279,7 @@ def test_a_film_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypat
     capture = dataclasses.replace(capture, points=points)
     spec = small_scene(start=StartSpec(motion="tracks"))
     model = scene.build(spec, scene.metadata_of(capture))
-    with pytest.warns(RuntimeWarning, match="of the pixels move by themselves"):
+    with pytest.warns(RuntimeWarning, match="of the pixels show moving objects"):
         state = model.init(capture, jax.random.key(0))
     # What might move has points of no other kind: random ones.
     active = splats.active_mask(state.params.rows["splats"]).sum()

@@ -34,8 +34,8 @@ def noisy():
     ("make", "preset", "words"),
     [
         (lambda: films.film(**MOVES, frames=24), "splats-tracked-small", ""),
-        (lambda: films.film(frames=24), "splats-static-small", "move by themselves"),
-        (noisy, UNTRACKED, "only 0 tracks of what moves"),
+        (lambda: films.film(frames=24), "splats-static-small", "show moving objects"),
+        (noisy, UNTRACKED, "only 0 tracks of moving objects"),
     ],
 )
 def test_motion_is_chosen_by_what_tracks_say(make, preset, words):
@@ -51,7 +51,7 @@ def test_what_moves_and_cannot_be_followed_is_no_still_scene(monkeypatch):
     monkeypatch.setattr(usable_paths, "LEAST_PATHS", 10**6)
     choice = representation.default_preset(films.film(**MOVES, frames=24))
     assert choice.preset == UNTRACKED
-    assert "are long enough to fit a motion to" in "".join(choice.notes)
+    assert "are long enough to fit a motion" in "".join(choice.notes)
 
 
 @pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (8, ())])
