@@ -1,7 +1,7 @@
 """Errors of preprocessing against the ground truth of a synthetic scene.
 
-Ground truth points are followed from where they are first visible, by the computed
-flow, realigned, and placed in space, like the tracks of preprocessing.
+Ground truth points are tracked from the frame in which they are first visible by the
+computed flow, realigned, and reconstructed in 3D, like the tracks of preprocessing.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.usable_paths import scene_unit
 
-LATER = 24  # frames after which a track is held against the truth
+LATER = 24  # frames after which a track is compared with the ground truth
 
 
 class TruePoints(NamedTuple):
@@ -29,13 +29,13 @@ class TruePoints(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Errors of masks, tracks and paths, NaN where there is nothing to measure."""
+    """Errors of masks, tracks and paths, NaN if there is nothing to measure."""
 
-    mask_iou: float  # of what moves
-    false_share: float  # of all pixels, marked as moving and at rest
+    mask_iou: float  # of moving pixels
+    false_share: float  # share of all pixels that are static but marked as moving
     track_px: float  # median after `LATER` frames
-    track_lost: float  # share of the points still to be seen then that are lost
-    path_error: float  # median, as a share of the typical distance
+    track_lost: float  # share of lost tracks among the points visible then
+    path_error: float  # median, relative to the scene distance
 
 
 def true_points(capture: Capture, truth: SceneTruth, evidence: Evidence) -> TruePoints:
@@ -50,7 +50,7 @@ def true_points(capture: Capture, truth: SceneTruth, evidence: Evidence) -> True
       The points.
 
     Raises:
-      ValueError: If the truth is not that of the capture.
+      ValueError: If the ground truth belongs to another capture.
     """
     position = truths.track_places(capture, truth, evidence.row)
     scale = evidence.moving.shape[2] / truth.things.shape[2]

@@ -84,14 +84,14 @@ def _seen_from(views, frame, places, colors, moving):
 
 
 def _farthest_in_cells(place, inverse):
-    """Rows of the farthest point of every cell that holds one: what lies all around."""
+    """Select the farthest point of every cell that contains one."""
     cell = np.floor(place).astype(int)
     order = np.argsort(inverse, kind="stable")
     return order[np.unique(cell[order], axis=0, return_index=True)[1]]
 
 
 def _plane(offset, value, weight):
-    """Planes over `offset` [n, k, 2]: value at offset zero [n], and gradient [n, 2]."""
+    """Fit planes over `offset` [n, k, 2]. Return values at zero and gradients."""
     weight = weight / weight.sum(1, keepdims=True)
     middle = np.einsum("nk,nkc->nc", weight, offset)
     mean = np.einsum("nk,nk->n", weight, value)

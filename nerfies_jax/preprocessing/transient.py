@@ -65,7 +65,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
     gone = gone[carried >= LEAST_CARRIED]
     if len(gone) <= 2 * MIN_TIMES:
         return cannot_tell(EFFECT, f"only {len(gone)} pairs of frames", threshold)
-    # The losses of the other pairs are the noise of those that jump.
+    # The losses of the other pairs are the noise level.
     usual = float(np.sort(gone)[: -2 * MIN_TIMES].mean())
     worst = np.sort(_above_neighbors(gone))[::-1]
     wanted, confidence = judge(float(worst[MIN_TIMES - 1]), GONE_SHARE, usual)
@@ -90,7 +90,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
 
 
 def _above_neighbors(gone):
-    """Losses of pairs beyond the median of their neighbors."""
+    """Return the losses of pairs above the median of their neighbors."""
     above = []
     for at, one in enumerate(gone):
         beside = np.r_[gone[max(0, at - AROUND) : at], gone[at + 1 : at + 1 + AROUND]]
@@ -145,7 +145,7 @@ class _Way(NamedTuple):
 
 
 def _way(flow, seen, part):
-    """Both in pixels so many times larger."""
+    """Return the flow and search range in pixels of reduced images."""
     flow = dense_flow.reduced(flow, part)
     seen = cv2.resize(np.uint8(seen), flow.shape[1::-1]) > 0
     usual = flow[seen] if seen.any() else flow.reshape(-1, 2)
@@ -157,14 +157,14 @@ def _way(flow, seen, part):
 
 
 def _leveled(gray):
-    """Image minus its local mean, over its contrast, without exposure."""
+    """Subtract the local mean of an image and normalize its contrast."""
     detail = gray - cv2.GaussianBlur(gray, (0, 0), LOCAL_PX)
     spread = np.sqrt(np.mean(detail**2))
     return detail / (5 * spread) if spread > 0 else detail
 
 
 def _gone(views, pictures, pair, there, back):
-    """The share of a frame's pixels whose surroundings are nowhere near in another."""
+    """Return the share of pixels of a frame that are not visible in another one."""
     picture, target = (pictures[index] for index in pair)
     lost = _lost(views, pair[0], picture, target, there, back)
     tried = np.argwhere(lost & views.textured[pair[0]])
@@ -182,7 +182,7 @@ def _gone(views, pictures, pair, there, back):
 
 
 def _lost(views, index, picture, target, there, back):
-    """[height, width]: not on a path to the other frame, though it should be there."""
+    """Find pixels [height, width] without a match that should be in the other frame."""
     width, height = views.size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
     end = np.moveaxis(grid + there.flow, -1, 0).astype(np.float32)
@@ -193,8 +193,8 @@ def _lost(views, index, picture, target, there, back):
     gap = np.linalg.norm(there.flow + led_back, axis=-1)
     open_end = gap > LOST_PX + LOST_SHARE * np.linalg.norm(there.flow, axis=-1)
     changed = cv2.GaussianBlur(np.abs(picture - color), (0, 0), 1.5) > LOST_COLOR
-    # Beyond the edge of the other image under the common shift, and the patch's own.
-    # Near objects move more than the rest, and leave the image where the rest stays.
+    # Pixels may leave the image by the common shift, or by the larger shift of near
+    # objects, and need a margin for the patch.
     rim = PATCH + there.reach
     common = grid + there.shift
     bound = np.array([width - 1, height - 1]) - rim
@@ -214,5 +214,5 @@ def _found(picture, target, line, column, shift, reach):
     low = [max(0, at - span) for at in middle]
     window = target[low[0] : middle[0] + span + 1, low[1] : middle[1] + span + 1]
     if min(window.shape) < 2 * PATCH + 1:
-        return True  # out of the image: nothing to be said
+        return True  # outside of the image, so not decidable
     return bool(skimage.feature.match_template(window, patch).max() > ALIKE)

@@ -1,9 +1,9 @@
-"""Flow over large displacements, searched for again from the flow of a static scene.
+"""Optical flow of large displacements, initialized with the flow of a static scene.
 
-A coarse-to-fine search confuses repetitive patterns, and over large displacements more
-than one position looks right at the coarse levels. Searches start from the flow of
-static planes, which known cameras determine, and the best match of all is taken. That
-helps moving objects too, which are then searched for in a smaller range.
+A coarse-to-fine search confuses repetitive patterns, and large displacements are
+ambiguous at coarse levels. Several searches are initialized with the flow of static
+planes, which follows from the known cameras, and the best match of each pixel is used.
+This also helps moving objects, whose search range becomes smaller.
 """
 
 from collections.abc import Callable
@@ -14,24 +14,26 @@ import numpy as np
 from nerfies_jax.preprocessing import view_set
 from nerfies_jax.preprocessing.view_set import Views
 
-# Median flow, as a share of the image width, above which a pair is searched again. The
-# video of `static` at 112x84 and 40 frames has such steps, and had 6.6 % of its pixels
-# marked as moving, a checkered cube that is 15 % off in each.
+# Median flow relative to the image width above which a pair is searched again. The
+# video of `static` at 112x84 and 40 frames has such displacements. Without another
+# search, 6.6 % of its pixels are marked as moving, because the flow of a checkered cube
+# has an error of 15 % in each pair.
 WIDE_SHARE = 0.03
-MOST_TURN_RAD = 0.8  # between viewing axes: then hardly anything looks alike
-# From one plane to the next, of the width, and how many at most. Twice as far apart and
-# three at most, that video keeps 5 % marked; with six it has 0.8 %. Groups of features
-# that a similarity takes to the next frame (SIFT, RANSAC) are no better to begin from:
-# of every sixth frame of `fast` 79 % of the moving points are lost with and without.
+MOST_TURN_RAD = 0.8  # maximum angle between viewing axes for another search
+# Displacement between consecutive planes relative to the width, and maximum number of
+# planes. With twice the displacement and at most three planes, 5 % of the pixels of
+# that video are marked, with six planes 0.8 %. Initialization with groups of SIFT
+# features (RANSAC of similarity transforms) is no better: for every sixth frame of
+# `fast`, 79 % of the moving points are lost with and without.
 STEP_SHARE, MOST_PLANES = 0.03, 6
-WINDOW_SHARE = 0.023  # of the width: deviation of the window that is to look alike
-OWN = 0.9  # the first search keeps a pixel unless another looks so much more alike
+WINDOW_SHARE = 0.023  # standard deviation of the matching window relative to the width
+OWN = 0.9  # maximum cost of another search relative to that of the first
 
-Search = Callable[..., np.ndarray]  # flow from one frame to another, from a guess
+Search = Callable[..., np.ndarray]  # flow between two frames from an initial flow
 
 
 def is_wide(views: Views, pair: tuple[int, int], flow: np.ndarray) -> bool:
-    """Return whether the flow of a pair of frames calls for another search.
+    """Test if the flow of a pair of frames should be searched for again.
 
     Args:
       views: The frames.
@@ -39,7 +41,7 @@ def is_wide(views: Views, pair: tuple[int, int], flow: np.ndarray) -> bool:
       flow: Flow in pixels, [height, width, 2].
 
     Returns:
-      True if it does.
+      True for large displacements.
     """
     one, other = (views.rotation[index, 2] for index in pair)
     if one @ other < np.cos(MOST_TURN_RAD):
@@ -60,7 +62,7 @@ def improved(
 
     Args:
       views: The frames.
-      pictures: Images of the pair, in the views' own pixels.
+      pictures: Images of the pair, in the pixels of the views.
       pair: Indices of the two frames.
       flow: Flow of the first search, [height, width, 2].
       search: Search from an initial flow.
@@ -101,14 +103,14 @@ def plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray:
     pixel, ahead = view_set.project(views, other, point.reshape(-1, 3))
     moved = pixel.reshape(height, width, 2) - np.stack([x, y], -1)
     behind = (ahead <= 0).reshape(height, width)
-    # A guess out of the image is as good as any.
+    # The initial flow of points behind the camera is arbitrary.
     return np.where(behind[..., None], 0, np.clip(moved, -width, width)).astype(
         np.float32
     )
 
 
 def unlike(pictures, flow):
-    """Compute the difference of surroundings along the flow.
+    """Compute the mean color difference around each pixel along the flow.
 
     Args:
       pictures: Images of the pair, [height, width].
@@ -121,6 +123,6 @@ def unlike(pictures, flow):
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     at = x + flow[..., 0], y.astype(np.float32) + flow[..., 1]
-    # Beyond the edge nothing looks alike.
+    # Positions outside of the image have a large difference.
     there = cv2.remap(np.float32(other), *at, cv2.INTER_LINEAR, borderValue=-255)
     return cv2.GaussianBlur(np.abs(one - there), (0, 0), WINDOW_SHARE * width)
