@@ -27,7 +27,7 @@ class CaptureChecks:
 
     captures: cli.Positional[pathlib.Path]
     """Folder of captures."""
-    out: pathlib.Path = pathlib.Path("runs/capture_checks.json")
+    out: pathlib.Path = pathlib.Path("capture_checks.json")
     """File of the findings."""
 
     def __post_init__(self):

@@ -38,7 +38,7 @@ class CaptureCost:
     """Frames of the capture whose memory is measured."""
     pairs: int = 5
     """Turns of each decoder, in this process and in the child."""
-    out: pathlib.Path = pathlib.Path("runs/capture_cost.json")
+    out: pathlib.Path = pathlib.Path("capture_cost.json")
     """File of the numbers."""
 
     def __post_init__(self):
