@@ -16,7 +16,7 @@ from nerfies_jax.geometry import lens, lie, matrices
 from nerfies_jax.geometry.precision import exact_product, refuse_half
 from nerfies_jax.runtime.contract import checked
 
-# Both keep what is at or behind the camera finite in float32, where 1/z² overflows
+# Both bounds keep points at or behind the camera finite in float32, where 1/z² overflows
 # below 1e-19 and the seventh power of a slope above 1e5.
 MAX_SLOPE = 1e4  # lateral offset over depth: 0.006 degrees short of sideways
 MIN_DEPTH = 1e-12  # scene units
@@ -438,7 +438,7 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
                 f"{_row(value <= 0, 0)}"
             )
     if min(size) < 1:
-        raise ValueError(f"{name}: picture size {size} must be at least 1x1 pixels")
+        raise ValueError(f"{name}: image size {size} must be at least 1x1 pixels")
     _check_range(camera, size, name)
     # Tiles of a large image have it far outside, of another resolution or unit farther.
     center = np.asarray(camera.principal_point_px, np.float64)
