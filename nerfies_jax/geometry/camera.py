@@ -16,7 +16,7 @@ from nerfies_jax.geometry import lens, lie, matrices
 from nerfies_jax.geometry.precision import exact_product, refuse_half
 from nerfies_jax.runtime.contract import checked
 
-# Both bounds keep points at or behind the camera finite in float32, where 1/z² overflows
+# Both keep points at or behind the camera finite in float32, where 1/z² overflows
 # below 1e-19 and the seventh power of a slope above 1e5.
 MAX_SLOPE = 1e4  # lateral offset over depth: 0.006 degrees short of sideways
 MIN_DEPTH = 1e-12  # scene units
