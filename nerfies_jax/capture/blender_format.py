@@ -13,7 +13,7 @@ from nerfies_jax.capture import (
     text_files,
     transforms_lens,
 )
-from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath, inside, named_file
 from nerfies_jax.capture.points import (
@@ -28,9 +28,13 @@ from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
 WHITE = (1.0, 1.0, 1.0)
-# Blender's and D-NeRF's cameras sit 4 from the origin, and their readers use 2 and 6.
+# Cameras of the Blender and D-NeRF data sets have distance 4 from the origin, and their
+# readers use near 2 and far 6.
 USUAL_RADIUS, USUAL_NEAR, USUAL_FAR = 4.0, 2.0, 6.0
-FAR_FROM_ORIGIN = 100.0  # extents of the cameras; Blender's stand around the origin
+# Ratio of the distance from the origin to the extent of the cameras from which on they
+# are not around the origin.
+FAR_FROM_ORIGIN = 100.0
+_GUESSED = "near and far are estimated from the cameras"
 
 
 @confines
@@ -51,13 +55,13 @@ def read(
       factor: Read images at 1/`factor` of their full size.
       max_side: Longest side of the images in pixels. At most one of the two can be
         given.
-      heldout: None for the test split, else validation, else every 8th frame. "val" or
-        "test" for that split. n for every n-th frame of the file (of split files, the
-        training one).
+      heldout: None for the first of these that exists: the test split, the validation
+        split, every 8th frame. "val" or "test" for that split. n for every n-th frame
+        of the file (of split files, the training one).
       missing: "refuse" or "skip" frames without an image.
       background: sRGB color in [0, 1] behind images with alpha.
-      near: Near plane in scene units. The default is 2 for Blender's cameras 4 from the
-        origin, and follows from the points for nerfstudio.
+      near: Near plane in scene units. By default 2 for Blender's cameras at distance 4
+        from the origin, and derived from the points for nerfstudio.
       far: Far plane in scene units, 6 for Blender's cameras by default.
 
     Returns:
@@ -71,16 +75,16 @@ def read(
     split = read_split(path, heldout, missing)
     entries = [*split.train, *split.heldout]
     where = str(split.file)
-    moved = _made_local(root, entries, split.transforms)
-    files = [_picture(root, entry, split.file) for entry in entries]
+    moved_notes = _made_local(root, entries, split.transforms)
+    files = [_image_file(root, entry, split.file) for entry in entries]
     names = [_name(entry.file_path) for entry in entries]
-    rows, lost = frames.keep_found(files, names, missing, where)
+    rows, skip_notes = frames.keep_found(files, names, missing, where)
     entries, files = [entries[row] for row in rows], [files[row] for row in rows]
     is_train = rows < len(split.train)
-    full = pictures.read_header(files[0]).size
+    full = image_files.read_header(files[0]).size
     _, shrink_by = frames.choose_source({1: root}, full, factor, max_side, where)
-    read_in = frames.read_frames(files, shrink_by, background)
-    images, alpha = read_in.images, read_in.alpha
+    stored = frames.read_frames(files, shrink_by, background)
+    images, alpha = stored.images, stored.alpha
     if alpha is not None and not alpha.any():
         raise CaptureError(
             f"{where}: all pixels of all images are transparent (alpha 0); save them "
@@ -94,10 +98,9 @@ def read(
     size = images.shape[2:0:-1]
     placement, more = _place(cameras, points, split.transforms, size)
     offset = cameras.position - placement.center
-    times, camera_ids, when = _times(entries, split)
+    times, camera_ids, time_notes = _times(entries, split)
     if camera_ids is None:
         camera_ids = _camera_ids(entries, times, split, is_train)
-    size = images.shape[2:0:-1]
     valid, masked = _valid(root, entries, split.file, size, shrink_by)
     return Capture(
         name=root.resolve().name,
@@ -115,24 +118,24 @@ def read(
         warp_ids=frames.dense(times),
         appearance_ids=np.zeros(len(rows), np.int32),
         camera_ids=camera_ids,
-        valid=frames.both(valid, read_in.observed),
-        points=_placed(points, placement),
+        valid=frames.both(valid, stored.observed),
+        points=_in_scene_units(points, placement),
         background=background if alpha is not None else split.transforms.background,
         scale=placement.scale,
         center=placement.center,
-        # Blender's and nerfstudio's world, where the file has not ours.
+        # z is up in Blender and nerfstudio. `up` is an extension of this library.
         up=frames.unit(split.transforms.up) or (0.0, 0.0, 1.0),
         frames_per_second=split.transforms.fps,
         path=path,
         notes=(
             *split.notes,
-            *moved,
-            *lost,
+            *moved_notes,
+            *skip_notes,
             *notes,
             *more,
-            *when,
+            *time_notes,
             *masked,
-            *read_in.notes,
+            *stored.notes,
             *_unread_depths(entries),
         ),
     )
@@ -140,17 +143,17 @@ def read(
 
 def _made_local(root, entries, transforms):
     """Replace paths of another machine by those of the same files in this folder."""
-    named = [(entry, key) for entry in entries for key in ("file_path", "mask_path")]
-    named.append((transforms, "ply_file_path"))
-    named = [(holder, key) for holder, key in named if getattr(holder, key)]
-    names = [getattr(holder, key) for holder, key in named]
+    fields = [(entry, key) for entry in entries for key in ("file_path", "mask_path")]
+    fields.append((transforms, "ply_file_path"))
+    fields = [(owner, key) for owner, key in fields if getattr(owner, key)]
+    names = [getattr(owner, key) for owner, key in fields]
     local = [frames.local_name(root, name) for name in names]
-    for (holder, key), name in zip(named, local, strict=True):
-        setattr(holder, key, name)
+    for (owner, key), name in zip(fields, local, strict=True):
+        setattr(owner, key, name)
     return frames.moved_note(names, local)
 
 
-def _placed(points, placement):
+def _in_scene_units(points, placement):
     """Return the points in scene units, or None if there are none."""
     if points is None:
         return None
@@ -159,42 +162,43 @@ def _placed(points, placement):
 
 
 def _name(file_path):
-    """One id, unique over the splits and fit for a file name: train_r_0."""
+    """An id that is unique over the splits and can be a file name, as train_r_0."""
     plain = pathlib.PurePosixPath(text_files.forward_slashes(file_path))
     stem = plain.with_suffix("") if plain.suffix.lower() in frames.SUFFIXES else plain
     return "_".join(part for part in stem.parts if part not in (".", "/"))
 
 
-def _picture(root, entry, file):
-    """The file of a frame, also with another ending: copies are often converted."""
+def _image_file(root, entry, file):
+    """The image of a frame. The suffix may differ, since copies are often converted."""
     name = entry.file_path
     inside(root, name, file)
-    found = frames.find_picture(root, name)
+    image = frames.find_picture(root, name)
     suffix = pathlib.PurePosixPath(name).suffix
-    if found is None and suffix.lower() in frames.SUFFIXES:
-        found = frames.find_picture(root, name.removesuffix(suffix))
-    return found
+    if image is None and suffix.lower() in frames.SUFFIXES:
+        image = frames.find_picture(root, name.removesuffix(suffix))
+    return image
 
 
 def _cameras(entries, transforms, size, where):
-    """Cameras in world units, their positions float64, and what had to be assumed."""
+    """Cameras in world units with float64 positions, and notes."""
     cameras, lenses = [], []
     for entry in entries:
         label = f"{where}: frame {entry.file_path!r}"
         lens = transforms_lens.resolve(entry, transforms, size, label)
         rotation, position = _pose(entry.transform_matrix, label)
-        one = Camera(
-            camera_from_world=rotation.astype(np.float32),
-            position=position,
-            focal_px=np.float32(lens.focal_px[0]),
-            principal_point_px=np.float32(lens.principal_point_px),
-            skew_px=np.float32(0),
-            pixel_aspect=np.float32(lens.focal_px[1] / lens.focal_px[0]),
-            radial=np.float32(lens.radial),
-            tangential=np.float32(lens.tangential),
-            fisheye=None if lens.fisheye is None else np.float32(lens.fisheye),
+        cameras.append(
+            Camera(
+                camera_from_world=rotation.astype(np.float32),
+                position=position,
+                focal_px=np.float32(lens.focal_px[0]),
+                principal_point_px=np.float32(lens.principal_point_px),
+                skew_px=np.float32(0),
+                pixel_aspect=np.float32(lens.focal_px[1] / lens.focal_px[0]),
+                radial=np.float32(lens.radial),
+                tangential=np.float32(lens.tangential),
+                fisheye=None if lens.fisheye is None else np.float32(lens.fisheye),
+            )
         )
-        cameras.append(one)
         lenses.append(lens)
     fisheyes = sum(one.fisheye is not None for one in cameras)
     if fisheyes not in (0, len(cameras)):
@@ -226,7 +230,7 @@ def _pose(matrix, label):
             f"{label} has a transform_matrix with the last row {last[0]}; expected "
             "0, 0, 0, 1, so transpose it if its last column is that"
         )
-    # A uniform scale (a scaled parent in Blender) leaves the direction of the axes.
+    # A uniform scale (of a parent object in Blender) does not affect the rotation.
     return axes / length[:, None] * [[1.0], [-1.0], [-1.0]], matrix[:, 3]
 
 
@@ -235,32 +239,30 @@ def _place(cameras, points, transforms, size):
         depths = []
         local, position = frames.near_origin(cameras, points.position)
         for row in range(len(cameras.focal_px)):
-            _, depth, seen = frames.pixels_of(local, row, position, size)
-            depths.append(depth[seen])
+            _, depth, inside = frames.pixels_of(local, row, position, size)
+            depths.append(depth[inside])
         depths = np.concatenate(depths)
         if depths.size:
-            placed = place_by_points(points.position, cameras.position, depths)
-            return placed, ()
+            return place_by_points(points.position, cameras.position, depths), ()
     if transforms.camera_angle_x is not None and transforms.fl_x is None:
         radius = float(np.median(np.linalg.norm(cameras.position, axis=1)))
         spread = float(np.linalg.norm(np.ptp(cameras.position, axis=0)))
         if 0 < spread < radius / FAR_FROM_ORIGIN:  # coordinates of a map
-            note = "no points: near and far are guessed from where the cameras look"
-            return place_by_cameras(cameras), (note,)
+            return place_by_cameras(cameras), (f"no points: {_GUESSED}",)
         usual = 0.75 * USUAL_RADIUS < radius < 1.25 * USUAL_RADIUS or radius == 0
         ratio = 1.0 if usual else radius / USUAL_RADIUS
         near, far = USUAL_NEAR * ratio, USUAL_FAR * ratio
         note = (
-            f"near {near:.3g} and far {far:.3g} as usual for cameras {radius:.3g} away"
+            f"near {near:.3g} and far {far:.3g}, the defaults for cameras at distance "
+            f"{radius:.3g}"
         )
         return Placement((0.0, 0.0, 0.0), 1.0, near, far), (note,)
-    known = "no points" if points is None else "no points in view"
-    note = f"{known}: near and far are guessed from where the cameras look"
-    return place_by_cameras(cameras), (note,)
+    reason = "no points" if points is None else "no points in view"
+    return place_by_cameras(cameras), (f"{reason}: {_GUESSED}",)
 
 
 def _times(entries, split):
-    """Times as stored, or those that the names tell, with the cameras they tell."""
+    """Stored times, or else times and cameras from the names, and notes."""
     stored = [entry.time for entry in entries]
     count = len(entries)
     if all(time is not None for time in stored):
@@ -282,26 +284,26 @@ def _times(entries, split):
 
 
 def _camera_ids(entries, times, split, is_train):
-    """Number the folders if two have images of one time, else return one camera."""
+    """Ids of the folders if two of them have images of one time, else zeros."""
     paths = [text_files.forward_slashes(entry.file_path) for entry in entries]
     names = [pathlib.PurePosixPath(path).parent.as_posix() for path in paths]
-    # D-NeRF's one camera fills train and test, whose times meet.
+    # In D-NeRF, train and test images of the one camera share times.
     several_files = split.file.name == "transforms_train.json"
     rows = np.flatnonzero(is_train) if several_files else range(len(entries))
-    seen = {(times[row], names[row]) for row in rows}
-    if np.ptp(times) == 0 or len(seen) == len({time for time, _ in seen}):
+    pairs = {(times[row], names[row]) for row in rows}
+    if np.ptp(times) == 0 or len(pairs) == len({time for time, _ in pairs}):
         return np.zeros(len(entries), np.int32)
     return frames.dense(names)
 
 
 def _unread_depths(entries):
-    named = [entry.depth_file_path for entry in entries if entry.depth_file_path]
-    if not named:
+    paths = [entry.depth_file_path for entry in entries if entry.depth_file_path]
+    if not paths:
         return ()
-    folder = pathlib.PurePosixPath(named[0]).parent
+    folder = pathlib.PurePosixPath(paths[0]).parent
     return (
-        f"depth_file_path of {len(named)} frames is not read; the depth maps in "
-        f"{folder} can be given as external depths",
+        f"depth_file_path of {len(paths)} frames is not read; the depth maps in "
+        f"{folder} can be used as external depths",
     )
 
 

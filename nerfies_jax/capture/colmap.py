@@ -1,4 +1,4 @@
-"""Reader of COLMAP reconstructions, through pycolmap."""
+"""Reader of COLMAP reconstructions with pycolmap."""
 
 import pathlib
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerfies_jax.capture import colmap_models, frames, name_times, text_files
-from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.colmap_lenses import undistort
@@ -17,20 +17,20 @@ from nerfies_jax.capture.points import place_by_points
 from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.geometry.camera import Camera
 
-PICTURES = ("images", "images_2", "images_4", "images_8", "input", "rgb", "")
+IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "input", "rgb", "")
 
 
 class Model(NamedTuple):
     """Contents of a reconstruction, in world units and pixels of its own images."""
 
-    names: tuple[str, ...]  # of the pictures, in natural order
-    lenses: list[Any]  # one pycolmap.Camera per picture
+    names: tuple[str, ...]  # of the images, in natural order
+    lenses: list[Any]  # one pycolmap.Camera per image
     camera_ids: np.ndarray
     rotations: np.ndarray  # [frames, 3, 3] camera from world
     positions: np.ndarray  # [frames, 3]
     points: np.ndarray  # [points, 3]
     colors: np.ndarray  # [points, 3] uint8
-    depths: np.ndarray  # z-depth of every kept observation
+    depths: np.ndarray  # [observations] z-depths of the points
 
 
 @confines
@@ -44,10 +44,10 @@ def read(
     """Read a capture from a folder with images and a COLMAP model.
 
     The images may be integer reductions of those of the model (images_2 and so on).
-    Lens models that are not supported are undistorted to a pinhole. Times come from
-    numbers in the image names, else from their order. `masks/` are read if present
-    (black is moving, as in COLMAP). If every image has a camera of its own, folders of
-    images count as physical cameras.
+    Images with unsupported lens models are undistorted to a pinhole. Times are derived
+    from numbers in the image names, or else from their order. Masks in `masks/` are
+    read (black is moving, as in COLMAP). If each image has a COLMAP camera of its own,
+    each folder of images counts as a physical camera.
 
     Args:
       path: The folder.
@@ -65,18 +65,18 @@ def read(
     """
     path = pathlib.Path(path)
     folder, notes = _best_model(path)
-    model, moved = _with_local_names(path, read_model(folder))
+    model, moved_notes = _with_local_names(path, read_model(folder))
     model, more = _with_physical_cameras(model)
-    notes += (*moved, *more)
+    notes += (*moved_notes, *more)
     if isinstance(heldout, str):
         raise CaptureError(
             f"{path}: COLMAP has no split {heldout!r}; pass a number n to hold out "
             "every n-th frame"
         )
-    model, files, shrink_by, lost = _with_pictures(
+    model, files, shrink_by, skip_notes = _with_images(
         path, model, factor, max_side, missing
     )
-    # COLMAP reads pixels as they lie in the file, whatever the EXIF orientation says.
+    # COLMAP reads pixels as stored and ignores the EXIF orientation.
     stored = frames.read_frames(files, shrink_by, orientation="stored")
     images, valid, moving, lenses, more = _as_pinholes(
         path, model, files, stored, shrink_by
@@ -91,12 +91,12 @@ def read(
     )
     times = frames.spread(clock.times)
     notes += clock.notes
-    if clock.cameras is not None:  # one device is not at two places at one time
+    if clock.cameras is not None:  # a camera has only one frame at a time
         model = model._replace(camera_ids=clock.cameras)
-    every = frames.HELD_OUT if heldout is None else heldout
+    interval = frames.HELD_OUT if heldout is None else heldout
     group = np.zeros(len(ids)) if clock.cameras is None else clock.cameras
-    train, scored = frames.hold_out_in_time(times, group, every, str(path))
-    notes += (frames.held_out_note(scored, every),)
+    train, heldout_rows = frames.hold_out_in_time(times, group, interval, str(path))
+    notes += (frames.held_out_note(heldout_rows, interval),)
     return Capture(
         name=path.resolve().name,
         source="colmap",
@@ -105,7 +105,7 @@ def read(
         cameras=cameras,
         times=times,
         train=train,
-        heldout=scored,
+        heldout=heldout_rows,
         near=placement.near,
         far=placement.far,
         warp_ids=frames.dense(times),
@@ -120,14 +120,14 @@ def read(
         center=placement.center,
         up=frames.up_direction(cameras),
         path=path,
-        notes=(*notes, *lost),
+        notes=(*notes, *skip_notes),
     )
 
 
 def _with_local_names(path, model):
     """Return the model with names of images in this folder, and a note of changes."""
-    for place in PICTURES:
-        local = [frames.local_name(path / place, name) for name in model.names]
+    for subfolder in IMAGE_FOLDERS:
+        local = [frames.local_name(path / subfolder, name) for name in model.names]
         note = frames.moved_note(model.names, local)
         if note:
             return model._replace(names=tuple(local)), note
@@ -135,45 +135,48 @@ def _with_local_names(path, model):
 
 
 def _with_physical_cameras(model):
-    """Return the model with ids of physical cameras, and a note if they are unknown.
+    """Return the model with ids of physical cameras, and a note if they are guessed.
 
-    COLMAP's default gives every image a camera of its own, which identifies no device.
+    By default COLMAP gives each image a camera of its own.
     """
     if len(np.unique(model.camera_ids)) < len(model.camera_ids):
         return model, ()
     folders = [pathlib.PurePosixPath(name).parent.as_posix() for name in model.names]
     camera_ids = frames.dense(folders)
-    kinds = "one camera for each folder of them" if camera_ids.any() else "one camera"
-    note = f"every picture has a COLMAP camera of its own: taken as {kinds}"
+    guess = "one camera per folder" if camera_ids.any() else "one camera"
+    note = f"each image has a COLMAP camera of its own: taken as {guess}"
     return model._replace(camera_ids=camera_ids), (note,)
 
 
-def _with_pictures(path, model, factor, max_side, missing):
-    """Return the model of the existing images, their files and reduction, and a
-    note.
-    """
-    available, paths = _find_pictures(path, model)
+def _with_images(path, model, factor, max_side, missing):
+    """The model of existing images, their files, a further reduction, and a note."""
+    available, paths = _find_images(path, model)
     full = (model.lenses[0].width, model.lenses[0].height)
     source, shrink_by = frames.choose_source(
         available, full, factor, max_side, str(path)
     )
-    rows, lost = frames.keep_found(paths[source], model.names, missing, str(path))
-    return _take(model, rows), [paths[source][row] for row in rows], shrink_by, lost
+    rows, skip_notes = frames.keep_found(paths[source], model.names, missing, str(path))
+    return (
+        _take(model, rows),
+        [paths[source][row] for row in rows],
+        shrink_by,
+        skip_notes,
+    )
 
 
 def _as_pinholes(path, model, files, stored, shrink_by):
-    """Pictures, masks and lenses as a capture holds them, and what was done to them."""
+    """Images and masks with supported lenses, and notes."""
     images, valid = stored.images, stored.valid()
     size = (images.shape[2], images.shape[1])
     moving, masked = _masks(path, model.names, size, shrink_by)
     valid, notes = without_black_borders(images, valid)
     notes += masked
-    full = pictures.read_header(files[0]).size
+    full = image_files.read_header(files[0]).size
     lenses = [_scaled(lens, full, size, path) for lens in model.lenses]
     fisheyes = {_is_fisheye(lens) for lens in lenses}
-    if not all(map(_is_ours, lenses)) or len(fisheyes) > 1:
+    if not all(map(_is_supported, lenses)) or len(fisheyes) > 1:
         names = sorted({lens.model_name for lens in lenses})
-        notes += (f"pictures undistorted from {' and '.join(names)} to a pinhole",)
+        notes += (f"images undistorted from {' and '.join(names)} to a pinhole",)
         images, exists, (valid, moving), pinhole = undistort(
             images, (valid, moving), lenses, str(path)
         )
@@ -210,13 +213,14 @@ def read_model(folder: pathlib.Path) -> Model:
     names = about["names"]
     if len(names) < 2:
         raise CaptureError(
-            f"{folder}: {len(names)} pictures have a pose; a reconstruction needs at "
+            f"{folder}: {len(names)} images have a pose; a reconstruction needs at "
             "least 2, so run COLMAP with more overlap"
         )
     if len(arrays["points"]) < 3:
         raise CaptureError(
-            f"{folder}: {len(arrays['points'])} points seen in {MIN_TRACK} frames or "
-            "more; the scene cannot be placed, so keep points3D or run COLMAP again"
+            f"{folder}: {len(arrays['points'])} points observed in {MIN_TRACK} frames "
+            "or more; at least 3 are needed to normalize the scene, so keep points3D "
+            "or run COLMAP again"
         )
     rows = sorted(range(len(names)), key=lambda row: frames.natural(names[row]))
     try:
@@ -226,7 +230,9 @@ def read_model(folder: pathlib.Path) -> Model:
         }
     except (ValueError, TypeError, RuntimeError) as error:
         reason = " ".join(str(error).split())
-        raise CaptureError(f"{folder}: cameras of no known kind ({reason})") from None
+        raise CaptureError(
+            f"{folder}: unknown camera model ({reason}); undistort to PINHOLE first"
+        ) from None
     camera_ids = [about["camera_ids"][row] for row in rows]
     depths = arrays["depths"]
     return Model(
@@ -245,18 +251,18 @@ def read_model(folder: pathlib.Path) -> Model:
 def _best_model(path):
     """Return the folder of the model with most images, and notes.
 
-    COLMAP numbers models in the order in which it found them.
+    The numbers of models tell nothing about their size.
     """
-    places = sparse_models(path)
-    if not places:
+    folders = sparse_models(path)
+    if not folders:
         raise CaptureError(
             f"{path}: no COLMAP model; looked for cameras, images and points3D (.bin "
             "or .txt) in sparse/0, sparse and here"
         )
-    if len(places) == 1:
-        return places[0], ()
+    if len(folders) == 1:
+        return folders[0], ()
     counts, broken = {}, {}
-    for folder in places:
+    for folder in folders:
         try:
             counts[folder] = len(colmap_models.tables(folder).about["names"])
         except CaptureError as error:
@@ -264,7 +270,7 @@ def _best_model(path):
     if not counts:
         raise next(iter(broken.values()))
     notes = tuple(
-        f"passed over: {error}".replace(f"{path}/", "") for error in broken.values()
+        f"skipped: {error}".replace(f"{path}/", "") for error in broken.values()
     )
     if len(counts) > 1:
         listed = ", ".join(f"{p.name}: {n}" for p, n in counts.items())
@@ -272,47 +278,46 @@ def _best_model(path):
     return max(counts, key=counts.get), notes
 
 
-def _find_pictures(path, model):
+def _find_images(path, model):
     """Find the folder of each stored reduction, and the file of each image or None."""
     first = model.lenses[0]
     available, paths = {}, {}
-    for place in PICTURES:
-        files = [_find(path, place, name) for name in model.names]
-        present = next((file for file in files if file is not None), None)
-        if present is None:
+    for subfolder in IMAGE_FOLDERS:
+        files = [_find(path, subfolder, name) for name in model.names]
+        sample = next((file for file in files if file is not None), None)
+        if sample is None:
             continue
-        width, height = pictures.read_header(present).size
+        width, height = image_files.read_header(sample).size
         ratio = max(1, round(first.width / width))
         if (
             abs(first.width / ratio - width) >= 1
             or abs(first.height / ratio - height) >= 1
         ):
             raise CaptureError(
-                f"{present}: {width}x{height} pixels, but its camera is for "
-                f"{first.width}x{first.height}; pictures must be a whole fraction of "
+                f"{sample}: {width}x{height} pixels, but its camera is for "
+                f"{first.width}x{first.height}; images must be an integer fraction of "
                 "that"
             )
         if ratio not in available:
-            available[ratio], paths[ratio] = path / place, files
+            available[ratio], paths[ratio] = path / subfolder, files
     if not available:
+        listed = ", ".join(folder or "the folder itself" for folder in IMAGE_FOLDERS)
         raise CaptureError(
-            f"{path}: a COLMAP model but none of its pictures ({model.names[0]}, ...); "
-            f"looked in {', '.join(place or 'the folder itself' for place in PICTURES)}"
+            f"{path}: a COLMAP model but none of its images ({model.names[0]}, ...); "
+            f"looked in {listed}"
         )
     return available, paths
 
 
-def _find(path, place, name):
-    """Find an image, also with another suffix, since reductions are often saved as
-    PNG.
-    """
-    inside(path / place, name, path)
+def _find(path, subfolder, name):
+    """Find an image by its name. The suffix may differ, as often for reductions."""
+    inside(path / subfolder, name, path)
     stem = pathlib.PurePosixPath(name).with_suffix("").as_posix()
     for each in (name, stem):
-        # From the capture's folder on: the case of `place` may differ as well.
-        found = frames.find_picture(path, f"{place}/{each}" if place else each)
-        if found is not None:
-            return found
+        # From the capture's folder, since the case of `subfolder` may differ as well.
+        file = frames.find_picture(path, f"{subfolder}/{each}" if subfolder else each)
+        if file is not None:
+            return file
     return None
 
 
@@ -335,30 +340,30 @@ def _masks(path, names, size, shrink_by):
         for name in names
     ]
     if not any(paths):
-        return None, ("no file in masks/ is named as an image: no mask is read",)
+        return None, ("no file in masks/ has the name of an image: masks not read",)
     white, notes = frames.read_masks(paths, size, shrink_by, "moving")
     return white < 1, notes
 
 
 def _scaled(lens, stored, size, path):
-    """Return the lens for images of `size`, made from stored ones by whole blocks."""
+    """Return the lens for images of `size`, which are downscaled stored images."""
     if lens.is_spherical():
         raise CaptureError(
-            f"{path}: camera {lens.camera_id} is {lens.model_name}, a whole sphere; "
-            "cut perspective pictures out of it first"
+            f"{path}: camera {lens.camera_id} is {lens.model_name}, a full panorama; "
+            "convert it to perspective images first"
         )
     ratio = max(1, round(lens.width / stored[0]))
     trimmed = abs(np.array((lens.width, lens.height)) / ratio - stored)
     if trimmed.max() >= 1:
         raise CaptureError(
             f"{path}: camera {lens.camera_id} is for {lens.width}x{lens.height} "
-            f"pixels, but its images have {stored[0]}x{stored[1]}; images must be a "
-            "whole fraction of that"
+            f"pixels, but its images have {stored[0]}x{stored[1]}; images must be an "
+            "integer fraction of that"
         )
     copy = library().Camera(lens.todict())
     copy.rescale(*stored)
     shrink_by = stored[0] // size[0]
-    # Trimming to whole blocks takes nothing from the left or the top.
+    # Incomplete blocks are cropped at the right and bottom only.
     copy.width, copy.height = size[0] * shrink_by, size[1] * shrink_by
     copy.rescale(*size)
     return copy
@@ -368,9 +373,9 @@ def _is_fisheye(lens):
     return lens.model_name == "OPENCV_FISHEYE"
 
 
-def _is_ours(lens):
+def _is_supported(lens):
     if lens.model_name == "FULL_OPENCV":
-        return not np.any(lens.params[9:])  # k4 to k6 divide; ours does not
+        return not np.any(lens.params[9:])  # k4 to k6 of the rational model
     return lens.model_name in {
         "SIMPLE_PINHOLE",
         "PINHOLE",

@@ -1,7 +1,8 @@
-"""Program of `decoder`: decode files of strangers under limits of memory and time.
+"""Child process of `decoder`, which decodes untrusted files with resource limits.
 
-Requests come on stdin, one JSON object a line. Each answer on stdout is a line of JSON
-and the bytes of the arrays that it lists; the last one of a request only says so.
+Requests arrive on stdin, one JSON object per line. Each answer on stdout is a line of
+JSON followed by the bytes of the arrays that it lists. The last line of a request marks
+its end.
 """
 
 import contextlib
@@ -18,12 +19,12 @@ from nerfies_jax.runtime import children
 
 try:
     import resource
-except ImportError:  # Windows has no such limits
+except ImportError:  # Windows has no such module
     resource = None  # type: ignore[assignment]
 
 
 def _limit(cpu_seconds, memory_bytes):
-    """Bound what this process may take from here on."""
+    """Bound the further processor time and memory of this process."""
     if resource is None:
         return
     spent = time.process_time()
@@ -129,17 +130,18 @@ def main() -> None:
     for line in sys.stdin.buffer:
         job = json.loads(line)
         operation, module = OPERATIONS[job["operation"]]
-        importlib.import_module(module)  # its libraries are not the file's memory
+        # Imported first, since the limit of memory excludes libraries.
+        importlib.import_module(module)
         try:
             spent = time.process_time()
             _limit(job["cpu_seconds"], job["memory_bytes"])
             for about, arrays in operation(**job["arguments"]):
                 _answer(answers, about, arrays)
-                if time.process_time() - spent > 1.0:  # the limit is for one answer
+                if time.process_time() - spent > 1.0:  # the limit holds per answer
                     spent = time.process_time()
                     _limit(job["cpu_seconds"], job["memory_bytes"])
             _say(answers, {"end": True})
-        # Decoders raise whatever they meet; the parent names the file.
+        # Decoders may raise anything. The parent adds the path.
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             if isinstance(error, MemoryError):

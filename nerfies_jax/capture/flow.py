@@ -112,11 +112,11 @@ def take(flow: FrameFlow, rows: np.ndarray) -> FrameFlow:
     leaves = []
     for _, shift, seen, neighbor in sides(flow):
         new_neighbor = new_index[neighbor[rows]]
-        lost = new_neighbor < 0
+        is_alone = new_neighbor < 0
         # A frame without a neighbor refers to its own row.
-        new_neighbor = np.where(lost, np.arange(len(rows)), new_neighbor)
+        new_neighbor = np.where(is_alone, np.arange(len(rows)), new_neighbor)
         shift, seen = shift[rows], seen[rows]  # copies, by indexing with an array
-        shift[lost], seen[lost] = 0, False
+        shift[is_alone], seen[is_alone] = 0, False
         leaves += [shift, seen, new_neighbor.astype(np.int32)]
     return FrameFlow(*leaves)
 

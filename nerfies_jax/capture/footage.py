@@ -1,7 +1,7 @@
-"""Images without cameras: sharp frames of a video, or photographs turned upright.
+"""Images without cameras: sharp frames of a video, or photographs rotated upright.
 
-Both become a folder of PNG files of one size, with masks in a second folder if there
-are any.
+Both are written as a folder of PNG files of one size, with a second folder for masks if
+there are any.
 """
 
 import collections
@@ -24,9 +24,11 @@ from nerfies_jax.capture.video import notes_of, read_video, transfer_of
 from nerfies_jax.runtime import events
 
 PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
-FRAMES = 100  # kept of a film
-OWN_TIMES = 0.9  # of the frames of a film must have a time that no other has
-BLURRED = 0.4  # of the usual sharpness around it; planted blurs came out below 0.2
+FRAMES = 100  # default number of frames to select from a video
+OWN_TIMES = 0.9  # share of the frames of a video that must have distinct times
+# Frames below this share of the median sharpness around them are blurred. In tests,
+# blurred frames have less than 0.2.
+BLURRED = 0.4
 _BROKEN = "not readable, so copy them again"
 _LARGE = f"of more than {MAX_PIXELS:,} pixels, so make them smaller first"
 
@@ -34,20 +36,21 @@ _LARGE = f"of more than {MAX_PIXELS:,} pixels, so make them smaller first"
 class Taken(NamedTuple):
     """Images taken from a video or from a folder of photographs."""
 
-    names: tuple[str, ...]  # of the files written, in order
-    notes: tuple[str, ...]  # what was left out, and why
-    seconds: float | None = None  # from the first frame of a film to the last
-    focal: float | None = None  # in longest sides of the picture, where files say it
+    names: tuple[str, ...]  # of the written files, in order
+    notes: tuple[str, ...]  # on images that were left out
+    seconds: float | None = None  # from the first to the last frame of a video
+    # Focal length over the longest side of the image, if files state it.
+    focal: float | None = None
 
 
 def kind_of(path: pathlib.Path) -> str | None:
-    """Tell videos from folders of images.
+    """Distinguish videos and folders of images.
 
     Args:
       path: A file or folder.
 
     Returns:
-      "film", "pictures" (a folder with two at least), or None.
+      "film" for a video, "pictures" for a folder with at least two images, or None.
     """
     if path.is_file() and path.suffix.lower() in VIDEOS:
         return "film"
@@ -97,26 +100,25 @@ def from_film(
     Raises:
       CaptureError: If the video cannot be used.
     """
-    shown_at, sharpnesses = [], []
+    stored_times, sharpnesses = [], []
     with events.stage("decoding the video to find sharp frames") as stage:
         for seconds, gray in read_video(film, gray=True, damaged="skip"):
-            shown_at.append(seconds)
+            stored_times.append(seconds)
             sharpnesses.append(sharpness(gray))
-            stage.advance(text=f"{len(shown_at):,} frames")
-    # Frames come in the order in which they are shown, but .avi has only the times at
-    # which they are decoded, and B-frames are not decoded in that order.
-    moments, scores = np.sort(shown_at), np.array(sharpnesses)
-    stamps = np.round(1000 * moments)  # as names keep them
-    # One or two of a phone's film may share one; of a film without times all do.
-    if len(np.unique(stamps)) < OWN_TIMES * len(stamps):
-        raise CaptureError(
-            f"{film}: its frames have no times of their own; encode it again"
-        )
-    count = _wanted(film, moments, count, per_second)
-    kept, blurred = sharp_rows(scores, moments, count)
-    kept = kept[np.unique(stamps[kept], return_index=True)[1]]
-    sources = None if masks is None else _masks_of_film(masks, len(moments))
-    names, rows, white = [], kept.tolist(), []  # the rows rise
+            stage.advance(text=f"{len(stored_times):,} frames")
+    # Frames arrive in display order, but .avi files hold decoding times, and B-frames
+    # are decoded in another order.
+    times, scores = np.sort(stored_times), np.array(sharpnesses)
+    milliseconds = np.round(1000 * times)  # in the names of the files
+    # In a phone's video, one or two frames may share a time. In a video without times
+    # all do.
+    if len(np.unique(milliseconds)) < OWN_TIMES * len(milliseconds):
+        raise CaptureError(f"{film}: its frames have no times; encode it again")
+    count = _frame_count(film, times, count, per_second)
+    selected, blurred = sharp_rows(scores, times, count)
+    selected = selected[np.unique(milliseconds[selected], return_index=True)[1]]
+    sources = None if masks is None else _masks_of_video(masks, len(times))
+    names, rows, white = [], selected.tolist(), []  # rows are in ascending order
     if sources is not None:
         sources = {row: sources[row] for row in rows}
         encoding = mask_files.find_encoding([*sources.values()], "upright")
@@ -124,8 +126,7 @@ def from_film(
     with events.stage("writing frames of the video", len(rows)) as stage:
         for row, (_, frame) in zip(rows, colors, strict=True):
             factor = _factor(frame.shape[1::-1], max_side)
-            # The name keeps the time.
-            names.append(f"ms{round(moments[row] * 1000):08d}.png")
+            names.append(f"ms{round(times[row] * 1000):08d}.png")
             _write(out / "images" / names[-1], shrink(frame, factor))
             if sources is not None:
                 source = sources[row]
@@ -133,38 +134,41 @@ def from_film(
                 white.append(mask.mean())
                 _write_mask(out, names[-1], mask, frame.shape, factor, source)
             stage.advance()
-    notes = [f"{len(kept)} of {len(scores)} frames kept, {blurred} too blurred"]
-    notes += notes_of(film, len(scores), float(moments[-1]))
+    notes = [f"{len(selected)} of {len(scores)} frames selected, {blurred} too blurred"]
+    notes += notes_of(film, len(scores), float(times[-1]))
     transfer = transfer_of(film)
     if transfer is not None:
-        notes.append(f"filmed in high dynamic range ({transfer}), tone-mapped to sRGB")
+        notes.append(f"video in high dynamic range ({transfer}), tone-mapped to sRGB")
     if sources is not None:
         used = [*sources.values()]
         notes.append(
             mask_files.describe(used, len(used), encoding, np.mean(white), "moving")
         )
-    return Taken(tuple(names), tuple(notes), float(np.ptp(moments[kept])))
+    return Taken(tuple(names), tuple(notes), float(np.ptp(times[selected])))
 
 
-def _wanted(film, moments, count, per_second):
+def _frame_count(film, times, count, per_second):
+    """Number of frames to select."""
     if per_second is not None:
         if count is not None:
-            raise ValueError("give the frames of a film or so many a second, not both")
-        count = round(per_second * np.ptp(moments)) + 1
+            raise ValueError(
+                f"count={count} and per_second={per_second}; pass only one of the two"
+            )
+        count = round(per_second * np.ptp(times)) + 1
     count = FRAMES if count is None else count
     if count < MIN_TRACK:
         raise ValueError(
-            f"{film}: {count} frames to keep; a reconstruction needs at least "
+            f"{film}: {count} frames to select; a reconstruction needs at least "
             f"{MIN_TRACK}"
         )
     return count
 
 
-def _masks_of_film(folder, count):
+def _masks_of_video(folder, count):
     files = pictures_in(folder)
     if len(files) != count:
         raise CaptureError(
-            f"{folder}: {len(files)} masks for a film of {count} frames; there must "
+            f"{folder}: {len(files)} masks for a video of {count} frames; there must "
             "be one for each, in the order of their names"
         )
     return files
@@ -179,8 +183,8 @@ def from_pictures(
 ) -> Taken:
     """Write the images of a folder, upright and of one size, into `out/images`.
 
-    Images that cannot be read or differ in size from the majority are left out, and
-    named in the notes.
+    Images that cannot be read or differ in size from the majority are left out with a
+    note.
 
     Args:
       folder: The folder.
@@ -197,55 +201,56 @@ def from_pictures(
     """
     headers, notes = _readable(folder)
     sizes = collections.Counter(header.size for header in headers.values())
-    usual = sizes.most_common(1)[0][0]
-    taken = [file for file in headers if headers[file].size == usual]
-    others = [file.name for file in headers if headers[file].size != usual]
-    notes += _left_out(others, f"not of {usual[0]}x{usual[1]} pixels like most")
-    stems = collections.Counter(_spoken(file.stem) for file in taken)
-    stem, times = stems.most_common(1)[0]
-    if times > 1:
-        raise CaptureError(f"{folder}: {times} pictures are named {stem}; keep one")
-    factor, broken, used, white = _factor(usual, max_side), [], [], []
+    size = sizes.most_common(1)[0][0]
+    selected = [file for file in headers if headers[file].size == size]
+    others = [file.name for file in headers if headers[file].size != size]
+    notes += _left_out_note(others, f"not of {size[0]}x{size[1]} pixels like most")
+    stems = collections.Counter(_encodable(file.stem) for file in selected)
+    stem, count = stems.most_common(1)[0]
+    if count > 1:
+        raise CaptureError(f"{folder}: {count} images are named {stem}; keep one")
+    factor, broken, used, white = _factor(size, max_side), [], [], []
     if masks is not None:
-        sources = {file: _mask_of(masks, file) for file in taken}
+        sources = {file: _mask_of(masks, file) for file in selected}
         encoding = mask_files.find_encoding([*sources.values()], "upright")
-    with events.stage("reading images", len(taken)) as stage:
-        for file in taken:
+    with events.stage("reading images", len(selected)) as stage:
+        for file in selected:
             stage.advance()
             try:
                 color = photographs.read_upright(file)
-            except photographs.Unreadable:  # behind its header
+            except photographs.Unreadable:  # damaged after its header
                 broken.append(file)
                 continue
-            name = f"{_spoken(file.stem)}.png"
+            name = f"{_encodable(file.stem)}.png"
             _write(out / "images" / name, shrink(color, factor))
             if masks is not None:
                 used.append(sources[file])
                 mask = mask_files.read_mask(used[-1], encoding, "upright")
                 white.append(mask.mean())
                 _write_mask(out, name, mask, color.shape, factor, used[-1])
-    notes += _left_out([file.name for file in broken], _BROKEN)
-    taken = [file for file in taken if file not in broken]
-    _check_enough(folder, len(taken), notes)
+    notes += _left_out_note([file.name for file in broken], _BROKEN)
+    selected = [file for file in selected if file not in broken]
+    count = len(selected)
+    _check_enough(folder, count, notes)
     if masks is not None:
-        note = mask_files.describe(used, len(taken), encoding, np.mean(white), "moving")
+        note = mask_files.describe(used, count, encoding, np.mean(white), "moving")
         notes += (note,)
-    names = tuple(f"{_spoken(file.stem)}.png" for file in taken)
-    focals = [headers[file].focal for file in taken]
+    names = tuple(f"{_encodable(file.stem)}.png" for file in selected)
+    focals = [headers[file].focal for file in selected]
     stated = [focal for focal in focals if focal is not None]
     return Taken(names, notes, focal=float(np.median(stated)) if stated else None)
 
 
 def _readable(folder):
-    """Return the headers of readable images, and a note of the others."""
+    """Return the headers of readable images, and notes on the others."""
     files = pictures_in(folder)
-    of_phones = [file.name for file in files if file.suffix.lower() in HEIC]
+    heic_names = [file.name for file in files if file.suffix.lower() in HEIC]
     notes = ()
-    if of_phones and not photographs.heic_is_read():
-        notes = _left_out(
-            of_phones, "HEIC, which needs pip install 'nerfies-jax[heic]'"
+    if heic_names and not photographs.heic_is_read():
+        notes = _left_out_note(
+            heic_names, "HEIC, which needs pip install 'nerfies-jax[heic]'"
         )
-        files = [file for file in files if file.name not in of_phones]
+        files = [file for file in files if file.name not in heic_names]
     headers, broken, large = {}, [], []
     for file in files:
         try:
@@ -254,7 +259,7 @@ def _readable(folder):
             broken.append(file.name)
         except photographs.TooLarge:
             large.append(file.name)
-    notes += _left_out(broken, _BROKEN) + _left_out(large, _LARGE)
+    notes += _left_out_note(broken, _BROKEN) + _left_out_note(large, _LARGE)
     _check_enough(folder, len(headers), notes)
     return headers, notes
 
@@ -262,20 +267,21 @@ def _readable(folder):
 def _check_enough(folder, count, notes):
     if count < MIN_TRACK:
         raise CaptureError(
-            f"{folder}: {count} pictures; a reconstruction needs at least {MIN_TRACK}"
+            f"{folder}: {count} images; a reconstruction needs at least {MIN_TRACK}"
             + "".join(f" ({note})" for note in notes)
         )
 
 
-def _left_out(names, reason):
+def _left_out_note(names, reason):
     if not names:
         return ()
-    listed = ", ".join(map(_spoken, names[:5])) + (", ..." if len(names) > 5 else "")
-    return (f"{len(names)} pictures left out, {reason}: {listed}",)
+    listed = ", ".join(map(_encodable, names[:5]))
+    listed += ", ..." if len(names) > 5 else ""
+    return (f"{len(names)} images left out, {reason}: {listed}",)
 
 
-def _spoken(name):
-    """The name in letters: of an old archive it may be no UTF-8, which COLMAP wants."""
+def _encodable(name):
+    """The name in UTF-8, which COLMAP expects. Names in old archives may not be."""
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -283,13 +289,11 @@ def _spoken(name):
     return name
 
 
-def _mask_of(folder, picture):
-    for name in (f"{picture.stem}.png", f"{picture.name}.png"):
+def _mask_of(folder, image):
+    for name in (f"{image.stem}.png", f"{image.name}.png"):
         if (folder / name).is_file():
             return folder / name
-    raise CaptureError(
-        f"{folder}: no mask {picture.stem}.png; name each after its picture"
-    )
+    raise CaptureError(f"{folder}: no mask {image.stem}.png; name each after its image")
 
 
 def _factor(size, max_side):
@@ -298,16 +302,16 @@ def _factor(size, max_side):
     return max(1, math.ceil(max(size) / max_side))
 
 
-def _write(path, picture):
+def _write(path, image):
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, np.ascontiguousarray(picture))
+    write_png(path, np.ascontiguousarray(image))
 
 
 def _write_mask(out, name, mask, shape, factor, source):
     if mask.shape != shape[:2]:
         raise CaptureError(
-            f"{source}: a mask of {mask.shape[1]}x{mask.shape[0]} pixels for pictures "
-            f"of {shape[1]}x{shape[0]}; they must agree"
+            f"{source}: a mask of {mask.shape[1]}x{mask.shape[0]} pixels for images of "
+            f"{shape[1]}x{shape[0]}; the sizes must agree"
         )
     _write(out / "masks" / f"{name}.png", blocks(mask, factor).all((-3, -1)))
 
@@ -322,8 +326,8 @@ def sharpness(gray: np.ndarray) -> float:
       The variance.
     """
     step = max(1, max(gray.shape) // 480)
-    thinned = gray[::step, ::step].astype(np.float32)
-    return float(scipy.ndimage.laplace(thinned).var())
+    reduced = gray[::step, ::step].astype(np.float32)
+    return float(scipy.ndimage.laplace(reduced).var())
 
 
 def sharp_rows(
@@ -343,20 +347,25 @@ def sharp_rows(
       Indices of the selected frames, and the number of intervals without a sharp frame.
     """
     share = (seconds - seconds[0]) / max(np.ptp(seconds), np.finfo(float).tiny)
-    # A frame stands for the time until the next one: the last has a stretch as well.
-    stretch = np.floor(share * (1 - 1 / len(seconds)) * count + 1e-9).astype(int)
+    # Each frame lasts until the next one, and so does the last.
+    interval = np.floor(share * (1 - 1 / len(seconds)) * count + 1e-9).astype(int)
     best = np.array(
         [
             rows[np.argmax(scores[rows])]
-            for rows in (np.flatnonzero(stretch == k) for k in np.unique(stretch))
+            for rows in (np.flatnonzero(interval == k) for k in np.unique(interval))
         ]
     )
-    own = scores[best]
-    clear = np.array([own[i] >= BLURRED * _usual(own, i) for i in range(len(own))])
-    return best[clear], int((~clear).sum())
+    best_scores = scores[best]
+    is_sharp = np.array(
+        [
+            score >= BLURRED * _typical_score(best_scores, row)
+            for row, score in enumerate(best_scores)
+        ]
+    )
+    return best[is_sharp], int((~is_sharp).sum())
 
 
-def _usual(scores, row):
+def _typical_score(scores, row):
     """Lower of the medians before and after, since texture may change abruptly."""
     sides = scores[max(0, row - 5) : row], scores[row + 1 : row + 6]
     return min((np.median(side) for side in sides if side.size), default=0.0)

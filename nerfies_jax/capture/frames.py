@@ -1,4 +1,4 @@
-"""Selecting, sorting, splitting and decoding of frames, shared by all readers."""
+"""Selection, order, splits and decoding of frames, shared by all readers."""
 
 import math
 import pathlib
@@ -20,18 +20,18 @@ from nerfies_jax.capture import (
     safe_files,
     text_files,
 )
-from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import CaptureError, PointCloud, blocks, shrink
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.runtime import events
 
 MAX_FRAMES = 100_000
-MAX_BYTES = 16 * 2**30  # of decoded pictures
-HELD_OUT = 8  # every 8th frame where the files say nothing, as LLFF and Mip-NeRF 360
-OPAQUE = 128  # alpha from here on
-UNSEEN = 128  # gray of a point that no frame shows
-SUFFIXES = (".png", ".jpg", ".jpeg")  # in small letters; files may have others
+MAX_BYTES = 16 * 2**30  # of decoded images
+HELD_OUT = 8  # by default every 8th frame is held out, as in LLFF and Mip-NeRF 360
+OPAQUE = 128  # smallest alpha of opaque pixels
+UNSEEN = 128  # gray value of points that no frame shows
+SUFFIXES = (".png", ".jpg", ".jpeg")  # in lower case; files may use any case
 _ENDINGS = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
 
 
@@ -88,8 +88,8 @@ def choose_source(
     divisors = [source for source in available if factor >= 1 and factor % source == 0]
     if not divisors:
         raise CaptureError(
-            f"{where}: pictures smaller by {factor} cannot be made; there are "
-            f"{sorted(available)}, so ask for a multiple of one of them"
+            f"{where}: images cannot be reduced by factor={factor}; there are "
+            f"reductions {sorted(available)}, so use a multiple of one of them"
         )
     return max(divisors), factor // max(divisors)
 
@@ -124,22 +124,22 @@ def local_name(folder: pathlib.Path, name: str) -> str:
 
 
 def moved_note(names: Sequence[str], local: Sequence[str]) -> tuple[str, ...]:
-    """Say which names `local_name` replaced.
+    """Describe the names that `local_name` replaced.
 
     Args:
       names: Names from a file.
-      local: The same as `local_name` returned them.
+      local: The results of `local_name`.
 
     Returns:
-      A note, or none.
+      A note, or an empty tuple if the names are equal.
     """
     pairs = zip(names, local, strict=True)
-    moved = [(name, end) for name, end in pairs if name != end]
-    if not moved:
+    replaced = [(name, end) for name, end in pairs if name != end]
+    if not replaced:
         return ()
-    name, end = moved[0]
+    name, end = replaced[0]
     return (
-        f"{len(moved)} names of files are paths of another folder ({name}, ...): read "
+        f"{len(replaced)} file names are paths in another folder ({name}, ...): read "
         f"from this one ({end}, ...)",
     )
 
@@ -149,14 +149,14 @@ def pictures_in(
 ) -> list[pathlib.Path]:
     """List the image files of a folder.
 
-    Hidden files do not count: macOS puts ._A.JPG next to A.JPG, with no image in it.
+    Hidden files are skipped: macOS writes ._A.JPG next to A.JPG, which is not an image.
 
     Args:
       folder: The folder.
       suffixes: Suffixes of images in lower case.
 
     Returns:
-      Paths, sorted character by character.
+      Paths in lexicographic order.
     """
     return sorted(
         file
@@ -204,16 +204,16 @@ def keep_found(
     """
     check_missing(missing, where)
     rows = np.array([row for row, path in enumerate(paths) if path is not None], int)
-    lost = [name for name, path in zip(names, paths, strict=True) if path is None]
-    if not lost:
+    absent = [name for name, path in zip(names, paths, strict=True) if path is None]
+    if not absent:
         return rows, ()
-    listed = ", ".join(lost[:5]) + (", ..." if len(lost) > 5 else "")
+    listed = ", ".join(absent[:5]) + (", ..." if len(absent) > 5 else "")
     if missing == "refuse" or not rows.size:
         raise CaptureError(
-            f"{where}: {len(lost)} of {len(names)} pictures are missing ({listed}); "
+            f"{where}: {len(absent)} of {len(names)} images are missing ({listed}); "
             'restore them, or leave those frames out with missing="skip"'
         )
-    return rows, (f"{len(lost)} frames left out, their pictures are missing: {listed}",)
+    return rows, (f"{len(absent)} frames left out, their images are missing: {listed}",)
 
 
 class Frames(NamedTuple):
@@ -226,7 +226,7 @@ class Frames(NamedTuple):
     notes: tuple[str, ...]
 
     def valid(self) -> np.ndarray | None:
-        """Return the observed pixels of a format that marks them by an alpha of 255.
+        """Return the observed pixels of a format that marks them with alpha 255.
 
         Returns:
           Booleans [frames, height, width], None for all.
@@ -278,9 +278,9 @@ def read_frames(
         raise CaptureError(
             f"{paths[0].parent}: {len(paths)} frames; at most {MAX_FRAMES}"
         )
-    width, height = size = pictures.read_header(paths[0]).size
+    width, height = size = image_files.read_header(paths[0]).size
     for path in paths[1:]:
-        other = pictures.read_header(path).size
+        other = image_files.read_header(path).size
         if other != size:
             raise CaptureError(
                 f"{path}: {other[0]}x{other[1]} pixels, but {paths[0].name} has "
@@ -288,25 +288,29 @@ def read_frames(
             )
     width, height = width // shrink_by, height // shrink_by
     if min(width, height) < 1:
-        raise CaptureError(f"{paths[0]}: {size} pixels cannot shrink by {shrink_by}")
+        raise CaptureError(
+            f"{paths[0]}: {size} pixels cannot be reduced by {shrink_by}; use a "
+            "smaller factor"
+        )
     if len(paths) * width * height * 3 > MAX_BYTES:
         raise CaptureError(
-            f"{paths[0].parent}: {len(paths)} pictures of {width}x{height} need "
+            f"{paths[0].parent}: {len(paths)} images of {width}x{height} need "
             f"{len(paths) * width * height * 3 / 2**30:.0f} GiB, more than "
             f"{MAX_BYTES / 2**30:.0f}; read them smaller with factor= or max_side="
         )
     colors = frame_memory.aligned_empty((len(paths), height, width, 3), np.uint8)
-    # Zeros cost no memory until they are written, and most captures have no alpha.
+    # 255 - alpha: the zeros of opaque images, as of most captures, use no memory until
+    # they are written.
     transparencies = np.zeros((len(paths), height, width), np.uint8)
 
     def decode(row):
         alpha = known = None
-        if paths[row].suffix.lower() == pictures.EXR:
-            color, known = pictures.read_light(paths[row])
+        if paths[row].suffix.lower() == image_files.EXR:
+            color, known = image_files.read_light(paths[row])
         else:
-            color, alpha = pictures.read_image(paths[row], orientation)
+            color, alpha = image_files.read_image(paths[row], orientation)
         if alpha is not None and background is not None:
-            color = pictures.over(color, alpha, background)
+            color = image_files.over(color, alpha, background)
         colors[row] = shrink(color, shrink_by)
         if alpha is not None:
             transparencies[row] = 255 - shrink(alpha[..., None], shrink_by)[..., 0]
@@ -314,8 +318,8 @@ def read_frames(
             known = blocks(known, shrink_by).all((-3, -1))
         return alpha is not None, known
 
-    # Decoding releases the interpreter lock; four threads read 86 frames of 512x384 in
-    # 0.25 s instead of 0.8.
+    # Decoding releases the GIL. Four threads read 86 frames of 512x384 in 0.25 s, and
+    # one in 0.8 s.
     any_alpha, unknown = False, {}
     stage = events.stage("reading images", len(paths))
     with ThreadPoolExecutor(4) as pool, stage as reading:
@@ -355,18 +359,18 @@ def read_masks(
     """Read the masks of all frames.
 
     Args:
-        paths: One for each frame, at least one of them; None where there is no file.
-        size: Width and height of the shrunk images.
-        shrink_by: Integer reduction of masks of the images' size. Others may be a
-          whole multiple of the shrunk images.
-        black: Meaning of black pixels, for messages: "not observed" or "moving".
+      paths: A file per frame, None for frames without a mask. At least one is a file.
+      size: Width and height of the reduced images in pixels.
+      shrink_by: Integer reduction of masks that have the size of the stored images.
+        Other masks may have any integer multiple of `size`.
+      black: Meaning of black pixels, for messages: "not observed" or "moving".
 
     Returns:
-        The share of white in each block, float32 [frames, height, width], 1 where there
-        is no file; and a note of how white was told from black.
+      The share of white in each block, float32 [frames, height, width], 1 for frames
+      without a mask; and a note on the encoding of white.
 
     Raises:
-        CaptureError: A mask does not fit, or all of them are black.
+      CaptureError: If a mask has another size, or all masks are black.
     """
     width, height = size
     share = np.ones((len(paths), height, width), np.float32)
@@ -376,16 +380,16 @@ def read_masks(
         if path is None:
             continue
         mask = masks.read_mask(path, encoding)
-        tall, wide = mask.shape
-        # Masks are often kept at full size alone, next to smaller images.
-        for factor in (shrink_by, max(1, round(wide / width))):
-            if (wide // factor, tall // factor) == (width, height):
+        mask_height, mask_width = mask.shape
+        # Masks are often stored at full size only, next to smaller images.
+        for factor in (shrink_by, max(1, round(mask_width / width))):
+            if (mask_width // factor, mask_height // factor) == (width, height):
                 break
         else:
             raise CaptureError(
-                f"{path}: a mask of {wide}x{tall} pixels for pictures of "
-                f"{width * shrink_by}x{height * shrink_by}; they must agree, or the "
-                "mask be a whole multiple of them"
+                f"{path}: a mask of {mask_width}x{mask_height} pixels for images of "
+                f"{width * shrink_by}x{height * shrink_by}; the sizes must agree, or "
+                "that of the mask be an integer multiple"
             )
         share[row] = blocks(mask, factor).mean((-3, -1))
     white = share[[path is not None for path in paths]].mean()
@@ -401,26 +405,26 @@ def hold_out_in_time(
     Args:
       times: Frame times, in any order.
       camera_ids: Physical camera of each frame.
-      every: One of so many frames is held out.
+      every: Interval of held-out frames.
       where: Name of the capture in error messages.
 
     Returns:
       Training rows and held-out rows, each in ascending order.
     """
     order = np.lexsort((np.asarray(times), np.asarray(camera_ids)))
-    kept, scored = hold_out_every(len(order), every, where)
-    return np.sort(order[kept]), np.sort(order[scored])
+    train, heldout = hold_out_every(len(order), every, where)
+    return np.sort(order[train]), np.sort(order[heldout])
 
 
 def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Hold out the middle frame of every `every` frames.
+    """Hold out the middle frame of each group of `every` frames.
 
-    With the middle one, a held-out frame has neighbors on both sides. One frame is held
-    out if there are fewer than `every`, and none if there are fewer than three.
+    Held-out frames thus have training frames on both sides. One frame is held out if
+    there are fewer than `every`, and none if there are fewer than three.
 
     Args:
       count: Number of frames.
-      every: One of so many frames is held out, at least 2.
+      every: Interval of held-out frames, at least 2.
       where: Name of the capture in error messages.
 
     Returns:
@@ -431,21 +435,20 @@ def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.n
     """
     if every < 2:
         raise CaptureError(
-            f"{where}: heldout={every} leaves nothing to learn from; expected at "
-            "least 2"
+            f"{where}: heldout={every} leaves no training frames; expected at least 2"
         )
     if count >= 3:
         every = min(every, count)
     rows = np.arange(count)
-    scored = rows % every == every // 2
-    return rows[~scored], rows[scored]
+    is_heldout = rows % every == every // 2
+    return rows[~is_heldout], rows[is_heldout]
 
 
-def held_out_note(scored: np.ndarray | list[Any], every: int) -> str:
-    """Say what `hold_out_every` held out."""
-    if not len(scored):
-        return "no frame is held out: there are too few"
-    if len(scored) == 1:
+def held_out_note(heldout: np.ndarray | list[Any], every: int) -> str:
+    """Describe the frames that `hold_out_every` held out."""
+    if not len(heldout):
+        return "no frames are held out: there are too few"
+    if len(heldout) == 1:
         return "one frame is held out"
     ending = {1: "st", 2: "nd", 3: "rd"}.get(every % 10, "th")
     ending = "th" if every % 100 in (11, 12, 13) else ending
@@ -505,7 +508,7 @@ def up_direction(cameras: Camera) -> tuple[float, float, float] | None:
     """
     mean = -cameras.camera_from_world[:, 1].astype(np.float64).mean(0)
     length = np.linalg.norm(mean)
-    if length < 0.1:  # rolled every way: no common up
+    if length < 0.1:  # the up directions cancel
         return None
     return tuple((mean / length).tolist())
 
@@ -534,9 +537,9 @@ def pixels_of(
       the image [points].
     """
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), cameras)
-    pixel, depth, seen = map(np.asarray, _project(one, jnp.asarray(position)))
+    pixel, depth, projectable = map(np.asarray, _project(one, jnp.asarray(position)))
     inside = (pixel >= 0).all(-1) & (pixel < np.asarray(size)).all(-1)
-    return pixel, depth, inside & seen & (depth > 0)
+    return pixel, depth, inside & projectable & (depth > 0)
 
 
 def near_origin(cameras: Camera, position: np.ndarray) -> tuple[Camera, np.ndarray]:
@@ -552,8 +555,9 @@ def near_origin(cameras: Camera, position: np.ndarray) -> tuple[Camera, np.ndarr
       Cameras and points in float32, with the median point at the origin.
     """
     origin = np.median(position, axis=0)
-    moved = (cameras.position - origin).astype(np.float32)
-    return cameras._replace(position=moved), (position - origin).astype(np.float32)
+    camera_position = (cameras.position - origin).astype(np.float32)
+    points = (position - origin).astype(np.float32)
+    return cameras._replace(position=camera_position), points
 
 
 def colored_points(
@@ -565,7 +569,7 @@ def colored_points(
 ) -> PointCloud:
     """Color points with the median over up to 16 frames.
 
-    Occlusion is not tested. The median tolerates it in a minority of the frames.
+    Occlusion is not tested, but the median is robust to it in a minority of the frames.
 
     Args:
       position: Points in scene units, [points, 3].
@@ -582,14 +586,14 @@ def colored_points(
     samples = np.full((len(rows), len(position), 3), np.nan, np.float32)
     for sample, row in zip(samples, rows.tolist(), strict=True):
         pixel, _, inside = pixels_of(cameras, row, position, size)
-        column, line = np.where(inside[:, None], pixel, 0).astype(int).T
+        x, y = np.where(inside[:, None], pixel, 0).astype(int).T
         if skip is not None:
-            inside &= ~skip[row, line, column]
-        sample[inside] = images[row, line, column][inside]
-    seen = ~np.isnan(samples[..., 0]).all(0)
+            inside &= ~skip[row, y, x]
+        sample[inside] = images[row, y, x][inside]
+    visible = ~np.isnan(samples[..., 0]).all(0)
     color = np.full((len(position), 3), UNSEEN, np.uint8)
-    if seen.any():
-        color[seen] = np.round(np.nanmedian(samples[:, seen], axis=0))
+    if visible.any():
+        color[visible] = np.round(np.nanmedian(samples[:, visible], axis=0))
     return PointCloud(position, color)
 
 
@@ -604,7 +608,7 @@ def load_array(path: pathlib.Path, most: int) -> np.ndarray:
       The array.
 
     Raises:
-      CaptureError: If it is damaged, larger, or no array of numbers.
+      CaptureError: If it is damaged, larger, or not an array of numbers.
     """
     try:
         array = npz_files.read_npy(path, 8 * most + npz_files.MAX_HEADER)

@@ -1,4 +1,4 @@
-"""Check of camera poses by where the cameras look, for captures without points."""
+"""Check of camera poses by their viewing directions, for captures without points."""
 
 from typing import NamedTuple
 
@@ -9,20 +9,21 @@ from nerfies_jax.capture.gate_finding import Finding
 from nerfies_jax.geometry.rays import across_ray
 
 LEAST_FRAMES = 4
-# Cameras look at one point if nearly all have it in front of them, their axes pass it
-# within this share of its distance, and cross at more than a few degrees.
+# Cameras look at a common point if at least this share of them has it in front, their
+# axes pass it within this share of its distance, and they converge by at least this.
 AHEAD, PASSES, CROSSES = 0.95, 0.15, 0.02
-BEHIND, FAR_OFF = 0.1, 0.3  # otherwise not at all
-TURNS = 0.1  # in entries of the rotation: a camera on a tripod turns by less
+# They do not if at most this share has it in front, or axes pass it farther away.
+BEHIND, FAR_OFF = 0.1, 0.3
+TURNS = 0.1  # smallest range of rotation matrix entries of a camera that rotates
 _FLIP = np.diag([1.0, -1.0, -1.0])  # between OpenGL and OpenCV axes of a camera
 
 
 class Look(NamedTuple):
-    """The point nearest to the axes of all cameras, and how well they look at it."""
+    """Measures of how cameras look at the point nearest to all their axes."""
 
     ahead: float  # share of the cameras that have it in front
-    passes: float  # distance of the axes from it, in distances of the cameras
-    crosses: float  # 0 for parallel axes, up to 2/3
+    passes: float  # distance of the axes from it over the distance of the cameras
+    crosses: float  # convergence: 0 for parallel axes, up to 2/3
 
 
 def findings(capture: Capture) -> list[Finding]:
@@ -37,10 +38,10 @@ def findings(capture: Capture) -> list[Finding]:
     rotation = np.asarray(capture.cameras.camera_from_world, np.float64)
     position = np.asarray(capture.cameras.position, np.float64) / capture.scale
     position = position + np.array(capture.center)
-    few = len(np.unique(capture.cameras.position, axis=0)) < LEAST_FRAMES
-    turning = len(position) >= LEAST_FRAMES and np.ptp(rotation, axis=0).max() > TURNS
-    if few and not turning:
-        return []  # fixed cameras
+    fixed = len(np.unique(capture.cameras.position, axis=0)) < LEAST_FRAMES
+    rotates = len(position) >= LEAST_FRAMES and np.ptp(rotation, axis=0).max() > TURNS
+    if fixed and not rotates:
+        return []
     look = look_of(rotation[:, 2], position)
     subject = "common point"
     value = f"{look.ahead:.0%} of the cameras look toward it"
@@ -48,27 +49,28 @@ def findings(capture: Capture) -> list[Finding]:
         value = "none, the axes of the cameras are nearly parallel"
     if look.ahead > BEHIND and look.passes <= FAR_OFF:
         return [Finding(subject, value)]
-    for reason, (turn, place) in _others(capture, rotation, position).items():
-        other = look_of(turn[:, 2], place)
+    readings = _other_conventions(capture, rotation, position)
+    for reason, (other_rotation, other_position) in readings.items():
+        other = look_of(other_rotation[:, 2], other_position)
         if other.ahead >= AHEAD and other.passes <= PASSES and other.crosses >= CROSSES:
             problem = (
                 f"{look.ahead:.0%} of the cameras look toward a common point, and "
-                f"{other.ahead:.0%} if {reason}; convert the poses, unless the cameras "
-                "were turned on the spot or look outwards"
+                f"{other.ahead:.0%} if {reason}; convert the poses, unless the camera "
+                "rotates in place or the cameras look outward"
             )
             return [Finding(subject, value, problem)]
     return [Finding(subject, value)]
 
 
 def look_of(axes: np.ndarray, position: np.ndarray) -> Look:
-    """Find the point that cameras look at.
+    """Measure how cameras look at the point nearest to all their axes.
 
     Args:
       axes: Viewing directions, [frames, 3].
       position: Positions, [frames, 3].
 
     Returns:
-      How well they look at it.
+      The measures.
     """
     across = across_ray(axes)
     matrix, origin = across.sum(0), position.mean(0)
@@ -78,17 +80,17 @@ def look_of(axes: np.ndarray, position: np.ndarray) -> Look:
         return Look(0.0, np.inf, crosses)
     offset = np.linalg.solve(matrix, right) + origin - position
     distance = float(np.linalg.norm(offset, axis=1).mean())
-    missed = np.linalg.norm(np.einsum("nij,nj->ni", across, offset), axis=1)
-    passes = float(np.sqrt((missed**2).mean()) / distance) if distance > 0 else np.inf
-    # As in rotations that were taken for those back: all cameras at one place.
+    misses = np.linalg.norm(np.einsum("nij,nj->ni", across, offset), axis=1)
+    passes = float(np.sqrt((misses**2).mean()) / distance) if distance > 0 else np.inf
+    # All cameras at the point itself, as with inverted rotations, are no evidence.
     if distance <= 1e-6 * np.abs(position).max(initial=1.0):
         passes = np.inf
     ahead = float(((axes * offset).sum(1) > 0).mean())
     return Look(ahead, passes, crosses)
 
 
-def _others(capture, rotation, position):
-    """Rotations from the world and positions under other readings, by reason."""
+def _other_conventions(capture, rotation, position):
+    """Rotations from the world and positions under other conventions, by reason."""
     back = rotation.swapaxes(1, 2)
     if capture.source != "blender":
         inverse = -np.einsum("nij,nj->ni", rotation, position)
@@ -99,7 +101,7 @@ def _others(capture, rotation, position):
             ),
             "the poses are the inverse": (back, inverse),
         }
-    matrix = back @ _FLIP  # as it stands in the file
+    matrix = back @ _FLIP  # as in the file
     inverse = -np.einsum("nij,nj->ni", matrix.swapaxes(1, 2), position)
     return {
         "transform_matrix is camera to world with axes right, down, forward (OpenCV)": (

@@ -9,16 +9,20 @@ from nerfies_jax.capture.gate_finding import Finding
 from nerfies_jax.capture.gate_poses import fold_radius
 from nerfies_jax.geometry.camera import unproject
 
-# Degrees across the image that a pinhole may have, and those that are usual.
+# Ranges of the horizontal field of view in degrees: valid ones, and usual ones.
 POSSIBLE, USUAL = (0.01, 165.0), (0.5, 140.0)
+# Relative difference of two ratios that count as equal. Distance of the principal point
+# from the center, as a share of the image.
 ALIKE, OFF_CENTER = 0.03, 0.25
-ZOOM = 2.0
-# Float32 steps in pixels: what is worth a note, and what makes a capture useless.
+ZOOM = 2.0  # largest ratio of the focal lengths of one camera
+# Spacing of float32 in pixels that is noted, and that is refused.
 DOUBTFUL_PX, WRONG_PX = 0.1, 2.0
+# Share of the image in which a lens is not one-to-one: noted, and refused.
 FOLDED, MOST_FOLDED = 1e-3, 0.5
-MOST_BENT = 0.6  # share by which a lens may move the corner of an image
-ON_STEPS = 0.99  # of the coordinates: they were float32 once
-MOST_ROUNDED = 10_000  # points; more say the same
+MOST_BENT = 0.6  # largest relative displacement of image corners by a lens
+# Share of coordinates that are multiples of the float32 spacing if they were rounded.
+ON_STEPS = 0.99
+MOST_ROUNDED = 10_000  # points that are tested for rounding
 
 
 def findings(capture: Capture) -> list[Finding]:
@@ -45,7 +49,7 @@ def _field_of_view(capture):
     focal = np.float64(capture.cameras.focal_px)
     degrees = np.degrees(2 * np.arctan2(width / 2, focal))
     low, high = float(degrees.min()), float(degrees.max())
-    value = f"{low:.3g} to {high:.3g} degrees across" if high > low else f"{low:.3g}"
+    value = f"{low:.3g} to {high:.3g} degrees" if high > low else f"{low:.3g} degrees"
     value += f"; focal length {focal.min():.4g} to {focal.max():.4g} px"
     subject = "field of view"
     if high > USUAL[1]:
@@ -59,14 +63,14 @@ def _field_of_view(capture):
             "it in pixels of these images"
         )
     elif any(
-        focal[rows].max() > ZOOM * focal[rows].min() for rows in _of_cameras(capture)
+        focal[rows].max() > ZOOM * focal[rows].min() for rows in _by_camera(capture)
     ):
         return Finding(
             subject,
             value,
-            f"focal lengths of one camera run from {focal.min():.4g} to "
-            f"{focal.max():.4g} px: unless it zooms, some are of images of another "
-            "size",
+            f"focal lengths of one camera range from {focal.min():.4g} to "
+            f"{focal.max():.4g} px: unless it zooms, some are for images of another "
+            "size; state them for these images",
         )
     else:
         return Finding(subject, value)
@@ -79,21 +83,22 @@ def _field_of_view(capture):
     return Finding(subject, value, problem, impossible)
 
 
-def _of_cameras(capture):
+def _by_camera(capture):
+    """Indices of the frames of each camera."""
     ids = capture.camera_ids
     return [np.flatnonzero(ids == each) for each in np.unique(ids)]
 
 
 def _aspect(capture):
     aspect = np.float64(capture.cameras.pixel_aspect)
-    odd = aspect[np.abs(aspect - 1) > 0.01]
+    not_square = aspect[np.abs(aspect - 1) > 0.01]
     value = f"{aspect.min():.4g} to {aspect.max():.4g}"
-    if not odd.size:
+    if not not_square.size:
         return Finding("pixel aspect", value)
     problem = (
-        f"{odd.size} frames have pixels that are not square: vertical over horizontal "
-        f"focal length {odd.min():.3g} to {odd.max():.3g}; check that both are of "
-        "images of one size"
+        f"{not_square.size} frames have pixels that are not square: vertical over "
+        f"horizontal focal length {not_square.min():.3g} to {not_square.max():.3g}; "
+        "check that both are for images of one size"
     )
     return Finding("pixel aspect", value, problem)
 
@@ -103,34 +108,36 @@ def _principal_point(capture):
     median = np.median(share, axis=0)
     value = f"at {median[0]:.0%} of the width and {median[1]:.0%} of the height"
     subject = "principal point"
-    off = np.abs(share - 0.5).max(1)
-    row = int(off.argmax())
+    distance = np.abs(share - 0.5).max(1)
+    row = int(distance.argmax())
     ratio = 2 * share[row]
     larger = ratio.min() > 1.5 and np.ptp(ratio) <= ALIKE * ratio.max()
     smaller = 0.05 < ratio.max() < 0.67 and np.ptp(ratio) <= ALIKE * ratio.max()
-    # Points that fall into the images confirm a tile of a larger image, whose principal
-    # point seldom lies as far out across as down.
-    if off.max() <= OFF_CENTER or (
+    # Points that project into the images confirm that images are tiles of a larger one,
+    # but the principal point of a tile seldom has equal ratios in x and y.
+    if distance.max() <= OFF_CENTER or (
         capture.points is not None and not larger and not smaller
     ):
         return Finding(subject, value)
-    where = ", ".join(f"{each:.4g}" for each in capture.cameras.principal_point_px[row])
+    position = ", ".join(
+        f"{each:.4g}" for each in capture.cameras.principal_point_px[row]
+    )
     reason = "unless the images are tiles, check the units of the principal point"
     if larger or smaller:
         reason = (
-            f"the intrinsics seem to be of images {ratio.mean():.3g} times as large; "
+            f"the intrinsics seem to be for images {ratio.mean():.3g} times as large; "
             "scale them, unless the images are tiles"
         )
     return Finding(
         subject,
         value,
-        f"frame {capture.ids[row]!r} has its principal point at {where} in an image of "
-        f"{capture.size[0]}x{capture.size[1]}: {reason}",
+        f"frame {capture.ids[row]!r} has its principal point at {position} in an image "
+        f"of {capture.size[0]}x{capture.size[1]}: {reason}",
     )
 
 
 def _lens(capture):
-    """Check that lens models do not fold back or move corners too far."""
+    """Check that lens models are one-to-one and do not move corners too far."""
     cameras = capture.cameras
     if cameras.fisheye is not None:
         return _fisheye(capture)
@@ -138,7 +145,7 @@ def _lens(capture):
         return Finding("lens distortion", "none")
     width, height = capture.size
     y, x = (np.indices((17, 17)) / 16 * np.array([height, width])[:, None, None]) * 1.0
-    folded, bent = [], []
+    folded_shares, shifts = [], []
     columns = (
         cameras.radial,
         cameras.focal_px[:, None],
@@ -152,10 +159,11 @@ def _lens(capture):
         reach = np.inf
         if np.isfinite(fold):
             reach = fold * (1 + fold**2 * (k1 + fold**2 * (k2 + fold**2 * k3)))
-        folded.append(float((radius >= reach).mean()))
-        far = min(float(radius.max()), fold)
-        bent.append(abs(far**2 * (k1 + far**2 * (k2 + far**2 * k3))))
-    share, shift = max(folded), max(bent)
+        folded_shares.append(float((radius >= reach).mean()))
+        corner = min(float(radius.max()), fold)
+        stretch = corner**2 * (k1 + corner**2 * (k2 + corner**2 * k3))
+        shifts.append(abs(stretch))
+    share, shift = max(folded_shares), max(shifts)
     value = f"moves corners by {shift:.1%}, folds in {share:.1%} of the image"
     reason = (
         "the coefficients may be of another model (fisheye), in another order, or of "
@@ -193,57 +201,57 @@ def _fisheye(capture):
 
 def _precision(capture):
     """Check that float32 resolves positions in scene units to a fraction of a pixel."""
-    places = [capture.cameras.position]
+    positions = [capture.cameras.position]
     if capture.points is not None:
-        places.append(capture.points.position)
-    step = max(units.float32_step(each) for each in places)
+        positions.append(capture.points.position)
+    step = max(units.float32_step(each) for each in positions)
     step_px = units.in_pixels(capture, step)
     value = f"{step_px:.1g} px"
     problem = ""
     if step_px > DOUBTFUL_PX:
-        largest = max(np.abs(each).max() for each in places)
+        largest = max(np.abs(each).max() for each in positions)
         problem = (
-            f"positions reach {largest:.3g} scene units, where float32 has steps of "
-            f"{step_px:.2g} px: coordinates of a map are not centered; set the center "
-            "of the scene to that of the cameras"
+            f"positions reach {largest:.3g} scene units, where the spacing of float32 "
+            f"is {step_px:.2g} px: map coordinates are not centered; set the center of "
+            "the scene to that of the cameras"
         )
     return Finding("float32 step", value, problem, step_px > WRONG_PX)
 
 
 def _rounded(capture):
     """Check if positions in the files were rounded to float32."""
-    found = _rounded_positions(capture, capture.cameras.position, "camera positions")
+    results = _rounded_positions(capture, capture.cameras.position, "camera positions")
     if capture.points is not None and len(capture.points.position):
         points = capture.points.position
         points = points[:: max(1, len(points) // MOST_ROUNDED)]
-        # Points are where training begins, and cameras are what it is held against.
-        found += [
-            one._replace(refused=False)
-            for one in _rounded_positions(capture, points, "points")
+        # Not refused, since points only initialize the scene.
+        results += [
+            finding._replace(refused=False)
+            for finding in _rounded_positions(capture, points, "points")
         ]
-    return found
+    return results
 
 
-def _rounded_positions(capture, position, what):
+def _rounded_positions(capture, position, name):
     world = np.float64(position) / capture.scale + np.array(capture.center)
     steps = np.spacing(np.abs(world).max(0).astype(np.float32)).astype(float)
-    # Scene units are float32 themselves, which blurs what was rounded more finely.
-    own = units.float32_step(position) / capture.scale
+    # Positions in scene units are float32, which hides any finer rounding.
+    resolution = units.float32_step(position) / capture.scale
     rounded = []
     for axis in range(3):
-        step = steps[axis] / 2  # of coordinates down to half of the largest
-        parts = world[:, axis] / step
-        on_steps = (np.abs(parts - np.round(parts)) < 0.1).mean() >= ON_STEPS
-        if step > 20 * own and on_steps:
+        step = steps[axis] / 2  # spacing at half of the largest coordinate
+        multiples = world[:, axis] / step
+        on_steps = (np.abs(multiples - np.round(multiples)) < 0.1).mean() >= ON_STEPS
+        if step > 20 * resolution and on_steps:
             rounded.append(axis)
     step = max(steps[rounded], default=0.0) / 2
     step_px = units.in_pixels(capture, step * capture.scale)
-    # A coordinate that never changes may be such a number by itself.
+    # A constant coordinate may be such a multiple by chance.
     if step_px < DOUBTFUL_PX or not np.ptp(world[:, rounded], axis=0).any():
         return []
     problem = (
-        f"{what} are multiples of {step:.3g} world units, {step_px:.2g} px: "
+        f"{name} are multiples of {step:.3g} world units, {step_px:.2g} px: "
         f"coordinates of up to {np.abs(world).max():.4g} were rounded to float32; "
         "subtract an origin before exporting them"
     )
-    return [Finding(f"rounded {what}", f"{step:.3g}", problem, step_px > WRONG_PX)]
+    return [Finding(f"rounded {name}", f"{step:.3g}", problem, step_px > WRONG_PX)]

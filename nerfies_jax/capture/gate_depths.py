@@ -1,4 +1,4 @@
-"""Checks of depths against the scene, and of masks and depths that were not read."""
+"""Checks of depths against the scene, and of masks and depths that are not read."""
 
 import pathlib
 
@@ -8,8 +8,9 @@ from nerfies_jax.capture import units
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.gate_finding import Finding
 
-WRONG_UNITS = 20.0  # factor between stored depths and the scene that units explain
-# Names of factors between the units of depths and of cameras.
+# Smallest ratio of stored depths to the scene that indicates another unit.
+WRONG_UNITS = 20.0
+# Ratios of stored depths to the scene, and their explanations.
 UNITS = (
     (1000.0, "the depths are in millimeters and the cameras in meters"),
     (100.0, "the depths are in centimeters and the cameras in meters"),
@@ -18,11 +19,11 @@ UNITS = (
 )
 MASKS = ("masks", "mask", "motion_masks", "dynamic_masks")
 DEPTHS = ("depth", "depths", "depth_maps", "disp")
-SAMPLES = 1_000_000  # of the pixels; more change no median
+SAMPLES = 1_000_000  # pixels, enough for an accurate median
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check the units of depths, and find folders that nothing in the capture names.
+    """Check the units of depths, and find folders of masks or depths that are not read.
 
     Args:
       capture: The capture.
@@ -34,24 +35,24 @@ def findings(capture: Capture) -> list[Finding]:
 
 
 def _unread(capture):
-    """Folders next to the capture whose names promise what was not read."""
+    """Folders in the capture whose names suggest masks or depths that are not read."""
     if capture.path is None:
         return []
     root = pathlib.Path(capture.path)
     root = root if root.is_dir() else root.parent
-    found = []
-    for names, has, way_out in (
+    results = []
+    for names, was_read, kind in (
         (MASKS, capture.valid is not None or capture.moving is not None, "masks"),
         (DEPTHS, capture.depths is not None, "depths"),
     ):
-        there = [name for name in names if _has_files(root / name)]
-        if there and not has:
+        existing = [name for name in names if _has_files(root / name)]
+        if existing and not was_read:
             problem = (
-                f"the folder {there[0]} is not read: nothing in the capture names its "
-                f"files; they can be given as external {way_out}"
+                f"the folder {existing[0]} is not read: nothing in the capture refers "
+                f"to its files; they can be used as external {kind}"
             )
-            found.append(Finding(f"folder {there[0]}", "not read", problem))
-    return found
+            results.append(Finding(f"folder {existing[0]}", "not read", problem))
+    return results
 
 
 def _has_files(folder):
@@ -73,25 +74,25 @@ def _depths(capture):
     near, far = capture.near, capture.far
     median = float(np.median(known))
     beyond = float(((known < near) | (known > far)).mean())
-    usual = units.usual_depth(capture)
-    ratio = median / usual
-    of_points = units.point_depths(capture).size
-    stated = (
+    expected = units.usual_depth(capture)
+    ratio = median / expected
+    has_points = units.point_depths(capture).size
+    statement = (
         f"the median stored depth is {median:.3g} scene units, {ratio:.3g} times that "
-        + ("of the points" if of_points else f"between near and far ({usual:.3g})")
+        + ("of the points" if has_points else f"between near and far ({expected:.3g})")
         + f"; near is {near:.3g} and far {far:.3g}"
     )
     value = f"median {median:.3g}, {beyond:.0%} outside near and far"
     if 1 / WRONG_UNITS < ratio < WRONG_UNITS:
-        problem = f"{beyond:.0%} of depths: {stated}" if beyond > 0.5 else ""
+        problem = f"{beyond:.0%} of depths: {statement}" if beyond > 0.5 else ""
         scaled = abs(np.log(capture.scale)) > np.log(2)
         if problem and scaled and abs(np.log(ratio / capture.scale)) < np.log(1.5):
             problem += "; they seem to be in scene units, and world units are expected"
         return [Finding(subject, value, problem)]
     factor, reason = min(UNITS, key=lambda one: abs(np.log(ratio / one[0])))
-    way_out = "convert the depths to the unit of the cameras or remove them"
+    remedy = "convert the depths to the unit of the cameras or remove them"
     if abs(np.log(ratio / capture.scale)) < abs(np.log(ratio / factor)):
         factor, reason = capture.scale, "the depths are in scene units already"
     if abs(np.log(ratio / factor)) < np.log(3):
-        way_out = f"probably {reason}, so multiply the depths by {1 / factor:g}"
-    return [Finding(subject, value, f"{stated}; {way_out}", refused=True)]
+        remedy = f"probably {reason}, so multiply the depths by {1 / factor:g}"
+    return [Finding(subject, value, f"{statement}; {remedy}", refused=True)]

@@ -7,11 +7,14 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.gate_finding import Finding
 
 LEAST_OBSERVED, MOST_MOVING = 0.02, 0.9
-DARK = 64  # as images of 12 bits, and fewer, in 16 bits are
-# A gap between times is named if it is so many times the usual one, and such a share
-# of the whole.
+# Largest value of a dark image, of 255. 16-bit images with values of 12 or fewer bits
+# are darker.
+DARK = 64
+# A gap between times is a problem if it exceeds this multiple of the median gap and
+# this share of the duration.
 GAP, GAP_SHARE = 10.0, 0.25
-OUT_OF_ORDER = 0.05  # of the steps between frames in the order of their numbers
+# Largest share of consecutive frames, by numbers in their names, with falling times.
+OUT_OF_ORDER = 0.05
 _MASKS = (
     "check the masks (white is observed; 0 and 1 are read as black and white) and "
     "the alpha channel of the images"
@@ -52,12 +55,12 @@ def _observed(capture):
     if capture.valid is None:
         return [Finding("observed pixels", "all")]
     share = capture.valid.mean((1, 2))
-    learned = share[capture.train]
+    train_share = share[capture.train]
     value = f"{share.mean():.1%}"
     problem = ""
-    if learned.mean() < LEAST_OBSERVED:
-        problem = f"{learned.mean():.2%} of the pixels are observed; {_MASKS}"
-    elif (empty := capture.train[learned == 0]).size:
+    if train_share.mean() < LEAST_OBSERVED:
+        problem = f"{train_share.mean():.2%} of the pixels are observed; {_MASKS}"
+    elif (empty := capture.train[train_share == 0]).size:
         problem = f"{_listed(capture, empty)} without an observed pixel; {_MASKS}"
     return [Finding("observed pixels", value, problem)]
 
@@ -68,15 +71,15 @@ def _moving(capture):
     if moving is None:
         return []
     share = moving.mean((1, 2))
-    learned = share[capture.train]
+    train_share = share[capture.train]
     value = f"{share.mean():.1%}"
     problem = ""
-    if learned.mean() > MOST_MOVING:
+    if train_share.mean() > MOST_MOVING:
         problem = (
-            f"{learned.mean():.0%} of the pixels are marked as moving: the masks may "
-            "be inverted"
+            f"{train_share.mean():.0%} of the pixels are marked as moving: the masks "
+            "may be inverted"
         )
-    elif (full := capture.train[learned == 1]).size:
+    elif (full := capture.train[train_share == 1]).size:
         problem = (
             f"{_listed(capture, full)} marked as moving everywhere; check their masks"
         )
@@ -91,44 +94,46 @@ def _listed(capture, rows):
 def _times(capture):
     rows = capture.train
     times = np.float64(capture.times[rows])
-    moments = np.unique(times)
-    if len(moments) < 2:
+    distinct = np.unique(times)
+    if len(distinct) < 2:
         return [Finding("times", "all frames at one time")]
-    gaps = np.diff(moments)
-    widest = int(gaps.argmax())
-    largest, usual = float(gaps[widest]), float(np.median(gaps))
+    gaps = np.diff(distinct)
+    largest, median = float(gaps.max()), float(np.median(gaps))
     pairs = np.stack([times, capture.camera_ids[rows]], axis=1)
-    doubles = len(rows) - len(np.unique(pairs, axis=0))
+    duplicates = len(rows) - len(np.unique(pairs, axis=0))
     value = (
-        f"{moments[0]:.4g} to {moments[-1]:.4g}, {len(moments)} different, largest gap "
-        f"{largest:.3g} (usually {usual:.3g}), {doubles} duplicates"
+        f"{distinct[0]:.4g} to {distinct[-1]:.4g}, {len(distinct)} different, largest "
+        f"gap {largest:.3g} (median {median:.3g}), {duplicates} duplicates"
     )
-    return [Finding("times", value, _time_problem(capture, largest, usual, doubles))]
+    problem = _time_problem(capture, largest, median, duplicates)
+    return [Finding("times", value, problem)]
 
 
-def _time_problem(capture, largest, usual, doubles):
-    if doubles:
+def _time_problem(capture, largest, median, duplicates):
+    if duplicates:
         return (
-            f"{doubles} frames have the time of another frame of their camera: several "
-            "cameras may be taken for one, or times are rounded; state the times"
+            f"{duplicates} frames have the time of another frame of their camera: "
+            "several cameras may be taken for one, or times are rounded; provide the "
+            "times"
         )
-    if largest > GAP * usual and largest > GAP_SHARE:
+    if largest > GAP * median and largest > GAP_SHARE:
         return (
-            f"nothing was filmed during {largest:.0%} of the time, and frames are "
-            f"usually {usual:.2g} apart: times may mix clocks or units; state the "
-            "times, or cut the capture there"
+            f"there are no frames during {largest:.0%} of the time, and frames are "
+            f"usually {median:.2g} apart: times may mix clocks or units; provide the "
+            "times, or split the capture there"
         )
-    disordered = _disorder(capture)
-    if disordered > OUT_OF_ORDER:
+    out_of_order = _share_out_of_order(capture)
+    if out_of_order > OUT_OF_ORDER:
         return (
-            f"times fall in {disordered:.0%} of the steps from one number in the names "
-            "to the next: times or names may be of other frames; state the times"
+            f"times fall in {out_of_order:.0%} of the steps from one number in the "
+            "names to the next: times or names may belong to other frames; provide the "
+            "times"
         )
     return ""
 
 
-def _disorder(capture):
-    """Share of steps between numbers in the names at which times fall."""
+def _share_out_of_order(capture):
+    """Share of consecutive frames, by numbers in their names, with falling times."""
     falls = steps = 0
     for number in np.unique(capture.camera_ids[capture.train]):
         rows = capture.train[capture.camera_ids[capture.train] == number]

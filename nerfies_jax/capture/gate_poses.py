@@ -1,6 +1,6 @@
 """Checks of cameras against scene points, and the conventions that explain a mismatch.
 
-Everything is measured in float64 in NumPy: positions may be wrong by many orders.
+Computations are in float64, since positions may be wrong by many orders of magnitude.
 """
 
 from typing import NamedTuple
@@ -15,18 +15,21 @@ from nerfies_jax.capture.gate_finding import Finding
 # Share of the points in an image, averaged over cameras. Below `DOUBTFUL`, another
 # convention is suggested if its share is at least `CONVINCING`.
 DOUBTFUL, CONVINCING = 0.05, 0.3
-NONE = 0.005  # share of the points: as good as none
-# Of more points another convention is named too if it shows so many, and so many times
-# as many.
+NONE = 0.005  # shares below this count as none
+# Above `DOUBTFUL`, another convention is suggested if its share is at least `BETTER`
+# and at least `FAR_BETTER` times as large.
 BETTER, FAR_BETTER = 0.6, 2.5
-SEEN = 0.5  # of the points, by any frame: a survey shows few of them in each image
-# Focal lengths of larger images leave out so many of the points, and scaled ones are no
-# wider than usual, in degrees.
+# Share of the points in any image. In a survey each image shows few points, but all
+# images together show most.
+SEEN = 0.5
+# Focal lengths are suspected to be for larger images if less than this share of the
+# points is in any image, scaled ones have at most this field of view in degrees, and
+# the principal point is within this share of the image from the center.
 MOST_UNSEEN, WIDE, CENTERED = 0.7, 90.0, 0.1
-SMALL = 0.03  # of the image, across and down, in which nearly all points lie
+SMALL = 0.03  # share of the width and height that all points cover if units are wrong
 MOST_FRAMES, MOST_POINTS, LEAST_POINTS = 1000, 1000, 10
-MOST_BEYOND = 0.3  # of the points in view, outside near and far
-NO_PARALLAX = 1e-4  # of the depth of the points, that the cameras move
+MOST_BEYOND = 0.3  # largest share of the visible points outside near and far
+NO_PARALLAX = 1e-4  # extent of the camera path over the depth of the points
 _FLIP = np.diag([1.0, -1.0, -1.0])  # between OpenGL and OpenCV axes of a camera
 
 
@@ -59,118 +62,120 @@ def findings(capture: Capture) -> list[Finding]:
     count = len(capture.ids)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).astype(int))
     cameras = jax.tree.map(lambda leaf: np.asarray(leaf, float)[rows], capture.cameras)
-    places = capture.points.position
-    some = np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)
-    points = np.float64(places[some]) / capture.scale + np.array(capture.center)
+    points = capture.points.position
+    sample = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).astype(int)
+    points = np.float64(points[sample]) / capture.scale + np.array(capture.center)
     pose = Pose(
         np.asarray(cameras.camera_from_world),
         np.asarray(cameras.position) / capture.scale + np.array(capture.center),
     )
-    shown = _project(cameras, pose, points, capture.size)
-    share, front = shown.inside.mean(), (shown.depth > 0).mean()
-    seen = shown.inside.any(0).mean()
+    projected = _project(cameras, pose, points, capture.size)
+    share, front = projected.inside.mean(), (projected.depth > 0).mean()
+    visible = projected.inside.any(0).mean()
     value = (
         f"{front:.0%} in front of a camera and {share:.0%} inside its image, on average"
     )
     subject = "points"
-    if share < DOUBTFUL and seen < SEEN:
-        problem, refused = _explained(capture, cameras, pose, points, share)
+    if share < DOUBTFUL and visible < SEEN:
+        problem, refused = _explain(capture, cameras, pose, points, share)
         return [Finding(subject, value, problem, refused)]
     problem = ""
     if share < CONVINCING:
-        others = _others(capture, cameras, pose)
-        if seen < MOST_UNSEEN:
-            others |= _smaller_images(capture, cameras, pose)
-        others |= _other_units(cameras, pose)
-        best, reason = _best_of(others, capture, points)
+        readings = _other_conventions(capture, cameras, pose)
+        if visible < MOST_UNSEEN:
+            readings |= _smaller_images(capture, cameras, pose)
+        readings |= _other_units(cameras, pose)
+        best, reason = _best_reading(readings, capture, points)
         if best >= max(BETTER, FAR_BETTER * share):
             problem = f"{share:.0%} of the points fall into the images, and " + reason
-    found = [Finding(subject, value, problem)]
-    found += _spread(capture, shown)
-    found += _parallax(pose, shown)
-    found += _near_and_far(capture, shown)
-    found += _empty_frames(capture, rows, shown)
-    return found
+    return [
+        Finding(subject, value, problem),
+        *_spread(capture, projected),
+        *_parallax(pose, projected),
+        *_near_and_far(capture, projected),
+        *_empty_frames(capture, rows, projected),
+    ]
 
 
-def _explained(capture, cameras, pose, points, share):
-    """Explain why hardly any point is visible, and tell if nothing else can."""
-    others = _others(capture, cameras, pose)
-    if share < NONE:  # a tile or a survey shows some, and other units many
-        others |= _other_units(cameras, pose)
-    best, reason = _best_of(others, capture, points)
-    fall = f"{share:.0%} of the points fall into the images, and "
+def _explain(capture, cameras, pose, points, share):
+    """The problem if hardly any point is visible, and True if it must be refused."""
+    readings = _other_conventions(capture, cameras, pose)
+    if share < NONE:  # tiles and surveys show some points, and other units may show all
+        readings |= _other_units(cameras, pose)
+    best, reason = _best_reading(readings, capture, points)
+    statement = f"{share:.0%} of the points fall into the images, and "
     if best >= CONVINCING:
-        return fall + reason, True
-    best, reason = _best_of(_smaller_images(capture, cameras, pose), capture, points)
+        return statement + reason, True
+    readings = _smaller_images(capture, cameras, pose)
+    best, reason = _best_reading(readings, capture, points)
     if best >= BETTER:
-        return fall + reason, False
+        return statement + reason, False
     if share >= NONE:
         return "", False
     return (
         f"{share:.1%} of the points fall into an image: the points or the poses are "
-        "probably of another world or unit; export both from one program, or remove "
-        "the file of points",
+        "probably in other coordinates or units; export both from one program, or "
+        "remove the file of points",
         bool(share == 0),
     )
 
 
-def _best_of(others, capture, points):
-    """The largest share of points in the images under another reading, and which."""
+def _best_reading(readings, capture, points):
+    """The largest share of points in the images of any reading, and its reason."""
     shares = {}
-    for name, (other, placed) in others.items():
-        shown = _project(other, placed, points, capture.size)
-        # From far enough away all points are seen, as a dot.
-        dot = max(_extent(capture, shown), default=0.0) < SMALL
-        shares[name] = 0.0 if dot else float(shown.inside.mean())
+    for name, (cameras, pose) in readings.items():
+        projected = _project(cameras, pose, points, capture.size)
+        # From far enough away all points are visible as a dot.
+        is_dot = max(_extent(capture, projected), default=0.0) < SMALL
+        shares[name] = 0.0 if is_dot else float(projected.inside.mean())
     if not shares:
         return 0.0, ""
-    likely = max(shares, key=shares.get)
-    return shares[likely], f"{shares[likely]:.0%} if {likely}"
+    best = max(shares, key=shares.get)
+    return shares[best], f"{shares[best]:.0%} if {best}"
 
 
-def _others(capture, cameras, pose):
-    """Cameras and poses under other readings of the same numbers, by reason."""
+def _other_conventions(capture, cameras, pose):
+    """Cameras and poses under other conventions, by reason."""
     rotation, position = pose
     back = rotation.swapaxes(1, 2)  # world from camera
 
-    def turned(matrix, vector):
+    def rotate(matrix, vector):
         return np.einsum("nij,nj->ni", matrix, vector)
 
     opencv = "axes right, down, forward (OpenCV)"
-    wanted = "; convert the poses to camera to world with axes right, up, back (OpenGL)"
-    others = {}
+    remedy = "; convert the poses to camera to world with axes right, up, back (OpenGL)"
+    readings = {}
     if capture.source == "blender":
         matrix = back @ _FLIP  # as it stands in the file
-        inverse = -turned(matrix.swapaxes(1, 2), position)
-        others |= {
-            f"transform_matrix is camera to world with {opencv}{wanted}": Pose(
+        inverse = -rotate(matrix.swapaxes(1, 2), position)
+        readings |= {
+            f"transform_matrix is camera to world with {opencv}{remedy}": Pose(
                 _FLIP @ rotation, position
             ),
-            f"transform_matrix is world to camera with {opencv}{wanted}": Pose(
+            f"transform_matrix is world to camera with {opencv}{remedy}": Pose(
                 matrix, inverse
             ),
             "transform_matrix is world to camera with axes right, up, back (OpenGL)"
-            + wanted: Pose(_FLIP @ matrix, inverse),
+            + remedy: Pose(_FLIP @ matrix, inverse),
         }
     else:
-        wanted = (
+        remedy = (
             "; convert the poses to rotations from world to camera with "
             f"{opencv}, and positions of the cameras"
         )
-        others |= {
-            f"the camera's axes are right, up, back (OpenGL){wanted}": Pose(
+        readings |= {
+            f"the camera's axes are right, up, back (OpenGL){remedy}": Pose(
                 _FLIP @ rotation, position
             ),
-            f"the rotations are from camera to world{wanted}": Pose(back, position),
-            f"the positions are translations from world to camera{wanted}": Pose(
-                rotation, -turned(back, position)
+            f"the rotations are from camera to world{remedy}": Pose(back, position),
+            f"the positions are translations from world to camera{remedy}": Pose(
+                rotation, -rotate(back, position)
             ),
-            f"the poses are the inverse, world to camera{wanted}": Pose(
-                back, -turned(rotation, position)
+            f"the poses are the inverse, world to camera{remedy}": Pose(
+                back, -rotate(rotation, position)
             ),
         }
-    others = {name: (cameras, other) for name, other in others.items()}
+    readings = {name: (cameras, other) for name, other in readings.items()}
     ratio = 2 * cameras.principal_point_px / np.array(capture.size)
     times = float(np.median(ratio))
     if times >= 1.5:
@@ -179,69 +184,67 @@ def _others(capture, cameras, pose):
             principal_point_px=cameras.principal_point_px / times,
         )
         name = (
-            f"the intrinsics are of images {times:.3g} times as large; state the size "
+            f"the intrinsics are for images {times:.3g} times as large; state the size "
             "that they refer to, or scale them"
         )
-        others[name] = smaller, pose
-    return others
+        readings[name] = smaller, pose
+    return readings
 
 
 def _smaller_images(capture, cameras, pose):
-    """Cameras whose focal lengths alone are of images times as large, by reason."""
-    off = np.abs(cameras.principal_point_px / np.array(capture.size) - 0.5).max()
-    if off > CENTERED:  # then the principal point says it
+    """Cameras if only the focal lengths are for larger images, by reason."""
+    offset = np.abs(cameras.principal_point_px / np.array(capture.size) - 0.5).max()
+    if offset > CENTERED:  # the principal point is wrong as well
         return {}
-    others = {}
+    readings = {}
     for times in (2, 4, 8):
         smaller = cameras._replace(focal_px=cameras.focal_px / times)
-        across = 2 * np.arctan2(capture.size[0] / 2, np.median(smaller.focal_px))
-        if np.degrees(across) > WIDE:
+        angle = 2 * np.arctan2(capture.size[0] / 2, np.median(smaller.focal_px))
+        if np.degrees(angle) > WIDE:
             break
         name = (
-            f"the focal lengths are of images {times} times as large; state the size "
+            f"the focal lengths are for images {times} times as large; state the size "
             "that they refer to, or scale them"
         )
-        others[name] = smaller, pose
-    return others
+        readings[name] = smaller, pose
+    return readings
 
 
 def _other_units(cameras, pose):
     """Cameras and poses with positions in another unit than the points, by reason."""
-    others = {}
-    for factor, what in (
+    readings = {}
+    for factor, description in (
         (0.001, "camera positions in millimeters and points in meters"),
         (1000.0, "camera positions in meters and points in millimeters"),
         (0.01, "camera positions in centimeters and points in meters"),
         (100.0, "camera positions in meters and points in centimeters"),
     ):
-        name = f"the units differ: {what}; export both in one unit"
-        others[name] = cameras, Pose(pose.rotation, pose.position * factor)
-    return others
+        name = f"the units differ: {description}; export both in one unit"
+        readings[name] = cameras, Pose(pose.rotation, pose.position * factor)
+    return readings
 
 
-def _extent(capture, shown):
-    """Shares of width and height that nearly all points cover, or () for too few
-    points.
-    """
+def _extent(capture, projected):
+    """Shares of width and height that 90 % of the points cover. () for few points."""
     extents = []
-    for pixel, inside in zip(shown.pixel, shown.inside, strict=True):
+    for pixel, inside in zip(projected.pixel, projected.inside, strict=True):
         if inside.sum() >= LEAST_POINTS:
             low, high = np.quantile(pixel[inside], (0.05, 0.95), axis=0)
             extents.append((high - low) / np.array(capture.size))
     return np.median(extents, axis=0) if extents else ()
 
 
-def _spread(capture, shown):
+def _spread(capture, projected):
     """Check if all points lie in a small part of the images, as in a wrong unit."""
-    extent = _extent(capture, shown)
+    extent = _extent(capture, projected)
     if not len(extent):
         return []
-    across, down = extent
-    value = f"{across:.0%} of the width and {down:.0%} of the height"
+    x, y = extent
+    value = f"{x:.0%} of the width and {y:.0%} of the height"
     problem = ""
-    if max(across, down) < SMALL:
+    if max(x, y) < SMALL:
         problem = (
-            f"the points cover {across:.1%} of the width and {down:.1%} of the height "
+            f"the points cover {x:.1%} of the width and {y:.1%} of the height "
             "of an image: the focal length is too small (in millimeters, or of smaller "
             "images), or camera positions and points are in different units, such as "
             "millimeters and meters"
@@ -249,13 +252,13 @@ def _spread(capture, shown):
     return [Finding("points cover", value, problem)]
 
 
-def _parallax(pose, shown):
-    """Check if cameras move so little that their unit must be another one."""
-    moved = float(np.linalg.norm(np.ptp(pose.position, axis=0)))
-    depths = shown.depth[shown.inside]
-    if moved == 0 or not depths.size:
+def _parallax(pose, projected):
+    """Check if the camera path is so short that its unit must be another one."""
+    extent = float(np.linalg.norm(np.ptp(pose.position, axis=0)))
+    depths = projected.depth[projected.inside]
+    if extent == 0 or not depths.size:
         return []
-    ratio = moved / float(np.median(depths))
+    ratio = extent / float(np.median(depths))
     problem = ""
     if ratio < NO_PARALLAX:
         problem = (
@@ -263,12 +266,12 @@ def _parallax(pose, shown):
             "positions and points seem to be in different units, such as meters and "
             "millimeters; export both in one unit"
         )
-    return [Finding("cameras move by", f"{ratio:.2g} of the usual depth", problem)]
+    return [Finding("cameras move by", f"{ratio:.2g} of the median depth", problem)]
 
 
-def _near_and_far(capture, shown):
+def _near_and_far(capture, projected):
     """Check that the visible points lie between near and far."""
-    depths = shown.depth[shown.inside] * capture.scale
+    depths = projected.depth[projected.inside] * capture.scale
     if not depths.size:
         return []
     near, far = capture.near, capture.far
@@ -285,24 +288,24 @@ def _near_and_far(capture, shown):
         )
     problem = (
         f"{beyond:.0%} of the points lie outside near {near:.3g} and far {far:.3g}, at "
-        f"a usual depth of {median:.3g} scene units: {reason}"
+        f"a median depth of {median:.3g} scene units: {reason}"
     )
     return [Finding(subject, value, problem, beyond > 0.95)]
 
 
-def _empty_frames(capture, rows, shown):
-    """Frames that see next to none of the points that the others see."""
-    counts = shown.inside.sum(1)
-    usual = np.median(counts)
-    few = usual < 2 * LEAST_POINTS  # then none may be in view by chance
-    empty = rows[counts < DOUBTFUL * usual] if not few else rows[:0]
+def _empty_frames(capture, rows, projected):
+    """Frames that show hardly any points, compared with the other frames."""
+    counts = projected.inside.sum(1)
+    median = np.median(counts)
+    is_few = median < 2 * LEAST_POINTS  # a frame may have none by chance
+    empty = rows[:0] if is_few else rows[counts < DOUBTFUL * median]
     value = f"{len(empty)} of {len(rows)}"
     problem = ""
     if len(empty):
         names = ", ".join(capture.ids[row] for row in empty[:5])
         names += ", ..." if len(empty) > 5 else ""
         problem = (
-            f"{len(empty)} frames see no points ({names}): their poses may be wrong; "
+            f"{len(empty)} frames show no points ({names}): their poses may be wrong; "
             "estimate them again or leave those frames out"
         )
     return [Finding("frames without points", value, problem)]
@@ -314,25 +317,25 @@ def _project(cameras, pose, points, size):
     offset = (points - origin)[None] - (pose.position - origin)[:, None]
     local = np.einsum("fij,fnj->fni", pose.rotation, offset)
     depth = local[..., 2]
-    ahead = depth > 0
-    slope = local[..., :2] / np.where(ahead, depth, 1.0)[..., None]
-    x, y = slope[..., 0], slope[..., 1]
-    bent_x, bent_y, single = _distorted(cameras, x, y)
+    in_front = depth > 0
+    plane = local[..., :2] / np.where(in_front, depth, 1.0)[..., None]
+    x, y = plane[..., 0], plane[..., 1]
+    distorted_x, distorted_y, is_unique = _distort(cameras, x, y)
     focal = cameras.focal_px[:, None]
     pixel = np.stack(
         [
-            focal * bent_x + cameras.skew_px[:, None] * bent_y,
-            focal * cameras.pixel_aspect[:, None] * bent_y,
+            focal * distorted_x + cameras.skew_px[:, None] * distorted_y,
+            focal * cameras.pixel_aspect[:, None] * distorted_y,
         ],
         axis=-1,
     )
     pixel = pixel + cameras.principal_point_px[:, None]
     within = ((pixel >= 0) & (pixel < np.array(size))).all(-1)
-    return Projected(pixel, depth, ahead & within & single)
+    return Projected(pixel, depth, in_front & within & is_unique)
 
 
-def _distorted(cameras, x, y):
-    """Distorted slopes [frames, points], and whether the lens has not folded there."""
+def _distort(cameras, x, y):
+    """Distorted positions [frames, points], and a mask where lenses are one-to-one."""
     radius_sq = np.minimum(x * x + y * y, 1e8)
     if cameras.fisheye is not None:
         angle = np.arctan(np.sqrt(radius_sq))
@@ -351,7 +354,7 @@ def _distorted(cameras, x, y):
 
 
 def fold_radius(radial: np.ndarray) -> np.ndarray:
-    """Compute the undistorted radius at which each lens folds back.
+    """Compute the undistorted radius up to which each lens is one-to-one.
 
     Args:
       radial: Coefficients k1, k2, k3 of each lens, [lenses, 3], or those of a fisheye,

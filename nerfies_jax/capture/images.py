@@ -1,7 +1,7 @@
-"""Image files: PNG and JPEG by scikit-image and imageio, EXR by OpenEXR.
+"""Image files: PNG and JPEG with scikit-image and imageio, EXR with OpenEXR.
 
-Sizes are checked in the header before anything is decoded. Colors are 8-bit sRGB on
-disk and in memory. The linear light of EXR is converted to sRGB.
+Sizes in headers are checked before anything is decoded. Colors are 8-bit sRGB on disk
+and in memory. Linear light from EXR is converted to sRGB.
 """
 
 import contextlib
@@ -21,14 +21,13 @@ from nerfies_jax.capture.json_files import AnyPath, replaced_file
 from nerfies_jax.capture.srgb import linear_from_srgb as linear_from_srgb
 from nerfies_jax.capture.srgb import srgb_from_linear as srgb_from_linear
 
-# An 8K video frame has 33 million. Pillow itself only warns above 89 million, and at
-# 144 million a picture is 430 MB.
+# An 8K video frame has 33 million pixels. Pillow only warns above 89 million.
 MAX_PIXELS = 64_000_000
 LARGE_PIXELS = 16_000_000  # larger images are decoded in a child process
-SECONDS_PER_PIXEL, BYTES_PER_PIXEL = 1e-6, 24  # at most, of decoding
+SECONDS_PER_PIXEL, BYTES_PER_PIXEL = 1e-6, 24  # upper bounds for decoding
 EXR, TIFF = ".exr", (".tif", ".tiff")
-_ORIENTATION = 0x0112  # the EXIF tag; 1 is upright, 0 unknown
-_PILLOW_ERRORS = (Exception,)  # its parsers raise whatever they meet
+_ORIENTATION = 0x0112  # EXIF tag; 1 is upright, 0 unknown
+_PILLOW_ERRORS = (Exception,)  # Pillow's parsers may raise anything
 
 
 class Header(NamedTuple):
@@ -36,7 +35,7 @@ class Header(NamedTuple):
 
     size: tuple[int, int]  # width, height as stored
     mode: str  # Pillow's name: RGB, RGBA, L, LA, P, I;16, ...; or EXR
-    orientation: int  # EXIF, 1 where absent
+    orientation: int  # of EXIF, by default 1
 
 
 def read_header(path: AnyPath) -> Header:
@@ -62,7 +61,7 @@ def read_header(path: AnyPath) -> Header:
                 header = Header(image.size, image.mode, _orientation(image))
     except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
         raise CaptureError(
-            f"{path}: more than {MAX_PIXELS} pixels; make the picture smaller first"
+            f"{path}: more than {MAX_PIXELS} pixels; make the image smaller first"
         ) from None
     except _PILLOW_ERRORS as error:
         raise _unreadable(path, error) from None
@@ -70,7 +69,7 @@ def read_header(path: AnyPath) -> Header:
 
 
 def _existing(path):
-    """Raise unless there is an image file that may be read."""
+    """Raise CaptureError if there is no such file or it may not be read."""
     if not path.is_file():
         raise CaptureError(f"{path}: no such image; restore it or drop its frame")
     safe_files.check(path)
@@ -80,14 +79,14 @@ def _checked(path, header):
     width, height = header.size
     if width * height > MAX_PIXELS:
         raise CaptureError(
-            f"{path}: {width}x{height} pixels, more than {MAX_PIXELS}; make the "
-            "picture smaller first"
+            f"{path}: {width}x{height} pixels, more than {MAX_PIXELS}; make the image "
+            "smaller first"
         )
     return header
 
 
 def _orientation(image):
-    """The EXIF orientation, without decoding: `getexif` of a PNG decodes all of it."""
+    """The EXIF orientation. For a PNG, `getexif` would decode the whole image."""
     if image.format != "PNG":
         return image.getexif().get(_ORIENTATION, 1)
     tags = PIL.Image.Exif()
@@ -98,13 +97,13 @@ def _orientation(image):
 def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
     """Read an image as uint8.
 
-    16-bit gray is rounded to 8 bits, and 16-bit color is truncated to them. The linear
-    light of an EXR becomes sRGB, with values above 1 clipped.
+    16-bit gray is rounded to 8 bits, and 16-bit color is truncated to 8 bits. Linear
+    light of an EXR is converted to sRGB, with values above 1 clipped.
 
     Args:
       path: The file.
       orientation: "refuse" an image that viewers rotate (EXIF), or read its pixels as
-        "stored", which is what COLMAP's cameras refer to.
+        "stored", since COLMAP's cameras refer to stored pixels.
 
     Returns:
       uint8 [height, width, 1 to 4]: gray, gray and alpha, RGB or RGBA.
@@ -118,8 +117,9 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
         return read_light(path)[0]
     if header.orientation not in (0, 1) and orientation != "stored":
         raise CaptureError(
-            f"{path}: its EXIF orientation is {header.orientation}, so a viewer turns "
-            "it and a camera file may or may not; turn the pixels and remove the tag"
+            f"{path}: its EXIF orientation is {header.orientation}, so viewers rotate "
+            "it, but cameras may refer to the stored pixels; rotate the pixels and "
+            "remove the tag"
         )
     if header.size[0] * header.size[1] > LARGE_PIXELS:
         pixels = decode_apart("image", path, header).arrays["pixels"]
@@ -156,7 +156,7 @@ def decode(path: AnyPath, header: Header | None = None) -> np.ndarray:
     try:
         plain = header.mode in {"RGB", "RGBA", "L", "1", "I;16", "I;16B"}
         if plain and path.suffix.lower() in TIFF:
-            # skimage.io.imread wants one more package for those that are packed.
+            # skimage.io.imread needs a further package for compressed files.
             with PIL.Image.open(path) as image:
                 pixels = np.asarray(image)
             if header.mode.startswith("I;16"):
@@ -164,8 +164,8 @@ def decode(path: AnyPath, header: Header | None = None) -> np.ndarray:
         elif plain:
             pixels = skimage.io.imread(path)
         elif header.mode in {"LA", "P", "PA"}:
-            # skimage.io.imread transposes LA ([height, width, 2] looks like channels
-            # first to it) and forgets the transparency of a palette.
+            # skimage.io.imread transposes LA (it takes [height, width, 2] for channels
+            # first) and ignores the transparency of a palette.
             with PIL.Image.open(path) as image:
                 opaque = header.mode == "P" and "transparency" not in image.info
                 pixels = np.asarray(image.convert("RGB" if opaque else "RGBA"))
@@ -205,7 +205,7 @@ def decode_apart(operation: str, path: pathlib.Path, header: Header) -> decoder.
                 path=str(path.absolute()),
             )
     except decoder.DecoderError as error:
-        if error.has_advice:  # and the path
+        if error.has_advice:  # the message is that of a CaptureError, with the path
             raise CaptureError(str(error)) from None
         raise _unreadable(path, error) from None
 
@@ -251,15 +251,15 @@ def read_numbers(path: AnyPath) -> np.ndarray:
 
 
 def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read the colors of an EXR, and the pixels that have one.
+    """Read the colors of an EXR and a mask of the pixels that have one.
 
     Args:
       path: The file.
 
     Returns:
       uint8 sRGB [height, width, 3] of the display window, and booleans [height, width]
-      that are False where nothing was stored or a channel was NaN or infinite. Their
-      color is black. None if all pixels are known.
+      that are False for pixels that are not stored, NaN or infinite. These are black.
+      None instead of booleans that are all True.
 
     Raises:
       CaptureError: If it cannot be read, has no color, or is partly transparent.
@@ -270,8 +270,9 @@ def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
     transparent = stored.alpha is not None and stored.color_finite & (stored.alpha < 1)
     if np.any(transparent):
         raise CaptureError(
-            f"{path}: it is transparent in places, and its colors may be multiplied "
-            "by alpha or not; lay it over its background first, or save it as a PNG"
+            f"{path}: it has transparent pixels, and its colors may be premultiplied "
+            "by alpha or not; composite it over its background first, or save it as a "
+            "PNG"
         )
     stored = exr.in_display_window(path, stored)
     assert stored.color is not None
@@ -314,9 +315,9 @@ def over(color: np.ndarray, alpha: np.ndarray, background: tuple) -> np.ndarray:
     Returns:
       uint8 color, [height, width, 3].
     """
-    cover = alpha[..., None].astype(np.float32) / 255
-    behind = np.asarray(background, np.float32) * 255
-    return np.round(color * cover + behind * (1 - cover)).astype(np.uint8)
+    opacity = alpha[..., None].astype(np.float32) / 255
+    background = np.asarray(background, np.float32) * 255
+    return np.round(color * opacity + background * (1 - opacity)).astype(np.uint8)
 
 
 def write_png(path: AnyPath, pixels: np.ndarray):
@@ -338,8 +339,8 @@ def write_png(path: AnyPath, pixels: np.ndarray):
             f"{path}: PNG holds uint8 or uint16, got {pixels.dtype}; convert first, or "
             "write an EXR"
         )
-    # In memory first: on a full disk imageio fails a second time when it is finalized,
-    # and Python prints that error with a traceback.
+    # Encoded in memory, since on a full disk imageio would fail again in its finalizer,
+    # and Python would print that error with a traceback.
     encoded = imageio.v3.imwrite("<bytes>", pixels, extension=".png")
     with replaced_file(path) as partial:
         partial.write_bytes(encoded)
@@ -348,6 +349,6 @@ def write_png(path: AnyPath, pixels: np.ndarray):
 def _unreadable(path, error):
     reason = " ".join(str(error).split()) or type(error).__name__
     return CaptureError(
-        f"{path}: not a readable picture ({reason}); it may be cut short, so copy or "
+        f"{path}: not a readable image ({reason}); it may be truncated, so copy or "
         "export it again"
     )

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerfies_jax.capture import frames, name_times
-from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath
@@ -25,7 +25,7 @@ class Poses(NamedTuple):
 
     rotations: np.ndarray  # [frames, 3, 3] camera from world
     positions: np.ndarray  # [frames, 3]
-    size: tuple[int, int]  # width and height of the full-size pictures
+    size: tuple[int, int]  # width and height of the full-size images
     focal_px: np.ndarray  # [frames]
     bounds: np.ndarray  # [frames, 2] nearest and farthest depth
 
@@ -42,15 +42,15 @@ def read(
 
     Poses belong to the images in the order of their names, so none may be missing. The
     columns of a pose are the camera's down, right and backward axes. The principal
-    point is the center of the image. Times are found as for COLMAP.
+    point is the center of the image. Times are derived from the names as for COLMAP.
 
     Args:
       path: The folder.
-      factor: Read images at 1/`factor` of the full size that the file states.
+      factor: Read images at 1/`factor` of the full size in the file.
       max_side: Longest side of the images in pixels. At most one of the two can be
         given.
       heldout: n for every n-th frame. None for every 8th.
-      missing: "refuse" or "skip", without effect here.
+      missing: "refuse" or "skip". It has no effect in this format.
 
     Returns:
       The capture.
@@ -70,7 +70,7 @@ def read(
     source, shrink_by = frames.choose_source(
         available, poses.size, factor, max_side, str(path)
     )
-    # LLFF's script sorts names letter by letter, too.
+    # In lexicographic order, as in LLFF's script.
     files = frames.pictures_in(available[source])
     stored = frames.read_frames(files, shrink_by, orientation="stored")
     images = stored.images
@@ -85,8 +85,10 @@ def read(
     camera_ids = np.zeros(len(files), np.int32)
     if clock.cameras is not None:
         camera_ids = clock.cameras
-    every = frames.HELD_OUT if heldout is None else heldout
-    train, scored = frames.hold_out_in_time(times, camera_ids, every, str(path))
+    interval = frames.HELD_OUT if heldout is None else heldout
+    train, heldout_rows = frames.hold_out_in_time(
+        times, camera_ids, interval, str(path)
+    )
     return Capture(
         name=path.resolve().name,
         source="llff",
@@ -95,7 +97,7 @@ def read(
         cameras=cameras,
         times=times,
         train=train,
-        heldout=scored,
+        heldout=heldout_rows,
         near=placement.near,
         far=placement.far,
         warp_ids=frames.dense(times),
@@ -106,31 +108,31 @@ def read(
         center=placement.center,
         up=frames.up_direction(cameras),
         path=path,
-        notes=(*notes, frames.held_out_note(scored, every)),
+        notes=(*notes, frames.held_out_note(heldout_rows, interval)),
     )
 
 
 def order_note(names: Sequence[str]) -> tuple[str, ...]:
-    """Say in which order images or cameras belong to poses, if numbers say another.
+    """Describe the order of poses if lexicographic and numeric order differ.
 
     Args:
-      names: Names in the order of the poses, letter by letter.
+      names: Names in the order of the poses, which is lexicographic.
 
     Returns:
-      A note, or none.
+      A note, or an empty tuple if both orders are equal.
     """
     if list(names) == sorted(names, key=frames.natural):
         return ()
     listed = ", ".join(names[:3])
     return (
-        f"the rows of {POSES} are taken to be in the order of the names letter by "
-        f"letter ({listed}, ...): if they are in that of the numbers, write those with "
-        "leading zeros",
+        f"the rows of {POSES} are assumed to be in the lexicographic order of the "
+        f"names ({listed}, ...): if they are in the order of the numbers, rename the "
+        "files with leading zeros",
     )
 
 
 def placed(poses: Poses) -> Placement:
-    """Place the scene by points at the bounds of each camera, for lack of others.
+    """Normalize the scene by points on each viewing axis at the depth bounds.
 
     Args:
       poses: The cameras.
@@ -138,9 +140,9 @@ def placed(poses: Poses) -> Placement:
     Returns:
       The placement.
     """
-    ahead = poses.rotations[:, None, 2] * poses.bounds[..., None]
-    box = (poses.positions[:, None] + ahead).reshape(-1, 3)
-    return place_by_points(box, poses.positions, poses.bounds.ravel())
+    offset = poses.rotations[:, None, 2] * poses.bounds[..., None]
+    points = (poses.positions[:, None] + offset).reshape(-1, 3)
+    return place_by_points(points, poses.positions, poses.bounds.ravel())
 
 
 def cameras_of(poses: Poses, placed: Placement, size: tuple[int, int]) -> Camera:
@@ -179,18 +181,16 @@ def read_poses(path: pathlib.Path) -> Poses:
     table = frames.load_array(path, MOST_NUMBERS)
     if table.ndim != 2 or table.shape[1] != 17 or len(table) < 2:
         raise CaptureError(
-            f"{path}: shape {table.shape}; expected [pictures, 17], at least two: a "
-            "3x5 matrix and two bounds each"
+            f"{path}: shape {table.shape}; expected [images, 17] with at least two "
+            "rows, each a 3x5 matrix and two bounds"
         )
     if not np.isfinite(table).all():
         row = int(np.argmin(np.isfinite(table).all(1)))
-        raise CaptureError(
-            f"{path}: row {row} is not finite; leave that picture and its row out"
-        )
+        raise CaptureError(f"{path}: row {row} is not finite; remove it and its image")
     pose, bounds = table[:, :15].reshape(-1, 3, 5).astype(float), table[:, 15:]
     down, right, back, position, shape = np.moveaxis(pose, -1, 0)
     if np.ptp(shape[:, :2], axis=0).any():
-        raise CaptureError(f"{path}: pictures of several sizes; keep those of one")
+        raise CaptureError(f"{path}: images of several sizes; keep those of one size")
     if not ((bounds > 0).all() and (bounds[:, 0] < bounds[:, 1]).all()):
         row = int(np.argmin((bounds[:, 0] > 0) & (bounds[:, 0] < bounds[:, 1])))
         raise CaptureError(
@@ -213,24 +213,24 @@ def _folders(path, poses):
             continue
         if len(files) != len(poses.positions):
             raise CaptureError(
-                f"{folder}: {len(files)} pictures for {len(poses.positions)} poses in "
-                f"{POSES}; they belong together in the order of the names, so restore "
-                "what is missing or remove what is too much"
+                f"{folder}: {len(files)} images for {len(poses.positions)} poses in "
+                f"{POSES}; they are matched in the order of the names, so restore "
+                "missing files or remove extra ones"
             )
-        width, height = pictures.read_header(files[0]).size
+        width, height = image_files.read_header(files[0]).size
         ratio = max(1, round(poses.size[0] / width))
-        trimmed = abs(np.array(poses.size) / ratio - (width, height))
-        if trimmed.max() > 1:
+        difference = abs(np.array(poses.size) / ratio - (width, height))
+        if difference.max() > 1:
             raise CaptureError(
-                f"{files[0]}: {width}x{height} pixels, but {POSES} is of "
-                f"{poses.size[0]}x{poses.size[1]}; pictures must be a whole fraction "
+                f"{files[0]}: {width}x{height} pixels, but {POSES} is for "
+                f"{poses.size[0]}x{poses.size[1]}; images must be an integer fraction "
                 "of that"
             )
         available.setdefault(ratio, folder)
     if not available:
         raise CaptureError(
-            f"{path}: {POSES} but no images; put them into images, or, of synchronized "
-            "cameras, one video for each next to it (cam00.mp4, cam01.mp4, ...) or one "
-            "folder of images for each (cam00/, cam01/, ...)"
+            f"{path}: {POSES} but no images; put them into images, or for synchronized "
+            "cameras, put one video per camera next to it (cam00.mp4, cam01.mp4, ...) "
+            "or one folder of images per camera (cam00/, cam01/, ...)"
         )
     return available

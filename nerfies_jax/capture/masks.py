@@ -1,6 +1,6 @@
-"""Mask images of every encoding, which is determined for a whole set.
+"""Mask images in any encoding, which is determined for a whole set.
 
-One mask alone is ambiguous: a file of zeros and ones looks black, and a frame in which
+A single mask is ambiguous: a file of zeros and ones looks black, and a frame in which
 nothing is marked has only one value.
 """
 
@@ -18,40 +18,40 @@ from nerfies_jax.capture.errors import CaptureError
 from nerfies_jax.capture.json_files import AnyPath
 
 ADVICE = "save the masks as 8-bit gray PNG of 0 and 255"
-OPAQUE = 128  # alpha from here on
-COLORFUL = 32  # difference of two channels; JPEG's noise stays below
-FEW = 16  # distinct values; a photograph has more
-MOST_LABELS = 64
+OPAQUE = 128  # smallest alpha of opaque pixels
+COLORFUL = 32  # smallest difference of two channels, above the artifacts of JPEG
+FEW = 16  # largest number of distinct values of a mask that is not a photograph
+MOST_LABELS = 64  # largest number of distinct labels
 LOSSY = (".jpg", ".jpeg")
 
 
 class Encoding(NamedTuple):
     """Encoding of white in a set of mask images."""
 
-    alpha: bool  # opaque pixels are white, whatever their color
-    threshold: int  # stored values from here on are white
-    text: str  # for a note
+    alpha: bool  # True if opaque pixels are white, regardless of their color
+    threshold: int  # smallest stored value of white
+    text: str  # description
 
 
 class Stored(NamedTuple):
-    """One mask as it is stored."""
+    """One mask as stored."""
 
-    value: np.ndarray  # [height, width]: the largest channel
+    value: np.ndarray  # [height, width], the largest of the color channels
     alpha: np.ndarray | None  # [height, width] bool
-    full: int  # the largest value that the file could hold
-    colorful: bool
+    full: int  # largest value of the file's type
+    colorful: bool  # True if it has pixels that are not gray
 
 
 class _Survey(NamedTuple):
     """Statistics of the values of one mask."""
 
     path: pathlib.Path
-    counts: np.ndarray  # of pixels, by value
+    counts: np.ndarray  # number of pixels of each value
     full: int
     colorful: bool
     has_alpha: bool
-    opaque: bool
-    cut_out: bool  # alpha alone can be the mask
+    opaque: bool  # True if all pixels are
+    cut_out: bool  # True if only alpha can be the mask
 
 
 def read_mask(
@@ -60,12 +60,12 @@ def read_mask(
     """Read one mask.
 
     Args:
-        path: An image of any kind that `images` reads.
-        encoding: Encoding of the set. By default, that of this file alone.
-        orientation: "refuse" a mask that EXIF turns, or turn it "upright".
+      path: An image of any type that `images` reads.
+      encoding: Encoding of the set. By default, that of this file alone.
+      orientation: "refuse" a mask that EXIF rotates, or rotate it "upright".
 
     Returns:
-        True where the mask is white, bool [height, width].
+      True where the mask is white, bool [height, width].
     """
     path = pathlib.Path(path)
     encoding = encoding or find_encoding([path], orientation)
@@ -76,7 +76,7 @@ def read_mask(
 
 
 def find_encoding(paths: Sequence[AnyPath], orientation: str = "refuse") -> Encoding:
-    """Find the encoding of white from the values of all masks of a set.
+    """Determine the encoding of white from the values of all masks of a set.
 
     Args:
       paths: Files of the set, at least one.
@@ -86,8 +86,7 @@ def find_encoding(paths: Sequence[AnyPath], orientation: str = "refuse") -> Enco
       The encoding.
 
     Raises:
-      CaptureError: If more than one interpretation is possible, with the name of the
-        file.
+      CaptureError: If the masks are ambiguous, with the name of a file.
     """
     with ThreadPoolExecutor(4) as pool:
         survey = safe_files.carried(_survey)
@@ -173,8 +172,8 @@ def _value_encoding(surveys):
     listed = ", ".join(map(str, values[:5])) + (", ..." if len(values) > 5 else "")
     if colorful and least > 0:
         raise CaptureError(
-            f"{first}: a mask in color without any black, so what is marked is not "
-            f"known; {ADVICE}"
+            f"{first}: a mask in color without any black, so the marked pixels are "
+            f"unknown; {ADVICE}"
         )
     if len(values) == 1 and (most in (0, 1) or most >= half):
         return Encoding(False, 1, f"the one value {most}")
@@ -188,11 +187,11 @@ def _value_encoding(surveys):
     if labels and (colorful or most < half or (few and most < 0.9 * scale)):
         return Encoding(False, 1, f"labels {listed}; all but 0 are taken as white")
     for one in surveys:
-        own = np.flatnonzero(one.counts)
+        present = np.flatnonzero(one.counts)
         lossy = one.path.suffix.lower() in LOSSY
-        if len(own) == 2 and own[0] == 0 and own[1] < half and not lossy:
+        if len(present) == 2 and present[0] == 0 and present[1] < half and not lossy:
             raise CaptureError(
-                f"{one.path}: a mask of 0 and {own[1]} among masks up to {most}; "
+                f"{one.path}: a mask of 0 and {present[1]} among masks up to {most}; "
                 f"{ADVICE}"
             )
     low = values[(values > 0) & (values < FEW)]
@@ -221,7 +220,7 @@ def _survey(path, orientation):
 
 
 def _is_cut_out(value, alpha):
-    """Test if the color inside is not a mask: it has no black, or is a photograph."""
+    """Test if the color of opaque pixels has no black, or is a photograph."""
     inside = value[alpha] if alpha.any() else value
     if not alpha.any() and value.min() == value.max():
         return True  # nothing is marked

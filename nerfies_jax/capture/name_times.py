@@ -18,13 +18,14 @@ _DATE = re.compile(
     r"(?<!\d)(\d{4})([-_.]?)(\d\d)\2(\d\d)(?:T| at |[ _-]{0,2})"
     r"(\d\d)([-_.:]?)(\d\d)\6(\d\d)(?:[.,](\d{1,9})|[_-]?(\d{3}|\d{6}|\d{9}))?Z?$"
 )
-LEAST_DIGITS = 9  # of a number without a point that can only be a timestamp
-# Cameras are synchronized if so many of the numbers of each are those of another one.
+LEAST_DIGITS = 9  # smallest number of digits of an integer timestamp
+# Cameras are synchronized if at least this share of the numbers of each camera also
+# occurs for another one.
 _SHARED = 0.5
 
 
 class Clock(NamedTuple):
-    """Frame times on any clock, of equal values for frames of equal time."""
+    """Frame times on any clock."""
 
     times: list[int] | list[float]
     cameras: np.ndarray | None  # [frames] int32 if the names tell several apart
@@ -51,7 +52,7 @@ def clock(names: Sequence[str]) -> Clock:
     """
     names = [forward_slashes(name) for name in names]
     dates = [_microseconds(name) for name in names]
-    # Read as counts, minute and hour boundaries would be gaps of 41 and 4041 frames.
+    # Dates read as counts would have gaps of 41 and 4041 at minute and hour boundaries.
     if None not in dates and not _is_counter(names, dates):
         return Clock(dates, None, ())
     fields = _time_fields(names)
@@ -77,7 +78,7 @@ def clock(names: Sequence[str]) -> Clock:
                     "as times of one clock"
                 )
                 return Clock(times, cameras, (note,))
-    note = "times are the order of the pictures' names: those end in no common count"
+    note = "times are the order of the image names, which have no common number"
     return Clock(order(names), None, (note,))
 
 
@@ -95,10 +96,10 @@ def order(names: Sequence[str]) -> list[int]:
 
 
 def _time_fields(names):
-    """Split each name into its time and the rest, or return None if one has no number.
+    """Split each name into its time and the remainder. None if a name has no number.
 
-    The time is the last number that differs between names of one form, or the last of
-    names of several forms. Numbers of cameras (cam03) are considered last.
+    The time is the last number that differs between names of one form, or the last
+    number of names of several forms. Camera numbers (cam03) are considered last.
     """
     numbers = [list(_NUMBER.finditer(name)) for name in names]
     if not all(numbers):
@@ -126,7 +127,7 @@ def _time_fields(names):
 
 
 def _values(groups, numbers):
-    """Decimal seconds, or counts where there is no point or 1.1 and 1.10 both occur."""
+    """Decimal seconds, or counts if there is no point or both 1.1 and 1.10 occur."""
     numbers = [number.replace(",", ".") for number in numbers]
     if any("." in number for number in numbers):
         values = [float(number) for number in numbers]
@@ -138,12 +139,10 @@ def _values(groups, numbers):
 def _are_synchronized(groups, times):
     """Test if several cameras share most of their times, and at least two."""
     members = collections.defaultdict(set)
-    for group, moment in zip(groups, times, strict=True):
-        members[group].add(moment)
-    count = collections.Counter(
-        moment for group in members.values() for moment in group
-    )
-    shared = {moment for moment, times in count.items() if times > 1}
+    for group, time in zip(groups, times, strict=True):
+        members[group].add(time)
+    counts = collections.Counter(time for group in members.values() for time in group)
+    shared = {time for time, count in counts.items() if count > 1}
     return len(shared) > 1 and all(
         len(group & shared) >= _SHARED * len(group) for group in members.values()
     )
@@ -158,8 +157,8 @@ def _overlap(groups, times):
     spans = collections.defaultdict(list)
     for group, time in zip(groups, times, strict=True):
         spans[group].append(time)
-    spans = {group: (min(own), max(own)) for group, own in spans.items()}
-    # In the order of their first times, a camera overlaps a neighbor or none.
+    spans = {group: (min(span), max(span)) for group, span in spans.items()}
+    # In the order of start times, a camera overlaps an earlier one or none.
     last = None
     alone = set(spans)
     for group, (first, end) in sorted(spans.items(), key=lambda one: one[1]):
@@ -177,22 +176,22 @@ def _microseconds(name):
         return None
     year, _, month, day, hour, _, minute, second, fraction, digits = match.groups()
     try:
-        moment = datetime.datetime(
+        date = datetime.datetime(
             *map(int, (year, month, day, hour, minute, second)), tzinfo=datetime.UTC
         )
     except ValueError:
         return None
-    since = moment - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+    elapsed = date - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
     part = (fraction or digits or "0")[:6].ljust(6, "0")
-    return since // datetime.timedelta(microseconds=1) + int(part)
+    return elapsed // datetime.timedelta(microseconds=1) + int(part)
 
 
 def _is_counter(names, dates):
-    """Test if a supposed time of day after a date is a regular count instead."""
+    """Test if the supposed time of day after a date is a regular count instead."""
     ends = [re.search(r"\d{6,}$", name) for name in names]
     if None in ends:  # a time of day with separators
         return False
     counts = [int(end[0]) for end in ends]
     steps, gaps = set(np.diff(np.sort(counts))), set(np.diff(np.sort(dates)))
-    # An interval timer is even as well, but in time.
+    # Images of an interval timer are evenly spaced in time instead.
     return len(steps) == 1 and len(gaps) > 1

@@ -57,7 +57,7 @@ def read(
     views = read_cameras(path, heldout, missing)
     folder, source, shrink_by, notes = _stored_images(path, views, factor, max_side)
     paths = [frames.find_picture(folder, name) for name in views.ids]
-    rows, lost = frames.keep_found(paths, views.ids, missing, str(folder))
+    rows, skip_notes = frames.keep_found(paths, views.ids, missing, str(folder))
     views = only(views, rows)
     stored = frames.read_frames([paths[row] for row in rows], shrink_by)
     images, alpha = stored.images, stored.alpha
@@ -103,7 +103,7 @@ def read(
         up=frames.unit(views.extra.up) or frames.up_direction(cameras),
         frames_per_second=views.extra.fps,
         path=path,
-        notes=(*views.notes, *notes, *lost, *more, *unread),
+        notes=(*views.notes, *notes, *skip_notes, *more, *unread),
     )
 
 

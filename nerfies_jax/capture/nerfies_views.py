@@ -134,7 +134,7 @@ def read_cameras(
     extra = read_json(extra_file, ExtraFile) if extra_file.exists() else ExtraFile()
     train, scored, notes = _splits(path, heldout)
     chosen = sorted(set(train) | set(scored), key=frames.natural)
-    ids, lost = _with_camera_files(path, chosen, missing)
+    ids, skip_notes = _with_camera_files(path, chosen, missing)
     files = [_camera_file(path, name) for name in ids]
     size = _common_size(path, ids, files)
     cameras = cameras_of(files, scene.scale, scene.center)
@@ -153,7 +153,7 @@ def read_cameras(
         camera_ids=frames.dense([e.camera_id for e in entries]),
         scene=scene,
         extra=extra,
-        notes=(*notes, *lost, *more, *_unread(path, ids)),
+        notes=(*notes, *skip_notes, *more, *_unread(path, ids)),
     )
 
 
@@ -236,19 +236,21 @@ def _named_split(path, heldout):
 def _with_camera_files(path, names, missing):
     """Names of the frames with a camera file, and a note about the others."""
     frames.check_missing(missing, str(path))
-    kept = tuple(name for name in names if _camera_path(path, name).is_file())
-    lost = [name for name in names if name not in set(kept)]
-    if not lost:
-        return kept, ()
-    listed = ", ".join(f"camera/{name}.json" for name in lost[:5])
-    listed += ", ..." if len(lost) > 5 else ""
-    if missing == "refuse" or not kept:
+    present = tuple(name for name in names if _camera_path(path, name).is_file())
+    absent = [name for name in names if name not in set(present)]
+    if not absent:
+        return present, ()
+    listed = ", ".join(f"camera/{name}.json" for name in absent[:5])
+    listed += ", ..." if len(absent) > 5 else ""
+    if missing == "refuse" or not present:
         raise CaptureError(
-            f"{path / 'dataset.json'}: {len(lost)} of {len(names)} frames have no "
+            f"{path / 'dataset.json'}: {len(absent)} of {len(names)} frames have no "
             f"camera file ({listed}); restore those files, or leave the frames out "
             'with missing="skip"'
         )
-    return kept, (f"{len(lost)} frames left out, they have no camera file: {listed}",)
+    return present, (
+        f"{len(absent)} frames left out, they have no camera file: {listed}",
+    )
 
 
 def _camera_path(path, name):

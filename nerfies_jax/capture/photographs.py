@@ -19,7 +19,7 @@ import PIL.ImageOps
 from nerfies_jax.capture import decoder, images, safe_files
 from nerfies_jax.capture.errors import CaptureError
 
-HEIC = (".heic", ".heif")  # read where pillow-heif is installed
+HEIC = (".heic", ".heif")  # read if pillow-heif is installed
 FULL_FRAME_MM = 36.0  # the longer side that the 35 mm equivalent refers to
 _ORIENTATION, _EXIF, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 
@@ -29,14 +29,14 @@ class Unreadable(CaptureError):
 
 
 class TooLarge(CaptureError):
-    """The image has more pixels than the limit, or a damaged header that says so."""
+    """The image has more pixels than the limit, or a damaged header."""
 
 
 class Header(NamedTuple):
     """Properties of a photograph from its header."""
 
     size: tuple[int, int]  # width and height, upright
-    focal: float | None  # focal length in longest sides, where the file states it
+    focal: float | None  # focal length over the longest side, if the file states it
 
 
 def heic_is_read() -> bool:
@@ -68,7 +68,7 @@ def read_header(path: pathlib.Path) -> Header:
 
 
 def read_upright(path: pathlib.Path) -> np.ndarray:
-    """Read a photograph, turned upright, with transparent parts over black.
+    """Read a photograph, rotated upright, with transparent parts over black.
 
     Args:
       path: The file.
@@ -78,7 +78,7 @@ def read_upright(path: pathlib.Path) -> np.ndarray:
 
     Raises:
       Unreadable: If it is damaged.
-      CaptureError: If its white is not known.
+      CaptureError: If its values have an unknown range.
     """
     width, height = read_header(path).size
     count = width * height
@@ -88,7 +88,7 @@ def read_upright(path: pathlib.Path) -> np.ndarray:
 
 
 def _decoded_apart(path, count, header_only):
-    """Let a child process decode a file of `count` pixels."""
+    """Decode a file of `count` pixels in a child process."""
     path = safe_files.check(path)
     try:
         with decoder.session() as child:
@@ -100,7 +100,7 @@ def _decoded_apart(path, count, header_only):
                 header_only=header_only,
             )
     except decoder.DecoderError as error:
-        if error.has_advice:  # and the path
+        if error.has_advice:  # the message is that of a CaptureError, with the path
             raise CaptureError(str(error)) from None
         raise _unreadable(path, error) from None
     if "refused" in answer.about:
@@ -122,13 +122,13 @@ def decode_header(path: pathlib.Path) -> Header:
       Unreadable: As for `read_header`.
       TooLarge: As for `read_header`.
     """
-    with _opened(path) as picture:
-        tags = picture.getexif()
-        turned = tags.get(_ORIENTATION, 1) in (5, 6, 7, 8)  # by a quarter
-        size = picture.size[::-1] if turned else picture.size
+    with _opened(path) as image:
+        tags = image.getexif()
+        is_rotated = tags.get(_ORIENTATION, 1) in (5, 6, 7, 8)  # by 90 degrees
+        size = image.size[::-1] if is_rotated else image.size
         value = tags.get_ifd(_EXIF).get(_FOCAL_35MM)
     focal = None
-    # Files of strangers hold anything here: several numbers, a word, 0 for unknown.
+    # The value may be anything: several numbers, text, or 0 for unknown.
     if isinstance(value, numbers.Real) and 0 < float(value) < math.inf:
         focal = float(value) / FULL_FRAME_MM
     return Header(size, focal)
@@ -141,32 +141,32 @@ def decode_upright(path: pathlib.Path) -> np.ndarray:
       path: The file.
 
     Returns:
-      The pixels as of `read_upright`.
+      uint8 sRGB, [height, width, 3].
 
     Raises:
       CaptureError: As for `read_upright`.
     """
-    with _opened(path) as picture:
-        picture = PIL.ImageOps.exif_transpose(picture)
-        if picture.mode == "F":
+    with _opened(path) as image:
+        image = PIL.ImageOps.exif_transpose(image)
+        if image.mode == "F":
             raise CaptureError(
-                f"{path}: a picture of 32-bit floats, whose white is not known; save "
-                "it with 8 or 16 bits"
+                f"{path}: an image of 32-bit floats, whose range is unknown; save it "
+                "with 8 or 16 bits"
             )
-        if picture.mode.startswith("I"):  # 16 bits of gray
-            values = np.asarray(picture)
+        if image.mode.startswith("I"):  # 16-bit gray
+            values = np.asarray(image)
             if not 0 <= values.min() <= values.max() <= 65535:
                 raise CaptureError(
-                    f"{path}: gray of 32 bits, up to {values.max()}, whose white is "
-                    "not known; save it with 8 or 16 bits"
+                    f"{path}: 32-bit gray up to {values.max()}, whose range is "
+                    "unknown; save it with 8 or 16 bits"
                 )
             values = values.astype(np.uint32) // 257
             return np.repeat(values.astype(np.uint8)[..., None], 3, axis=2)
-        if picture.has_transparency_data:  # what is cut out must not be seen again
-            picture = picture.convert("RGBA")
-            black = PIL.Image.new("RGBA", picture.size, (0, 0, 0, 255))
-            picture = PIL.Image.alpha_composite(black, picture)
-        return np.asarray(picture.convert("RGB"))
+        if image.has_transparency_data:  # RGB alone would show the removed parts
+            image = image.convert("RGBA")
+            black = PIL.Image.new("RGBA", image.size, (0, 0, 0, 255))
+            image = PIL.Image.alpha_composite(black, image)
+        return np.asarray(image.convert("RGB"))
 
 
 @contextlib.contextmanager
@@ -175,28 +175,27 @@ def _opened(path):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
-            with PIL.Image.open(path) as picture:
-                if picture.width * picture.height > images.MAX_PIXELS:
+            with PIL.Image.open(path) as image:
+                if image.width * image.height > images.MAX_PIXELS:
                     raise PIL.Image.DecompressionBombError
-                yield picture
+                yield image
     except CaptureError:
         raise
     except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
         raise _too_large(path) from None
-    # Its parsers raise whatever they meet.
+    # Pillow's parsers may raise anything.
     except Exception as error:
         raise _unreadable(path, error) from None
 
 
 def _too_large(path):
     return TooLarge(
-        f"{path}: more than {images.MAX_PIXELS:,} pixels; make the picture smaller "
-        "first"
+        f"{path}: more than {images.MAX_PIXELS:,} pixels; make the image smaller first"
     )
 
 
 def _unreadable(path, error):
     reason = " ".join(str(error).split()) or type(error).__name__
     return Unreadable(
-        f"{path}: not a readable picture ({reason}); copy it again or remove it"
+        f"{path}: not a readable image ({reason}); copy it again or remove it"
     )

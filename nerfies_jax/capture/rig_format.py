@@ -1,4 +1,4 @@
-"""Reader of synchronized cameras with `poses_bounds.npy`, as Neural 3D Video has them.
+"""Reader of synchronized cameras with `poses_bounds.npy`, as in Neural 3D Video.
 
 Each row of `poses_bounds.npy` is a fixed camera, in the order of their names, and each
 camera has one video (`cam00.mp4`) or one folder of images (`cam00/`, `cam00/images/`).
@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerfies_jax.capture import formats, frames, llff_format, name_times, video
-from nerfies_jax.capture import images as pictures
+from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import Capture, CaptureError, shrink
 from nerfies_jax.capture.json_files import AnyPath
 from nerfies_jax.capture.safe_files import confines
 from nerfies_jax.geometry import camera
 from nerfies_jax.runtime import events
 
-SPARE = 8  # frames of a video beyond those that its file states
+SPARE = 8  # allocated frames in addition to the number in the headers of the videos
 
 
 class _Recorded(NamedTuple):
@@ -26,7 +26,7 @@ class _Recorded(NamedTuple):
     images: np.ndarray  # [frames, height, width, 3] uint8
     valid: np.ndarray | None  # [frames, height, width] bool
     camera_ids: np.ndarray  # [frames] int32
-    numbers: np.ndarray  # [frames]: equal for frames of equal time
+    numbers: np.ndarray  # [frames] index of the frame time
     names: tuple[str, ...]
     rate: float | None  # frames per second
     notes: tuple[str, ...]
@@ -44,12 +44,12 @@ def read(
 
     Args:
       path: The folder.
-      factor: Read frames at 1/`factor` of the full size that `poses_bounds.npy` states.
+      factor: Read frames at 1/`factor` of the full size in `poses_bounds.npy`.
       max_side: Longest side of the frames in pixels. At most one of the two can be
         given.
       heldout: Name of the camera to hold out, or n for every n-th frame of all
-        cameras. None for the first camera, as in the data set's own evaluation.
-      missing: "refuse" or "skip", without effect here.
+        cameras. None for the first camera, as in the evaluation of the paper.
+      missing: "refuse" or "skip". It has no effect in this format.
 
     Returns:
       The capture. Frames of equal time have equal `times` and `warp_ids`.
@@ -68,7 +68,7 @@ def read(
     reader = _read_folders if cameras[0].is_dir() else _read_videos
     recorded = reader(path, cameras, shrink_by)
     names = [each.stem for each in cameras]
-    train, scored, note = _split(recorded, names, heldout, path)
+    train, heldout_rows, note = _split(recorded, names, heldout, path)
     placed = llff_format.placed(poses)
     size = recorded.images.shape[2:0:-1]
     fixed = llff_format.cameras_of(poses, placed, size)
@@ -81,7 +81,7 @@ def read(
         cameras=camera.take(fixed, recorded.camera_ids),
         times=times,
         train=train,
-        heldout=scored,
+        heldout=heldout_rows,
         near=placed.near,
         far=placed.far,
         warp_ids=frames.dense(recorded.numbers),
@@ -98,64 +98,67 @@ def read(
 
 
 def _sources(path, poses):
-    """For each reduction stored, the video or folder of each camera."""
+    """The video or folder of each camera, for each stored reduction."""
     available = {}
-    for kind, found in (
+    for kind, sources in (
         ("videos", formats.videos_in(path)),
         ("folders of images", formats.camera_folders(path)),
     ):
-        if len(found) < 2:
+        if len(sources) < 2:
             continue
         count = len(poses.positions)
-        if len(found) != count:
+        if len(sources) != count:
             raise CaptureError(
-                f"{path}: {len(found)} {kind} ({found[0].name}, ...) for {count} "
+                f"{path}: {len(sources)} {kind} ({sources[0].name}, ...) for {count} "
                 f"cameras in {llff_format.POSES}; each row is the camera of one of "
                 "them, in the order of their names, so restore or remove some"
             )
-        size = _size_of(found[0])
+        size = _size_of(sources[0])
         ratio = max(1, round(poses.size[0] / size[0]))
         if np.abs(np.array(poses.size) / ratio - size).max() > 1:
             raise CaptureError(
-                f"{found[0]}: {size[0]}x{size[1]} pixels, but {llff_format.POSES} is "
-                f"of {poses.size[0]}x{poses.size[1]}; frames must be a whole fraction "
-                "of that"
+                f"{sources[0]}: {size[0]}x{size[1]} pixels, but {llff_format.POSES} is "
+                f"for {poses.size[0]}x{poses.size[1]}; frames must be an integer "
+                "fraction of that"
             )
-        available.setdefault(ratio, found)
+        available.setdefault(ratio, sources)
     return available
 
 
 def _size_of(source):
     if source.is_dir():
-        return pictures.read_header(frames.pictures_in(_images_of(source))[0]).size
+        first_file = frames.pictures_in(_images_folder(source))[0]
+        return image_files.read_header(first_file).size
     _, first = next(video.read_video(source, most=1))
     return first.shape[1], first.shape[0]
 
 
-def _images_of(folder):
+def _images_folder(folder):
     inner = folder / "images"
     return inner if inner.is_dir() else folder
 
 
 def _read_folders(path, folders, shrink_by):
-    """Read the images of all cameras. Equal times are those of equal names."""
-    files = [frames.pictures_in(_images_of(folder)) for folder in folders]
-    camera_ids = np.repeat(np.arange(len(files)), [len(some) for some in files])
-    flat = [file for some in files for file in some]
+    """Read the images of all cameras. Images of equal names have equal times."""
+    files = [frames.pictures_in(_images_folder(folder)) for folder in folders]
+    camera_ids = np.repeat(np.arange(len(files)), [len(group) for group in files])
+    all_files = [file for group in files for file in group]
     names = [
         f"{folders[number].name}/{file.stem}"
-        for number, file in zip(camera_ids, flat, strict=True)
+        for number, file in zip(camera_ids, all_files, strict=True)
     ]
     clock = name_times.clock(names)
     notes: tuple[str, ...] = ()
     numbers = np.array(clock.times)
     if clock.cameras is None or not _same_groups(clock.cameras, camera_ids):
-        numbers = np.concatenate([name_times.order(_stems(some)) for some in files])
-        notes = (
-            "the names of the images tell no times that cameras share: the n-th image "
-            "of each camera is taken at one time",
+        numbers = np.concatenate(
+            [name_times.order([file.stem for file in group]) for group in files]
         )
-    stored = frames.read_frames(flat, shrink_by, orientation="stored")
+        notes = (
+            "the names of the images give no times that cameras share: the n-th images "
+            "of all cameras are assumed to have the same time",
+        )
+    stored = frames.read_frames(all_files, shrink_by, orientation="stored")
     return _Recorded(
         images=stored.images,
         valid=stored.valid(),
@@ -167,11 +170,8 @@ def _read_folders(path, folders, shrink_by):
     )
 
 
-def _stems(files):
-    return [file.stem for file in files]
-
-
 def _same_groups(one, other):
+    """Test if two labelings define the same groups."""
     pairs = set(zip(one.tolist(), other.tolist(), strict=True))
     return len(pairs) == len(set(one.tolist())) == len(set(other.tolist()))
 
@@ -194,11 +194,11 @@ def _read_videos(path, files, shrink_by):
     with events.stage("decoding videos", len(files)) as stage:
         for number, file in enumerate(files):
             first = len(seconds)
-            for moment, frame in video.read_video(file, damaged="skip"):
-                if len(seconds) == len(images):  # the file stated fewer
+            for time, frame in video.read_video(file, damaged="skip"):
+                if len(seconds) == len(images):  # more frames than in the headers
                     images = np.concatenate([images, np.empty_like(images)])
-                images[len(seconds)] = _shrunk(file, frame, shrink_by, (width, height))
-                seconds.append(moment)
+                images[len(seconds)] = _reduced(file, frame, shrink_by, (width, height))
+                seconds.append(time)
                 camera_ids.append(number)
             notes += tuple(
                 f"{file.name}: {note}"
@@ -222,7 +222,7 @@ def _read_videos(path, files, shrink_by):
     )
 
 
-def _shrunk(file, frame, shrink_by, size):
+def _reduced(file, frame, shrink_by, size):
     small = shrink(frame, shrink_by)
     if small.shape[1::-1] != size:
         raise CaptureError(
@@ -233,21 +233,22 @@ def _shrunk(file, frame, shrink_by, size):
 
 
 def _intervals(seconds, camera_ids):
-    """Number frames by the interval of the fastest camera, from each one's first."""
-    own = [seconds[camera_ids == number] for number in np.unique(camera_ids)]
-    gaps = [np.median(np.diff(one)) for one in own if len(one) > 1]
+    """Number frames by the interval of the fastest camera, from the first of each."""
+    groups = [seconds[camera_ids == number] for number in np.unique(camera_ids)]
+    gaps = [np.median(np.diff(times)) for times in groups if len(times) > 1]
     interval = float(min(gaps, default=0.0))
     if not interval > 0:
-        return np.concatenate([np.arange(len(one)) for one in own]), 0.0
-    numbers = [np.round((one - one[0]) / interval).astype(int) for one in own]
-    # Two frames closer than half an interval, as of phones: all by their order.
+        return np.concatenate([np.arange(len(times)) for times in groups]), 0.0
+    numbers = [np.round((times - times[0]) / interval).astype(int) for times in groups]
+    # If frames are closer than half an interval, as those of phones may be, all frames
+    # are numbered in order.
     if any(len(np.unique(each)) < len(each) for each in numbers):
-        numbers = [np.arange(len(one)) for one in own]
+        numbers = [np.arange(len(times)) for times in groups]
     return np.concatenate(numbers), interval
 
 
 def _lengths(cameras, camera_ids):
-    """A note where cameras have different numbers of frames."""
+    """A note if cameras have different numbers of frames."""
     counts = np.bincount(camera_ids, minlength=len(cameras))
     if counts.min() == counts.max():
         return ()
@@ -259,18 +260,18 @@ def _lengths(cameras, camera_ids):
 
 
 def _split(recorded, names, heldout, path):
-    """Rows to learn from, rows to score on, and a note."""
+    """Training rows, held-out rows and a note."""
     if isinstance(heldout, int):
-        train, scored = frames.hold_out_in_time(
+        train, heldout_rows = frames.hold_out_in_time(
             recorded.numbers, recorded.camera_ids, heldout, str(path)
         )
-        return train, scored, frames.held_out_note(scored, heldout)
+        return train, heldout_rows, frames.held_out_note(heldout_rows, heldout)
     chosen = names[0] if heldout is None else heldout
     if chosen not in names:
         raise CaptureError(
             f"{path}: no camera {chosen!r} to hold out; there are {', '.join(names)}, "
             "or a number n holds out every n-th frame"
         )
-    held = recorded.camera_ids == names.index(chosen)
-    note = f"camera {chosen} is held out, {len(names) - 1} are learned from"
-    return np.flatnonzero(~held), np.flatnonzero(held), note
+    is_heldout = recorded.camera_ids == names.index(chosen)
+    note = f"camera {chosen} is held out, {len(names) - 1} cameras are for training"
+    return np.flatnonzero(~is_heldout), np.flatnonzero(is_heldout), note

@@ -1,4 +1,4 @@
-"""Text from other programs: byte order marks, encodings and spellings of file names."""
+"""Text encodings and spellings of file names from other programs."""
 
 import codecs
 import functools
@@ -10,21 +10,22 @@ import time
 import unicodedata
 from collections.abc import Sequence
 
-MOST_FOLDERS = 8  # in front of a name that another machine wrote
+MOST_FOLDERS = 8  # largest number of trailing folders of a path that are matched
 _ELSEWHERE = re.compile(r"(file://)?(/|[A-Za-z]:/|(\./)*\.\./)")
-# A folder that changed so recently may change again within one tick of its clock.
+# Listings of folders are cached unless the folder changed more recently than this. It
+# could change again without a new timestamp.
 _SETTLED_NS = 2 * 10**9
 
 
 def encoding_of(head: bytes) -> str:
-    """Name the Unicode encoding of a text file by its first bytes.
+    """Detect the Unicode encoding of a text file from its first bytes.
 
     Args:
-      head: The first bytes, four at least if the file has them. Text in UTF-16 or
+      head: The first bytes, at least four if the file has them. Text in UTF-16 or
         UTF-32 is recognized without a byte order mark if it begins with ASCII.
 
     Returns:
-      A codec that also removes the byte order mark, if there is one.
+      Name of a codec that also removes the byte order mark, if there is one.
     """
     return json.detect_encoding(head[:4])
 
@@ -66,12 +67,13 @@ def find(
 ) -> pathlib.Path | None:
     """Find a file whose name may be spelled differently on disk.
 
-    The exact name is preferred. Else separators may be backslashes, letters may differ
-    in case, and characters may be composed (NFC) or decomposed (NFD), as copies between
-    operating systems change them. A spelling that fits several files fits none.
+    The exact name is preferred. Otherwise separators may be backslashes, letters may
+    differ in case, and characters may be composed (NFC) or decomposed (NFD), since
+    copies between operating systems change them. If several files match, none is
+    returned.
 
     Args:
-      folder: Where the name begins.
+      folder: Folder that the name is relative to.
       name: A relative path. The caller checks that it stays inside the folder.
       suffixes: Endings to try after the name, in order.
 
@@ -94,9 +96,9 @@ def find(
 def find_local(
     folder: pathlib.Path, name: str, suffixes: Sequence[str] = ("",)
 ) -> str | None:
-    """Find a file of another machine's absolute path, or of a path out of the folder.
+    """Find the local file of an absolute path, or of a path that leaves the folder.
 
-    Captures keep such paths when they are moved.
+    Captures contain such paths after they were moved from another machine.
 
     Args:
       folder: Folder of the capture.
@@ -104,8 +106,8 @@ def find_local(
       suffixes: As for `find`.
 
     Returns:
-      The longest end of the path that is a file in the folder, relative to it. None for
-      relative paths within the folder, and where there is no such file.
+      The longest trailing part of the path that is a file in the folder, relative to
+      it. None for relative paths within the folder, and if there is no such file.
     """
     plain = forward_slashes(name)
     if _ELSEWHERE.match(plain) is None:
@@ -119,7 +121,7 @@ def find_local(
 
 
 def _respelled(folder, name):
-    """Spell each part of a path as on disk, or return None if none or several match."""
+    """Spell a path as on disk, or return None if no or several spellings match."""
     path = folder
     for part in pathlib.PurePosixPath(name).parts:
         if os.path.exists(path / part):
@@ -137,12 +139,12 @@ def _key(name):
 
 
 def _listing(folder):
-    """Names in a folder by their case-folded spelling. Empty if it is no folder."""
+    """Names in a folder by their case-folded spelling. Empty if it is not a folder."""
     try:
         changed = folder.stat().st_mtime_ns
         if time.time_ns() - changed < _SETTLED_NS:
             return _read_listing(str(folder), changed)
-        return _kept_listing(str(folder), changed)
+        return _cached_listing(str(folder), changed)
     except OSError:
         return {}
 
@@ -154,4 +156,4 @@ def _read_listing(folder, _):
     return names
 
 
-_kept_listing = functools.lru_cache(16)(_read_listing)
+_cached_listing = functools.lru_cache(16)(_read_listing)

@@ -1,4 +1,4 @@
-"""Frame times from a file of the user, for captures whose own times are wrong."""
+"""Frame times from a separate file, for captures without correct times."""
 
 import collections
 import dataclasses
@@ -22,8 +22,8 @@ _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 def with_times(capture: Capture, path: AnyPath) -> Capture:
     """Replace the times of a capture by those of a file.
 
-    Frames of equal time are of several cameras, if the capture knows only one and their
-    names without the last number tell them apart.
+    If the capture has only one camera but several frames of equal time, and their names
+    without the last number differ, those names identify the cameras.
 
     Args:
       capture: The capture.
@@ -47,8 +47,8 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
     if listed is not None:
         if len(listed) != len(names):
             raise CaptureError(
-                f"{path}: {len(listed)} times for {len(names)} frames; give one for "
-                "each, in the order of their names, or write the names too"
+                f"{path}: {len(listed)} times for {len(names)} frames; write one for "
+                "each, in the order of their names, or add the names"
             )
         table = dict(zip(names, listed, strict=True))
         values = [table[name] for name in capture.ids]
@@ -63,14 +63,14 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
         )
     camera_ids, more = _cameras(capture, clock)
     first, last = clock.min(), clock.max()
-    note = f"times from {path.name}: {first:.6g} to {last:.6g} are 0 to 1"
+    note = f"times from {path.name}: {first:.6g} to {last:.6g} are mapped to 0 to 1"
     changed = not np.array_equal(camera_ids, capture.camera_ids)
     return dataclasses.replace(
         capture,
         times=frames.spread(clock),
         warp_ids=frames.dense(clock),
         camera_ids=camera_ids,
-        flow=None if changed else capture.flow,  # it is between frames of one camera
+        flow=None if changed else capture.flow,  # flow is between frames of one camera
         notes=(*capture.notes, note, *notes, *more),
     )
 
@@ -100,7 +100,7 @@ def _read(path):
     if rows and _number(rows[0][-1]) is None and _number(rows[0][0]) is None:
         rows = rows[1:]  # a heading
     if not rows:
-        raise CaptureError(f"{path}: no times in it; write a name and a time per line")
+        raise CaptureError(f"{path}: no times; write a name and a time per line")
     widths = collections.Counter(map(len, rows))
     width = widths.most_common(1)[0][0]
     time_first = any(_number(row[-1]) is None for row in rows) and all(
@@ -130,12 +130,12 @@ def _number(word):
     if _NUMBER.fullmatch(word):
         return float(word)
     try:
-        moment = datetime.datetime.fromisoformat(word)
+        date = datetime.datetime.fromisoformat(word)
     except ValueError:
         return None
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=datetime.UTC)
-    return moment.timestamp()
+    if date.tzinfo is None:
+        date = date.replace(tzinfo=datetime.UTC)
+    return date.timestamp()
 
 
 def _value(time, path):
@@ -149,7 +149,7 @@ def _value(time, path):
 
 
 def _by_name(capture, named, path):
-    """The time of each frame, and a note of entries that are of none."""
+    """The time of each frame, and a note on entries without a frame."""
     table = {_plain(name): number for name, number in named.items()}
     if len(table) < len(named):
         raise CaptureError(f"{path}: several names of one frame; keep one of each")
@@ -163,12 +163,12 @@ def _by_name(capture, named, path):
             "them under these names, or under those of their images"
         )
     unused = len(table) - len({*keys})
-    notes = (f"{unused} entries of {path.name} are of no frame",) if unused else ()
+    notes = (f"{unused} entries of {path.name} have no frame",) if unused else ()
     return [table[key] for key in keys], notes
 
 
 def _plain(name):
-    """A path of an image as the id of its frame: folders joined, without its ending."""
+    """The frame id of an image path: folders joined by underscores, without suffix."""
     stem = pathlib.PurePosixPath(text_files.forward_slashes(name))
     if stem.suffix.lower() in (*frames.SUFFIXES, ".exr"):
         stem = stem.with_suffix("")
@@ -176,7 +176,10 @@ def _plain(name):
 
 
 def _finder(table) -> Callable[[str], str | None]:
-    """Find the entry of a frame, whose id or name may have folders in front."""
+    """Make a function that finds the entry of a frame id.
+
+    Either of the two names may have additional folders in front.
+    """
     ends = collections.defaultdict(list)
     for key in table:
         parts = key.split("_")
@@ -188,14 +191,15 @@ def _finder(table) -> Callable[[str], str | None]:
             return name
         parts = name.split("_")
         shorter = ["_".join(parts[first:]) for first in range(1, len(parts))]
-        found = [*ends.get(name, ()), *(each for each in shorter if each in table)][:2]
-        return found[0] if len(found) == 1 or (found and found[0] in shorter) else None
+        matches = [*ends.get(name, ()), *(each for each in shorter if each in table)]
+        unique = len(matches) == 1 or (matches and matches[0] in shorter)
+        return matches[0] if unique else None
 
     return find
 
 
 def _cameras(capture, clock):
-    """Physical cameras, of frames that share times and tell cameras in their names."""
+    """Camera ids, derived from the names if frames share times, and a note."""
     pairs = {*zip(clock.tolist(), capture.camera_ids.tolist(), strict=True)}
     if len(pairs) == len(clock) or capture.camera_ids.any():
         return capture.camera_ids, ()
@@ -203,5 +207,5 @@ def _cameras(capture, clock):
     if len({*zip(clock.tolist(), groups, strict=True)}) < len(clock):
         return capture.camera_ids, ()
     count = len({*groups})
-    note = f"frames share times: taken as {count} cameras, told apart by their names"
+    note = f"frames share times: taken as {count} cameras, identified by their names"
     return frames.dense(groups), (note,)

@@ -120,26 +120,26 @@ def _with_poses(file, missing):
     transforms = read_json(file, Transforms)
     frames.check_missing(missing, str(file))
     posed = [each for each in transforms.frames if each.transform_matrix is not None]
-    lost = [
+    unposed = [
         each.file_path for each in transforms.frames if each.transform_matrix is None
     ]
-    if not lost:
+    if not unposed:
         return transforms, ()
-    listed = ", ".join(lost[:5]) + (", ..." if len(lost) > 5 else "")
+    listed = ", ".join(unposed[:5]) + (", ..." if len(unposed) > 5 else "")
     if missing == "refuse" or not posed:
         raise CaptureError(
-            f"{file}: {len(lost)} of {len(transforms.frames)} frames have no "
+            f"{file}: {len(unposed)} of {len(transforms.frames)} frames have no "
             f"transform_matrix ({listed}); add their poses, or leave those frames out "
             'with missing="skip"'
         )
-    skipped = {text_files.forward_slashes(name) for name in lost}
+    skipped = {text_files.forward_slashes(name) for name in unposed}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = getattr(transforms, key)
         if names is not None:
             kept = [n for n in names if text_files.forward_slashes(n) not in skipped]
             setattr(transforms, key, kept)
     transforms.frames = posed
-    note = f"{len(lost)} frames left out, they have no transform_matrix: {listed}"
+    note = f"{len(unposed)} frames left out, they have no transform_matrix: {listed}"
     return transforms, (note,)
 
 
@@ -148,8 +148,8 @@ def _fill_times(file, entries):
 
     If no frame has a time, all stay without.
     """
-    lost = [entry for entry in entries if entry.time is None]
-    if not lost or len(lost) == len(entries):
+    untimed = [entry for entry in entries if entry.time is None]
+    if not untimed or len(untimed) == len(entries):
         return ()
     folders = collections.defaultdict(list)
     for entry in entries:
@@ -157,19 +157,19 @@ def _fill_times(file, entries):
         folders[pathlib.PurePosixPath(path).parent].append(entry)
     for group in folders.values():
         _fill_folder(file, group)
-    return (f"{len(lost)} frames have no time: interpolated between neighbors",)
+    return (f"{len(untimed)} frames have no time: interpolated between neighbors",)
 
 
 def _fill_folder(file, entries):
-    lost = [entry for entry in entries if entry.time is None]
+    untimed = [entry for entry in entries if entry.time is None]
     known = [entry for entry in entries if entry.time is not None]
-    if not lost:
+    if not untimed:
         return
     clock = name_times.clock(stems(entries)).times
     name_time = dict(zip(map(id, entries), clock, strict=True))
     knots, rows = np.unique([float(name_time[id(entry)]) for entry in known], True)
     times = np.array([known[row].time for row in rows.tolist()], float)
-    for entry in lost:
+    for entry in untimed:
         knot = name_time[id(entry)]
         time = -1.0
         if len(knots) > 1:
@@ -240,11 +240,11 @@ def _split(file, transforms, heldout, missing):
         for name in split_names:
             other = file.with_name(f"transforms_{name}.json")
             if other.is_file():
-                second, lost = _with_poses(other, missing)
+                second, skip_notes = _with_poses(other, missing)
                 if not second.frames:
                     empty += (f"{other.name} has no frames",)
                     continue
-                more = lost + _fill_times(other, second.frames)
+                more = skip_notes + _fill_times(other, second.frames)
                 more += _fill_file(file, transforms.frames, second.frames)
                 more += _fill_file(other, second.frames, transforms.frames)
                 return Split(
@@ -271,14 +271,14 @@ def _split(file, transforms, heldout, missing):
         key=lambda row: (times[row], frames.natural(pool[row].file_path)),
     )
     ordered = [pool[row] for row in order]
-    every = frames.HELD_OUT if heldout is None else heldout
-    kept, scored = frames.hold_out_every(len(ordered), every, str(file))
+    interval = frames.HELD_OUT if heldout is None else heldout
+    train_rows, heldout_rows = frames.hold_out_every(len(ordered), interval, str(file))
     return Split(
         file,
         transforms,
-        [ordered[row] for row in kept],
-        [ordered[row] for row in scored],
-        (f"no other split: {frames.held_out_note(scored, every)}", *empty),
+        [ordered[row] for row in train_rows],
+        [ordered[row] for row in heldout_rows],
+        (f"no other split: {frames.held_out_note(heldout_rows, interval)}", *empty),
     )
 
 

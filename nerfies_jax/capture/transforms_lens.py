@@ -180,7 +180,7 @@ def _distortion(entry, transforms, label):
     for key in ("k5", "k6") if fisheye else ("k4", "k5", "k6"):
         if values[key] != 0:
             raise CaptureError(
-                f"{label} has {key} = {values[key]}; undistort the pictures first"
+                f"{label} has {key} = {values[key]}; undistort the images first"
             )
     if fisheye:
         return {

@@ -12,10 +12,10 @@ from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.high_dynamic_range import CODES, TRANSFERS, tone_mapped
 
 MAX_PIXELS = 64_000_000  # of a frame
-HD_LINES = 720  # from here on players take BT.709 where a film does not say
-_UNSAID = 2  # ffmpeg's number of a color space that is not told
+HD_LINES = 720  # from this height on, players assume BT.709 by default
+_UNSPECIFIED = 2  # FFmpeg's number of an unspecified color space
 COVERS = ("mjpeg", "png", "bmp", "gif", "webp", "tiff")  # image codecs
-SLACK = 3  # frames by which the stated length of a whole film may be wrong
+SLACK = 3  # frames by which the duration in the header may be wrong
 
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 
@@ -41,8 +41,8 @@ def frames(
     """
     av = extras.library("av", "video")
     last = math.inf if rows is None else max(rows, default=-1)
-    wanted = None if rows is None else set(rows)
-    shown, size = 0, None
+    requested = None if rows is None else set(rows)
+    emitted, size = 0, None
     with _words_of(av), av.open(path) as container:
         stream = _main_stream(container)
         _check_size(stream.width, stream.height)
@@ -56,19 +56,19 @@ def frames(
                     f"{frame.width}x{frame.height} pixels at frame {number}; cut the "
                     "video there"
                 )
-            if number % stride or not (wanted is None or number in wanted):
+            if number % stride or not (requested is None or number in requested):
                 yield {}, {}
                 continue
-            if shown >= most:
+            if emitted >= most:
                 return
-            shown += 1
+            emitted += 1
             squared = _square(frame, aspect)
             pixels = squared.to_ndarray(format="gray") if gray else _pixels(squared)
             upright = _upright(pixels, frame)
             yield {"seconds": float(frame.time or 0.0)}, {"pixels": upright}
             if number >= last:
                 return
-    if not shown:
+    if not emitted:
         raise FileError("holds no frames; copy or encode it again")
 
 
@@ -147,7 +147,7 @@ def _main_stream(container):
     # Some programs store covers as ordinary streams.
     videos = [each for each in videos if each.codec.name not in COVERS] or videos
     if not videos:
-        raise FileError("holds no pictures that move, at most a cover; pass a film")
+        raise FileError("holds no video, at most a cover image; pass a video")
     default = [
         stream for stream in videos if stream.disposition.default in stream.disposition
     ]
@@ -236,7 +236,7 @@ def _pixels(frame):
     """uint8 sRGB [height, width, 3]."""
     transfer = TRANSFERS.get(int(frame.color_trc))
     if transfer is None:
-        has_default = frame.colorspace != _UNSAID or frame.height < HD_LINES
+        has_default = frame.colorspace != _UNSPECIFIED or frame.height < HD_LINES
         space = None if has_default else "ITU709"  # FFmpeg would assume BT.601
         return frame.to_ndarray(
             format="rgb24", src_colorspace=space, dst_colorspace=space

@@ -280,7 +280,7 @@ def test_of_frames_listed_to_learn_from_alone_some_are_held_out(tmp_path):
     capture = blender_format.read(tmp_path)
     assert sorted(name[-1] for name in capture.ids) == list("12345678")
     assert [capture.ids[row][-1] for row in capture.heldout] == ["5"]
-    with pytest.raises(CaptureError, match="heldout=0 leaves nothing"):
+    with pytest.raises(CaptureError, match="heldout=0 leaves no"):
         blender_format.read(tmp_path, heldout=0)
 
 

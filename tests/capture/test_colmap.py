@@ -322,12 +322,12 @@ BAD = {
                 + "\n"
             ),
         ],
-        "0 points seen",
+        "0 points observed",
     ),
     "climbs": (spoil_text("images.txt", "f_000.png", "../../x.png"), "leads outside"),
     "no pictures": (
         lambda root: [file.unlink() for file in (root / "images").iterdir()],
-        "none of its pictures (f_000.png",
+        "none of its images (f_000.png",
     ),
     "picture of another shape": (
         lambda root: PIL.Image.fromarray(picture(0, (16, 24))).save(
@@ -357,7 +357,7 @@ def test_a_named_split_and_a_single_pose_are_refused(tmp_path):
     with pytest.raises(CaptureError, match="no split 'val'"):
         colmap.read(tmp_path / "good", heldout="val")
     make(tmp_path / "single", count=1)
-    with pytest.raises(CaptureError, match="1 pictures have a pose"):
+    with pytest.raises(CaptureError, match="1 images have a pose"):
         colmap.read(tmp_path / "single")
 
 

@@ -109,7 +109,7 @@ def test_large_images_are_decoded_in_the_child(tmp_path, monkeypatch):
     np.testing.assert_array_equal(images.read_pixels(tmp_path / "a.png"), pixels)
     content = (tmp_path / "a.png").read_bytes()
     (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
-    with pytest.raises(CaptureError, match=r"a\.png: not a readable picture"):
+    with pytest.raises(CaptureError, match=r"a\.png: not a readable image"):
         images.read_pixels(tmp_path / "a.png")
 
 
@@ -144,7 +144,7 @@ def test_heic_and_large_photographs_are_decoded_in_the_child(
     taken = footage.from_pictures(tmp_path, tmp_path / "out")
     assert taken.names == ("0.png", "1.png", "2.png")
     assert taken.focal == 0.5
-    assert f"1 pictures left out, not readable, so copy them again: 3.{ending}" in (
+    assert f"1 images left out, not readable, so copy them again: 3.{ending}" in (
         taken.notes
     )
     shown = images.read_pixels(tmp_path / "out/images/2.png")

@@ -104,7 +104,7 @@ def test_a_film_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
     assert len(footage.from_film(tmp_path / "a.mp4", tmp_path / "b").names) == 7
     half = footage.from_film(tmp_path / "a.mp4", tmp_path / "c", per_second=2.0)
     assert len(half.names) == 3
-    with pytest.raises(ValueError, match="1 frames to keep"):
+    with pytest.raises(ValueError, match="1 frames to select"):
         footage.from_film(tmp_path / "a.mp4", tmp_path / "d", 1)
 
 
@@ -151,7 +151,7 @@ def test_a_picture_of_floats_is_refused_by_name(tmp_path):
     deep = np.full((32, 32), 70_000, np.int32)
     for name in ("0.tif", "1.tif", "2.tif"):
         PIL.Image.fromarray(deep).save(tmp_path / name)
-    with pytest.raises(CaptureError, match=r"0\.tif: gray of 32 bits, up to 70000"):
+    with pytest.raises(CaptureError, match=r"0\.tif: 32-bit gray up to 70000"):
         footage.from_pictures(tmp_path, tmp_path / "out")
 
 
@@ -226,7 +226,7 @@ def test_a_folder_is_told_by_what_is_in_it(tmp_path):
     for name in ("a.jpg", "b.JPG"):
         (tmp_path / name).write_bytes(b"broken")
     assert footage.kind_of(tmp_path) == "pictures"
-    with pytest.raises(CaptureError, match=r"0 pictures.*not readable.*: a\.jpg, b\."):
+    with pytest.raises(CaptureError, match=r"0 images.*not readable.*: a\.jpg, b\."):
         footage.from_pictures(tmp_path, tmp_path / "out")
 
 
@@ -257,7 +257,7 @@ def test_what_cannot_be_read_is_left_out_and_what_is_hidden_is_no_picture(tmp_pa
     written = sorted(path.name for path in (tmp_path / "out/images").iterdir())
     assert written == ["0.png", "3.png", "für.png"]
     (folder / "3.jpg").unlink()
-    with pytest.raises(CaptureError, match=r"2 pictures; .*at least 3.*1\.jpg.*2\.jpg"):
+    with pytest.raises(CaptureError, match=r"2 images; .*at least 3.*1\.jpg.*2\.jpg"):
         footage.from_pictures(folder, tmp_path / "again")
 
 
@@ -286,5 +286,5 @@ def test_two_frames_of_one_time_cost_one_of_them(tmp_path, monkeypatch):
     taken = footage.from_film(tmp_path / "a.mp4", tmp_path, 30)
     assert len(taken.names) == len(set(taken.names)) == 29
     monkeypatch.setattr(footage, "OWN_TIMES", 0.99)
-    with pytest.raises(CaptureError, match="no times of their own"):
+    with pytest.raises(CaptureError, match="its frames have no times"):
         footage.from_film(tmp_path / "a.mp4", tmp_path / "b", 30)

@@ -176,7 +176,7 @@ def test_positions_that_float32_cannot_hold_are_refused():
         dataclasses.replace(capture, points=points),
         position=capture.cameras.position + moved,
     )
-    with pytest.raises(CaptureError, match="coordinates of a map are not centered"):
+    with pytest.raises(CaptureError, match="map coordinates are not centered"):
         gate.checked(dataclasses.replace(far, points=None))
     # Rounded to float32 by the program that wrote the file, whatever it was read with.
     world = np.float64(capture.cameras.position) / capture.scale + np.array(UTM)
@@ -230,7 +230,7 @@ def test_cameras_that_look_apart_are_said_without_points(reason):
 def test_focal_lengths_alone_of_larger_images_are_said():
     cameras = tiny_capture().cameras
     larger = with_cameras(changed(depths=None), focal_px=8 * cameras.focal_px)
-    assert any("of images 8 times as large" in one for one in problems(larger))
+    assert any("for images 8 times as large" in one for one in problems(larger))
 
 
 def test_images_that_use_few_of_their_values_are_said():
@@ -242,7 +242,7 @@ def test_a_frame_that_sees_no_points_is_named():
     turn = tiny_capture().cameras.camera_from_world.copy()
     turn[3] = np.diag(np.float32([-1, 1, -1])) @ turn[3]
     (problem,) = problems(with_cameras(changed(depths=None), camera_from_world=turn))
-    assert f"1 frames see no points ({tiny_capture().ids[3]})" in problem
+    assert f"1 frames show no points ({tiny_capture().ids[3]})" in problem
 
 
 def test_masks_that_leave_next_to_nothing_are_said():
@@ -266,7 +266,7 @@ def test_masks_that_leave_nothing_static_together_are_refused():
 @pytest.mark.parametrize(
     ("times", "problem"),
     [
-        ([0, 0.01, 0.02, 0.03, 0.99, 1], "nothing was filmed during 96% of the time"),
+        ([0, 0.01, 0.02, 0.03, 0.99, 1], "there are no frames during 96% of the time"),
         ([0, 0.2, 0.2, 0.2, 0.8, 1], "frames have the time of another frame"),
         ([0, 0.8, 0.2, 0.6, 0.4, 1], "times fall in"),
     ],
@@ -275,7 +275,7 @@ def test_doubtful_times_are_said(times, problem):
     capture = changed(times=np.float32([*times, 0]), flow=None)
     assert problem in problems(capture)[-1]
     apart = dataclasses.replace(capture, camera_ids=np.arange(7, dtype=np.int32))
-    assert ("nothing was filmed" in problem) == bool(problems(apart))
+    assert ("there are no frames" in problem) == bool(problems(apart))
 
 
 def test_the_table_has_a_line_for_each_check_and_one_for_each_problem():

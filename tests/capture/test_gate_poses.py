@@ -44,6 +44,6 @@ def test_another_convention_is_named(convention, tmp_path):
 
 def test_points_of_another_world_are_refused(tmp_path):
     with_points(tmp_path / "a", np.array, [0, 0, 1e4])
-    with pytest.raises(CaptureError, match="points or the poses are probably of anoth"):
+    with pytest.raises(CaptureError, match="points or the poses are probably in other"):
         formats.load(tmp_path / "a")
     assert formats.load(with_points(tmp_path / "b", np.array)).points is not None

@@ -82,7 +82,7 @@ BROKEN = {
     "bounds turned": ({"poses": changed(5, 15, 20.0)}, "row 5 has bounds [20.0, 9.0]"),
     "two sizes": ({"poses": changed(1, 4, 99.0)}, "several sizes"),
     "another size": ({"poses": table((100, 40))}, "24x16 pixels"),
-    "a picture missing": ({"count": 8}, "8 pictures for 9 poses"),
+    "a picture missing": ({"count": 8}, "8 images for 9 poses"),
     "no pictures": ({"folders": ()}, "but no images; put them"),
 }
 

@@ -161,7 +161,9 @@ def test_masks_may_be_a_whole_multiple_of_the_images(tmp_path):
     share, _ = frames.read_masks(paths, (5, 4), 1, "moving")
     blocks = WHITE.reshape(-1, 4, 2, 5, 2).mean((2, 4))
     np.testing.assert_allclose(share, blocks)
-    with pytest.raises(CaptureError, match="they must agree, or the mask be a whole"):
+    with pytest.raises(
+        CaptureError, match="the sizes must agree, or that of the mask be"
+    ):
         frames.read_masks(paths, (7, 4), 1, "moving")
 
 

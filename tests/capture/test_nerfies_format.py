@@ -298,7 +298,7 @@ def test_missing_pictures_are_listed_or_left_out(tmp_path):
     make(tmp_path)
     for name in ("001", "004"):
         (tmp_path / f"rgb/1x/{name}.png").unlink()
-    with pytest.raises(CaptureError, match=r"2 of 6 pictures are missing \(001, 004\)"):
+    with pytest.raises(CaptureError, match=r"2 of 6 images are missing \(001, 004\)"):
         nerfies_format.read(tmp_path)
     capture = nerfies_format.read(tmp_path, missing="skip")
     assert capture.ids == ("000", "002", "003", "005")

@@ -50,7 +50,7 @@ def test_each_camera_has_one_pose_and_frames_of_equal_times(kind, tmp_path):
     for row, camera in enumerate(capture.camera_ids):
         np.testing.assert_allclose(world[row], models.position(camera), atol=1e-5)
     assert capture.heldout.tolist() == [*range(COUNT)]
-    assert "held out, 2 are learned from" in capture.notes[-1]
+    assert "held out, 2 cameras are for training" in capture.notes[-1]
     assert capture.frames_per_second in (None, pytest.approx(10))
 
 
@@ -77,7 +77,7 @@ def test_what_does_not_fit_the_poses_is_refused(tmp_path):
     np.save(root / "poses_bounds.npy", llff.table()[:2])
     refused(rig_format.read, root, "3 folders of images (cam00, ...) for 2 cameras")
     np.save(root / "poses_bounds.npy", llff.table((100, 40))[:CAMERAS])
-    refused(rig_format.read, root, "24x16 pixels, but poses_bounds.npy is of 100x40")
+    refused(rig_format.read, root, "24x16 pixels, but poses_bounds.npy is for 100x40")
     (root / "poses_bounds.npy").unlink()
     for row in range(2):
         (root / f"cam{row}.mp4").touch()

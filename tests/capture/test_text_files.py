@@ -105,7 +105,7 @@ def test_paths_of_another_machine_are_those_of_this_folder(folder, tmp_path):
     read = room.load(tmp_path)
     assert read.ids == expected.ids
     np.testing.assert_array_equal(read.images, expected.images)
-    assert any("6 names of files are paths of another" in note for note in read.notes)
+    assert any("6 file names are paths in another" in note for note in read.notes)
 
 
 def test_transforms_written_on_windows_are_read(tmp_path):
@@ -147,7 +147,7 @@ def test_a_broken_model_among_others_is_passed_over_with_a_note(tmp_path):
     shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
     (tmp_path / "sparse/1/points3D.txt").unlink()
     capture = room.load(tmp_path)
-    assert any(note.startswith("passed over: sparse/1") for note in capture.notes)
+    assert any(note.startswith("skipped: sparse/1") for note in capture.notes)
     (tmp_path / "sparse/0/points3D.txt").unlink()
     with pytest.raises(CaptureError, match="sparse/0: not a readable COLMAP model"):
         room.load(tmp_path)

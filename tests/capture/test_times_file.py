@@ -43,7 +43,7 @@ def test_times_of_every_form_are_spread(form, tmp_path):
     np.testing.assert_allclose(capture.times, EXPECTED, atol=1e-7)
     assert capture.warp_ids.tolist() == [0, 1, 2, 3, 4, 5, 2]
     assert any(note.startswith(f"times from {name}: ") for note in capture.notes)
-    others = "1 entries of a.txt are of no frame"
+    others = "1 entries of a.txt have no frame"
     assert (others in capture.notes) == (form == "more than there are")
 
 
@@ -71,7 +71,7 @@ def test_frames_that_share_times_are_of_several_cameras(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no times in it"),
+        ("", "no times; write"),
         (lines("{name} {seconds}").replace(NAMES[3], "x"), "no time for 1 of 7 frames"),
         (lines("{name} {seconds}").replace("12.5", "nan"), "'0_00003 nan' is not a"),
         (lines("{name} {seconds}").replace(" 12.5", ""), "is not a frame's name and"),

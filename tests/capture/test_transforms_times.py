@@ -103,4 +103,4 @@ def test_notes_say_what_is_held_out(tmp_path):
     assert "no other split: every 8th frame is held out" not in capture.notes
     make(tmp_path / "two", {"": 2})
     (note, *_) = blender_format.read(tmp_path / "two").notes
-    assert note == "no other split: no frame is held out: there are too few"
+    assert note == "no other split: no frames are held out: there are too few"

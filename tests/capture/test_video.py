@@ -273,7 +273,7 @@ def test_what_is_no_film_is_refused(tmp_path):
         silence.sample_rate = 16_000
         container.mux(stream.encode(silence))
         container.mux(stream.encode())
-    with pytest.raises(CaptureError, match="holds no pictures"):
+    with pytest.raises(CaptureError, match="holds no video"):
         list(video.read_video(tmp_path / "d.mp4"))
 
 
@@ -308,7 +308,7 @@ def test_a_file_cut_short_says_how_much_of_it_was_read(ending, tmp_path):
     count = int(note.split(": ")[1].split(" of ")[0])
     assert 12 < count < 20
     assert "of 30 frames" in note
-    assert f"of {count} frames kept" in part.notes[0]
+    assert f"of {count} frames selected" in part.notes[0]
 
 
 def test_damaged_frames_are_left_out_with_a_note_and_refused_by_default(tmp_path):
