@@ -131,7 +131,7 @@ def init(spec: PlanesSpec, key: Key[Array, ""], dtype=jnp.float32) -> tuple[Leve
             jax.random.uniform(plane_key, shape, jnp.float32, low, high).astype(dtype)
             for plane_key in jax.random.split(level_key, len(PAIRS))
         )
-        time = ()
+        time: tuple[jax.Array, ...] = ()
         if spec.moments is not None:
             neutral = 1 if spec.combination == "product" else 0
             plane = jnp.full((spec.moments, side, spec.features), neutral, dtype)

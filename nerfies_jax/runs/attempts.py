@@ -34,7 +34,7 @@ class Attempts:
             if self._all_or_none:
                 raise
             self.failures.append(str(error))
-            return otherwise
+            return fallback
 
     def finish(self) -> None:
         """Report the products that were not written.
