@@ -70,8 +70,9 @@ def main(args):
             "machine": clock.machine(),
             "revision": revision(),
             "captures": rows,
-            "passed over": passed_over,
         }
+        if passed_over:
+            stored["passed over"] = passed_over
         write_json(args.out, stored)
         console.say(f"{len(rows)} captures, {problems} problems: {args.out}")
     return cli.Ended(stored, 1 if problems else 0)
@@ -199,7 +200,7 @@ def page(stored: dict) -> str:
         parts += ["Problems:", markdown.bullets(problems)]
     parts.append("Values of each check:")
     parts.append(_values(stored["captures"]))
-    if stored["passed over"]:
+    if "passed over" in stored:
         parts += [
             "These folders hold no capture:",
             markdown.bullets(

@@ -253,7 +253,10 @@ def keep(name: str, measured: pathlib.Path) -> None:
 
 def _check_of(name, stored, measured):
     """Raise ValueError if a file holds nothing, or results of another page."""
-    if not isinstance(stored, dict) or not all(stored.values()):
+    # A number may be 0, as the seed of damaged files is.
+    if not isinstance(stored, dict) or not all(
+        value or isinstance(value, int | float) for value in stored.values()
+    ):
         raise ValueError(f"--measured {measured}: holds no results; measure again")
     words = STUDIES[name].command.split()
     for option in ("--suite", "--scene"):

@@ -59,6 +59,18 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
     assert stored["benchmarks"] == benchmarks
 
 
+def test_a_seed_of_0_is_no_lack_of_results(tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "ROOT", tmp_path)
+    (tmp_path / "experiments/measured").mkdir(parents=True)
+    stored = json.loads((ROOT / "experiments/measured/fuzz.json").read_text())
+    assert stored["seed"] == 0
+    new = tmp_path / "new.json"
+    new.write_text(json.dumps(stored))
+    results.keep("fuzz", new)
+    kept = tmp_path / "experiments/measured/fuzz.json"
+    assert json.loads(kept.read_text()) == stored
+
+
 @pytest.mark.parametrize(
     ("page", "text", "words"),
     [
