@@ -140,7 +140,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     # While another process is at work in it, it is not resumed.
     with run_folder.owned(out):
         assert ended("--out", out, "--resume") == 2
-    refusal = f"process {os.getpid()} on .* is at work in this run folder"
+    refusal = f"process {os.getpid()} on .* is using this run folder"
     assert re.search(refusal, capsys.readouterr().err)
 
 

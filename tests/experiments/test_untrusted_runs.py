@@ -125,11 +125,11 @@ def ran(folder):
 HOSTILE = {
     "a motion beside it": (
         lambda s: s["spec"].update(motion={"type": "holiday:Drift"}),
-        r"holiday:Drift\), which run code .* with --trust holiday:Drift",
+        r"holiday:Drift\), which is executed .* with --trust holiday:Drift",
     ),
     "a class of another package in the spec": (
         lambda s: s["spec"]["init"].update(type="holiday:Loud"),
-        r"holiday:Loud\), which run code .* with --trust holiday:Loud",
+        r"holiday:Loud\), which is executed .* with --trust holiday:Loud",
     ),
     "functions of Python": (
         lambda s: s["config"].update(overrides=["a=os:abort", "b=subprocess:Popen x"]),
