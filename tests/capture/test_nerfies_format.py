@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import PIL.Image
 import pytest
@@ -107,7 +108,7 @@ def test_everything_in_the_files_arrives(tmp_path):
     np.testing.assert_array_equal(cameras.skew_px, np.float32([0.5] * 6))
     np.testing.assert_array_equal(cameras.radial[2], np.float32([0.1, 0.01, 0.001]))
     np.testing.assert_array_equal(cameras.tangential[2], np.float32([0.02, 0.03]))
-    assert all(leaf.dtype == np.float32 for leaf in cameras)
+    assert all(leaf.dtype == np.float32 for leaf in jax.tree.leaves(cameras))
     np.testing.assert_allclose(capture.up, [0, -1, 0], atol=1e-7)  # rows: right, down
 
 
@@ -454,7 +455,8 @@ def test_what_is_written_is_read_back(tmp_path):
     splits = ("train", "heldout", "warp_ids", "appearance_ids", "camera_ids")
     for name in ("images", "times", "valid", "moving", *splits):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name))
-    for one, other in zip(first.cameras, second.cameras, strict=True):
+    leaves = map(jax.tree.leaves, (first.cameras, second.cameras))
+    for one, other in zip(*leaves, strict=True):
         # Positions pass through float64 world units: half an ulp of the center, 3.
         np.testing.assert_allclose(one, other, atol=2e-7)
     np.testing.assert_allclose(second.depths, first.depths, rtol=3e-7)
