@@ -64,10 +64,10 @@ def test_frames_without_their_picture_are_left_out_where_asked(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--set", "init.points=0"), "at least one Gaussian"),
+        (("--set", "init.points=0"), "at least one initial Gaussian"),
         (("--set", "raster.capacity=1000000000000"), "GiB are free"),
         (("--preset", "splats-magic"), "splats-deformable-small"),
-        (("--steps", "0"), "at least one step"),
+        (("--steps", "0"), "must be at least 1"),
         (("--heldout", "1"), "held"),
         (("--prepare.frames", "9"), "has cameras"),
         (("--checkpoint-every", "-1"), "--checkpoint-every -1"),

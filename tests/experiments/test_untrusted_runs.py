@@ -27,7 +27,7 @@ SMALL = ("sh_degree=0", "strategy=none", "init.extra_random=0")
 HOLIDAY = """
 import dataclasses, pathlib
 import jax.numpy as jnp
-from gaussians_jax.protocols import MotionParams
+from gaussians_jax.core.protocols import MotionParams
 
 def mark(name):
     (pathlib.Path(__file__).parent / f"ran-{name}").touch()
