@@ -182,7 +182,7 @@ SETTINGS = {
         for name in ("charbonnier", "huber", "geman_mcclure")
     },
     "projection.project": {"size": (8, 8), "spec": GSPLAT},
-    "splats.active_degree": {"every": 10, "degree": 3},
+    "splats.active_degree": {"interval": 10, "degree": 3},
     "harmonics.basis": {"degree": 3},
     "entropy.noisy": {"key": lambda dtype: jax.random.key(0)},
 }

@@ -151,7 +151,7 @@ def test_planes_of_moments_say_when_as_well(dtype):
     at = functools.partial(read, TIMED, params, point, None)
     atol = {"float32": 1e-6, "float64": 1e-14}[dtype]
     np.testing.assert_allclose(at(time), np.concatenate(levels), rtol=0, atol=atol)
-    with pytest.raises(ValueError, match="4 dimensions, not of 3"):
+    with pytest.raises(ValueError, match="have 4 dimensions, but the points have 3"):
         at(None)
 
 

@@ -265,5 +265,5 @@ def test_what_cannot_be_fitted_is_refused_by_name():
         )
     with pytest.raises(ValueError, match=r'start\.motion="tracks" fits a warp'):
         dataclasses.replace(presets.PRESETS["nerf-small"], start=TRACKS)
-    with pytest.raises(ValueError, match=r"start\.first_rate=0.0 must be a share"):
+    with pytest.raises(ValueError, match=r"start\.first_rate=0.0 must be a fraction"):
         FieldStartSpec(first_rate=0.0)

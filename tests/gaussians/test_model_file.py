@@ -91,7 +91,7 @@ def test_a_failed_save_leaves_the_file_that_was_there(trained, saved):
     broken = params._replace(nets=put(nan))
     with pytest.raises(ValueError, match=r"model\.npz: params\.nets\..* not finite"):
         model_file.save(saved, broken, about)
-    with pytest.raises(ValueError, match=r"model\.npz: spec\.f holds a function"):
+    with pytest.raises(ValueError, match=r"model\.npz: spec\.f is a function"):
         model_file.save(saved, params, {"f": lambda: 0})
     logit = np.full_like(params.rows["splats"].opacity_logit, splats.INACTIVE_LOGIT)
     with pytest.raises(
