@@ -90,7 +90,11 @@ def main(args):
         threads = {kind.resources.threads for kind in kinds if kind is not None}
         with cli.user_errors():
             cli.find_code(args.trust)
-            platform.start_jax(args.device, "all" if "all" in threads else "one")
+            platform.start_jax(
+                args.device,
+                "all" if "all" in threads else "one",
+                wide=not args.trust,
+            )
             draw(folder / "pictures.png", compared, args.frames, args.trust)
     console.say(f"saved in {folder}")
     return cli.stored(folder / "compare.json")

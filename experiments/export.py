@@ -137,7 +137,8 @@ def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         cli.find_code(args.trust)
-        platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
+        threads = representations.cores_of_run(args.run).threads
+        platform.start_jax(args.device, threads, wide=not args.trust)
         from nerfies_jax import runs
         from nerfies_jax.capture.json_files import refuse_existing, sweep
 

@@ -123,7 +123,8 @@ def _outcome(args):
         if args.resume:
             args = _with_folder(args)
             _check_resumed(args)
-        platform.start_jax(args.device, *_cores(args))
+        wide = not (args.trust or named)
+        platform.start_jax(args.device, *_cores(args), wide=wide)
         watched = _watched(args)
     from nerfies_jax import runs
 

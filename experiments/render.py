@@ -125,7 +125,8 @@ def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         cli.find_code(args.trust)
-        platform.start_jax(args.device, representations.cores_of_run(args.run).threads)
+        threads = representations.cores_of_run(args.run).threads
+        platform.start_jax(args.device, threads, wide=not args.trust)
         from nerfies_jax import evaluation, runs
         from nerfies_jax.capture import json_files, video
         from nerfies_jax.capture.capture import CaptureError

@@ -13,7 +13,7 @@ import sys
 from nerfies_jax.runs import platform
 platform.start_jax("cpu", sys.argv[1], 2)
 import jax, jax.numpy as jnp
-from nerfies_jax.compiler import UNDIVIDED
+from nerfies_jax.runtime.compiler import UNDIVIDED
 lowered = jax.jit(jnp.exp).lower(jnp.zeros((2048, 2048)))
 for options in (None, UNDIVIDED):
     print("outer_dimension_partitions" in lowered.compile(options).as_text())
@@ -35,3 +35,37 @@ def are_divided(threads):
         command, env=environment, capture_output=True, text=True, check=True
     )
     return done.stdout.split()
+
+
+WIDE = """
+from nerfies_jax.runs import platform
+platform.start_jax("cpu")
+import jax, jax.numpy as jnp, numpy as np
+from nerfies_jax.geometry import so3
+
+rng = np.random.default_rng(0)
+vectors = rng.normal(size=(5000, 3)).astype(np.float32)
+rotated = jax.jit(jax.vmap(lambda v: so3.log(so3.exp(v))))(vectors)
+angle = np.linalg.norm(vectors, axis=1, keepdims=True).astype(np.float64)
+near = (angle + np.pi) % (2 * np.pi) - np.pi
+print(np.abs(rotated - vectors / angle * near)[angle[:, 0] < 3].max() < 1e-5)
+"""
+
+
+@pytest.mark.full
+def test_rotations_are_right_in_wide_vectors():
+    """XLA's arctan is wrong there for long arrays."""
+    environment = {name: x for name, x in os.environ.items() if name != "XLA_FLAGS"}
+    command = [sys.executable, "-c", WIDE]
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["True"]
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_code_of_other_packages_is_not_compiled_in_wide_vectors(wide, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(platform, "_processor_flags", lambda: {"avx512f"})
+    platform.start_jax("cpu", "all", wide=wide)
+    assert (platform.VECTOR_WIDTH in os.environ["XLA_FLAGS"]) == wide
