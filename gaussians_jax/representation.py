@@ -150,7 +150,9 @@ def advise(
         preset = "splats-tracked" if moves else "splats-static"
     if family is not None and family not in ADVISED:
         if moves and _spec_of(family, full).motion is None:
-            notes.append(f"{MOTION}: {family} has none, so {preset} is used")
+            notes.append(
+                f"{MOTION}: preset {family} is static, so {preset} is used instead"
+            )
         else:
             preset = family
     spec = _spec_of(preset, full)

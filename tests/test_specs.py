@@ -85,7 +85,7 @@ def test_a_field_is_listed_with_its_words_and_default():
     assert listed["strategy"].kind.endswith("MCMCStrategySpec or MODULE:NAME or none")
     start = spec_fields.fields_of(fields.SMALL_NERFIES)
     (jitter,) = (f.about for f in start if f.path == "elastic.points")
-    assert jitter.startswith("`points` samples of each ray are drawn by their weights")
+    assert jitter.startswith("`points` samples of each ray are chosen at random")
 
 
 def there_and_back(value):

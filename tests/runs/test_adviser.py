@@ -96,7 +96,7 @@ def test_the_family_stays_where_it_has_what_is_called_for(preset, motion, expect
     config, lines = adviser.follow(RunConfig(preset), (), answers)
     assert config.preset == expected
     family = preset.removesuffix("-small")
-    noted = any(f"motion: {family} has none" in line for line in lines)
+    noted = any(f"motion: preset {family} is static" in line for line in lines)
     assert noted == (preset != expected)
 
 
@@ -136,4 +136,4 @@ def test_codes_and_media_come_in_where_the_preset_has_none():
 def test_no_medium_is_brought_in_beside_a_warp():
     spec, advice = spec_of("radiance", motion=True, transient_objects=True)
     assert spec.transient is None
-    assert any("left to the warp" in note for note in advice.notes)
+    assert any("lowers scores next to a warp" in note for note in advice.notes)
