@@ -87,7 +87,8 @@ def _public(path):
             source = path.parent.joinpath(*(node.module or "").split("."))
             for alias in node.names:
                 # A module in a face has a page of its own.
-                is_module = (source / f"{alias.name}.py").exists()
+                target = source / alias.name
+                is_module = target.with_suffix(".py").exists() or target.is_dir()
                 if alias.asname == alias.name and not is_module:
                     yield alias.name
 

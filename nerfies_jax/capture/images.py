@@ -316,8 +316,8 @@ def over(color: np.ndarray, alpha: np.ndarray, background: tuple) -> np.ndarray:
       uint8 color, [height, width, 3].
     """
     opacity = alpha[..., None].astype(np.float32) / 255
-    background = np.asarray(background, np.float32) * 255
-    return np.round(color * opacity + background * (1 - opacity)).astype(np.uint8)
+    behind = np.asarray(background, np.float32) * 255
+    return np.round(color * opacity + behind * (1 - opacity)).astype(np.uint8)
 
 
 def write_png(path: AnyPath, pixels: np.ndarray):

@@ -86,8 +86,9 @@ class Camera(NamedTuple):
           ValueError: Where a shape is wrong, K is not an intrinsic matrix, the pose is
             not rigid, or the principal point lies far outside the image.
         """
-        fields = matrices.camera_fields(K, camera_from_world, distortion, camera_model)
-        camera = cls(**{name: part.astype(dtype) for name, part in fields.items()})
+        parts = matrices.camera_fields(K, camera_from_world, distortion, camera_model)
+        leaves: dict[str, Any] = {k: part.astype(dtype) for k, part in parts.items()}
+        camera = cls(**leaves)
         validate(camera, (width, height), "Camera.from_K")
         return camera
 

@@ -75,9 +75,8 @@ class ElasticSpec:
     def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
         """Compute the elastic energy of the warp at the coarse samples of a step."""
         value, folded = energy_of_step(self, context)
-        weight = schedule(self)
-        if callable(weight):
-            weight = weight(context.step)
+        planned = schedule(self)
+        weight = planned(context.step) if callable(planned) else planned
         return {"elastic": Term(value, weight), "folded": Term(folded, None)}
 
 
