@@ -277,7 +277,7 @@ def test_the_flow_from_picture_to_picture_is_drawn(run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--without", "warp"], "those are: motion"),
+        (["--without", "warp"], "effects that can be: motion"),
         (["--appearance", "0", "1"], "no appearance codes"),
         (["--knots", "1"], "reads 2 knots at once"),
         (["--still-below", "1e9"], "nothing in this run moves"),
@@ -357,7 +357,7 @@ def test_a_run_that_cannot_be_drawn_or_kept_says_so_and_ends(
     with monkeypatch.context() as patch:
         patch.setattr(products, "save_video", full)
         assert ended("--out", folder, "--resume") == 1
-    words = f"is written: {folder}: cannot be written (No space left on device)"
+    words = f"could not be written: {folder}: cannot be written (No space left"
     assert words in capsys.readouterr().err
     # The products of before stay together, though the player was there already.
     assert {name: (folder / name).read_bytes() for name in PRODUCTS} == before
@@ -369,7 +369,7 @@ def test_a_run_that_cannot_be_drawn_or_kept_says_so_and_ends(
     with monkeypatch.context() as patch:
         patch.setattr(products, "save_video", full)
         assert ended("--out", folder, "--resume") == 1
-    assert "is written: [Errno 28] No space left" in capsys.readouterr().err
+    assert "could not be written: [Errno 28] No space left" in capsys.readouterr().err
     assert {n for n in PRODUCTS if not (folder / n).exists()} == {"scene.mp4"}
     shutil.rmtree(folder / CHECKPOINTS / "12")
     trained = train.train
