@@ -94,7 +94,7 @@ class Export:
                     f"{fits}"
                 )
         if self.gaussians and None not in (self.time, self.frames):
-            raise ValueError("--time and --frames: one instant, or a sequence of them")
+            raise ValueError("--time and --frames exclude each other: give one of them")
         if self.time is not None and not 0 <= self.time <= 1:
             raise ValueError(f"--time {self.time}: the capture runs from 0 to 1")
         cli.check_frames(self.frames, self.path or cli.PATHS[0])
@@ -172,7 +172,7 @@ def _gaussians(args: Export, run: Any) -> str:
     instants.save_sequence(
         args.place, at, args.frames, f".{args.format}", overwrite=args.overwrite
     )
-    return f"Gaussians at {args.frames} instants"
+    return f"Gaussians at {args.frames} times"
 
 
 def _splatv(args: Export, run: Any) -> str:
@@ -195,17 +195,17 @@ def _splatv(args: Export, run: Any) -> str:
         model = run.representation.products.variant(spec, run.metadata, neutral, False)
     draw = evaluation.Renderer(model, capture.size)
     fit = splatv.measured(curves, learned, draw, state, raster, capture)
-    said = (
-        f"{len(curves.position)} Gaussians on cubics in time, off by {fit.rms:.2g} "
-        f"scene units (rms; {fit.most:.2g} for the worst of 99 in 100); pictures "
-        f"{fit.psnr:.1f} dB from the run's own ({fit.views} views)"
+    summary = (
+        f"{len(curves.position)} Gaussians on cubics in time, RMS error {fit.rms:.2g} "
+        f"scene units ({fit.most:.2g} at the 99th percentile), PSNR to renders of the "
+        f"run {fit.psnr:.1f} dB ({fit.views} views)"
     )
     if capture.near < splatv.NEAREST:
-        said += (
-            f"; what is nearer than {splatv.NEAREST:g} scene units is not drawn by "
-            f"that viewer, and this scene begins at {capture.near:.2g}"
+        summary += (
+            f"; that viewer does not render what is nearer than {splatv.NEAREST:g} "
+            f"scene units, and this scene begins at {capture.near:.2g}"
         )
-    return said
+    return summary
 
 
 def _cameras(args: Export, run: Any) -> str:
@@ -303,7 +303,7 @@ def _exr(args: Export, run: Any) -> str:
         args.overwrite,
     )
     flow = "without flow, since nothing moves points" if move is None else "and flow"
-    return f"{len(planned.times)} pictures: color, alpha, depth {flow}"
+    return f"{len(planned.times)} images: color, alpha, depth {flow}"
 
 
 WRITERS = {

@@ -97,7 +97,7 @@ def as_json(capture, inspected, advice):
         "findings": [dataclasses.asdict(one) for one in inspected.findings],
         "cost per step": prices.as_json(inspected.findings),
         "advice": [dataclasses.asdict(one) for one in advice],
-        "pictures made smaller by": inspected.factor,
+        "images downsampled by": inspected.factor,
         "seconds": inspected.seconds,
     }
 

@@ -51,8 +51,8 @@ def main(args):
         synthetic.write(spec, args.out, args.seed)
     width, height = spec.size
     console.say(
-        f"{args.out}: {spec.name}, {spec.frames} instants at {width}x{height}, "
-        f"truth in {args.out / synthetic.TRUTH_FILE}\n"
+        f"{args.out}: {spec.name}, {spec.frames} frame times at {width}x{height}, "
+        f"ground truth in {args.out / synthetic.TRUTH_FILE}\n"
         f"next: python -m experiments.reconstruct {shlex.quote(str(args.out))}"
     )
     return {"folder": str(args.out), "scene": specs.as_json(spec), "seed": args.seed}

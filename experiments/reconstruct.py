@@ -179,7 +179,7 @@ def _with_folder(args):
     if capture is None:
         raise ValueError(
             "--resume continues the run in a folder: name it with --out, or name the "
-            "capture or film that it was made of"
+            "capture or video that it was made from"
         )
     folder = run_folder.newest_of(capture)
     console.say(f"the newest run of {capture}: {folder}")
@@ -190,8 +190,8 @@ def _check_resumed(args):
     """Raise ValueError where options do not go with --resume."""
     if args.prepare != Preparation():
         raise ValueError(
-            "--prepare says how a film becomes a capture, and this run has one; leave "
-            "it out with --resume"
+            "--prepare converts a video to a capture, and the run to continue has one; "
+            "leave it out with --resume"
         )
     if args.effects == "auto":
         raise ValueError(

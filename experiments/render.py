@@ -305,7 +305,7 @@ def _report(out, renderer, count, files):
     """Print the location of the render, and return the result as JSON values."""
     width, height = renderer.size
     ms = renderer.ms_per_frame(count)
-    console.say(f"{count} pictures of {width}x{height}, {ms:.0f} ms each, in {out}")
+    console.say(f"{count} images of {width}x{height}, {ms:.0f} ms each, in {out}")
     return {
         "folder": str(out),
         "size": [width, height],

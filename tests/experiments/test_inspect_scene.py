@@ -14,7 +14,7 @@ from tests.preprocessing import films
 def test_the_command_line_prints_the_table_and_writes_both_files(
     tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
     nerfies_format.write(films.film(), tmp_path / "film")
     names = ("sheet.png", "findings.json")

@@ -11,7 +11,7 @@ from nerfies_jax.runs import platform
 
 @pytest.fixture(autouse=True)
 def no_global_settings(monkeypatch):
-    monkeypatch.setattr(platform, "start_jax", lambda device: None)
+    monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
 
 
 def test_a_scene_is_written_and_loads_as_a_capture(tmp_path, capsys):

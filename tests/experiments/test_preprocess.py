@@ -16,7 +16,7 @@ from tests.preprocessing.test_tracks import MOVES
 def test_the_command_line_says_draws_and_keeps_what_it_finds(
     tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
     nerfies_format.write(films.film(**MOVES), tmp_path / "film")
     words = [str(tmp_path / "film"), "--out", str(tmp_path / "out")]

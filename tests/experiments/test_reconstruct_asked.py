@@ -178,7 +178,7 @@ def test_help_names_the_presets(capsys):
 def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
     tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     nerfies_format.write(films.film(), tmp_path / "film")
     taken = {}
 

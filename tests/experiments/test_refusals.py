@@ -32,7 +32,7 @@ TABLE = [
     ("render", "OUT --max-side 0", "--max-side 0: draw at least one pixel"),
     ("export", "nowhere ply", "not a run folder"),
     ("export", "nowhere ply --frames 1", "a sequence has at least two"),
-    ("export", "nowhere ply --frames 2 --time 0.5", "one instant, or a sequence"),
+    ("export", "nowhere ply --frames 2 --time 0.5", "exclude each other"),
     ("export", "nowhere splat --time 2", "runs from 0 to 1"),
     ("export", "nowhere spz --out OUT.ply", "such a file ends in .spz"),
     ("export", "nowhere tracks --points 0", "track at least one"),
@@ -67,7 +67,7 @@ ROOM = pathlib.Path(__file__).resolve().parents[2] / "experiments"
 
 @pytest.mark.parametrize(("name", "words", "refusal"), TABLE)
 def test_what_cannot_be_is_refused(name, words, refusal, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
     monkeypatch.setitem(synthetic.PRESETS, "tiny", scenes.TINY_FILM)
     monkeypatch.chdir(tmp_path)
@@ -96,7 +96,7 @@ def test_results_of_earlier_measurements_are_kept(
     """Before anything is measured; none of these commands adds to what is there."""
     from experiments import compare
 
-    monkeypatch.setattr(platform, "start_jax", lambda *_: None)
+    monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     monkeypatch.setattr(compare, "read", lambda *_: None)
     kept = tmp_path / "earlier" / "numbers.png"
     kept.parent.mkdir()
