@@ -22,7 +22,7 @@ def test_the_command_line_says_draws_and_keeps_what_it_finds(
     words = [str(tmp_path / "film"), "--out", str(tmp_path / "out")]
     preprocess.main(words)
     printed = capsys.readouterr().out
-    assert "detecting moving objects" in printed
+    assert "masks of moving objects ..." in printed
     (kept,) = (tmp_path / "cache" / "evidence").glob("*.npz")
     assert f"stored result: {kept}" in printed
     assert (tmp_path / "out" / "tracks.png").stat().st_size > 10_000
@@ -31,4 +31,4 @@ def test_the_command_line_says_draws_and_keeps_what_it_finds(
     preprocess.main([*words[:-1], str(tmp_path / "again")])
     again = capsys.readouterr().out
     assert "already preprocessed" in again
-    assert "detecting moving objects" not in again
+    assert "masks of moving objects ..." not in again
