@@ -424,7 +424,7 @@ def test_who_looks_on_changes_nothing_of_what_is_learned(tmp_path, capsys):
     frames = evaluation.frames_of(CAPTURE, run.model.required_data)
     alone = loop.fit(run.model, state, frames, steps=3)
     with viewer.live(run, tmp_path, 8190) as hook:
-        address = re.search(r"trains: (\S+)", capsys.readouterr().out)[1]
+        address = re.search(r"during training: (\S+)", capsys.readouterr().out)[1]
         browser = Browser(address)
         try:
             browser.look(eye_of(int(CAPTURE.train[0])))
