@@ -152,12 +152,12 @@ def test_gaussians_leave_at_an_instant_and_as_a_sequence(splats, tmp_path, capsy
 @pytest.mark.full
 def test_a_scene_leaves_with_all_its_motion_and_how_far_it_is_off(splats, capsys):
     assert main(splats, "splatv") == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     path = splats / "exports" / "splatv.splatv"
-    assert str(path) in said
-    told = re.search(r"off by (\S+) scene units.* pictures (\S+) dB", said)
-    assert 0 < float(told[1]) < 0.1
-    assert 20 < float(told[2]) < 100
+    assert str(path) in printed
+    errors = re.search(r"RMS error (\S+) scene units.* of the run (\S+) dB", printed)
+    assert 0 < float(errors[1]) < 0.1
+    assert 20 < float(errors[2]) < 100
     assert len(splatv.decode(path.read_bytes()).position) > 100
     assert main(splats, "splatv", "--frames", 2) == 2
     assert "--frames is not for splatv" in capsys.readouterr().err

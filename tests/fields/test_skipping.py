@@ -93,11 +93,11 @@ occupied_at = jax.jit(occupancy.at, static_argnums=2)
 @pytest.mark.parametrize(
     ("spec", "background", "row"),
     [
-        # Each compiles three programs; the first three have no part of their own.
+        # Each compiles three programs, and those of the core tests have most parts.
         pytest.param(STILL, None, 3, marks=pytest.mark.full),
         pytest.param(ONE_LEVEL, ORANGE, 3, marks=pytest.mark.full),
         pytest.param(WARPED, ORANGE, 3, marks=pytest.mark.full),
-        (GUIDED, ORANGE, 3),
+        pytest.param(GUIDED, ORANGE, 3, marks=pytest.mark.full),
         (WARPED_TWO_LEVELS, ORANGE, 3),
         *((MOVING, ORANGE, n) for n in range(3)),
     ],
@@ -161,6 +161,7 @@ def test_space_is_surveyed_of_a_warp_that_colors_what_it_moves():
     assert cells.shape == (skipping.STILL_CELLS,) * 3
 
 
+@pytest.mark.full
 def test_where_nothing_is_skipped_a_frame_is_the_full_quadrature(monkeypatch):
     """Samples that the fine level takes over are where they were asked before."""
     monkeypatch.setattr(skipping, "SKIPPED_DEPTH", -1.0)

@@ -265,6 +265,7 @@ def test_rasterization_through_a_lens_is_a_large_pinhole_image_resampled(name, r
         assert np.sqrt(np.mean(error**2)) < 0.01
 
 
+@pytest.mark.full
 def test_rasterization_takes_a_lens_under_grad_and_vmap(float64, rng):
     *scene, views, intrinsics = arguments(rng, float64, count=8)
     lenses = jnp.tile(jnp.asarray(LENSES["tangential"][1]), (2, 1))

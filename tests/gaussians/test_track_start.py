@@ -93,13 +93,8 @@ def test_every_motion_can_be_fitted_to_paths(name):
     assert np.median(off) < 0.03
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "mlp",
-        pytest.param("embedding", marks=pytest.mark.full),  # which has rows
-    ],
-)
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["mlp", "embedding"])  # the latter has rows
 def test_networks_that_are_fitted_leave_the_wall_where_it_is(name, monkeypatch):
     """Also where the fit has not looked: points drawn apart."""
     monkeypatch.setattr(motion_fit, "RESTING", 64)

@@ -135,6 +135,7 @@ def test_depths_of_any_scale_are_brought_to_the_points_at_rest(inverse):
     assert given_depth.aligned(noise, tracks, RestPoints(None, None, depth))[1] > 0.1
 
 
+@pytest.mark.full
 def test_paths_lean_on_depths_given(tmp_path):
     film, folders = films.film(**MOVES, frames=24), {}
     for kind in ("exr", "png"):

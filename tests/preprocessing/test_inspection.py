@@ -49,6 +49,7 @@ def test_a_swaying_card_moves():
     assert verdict(swaying(), "motion") == (True, CERTAIN)
 
 
+@pytest.mark.full
 def test_cameras_that_take_turns_see_what_one_camera_sees():
     ids = np.arange(films.FRAMES, dtype=np.int32)
     film = dataclasses.replace(swaying_film(), camera_ids=ids)
