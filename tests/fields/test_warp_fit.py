@@ -201,6 +201,7 @@ def test_a_medium_on_tables_learns_at_the_rate_of_the_template(motion):
     assert own.network == rates["template"] == spec.template_rate * own.blend
 
 
+@pytest.mark.full
 def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
     """Against the body's own velocity; also where frames are two moments apart.
 

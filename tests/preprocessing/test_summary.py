@@ -59,6 +59,7 @@ def test_errors_are_those_of_what_was_followed(monkeypatch):
     assert bare.false_share == evidence.moving.mean()
 
 
+@pytest.mark.full
 def test_words_say_what_there_is_and_what_cannot_be_told():
     capture, evidence = gathered()
     counted = summary.of(views_of(capture), evidence)
