@@ -25,7 +25,7 @@ from experiments import options
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
-from nerfies_jax.runs import trust
+from nerfies_jax.runs import platform, representations, trust
 from nerfies_jax.runs.config import (
     CaptureNotFound,
     CaptureSource,
@@ -177,6 +177,17 @@ def find_code(names: Iterable[str]) -> None:
         if (here / f"{module}.py").is_file() or (here / module).is_dir():
             sys.path.append(str(here))
             return
+
+
+def start_for_run(args: Any) -> None:
+    """Start JAX for the run of a command, and let the code that it trusts be found.
+
+    Args:
+      args: Settings with `device`, `run` and `trust`.
+    """
+    find_code(args.trust)
+    threads = representations.cores_of_run(args.run).threads
+    platform.start_jax(args.device, threads, wide=not args.trust)
 
 
 class Ended(NamedTuple):

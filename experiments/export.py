@@ -19,7 +19,7 @@ import pathlib
 from typing import Any, Literal
 
 from experiments import cli, render_folder
-from nerfies_jax.runs import platform, representations, run_folder
+from nerfies_jax.runs import run_folder
 from nerfies_jax.runtime import console, events
 
 # Options of each format, in addition to --out, --overwrite and --device.
@@ -136,9 +136,7 @@ class Export:
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        cli.find_code(args.trust)
-        threads = representations.cores_of_run(args.run).threads
-        platform.start_jax(args.device, threads, wide=not args.trust)
+        cli.start_for_run(args)
         from nerfies_jax import runs
         from nerfies_jax.capture.json_files import refuse_existing, sweep
 

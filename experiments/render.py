@@ -23,7 +23,6 @@ import numpy as np
 import tyro
 
 from experiments import cli, render_folder
-from nerfies_jax.runs import platform, representations
 from nerfies_jax.runtime import console, events
 
 
@@ -124,9 +123,7 @@ class Render:
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        cli.find_code(args.trust)
-        threads = representations.cores_of_run(args.run).threads
-        platform.start_jax(args.device, threads, wide=not args.trust)
+        cli.start_for_run(args)
         from nerfies_jax import evaluation, runs
         from nerfies_jax.capture import json_files, video
         from nerfies_jax.capture.capture import CaptureError

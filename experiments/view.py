@@ -11,7 +11,6 @@ import time
 from typing import Literal
 
 from experiments import cli
-from nerfies_jax.runs import platform, representations
 from nerfies_jax.runtime import console, stopping
 
 
@@ -47,9 +46,7 @@ class View:
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        cli.find_code(args.trust)
-        threads = representations.cores_of_run(args.run).threads
-        platform.start_jax(args.device, threads, wide=not args.trust)
+        cli.start_for_run(args)
         from nerfies_jax import runs
         from nerfies_jax.runs import curves, viewer
 
