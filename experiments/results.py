@@ -37,9 +37,9 @@ the result of a command and rewrites its page.
 
 ## Finished studies
 
-These studies answered their question. Their pages and numbers stay, and their code is
-in revision {revision} of this repository, which can run the command on each page. The
-numbers of a page NAME.md are in NAME.json.
+These studies answered their question. Their pages and numbers stay. The code of each is
+in the revision of this repository that its page names, which can run the command on the
+page. The numbers of a page NAME.md are in NAME.json.
 
 {finished}
 """
@@ -115,25 +115,11 @@ STUDIES = {
         "speed.player",
         "speed.player",
     ),
-    "faults": _package("signals, full disks, closed pipes", "faults --trials 200"),
     "fuzz": _package("damaged files", "fuzz --mutations 1000000"),
-    "capture_checks": Study(
-        "consistency checks of good captures",
-        "capture_checks CAPTURES",
-        "capture_checks",
-        "capture_checks",
-    ),
-    "capture_cost": Study(
-        "memory of frames, cost of decoders",
-        "capture_cost",
-        "capture_cost",
-        "capture_cost",
-    ),
     "mutants": _package("faults that the tests detect", "mutants --count 44"),
     "mutants_unseen": _package("the same, other faults", "mutants --count 24 --seed 1"),
 }
 # Studies that answered their question: the page and its numbers stay, without the code.
-REVISION = "99f3f69"  # the last revision with all of them
 FINISHED = {
     "league": "comparison of all small presets, and margins that the papers print",
     "accuracy_time": "quality against training time",
@@ -158,7 +144,13 @@ FINISHED = {
     "solver_table_poses": "solvers of poses",
     "spectral_bias": "spectral bias",
     "transient_medium": "transient media",
+    "capture_checks": "consistency checks of good captures",
+    "capture_cost": "memory of frames, cost of decoders",
+    "faults": "signals, full disks, closed pipes",
 }
+# The last revision with the code of each.
+REVISIONS = dict.fromkeys(FINISHED, "99f3f69")
+REVISIONS |= dict.fromkeys(("capture_checks", "capture_cost", "faults"), "566f225")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,7 +297,6 @@ def index() -> str:
     return INDEX.format(
         pages=markdown.table(("page", "subject", "measured by"), rows, words=3),
         missing=MISSING.format(commands=markdown.bullets(missing)) if missing else "",
-        revision=REVISION,
         finished=markdown.bullets(
             f"[{name}.md]({name}.md): {about}" for name, about in FINISHED.items()
         ),

@@ -83,7 +83,7 @@ class Command:
 
 
 # In the order in which the main job imports them: pure Python before and after JAX, a
-# library of C++, and in the middle of JAX. `experiments.faults` tries others.
+# library of C++, and in the middle of JAX.
 MODULES = ("tyro", "jaxlib", "jax._src.core", "orbax.checkpoint")
 CORE = ("jaxlib", "jax._src.core")
 

@@ -1,1 +1,0 @@
-"""Faults injected into jobs, and what is left of the jobs afterwards."""
