@@ -51,6 +51,7 @@ Scene = Literal[
     "pose-error",
     "barrel",
     "fisheye",
+    "rig",
 ]
 SCENES: tuple[str, ...] = typing.get_args(Scene)
 # Arguments of the library that have an option of the same name; "..." is any value.

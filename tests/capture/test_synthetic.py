@@ -407,3 +407,22 @@ def test_the_digest_knows_every_setting_and_the_seed():
     assert len({synthetic.digest(spec) for spec in specs}) == len(specs)
     assert synthetic.digest(specs[0], 1) != synthetic.digest(specs[0], 0)
     assert synthetic.digest(specs[0]) == synthetic.digest(specs[0])
+
+
+def test_the_cameras_of_a_rig_take_turns_in_wide_steps():
+    spec = synthetic.PRESETS["rig"]
+    plan = rendering.schedule(spec, seed=3)
+    position = plan.cameras.position[plan.camera_id == 0]
+    there, back = position[:12], position[11:23]
+    assert len(np.unique(there, axis=0)) == 12
+    np.testing.assert_array_equal(back, there[::-1])
+    # Without the rows of different height: the turn seen from the target.
+    flat = there[:, [0, 2]] - np.array(spec.cameras.target)[[0, 2]]
+    turn = np.degrees(np.diff(np.arctan2(flat[:, 0], flat[:, 1])))
+    assert ((turn > 7) & (turn < 11)).all()
+
+
+@pytest.mark.parametrize("settings", [{"count": 1}, {"count": 40}, {"step_rad": 0.0}])
+def test_a_rig_without_an_arc_is_refused(settings):
+    with pytest.raises(ValueError, match=r"(two cameras|arc of .* between 0 and 3)"):
+        synthetic.Rig(**settings)

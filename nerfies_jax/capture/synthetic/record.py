@@ -147,10 +147,9 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
       Twelve hex digits of a hash of the spec, the seed and the version of the renderer.
     """
     text = f"{VERSION} {seed} {spec!r}"
-    if spec.pose_error is not None:
-        text += f" {spec.pose_error!r}"
-    if spec.lens is not None:
-        text += f" {spec.lens!r}"
+    for effect in (spec.pose_error, spec.lens, spec.rig):
+        if effect is not None:
+            text += f" {effect!r}"
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

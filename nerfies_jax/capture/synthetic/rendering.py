@@ -230,11 +230,18 @@ def _arc(spec, times, seed, is_second):
     sweep = 2 * np.pi * setting.sweeps * times
     angle = setting.arc_rad * np.sin(sweep)
     distance = setting.distance - setting.forward * np.sin(sweep / 2) ** 2
+    if spec.rig is not None:
+        shake = np.zeros_like(shake)
+        angle = np.array(spec.rig.angles(len(times)))
+        distance = np.full(len(times), setting.distance)
     target = np.asarray(setting.target) + shake[:, 3:]
     right = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], -1)
     back = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
     up = np.array([0.0, 1.0, 0.0])
     rise = (setting.height + 0.2 * setting.height * np.cos(sweep))[:, None] * up
+    if spec.rig is not None:
+        raised = np.array(spec.rig.turns(len(times))) % 2
+        rise = (setting.height + spec.rig.rise * raised)[:, None] * up
     position = setting.target + distance[:, None] * back + rise + shake[:, :3]
     if is_second:
         offset_right, offset_up, offset_back = setting.beside

@@ -64,6 +64,55 @@ class Cameras:
 
 
 @dataclasses.dataclass(frozen=True)
+class Rig:
+    """Static cameras on an arc in two rows that take turns, in place of the first one.
+
+    Frame n is observed by camera n up to the last one, and then backward. The distance,
+    target and height are those of `Cameras`, without its movement and shake.
+    """
+
+    count: int = 12
+    step_rad: float = 0.15  # between neighboring cameras, as seen from the target
+    rise: float = 0.05  # of every second camera above the others, scene units
+
+    def __post_init__(self):
+        if self.count < 2:
+            raise ValueError(f"count={self.count}: a rig needs at least two cameras")
+        span = self.step_rad * (self.count - 1)
+        if not 0 < span < 3:
+            raise ValueError(
+                f"step_rad={self.step_rad} for count={self.count} cameras makes an arc "
+                f"of {span:.2f} rad, which must lie between 0 and 3"
+            )
+
+    def angles(self, frames: int) -> list[float]:
+        """Return the angle of the camera of each frame on the arc.
+
+        Args:
+          frames: Number of frames.
+
+        Returns:
+          Angles in rad, zero in the middle of the arc.
+        """
+        return [
+            (camera - (self.count - 1) / 2) * self.step_rad
+            for camera in self.turns(frames)
+        ]
+
+    def turns(self, frames: int) -> list[int]:
+        """Return the index of the camera that observes each frame.
+
+        Args:
+          frames: Number of frames.
+
+        Returns:
+          Indices along the arc.
+        """
+        last = self.count - 1
+        return [last - abs(last - frame % (2 * last)) for frame in range(frames)]
+
+
+@dataclasses.dataclass(frozen=True)
 class Lens:
     """Lens distortion of both cameras."""
 
@@ -160,6 +209,8 @@ class SceneSpec:
     # their identity.
     pose_error: PoseError | None = dataclasses.field(default=None, repr=False)
     lens: Lens | None = dataclasses.field(default=None, repr=False)
+    # The first camera's frames are then those of the rig.
+    rig: Rig | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self):
         unit_axis(self.light)
