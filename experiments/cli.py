@@ -52,6 +52,8 @@ Scene = Literal[
     "barrel",
     "fisheye",
     "rig",
+    "collection",
+    "collection-masked",
 ]
 SCENES: tuple[str, ...] = typing.get_args(Scene)
 # Arguments of the library that have an option of the same name; "..." is any value.

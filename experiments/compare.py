@@ -21,11 +21,13 @@ from nerfies_jax.runs import platform, representations, run_folder, trust
 from nerfies_jax.runtime import console
 
 LARGEST_ERROR = 0.2
+UNFITTED = "unfitted.psnr"  # `heldout.psnr` of runs whose main result has fitted codes
 SAME = ("capture", "scene", "factor", "max_side", "heldout")
 # Columns: key of metrics.json, head, digits behind the point, divisor.
 COLUMNS = (
     ("heldout.psnr", "PSNR", 2, 1),
     ("heldout.ssim", "SSIM", 3, 1),
+    (UNFITTED, "unfitted PSNR", 2, 1),
     ("train.steps", "steps", 0, 1),
     ("train.seconds", "train s", 0, 1),
     ("train.compile_seconds", "compile s", 0, 1),
@@ -186,7 +188,20 @@ def times(compared, goals) -> list[list[float | None]]:
 
 def _columns(compared):
     """Return the columns for which any run has a number."""
-    return [c for c in COLUMNS if any(run.metrics.get(c[0]) for run in compared)]
+    return [c for c in COLUMNS if any(_value(run, c[0]) for run in compared)]
+
+
+def _value(run, key):
+    """Return a metric, with fitted codes if the model has codes of single images."""
+    from nerfies_jax.metrics.metric_table import main_key
+
+    if key == UNFITTED:
+        return run.metrics.get("heldout.psnr") if _is_fitted(run) else None
+    return run.metrics.get(main_key(key, run.metrics))
+
+
+def _is_fitted(run):
+    return run.metrics.get("heldout.fitted_psnr") is not None
 
 
 def legend(compared) -> list[str]:
@@ -194,7 +209,10 @@ def legend(compared) -> list[str]:
     from nerfies_jax.metrics.metric_table import METRICS
 
     better = {"higher": " Higher is better.", "lower": " Lower is better.", "equal": ""}
-    entries = [(head, METRICS[key]) for key, head, *_ in _columns(compared)]
+    entries = [
+        (head, METRICS["heldout.psnr" if key == UNFITTED else key])
+        for key, head, *_ in _columns(compared)
+    ]
     return [
         f"  {head}: {entry.explanation}{better[entry.direction]}"
         for head, entry in entries
@@ -208,7 +226,7 @@ def table(compared, goals) -> str:
     lines = [heads]
     for run, reached in zip(compared, times(compared, goals), strict=True):
         cells = [
-            _cell(run.metrics.get(key), digits, unit) for key, _, digits, unit in known
+            _cell(_value(run, key), digits, unit) for key, _, digits, unit in known
         ]
         cells += ["never" if x is None else f"{x:.0f}" for x in reached]
         lines.append([run.name, *cells])
@@ -228,7 +246,15 @@ def _cell(value, digits, unit):
 
 def remarks(compared) -> list[str]:
     """Report differences between the runs that affect the table."""
+    from nerfies_jax.metrics.metric_table import PROTOCOL
+
     sentences = [run.remark for run in compared if run.remark]
+    fitted = [run.name for run in compared if _is_fitted(run)]
+    if fitted:
+        sentences.append(
+            f"PSNR, SSIM and curve of {', '.join(fitted)} follow {PROTOCOL}. Those of "
+            "runs without codes of single images are of whole frames."
+        )
     first = compared[0]
     for run in compared:
         scored, drawn = run.metrics.get("heldout.frames"), len(run.curve.frames)

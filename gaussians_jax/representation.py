@@ -275,7 +275,7 @@ GAUSSIANS = Representation(
     ),
     scoring=Scoring(
         models_lenses=lambda metadata: metadata.distorted,
-        score_halves=held_out_exposure.score,
+        half_scorer=held_out_exposure.scorer,
         follow=gaussian_tracks.follow,
         mover=gaussian_tracks.mover,
     ),

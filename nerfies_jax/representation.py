@@ -105,7 +105,7 @@ RADIANCE = Representation(
         step_parts=step_time.parts,
     ),
     scoring=Scoring(
-        score_halves=held_out_codes.score,
+        half_scorer=held_out_codes.scorer,
         fitted_rays=held_out_codes.RAYS * held_out_codes.EVALUATIONS,
         follow=warp_tracks.follow,
         mover=warp_tracks.mover,

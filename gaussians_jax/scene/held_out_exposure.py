@@ -14,36 +14,43 @@ from gaussians_jax.per_frame import exposure
 from gaussians_jax.scene import scene
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation.representation import HalfScorer
 from nerfies_jax.training.model import Rendering, TrainState, View
 
 
-def score(
-    spec,
-    metadata,
-    state: TrainState,
-    capture: Capture,
-    rows: np.ndarray,
-) -> evaluation.Halves | None:
-    """Compute metrics of right halves of frames, with exposures of the left halves.
+def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
+    """Return a function that evaluates right halves with exposures of left halves.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      size: Width and height of the frames in pixels.
 
     Returns:
-      The metrics, or None if the scene has no exposure model.
+      A function of a trained state, a capture and the indices of its frames, which
+      returns the metrics. None if the scene has no exposure model.
     """
     if spec.exposure is None:
         return None
     neutral = dataclasses.replace(spec, exposure=None)
     model = scene.build(neutral, metadata)
-    renderer = evaluation.Renderer(model, capture.size)
+    renderer = evaluation.Renderer(model, size)
 
-    def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
-        color = np.asarray(renderer(state, view).color)
-        rendering = color[:, : left.shape[1]]
-        return exposure.fit(rendering, left.astype(np.float32) / 255, valid)
+    def score(
+        state: TrainState, capture: Capture, rows: np.ndarray
+    ) -> evaluation.Halves:
+        def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None):
+            rendering = renderer(state, view)
+            color = np.asarray(rendering.color)[:, : left.shape[1]]
+            change = exposure.fit(color, left.astype(np.float32) / 255, valid)
+            return rendering, change
 
-    def render(view: View, change: np.ndarray) -> Rendering:
-        rendering = renderer(state, view)
-        image = jnp.asarray(rendering.color)
-        color = exposure.apply_exposure(image, jnp.asarray(change, image.dtype))
-        return rendering._replace(color=jax.device_get(color))
+        def render(view: View, fitted: tuple[Rendering, np.ndarray]) -> Rendering:
+            rendering, change = fitted
+            image = jnp.asarray(rendering.color)
+            color = exposure.apply_exposure(image, jnp.asarray(change, image.dtype))
+            return rendering._replace(color=jax.device_get(color))
 
-    return evaluation.score_halves(fit_code, render, capture, rows)
+        return evaluation.score_halves(fit_code, render, capture, rows)
+
+    return score

@@ -100,15 +100,18 @@ class Resources(NamedTuple):
     step_parts: Callable[..., StepParts] | None = None
 
 
+HalfScorer = Callable[[TrainState, Capture, np.ndarray], Halves]
+
+
 class Scoring(NamedTuple):
     """Evaluation of a trained scene beyond its renders."""
 
     # (metadata) -> True if lens distortion of any camera is modeled. That of the
     # capture's cameras always is.
     models_lenses: Callable[[Any], bool] = lambda metadata: True
-    # (spec, metadata, state, capture, rows) -> metrics with codes fitted to half of
-    # each frame, or None if the model has no per-frame codes
-    score_halves: Callable[..., Halves | None] = lambda *args: None
+    # (spec, metadata, size) -> a function (state, capture, rows) of metrics with codes
+    # fitted to half of each frame, or None if the model has no per-frame codes
+    half_scorer: Callable[..., HalfScorer | None] = lambda *args: None
     fitted_rays: int = 0  # rendered to fit the codes of one frame
     follow: Follow = lambda *args: None
     mover: Mover = lambda spec, metadata: None

@@ -1,5 +1,6 @@
 """Name, unit, better direction and explanation of the metrics in `metrics.json`."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from nerfies_jax.metrics.clock import Metric
@@ -15,6 +16,32 @@ class Entry(NamedTuple):
     unit: str  # "dB", "ms", "bytes", or "" for a share or a count
     direction: str  # better values: "higher", "lower", or "equal" for neither
     explanation: str  # one sentence
+
+
+# Metrics of held-out frames without fitted codes, and those that replace them as the
+# main result of a model with per-frame codes.
+FITTED = {
+    "heldout.psnr": "heldout.fitted_psnr",
+    "heldout.ssim": "heldout.fitted_ssim",
+}
+PROTOCOL = (
+    "NeRF-W's protocol: codes fitted to the left half of each frame, scored on the "
+    "right half"
+)
+
+
+def main_key(key: str, values: Mapping[str, object]) -> str:
+    """Return the key of the main result in place of `key`.
+
+    Args:
+      key: A key of `METRICS`.
+      values: The metrics of a run by key.
+
+    Returns:
+      The key of the metric with fitted codes, if the run has it. `key` otherwise.
+    """
+    fitted = FITTED.get(key, key)
+    return fitted if values.get(fitted) is not None else key
 
 
 METRICS: dict[str, Entry] = {
@@ -51,18 +78,23 @@ METRICS: dict[str, Entry] = {
         "PSNR over the pixels of the static part of the scene.",
     ),
     "heldout.fitted_psnr": Entry(
-        *("PSNR, fitted codes", "Quality", "dB", "higher"),
+        *("PSNR, NeRF-W protocol", "Quality", "dB", "higher"),
         "PSNR of the right halves of held-out frames, with appearance code or exposure "
-        "fitted to the left halves.",
+        "fitted to the left halves. It is the main result of models that have them.",
     ),
     "heldout.fitted_ssim": Entry(
-        *("SSIM, fitted codes", "Quality", "", "higher"),
+        *("SSIM, NeRF-W protocol", "Quality", "", "higher"),
         "SSIM of the right halves of held-out frames, with appearance code or exposure "
         "fitted to the left halves.",
     ),
     "heldout.camera_fitted_psnr": Entry(
         *("PSNR, fitted cameras", "Quality", "dB", "higher"),
         "PSNR of held-out frames whose cameras were optimized for the observed images.",
+    ),
+    "transient.share": Entry(
+        *("Share of transients", "Quality", "", "equal"),
+        "Mean opacity of the transient medium in training pixels at the end of "
+        "training. A static scene that it swallows makes it large.",
     ),
     "heldout.frames": Entry(
         *("Frames scored", "Quality", "", "equal"),

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+from nerfies_jax.metrics.metric_table import main_key
+
 # A static model loses a little to rounding: -0.0017 dB was measured.
 _WORSE_DB = -0.05
 
@@ -47,7 +49,7 @@ def warnings(numbers: Mapping[str, float]) -> list[str]:
     Returns:
       One line for each of these baselines.
     """
-    psnr, sentences = numbers["heldout.psnr"], []
+    psnr, sentences = numbers[main_key("heldout.psnr", numbers)], []
     if psnr < numbers.get("baseline.neighbor_mean", psnr):
         sentences.append(
             f"warning: {psnr:.2f} dB is below the "

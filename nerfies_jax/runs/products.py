@@ -19,10 +19,10 @@ from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.json_files import merged_folder, write_json
 from nerfies_jax.capture.video import write_video
 from nerfies_jax.evaluation import Renderer, Scored, heldout
-from nerfies_jax.evaluation.representation import Saved
+from nerfies_jax.evaluation.representation import HalfScorer, Saved
 from nerfies_jax.metrics import clock
 from nerfies_jax.metrics.clock import Metric
-from nerfies_jax.metrics.metric_table import metric
+from nerfies_jax.metrics.metric_table import PROTOCOL, main_key, metric
 from nerfies_jax.runs import (
     baselines_text,
     budget,
@@ -39,11 +39,11 @@ from nerfies_jax.runs.run import Run, with_found_cameras
 from nerfies_jax.runs.run_folder import CONFIG, PREPROCESSING_NOTES
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.runtime import console, events
-from nerfies_jax.training import losses
 from nerfies_jax.training.model import TrainState
 from nerfies_jax.visualization import panels
 
 METRICS = "metrics.json"
+SHARE = "transient/share"  # of the losses of a field with a transient medium
 COMPARISON_FRAMES = 4
 COMPARISON_CAPTION = (
     "Held-out frames, which the model was not trained on. Each row shows the observed "
@@ -106,13 +106,22 @@ def make(
             history = trained.result.history
             attempt(None, curves.write, target, history, watched, course)
             path = target / "psnr_over_time.png"
+            seconds = ms_per_frame / 1e3
+            fitted, fit_notes = score_halves(
+                run, state, trained.scorer, scored, seconds
+            )
+            final = curve_figure.Result(
+                fitted[0].value if fitted else evaluation.known_mean(scored.psnr),
+                len(scored.rows),
+                is_fitted=bool(fitted),
+            )
             curve = attempt(
-                None, with_extra, curve_figure.save, path, run, trained, scored
+                None, with_extra, curve_figure.save, path, run, trained, final
             )
             if curve is not None:
-                caption = curve_figure.caption(run, trained, scored)
+                caption = curve_figure.caption(run, trained, final)
                 figures.append(report.Figure(curve, caption))
-            seconds, path = ms_per_frame / 1e3, target / "scene.mp4"
+            path = target / "scene.mp4"
             video = attempt(
                 None, with_extra, save_video, path, run, renderer, state, seconds
             )
@@ -121,7 +130,6 @@ def make(
             model = run.spec, run.metadata, state
             with events.stage("saving the model"):
                 saved = attempt(Saved(), save, target, *model)
-            fitted, fit_notes = score_halves(run, state, scored, seconds)
             numbers, quality_notes = quality.measure(
                 run, state, trained.draw, scored, extra, seconds
             )
@@ -129,7 +137,8 @@ def make(
             metrics += measured(run, trained, scored, ms_per_frame, start_time)
             metrics += [*fitted, *model_size(saved)]
             attempt(None, save_metrics, target / METRICS, metrics)
-            warnings = baselines_text.warnings(numbers)
+            main = {each.key: each.value for each in metrics}
+            warnings = baselines_text.warnings(main)
             notes = [*warnings, trained.result.message, *skipped_frames]
             notes += _capture_notes(run, folder)
             notes += [*quality_notes, *fit_notes, *saved.notes, *player_notes]
@@ -253,6 +262,7 @@ def measured(
         metric("render.fps", fps, 0.2 * fps),
         metric("memory.peak_bytes", clock.peak_bytes(), 2e8),
         *_device_memory(),
+        *_transient_share(result.history),
         metric("total.seconds", seconds, 0.2 * seconds),
         *(metric(name, count, 0.1 * count) for name, count in counts.items()),
     ]
@@ -264,6 +274,12 @@ def _device_memory():
     if peak is None:
         return []
     return [metric("memory.device_peak_bytes", peak, 2e8)]
+
+
+def _transient_share(history):
+    """Return the share of training pixels that a transient medium explains."""
+    shares = [row[SHARE] for row in history.rows if SHARE in row]
+    return [metric("transient.share", shares[-1])] if shares else []
 
 
 def model_size(saved: Saved) -> list[Metric]:
@@ -281,38 +297,40 @@ def model_size(saved: Saved) -> list[Metric]:
 
 @events.stage("scoring halves of frames")
 def score_halves(
-    run: Run, state: TrainState, scored: Scored, frame_seconds: float
+    run: Run,
+    state: TrainState,
+    scorer: HalfScorer | None,
+    scored: Scored,
+    frame_seconds: float,
 ) -> tuple[list[Metric], tuple[str, ...]]:
     """Evaluate the right halves of frames after fitting codes to their left halves.
 
     Args:
       run: The run.
       state: Trained state.
+      scorer: The function of `train.half_scorer`.
       scored: Evaluated frames.
       frame_seconds: Seconds to render a frame.
 
     Returns:
       Metrics and notes, both empty if the model has no per-frame codes.
     """
+    if scorer is None:
+        return [], ()
     width, height = run.capture.size
-    if width // 2 < len(losses.WINDOW):
-        return [], ()  # too narrow for the window of the SSIM
     share = run.representation.scoring.fitted_rays / (width * height)
     count = budget.fitted_frames(frame_seconds, share, len(scored.rows))
     places = evaluation.spread(np.arange(len(scored.rows)), count)
     rows = scored.rows[places]
-    halves = run.representation.scoring.score_halves(
-        run.spec, run.metadata, state, run.capture, rows
-    )
-    if halves is None:
-        return [], ()
+    halves = scorer(state, run.capture, rows)
     before = evaluation.score_right_halves(run.capture, rows, scored.color[places])
     psnr, ssim = (evaluation.known_mean(each) for each in (halves.psnr, halves.ssim))
     unfitted = evaluation.known_mean(before.psnr)
     note = (
-        f"PSNR of the right halves of {count} held-out frames: {unfitted:.2f} dB with "
-        f"codes interpolated in time, {psnr:.2f} dB with codes fitted to the left "
-        "halves, without the transient field."
+        f"The main result follows {PROTOCOL}. The right halves of {count} held-out "
+        f"frames have {psnr:.2f} dB with codes fitted to the left halves, without the "
+        f"transient field, and {unfitted:.2f} dB without fitting, with codes "
+        "interpolated in time."
     )
     metrics = [
         metric("heldout.fitted_psnr", psnr, 0.2),
@@ -479,9 +497,16 @@ def _next(folder, run, trained, base=None):
 def _log(folder, page, metrics, baselines, suggestions):
     """Print the main metrics, the paths of the products, and suggested commands."""
     value = {metric.key: metric.value for metric in metrics}
+    psnr, ssim = (main_key(f"heldout.{name}", value) for name in ("psnr", "ssim"))
+    protocol = ""
+    if psnr != "heldout.psnr":
+        protocol = (
+            f" ({PROTOCOL}; {value['heldout.psnr']:.2f} dB PSNR, "
+            f"{value['heldout.ssim']:.3f} SSIM of whole frames without fitting)"
+        )
     console.say(
-        f"held-out:   {value['heldout.psnr']:.2f} dB PSNR, "
-        f"{value['heldout.ssim']:.3f} SSIM over {value['heldout.frames']} frames"
+        f"held-out:   {value[psnr]:.2f} dB PSNR, "
+        f"{value[ssim]:.3f} SSIM{protocol} over {value['heldout.frames']} frames"
         f"{_parts(value)}; "
         f"{value['train.seconds']:.0f} s of training, "
         f"{value['train.compile_seconds']:.0f} s of compilation; "

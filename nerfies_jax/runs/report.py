@@ -20,7 +20,7 @@ import PIL.Image
 from nerfies_jax.capture import images
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.metrics.clock import Metric
-from nerfies_jax.metrics.metric_table import GROUPS, METRICS, Entry
+from nerfies_jax.metrics.metric_table import GROUPS, METRICS, Entry, main_key
 from nerfies_jax.runs import relative_paths
 from nerfies_jax.runs.report_style import STYLE
 from nerfies_jax.runtime import events
@@ -28,6 +28,8 @@ from nerfies_jax.runtime import events
 # Larger videos are linked: base64 adds a third, and mail servers reject about 10 MB.
 EMBEDDED_VIDEO_BYTES = 6 * 2**20
 HEADLINES = (
+    "heldout.fitted_psnr",
+    "heldout.fitted_ssim",
     "heldout.psnr",
     "heldout.ssim",
     "heldout.moving_psnr",
@@ -180,9 +182,14 @@ def _entry(metric):
 
 def _headlines(metrics):
     by_key = {metric.key: metric for metric in metrics}
+
+    def name(metric):
+        is_main = main_key(metric.key, by_key) == metric.key
+        return _entry(metric).name + ("" if is_main else ", without fitting")
+
     tiles = [
         f'<div title="{_safe(_entry(metric).explanation)}">'
-        f"<dt>{_safe(_entry(metric).name)}</dt>"
+        f"<dt>{_safe(name(metric))}</dt>"
         f"<dd>{_safe(readable(metric.value, metric.unit))}</dd></div>"
         for metric in map(by_key.get, HEADLINES)
         if metric is not None

@@ -8,11 +8,12 @@ import numpy as np
 
 from nerfies_jax import evaluation
 from nerfies_jax.evaluation import Renderer
+from nerfies_jax.evaluation.representation import HalfScorer
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.runs import budget, run_folder
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runtime import events
-from nerfies_jax.training import chunk, loop
+from nerfies_jax.training import chunk, loop, losses
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult, History, Hook
 
@@ -43,6 +44,7 @@ class Trained(NamedTuple):
     renderer: Renderer
     draw: Draw  # renderer of the captured frames
     watched: np.ndarray  # rows of the held-out frames evaluated during training
+    scorer: HalfScorer | None = None  # of halves of frames with fitted codes
 
 
 def open_checkpoints(folder: pathlib.Path, run: Run, after: int | None) -> Checkpoints:
@@ -93,11 +95,13 @@ def train(
     frames = evaluation.frames_of(run.capture, run.model.required_data)
     history = History() if record is None else History(**record)
     first = evaluation.view_of(run.capture, int(rows[0])) if len(rows) else None
+    scorer = half_scorer(run)
     seconds = history.compile_seconds + _compile(run, state, frames, renderer, first)
     history = history._replace(compile_seconds=seconds)
     if first is not None:
         renderer(state, first)  # measures the time of a frame
-        plan = budget.evaluations(renderer.seconds[-1], evaluate_every, EVALUATED)
+        cost = renderer.seconds[-1] * (1 + _fit_cost(run, scorer))
+        plan = budget.evaluations(cost, evaluate_every, EVALUATED)
         rows = evaluation.spread(run.capture.heldout, plan.frames)
         evaluate_every = plan.every_seconds
 
@@ -105,9 +109,18 @@ def train(
         del step, metrics
         capture = evaluation.as_found(run.model, state, run.filmed)
         scored = evaluation.score(renderer, state, capture, rows)
-        return {
+        whole = {
             "psnr": evaluation.known_mean(scored.psnr),
             "ssim": evaluation.known_mean(scored.ssim),
+        }
+        if scorer is None:
+            return whole
+        observed = evaluation.as_found(run.model, state, run.capture)
+        halves = scorer(state, observed, rows)
+        return {
+            "psnr": evaluation.known_mean(halves.psnr),
+            "ssim": evaluation.known_mean(halves.ssim),
+            **{f"unfitted_{name}": value for name, value in whole.items()},
         }
 
     if len(rows):
@@ -125,7 +138,32 @@ def train(
         checkpoint_seconds=pace.checkpoint_every,
         history=history,
     )
-    return Trained(result, renderer, renderer, rows)
+    return Trained(result, renderer, renderer, rows, scorer)
+
+
+def half_scorer(run: Run) -> HalfScorer | None:
+    """Return a function that scores halves of frames with codes fitted to the others.
+
+    Args:
+      run: The run.
+
+    Returns:
+      The function. None if the model has no codes of single frames, or the halves are
+      too narrow to score.
+    """
+    if run.capture.size[0] // 2 < len(losses.WINDOW):
+        return None  # of the SSIM
+    build = run.representation.scoring.half_scorer
+    return build(run.spec, run.metadata, run.capture.size)
+
+
+def _fit_cost(run, scorer):
+    """Time to fit codes to a frame and to render it, relative to a render."""
+    if scorer is None:
+        return 0.0
+    width, height = run.capture.size
+    # A gradient takes about three times as long as a render.
+    return 1 + 3 * run.representation.scoring.fitted_rays / (width * height)
 
 
 def _compile(run, state, frames, renderer, view) -> float:

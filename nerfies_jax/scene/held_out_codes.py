@@ -11,6 +11,7 @@ import numpy as np
 
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation.representation import HalfScorer
 from nerfies_jax.fields import field_ray, skipping
 from nerfies_jax.scene import scene
 from nerfies_jax.training import fit, losses
@@ -31,26 +32,20 @@ EVALUATIONS = 2 * MOST_STEPS
 TOLERANCE = 1e-6
 
 
-def score(
-    spec,
-    metadata,
-    state: TrainState,
-    capture: Capture,
-    rows: np.ndarray,
-) -> evaluation.Halves | None:
-    """Evaluate the right halves of frames, with codes fitted to the left halves.
+def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
+    """Return a function that evaluates right halves with codes of left halves.
 
     A transient medium is left out, because transient objects are in one frame only.
 
     Args:
       spec: The scene.
       metadata: Scene metadata.
-      state: Trained state.
-      capture: The capture.
-      rows: Indices of the frames.
+      size: Width and height of the frames in pixels.
 
     Returns:
-      The metrics. None if the field has no codes that only training frames have.
+      A function of a trained state, a capture and the indices of its frames, which
+      returns the metrics. None if the field has no codes that only training frames
+      have.
     """
     whole = scene.field(spec, metadata)
     names = {effect.name for effect in whole.effects}
@@ -59,9 +54,9 @@ def score(
     tables = _tables(field)
     if not tables:
         return None
-    params, step = state.params, state.step
-    draw = jax.jit(field.render, static_argnums=4)
     guided = spec.sampling.occupancy is not None
+    draw = jax.jit(field.render, static_argnums=4)
+    codes_of = jax.jit(field.codes_at)
 
     @jax.jit
     def solve(params, view, pixels, colors, step):
@@ -87,20 +82,29 @@ def score(
         solution = fit.fit_code(loss, start, max_steps=MOST_STEPS, tolerance=TOLERANCE)
         return codes | solution.value
 
-    def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> Any:
-        place = np.argwhere(np.ones(left.shape[:2], bool) if valid is None else valid)
-        if not len(place):  # no valid pixels
-            return field.codes_at(params, view)
-        # With replacement, so that shapes do not depend on the number of valid pixels.
-        line, column = place[np.random.default_rng(0).integers(len(place), size=RAYS)].T
-        pixels = in_default_precision(np.stack([column, line], axis=1) + 0.5)
-        colors = in_default_precision(left[line, column].astype(np.float32) / 255)
-        return solve(params, view, pixels, colors, step)
+    def score(
+        state: TrainState, capture: Capture, rows: np.ndarray
+    ) -> evaluation.Halves:
+        params, step = state.params, state.step
 
-    def render(view: View, codes: Any) -> Rendering:
-        return draw(params, view.camera, view.time, codes, capture.size, step)
+        def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> Any:
+            shown = np.ones(left.shape[:2], bool) if valid is None else valid
+            place = np.argwhere(shown)
+            if not len(place):  # no valid pixels
+                return codes_of(params, view)
+            # With replacement, so that shapes do not depend on the number of pixels.
+            chosen = np.random.default_rng(0).integers(len(place), size=RAYS)
+            line, column = place[chosen].T
+            pixels = in_default_precision(np.stack([column, line], axis=1) + 0.5)
+            colors = in_default_precision(left[line, column].astype(np.float32) / 255)
+            return solve(params, view, pixels, colors, step)
 
-    return evaluation.score_halves(fit_code, render, capture, rows)
+        def render(view: View, codes: Any) -> Rendering:
+            return draw(params, view.camera, view.time, codes, size, step)
+
+        return evaluation.score_halves(fit_code, render, capture, rows)
+
+    return score
 
 
 def _tables(field):

@@ -9,6 +9,7 @@ import scipy.ndimage
 
 from nerfies_jax.capture import nerfies_format, synthetic
 from nerfies_jax.capture.synthetic import presets, record, rendering, truth
+from nerfies_jax.capture.synthetic.collection import BASE_GAIN
 from nerfies_jax.capture.synthetic.spec import Exposure, Specular, Transient
 from nerfies_jax.geometry import camera as cameras
 from tests import scene_oracle
@@ -426,3 +427,43 @@ def test_the_cameras_of_a_rig_take_turns_in_wide_steps():
 def test_a_rig_without_an_arc_is_refused(settings):
     with pytest.raises(ValueError, match=r"(two cameras|arc of .* between 0 and 3)"):
         synthetic.Rig(**settings)
+
+
+def test_a_collection_has_an_appearance_for_each_photograph_and_views_to_score():
+    collection = synthetic.Collection(masked=True)
+    spec = dataclasses.replace(
+        synthetic.PRESETS["collection"],
+        things=presets.MONUMENT[:4],
+        size=(32, 24),
+        frames=9,
+        heldout_every=4,
+        supersampling=1,
+        collection=collection,
+    )
+    capture, known = synthetic.make(spec)
+    np.testing.assert_array_equal(capture.train, np.arange(9))
+    np.testing.assert_array_equal(capture.heldout, [9, 10])
+    # The views have the appearance of two photographs, but no board.
+    np.testing.assert_array_equal(capture.appearance_ids[9:], [2, 6])
+    np.testing.assert_array_equal(known.light_gain[9:], known.light_gain[[2, 6]])
+    boards = known.transient.any((1, 2))
+    assert boards[:9].sum() == 3
+    assert not boards[9:].any()
+    assert known.thing_names[-1] == "board"
+    # Distances of two to eight object sizes, and as many focal lengths as cameras.
+    away = np.linalg.norm(capture.cameras.position - collection.target, axis=1)
+    assert 2 <= away.min() / collection.object_size <= away.max() / 0.3 <= 8
+    assert len(np.unique(capture.cameras.focal_px)) > 8
+    stops = np.log2(known.light_gain[:9, 1] / BASE_GAIN)
+    assert np.ptp(stops) > 1
+    assert np.abs(stops).max() <= 1.5
+    # Neither boards nor skies are observed, and points lie on the monument and square.
+    shown = (known.things >= 0) & ~known.transient
+    np.testing.assert_array_equal(capture.valid, shown)
+    assert capture.points.position[:, 1].min() > -0.18
+    skies = [capture.images[row][known.things[row] < 0] for row in range(9)]
+    skies = np.array([sky.mean(axis=0) for sky in skies if len(sky)])
+    assert np.ptp(skies, axis=0).max() > 60
+    assert capture.background is capture.flow is None
+    with pytest.raises(ValueError, match="remove exposure"):
+        dataclasses.replace(spec, exposure=synthetic.Exposure())

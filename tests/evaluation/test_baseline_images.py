@@ -124,6 +124,9 @@ def test_a_run_below_a_baseline_is_told_what_to_do():
     assert "splats-static" in worse
     assert baselines_text.lines({"heldout.psnr": 20.0}) == []
     assert baselines_text.warnings({"heldout.psnr": 20.0}) == []
+    coded = numbers | {"heldout.psnr": 18.0}  # and 20 dB with fitted codes
+    assert len(baselines_text.warnings(coded)) == 1
+    assert baselines_text.warnings(coded | {"heldout.fitted_psnr": 20.0}) == []
 
 
 def test_rays_through_a_lens_are_scored_but_where_it_has_none():

@@ -56,6 +56,19 @@ def test_the_table_tells_who_was_when_as_good(tmp_path, capsys):
     assert (out / "curves.png").stat().st_size > 5000
 
 
+def test_runs_with_codes_are_compared_by_the_protocol_of_nerf_w(tmp_path):
+    plain, coded = (run_folder(tmp_path / name, (1.0, 20.0)) for name in "ab")
+    scores = {"heldout.psnr": 14.04, "heldout.fitted_psnr": 17.72}
+    (coded / "metrics.json").write_text(json.dumps(scores))
+    compared = compare.read([plain, coded])
+    head, first, second = compare.table(compared, ()).splitlines()
+    assert head.split()[:4] == ["run", "PSNR", "unfitted", "PSNR"]
+    assert first.split()[:3] == ["a", "20.00", "-"]
+    assert second.split()[:3] == ["b", "17.72", "14.04"]
+    assert any("curve of b follow NeRF-W's" in x for x in compare.remarks(compared))
+    assert not any("NeRF-W" in x for x in compare.remarks(compared[:1]))
+
+
 def test_a_run_that_has_not_ended_is_compared_as_far_as_it_came(tmp_path, capsys):
     good = run_folder(tmp_path / "good", (10.0, 30.0), (1.0, 3.0))
     running = tmp_path / "running"

@@ -69,6 +69,10 @@ def test_a_field_leaves_the_files_and_metrics_of_a_run_and_no_gaussians(run):
     wanted += ["heldout.fitted_ssim", "train.seconds", "render.ms_per_frame"]
     assert all(np.isfinite(metrics[key]) for key in wanted)
     assert metrics["train.steps"] == 12
+    # The curve follows the same protocol, with the scores without fitting next to it.
+    *_, last = json.loads((run / "curve.json").read_text())["evaluations"]
+    assert {"psnr", "ssim", "unfitted_psnr", "unfitted_ssim"} <= set(last)
+    assert last["psnr"] != last["unfitted_psnr"]
     page = (run / "report.html").read_text()
     assert "codes fitted to the left halves" in page
     assert "backward" in page

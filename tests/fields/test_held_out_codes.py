@@ -40,11 +40,13 @@ def test_a_code_is_found_again_from_half_a_picture_if_that_was_filmed():
     state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
     renderer = evaluation.Renderer(nerf_scene.build(TINY_FIELD, metadata), filmed.size)
 
+    score = held_out_codes.scorer(TINY_FIELD, metadata, filmed.size)
+
     def before_and_after(capture):
         color = evaluation.score(renderer, state, capture, rows).color
         return (
             evaluation.score_right_halves(capture, rows, color),
-            held_out_codes.score(TINY_FIELD, metadata, state, capture, rows),
+            score(state, capture, rows),
         )
 
     before, after = before_and_after(filmed)
@@ -70,13 +72,12 @@ def test_codes_are_fitted_to_the_samples_that_a_picture_is_made_of():
     color = draw(params, view.camera, view.time, codes, capture.size, step).color
     capture.images[rows[0]] = evaluation.as_picture(np.asarray(color))
     state = TrainState(params, (), (), step, jax.random.key(0))
-    scored = held_out_codes.score(spec, metadata, state, capture, rows)
+    score = held_out_codes.scorer(spec, metadata, capture.size)
+    scored = score(state, capture, rows)
     assert scored.psnr[0] > 48  # of evenly spread samples: 33
 
 
 def test_a_field_without_codes_has_none_to_fit():
-    metadata, params, _ = scenes.tiny_field()
+    metadata, _, _ = scenes.tiny_field()
     plain = dataclasses.replace(TINY_FIELD, appearance=None)
-    capture, state = scenes.tiny_capture(), TrainState(params, (), (), None, None)
-    scored = held_out_codes.score(plain, metadata, state, capture, capture.heldout)
-    assert scored is None
+    assert held_out_codes.scorer(plain, metadata, (40, 30)) is None

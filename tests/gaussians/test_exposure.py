@@ -87,12 +87,12 @@ def test_half_a_frame_tells_the_light_of_the_other_half(built):
     images = CAPTURE.images.copy()
     images[CAPTURE.heldout] = np.round(255 * lit.clip(0, 1))
     filmed = dataclasses.replace(CAPTURE, images=images)
-    halves = held_out_exposure.score(SPEC, metadata, state, filmed, filmed.heldout)
+    score = held_out_exposure.scorer(SPEC, metadata, filmed.size)
+    halves = score(state, filmed, filmed.heldout)
     # 8 bits of both pictures leave 56 dB; nothing else is between them
     assert halves.psnr.min() > 50
     still = dataclasses.replace(SPEC, exposure=None)
-    score = held_out_exposure.score
-    assert score(still, metadata, state, filmed, filmed.heldout) is None
+    assert held_out_exposure.scorer(still, metadata, filmed.size) is None
     # Of a black picture nothing can be told but the offset.
     black = np.zeros((4, 5, 3))
     change = exposure.fit(black, black + 0.25, None)

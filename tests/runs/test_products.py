@@ -123,18 +123,18 @@ def test_the_curve_and_the_headline_agree_visibly(tmp_path, monkeypatch):
     rows = ({"seconds": 1.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 30.61})
     history = types.SimpleNamespace(evaluations=rows)
     result = types.SimpleNamespace(history=history, seconds=3.5)
-    some = np.zeros((3, 4, 5), np.float32)
-    scored = Scored(
-        np.arange(3), some, some, some, np.array([28.0, 29.0, 31.5]), np.ones(3)
-    )
+    score = curve_figure.Result(29.5, 3, is_fitted=False)
     for watched, final in ((np.arange(2), (3.5, 29.5, 3, 2)), (np.arange(3), None)):
         trained = Trained(result, None, None, watched)
         path = tmp_path / "curve.png"
-        assert curve_figure.save(path, run, trained, scored) == path
+        assert curve_figure.save(path, run, trained, score) == path
         (history, _, mark) = drawn.pop()
         assert history["splats-static-small"].psnr == [20.0, 30.61]
         assert mark == final
-        caption = curve_figure.caption(run, trained, scored)
+        caption = curve_figure.caption(run, trained, score)
+        assert "protocol" not in caption
+        fitted = score._replace(is_fitted=True)
+        assert "NeRF-W's protocol" in curve_figure.caption(run, trained, fitted)
         assert "ends at 30.61 dB" in caption
         assert ("over all 3 frames" in caption) == (final is not None)
         assert ("29.50 dB" in caption) == (final is not None)

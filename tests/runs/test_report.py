@@ -115,6 +115,15 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path, picture):
     assert "@import" not in path.read_text()
 
 
+def test_the_first_number_of_a_model_with_codes_is_of_fitted_ones(tmp_path):
+    fitted = metric("heldout.fitted_psnr", 17.72)
+    page = Page(report.write(tmp_path, "a run", [*MEASURED, fitted], {}))
+    first, unfitted = page.text.index("17.72 dB"), page.text.index("30.94 dB")
+    assert first < unfitted
+    assert "PSNR, NeRF-W protocol" in page.text[:unfitted]
+    assert "PSNR, without fitting" in page.text[first:unfitted]
+
+
 def test_what_was_written_by_others_cannot_become_markup(tmp_path, picture):
     evil = '"><script>alert(1)</script>&'
     path = report.write(

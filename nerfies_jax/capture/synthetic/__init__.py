@@ -17,6 +17,7 @@ from nerfies_jax.capture.synthetic.record import (
 )
 from nerfies_jax.capture.synthetic.spec import (
     Cameras,
+    Collection,
     Exposure,
     Lens,
     PoseError,
@@ -35,6 +36,7 @@ __all__ = [
     "TRUTH_FILE",
     "VERSION",
     "Cameras",
+    "Collection",
     "Exposure",
     "Lens",
     "PoseError",

@@ -6,6 +6,7 @@ from nerfies_jax.capture.synthetic.motion import Arm, Glide, Hinge, Path
 from nerfies_jax.capture.synthetic.shapes import Box, Sheet, Sphere, Squash
 from nerfies_jax.capture.synthetic.spec import (
     Cameras,
+    Collection,
     Exposure,
     Lens,
     PoseError,
@@ -267,6 +268,78 @@ RIG = SceneSpec(
     rig=Rig(),
 )
 
+
+def _stone(name, half, place, seed_size=0.03):
+    """A part of the monument. `place` is the center of its base above the ground."""
+    x, y, z = place
+    texture = Texture(
+        dark=(0.42, 0.36, 0.28),
+        light=(0.90, 0.84, 0.72),
+        blot=(0.55, 0.30, 0.22),
+        checker=0.35,
+        checker_size=seed_size,
+        noise=0.6,
+        noise_size=0.02,
+        blots=0.5,
+        blot_size=0.04,
+    )
+    return Thing(name, Box(half), (x, FLOOR_Y + y + half[1], z), texture)
+
+
+def _bar(name, half, place):
+    """A thin part of dark metal."""
+    x, y, z = place
+    metal = Texture(
+        dark=(0.10, 0.12, 0.12), light=(0.25, 0.32, 0.30), blot=(0.45, 0.30, 0.15)
+    )
+    return Thing(name, Box(half), (x, FLOOR_Y + y + half[1], z), metal)
+
+
+COLUMNS = (
+    *((x, 0.06) for x in (-0.095, -0.032, 0.032, 0.095)),
+    *((x, -0.06) for x in (-0.095, 0.095)),
+)
+# A small temple with columns, a globe on its roof, and a spire and a railing of 2 %
+# of its size.
+MONUMENT = (
+    Thing(
+        "square",
+        Box((3.0, 0.02, 3.0)),
+        (0.0, FLOOR_Y - 0.02, 0.0),
+        dataclasses.replace(
+            FLOOR.texture, checker=0.3, checker_size=0.12, noise_size=0.05
+        ),
+    ),
+    _stone("base", (0.15, 0.012, 0.11), (0.0, 0.0, 0.0)),
+    _stone("step", (0.125, 0.01, 0.09), (0.0, 0.024, 0.0), 0.02),
+    *(
+        _stone(f"column {index}", (0.011, 0.065, 0.011), (x, 0.044, z), 0.015)
+        for index, (x, z) in enumerate(COLUMNS)
+    ),
+    _stone("roof", (0.12, 0.012, 0.085), (0.0, 0.174, 0.0), 0.02),
+    dataclasses.replace(
+        GLOBE, shape=Sphere(0.032), place=(0.0, FLOOR_Y + 0.198 + 0.032, 0.0)
+    ),
+    dataclasses.replace(
+        CUBE, name="statue", place=(0.0, FLOOR_Y + 0.044 + 0.042, -0.01), motion=None
+    ),
+    _bar("spire", (0.003, 0.04, 0.003), (0.0, 0.26, 0.0)),
+    _bar("rail", (0.15, 0.003, 0.003), (0.0, 0.045, 0.16)),
+    *(
+        _bar(f"post {index}", (0.003, 0.025, 0.003), (x, 0.0, 0.16))
+        for index, x in enumerate((-0.147, -0.05, 0.05, 0.147))
+    ),
+)
+COLLECTION = SceneSpec(
+    "collection",
+    MONUMENT,
+    size=(128, 96),
+    frames=100,
+    heldout_every=8,
+    points=2000,
+    collection=Collection(),
+)
+
 PRESETS = {
     "default": DEFAULT,
     "static": STATIC,
@@ -282,4 +355,8 @@ PRESETS = {
     "barrel": BARREL,
     "fisheye": FISHEYE,
     "rig": RIG,
+    "collection": COLLECTION,
+    "collection-masked": dataclasses.replace(
+        COLLECTION, collection=Collection(masked=True)
+    ),
 }

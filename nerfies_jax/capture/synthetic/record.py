@@ -13,7 +13,7 @@ from nerfies_jax.capture import cache_files, nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.capture.json_files import AnyPath, new_folder
-from nerfies_jax.capture.synthetic import rendering, trace, truth
+from nerfies_jax.capture.synthetic import collection, rendering, trace, truth
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.capture.synthetic.truth import SceneTruth
 from nerfies_jax.geometry import camera as cameras
@@ -47,6 +47,8 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         for instant, camera in zip(plan.instant, plan.camera_id, strict=True)
     )
     scene_truth = _truth(spec, plan, hits, ids, programs, seed)
+    in_collection = spec.collection is not None
+    known = depths[(depths > 0) & (hits.thing != spec.transient_id)]
     capture = Capture(
         name=f"synthetic {spec.name}",
         source="synthetic",
@@ -56,16 +58,17 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         times=plan.time,
         train=np.flatnonzero(plan.learn),
         heldout=np.flatnonzero(~plan.learn),
-        near=float(0.9 * depths[depths > 0].min()),
+        near=float(0.9 * known.min()),
         far=float(1.1 * depths.max()),
         warp_ids=plan.instant,
         appearance_ids=plan.instant,
         camera_ids=plan.camera_id,
-        moving=moving,
+        valid=collection.observed(spec, hits.thing),
+        moving=None if in_collection else moving,
         depths=depths,
-        flow=_flow(plan, scene_truth),
+        flow=None if in_collection else _flow(plan, scene_truth),
         points=_points(spec, plan, images, hits, moving, seed),
-        background=spec.background,
+        background=None if in_collection else spec.background,
         up=(0.0, 1.0, 0.0),
     )
     return capture, scene_truth
@@ -147,7 +150,7 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
       Twelve hex digits of a hash of the spec, the seed and the version of the renderer.
     """
     text = f"{VERSION} {seed} {spec!r}"
-    for effect in (spec.pose_error, spec.lens, spec.rig):
+    for effect in (spec.pose_error, spec.lens, spec.rig, spec.collection):
         if effect is not None:
             text += f" {effect!r}"
     return hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -155,6 +158,8 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
 
 def _render_frames(spec, plan):
     rows = plan.cameras, plan.time, plan.light_gain, plan.transient_shown
+    if plan.photo is not None:
+        rows = (*rows, plan.photo)
     images, depths, hits = [], [], []
     with events.stage("rendering the built-in scene", len(plan.time)) as stage:
         for frame in data_parallel.rows_on_devices(rendering.render, spec, rows):
@@ -174,6 +179,7 @@ def _points(spec, plan, images, hits, moving, seed):
     """
     rng = np.random.default_rng([seed, 4])
     static = (hits.thing != trace.NOTHING) & ~moving
+    static &= hits.thing != spec.transient_id
     candidates = np.flatnonzero(static & plan.learn[:, None, None])
     sample = rng.choice(candidates, min(spec.points, len(candidates)), replace=False)
     row = sample // static[0].size
@@ -211,10 +217,13 @@ def _flow(plan, scene_truth):
 @events.stage("computing the scene's ground truth")
 def _truth(spec, plan, hits, ids, programs, seed):
     forward, backward = truth.flows(spec, plan, hits, programs)
+    names = tuple(thing.name for thing in spec.all_things())
+    if spec.collection is not None:
+        names = (*names, "board")
     return SceneTruth(
         ids,
         hits.thing.astype(np.int8),
-        tuple(thing.name for thing in spec.all_things()),
+        names,
         hits.thing == spec.transient_id,
         forward.pixel,
         forward.seen,

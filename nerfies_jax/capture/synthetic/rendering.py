@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.capture.synthetic import texture, trace
+from nerfies_jax.capture.synthetic import collection, texture, trace
+from nerfies_jax.capture.synthetic.collection import Photo
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import lens, rays
@@ -28,6 +29,7 @@ class Schedule(NamedTuple):
     cameras: Camera
     light_gain: np.ndarray  # [frames, 3] float32 gain of linear light
     transient_shown: np.ndarray  # bool
+    photo: Photo | None = None  # of a collection, one row per frame
 
 
 class Frame(NamedTuple):
@@ -50,6 +52,8 @@ def schedule(spec: SceneSpec, seed: int) -> Schedule:
     Returns:
       The schedule.
     """
+    if spec.collection is not None:
+        return _collection_schedule(spec, seed)
     instants = np.arange(spec.frames)
     second_instants = instants[spec.heldout_every // 2 :: spec.heldout_every]
     instant = np.concatenate([instants, second_instants])
@@ -78,12 +82,31 @@ def schedule(spec: SceneSpec, seed: int) -> Schedule:
     )
 
 
+def _collection_schedule(spec, seed):
+    """Photographs, and views for evaluation with the appearance of some of them."""
+    instants = np.arange(spec.frames)
+    known = instants[spec.heldout_every // 2 :: spec.heldout_every]
+    instant = np.concatenate([instants, known]).astype(np.int32)
+    taken = collection.photographs(spec, instant, seed)
+    return Schedule(
+        instant=instant,
+        camera_id=np.arange(len(instant), dtype=np.int32),
+        time=(instant / (spec.frames - 1)).astype(np.float32),
+        learn=np.arange(len(instant)) < spec.frames,
+        cameras=taken.cameras,
+        light_gain=taken.light_gain,
+        transient_shown=np.asarray(taken.photo.board_shown),
+        photo=taken.photo,
+    )
+
+
 def render(
     spec: SceneSpec,
     camera: Camera,
     time: Float[Array, ""],
     light_gain: Float[Array, "3"],
     transient_shown: Bool[Array, ""],
+    photo: Photo | None = None,
 ) -> Frame:
     """Render one frame in square tiles.
 
@@ -95,17 +118,24 @@ def render(
       time: Time in [0, 1].
       light_gain: Gain of linear light for each channel, [3].
       transient_shown: True if the transient object is present.
+      photo: Appearance of the frame, if it is a photograph of a collection.
 
     Returns:
       The frame.
     """
 
     def hit(direction):
-        return trace.cast(spec, camera.position, direction, time, transient_shown)
+        first = trace.cast(spec, camera.position, direction, time, transient_shown)
+        if photo is None:
+            return first
+        return collection.in_front(spec, photo, camera, direction, first)
 
     def color(hit, direction):
+        light = trace.shade(spec, hit, direction, light_gain)
+        if photo is not None:
+            light = collection.shade(spec, photo, direction, hit, light, light_gain)
         # Clipping each sample keeps saturated highlights from bleeding over edges.
-        return jnp.clip(trace.shade(spec, hit, direction, light_gain), 0, 1)
+        return jnp.clip(light, 0, 1)
 
     # The center is the last sample, so that a single program suffices.
     offsets = _sub_pixels(spec.supersampling, time.dtype)
@@ -119,7 +149,10 @@ def render(
         color_hits = jax.tree.map(lambda leaf: leaf[:, :-1], hits)
         light = jax.vmap(jax.vmap(color))(color_hits, directions[:, :-1])
         center = jax.tree.map(lambda leaf: leaf[:, -1], hits)
-        return texture.srgb(jnp.mean(light, axis=1)), center
+        image = texture.srgb(jnp.mean(light, axis=1))
+        if photo is not None:
+            image = collection.develop(photo, image)
+        return image, center
 
     tiles = jax.lax.map(tile, _tiles(spec.size, time.dtype))
     image, center = _untiled(tiles, spec.size)

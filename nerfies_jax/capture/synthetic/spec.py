@@ -185,6 +185,39 @@ class Specular:
 
 
 @dataclasses.dataclass(frozen=True)
+class Collection:
+    """Photographs of a static object by many people, as on the internet.
+
+    Each photograph has its own camera, focal length, exposure, white balance, tone
+    curve and sky, and some show a board in front of the object. They replace the
+    hand-held camera, and `SceneSpec.frames` is their number. Views for evaluation show
+    no boards and have the appearance of one of the photographs.
+    """
+
+    object_size: float = 0.3  # scene units
+    target: Vector = (0.0, -0.03, 0.0)
+    distance: tuple[float, float] = (2.0, 8.0)  # from the target, in object sizes
+    arc_rad: float = 1.2  # to either side
+    elevation_rad: tuple[float, float] = (0.02, 0.3)
+    fill: tuple[float, float] = (0.5, 0.95)  # share of the width that the object fills
+    focal_widths: tuple[float, float] = (0.7, 5.0)  # bounds, in image widths
+    stops: float = 1.5  # largest deviation of the exposure
+    tint_stops: float = 0.35  # largest deviation of red and blue
+    tone: float = 0.25  # strength of the tone curves
+    boards: float = 1 / 3  # share of the photographs
+    masked: bool = False  # True for masks without skies and boards
+
+    def __post_init__(self):
+        if not (self.object_size > 0 and 0 < self.distance[0] <= self.distance[1]):
+            raise ValueError(
+                f"object_size={self.object_size} and distance={self.distance} must be "
+                "positive, and distance must not decrease"
+            )
+        if not 0 <= self.boards <= 1:
+            raise ValueError(f"boards={self.boards} must lie in [0, 1]")
+
+
+@dataclasses.dataclass(frozen=True)
 class SceneSpec:
     """An analytic dynamic scene and its cameras. An effect of None is absent."""
 
@@ -211,6 +244,7 @@ class SceneSpec:
     lens: Lens | None = dataclasses.field(default=None, repr=False)
     # The first camera's frames are then those of the rig.
     rig: Rig | None = dataclasses.field(default=None, repr=False)
+    collection: Collection | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self):
         unit_axis(self.light)
@@ -223,6 +257,18 @@ class SceneSpec:
             raise ValueError(
                 f"specular thing {self.specular.thing!r} is not in the scene; "
                 f"choose one of {', '.join(names)}"
+            )
+        if self.collection is not None:
+            self._check_collection()
+
+    def _check_collection(self):
+        others = ("exposure", "transient", "pose_error", "lens", "rig")
+        present = [name for name in others if getattr(self, name) is not None]
+        moving = [thing.name for thing in self.things if thing.moves()]
+        if present or moving:
+            raise ValueError(
+                "a collection shows static objects and has its own cameras and "
+                f"appearances; remove {', '.join(present + moving)}"
             )
 
     def _check_counts(self):
@@ -279,5 +325,6 @@ class SceneSpec:
 
     @property
     def transient_id(self) -> int:
-        """Id of the transient object, or -2, which no pixel has, if there is none."""
-        return -2 if self.transient is None else len(self.things)
+        """Id of the transient object or of boards, or -2, which no pixel has."""
+        there = self.transient is not None or self.collection is not None
+        return len(self.things) if there else -2

@@ -113,7 +113,7 @@ def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flo
 class Programs(NamedTuple):
     """Programs of `flows` and `tracks`, compiled in the background."""
 
-    flow: Future[jax.stages.Compiled]
+    flow: Future[jax.stages.Compiled] | None  # None for photographs
     follow: Future[jax.stages.Compiled] | None = None  # None for a static scene
     watch: Future[jax.stages.Compiled] | None = None
 
@@ -140,6 +140,8 @@ def programs(spec: SceneSpec, plan: Schedule) -> Programs:
         plan.time,
         plan.transient_shown,
     )
+    if spec.collection is not None:  # no two photographs share a camera
+        return Programs(None)
     lowered = [data_parallel.lower_rows(flow, spec, seen)]
     if points and any(thing.moves() for thing in spec.things):
         thing, times = shape((points,), np.int32), shape((spec.frames,), np.float32)
@@ -180,9 +182,11 @@ def flows(
     )
     shift = np.zeros((2 * count, height, width, 2), np.float32)
     seen = np.zeros((2 * count, height, width), bool)
-    results = data_parallel.rows_on_devices(flow, spec, pairs, programs.flow.result())
-    for index, result in zip(np.flatnonzero(exists), results, strict=True):
-        shift[index], seen[index] = result
+    if programs.flow is not None:
+        program = programs.flow.result()
+        results = data_parallel.rows_on_devices(flow, spec, pairs, program)
+        for index, result in zip(np.flatnonzero(exists), results, strict=True):
+            shift[index], seen[index] = result
     forward = Flow._make((shift[:count], seen[:count]))
     return forward, Flow._make((shift[count:], seen[count:]))
 
