@@ -1,4 +1,4 @@
-"""Commands, benchmarks and checks: `python -m experiments.NAME`."""
+"""Commands, benchmarks and checks: `nerfies NAME`, or `python -m experiments.NAME`."""
 
 import os
 import sys

@@ -1,40 +1,38 @@
-"""List all commands; `python -m experiments NAME ...` runs one.
+"""List the commands, or run one: `nerfies NAME ...`.
 
-`nerfies NAME ...` is the same.
+`python -m experiments NAME ...` is the same.
 """
 
-import ast
 import functools
 import importlib
+import importlib.metadata
 import operator
-import pathlib
+import platform
 import sys
 from typing import Annotated, Any
 
 import tyro
 
-from experiments import options
+from experiments import names, options
+from experiments.names import HERE, STUDY, commands
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runtime import console
+from nerfies_jax.runtime.version import __version__
 
-HERE = pathlib.Path(__file__).resolve().parent
+USAGE = f"""\
+usage: nerfies NAME ...
 
+{{commands}}
 
-def commands() -> dict[str, str]:
-    """Read the first docstring line of each module with a `main`, without importing it.
+nerfies NAME --help    options of a command
+nerfies {STUDY}          benchmarks and checks of this project
+nerfies --version      versions, for reports of bugs"""
+STUDIES = f"""\
+usage: nerfies {STUDY} NAME ...
 
-    Returns:
-      Lines by command name.
-    """
-    files = {path.stem: path for path in HERE.glob("*.py") if path.stem != "__main__"}
-    files |= {path.parent.name: path for path in HERE.glob("*/__main__.py")}
-    summaries = {}
-    for name in sorted(files):
-        module = ast.parse(files[name].read_text())
-        if any(getattr(node, "name", None) == "main" for node in module.body):
-            text = ast.get_docstring(module) or ""
-            summaries[name] = text.partition("\n")[0]
-    return summaries
+{{commands}}
+
+nerfies {STUDY} NAME --help    options of a study"""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -51,22 +49,51 @@ def main(arguments: list[str] | None = None) -> None:
 def _main(arguments):
     words = sys.argv[1:] if arguments is None else arguments
     known = commands()
+    studies = names.studies()
+    if words[:1] == [STUDY]:
+        if words[1:2] in ([], ["-h"], ["--help"]):
+            console.say(STUDIES.format(commands=_table(studies)))
+            return
+        _run(words[1:], known, STUDY, studies)
+        return
+    for_users = {name: text for name, text in known.items() if name not in studies}
     if not words or words[0] in ("-h", "--help"):
-        width = max(map(len, known))
-        console.say("usage: nerfies NAME ...   or   python -m experiments.NAME ...\n")
-        console.say(
-            "\n".join(f"{name:{width}}  {line}" for name, line in known.items())
-        )
+        console.say(USAGE.format(commands=_table(for_users)))
+        return
+    if words[0] == "--version":
+        console.say(version())
         return
     if words[0].startswith(options.COMPLETION):
         print_completion(words)
         return
+    _run(words, known, "command", [*for_users, STUDY])
+
+
+def _run(words, known, kind, shown):
     name, *rest = words
     if name not in known:
-        meant = known_names(name, known)
-        console.error(f"no command {name!r}; {meant}")
+        console.error(f"no {kind} {name!r}; {known_names(name, shown)}")
         raise SystemExit(2)
     main_of(name)(rest)
+
+
+def _table(summaries):
+    width = max(map(len, summaries))
+    return "\n".join(f"{name:{width}}  {line}" for name, line in summaries.items())
+
+
+def version() -> str:
+    """Name the versions that matter in a report of a bug.
+
+    Returns:
+      One line, with the versions of this package, JAX and Python, and the platform.
+    """
+    parts = [f"nerfies-jax {__version__}"]
+    parts += [
+        f"{name} {importlib.metadata.version(name)}" for name in ("jax", "jaxlib")
+    ]
+    parts += [f"Python {platform.python_version()}"]
+    return ", ".join([*parts, f"{platform.system()} {platform.machine()}"])
 
 
 def main_of(name: str) -> options.Command:
@@ -89,11 +116,17 @@ def print_completion(words: list[str]) -> None:
     Args:
       words: The option, and the name of the shell.
     """
-    kinds = [
-        Annotated[options.offered(main_of(name).settings), tyro.conf.subcommand(name)]
+    kinds = {
+        name: Annotated[
+            options.offered(main_of(name).settings), tyro.conf.subcommand(name)
+        ]
         for name in commands()
-    ]
-    union: Any = functools.reduce(operator.or_, kinds)
+    }
+    studies = [kinds.pop(name) for name in names.studies()]
+    within = options.several(studies)
+    union: Any = functools.reduce(
+        operator.or_, [*kinds.values(), Annotated[within, tyro.conf.subcommand(STUDY)]]
+    )
     tyro.cli(union, prog="nerfies", args=words, config=options.READ_BY)
 
 

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import tyro
 from tyro.conf import Positional
 
-from experiments import options
+from experiments import names, options
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
@@ -297,7 +297,8 @@ def _called(run):
     """Return the name that a user calls the command by."""
     name = run.__module__
     if name != "__main__":
-        return f"nerfies {name.removesuffix('.__main__').removeprefix('experiments.')}"
+        name = name.removesuffix(".__main__").removeprefix("experiments.")
+        return names.line(name)
     found = sys.modules[name].__spec__
     name = pathlib.Path(sys.argv[0]).stem if found is None else found.name
     return f"python -m {name.removesuffix('.__main__')}"
@@ -419,6 +420,6 @@ def as_options(text: str, error: Exception) -> str:
             return f"{text}, with --trust {shlex.join(each.names)}"
         if isinstance(each, CaptureNotFound):
             words = ("--out", str(each.folder), "--resume")
-            command = f"python -m experiments.reconstruct CAPTURE {shlex.join(words)}"
+            command = f"nerfies reconstruct CAPTURE {shlex.join(words)}"
             return f"{text}: {command}"
     return text

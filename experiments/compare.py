@@ -1,7 +1,7 @@
 """Compare runs of one capture: curves, time to quality, images, a table.
 
-    python -m experiments.compare RUN RUN ...
-    python -m experiments.compare RUN RUN --psnr 22 24 --frames 4 --out compared
+    nerfies compare RUN RUN ...
+    nerfies compare RUN RUN --psnr 22 24 --frames 4 --out compared
 
 The runs must have the same training frames of the same capture. Prints a table of
 metrics, times and sizes, and the seconds of training until each run reached a PSNR.
@@ -43,7 +43,7 @@ class Compare:
     """Compare runs of one capture: finished, running or interrupted."""
 
     runs: cli.Positional[tuple[pathlib.Path, ...]]
-    """Folders that experiments.reconstruct made."""
+    """Folders that nerfies reconstruct made."""
     psnr: tuple[float, ...] = ()
     """Qualities in dB to wait for (default: what the runs but the best ended with)."""
     frames: int = 2

@@ -1,17 +1,17 @@
 """Export a finished run for other programs: Gaussians, cameras, tracks, EXR.
 
-python -m experiments.export RUN ply --time 0.4          # the scene at one time
-python -m experiments.export RUN ply --frames 48         # a numbered sequence
-python -m experiments.export RUN splat
-python -m experiments.export RUN spz --units world
-python -m experiments.export RUN splatv                  # all times in one file
-python -m experiments.export RUN transforms              # cameras, images, points
-python -m experiments.export RUN colmap --units world
-python -m experiments.export RUN nerfies
-python -m experiments.export RUN path --path stabilized  # camera_path.json, with times
-python -m experiments.export RUN nerfies-path --path sway --frames 48
-python -m experiments.export RUN tracks --points 500     # what is seen, followed
-python -m experiments.export RUN exr --path stabilized   # color, alpha, depth, flow
+nerfies export RUN ply --time 0.4          # the scene at one time
+nerfies export RUN ply --frames 48         # a numbered sequence
+nerfies export RUN splat
+nerfies export RUN spz --units world
+nerfies export RUN splatv                  # all times in one file
+nerfies export RUN transforms              # cameras, images, points
+nerfies export RUN colmap --units world
+nerfies export RUN nerfies
+nerfies export RUN path --path stabilized  # camera_path.json, with times
+nerfies export RUN nerfies-path --path sway --frames 48
+nerfies export RUN tracks --points 500     # what is seen, followed
+nerfies export RUN exr --path stabilized   # color, alpha, depth, flow
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ class Export:
     """Write what a run learned in the formats of other programs (docs/formats.md)."""
 
     run: cli.Positional[pathlib.Path]
-    """Run folder that experiments.reconstruct made."""
+    """Run folder that nerfies reconstruct made."""
     format: cli.Positional[
         Literal[
             "ply",
@@ -70,7 +70,7 @@ class Export:
     points: int | None = None
     """Number of points to track (default: 1000)."""
     path: str | None = None
-    """Camera path, as for experiments.render (default: sway)."""
+    """Camera path, as for nerfies render (default: sway)."""
     units: Literal["scene", "world"] | None = None
     """Lengths as in the run's own files, or as in those of the capture (default:
     scene)."""
@@ -243,7 +243,7 @@ def _path(args: Export, run: Any) -> str:
 
 
 def _planned(args: Export, run: Any) -> Any:
-    """Return a path with its times, or with those of `experiments.render`."""
+    """Return a path with its times, or with those of `nerfies render`."""
     from nerfies_jax.capture import camera_paths, path_files, pinholes
 
     planned = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)

@@ -1,7 +1,7 @@
 """Recommend effects for a capture from its images, before any training.
 
-    python -m experiments.inspect_scene CAPTURE
-    python -m experiments.inspect_scene --scene transient
+    nerfies inspect_scene CAPTURE
+    nerfies inspect_scene --scene transient
 
 Prints a table of decisions and the commands to continue with, and writes a contact
 sheet.

@@ -1,6 +1,6 @@
 """Render a built-in dynamic scene as a Nerfies directory, with its ground truth.
 
-python -m experiments.make_scene OUT [--preset NAME] [--frames N] [--set path=value]
+nerfies make_scene OUT [--preset NAME] [--frames N] [--set path=value]
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ def main(args):
     console.say(
         f"{args.out}: {spec.name}, {spec.frames} frame times at {width}x{height}, "
         f"ground truth in {args.out / synthetic.TRUTH_FILE}\n"
-        f"next: python -m experiments.reconstruct {shlex.quote(str(args.out))}"
+        f"next: nerfies reconstruct {shlex.quote(str(args.out))}"
     )
     return {"folder": str(args.out), "scene": specs.as_json(spec), "seed": args.seed}
 

@@ -69,8 +69,11 @@ def parse(settings: Any, arguments: list[str], prog: str) -> Any:
 def offered(settings: Any) -> type:
     """Return the type that completes a command among all commands."""
     kinds = [shown(kind, offering=True) for kind in _kinds(settings)]
-    if len(kinds) == 1:
-        return kinds[0]
+    return kinds[0] if len(kinds) == 1 else several(kinds)
+
+
+def several(kinds: list[Any]) -> type:
+    """Return a type whose subcommands are these types."""
     marks = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     union: Any = Annotated[(functools.reduce(operator.or_, kinds), *marks)]
     return _made("Several", [("kind", union, dataclasses.field())], "")

@@ -1,8 +1,8 @@
 """Convert an archive of arrays, a video or images to a capture.
 
-python -m experiments.prepare npz FILE OUT       images, poses, times, focal in one .npz
-python -m experiments.prepare video FILE OUT     sharp frames, cameras by COLMAP
-python -m experiments.prepare pictures DIR OUT   cameras by COLMAP
+nerfies prepare npz FILE OUT       images, poses, times, focal in one .npz
+nerfies prepare video FILE OUT     sharp frames, cameras by COLMAP
+nerfies prepare pictures DIR OUT   cameras by COLMAP
 """
 
 import dataclasses
@@ -74,7 +74,7 @@ def main(args):
 
             preparation.prepare(args.file, args.out, args.how, console.say)
             record = cli.stored(args.out / preparation.RECORD)
-    console.say(f"next: python -m experiments.reconstruct {shlex.quote(str(args.out))}")
+    console.say(f"next: nerfies reconstruct {shlex.quote(str(args.out))}")
     return {"folder": str(args.out), "prepared": record}
 
 

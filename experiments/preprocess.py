@@ -1,7 +1,7 @@
 """Preprocess a capture: optical flow, tracks, masks of moving objects, rigid groups.
 
-    python -m experiments.preprocess CAPTURE
-    python -m experiments.preprocess --scene fast --out runs/fast-preprocessed
+    nerfies preprocess CAPTURE
+    nerfies preprocess --scene fast --out runs/fast-preprocessed
 
 Prints the share of pixels with flow, moving objects, tracks and their 3D paths, static
 points and rigid groups. Draws frames with masks and tracks. The result is stored where

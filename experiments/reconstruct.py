@@ -1,8 +1,8 @@
 """Reconstruct a dynamic scene from a capture, a video or images.
 
-    python -m experiments.reconstruct              # the built-in scene
-    python -m experiments.reconstruct CAPTURE      # your own
-    python -m experiments.reconstruct CLIP.mp4     # a video: cameras first
+    nerfies reconstruct              # the built-in scene
+    nerfies reconstruct CAPTURE      # your own
+    nerfies reconstruct CLIP.mp4     # a video: cameras first
 
 Writes a run folder with checkpoints, metrics, images, a video and a report.
 """
@@ -46,7 +46,7 @@ class Reconstruct:
     nothing moves, or spacetime-small without tracks if tracking fails)."""
     effects: Literal["preset", "auto"] = "preset"
     """auto: inspect the capture first and enable the effects that it needs, in the
-    representation and size of the preset (see experiments.inspect_scene)."""
+    representation and size of the preset (see nerfies inspect_scene)."""
     steps: int | None = None
     """Training steps. Schedules are stretched with them."""
     seconds: float | None = None
@@ -73,7 +73,7 @@ class Reconstruct:
     """Seconds between two checkpoints, which is the most that a killed run loses."""
     view: bool = False
     """View the scene while it trains, in the browser of this machine, as
-    experiments.view does afterwards. Training waits while it renders."""
+    nerfies view does afterwards. Training waits while it renders."""
     log: tuple[Literal["tensorboard", "wandb", "rerun"], ...] = ()
     """Experiment trackers that receive losses and metrics during training, in addition
     to events.jsonl (docs/events.md); extra log."""

@@ -1,6 +1,6 @@
 """Build the API reference, a page for each module, from the docstrings.
 
-    python -m experiments.reference                # into build/reference
+    nerfies study reference                # into build/reference
 
 Written by pdoc (extra `docs`). Exit code 1 where a public name is on no page.
 """

@@ -1,17 +1,17 @@
 """Render a finished run: held-out frames, camera paths, frozen time, slow motion.
 
-python -m experiments.render RUN                         # the held-out frames
-python -m experiments.render RUN --path orbit            # mp4 of the moving scene
-python -m experiments.render RUN --path sway --freeze 0.5
-python -m experiments.render RUN --path stabilized       # as captured, smoothed
-python -m experiments.render RUN --path camera_path.json # as nerfstudio writes it
-python -m experiments.render RUN --path sway --show depth
-python -m experiments.render RUN --path sway --show flow
-python -m experiments.render RUN --without warp          # the canonical scene
-python -m experiments.render RUN --hide-moving 0.02       # the static scene
-python -m experiments.render RUN --path sway --freeze 0 --appearance 0 7
-python -m experiments.render RUN --path sway --knots 32   # the motion from a table
-python -m experiments.render RUN --path sway --static-threshold 1e-4
+nerfies render RUN                         # the held-out frames
+nerfies render RUN --path orbit            # mp4 of the moving scene
+nerfies render RUN --path sway --freeze 0.5
+nerfies render RUN --path stabilized       # as captured, smoothed
+nerfies render RUN --path camera_path.json # as nerfstudio writes it
+nerfies render RUN --path sway --show depth
+nerfies render RUN --path sway --show flow
+nerfies render RUN --without warp          # the canonical scene
+nerfies render RUN --hide-moving 0.02       # the static scene
+nerfies render RUN --path sway --freeze 0 --appearance 0 7
+nerfies render RUN --path sway --knots 32   # the motion from a table
+nerfies render RUN --path sway --static-threshold 1e-4
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ class Render:
     }
 
     run: cli.Positional[pathlib.Path]
-    """Run folder that experiments.reconstruct made."""
+    """Run folder that nerfies reconstruct made."""
     path: str = "heldout"
     """heldout: the held-out frames. Or a camera path within the captured viewpoints
     (sway, lemniscate), on a circle (orbit), as captured (captured), or captured and

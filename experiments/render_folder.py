@@ -31,7 +31,7 @@ def name(args: Any) -> str:
     """Name the folder of a render in RUN/renders by the settings that are not default.
 
     Args:
-      args: Settings of `experiments.render`.
+      args: Settings of `nerfies render`.
     """
     parts = [path_name(args.path)]
     if args.frames is not None:
@@ -91,7 +91,7 @@ def request(args: Any) -> dict[str, Any]:
     paths.
 
     Args:
-      args: Settings of `experiments.render`.
+      args: Settings of `nerfies render`.
 
     Returns:
       The values.
@@ -109,7 +109,7 @@ def record(made: Made, args: Any, files: Iterable[str]) -> dict[str, Any]:
 
     Args:
       made: Settings that determine the images.
-      args: Settings of `experiments.render`.
+      args: Settings of `nerfies render`.
       files: Files by their names in the folder.
     """
     from nerfies_jax.training.provenance import provenance
@@ -129,7 +129,7 @@ def replaceable(
 
     Args:
       out: Folder of the render. It may be absent.
-      args: Settings of `experiments.render`.
+      args: Settings of `nerfies render`.
       made: What decides the images of this render.
       files: Names of the files that this render will write.
 

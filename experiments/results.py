@@ -1,8 +1,8 @@
 """Write the pages of docs/results from the stored measurements.
 
-    python -m experiments.results                  # every page with stored numbers
-    python -m experiments.results effect_cost      # one
-    python -m experiments.results benchmark --measured runs/benchmark/benchmark.json
+    nerfies study results                  # every page with stored numbers
+    nerfies study results effect_cost      # one
+    nerfies study results benchmark --measured runs/benchmark/benchmark.json
 
 Nothing is measured here. A page consists of the docstring of its command and of tables
 of the stored file, which `--measured FILE` replaces first. A test compares every page
@@ -24,16 +24,16 @@ PAGES = ROOT / "docs" / "results"
 INDEX = """\
 # Results
 
-`python -m experiments.results` writes every page from a file of this repository, and a
+`nerfies study results` writes every page from a file of this repository, and a
 test compares each page with its file. The command next to a page measures again. If a
 page has rows of several captures or presets, the command was run once for each.
-`python -m experiments.results benchmark --measured benchmark.json`, for example, stores
+`nerfies study results benchmark --measured benchmark.json`, for example, stores
 the result of a command and rewrites its page.
 
 {pages}
 
 {missing}Errors and costs of single formulas are in [numerics.md](../numerics.md), which
-`python -m experiments.hard_cases --document docs/numerics.md` rewrites.
+`nerfies study hard_cases --document docs/numerics.md` rewrites.
 
 ## Finished studies
 
@@ -56,7 +56,7 @@ class Study(NamedTuple):
     """A page: the command that measures, and the functions that format the result."""
 
     about: str  # subject of the page
-    command: str  # words after `python -m experiments.`
+    command: str  # words after `nerfies study`
     module: str  # of experiments, whose docstring opens the page
     page: str  # of experiments, with `page(stored)`
     measured: str = ""  # the stored file, if it is not in experiments/measured
@@ -64,7 +64,7 @@ class Study(NamedTuple):
     @property
     def line(self) -> str:
         """The whole command."""
-        return f"python -m experiments.{self.command}"
+        return f"nerfies study {self.command}"
 
 
 def _suite(about, words):
@@ -317,7 +317,7 @@ def _page_of(name, stored):
     stored_in = path_of(name).relative_to(ROOT)
     parts.append(
         f"Measured by `{study.line}` ({origin}); the numbers are in `{stored_in}`, and "
-        f"`python -m experiments.results {name}` wrote this page from them."
+        f"`nerfies study results {name}` wrote this page from them."
     )
     return "\n\n".join(parts) + "\n"
 

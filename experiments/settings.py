@@ -1,7 +1,7 @@
 """List the fields of a preset that `--set` changes: value, default and meaning.
 
-    python -m experiments.settings splats-tracked-small
-    python -m experiments.settings nerfies-small --json
+    nerfies settings splats-tracked-small
+    nerfies settings nerfies-small --json
 
 A line is an argument of `--set` with the present value. If a field holds one of several
 kinds of settings, or none, the kinds are named: `--set strategy=MCMCStrategySpec`.
@@ -24,7 +24,7 @@ class Settings:
     """List the fields of a preset that --set can change."""
 
     preset: cli.Positional[cli.Preset]
-    """Preset, as for experiments.reconstruct."""
+    """Preset, as for nerfies reconstruct."""
 
 
 @cli.command(Settings)

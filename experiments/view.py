@@ -1,7 +1,7 @@
 """View a run in the browser: any view, any time, effects on and off.
 
-python -m experiments.view RUN                # and open the address it prints
-python -m experiments.view RUN --max-side 640
+nerfies view RUN                # and open the address it prints
+nerfies view RUN --max-side 640
 """
 
 import contextlib
@@ -24,7 +24,7 @@ class View:
     """
 
     run: cli.Positional[pathlib.Path]
-    """Run folder that experiments.reconstruct made, or is making: then as it was last
+    """Run folder that nerfies reconstruct made, or is making: then as it was last
     saved."""
     port: int = cli.VIEW_PORT
     """Port on this machine. The next free one is used."""

@@ -23,3 +23,5 @@ from .splatting.raster_spec import RasterSpec as RasterSpec
 from .splatting.rasterization import RasterizationInfo as RasterizationInfo
 from .splatting.rasterization import rasterization as rasterization
 from .splatting.rendering import render as render
+
+__version__: str

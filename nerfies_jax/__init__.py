@@ -11,6 +11,7 @@ The names in `__init__.pyi` are the public API. Each is imported when it is used
 import lazy_loader
 
 from nerfies_jax.runtime import earlier_names
+from nerfies_jax.runtime.version import __version__ as __version__
 
 earlier_names.install()
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

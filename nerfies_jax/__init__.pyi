@@ -42,3 +42,5 @@ from .training import losses as losses
 from .training.effects import FrameCondition as FrameCondition
 from .training.effects import Term as Term
 from .training.loop import fit as fit
+
+__version__: str

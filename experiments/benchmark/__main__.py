@@ -1,12 +1,12 @@
 """Quality of methods over seeds: the default command, presets, ablations.
 
-    python -m experiments.benchmark                            # the default command
-    python -m experiments.benchmark CAPTURE --max-side 256
-    python -m experiments.benchmark --preset nerfies-small --set elastic=none
-    python -m experiments.benchmark --suite sonata --steps 900 --jobs 2
-    python -m experiments.benchmark --suite presets --seconds 90
+    nerfies study benchmark                            # the default command
+    nerfies study benchmark CAPTURE --max-side 256
+    nerfies study benchmark --preset nerfies-small --set elastic=none
+    nerfies study benchmark --suite sonata --steps 900 --jobs 2
+    nerfies study benchmark --suite presets --seconds 90
 
-Every run is one of `experiments.reconstruct`, in its own process and folder. The
+Every run is one of `nerfies reconstruct`, in its own process and folder. The
 methods of a suite train on the same frames with the same seeds, for the same number of
 steps (`--steps`) or the same time (`--seconds`), and the final state is evaluated. The
 seed determines the initial model and the order of the frames, and the camera path of a
@@ -15,7 +15,7 @@ its spread over the seeds. Two baselines are reported: the mean of the two neigh
 training images, and the run's own renders averaged over time.
 
 The same command continues interrupted runs, and other results in OUT/benchmark.json
-stay. `experiments.compare` draws curves and images of the run folders.
+stay. `nerfies compare` draws curves and images of the run folders.
 """
 
 import dataclasses
@@ -54,7 +54,7 @@ class Benchmark:
     preset: cli.Preset = None
     """Preset, without a suite (default: chosen by the tracks of the capture)."""
     set: cli.Overrides = ()
-    """Fields changed in every method, as for experiments.reconstruct."""
+    """Fields changed in every method, as for nerfies reconstruct."""
     steps: int | None = None
     """Steps of training of every method (default: the presets' own)."""
     seconds: float | None = None
@@ -217,7 +217,7 @@ def keep(args: Benchmark, results: Mapping[jobs.Run, jobs.Result]) -> None:
     folders = [run.folder for run in results if run.seed == 0]
     if len(folders) > 1:
         words = shlex.join(map(str, folders))
-        console.say(f"images: python -m experiments.compare {words}")
+        console.say(f"images: nerfies compare {words}")
     console.say(f"stored in {path}")
 
 

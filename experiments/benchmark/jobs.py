@@ -1,4 +1,4 @@
-"""Runs of `experiments.reconstruct` in processes of their own, several at a time."""
+"""Runs of `nerfies reconstruct` in processes of their own, several at a time."""
 
 import json
 import os
@@ -26,7 +26,7 @@ class Run(NamedTuple):
     method: str
     seed: int
     folder: pathlib.Path
-    words: tuple[str, ...]  # options of `experiments.reconstruct`
+    words: tuple[str, ...]  # options of `nerfies reconstruct`
     seconds: float | None  # of training; None for the steps of the preset
 
     @property
@@ -51,7 +51,7 @@ class Result(NamedTuple):
 def words(
     source: Sequence[str], settings: str, seed: int, steps: int | None
 ) -> tuple[str, ...]:
-    """Assemble the options of `experiments.reconstruct`.
+    """Assemble the options of `nerfies reconstruct`.
 
     Args:
       source: Options that name the capture.
@@ -130,7 +130,7 @@ def _start(run, alone):
         environment |= {"PJRT_NPROC": "1", "JAX_NUM_CPU_DEVICES": "1"}
     with run.log.open("w") as file:
         return children.start(
-            [sys.executable, "-m", "experiments.reconstruct", *options],
+            [sys.executable, "-P", "-m", "experiments.reconstruct", *options],
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=subprocess.STDOUT,

@@ -1,7 +1,7 @@
 """Damaged files for every reader: read, or refused with the file's path.
 
-    python -m experiments.fuzz --mutations 1000000
-    python -m experiments.fuzz --seconds 600 --only EXR
+    nerfies study fuzz --mutations 1000000
+    nerfies study fuzz --seconds 600 --only EXR
 
 Small valid files of every kind are damaged at random (bits, integers of headers,
 numbers and names in text, pieces cut out or repeated, also inside archives whose

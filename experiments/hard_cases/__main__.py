@@ -1,8 +1,8 @@
 """Errors and costs of formulas at their hard points, and of their textbook forms.
 
-    python -m experiments.hard_cases
-    python -m experiments.hard_cases --topics rotations splats --repeats 30
-    python -m experiments.hard_cases --document docs/numerics.md   # rewrite its table
+    nerfies study hard_cases
+    nerfies study hard_cases --topics rotations splats --repeats 30
+    nerfies study hard_cases --document docs/numerics.md   # rewrite its table
 
 Every case sweeps a function to its singular point. The table shows the largest errors
 of value, gradient and curvature of the textbook form and of the stable one compared

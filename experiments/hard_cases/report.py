@@ -9,8 +9,8 @@ from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.metrics import clock
 from nerfies_jax.metrics.clock import Metric
 
-BEGIN = "<!-- begin: python -m experiments.hard_cases -->"
-END = "<!-- end: python -m experiments.hard_cases -->"
+BEGIN = "<!-- begin: nerfies study hard_cases -->"
+END = "<!-- end: nerfies study hard_cases -->"
 
 
 def number(values) -> str:

@@ -1,7 +1,7 @@
 """Mutation tests: random faults in both packages, and the tests that detect them.
 
-    python -m experiments.mutants
-    python -m experiments.mutants --count 12 --seed 3 --only gaussians_jax/raster
+    nerfies study mutants
+    nerfies study mutants --count 12 --seed 3 --only gaussians_jax/raster
 
 A copy of the checkout gets one fault at a time (an operator, a sign, a comparison, a
 number, two swapped arguments, in some function body, with modules in turn), and the

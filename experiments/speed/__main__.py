@@ -1,11 +1,11 @@
 """Time of training steps, effects, the rasterizer, the default command and the player.
 
-    python -m experiments.speed steps                       # every small preset
-    python -m experiments.speed effects --presets sonata-small
-    python -m experiments.speed raster 10000@256x256 --reference PATH/run.py
-    python -m experiments.speed job --compare CHECKOUT
-    python -m experiments.speed player PLAYER.html --gsplat INDEX.es.js
-    python -m experiments.speed steps --check BEFORE/speed.json
+    nerfies study speed steps                       # every small preset
+    nerfies study speed effects --presets sonata-small
+    nerfies study speed raster 10000@256x256 --reference PATH/run.py
+    nerfies study speed job --compare CHECKOUT
+    nerfies study speed player PLAYER.html --gsplat INDEX.es.js
+    nerfies study speed steps --check BEFORE/speed.json
 
 `steps` times every preset in two fresh processes, one that sees one core and one with
 the cores that its step is made for. `job` times the README's first command with empty

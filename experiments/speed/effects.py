@@ -1,8 +1,8 @@
 """Cost of each effect of a scene, by itself and together with the others.
 
-    python -m experiments.speed effects
-    python -m experiments.speed effects --presets sonata-small --repeats 9
-    python -m experiments.speed effects --check BEFORE/effect_cost.json
+    nerfies study speed effects
+    nerfies study speed effects --presets sonata-small --repeats 9
+    nerfies study speed effects --check BEFORE/effect_cost.json
 
 For every preset: the bare scene, the bare scene with each effect alone (and its
 requirements), the whole preset, and the whole preset without each effect, or without a

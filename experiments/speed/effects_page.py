@@ -25,7 +25,7 @@ operations:
   modules of the missing effect raises. The same holds for parts of motions that are
   `None`, and for penalties of weight zero.
 
-So `python -m experiments.reconstruct --preset nerfies-small --set background=none` is
+So `nerfies reconstruct --preset nerfies-small --set background=none` is
 Nerfies without background points, and not Nerfies with a term of weight zero.
 
 ## How to read the tables

@@ -1,6 +1,6 @@
 """Frame times of the browser player next to gsplat.js, on the same Gaussians.
 
-    python -m experiments.speed player PLAYER.html --gsplat INDEX.es.js
+    nerfies study speed player PLAYER.html --gsplat INDEX.es.js
 
 Each page that a run of splats wrote (`player.html`) is opened in Chromium. Its
 Gaussians at one time are passed to

@@ -2,7 +2,13 @@
 
 import importlib
 import importlib.util
+import platform
 import types
+
+# Modules of extras that have no distribution for some machines (pyproject.toml).
+_MACHINES = {
+    "pycolmap": {"Linux": ("x86_64",), "Darwin": ("arm64",), "Windows": ("AMD64",)}
+}
 
 
 class MissingExtra(ModuleNotFoundError, ValueError):
@@ -38,6 +44,13 @@ def check(name: str, extra: str) -> None:
     """
     package = name.partition(".")[0]
     if importlib.util.find_spec(package) is None:
+        system, machine = platform.system(), platform.machine()
+        if machine not in _MACHINES.get(package, {}).get(system, (machine,)):
+            raise MissingExtra(
+                f"this needs the package {package}, which has no release for {system} "
+                f"on {machine}; do this step on another machine or build {package} "
+                "from its source"
+            )
         raise MissingExtra(
             f"this needs the package {package}, which is not installed: "
             f"pip install 'nerfies-jax[{extra}]' (in a clone of it '.[{extra}]')"

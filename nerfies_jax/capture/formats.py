@@ -188,7 +188,7 @@ def recognize(path: AnyPath) -> Format:
         verb = "npz" if path.suffix == ".npz" else "video"
         raise CaptureError(
             f"{path}: a file, not a capture; pass a capture's folder, or make one with "
-            f"python -m experiments.prepare {verb} {shlex.quote(str(path))} OUT"
+            f"nerfies prepare {verb} {shlex.quote(str(path))} OUT"
         )
     for each in FORMATS:
         if each.recognize(path):
@@ -196,15 +196,15 @@ def recognize(path: AnyPath) -> Format:
     images = _count_images(path)
     if images >= 2:
         raise CaptureError(
-            f"{path}: {images} images without cameras; estimate those with python -m "
-            f"experiments.prepare pictures {shlex.quote(str(path))} OUT"
+            f"{path}: {images} images without cameras; estimate those with "
+            f"nerfies prepare pictures {shlex.quote(str(path))} OUT"
         )
     videos = videos_in(path)
     if len(videos) > 1:
         raise CaptureError(
             f"{path}: {len(videos)} videos ({videos[0].name}, ...) without cameras; "
             "for synchronized cameras, put poses_bounds.npy as in Neural 3D Video next "
-            "to them; prepare a single video with python -m experiments.prepare "
+            "to them; prepare a single video with nerfies prepare "
             f"video {shlex.quote(str(videos[0]))} OUT"
         )
     expected = "; ".join(each.looks_for for each in FORMATS)

@@ -19,7 +19,7 @@ class Advice:
     notes: tuple[str, ...]
 
     def arguments(self) -> str:
-        """Return the arguments of `experiments.reconstruct` for this advice.
+        """Return the arguments of `nerfies reconstruct` for this advice.
 
         Returns:
           Part of a command line.

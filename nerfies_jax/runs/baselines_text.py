@@ -55,7 +55,7 @@ def warnings(numbers: Mapping[str, float]) -> list[str]:
             f"warning: {psnr:.2f} dB is below the "
             f"{numbers['baseline.neighbor_mean']:.2f} dB of the mean of two "
             "neighboring frames; train for more steps, or use the preset that "
-            "python -m experiments.inspect_scene recommends"
+            "nerfies inspect_scene recommends"
         )
     if numbers.get("motion.gain", 0.0) < _WORSE_DB:
         sentences.append(

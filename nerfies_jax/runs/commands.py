@@ -11,7 +11,7 @@ import shlex
 from nerfies_jax.runs import relative_paths
 from nerfies_jax.runs.config import RunConfig
 
-_RECONSTRUCT = ("python", "-m", "experiments.reconstruct")
+_RECONSTRUCT = ("nerfies", "reconstruct")
 
 
 def resume(
@@ -68,7 +68,7 @@ def render(
     Returns:
       The command line.
     """
-    words = ["python", "-m", "experiments.render", str(folder), "--path", "orbit"]
+    words = ["nerfies", "render", str(folder), "--path", "orbit"]
     return _line([*words, *_trust(code)], base)
 
 

@@ -429,7 +429,7 @@ def _stored(folder):
     if not path.is_file():
         raise ValueError(
             f"{folder}: not a run folder (there is no {CONFIG}); pass the folder that "
-            "experiments.reconstruct printed; a run that was killed before it wrote "
+            "nerfies reconstruct printed; a run that was killed before it wrote "
             "that file must be started again"
         )
     with _readable(folder):

@@ -278,8 +278,8 @@ class PathPanel:
         except (ValueError, OSError) as error:
             self._message.content = f"Could not be saved: {error}"
             return
-        arguments = "experiments.render", str(self._folder), "--path", str(file)
-        render = shlex.join(("python", "-m", *arguments))
+        words = ("nerfies", "render", str(self._folder), "--path", str(file))
+        render = shlex.join(words)
         self._message.content = f"Saved. To render it later:\n\n`{render}`"
         console.say(f"{len(path.times)} cameras: {file}; {render}")
 

@@ -11,8 +11,10 @@ from typing import ClassVar, Literal
 
 import pytest
 
+import gaussians_jax
+import nerfies_jax
 from experiments import __main__ as every
-from experiments import cli
+from experiments import cli, names
 from nerfies_jax.capture import json_files
 from nerfies_jax.runs import representations, run_folder
 from nerfies_jax.runs.config import CaptureNotFound
@@ -171,9 +173,16 @@ def test_json_alone_is_on_standard_output(capfd):
 
 def test_every_command_is_listed_with_a_line(capsys):
     every.main([])
-    printed = capsys.readouterr().out
-    for name in ("reconstruct", "render", "prepare", "benchmark", "hard_cases"):
-        assert f"\n{name} " in printed
+    first = capsys.readouterr().out
+    every.main(["study"])
+    second = capsys.readouterr().out
+    assert {*names.FOR_USERS} < every.commands().keys()
+    for name in every.commands():
+        here, elsewhere = first, second
+        if name not in names.FOR_USERS:
+            here, elsewhere = second, first
+        assert f"\n{name} " in here
+        assert f"\n{name} " not in elsewhere
     assert all(line.endswith((".", "?")) for line in every.commands().values())
 
 
@@ -184,14 +193,15 @@ NEED_JAX = {
 ASK_FOR_HELP = """
 import contextlib, io, sys
 from experiments import __main__ as every
+from experiments import names
 for name in sys.argv[1:]:
     try:
         with contextlib.redirect_stdout(io.StringIO()) as page:
-            every.main([name, "--help"])
+            every.main([*names.line(name).split()[1:], "--help"])
     except SystemExit as stop:
         said = page.getvalue()
         told = "subcommands" in said or "--json" in said
-        if stop.code or not told or f"usage: nerfies {name}" not in said:
+        if stop.code or not told or f"usage: {names.line(name)}" not in said:
             sys.exit(f"{name} --help does not help")
     if "jax" in sys.modules:
         sys.exit(f"{name} --help imports JAX")
@@ -228,7 +238,39 @@ def test_an_unknown_command_names_those_there_are(capsys):
     with pytest.raises(SystemExit) as stop:
         every.main(["reconstrct"])
     assert stop.value.code == 2
-    assert "did you mean reconstruct? there are benchmark, " in capsys.readouterr().err
+    words = "did you mean reconstruct? there are reconstruct, prepare, "
+    assert words in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stop:
+        every.main(["study", "benchmrk"])
+    assert stop.value.code == 2
+    assert "did you mean benchmark? there are benchmark, " in capsys.readouterr().err
+
+
+def test_one_version_is_told_everywhere(capsys):
+    root = pathlib.Path(every.__file__).parents[1]
+    version = nerfies_jax.__version__
+    every.main(["--version"])
+    assert capsys.readouterr().out.startswith(f"nerfies-jax {version}, jax ")
+    assert gaussians_jax.__version__ == version
+    assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text()
+    assert f"\n## [{version}] " in (root / "CHANGELOG.md").read_text()
+
+
+SHADOWED = """
+import runpy, sys
+sys.path[0] = sys.argv.pop(1)  # as in the script `nerfies`, whose folder comes first
+from experiments.__main__ import main
+main()
+"""
+
+
+def test_a_folder_named_experiments_does_not_matter(tmp_path):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/__init__.py").write_text("raise ImportError('mine')")
+    root = pathlib.Path(every.__file__).parents[1]
+    words = [sys.executable, "-c", SHADOWED, str(root), "--version"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.full

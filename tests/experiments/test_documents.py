@@ -15,7 +15,7 @@ PAGES = sorted(
     {*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")}
     - {results.PAGES / f"{name}.md" for name in results.FINISHED}
 )
-COMMAND = re.compile(r"python -m experiments\.([a-z_]+)([^\n#&;]*)")
+COMMAND = re.compile(r"(?<![\w/])nerfies (?!study[`\n])(?:study )?([a-z_]+)([^\n#&;]*)")
 
 
 def commands():
@@ -25,9 +25,9 @@ def commands():
         plain, *fenced = re.split(r"^```", page.read_text(), flags=re.M)
         prose = "".join([plain, *fenced[1::2]])
         spans = re.findall(r"`([^`]+)`", prose)
-        code = [" ".join(span.split()) for span in spans]
-        code += [*re.sub(r"`[^`]+`", "", prose).splitlines(), *fenced[::2]]
-        for name, words in COMMAND.findall("\n".join(code)):
+        code = [*(" ".join(span.split()) for span in spans), *fenced[::2]]
+        comments = re.findall(r"<!--.*?-->", prose)
+        for name, words in COMMAND.findall("\n".join([*code, *comments])):
             # "..." stands for more options; numerics.md has commands in comments
             words = words.replace("...", "").replace("-->", "").strip()
             first_page.setdefault((name, words), page.name)

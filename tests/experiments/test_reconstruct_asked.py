@@ -157,8 +157,8 @@ def test_a_command_that_is_printed_keeps_all_options(source):
     overrides = ("sh_degree=1", "strategy=none")
     config = RunConfig("splats-static", source, 60, overrides, seed=3)
     words = shlex.split(commands.reconstruct(config))
-    assert words[:3] == ["python", "-m", "experiments.reconstruct"]
-    args = cli.parse(reconstruct.Reconstruct, words[3:])
+    assert words[:2] == ["nerfies", "reconstruct"]
+    args = cli.parse(reconstruct.Reconstruct, words[2:])
     assert cli.plain(args.source) == source
     settings = (args.preset, args.steps, args.set, args.seed)
     assert settings == (config.preset, config.steps, config.overrides, config.seed)

@@ -54,7 +54,7 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
     with pytest.raises(SystemExit) as stop:
         results.main(["benchmark", "--measured", str(new)])
     assert stop.value.code == 2
-    assert "not what python -m experiments.benchmark" in capsys.readouterr().err
+    assert "not what nerfies study benchmark" in capsys.readouterr().err
     stored = json.loads((tmp_path / "kept.json").read_text())
     assert stored["benchmarks"] == benchmarks
 

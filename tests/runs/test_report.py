@@ -220,7 +220,7 @@ def test_no_path_of_the_machine_is_on_the_page(
     way = "" if inside else "../../"
     run = "'runs/first run'" if inside else "."
     for words in (
-        f"experiments.render {run} --path orbit",
+        f"nerfies render {run} --path orbit",
         f"--out {run} --resume",
         f"reconstruct '{way}captures/a clip' --preset nerf",
         f"{way}captures/a clip",

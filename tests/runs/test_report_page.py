@@ -38,7 +38,7 @@ def address(tmp_path_factory):
         report.Video(folder / "scene.mp4", WORDS, broad[:60, :80]),
         {"project and blend": 30.0, "rest": 10.0},
         [WORDS],
-        [report.Command("Go on:", f"python -m experiments.render {'x' * 90}")],
+        [report.Command("Go on:", f"nerfies render {'x' * 90}")],
     )
     return path.as_uri()
 
