@@ -15,7 +15,7 @@ PAGES = sorted(
     {*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")}
     - {results.PAGES / f"{name}.md" for name in results.FINISHED}
 )
-COMMAND = re.compile(r"(?<![\w/])nerfies (?!study[`\n])(?:study )?([a-z_]+)([^\n#&;]*)")
+COMMAND = re.compile(r"(?:(?<![\w/])|(?<=bin/))nerfies (?!study[`\n])(?:study )?([a-z_]+)([^\n#&;]*)")
 
 
 def commands():
