@@ -44,9 +44,12 @@ class Reconstruct:
     nerf-w-grid, d-nerf-grid, nerfies-grid, hypernerf-grid and nsff-grid, on feature
     grids, exist with -small only (default: splats-tracked-small, splats-static-small if
     nothing moves, or spacetime-small without tracks if tracking fails)."""
-    effects: Literal["preset", "auto"] = "preset"
-    """auto: inspect the capture first and enable the effects that it needs, in the
-    representation and size of the preset (see nerfies inspect_scene)."""
+    effects: Literal["preset", "auto"] | None = None
+    """auto: inspect the capture first. Without --preset, compensation of exposures and
+    a depth loss are enabled where they are certainly needed, and tried in a short run
+    where they are likely to be. With --preset, all recommendations of
+    nerfies inspect_scene are followed. preset: only what the preset has (default:
+    auto without --preset, preset with it)."""
     steps: int | None = None
     """Training steps. Schedules are stretched with them."""
     seconds: float | None = None

@@ -147,6 +147,11 @@ class Recommendation(NamedTuple):
     advise: Callable[[dict[str, bool | None], bool, str | None], Choice]
     # Preset of a capture if the user names none.
     default_preset: Callable[[Capture], Choice] | None = None
+    # ({effect: True if needed, None if undecided}, spec) -> overrides that enable or
+    # disable effects other than motion
+    effect_overrides: Callable[[dict[str, bool | None], Spec], tuple[str, ...]] = (
+        lambda wanted, spec: ()
+    )
     # By effect, as in `nerfies_jax.preprocessing.findings`.
     prices: Mapping[str, Pair] = MappingProxyType({})
 

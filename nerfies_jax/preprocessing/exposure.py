@@ -1,12 +1,14 @@
 """Exposure and color: test if static points have the same colors in all frames."""
 
+import itertools
+
 import cv2
 import numpy as np
 
 from nerfies_jax.capture.images import linear_from_srgb
 from nerfies_jax.preprocessing import view_set
+from nerfies_jax.preprocessing.findings import DEVIATIONS, Finding, cannot_tell, judge
 from nerfies_jax.preprocessing.findings import LIGHT as EFFECT
-from nerfies_jax.preprocessing.findings import Finding, cannot_tell, judge
 from nerfies_jax.preprocessing.view_set import Views
 
 # An uncorrected gain of a tenth of a stop (7 %, 3 % of a mean sRGB value of 0.5) limits
@@ -46,18 +48,12 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
             EFFECT, f"only {known.sum()} frames show enough static points", threshold
         )
     each = each[:, known]
-    count = np.isfinite(each).sum(0)
+    drift, error = common_drift(each)
     common = np.nanmedian(each, axis=0)
     common = common - common.mean(0)
-    # Standard error of a median over groups: 1.25 times that of their mean.
-    spread = np.nanmedian(np.abs(each - np.nanmedian(each, axis=0)), axis=0) * 1.48
-    error = float(np.sqrt(np.mean((1.25 * spread) ** 2 / count)))
-    total = float(np.sqrt(np.mean(common**2)))
-    drift = float(np.sqrt(max(total**2 - error**2, 0)))
     brightness = float(np.sqrt(np.mean(common.mean(-1) ** 2)))
     tint = float(np.sqrt(np.mean((common - common.mean(-1, keepdims=True)) ** 2)))
-    # Half of it: the error of a root mean square over dozens of frames is less still.
-    wanted, confidence = judge(drift, DRIFT_STOPS, error / 2)
+    wanted, confidence = judge(drift, DRIFT_STOPS, error)
     evidence = (
         f"colors of static points differ by {drift:.3f} stops between frames "
         f"(brightness {brightness:.3f}, color {tint:.3f}), with an error of "
@@ -71,6 +67,39 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
         "points": float(len(points)),
     }
     return Finding(EFFECT, evidence, threshold, wanted, confidence, numbers)
+
+
+def common_drift(gain: np.ndarray) -> tuple[float, float]:
+    """Estimate how much a gain common to all groups of points changes over time.
+
+    Errors of different groups are independent, so the mean product of the gains of two
+    groups is an unbiased estimate of the variance of the common gain, whatever the
+    errors within a group and their correlation over time. The median over all pairs
+    tolerates a group that a moving object hides.
+
+    Args:
+      gain: Gain of each group and frame in stops, [groups, frames, channels]. NaN where
+        it is unknown.
+
+    Returns:
+      Root mean square of the common gain around its mean, in stops, and its standard
+      error in the direction of `DRIFT_STOPS`, from a jackknife over the groups.
+    """
+    centered = gain - np.nanmean(gain, axis=1, keepdims=True)
+    count = len(gain)
+    products = np.full((count, count), np.nan)
+    for first, second in itertools.combinations(range(count), 2):
+        product = centered[first] * centered[second]
+        if np.isfinite(product).any():
+            products[first, second] = np.nanmean(product)
+    variance = np.nanmedian(products)
+    others = [np.delete(np.arange(count), index) for index in range(count)]
+    without = [np.nanmedian(products[np.ix_(kept, kept)]) for kept in others]
+    error = np.sqrt((count - 1) * np.var(without))
+    drift = np.sqrt(max(variance, 0))
+    sign = -1 if drift > DRIFT_STOPS else 1
+    bound = np.sqrt(max(max(variance, 0) + sign * DEVIATIONS * error, 0))
+    return float(drift), float(abs(bound - drift) / DEVIATIONS)
 
 
 def sightings(views: Views, points: np.ndarray) -> np.ndarray:

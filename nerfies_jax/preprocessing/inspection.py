@@ -3,7 +3,9 @@
 import dataclasses
 import pathlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +21,18 @@ from nerfies_jax.preprocessing import (
     transient,
     view_set,
 )
-from nerfies_jax.preprocessing.findings import Finding
+from nerfies_jax.preprocessing.findings import (
+    BACKGROUND,
+    DEPTH,
+    LENS,
+    LIGHT,
+    MASKS,
+    MOTION,
+    START,
+    TEXTURE,
+    TRANSIENT,
+    Finding,
+)
 from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.runtime import events
@@ -64,33 +77,80 @@ def inspect(
       The findings.
     """
     began = time.perf_counter()
+    read = _read(capture, folder, tell)
+    findings = _findings(read, EFFECTS)
+    with events.stage("drawing the contact sheet"):
+        sheet = contact_sheet.followed(read.views, read.evidence)
+    seconds = time.perf_counter() - began
+    factor = read.evidence.factor
+    return Inspection(findings, sheet, factor, seconds, read.views, read.evidence)
+
+
+def find(
+    capture: Capture, effects: Collection[str], folder: pathlib.Path | None = None
+) -> tuple[Finding, ...]:
+    """Inspect a capture for some effects only.
+
+    Args:
+      capture: The capture.
+      effects: Names of the effects, of `EFFECTS`.
+      folder: Cache folder of preprocessing. None for no cache.
+
+    Returns:
+      Their findings.
+
+    Raises:
+      ValueError: If there is no effect with such a name.
+    """
+    unknown = set(effects) - set(EFFECTS)
+    if unknown:
+        raise ValueError(
+            f"{min(unknown)!r} is no effect of an inspection; there are "
+            f"{', '.join(EFFECTS)}"
+        )
+    return _findings(_read(capture, folder), effects)
+
+
+class _Read(NamedTuple):
+    """Data of an inspection."""
+
+    capture: Capture
+    looked: Capture  # at the size of preprocessing
+    views: Views
+    evidence: Evidence
+    points: np.ndarray  # of the capture, [points, 3]
+    static: np.ndarray  # the same, or of preprocessing where the capture has none
+
+
+def _read(capture, folder, tell=lambda part: None):
     if folder is None:
         evidence = record.gather(capture, tell=tell)
     else:
         evidence = record.cached(capture, folder, tell=tell)
     looked = record.looked_at(capture, evidence.factor)
-    views = view_set.in_time_order(looked)
     points = view_set.own_points(looked)
-    rest = points
+    static = points
     if not len(points) and not evidence.unusable:
-        rest = view_set.some(evidence.still.position)
-    findings = _findings(capture, looked, views, evidence, points, rest)
-    with events.stage("drawing the contact sheet"):
-        sheet = contact_sheet.followed(views, evidence)
-    seconds = time.perf_counter() - began
-    return Inspection(findings, sheet, evidence.factor, seconds, views, evidence)
+        static = view_set.some(evidence.still.position)
+    views = view_set.in_time_order(looked)
+    return _Read(capture, looked, views, evidence, points, static)
+
+
+EFFECTS: Mapping[str, Callable[[_Read], Finding]] = MappingProxyType(
+    {
+        MOTION: lambda x: motion.motion(x.views, x.evidence),
+        LIGHT: lambda x: exposure.exposure(x.views, x.static),
+        TRANSIENT: lambda x: transient.transient(x.views, x.evidence),
+        START: lambda x: scene_points.start(x.looked, x.views, x.evidence, x.points),
+        BACKGROUND: lambda x: scene_points.background(x.views, x.evidence, x.points),
+        DEPTH: lambda x: stored.depth(x.looked, x.views, x.evidence),
+        MASKS: lambda x: stored.masks(x.looked, x.evidence),
+        LENS: lambda x: stored.lens(x.capture),
+        TEXTURE: lambda x: texture.texture(x.looked, x.views, x.evidence.factor),
+    }
+)
 
 
 @events.stage("deciding on effects")
-def _findings(capture, looked, views, evidence, points, rest):
-    return (
-        motion.motion(views, evidence),
-        exposure.exposure(views, rest),
-        transient.transient(views, evidence),
-        scene_points.start(looked, views, evidence, points),
-        scene_points.background(views, evidence, points),
-        stored.depth(looked, views, evidence),
-        stored.masks(looked, evidence),
-        stored.lens(capture),
-        texture.texture(looked, views, evidence.factor),
-    )
+def _findings(read, effects):
+    return tuple(find(read) for name, find in EFFECTS.items() if name in effects)

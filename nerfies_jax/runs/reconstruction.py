@@ -14,6 +14,7 @@ from nerfies_jax.preprocessing import inspection, record
 from nerfies_jax.runs import (
     adviser,
     commands,
+    effect_choice,
     plan,
     preparation,
     products,
@@ -62,7 +63,7 @@ def reconstruct(
     config: RunConfig,
     out: str | pathlib.Path | None = None,
     *,
-    effects: Literal["preset", "auto"] = "preset",
+    effects: Literal["preset", "auto"] | None = None,
     seconds: float | int | None = None,
     evaluate_every: float | int = 20.0,
     checkpoint_every: float | int = 60.0,
@@ -81,7 +82,9 @@ def reconstruct(
     Args:
       config: Settings of the run.
       out: A new folder for everything. None for `runs/CAPTURE-PRESET`.
-      effects: "preset", or "auto" to enable the effects that the capture needs.
+      effects: "auto" to enable the effects that the capture needs, or "preset" for
+        those of the preset. None for "preset" if `config` names a preset, and "auto" if
+        not.
       seconds: Time budget in seconds of training. It determines the number of steps. If
         `config` sets that number, training ends early when the budget is spent.
       evaluate_every: Seconds of training between two evaluations.
@@ -245,16 +248,18 @@ def _sets_steps(config):
 
 
 def _new_run(config, effects):
-    if config.preset is not None and effects == "preset":
+    if config.preset is not None and effects != "auto":
         return new_run(config)
     stored = stored_capture(config.source, config.seed)
     chosen, lines = config, []
     if config.preset is None:
         chosen, lines = adviser.by_tracks(config, stored)
-    if effects == "auto":
+        if effects != "preset":
+            chosen, more = effect_choice.choose(chosen, stored, config.overrides)
+            lines += more
+    else:
         findings = inspection.inspect(stored, CACHE / "evidence").findings
-        chosen, more = adviser.follow(chosen, config.overrides, findings)
-        lines += more
+        chosen, lines = adviser.follow(chosen, config.overrides, findings)
     console.say("\n".join(lines))
     return new_run(chosen, stored)
 

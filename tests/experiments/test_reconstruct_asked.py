@@ -189,7 +189,10 @@ def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
     monkeypatch.setattr(reconstruction, "new_run", caught)
     with pytest.raises(SystemExit):
         reconstruct.main(
-            [str(tmp_path / "film"), "--effects", "auto", "--set", "sh_degree=0"]
+            [
+                *(str(tmp_path / "film"), "--preset", "splats-deformable-small"),
+                *("--effects", "auto", "--set", "sh_degree=0"),
+            ]
         )
     assert taken["config"].preset == "splats-static-small"
     assert taken["config"].overrides[-1] == "sh_degree=0"

@@ -6,7 +6,7 @@ import functools
 import numpy as np
 import pytest
 
-from nerfies_jax.preprocessing import findings, motion, texture
+from nerfies_jax.preprocessing import exposure, findings, motion, texture
 from nerfies_jax.preprocessing import inspection as inspect_job
 from nerfies_jax.preprocessing import stored as inspect_stored
 from nerfies_jax.preprocessing.findings import CANNOT_TELL, CERTAIN, LIKELY
@@ -99,6 +99,23 @@ def test_a_drifting_exposure_is_told_from_motion():
     stops = inspected.finding("appearance codes").numbers["drift_stops"]
     # The film is coded by a power of 1/2.2 and read as sRGB: some 3 % apart.
     assert stops == pytest.approx(truth, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("drift", "noise", "wanted"),
+    [(0.22, 0.3, True), (0.22, 0.1, True), (0.0, 0.3, False), (0.0, 0.02, False)],
+)
+def test_exposure_drift_is_separated_from_errors_of_single_groups(drift, noise, wanted):
+    rng = np.random.default_rng(0)
+    walk = np.cumsum(rng.normal(size=87))
+    common = drift * (walk - walk.mean()) / walk.std()
+    errors = noise * rng.normal(size=(exposure.GROUPS, 87, 3))
+    errors[2, 20:] += 1.0  # an object hides this group for most of the video
+    errors[4, :10] = np.nan
+    found, error = exposure.common_drift(common[None, :, None] + errors)
+    assert abs(found**2 - drift**2) < 0.02**2 + 3 * error * (found + drift)
+    decision, _ = findings.judge(found, exposure.DRIFT_STOPS, error)
+    assert decision is wanted
 
 
 @pytest.mark.full

@@ -1,0 +1,86 @@
+"""Effects that a new run gets, and those that the user keeps out."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from nerfies_jax import runs
+from nerfies_jax.preprocessing.findings import CANNOT_TELL, CERTAIN, LIKELY, Finding
+from nerfies_jax.runs import effect_choice
+from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runs.effect_choice import Trial
+from tests import scenes
+
+EXPOSURE, DEPTH = "exposure.learning_rate=0.01", "depth.weight=0.1"
+
+
+@pytest.fixture
+def chosen(monkeypatch):
+    """Choose effects for given findings; returns the overrides, lines and trials."""
+
+    def choose(light, depth, gain=0.0, user=()):
+        found = []
+        for effect, answer in (("appearance codes", light), ("depth", depth)):
+            wanted = None if answer == CANNOT_TELL else True
+            found.append(Finding(effect, "numbers", "bound", wanted, answer))
+        monkeypatch.setattr(
+            effect_choice.inspection, "find", lambda *args: tuple(found)
+        )
+        tried = []
+
+        def try_out(config, overrides, capture):
+            tried.append(overrides)
+            return Trial(300, 8, 20.0, 20.0 + gain)
+
+        capture = scenes.tiny_capture()
+        config = RunConfig("splats-tracked-small", overrides=("motion.bases=12", *user))
+        config, lines = effect_choice.choose(config, capture, user, try_out)
+        assert config.overrides[0] == "motion.bases=12"
+        assert config.overrides[len(config.overrides) - len(user) :] == user
+        return config.overrides[1 : len(config.overrides) - len(user)], lines, tried
+
+    return choose
+
+
+def test_certain_effects_are_enabled_and_undecided_ones_are_not(chosen):
+    overrides, lines, tried = chosen(CERTAIN, CANNOT_TELL)
+    assert overrides == (EXPOSURE,)
+    assert not tried
+    assert lines == [f"effects: {EXPOSURE}, for appearance codes (certain: numbers)"]
+
+
+@pytest.mark.parametrize(("gain", "kept"), [(0.3, True), (0.05, False), (-1, False)])
+def test_likely_effects_are_enabled_if_a_trial_pays(chosen, gain, kept):
+    overrides, (line,), tried = chosen(CANNOT_TELL, LIKELY, gain)
+    assert tried == [(DEPTH,)]
+    assert overrides == ((DEPTH,) if kept else ())
+    assert f"20.00 dB without and {20 + gain:.2f} dB with" in line
+    assert line.startswith("effects: not") == (not kept)
+
+
+@pytest.mark.parametrize("setting", ["exposure=none", "exposure.learning_rate=0.1"])
+def test_components_set_by_the_user_are_kept(chosen, setting):
+    assert chosen(CERTAIN, CERTAIN, user=(setting,))[0] == (DEPTH,)
+
+
+@pytest.mark.parametrize("frames", [2, 5, 6, 60, 1000])
+def test_frames_left_out_of_a_trial_are_spread(frames):
+    train = np.arange(frames) * 3 + 1
+    rows = effect_choice.left_out(train)
+    assert 1 <= len(set(rows)) == len(rows) <= min(8, frames - 1)
+    assert set(rows) <= set(train)
+
+
+@pytest.mark.full
+def test_a_trial_finds_that_exposures_pay_where_brightness_alternates():
+    capture = scenes.tiny_capture()
+    gain = np.where(np.arange(len(capture.images)) % 2, 1.0, 0.5)
+    images = (capture.images * gain[:, None, None, None]).astype(np.uint8)
+    capture = dataclasses.replace(capture, images=images)
+    config = RunConfig("splats-static-small", steps=60)
+    before = runs.new_run(config, capture).capture.images.copy()
+    trial = effect_choice.compare(config, (EXPOSURE,), capture)
+    assert trial.steps == 60
+    assert trial.pays
+    np.testing.assert_array_equal(capture.images, before)
