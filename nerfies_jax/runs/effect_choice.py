@@ -134,15 +134,12 @@ def compare(config: RunConfig, overrides: tuple[str, ...], capture: Capture) -> 
     """
     changed = dataclasses.replace(config, overrides=(*config.overrides, *overrides))
     with events.stage(f"trying {' '.join(overrides)}"):
-        runs = [new_run(config, capture), new_run(changed, capture)]
-        scorer = runs[1]
-        scores = []
-        for run in runs:
-            run = with_steps(run, _steps(run))
-            rows = left_out(run.capture.train)
-            state = _trained(run, rows)
-            scores.append(_score(run, scorer, state, rows))
-    return Trial(run.spec.steps, len(rows), *scores)
+        short = [_short_run(each, capture) for each in (config, changed)]
+        rows = left_out(short[0].capture.train)
+        without, with_effect = (
+            _score(run, short[1], _trained(run, rows), rows) for run in short
+        )
+    return Trial(short[0].spec.steps, len(rows), without, with_effect)
 
 
 def left_out(train: np.ndarray) -> np.ndarray:
@@ -159,11 +156,12 @@ def left_out(train: np.ndarray) -> np.ndarray:
     return train[places.astype(int)]
 
 
-def _steps(run: Run) -> int:
-    """Return the number of steps of a trial, fewer for large images."""
+def _short_run(config: RunConfig, capture: Capture) -> Run:
+    """Return a run with the steps of a trial, fewer for large images."""
+    run = new_run(config, capture)
     width, height = run.capture.size
     steps = round(STEPS * min(PIXELS / (width * height), 1))
-    return min(max(steps, MIN_STEPS), run.spec.steps)
+    return with_steps(run, min(max(steps, MIN_STEPS), run.spec.steps))
 
 
 def _trained(run: Run, rows: np.ndarray):
@@ -180,13 +178,14 @@ def _trained(run: Run, rows: np.ndarray):
     return result.state
 
 
-def _score(run: Run, scorer: Run, state, rows: np.ndarray) -> float:
+def _score(run: Run, fitted_as: Run, state, rows: np.ndarray) -> float:
     """Return the PSNR of frames, by the protocol of another run of the capture."""
-    halves = run.representation.scoring.score_halves(
-        scorer.spec, scorer.metadata, state, run.capture, rows
+    size = run.capture.size
+    scorer = run.representation.scoring.half_scorer(
+        fitted_as.spec, fitted_as.metadata, size
     )
-    if halves is not None:
-        return evaluation.known_mean(halves.psnr)
-    renderer = Renderer(run.model, run.capture.size)
+    if scorer is not None:
+        return evaluation.known_mean(scorer(state, run.capture, rows).psnr)
+    renderer = Renderer(run.model, size)
     scored = evaluation.score(renderer, state, run.capture, rows)
     return evaluation.known_mean(scored.psnr)

@@ -59,13 +59,13 @@ def test_a_still_scene_gets_no_motion_and_a_moving_one_gets_it():
 
 
 def test_advice_is_followed_but_for_what_the_user_sets():
-    wanted = RunConfig("splats-static-small", overrides=("depth.weight=0.5",))
-    answers = findings(motion=True, depth=True)
+    wanted = RunConfig("splats-static-small", overrides=("exposure.learning_rate=0.5",))
+    answers = findings(motion=True, appearance_codes=True)
     config, lines = adviser.follow(wanted, wanted.overrides, answers)
     assert config.preset == "splats-tracked-small"
-    assert config.overrides == ("depth.weight=0.1", "depth.weight=0.5")
+    assert config.overrides == ("exposure.learning_rate=0.01", "exposure.learning_rate=0.5")
     assert any(line.split()[:3] == ["motion", "yes", "certain"] for line in lines)
-    assert "effects: --preset splats-tracked-small --set depth.weight=0.1" in lines
+    assert "effects: --preset splats-tracked-small --set exposure.learning_rate=0.01" in lines
 
 
 @pytest.mark.parametrize("motion", [None, False, True])

@@ -7,7 +7,7 @@ import pytest
 
 from nerfies_jax import runs
 from nerfies_jax.preprocessing.findings import CANNOT_TELL, CERTAIN, LIKELY, Finding
-from nerfies_jax.runs import effect_choice
+from nerfies_jax.runs import effect_choice, representations
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.effect_choice import Trial
 from tests import scenes
@@ -34,9 +34,9 @@ def chosen(monkeypatch):
             return Trial(300, 8, 20.0, 20.0 + gain)
 
         capture = scenes.tiny_capture()
-        config = RunConfig("splats-tracked-small", overrides=("motion.bases=12", *user))
+        config = RunConfig("splats-static-small", overrides=("sh_degree=1", *user))
         config, lines = effect_choice.choose(config, capture, user, try_out)
-        assert config.overrides[0] == "motion.bases=12"
+        assert config.overrides[0] == "sh_degree=1"
         assert config.overrides[len(config.overrides) - len(user) :] == user
         return config.overrides[1 : len(config.overrides) - len(user)], lines, tried
 
@@ -62,6 +62,17 @@ def test_likely_effects_are_enabled_if_a_trial_pays(chosen, gain, kept):
 @pytest.mark.parametrize("setting", ["exposure=none", "exposure.learning_rate=0.1"])
 def test_components_set_by_the_user_are_kept(chosen, setting):
     assert chosen(CERTAIN, CERTAIN, user=(setting,))[0] == (DEPTH,)
+
+
+def test_splats_whose_motion_starts_from_tracks_get_no_depth_loss():
+    wanted = {"depth": True, "appearance codes": True}
+    kind = representations.of_preset("splats-tracked-small")
+    for preset, expected in (
+        ("splats-tracked-small", (EXPOSURE,)),
+        ("splats-static-small", (EXPOSURE, DEPTH)),
+    ):
+        overrides = kind.recommendation.effect_overrides(wanted, kind.presets[preset])
+        assert overrides == expected
 
 
 @pytest.mark.parametrize("frames", [2, 5, 6, 60, 1000])
