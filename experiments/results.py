@@ -109,12 +109,6 @@ STUDIES = {
         "speed.effects_page",
         "nerfies_jax/runs/effect_cost.json",
     ),
-    "player_speed": Study(
-        "frames of the browser player",
-        "speed player PLAYER.html --gsplat INDEX.es.js",
-        "speed.player",
-        "speed.player",
-    ),
     "fuzz": _package("damaged files", "fuzz --mutations 1000000"),
     "mutants": _package("faults that the tests detect", "mutants --count 44"),
     "mutants_unseen": _package("the same, other faults", "mutants --count 24 --seed 1"),
@@ -147,10 +141,13 @@ FINISHED = {
     "capture_checks": "consistency checks of good captures",
     "capture_cost": "memory of frames, cost of decoders",
     "faults": "signals, full disks, closed pipes",
+    "player_speed": "frames of the browser player",
 }
 # The last revision with the code of each.
 REVISIONS = dict.fromkeys(FINISHED, "99f3f69")
-REVISIONS |= dict.fromkeys(("capture_checks", "capture_cost", "faults"), "566f225")
+REVISIONS |= dict.fromkeys(
+    ("capture_checks", "capture_cost", "faults", "player_speed"), "566f225"
+)
 
 
 @dataclasses.dataclass(frozen=True)

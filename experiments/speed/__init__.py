@@ -1,1 +1,1 @@
-"""Time and memory of training, rendering and the player."""
+"""Time and memory of training and rendering."""

@@ -1,18 +1,16 @@
-"""Time of training steps, effects, the rasterizer, the default command and the player.
+"""Time of training steps, effects, the rasterizer and the default command.
 
     nerfies study speed steps                       # every small preset
     nerfies study speed effects --presets sonata-small
     nerfies study speed raster 10000@256x256 --reference PATH/run.py
     nerfies study speed job --compare CHECKOUT
-    nerfies study speed player PLAYER.html --gsplat INDEX.es.js
     nerfies study speed steps --check BEFORE/speed.json
 
 `steps` times every preset in two fresh processes, one that sees one core and one with
 the cores that its step is made for. `job` times the README's first command with empty
 caches, and `--compare` that of another checkout between two of this one. `raster` times
 the rasterizer, and `--reference` another one on the same scene. Times of these three
-are wall clock, so leave the machine idle. `effects` and `player` are described on their
-own pages.
+are wall clock, so leave the machine idle. `effects` is described on its own page.
 
 Earlier results in --out stay where they are not repeated. `--check` compares with an
 earlier file and ends with exit code 1 if a number is worse than its tolerance: a
@@ -32,7 +30,7 @@ from experiments.speed import raster
 from nerfies_jax.runs import representations
 from nerfies_jax.runtime import children, console
 
-STORED, EFFECTS, PLAYER = "speed.json", "effect_cost.json", "player_speed.json"
+STORED, EFFECTS = "speed.json", "effect_cost.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,33 +101,7 @@ class Job(_Stored):
     """Checkout of another revision of the library to compare with."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Player:
-    """Time frames of the browser player, and of gsplat.js on the same Gaussians."""
-
-    pages: cli.Positional[tuple[pathlib.Path, ...]]
-    """Pages that runs of splats have written (player.html)."""
-    gsplat: pathlib.Path | None = None
-    """Its module, node_modules/gsplat/dist/index.es.js after `npm install gsplat`."""
-    size: int = 600
-    """Width and height of the canvases, in pixels."""
-    time: float = 0.5
-    """Time of the scene to render, from 0 to 1."""
-    frames: int = 4
-    """Frames in a row of one player."""
-    rounds: int = 9
-    """Rounds of measurements, in which the players take turns."""
-    out: pathlib.Path = pathlib.Path("runs/speed")
-    """Folder of the results."""
-
-    def __post_init__(self):
-        if min(self.size, self.frames, self.rounds) < 1 or not 0 <= self.time <= 1:
-            raise ValueError(
-                "--size, --frames and --rounds are at least 1, --time is from 0 to 1"
-            )
-
-
-@cli.command(Steps | Effects | Raster | Job | Player)
+@cli.command(Steps | Effects | Raster | Job)
 def main(args):
     """Measure and store. Wrong input ends with exit code 2."""
     from nerfies_jax.metrics import baselines
@@ -154,11 +126,9 @@ def main(args):
 
 def _check_files(args):
     """Raise ValueError if a file or folder that options name does not exist."""
-    files = [*getattr(args, "pages", ())]
-    files += [getattr(args, "gsplat", None), getattr(args, "reference", None)]
-    for path in filter(None, files):
-        if not path.is_file():
-            raise ValueError(f"{path}: no such file")
+    reference = getattr(args, "reference", None)
+    if reference is not None and not reference.is_file():
+        raise ValueError(f"{reference}: no such file")
     checkout = getattr(args, "compare", None)
     if checkout is not None and not (checkout / "experiments").is_dir():
         raise ValueError(f"--compare {checkout}: no checkout of this library")
@@ -241,21 +211,11 @@ def _effects(args):
     return effects.measure_all(args, args.out / EFFECTS)
 
 
-def _player(args):
-    from experiments.speed import player
-
-    path = args.out / PLAYER
-    rows, machine = player.measure(args)
-    records.write(path, {"rows": rows}, machine)
-    return path
-
-
 MEASURES = {
     Steps: _steps,
     Effects: _effects,
     Raster: _raster,
     Job: _job,
-    Player: _player,
 }
 
 if __name__ == "__main__":
