@@ -141,7 +141,7 @@ def _of_stretches(form):
 _LEAST = np.array([1e-5, 1e-4, 1e-3, 9.99e-3, 1.001e-2, 2e-2, 0.1, 0.5])
 COLLAPSE = Case(
     name="a direction that collapses",
-    breaks="JᵀJ loses stretches below 3e-4; log 0, or a clamp without slope",
+    breaks="JᵀJ loses stretches below 3e-4; log 0, or a clamp without gradient",
     formula="one-sided Jacobi on J itself; tangent of the logarithm",
     switch=f"stretch = {matrix3.COLLAPSED:g}",
     axis="least stretch",

@@ -140,7 +140,7 @@ _OPENING = np.array(
 )
 WINDOW = Case(
     name="window of a band that opens",
-    breaks="½(1 - cos πa) cancels: 0 below a = 1e-4, a slope that is not 0 at 0",
+    breaks="½(1 - cos πa) cancels: 0 below a = 1e-4, a gradient that is not 0 at 0",
     formula="sin²(πa/2) by the same polynomial",
     switch="quadrant, a = ½",
     axis="bands open, a",
@@ -179,8 +179,8 @@ def _exact_contraction(x):
 _DISTANCES = _with_negatives([0, 1e-30, 1e-8, 0.5, *sides(1.0), 2, 100, 1e8, 1e30])
 CONTRACTION = Case(
     name="contraction of space",
-    breaks="(2 - 1/|x|) x/|x| in the branch not taken: NaN slope at the center",
-    formula="the norm held at one there, x / |x| before the factor",
+    breaks="(2 - 1/|x|) x/|x| in the branch not taken: NaN gradient at the center",
+    formula="the norm clamped at one there, x / |x| before the factor",
     switch="the box, |x| = 1",
     axis="|x|",
     at=_DISTANCES,

@@ -99,7 +99,7 @@ _OFFSET = 20 * _ALONG + 0.4 * _ACROSS  # px
 
 NEEDLE = Case(
     name="Gaussian of a needle",
-    breaks="ac - b² has no digit left from 3000 px: values above 1, infinite slopes",
+    breaks="ac - b² has no digit left from 3000 px: values above 1, infinite gradients",
     formula="u = p dx, v = r (dy - k dx); c - b²/a as a sum of squares",
     axis="length / px",
     at=_LENGTHS,

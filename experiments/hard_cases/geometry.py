@@ -88,7 +88,7 @@ _DEPTHS = np.array(
 )
 NEAR_PLANE = Case(
     name="point at or behind the camera",
-    breaks="x/z is infinite at 0, and behind the camera lands inside the picture",
+    breaks="x/z is infinite at 0, and behind the camera lands inside the image",
     formula="depth at least 1e-4 of the lateral offset and 1e-12",
     switch=f"slope = {cameras.MAX_SLOPE:g}",
     axis="z / scene units",
@@ -169,7 +169,7 @@ def _exact_span(direction):
 _SLANTS = np.array([0, 1e-38, 1e-30, 1e-20, 1e-10, 1e-3, 0.25])
 BOX = Case(
     name="ray along a face of the box",
-    breaks="0/0 in the plane of a face; slopes of quotients by 1e-20 overflow",
+    breaks="0/0 in the plane of a face; gradients of quotients by 1e-20 overflow",
     formula="components without motion cross nothing",
     switch=f"component = {rays.PARALLEL:g}",
     axis="component across",

@@ -36,7 +36,7 @@ def _exact_sq(r):
 
 GEMAN = Case(
     name="Geman-McClure of a vector",
-    breaks="a length has no slope at 0; 2 - 2/(1 + u) is 0 below u = 1e-8",
+    breaks="a length has no gradient at 0; 2 - 2/(1 + u) is 0 below u = 1e-8",
     formula="2u/(1 + u) of u = |r|²/4c², 1/(1 + 1/u) above; derivative 1/(1 + u)²",
     switch="u = 1",
     **_along([0, 1e-15, 1e-9, 1e-6, 1e-3, *_sides(2 * WIDTH), 1, 1e3, 1e6, 1e15]),
@@ -87,7 +87,7 @@ def _exact_huber(r):
 
 HUBER = Case(
     name="Huber of a vector",
-    breaks="the length has no slope at 0",
+    breaks="the length has no gradient at 0",
     formula="s / 2 of the squared length; the root is taken of what is above",
     switch="|r| = c",
     **_along([0, 1e-15, 1e-9, 1e-3, *_sides(WIDTH), 1, 1e3, 1e6, 1e15]),
@@ -102,8 +102,8 @@ _ERRORS = np.array([0, 1e-30, *_sides(1e-10), 1e-8, 1e-4, 0.1, 10, 1e6])
 
 
 PSNR = Case(
-    name="PSNR of equal pictures",
-    breaks="log of 0; log(mse + 1e-10) reads 79.957 dB for 80, slope -4e10 at 0",
+    name="PSNR of equal images",
+    breaks="log of 0; log(mse + 1e-10) reads 79.957 dB for 80, gradient -4e10 at 0",
     formula="log of max(mse, 1e-10)",
     switch="mse = 1e-10",
     axis="mean squared error",
@@ -144,7 +144,7 @@ def _exact_uncertain(x):
 
 NERF_W = Case(
     name="NeRF-W's loss over its raw β",
-    breaks="log(1 + exp(x)) is infinite from x = 89 (709), 0 / ∞ in its slope",
+    breaks="log(1 + exp(x)) is infinite from x = 89 (709), 0 / ∞ in its gradient",
     formula="softplus by logaddexp, β_min added, r / β squared",
     axis="raw β",
     at=_RAW,
@@ -172,7 +172,7 @@ def _exact_srgb(light):
 
 SRGB = Case(
     name="sRGB at black",
-    breaks="the slope of the power is infinite at 0, and `where` multiplies it by 0",
+    breaks="the gradient of the power is infinite at 0, and `where` multiplies it by 0",
     formula="the power sees 1 where the line is taken",
     switch="light = 0.0031308",
     axis="linear light",

@@ -30,7 +30,7 @@ def _exact_sparsity(x):
 
 SPARSITY = Case(
     name="trajectories that a Gaussian at rest uses",
-    breaks="sum |c| / max |c| is 0/0; its slope at 1e-12 is 1e12",
+    breaks="sum |c| / max |c| is 0/0; its gradient at 1e-12 is 1e12",
     formula="1e-3, which moves nothing, added to the denominator",
     axis="largest coefficient",
     at=_SIZES,
@@ -65,9 +65,9 @@ def _exact_visible(x):
 VISIBLE = Case(
     name="opacity over time of any width",
     breaks="s / w is 0/0 once the width has underflowed, at -104 (-745)",
-    formula="exp(-(s e^-w)²), the logarithm of the width held to ±9",
+    formula="exp(-(s e^-w)²), the logarithm of the width clamped to ±9",
     switch="-9 and 9",
-    axis="logarithm of the width, films",
+    axis="logarithm of the width, videos",
     at=_WIDTHS[:, 1],
     points=_WIDTHS,
     stable=_visible,
@@ -81,8 +81,8 @@ VISIBLE = Case(
 _PLACES = np.array([0.0, 0.5, 1 - 2.0**-20, 1.0, 1 + 2.0**-20, 1.5, 1e6])
 UNREST = Case(
     name="distance of a plane of time from one",
-    breaks="planes start at one, where |1 - p| has the slope 1: all go the same way",
-    formula="(p - 1) sign(p - 1), whose slope there is 0",
+    breaks="planes start at one, where |1 - p| has the gradient 1: all go the same way",
+    formula="(p - 1) sign(p - 1), whose gradient there is 0",
     switch="1",
     axis="feature",
     at=_PLACES,
@@ -122,7 +122,7 @@ def _exact_shares(x):
 SHARES = Case(
     name="nodes far from what they carry",
     breaks="exp(-d²/2r²) over their sum is 0/0 from 13 radii (38) on",
-    formula="softmax of -d² e^-2l / 2, l = log r held to -20 .. 15",
+    formula="softmax of -d² e^-2l / 2, l = log r clamped to -20 .. 15",
     switch="-20 and 15",
     axis="distance, in distances of nodes",
     at=np.repeat(_AWAY, len(_RADII)),

@@ -53,8 +53,8 @@ _PLACES = np.array(
 )
 OUTSIDE = Case(
     name="KAN input outside its grid",
-    breaks="kernels are 1e-11 five spacings outside: value and slope vanish",
-    formula="held to w/√2 beyond the end by 1 - 1/√(1 + 2e + 3e²)",
+    breaks="kernels are 1e-11 five spacings outside: value and gradient vanish",
+    formula="clamped to w/√2 beyond the end by 1 - 1/√(1 + 2e + 3e²)",
     switch="the ends of the grid",
     axis="x, grid 0 to 7",
     at=_PLACES,
@@ -126,8 +126,8 @@ _WIDTHS = np.array(
 )
 WIDTH = Case(
     name="KAN kernel of a trained width",
-    breaks="(x - μ)² over a squared width: 0/0 below 1e-20, slopes before",
-    formula="((x - μ) e^-s)², s held to ±10 of its start",
+    breaks="(x - μ)² over a squared width: 0/0 below 1e-20, gradients before",
+    formula="((x - μ) e^-s)², s clamped to ±10 of its start",
     switch="s = ±10",
     axis="s, the width's logarithm",
     at=_WIDTHS[:, 1],
@@ -305,10 +305,10 @@ _SLOPES = np.array(
     [[3, g] for g in (1e-30, 1e-20, 1e-18, 1e-15, 1e-10, 1e-8, 1e-4, 1, 1e10, 1e18)]
 )
 SIZE = NEWBORN._replace(
-    name="Adam's update for a slope of any size",
-    breaks="eps 1e-8 halves the step where slopes are 1e-8; 1e-3 of it at 1e-11",
+    name="Adam's update for a gradient of any size",
+    breaks="eps 1e-8 halves the step where gradients are 1e-8; 1e-3 of it at 1e-11",
     formula="eps 1e-15",
-    axis="slope",
+    axis="gradient",
     at=_SLOPES[:, 1],
     points=_SLOPES,
     textbook=lambda x: _update_at(x[:1], x),

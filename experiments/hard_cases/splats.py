@@ -172,8 +172,8 @@ def _exact_variance(log_scale):
 
 LOG_SCALE = Case(
     name="variance of a log-scale",
-    breaks="exp(s)² is infinite from 45 (355), and its slope NaN",
-    formula="exp(clip(s, -20, 15)); no slope outside",
+    breaks="exp(s)² is infinite from 45 (355), and its gradient NaN",
+    formula="exp(clip(s, -20, 15)); no gradient outside",
     switch="-20 and 15",
     axis="log-scale",
     at=_LOGS,

@@ -57,9 +57,9 @@ def _exact_direction(vector):
 
 NORMALS = Case(
     name="normals where density is next to level",
-    breaks="the square of a slope of 1e-24 is 0 and of 1e20 infinite",
+    breaks="the square of a gradient of 1e-24 is 0 and of 1e20 infinite",
     formula="divided by the largest entry first",
-    axis="length of the slope",
+    axis="length of the gradient",
     **_times([1e-24, 1e-22, 1e-6, 1, 1e10, 1e20, 1e30], [0.5, -1, 0.25]),
     stable=surface.unit,
     textbook=lambda vector: vector / jnp.sqrt(jnp.sum(vector * vector)),
@@ -130,7 +130,7 @@ def _exact_expected(weights):
 _EDGE = EMPTY_BELOW / 4
 DISTANCE = Case(
     name="expected distance of an empty ray",
-    breaks="0/0, and a slope that grows as 1/opacity",
+    breaks="0/0, and a gradient that grows as 1/opacity",
     formula="opacity below 1e-3 is filled up at the far end",
     switch="opacity 1e-3",
     axis="opacity / 4",

@@ -1,12 +1,11 @@
-"""Small optimization problems for a trained field: cameras and latent codes.
+"""Fit latent codes of a trained field to a loss, with a choice of solvers.
 
-Inverse warps are in `tracks`. The functions take plain functions, run under `jit`, and
-report convergence by a flag, never by an exception. The flag is computed from the
-result, because solvers report only on their last step. jaxopt is imported in this file
-only. jaxopt and optimistix are imported when one of their solvers is used.
+Inverse warps are in `tracks`, and cameras in `evaluation.fitted_cameras`. Convergence
+is reported by a flag, never by an exception. The flag is computed from the result,
+because solvers report only on their last step. jaxopt is imported in this file only.
+jaxopt and optimistix are imported when one of their solvers is used.
 """
 
-import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Mapping
@@ -18,9 +17,6 @@ import jax.numpy as jnp
 import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
-
-from nerfies_jax.geometry.camera import Camera, move
-from nerfies_jax.geometry.precision import exact_product
 
 PyTree = Any
 Scalar = Float[Array, ""]
@@ -59,103 +55,6 @@ def counted(steps) -> Int[Array, "*batch"]:
       The counts as int32, [...].
     """
     return jnp.asarray(steps, jnp.int32)
-
-
-@dataclasses.dataclass(frozen=True)
-class CameraSpec:
-    """Settings of the refinement of a camera, and its convergence criteria.
-
-    A fit has converged if one more Gauss-Newton step would rotate the camera by less
-    than `tolerance` (in rad, and for other unknowns by the equivalent change of the
-    residuals), if the residuals determine all unknowns, and if their root mean square
-    is at most `max_residual`. Set this bound wherever wrong local minima exist, because
-    the other criteria hold there too.
-    """
-
-    unknowns: tuple[str, ...] = ("angular", "linear")  # and "focal"
-    tolerance: float = 1e-5  # rad
-    max_residual: float = math.inf  # in units of the residuals
-    max_steps: int = 64
-
-    def __post_init__(self):
-        check_positive(tolerance=self.tolerance, max_steps=self.max_steps)
-        if not self.max_residual > 0:
-            raise ValueError(f"max_residual={self.max_residual} must be positive")
-        unknown = set(self.unknowns) - set(_WIDTHS)
-        if unknown or not self.unknowns or len(set(self.unknowns)) < len(self.unknowns):
-            raise ValueError(
-                f"unknowns={self.unknowns} must be different names of {tuple(_WIDTHS)}"
-            )
-
-
-_WIDTHS = {"angular": 3, "linear": 3, "focal": 1}
-# Bound on the smallest over the largest singular value of the Jacobian with columns of
-# unit length. A camera that sees a few degrees of a distant scene has 1e-3. Rounding in
-# float32 gives 1e-6.
-DETERMINED = 1e-4
-
-
-def refine_camera(
-    residuals: Callable[[Camera], Float[Array, "..."]],
-    camera: Camera,
-    spec: CameraSpec = CameraSpec(),
-) -> Fit:
-    """Minimize the sum of squared residuals over a camera near the given one.
-
-    The solver is Levenberg-Marquardt. The result has no derivatives.
-
-    Args:
-      residuals: Function from a camera to residuals of any shape.
-      camera: Initial camera.
-      spec: Unknowns and convergence criteria.
-
-    Returns:
-      The fit, with the camera as `value`. `residual` is the root mean square of the
-      residuals.
-
-    Raises:
-      ValueError: If there are fewer residuals than unknowns.
-    """
-    camera = jax.tree.map(lambda leaf: lax.stop_gradient(jnp.asarray(leaf)), camera)
-    start = jnp.zeros(
-        sum(_WIDTHS[name] for name in spec.unknowns), camera.position.dtype
-    )
-
-    def unscaled(step):
-        return residuals(_apply_step(camera, step, spec.unknowns)).reshape(-1)
-
-    grads = jax.jacfwd(unscaled)(start)
-    if grads.shape[0] < start.size:
-        raise ValueError(
-            f"{grads.shape[0]} residuals cannot determine {start.size} unknowns "
-            f"{spec.unknowns}; use more residuals or fewer unknowns"
-        )
-    # Damping treats all unknowns alike. Columns of equal length make rad, scene units
-    # and logarithms of focal length comparable.
-    lengths = jnp.sqrt(jnp.sum(grads**2, axis=0))
-    largest = jnp.max(lengths)
-    unit = jnp.where(largest > 0, largest, 1)
-    scale = jnp.where(lengths > 0, unit / jnp.where(lengths > 0, lengths, 1), 1)
-
-    def scaled(step, _):
-        return unscaled(step * scale) / unit
-
-    import optimistix
-
-    solver: optimistix.LevenbergMarquardt[Array, Array, None]
-    solver = optimistix.LevenbergMarquardt(
-        rtol=spec.tolerance / 10, atol=spec.tolerance / 10
-    )
-    solution: optimistix.Solution[Array, None] = optimistix.least_squares(
-        scaled, solver, start, max_steps=spec.max_steps, throw=False
-    )
-    step = lax.stop_gradient(solution.value)
-    rms = jnp.sqrt(jnp.mean(unscaled(step * scale) ** 2))
-    is_minimum = _is_minimum(lambda y: scaled(y, None), step, spec.tolerance)
-    converged = is_minimum & (rms <= spec.max_residual)
-    step = jnp.where(jnp.all(jnp.isfinite(step)), step, start)
-    value = _apply_step(camera, step * scale, spec.unknowns)
-    return Fit(value, converged, counted(solution.stats["num_steps"]), rms)
 
 
 def fit_code(
@@ -309,27 +208,3 @@ CODE_SOLVERS: Mapping[str, CodeSolver] = {
 
 def _length(vector):
     return jnp.sqrt(jnp.sum(vector**2))
-
-
-def _apply_step(camera, step, unknowns):
-    parts, start = {}, 0
-    for name in unknowns:
-        parts[name] = step[start : start + _WIDTHS[name]]
-        start += _WIDTHS[name]
-    zero = jnp.zeros(3, step.dtype)
-    camera = move(camera, parts.get("angular", zero), parts.get("linear", zero))
-    if "focal" in parts:  # as a logarithm, so that it stays positive
-        camera = camera._replace(focal_px=camera.focal_px * jnp.exp(parts["focal"][0]))
-    return camera
-
-
-def _is_minimum(residuals, step, tolerance):
-    """Test if the next Gauss-Newton step is small and well determined."""
-    grads = jax.jacfwd(residuals)(step)
-    basis, triangle = jnp.linalg.qr(grads)
-    values = jnp.linalg.svd(triangle, compute_uv=False)
-    determined = values[-1] > DETERMINED * values[0]
-    next_step = jax.scipy.linalg.solve_triangular(
-        triangle, exact_product(basis.T, residuals(step))
-    )
-    return determined & (jnp.max(jnp.abs(next_step)) <= tolerance)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
@@ -238,3 +239,17 @@ def test_unusable_cameras_and_requests_are_refused(call, message):
     validated()
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_camera_moves_as_its_matrix_does(float64):
+    """Against the matrix exponential, also far out, where R x + t cancels."""
+    angular, linear = np.array([0.03, -0.05, 0.04]), np.array([0.1, -0.06, 0.08])
+    camera = make_camera("float64")
+    camera = camera._replace(position=camera.position + 1e4)
+    moved = jax.jit(cameras.move)(camera, angular, linear)
+    twist = np.zeros((4, 4))
+    twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), angular), linear
+    before = np.asarray(cameras.world_from_camera(camera))
+    exact = before @ np.linalg.inv(scipy.linalg.expm(twist))
+    # 1e-11: SciPy's side multiplies positions of 1e4
+    np.testing.assert_allclose(cameras.world_from_camera(moved), exact, atol=1e-11)

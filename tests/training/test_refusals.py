@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerfies_jax.training import losses, schedules
-from nerfies_jax.training.fit import CameraSpec, fit_code
+from nerfies_jax.training.fit import fit_code
 from nerfies_jax.training.track_start import TrackStartSpec
 from nerfies_jax.training.tracks import InverseSpec, point_tracks
 
@@ -50,9 +50,6 @@ REFUSED = [
     (lambda: InverseSpec(atol=0.0), r"atol=0\.0 must"),
     (lambda: InverseSpec(reach=-1.0), r"reach=-1\.0 must"),
     (lambda: tracks_from(3), r"row=3 is not in 0 \.\. 2"),
-    (lambda: CameraSpec(tolerance=-1.0), "tolerance=-1"),
-    (lambda: CameraSpec(unknowns=("roll",)), "different names"),
-    (lambda: CameraSpec(max_residual=0.0), "max_residual=0"),
     (lambda: fit_code(jnp.sum, TWO, "newton"), "unknown solver 'newton'; choose from"),
     (lambda: fit_code(jnp.sum, WHOLE), r"one floating-point dtype, got \['int32'\]"),
     (lambda: fit_code(jnp.sum, (TWO, HALF)), "float16"),

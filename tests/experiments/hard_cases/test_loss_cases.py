@@ -5,15 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.hard_cases import images as image_cases
 from experiments.hard_cases import losses as loss_cases
-from experiments.hard_cases import pictures as picture_cases
 from gaussians_jax.losses import spectral
 from nerfies_jax.metrics import geometry_quality, image_quality
 from nerfies_jax.training import losses
 from tests.experiments.hard_cases import checks
 
 pytestmark = pytest.mark.hard_cases
-CASES = loss_cases.CASES + picture_cases.CASES
+CASES = loss_cases.CASES + image_cases.CASES
 test_held = checks.by_case(CASES)
 
 

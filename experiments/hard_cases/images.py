@@ -1,4 +1,4 @@
-"""Hard cases of measures of pictures: spectra, similarities, correlation."""
+"""Hard cases of measures of images: spectra, similarities, correlation."""
 
 import jax.numpy as jnp
 import mpmath
@@ -41,8 +41,8 @@ def _exact_amplitudes(pixels):
 
 
 AMPLITUDE = Case(
-    name="Fourier amplitudes of an almost black picture",
-    breaks="√(re² + im²) is 0 below 1e-19 (f32), its slope 0/0",
+    name="Fourier amplitudes of an almost black image",
+    breaks="√(re² + im²) is 0 below 1e-19 (f32), its gradient 0/0",
     formula="abs of the complex number; gradient 0 where it vanishes",
     axis="contrast",
     at=_CONTRAST,
@@ -112,8 +112,8 @@ def _exact_dssim(x):
 
 
 DSSIM = Case(
-    name="SSIM of pictures almost alike",
-    breaks="E[xy] - E[x] E[y]: 4e-5 off at level 0.9, slope of noise where 0 is true",
+    name="SSIM of images almost alike",
+    breaks="E[xy] - E[x] E[y]: 4e-5 off at level 0.9, a noisy gradient where it is 0",
     formula="a + b - ab from the window of image - target, about the target's mean",
     axis="row of level, offset, contrast",
     at=np.arange(len(_LEVELS), dtype=float),
