@@ -8,21 +8,18 @@ Gaussian is then at p' + V(p) w(p', t). Everything that depends on p only is cac
 """
 
 import dataclasses
-import zlib
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.metadata import SceneMetadata
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
-from gaussians_jax.motion import mlp as mlp_motion
 from gaussians_jax.motion.blocks import in_blocks
-from gaussians_jax.motion.bound import BoundMotion
-from gaussians_jax.motion.mlp import SmoothingSpec
+from gaussians_jax.motion.mlp import BoundNetworks, SmoothingSpec
 from nerfies_jax.geometry.precision import exact_product
 from nerfies_jax.nn import encoding, mlp
 from nerfies_jax.nn.encoding import EncodingSpec
@@ -33,7 +30,6 @@ from nerfies_jax.training.step_counts import steps
 
 NAME = "motion_basis"
 BASIS_FORMS = ("bounded", "free")
-_STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the noise on the time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -387,23 +383,11 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class Bound(BoundMotion):
+class Bound(BoundNetworks):
     """The `Motion` of a `BasisMotionSpec` in a run of `steps`."""
 
-    spec: BasisMotionSpec
-    frames: int
-
     name = NAME
-
-    def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
-        """Evaluate the learning rate of the networks."""
-        return MotionParams(shared=self.rate(step))
-
-    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
-        """Initialize the networks."""
-        _, shared_key = jax.random.split(key)
-        return MotionParams(shared=init(shared_key, self.spec))
+    init_shared = staticmethod(init)
 
     def precompute(self, params: MotionParams, gaussians: Splats) -> Prepared:
         """Compute everything that does not depend on the time."""
@@ -418,11 +402,7 @@ class Bound(BoundMotion):
         frame: FrameCondition,
     ) -> Gaussians:
         """Move the Gaussians to a time, which is noisy early in training."""
-        time, smoothing = frame.time, self.spec.smoothing
-        if smoothing is not None and frame.step is not None:
-            assert frame.key is not None
-            key = jax.random.fold_in(frame.key, _STREAM)
-            time = mlp_motion.smooth_time(key, smoothing, time, frame.step, self.frames)
-        active, mean = splats.in_use(gaussians), gaussians.mean
+        time, active = self.noisy_time(frame), splats.in_use(gaussians)
+        mean = gaussians.mean
         offsets = deform(params.shared, self.spec, mean, time, cache, active)
         return apply(gaussians, offsets)

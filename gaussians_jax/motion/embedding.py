@@ -15,20 +15,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from gaussians_jax.core import splats
 from gaussians_jax.core.metadata import SceneMetadata
-from gaussians_jax.core.protocols import MotionParams
-from gaussians_jax.core.splats import Gaussians, Splats
 from gaussians_jax.motion import codes as motion_codes
-from gaussians_jax.motion import kan as kan_motion
 from gaussians_jax.motion.blocks import in_blocks
-from gaussians_jax.motion.kan import KanMotionSpec, Offsets
+from gaussians_jax.motion.kan import BoundResiduals, KanMotionSpec, Offsets
 from nerfies_jax.nn import mlp
 from nerfies_jax.nn.mlp import MLP, HeadSpec, Layer, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import (
-    FrameCondition,
-)
 from nerfies_jax.training.step_counts import steps
 
 NAME = "embedding_motion"
@@ -219,40 +212,13 @@ def deform(
     return Offsets(**in_blocks(evaluate, (prepared,), active, spec.block))
 
 
-@dataclasses.dataclass(frozen=True)
-class Bound(motion_codes.BoundCodes):
+class Bound(BoundResiduals):
     """The `Motion` of an `EmbeddingMotionSpec` in a run of `steps`."""
 
-    spec: EmbeddingMotionSpec
-
     name = NAME
-
-    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
-        """Initialize the embeddings, the time codes and the networks."""
-        rows_key, shared_key = jax.random.split(key)
-        return MotionParams(
-            motion_codes.init_embedding(rows_key, self.spec, gaussians.mean),
-            init(shared_key, self.spec, self.frames),
-        )
-
-    def precompute(
-        self, params: MotionParams, gaussians: Splats
-    ) -> Float[Array, "gaussians features"]:
-        """Compute the features that do not depend on the time."""
-        active = splats.active_mask(gaussians)
-        return prepare(params.shared, self.spec, params.per_gaussian, active)
-
-    def apply(
-        self,
-        params: MotionParams,
-        cache: Float[Array, "gaussians features"],
-        gaussians: Gaussians,
-        frame: FrameCondition,
-    ) -> Gaussians:
-        """Move the Gaussians to their state at a time."""
-        active = splats.in_use(gaussians)
-        offsets = deform(params.shared, self.spec, frame.time, cache, active)
-        return kan_motion.apply(gaussians, offsets)
+    init_shared = staticmethod(init)
+    prepare = staticmethod(prepare)
+    deform = staticmethod(deform)
 
 
 # 30 codes for the built-in scene. The coarse network reads 6, the fine one 6 to 30.

@@ -15,7 +15,8 @@ all Gaussians.
 import dataclasses
 import functools
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -401,19 +402,20 @@ def apply(gaussians: Gaussians, offsets: Offsets) -> Gaussians:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound(motion_codes.BoundCodes):
-    """The `Motion` of a `KanMotionSpec` in a run of `steps`."""
+class BoundResiduals(motion_codes.BoundCodes):
+    """Base of the motions by residuals that networks compute from both codes."""
 
-    spec: KanMotionSpec
-
-    name = NAME
+    # Functions of the module of the motion.
+    init_shared: ClassVar[Callable[..., Any]]
+    prepare: ClassVar[Callable[..., Any]]
+    deform: ClassVar[Callable[..., Offsets]]
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the embeddings, the time codes and the networks."""
         rows_key, shared_key = jax.random.split(key)
         return MotionParams(
             motion_codes.init_embedding(rows_key, self.spec, gaussians.mean),
-            init(shared_key, self.spec, self.frames),
+            self.init_shared(shared_key, self.spec, self.frames),
         )
 
     def precompute(
@@ -421,7 +423,7 @@ class Bound(motion_codes.BoundCodes):
     ) -> Float[Array, "gaussians features"]:
         """Compute the features that do not depend on the time."""
         active = splats.active_mask(gaussians)
-        return prepare(params.shared, self.spec, params.per_gaussian, active)
+        return self.prepare(params.shared, self.spec, params.per_gaussian, active)
 
     def apply(
         self,
@@ -432,5 +434,14 @@ class Bound(motion_codes.BoundCodes):
     ) -> Gaussians:
         """Move the Gaussians to their state at a time."""
         active = splats.in_use(gaussians)
-        offsets = deform(params.shared, self.spec, frame.time, cache, active)
+        offsets = self.deform(params.shared, self.spec, frame.time, cache, active)
         return apply(gaussians, offsets)
+
+
+class Bound(BoundResiduals):
+    """The `Motion` of a `KanMotionSpec` in a run of `steps`."""
+
+    name = NAME
+    init_shared = staticmethod(init)
+    prepare = staticmethod(prepare)
+    deform = staticmethod(deform)

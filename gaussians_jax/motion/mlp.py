@@ -6,7 +6,8 @@ encoded canonical mean and the encoded time to residuals of mean, rotation and s
 
 import dataclasses
 import zlib
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,6 @@ from nerfies_jax.training.step_counts import steps
 
 NAME = "mlp_motion"
 SCALE_RULES = ("log", "linear")
-_STREAM = zlib.crc32(NAME.encode()) >> 1  # of the step's key, for the noise on the time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,13 +287,17 @@ def smooth_time(
 
 
 @dataclasses.dataclass(frozen=True)
-class Bound(BoundMotion):
-    """The `Motion` of a `MotionSpec` in a run of `steps`."""
+class BoundNetworks(BoundMotion):
+    """Base of the motions by networks of position and time.
 
-    spec: MotionSpec
+    Attributes:
+      frames: Number of training frames.
+    """
+
     frames: int
 
-    name = NAME
+    name: ClassVar[str]
+    init_shared: ClassVar[Callable[..., Any]]  # of the module of the motion
 
     def learning_rate(self, step: Int[Array, ""]) -> MotionParams:
         """Evaluate the learning rate of the networks."""
@@ -302,7 +306,23 @@ class Bound(BoundMotion):
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize the networks."""
         _, shared_key = jax.random.split(key)
-        return MotionParams(shared=init(shared_key, self.spec))
+        return MotionParams(shared=self.init_shared(shared_key, self.spec))
+
+    def noisy_time(self, frame: FrameCondition) -> Float[Array, ""]:
+        """Return the time of a frame, with the noise of early training steps."""
+        smoothing = self.spec.smoothing
+        if smoothing is None or frame.step is None:
+            return frame.time
+        assert frame.key is not None
+        key = jax.random.fold_in(frame.key, zlib.crc32(self.name.encode()) >> 1)
+        return smooth_time(key, smoothing, frame.time, frame.step, self.frames)
+
+
+class Bound(BoundNetworks):
+    """The `Motion` of a `MotionSpec` in a run of `steps`."""
+
+    name = NAME
+    init_shared = staticmethod(init)
 
     def apply(
         self,
@@ -312,11 +332,6 @@ class Bound(BoundMotion):
         frame: FrameCondition,
     ) -> Gaussians:
         """Move the Gaussians to a time, which is noisy early in training."""
-        time, smoothing = frame.time, self.spec.smoothing
-        if smoothing is not None and frame.step is not None:
-            assert frame.key is not None
-            key = jax.random.fold_in(frame.key, _STREAM)
-            time = smooth_time(key, smoothing, time, frame.step, self.frames)
-        active = splats.in_use(gaussians)
+        time, active = self.noisy_time(frame), splats.in_use(gaussians)
         offsets = deform(params.shared, self.spec, gaussians.mean, time, active)
         return apply(gaussians, offsets, self.spec.scale_rule)
