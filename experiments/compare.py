@@ -322,10 +322,10 @@ def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
         run = runs.saved_run(each.folder, trusted=trusted)
         state = runs.restore(each.folder, run).state
         run = runs.with_found_cameras(run, state)
-        rows = evaluation.spread(run.filmed.heldout, count)
+        rows = evaluation.spread(run.observed.heldout, count)
         draw = evaluation.Renderer(run.model, run.capture.size)
-        scored.append(evaluation.score(draw, state, run.filmed, rows))
-        capture = run.filmed
+        scored.append(evaluation.score(draw, state, run.observed, rows))
+        capture = run.observed
     tiles, captions = [], []
     for place, row in enumerate(scored[0].rows):
         truth = capture.images[row]

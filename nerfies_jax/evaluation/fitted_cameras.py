@@ -135,18 +135,18 @@ def fit_cameras(
     capture: Capture,
     rows: np.ndarray,
     spec: CameraFitSpec = CameraFitSpec(),
-    filmed: Capture | None = None,
+    observed: Capture | None = None,
 ) -> FittedCameras:
     """Refine the cameras of some frames, and evaluate these frames with them.
 
     Args:
       model: The model.
-      draw: Renderer of `filmed`.
+      draw: Renderer of `observed`.
       state: Trained state.
       capture: The capture, undistorted if the model renders pinhole cameras.
       rows: Indices of the frames.
       spec: Settings.
-      filmed: The original, distorted capture, which metrics are computed on. None for
+      observed: The original, distorted capture, which metrics are computed on. None for
         `capture` itself.
 
     Returns:
@@ -195,7 +195,7 @@ def fit_cameras(
     stacked = jax.tree.map(
         lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *cameras
     )
-    scored = score(draw, state, _with_poses(filmed or capture, rows, stacked), rows)
+    scored = score(draw, state, _with_poses(observed or capture, rows, stacked), rows)
     return FittedCameras(stacked, np.asarray(converged), scored)
 
 

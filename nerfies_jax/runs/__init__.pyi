@@ -6,8 +6,8 @@ from .reconstruction import reconstruct as reconstruct
 from .reconstruction import resume as resume
 from .run import Run as Run
 from .run import built_in_scene as built_in_scene
-from .run import first_state as first_state
 from .run import free_memory as free_memory
+from .run import initial_state as initial_state
 from .run import load_capture as load_capture
 from .run import new_run as new_run
 from .run import open_run as open_run

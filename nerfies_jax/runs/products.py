@@ -79,7 +79,7 @@ def make(
     state, renderer = trained.result.state, trained.renderer
     run = with_found_cameras(run, state)
     rows, skipped_frames = frames_to_score(run, trained)
-    scored = evaluation.score(trained.draw, state, run.filmed, rows)
+    scored = evaluation.score(trained.draw, state, run.observed, rows)
     if not np.isfinite(scored.color).all():
         raise FloatingPointError(
             f"no report: the images rendered at step {trained.result.steps:,} are not "
@@ -97,7 +97,7 @@ def make(
         with step_profile.profiling(run, state) as profile:
             figures = [*player]
             comparison = attempt(
-                None, save_comparison, target / "comparison.png", run.filmed, scored
+                None, save_comparison, target / "comparison.png", run.observed, scored
             )
             if comparison is not None:
                 figures.append(report.Figure(comparison, COMPARISON_CAPTION))
@@ -210,7 +210,7 @@ def _capture_notes(run, folder):
     """Notes on the training images, their preprocessing, and the evaluated images."""
     config = json.loads((folder / CONFIG).read_text())
     preprocessing = config.get(PREPROCESSING_NOTES, [])
-    return dict.fromkeys([*run.capture.notes, *preprocessing, *run.filmed.notes])
+    return dict.fromkeys([*run.capture.notes, *preprocessing, *run.observed.notes])
 
 
 def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:

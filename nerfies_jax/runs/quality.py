@@ -99,7 +99,7 @@ def measure(
       Values by the keys of `heldout.TOLERANCES`, and notes.
     """
     known = tracked = flow = fitted = None
-    capture, note = moving_masks.with_masks(run.filmed, CACHE / "evidence")
+    capture, note = moving_masks.with_masks(run.observed, CACHE / "evidence")
     notes = [note] if note else []
     try:
         truth = protocol.stored_truth(capture)
@@ -121,7 +121,7 @@ def measure(
             state,
             run.capture,
             scored.rows[places],
-            filmed=run.filmed,
+            observed=run.observed,
         )
         before, after = map(
             evaluation.known_mean, (scored.psnr[places], fitted.scored.psnr)
@@ -147,10 +147,10 @@ def measure(
 
 
 def _baselines(run, state, draw, rows, frame_seconds):
-    counts = budget.static_renders(frame_seconds, len(rows), run.filmed.size)
+    counts = budget.static_renders(frame_seconds, len(rows), run.observed.size)
     return Baselines(
-        baseline_images.neighbor_means(run.filmed, rows),
-        baseline_images.time_averages(draw, state, run.filmed, rows, *counts),
+        baseline_images.neighbor_means(run.observed, rows),
+        baseline_images.time_averages(draw, state, run.observed, rows, *counts),
     )
 
 

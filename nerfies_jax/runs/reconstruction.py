@@ -28,7 +28,7 @@ from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 from nerfies_jax.runs.following import following
 from nerfies_jax.runs.run import (
     Run,
-    first_state,
+    initial_state,
     new_run,
     read_config,
     restore,
@@ -114,7 +114,7 @@ def reconstruct(
             run = _new_run(config, effects)
             _describe(run)
             quality.check(extra, run.capture.size)
-            state = first_state(run)
+            state = initial_state(run)
             if seconds is not None and not _sets_steps(run.config):
                 run, line = plan.with_seconds(run, state, seconds)
                 console.say(line)
@@ -312,7 +312,7 @@ def _restore(folder, run):
     If it was killed before it saved any, the initial state without the other two.
     """
     if checkpoint.latest(folder / run_folder.CHECKPOINTS) is None:
-        return first_state(run), None, None
+        return initial_state(run), None, None
     restored = restore(folder, run)
     return restored.state, restored.record, restored.step
 

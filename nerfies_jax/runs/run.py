@@ -45,7 +45,7 @@ class Run(NamedTuple):
     # Training images, with data that was computed for the model.
     capture: Capture
     # Images that held-out frames are scored against (`pinholes.scorable`).
-    filmed: Capture
+    observed: Capture
     representation: Representation
     spec: Any  # of the representation's `spec_type`
     metadata: Any  # scene metadata computed from the capture
@@ -100,12 +100,12 @@ def open_run(
       The run.
     """
     stored = stored or stored_capture(config.source, config.seed)
-    filmed = pinholes.scorable(stored)
-    run = _build(config, representation, spec, filmed, filmed)
-    capture = _add_required(filmed, run.model.required_data)
-    if capture is filmed:
+    observed = pinholes.scorable(stored)
+    run = _build(config, representation, spec, observed, observed)
+    capture = _add_required(observed, run.model.required_data)
+    if capture is observed:
         return run
-    return _build(config, representation, spec, capture, filmed)
+    return _build(config, representation, spec, capture, observed)
 
 
 def _add_required(capture, required):
@@ -138,14 +138,14 @@ def with_steps(run: Run, steps: int) -> Run:
     """
     config = dataclasses.replace(run.config, steps=steps)
     spec = scene_spec(config)
-    return _build(config, run.representation, spec, run.capture, run.filmed)
+    return _build(config, run.representation, spec, run.capture, run.observed)
 
 
 @events.stage("building the model")
-def _build(config, representation, spec, capture, filmed):
+def _build(config, representation, spec, capture, observed):
     metadata = representation.metadata_of(capture, spec)
     model = representation.build(spec, metadata)
-    return Run(config, capture, filmed, representation, spec, metadata, model)
+    return Run(config, capture, observed, representation, spec, metadata, model)
 
 
 def with_found_cameras(run: Run, state: TrainState) -> Run:
@@ -159,10 +159,10 @@ def with_found_cameras(run: Run, state: TrainState) -> Run:
       The run, unchanged if its cameras are not trained.
     """
     capture = as_found(run.model, state, run.capture)
-    if run.filmed is run.capture:
-        return run._replace(capture=capture, filmed=capture)
-    filmed = as_found(run.model, state, run.filmed)
-    return run._replace(capture=capture, filmed=filmed)
+    if run.observed is run.capture:
+        return run._replace(capture=capture, observed=capture)
+    observed = as_found(run.model, state, run.observed)
+    return run._replace(capture=capture, observed=observed)
 
 
 def scene_spec(config: RunConfig) -> Any:
@@ -457,7 +457,7 @@ def _readable(folder):
 
 
 @events.stage("initializing the scene")
-def first_state(run: Run) -> TrainState:
+def initial_state(run: Run) -> TrainState:
     """Initialize the training state.
 
     Args:

@@ -107,7 +107,7 @@ def train(
 
     def held_out(state, step, metrics):
         del step, metrics
-        capture = evaluation.as_found(run.model, state, run.filmed)
+        capture = evaluation.as_found(run.model, state, run.observed)
         scored = evaluation.score(renderer, state, capture, rows)
         whole = {
             "psnr": evaluation.known_mean(scored.psnr),

@@ -121,7 +121,7 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
         film,
         rows,
         spec,
-        filmed=dataclasses.replace(film, cameras=lens),
+        observed=dataclasses.replace(film, cameras=lens),
     )
     assert [float(camera.radial[0]) for camera in scored] == [np.float32(0.1)] * 3
     for camera, position in zip(scored, fitted.cameras.position, strict=True):

@@ -335,7 +335,7 @@ def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tm
     scored = drawn(run.capture, rng)
     elsewhere = dataclasses.replace(run.capture, path=None)
     numbers, notes = quality.measure(
-        run._replace(filmed=elsewhere), state, renderer, scored
+        run._replace(observed=elsewhere), state, renderer, scored
     )
     assert notes == []
     assert set(numbers) == ALWAYS | MASKED | BASELINES | DEPTHS
@@ -343,7 +343,7 @@ def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tm
     (tmp_path / synthetic.TRUTH_FILE).write_bytes(b"cut short")
     broken = dataclasses.replace(run.capture, path=tmp_path)
     numbers, notes = quality.measure(
-        run._replace(filmed=broken), state, renderer, scored
+        run._replace(observed=broken), state, renderer, scored
     )
     assert set(numbers) == ALWAYS | MASKED | BASELINES | DEPTHS
     assert "not a readable ground truth" in notes[0]

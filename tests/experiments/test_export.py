@@ -37,7 +37,7 @@ def saved(folder, preset, overrides, shaken):
     nerfies_format.write(capture, folder / "filmed")
     source = CaptureSource(capture=folder / "filmed")
     run = runs.new_run(RunConfig(preset, source, steps=12, overrides=overrides))
-    state, rng = runs.first_state(run), np.random.default_rng(0)
+    state, rng = runs.initial_state(run), np.random.default_rng(0)
 
     def shake(leaf):
         return leaf + np.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype)

@@ -87,13 +87,13 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     # Two steps are what the seconds allow.
     monkeypatch.setattr(rate, "step_time", lambda *_: rate.StepTime(100.0, 0.0))
     # A first state may take a fit of ten seconds: the one that is measured is trained.
-    states, first_state = [], reconstruction.first_state
+    states, initial_state = [], reconstruction.initial_state
 
     def counted(run):
-        states.append(first_state(run))
+        states.append(initial_state(run))
         return states[-1]
 
-    monkeypatch.setattr(reconstruction, "first_state", counted)
+    monkeypatch.setattr(reconstruction, "initial_state", counted)
     words = (tmp_path / "filmed", "--preset", "splats-static-small", "--seconds", 250)
     quick = ("strategy=none", "sh_degree=0", "init.extra_random=0")
     assert ended(*words, "--out", out, "--json", "--set", *quick) == 0

@@ -70,7 +70,7 @@ def finished(tmp_path_factory):
     source = CaptureSource(capture=folder / "filmed")
     config = RunConfig("splats-static-small", source, steps=2, overrides=SMALL)
     run = runs.new_run(config)
-    state = runs.first_state(run)
+    state = runs.initial_state(run)
     kept = {"step": 1, "seconds": 1.0, "loss": 0.1}
     scored = {"hook": "held out", **kept, "psnr": 20.0, "ssim": 0.5}
     for name in ("run", "other"):

@@ -59,7 +59,7 @@ def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     longer = planned.model.init(planned.capture, jax.random.key(0))
     jax.tree.map(np.testing.assert_array_equal, longer.params, state.params)
     assert planned.capture is run.capture
-    assert planned.filmed is run.filmed
+    assert planned.observed is run.observed
     assert line.startswith(
         f"plan: {planned.spec.steps:,} steps in 10 s of training (10"
     )

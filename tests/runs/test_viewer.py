@@ -35,7 +35,7 @@ def a_run(kind, shaken=0.1):
     """A run of the tiny capture, and its state, in which something moves."""
     config = RunConfig("splats-static-small", CaptureSource())
     run = runs.open_run(config, representations.named(kind), SPECS[kind], CAPTURE)
-    state, rng = runs.first_state(run), np.random.default_rng(0)
+    state, rng = runs.initial_state(run), np.random.default_rng(0)
 
     def shake(leaf):
         return leaf + np.asarray(shaken * rng.normal(size=leaf.shape), leaf.dtype)
