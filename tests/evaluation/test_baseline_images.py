@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -195,10 +196,11 @@ def test_masks_of_what_moves_come_from_all_frames(lens, looked, tmp_path):
     moving = masked.moving[5]
     if lens:
         # The upper left quarter of undistorted pixels, which are larger than these.
-        rays = pixel_rays(cameras.take(capture.cameras, 5), capture.size)
-        straight = pinholes.pinhole(cameras.take(capture.cameras, 5))
+        camera = cameras.take(capture.cameras, 5)
+        straight = pinholes.pinhole(camera)
+        rays = jax.jit(pixel_rays, static_argnums=1)(camera, capture.size)
         points = straight.position + rays.direction
-        pixel, _ = cameras.project(straight, points)
+        pixel, _ = jax.jit(cameras.project)(straight, points)
         expected = (np.asarray(pixel) < np.array([width, height]) / 2).all(-1)
         assert np.mean(moving != expected) < 0.02  # a mask of half the size
     else:

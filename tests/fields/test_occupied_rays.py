@@ -19,10 +19,10 @@ from nerfies_jax.nn.grids import HashGridSpec
 from nerfies_jax.scene import scene
 from nerfies_jax.training import loop
 from tests import scenes
-from tests.fields.test_skipping import GRID, STILL, with_holes
+from tests.fields.test_skipping import GRID, TWO_LEVELS, with_holes
 
 SPEC = dataclasses.replace(
-    STILL,
+    TWO_LEVELS,
     rays=40,
     template=dataclasses.replace(
         GRID, position=HashGridSpec(levels=1, coarsest=4, finest=4)

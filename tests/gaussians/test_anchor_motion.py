@@ -291,9 +291,13 @@ def test_settings_of_anchors_that_cannot_work_are_refused(kind, changes, words):
 
 
 def test_the_law_starts_as_wide_as_the_features(float64):
-    net = anchors.init(jax.random.key(0), SPEC, FRAMES)
-    features = anchors.init_features(jax.random.key(1), SPEC, 500)
-    first, others = anchors.bits(features, net.law, SPEC)
+    @jitted
+    def first_bits():
+        net = anchors.init(jax.random.key(0), SPEC, FRAMES)
+        features = anchors.init_features(jax.random.key(1), SPEC, 500)
+        return anchors.bits(features, net.law, SPEC)
+
+    first, others = first_bits()
     # Of a normal law of deviation 0.5 in steps of 0.1: log2(5 sqrt(2 pi e)).
     entropy_bits = np.log2(5 * np.sqrt(2 * np.pi * np.e))
     np.testing.assert_allclose(first.mean(), entropy_bits, atol=0.1)

@@ -158,6 +158,7 @@ def test_normals_and_colors_of_a_ray_are_those_written_out(number, float64):
     np.testing.assert_allclose(level.color, whole, atol=1e-7)
 
 
+@pytest.mark.full
 def test_float32_normals_are_those_of_float64():
     levels, _, code = seen(params_of("float32"), "float32")
     by_hand = ByHand(params_of("float32"), code)
