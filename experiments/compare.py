@@ -82,9 +82,9 @@ def main(args):
     with cli.user_errors():
         compared = read(args.runs, args.trust if args.frames else None)
         folder = run_folder.new_run_folder(args.out, "compare")
-        goals = args.psnr or default_goals(compared)
+        goals = args.psnr or _default_goals(compared)
     console.say(table(compared, goals))
-    for line in (*legend(compared), *remarks(compared)):
+    for line in (*_legend(compared), *remarks(compared)):
         console.say(line)
     save(folder, compared, goals)
     if args.frames:
@@ -172,7 +172,7 @@ def _names(folders):
     return names
 
 
-def default_goals(compared) -> tuple[float, ...]:
+def _default_goals(compared) -> tuple[float, ...]:
     """Return the final PSNR of all runs except the best, in tenths of a dB."""
     ends = sorted(run.curve.psnr[-1] for run in compared if run.curve.psnr)
     ends = [math.floor(10 * psnr) / 10 for psnr in ends[:-1] if math.isfinite(psnr)]
@@ -204,7 +204,7 @@ def _is_fitted(run):
     return run.metrics.get("heldout.fitted_psnr") is not None
 
 
-def legend(compared) -> list[str]:
+def _legend(compared) -> list[str]:
     """Explain the columns of the table, a line each."""
     from nerfies_jax.metrics.metric_table import METRICS
 

@@ -61,7 +61,7 @@ def main(args):
         path.parent.mkdir(parents=True, exist_ok=True)
         panels.save(inspected.sheet, path)
         console.say(f"contact sheet: {path}")
-        record = as_json(capture, inspected, advice)
+        record = _as_json(capture, inspected, advice)
         if args.findings is not None:
             write_json(args.findings, record)
             console.say(f"findings: {args.findings}")
@@ -86,7 +86,7 @@ def report(inspected, advice, source):
     return lines
 
 
-def as_json(capture, inspected, advice):
+def _as_json(capture, inspected, advice):
     """The same as plain data."""
     from nerfies_jax.capture import gate
     from nerfies_jax.runs import prices

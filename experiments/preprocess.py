@@ -60,11 +60,11 @@ def main(args):
         views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
         numbers = summary.of(views, evidence)
         console.say("\n".join(summary.lines(numbers, evidence)))
-        stored = {"capture": capture.name, "found": as_json(numbers._asdict())}
+        stored = {"capture": capture.name, "found": _as_json(numbers._asdict())}
         errors = _errors(capture, evidence)
         if errors is not None:
-            stored["errors"] = as_json(errors._asdict())
-            console.say("\n".join(error_lines(errors)))
+            stored["errors"] = _as_json(errors._asdict())
+            console.say("\n".join(_error_lines(errors)))
         panels.save(contact_sheet.followed(views, evidence), out / "tracks.png")
         write_json(out / "preprocessing.json", stored)
     console.say(f"frames with tracks: {out / 'tracks.png'}")
@@ -87,15 +87,8 @@ def _errors(capture, evidence):
     return against_truth.errors(capture, evidence, points)
 
 
-def error_lines(errors: Any) -> list[str]:
-    """Describe the errors in a built-in scene.
-
-    Args:
-      errors: The errors, `against_truth.Errors`.
-
-    Returns:
-      Lines of text.
-    """
+def _error_lines(errors: Any) -> list[str]:
+    """Describe the errors in a built-in scene."""
     from nerfies_jax.preprocessing.against_truth import LATER
 
     lines = [
@@ -117,15 +110,8 @@ def error_lines(errors: Any) -> list[str]:
     return lines
 
 
-def as_json(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace numbers that are not finite by None.
-
-    Args:
-      values: Values by name.
-
-    Returns:
-      JSON values by name.
-    """
+def _as_json(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace numbers that are not finite by None."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in values.items()

@@ -31,7 +31,7 @@ def main(args):
     pdoc = extras.library("pdoc", "docs")
     render = extras.library("pdoc.render", "docs")
     render.configure(docformat="markdown", math=True)
-    names = public_names()
+    names = _public_names()
     # A package without a face of its own brings its modules along.
     shown = [module for module in names if _has_face(module.rpartition(".")[0])]
     pdoc.pdoc(*shown, output_directory=args.out)
@@ -53,7 +53,7 @@ def page(folder: pathlib.Path, module: str) -> pathlib.Path:
     return folder.joinpath(*module.split(".")).with_suffix(".html")
 
 
-def public_names() -> dict[str, list[str]]:
+def _public_names() -> dict[str, list[str]]:
     """List the public functions and classes, or the face, of each module."""
     names = {}
     for package in PACKAGES:

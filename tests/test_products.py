@@ -68,7 +68,7 @@ def rounded_products(program):
     }
 
 
-IN_CORE = ("splats-tracked-small", "nerfies-grid-small", "nerf-w-small", "nsff-small")
+IN_CORE = ("splats-tracked-small", "nerf-w-small", "nsff-small")
 
 
 @pytest.mark.parametrize(

@@ -25,11 +25,11 @@ def clock(monkeypatch, module, *times, whole):
 
 
 @pytest.mark.parametrize(
-    ("whole", "rest"), [(9.0, 3.25), pytest.param(4.0, 0.0, id="nothing left")]
+    ("batches", "whole", "rest"),
+    [(2, 9.0, 3.25), pytest.param(1, 4.0, 0.0, id="nothing left")],
 )
-@pytest.mark.parametrize("batches", [1, 2])
 def test_what_parts_of_a_field_leave_of_a_step_is_never_negative(
-    whole, rest, batches, monkeypatch
+    batches, whole, rest, monkeypatch
 ):
     spec = dataclasses.replace(scenes.TINY_FIELD, micro_batches=batches)
     whole += 5.5 * (batches - 1)

@@ -50,7 +50,7 @@ def tried(
     right = path.read_bytes()
     wrong = right[: fault.start] + fault.text.encode() + right[fault.end :]
     began = time.monotonic()
-    tests = tests_that_enter(fault, reached)
+    tests = _tests_that_enter(fault, reached)
     path.write_bytes(wrong)
     try:
         caught_by = _failures(tests, copy, seconds) if tests else []
@@ -71,7 +71,7 @@ def _line(source, line):
     return source.decode().splitlines()[line - 1].strip()
 
 
-def tests_that_enter(fault: Fault, reached: dict[str, set[str]]) -> list[str]:
+def _tests_that_enter(fault: Fault, reached: dict[str, set[str]]) -> list[str]:
     """Files of tests that enter the function, those named after its module first."""
     named = f"test_{pathlib.Path(fault.path).stem.strip('_')}"
     place = f"{fault.path}:{fault.function}"

@@ -77,7 +77,7 @@ def compiled(text: str, scene: dict) -> tuple:
     # The clamp of the other rasterizer.
     spec = dataclasses.replace(GSPLAT, alpha_max=0.999)
     size = parsed(text)[1:]
-    footprints = footprints_of(scene, spec.alpha_threshold)
+    footprints = _footprints_of(scene, spec.alpha_threshold)
     colors = jnp.asarray(scene["colors"], jnp.float32)
 
     @jax.jit
@@ -124,7 +124,7 @@ def make_scene(count: int, width: int, height: int) -> dict:
     )
 
 
-def footprints_of(scene: dict, alpha_threshold: float):
+def _footprints_of(scene: dict, alpha_threshold: float):
     """Footprints of a scene given by image covariances (px^2)."""
     import jax.numpy as jnp
     import numpy as np
@@ -146,7 +146,7 @@ def footprints_of(scene: dict, alpha_threshold: float):
     return Footprints(*(jnp.asarray(field, jnp.float32) for field in fields))
 
 
-def median_ms(call) -> float:
+def _median_ms(call) -> float:
     """Milliseconds of a call, the median of several after one that warms up."""
     import jax
     import numpy as np
@@ -160,17 +160,8 @@ def median_ms(call) -> float:
     return float(np.median(times))
 
 
-def reference_times(script: pathlib.Path, text: str, scene_file: str) -> dict:
-    """Time the other rasterizer on a scene.
-
-    Args:
-      script: Its script.
-      text: The case, "COUNT@SIZE".
-      scene_file: File of the scene.
-
-    Returns:
-      Its measurements.
-    """
+def _reference_times(script: pathlib.Path, text: str, scene_file: str) -> dict:
+    """Time the other rasterizer on a scene."""
     count, size = text.split("@")
     command = [sys.executable, str(script), "--gaussians", count, "--size", size]
     command += ["--scene", scene_file, "--json"]
@@ -188,19 +179,19 @@ def time_case(text: str, reference: pathlib.Path | None) -> dict:
     if reference is not None:
         with tempfile.TemporaryDirectory() as folder:
             file = str(pathlib.Path(folder) / "scene.npz")
-            theirs.append(reference_times(reference, text, file))
+            theirs.append(_reference_times(reference, text, file))
             with np.load(file) as stored:
                 scene = {name: stored[name] for name in stored.files}
     forward, both = compiled(text, scene)
     row: dict[str, Any] = {
         "case": text,
-        "forward_ms": median_ms(forward),
-        "forward_backward_ms": median_ms(both),
+        "forward_ms": _median_ms(forward),
+        "forward_backward_ms": _median_ms(both),
     }
     if reference is not None:
         with tempfile.TemporaryDirectory() as folder:
             file = str(pathlib.Path(folder) / "scene.npz")
-            theirs.append(reference_times(reference, text, file))
+            theirs.append(_reference_times(reference, text, file))
         for name in ("forward_ms", "forward_backward_ms"):
             row[f"reference_{name}"] = sum(times[name] for times in theirs) / 2
         row["ratio"] = row["forward_backward_ms"] / row["reference_forward_backward_ms"]

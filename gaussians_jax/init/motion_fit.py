@@ -100,7 +100,7 @@ class PathFit(NamedTuple):
     last: float
 
 
-def mean_positions(paths: Paths) -> Float[np.ndarray, "points 3"]:
+def _mean_positions(paths: Paths) -> Float[np.ndarray, "points 3"]:
     """Compute the mean of the known positions of each point."""
     weight = paths.known[..., None].astype(float)
     total = np.sum(np.where(weight > 0, paths.position, 0), axis=1)
@@ -196,7 +196,7 @@ def combination(
     stiff = BEND * bend.T @ bend + DRIFT * drift.T @ drift
     stiff += RIDGE * np.eye(basis.shape[1]) * np.trace(basis.T @ basis)
     weight = paths.known.astype(float)
-    middle = mean_positions(paths)[:, None]
+    middle = _mean_positions(paths)[:, None]
     # Relative to the mean position, so that the ridge does not pull to the origin.
     offset = np.where(paths.known[..., None], paths.position - middle, 0)
     normal = np.einsum("tk,nt,tl->nkl", basis, weight, basis, optimize=True) + stiff

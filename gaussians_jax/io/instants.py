@@ -28,15 +28,8 @@ MOST_STEP_PX = 0.1  # largest rounding error of float32 coordinates
 NUMBERED = "frame_{:04d}"  # viewers play files whose names differ in a number only
 
 
-def check_time(time: float) -> None:
-    """Refuse a time outside the capture.
-
-    Args:
-      time: Normalized time.
-
-    Raises:
-      ValueError: If the time is not in [0, 1].
-    """
+def _check_time(time: float) -> None:
+    """Refuse a time outside the capture."""
     if not 0 <= time <= 1:
         raise ValueError(f"time={time:g} must lie in [0, 1]")
 
@@ -67,7 +60,7 @@ def gaussians_at(model: Model, state: TrainState) -> At:
     dtype = params.rows["splats"].mean.dtype
 
     def at(time: float) -> Gaussians:
-        check_time(time)
+        _check_time(time)
         return deform(params, prepared, jnp.asarray(time, dtype))
 
     return at

@@ -181,7 +181,7 @@ def _split(image):
     return ((a + b) + (c + d)) / 2, bands
 
 
-def filled(
+def _filled(
     render: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],
     valid: Bool[Array, "height width"] | None,
@@ -192,14 +192,6 @@ def filled(
 
     A spectrum needs a complete image. Invalid pixels then add no difference and have no
     gradient. Where the truth is not finite there, both images are black.
-
-    Args:
-      render: Rendered image.
-      truth: Reference image.
-      valid: Valid pixels.
-
-    Returns:
-      Both images.
     """
     render, truth = widened(render), widened(truth)
     if valid is None:
@@ -227,7 +219,7 @@ def wavelet_loss(
     Returns:
       The loss.
     """
-    render, truth = filled(render, truth, valid)
+    render, truth = _filled(render, truth, valid)
     # The transform is linear, so one pyramid of the difference is enough.
     pyramid = haar_pyramid(render - truth, spec.levels)
     factors = [spec.level_factor**level for level in range(spec.levels)]
@@ -262,7 +254,7 @@ def fourier_loss(
     Returns:
       The loss.
     """
-    render, truth = filled(render, truth, valid)
+    render, truth = _filled(render, truth, valid)
     width = truth.shape[1]
     difference = amplitudes(render) - amplitudes(truth)
     multiplicity = _times_in_whole_spectrum(width, truth.dtype)

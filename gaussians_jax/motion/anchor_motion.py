@@ -121,25 +121,14 @@ def offsets(
     return Offsets(**mlp.apply(feature_spec, at_time, features))
 
 
-def pose_children(
+def _pose_children(
     net: Anchors,
     spec: AnchorMotionSpec,
     derived: tuple[Splats, tuple[Carried, Features]],
     rows: Gaussians,
     code: Float[Array, " code"] | None,
 ) -> Gaussians:
-    """Compute the child Gaussians of moved anchors, with their own motion at a time.
-
-    Args:
-      net: Parameters of the networks.
-      spec: Settings.
-      derived: Children in their canonical state, and what they were computed from.
-      rows: Anchors, moved by the motion or by hand.
-      code: Code of the time. None disables the motion of the children.
-
-    Returns:
-      The child Gaussians.
-    """
+    """Compute the child Gaussians of moved anchors, with their own motion at a time."""
     canonical, (children, features) = derived
     if code is None:
         return carried.pose_children(children, None, canonical, rows)
@@ -172,22 +161,13 @@ def significance(gaussians: Gaussians) -> Float[Array, " gaussians"]:
     return jax.lax.stop_gradient(weight)
 
 
-def fit_to_paths(
+def _fit_to_paths(
     spec: AnchorMotionSpec, frames: int, paths: Paths, key: Key[Array, ""]
 ) -> Guess:
     """Initialize anchors at the middle of the video, with random features, on the host.
 
     Motion of other random features is penalized, so that anchors without paths are
     static.
-
-    Args:
-      spec: Settings.
-      frames: Number of training frames.
-      paths: 3D paths of points.
-      key: PRNG key.
-
-    Returns:
-      Initial guess of a fit.
     """
     rows_key, nets_key, rest_key = jax.random.split(key, 3)
     points = jnp.asarray(motion_fit.positions_at_middle(paths), jnp.float32)
@@ -211,19 +191,10 @@ def fit_to_paths(
     return Guess(start, rates, penalty)
 
 
-def features_of(
+def _features_of(
     spec: AnchorMotionSpec, params: MotionParams, condition: FrameCondition | None
 ) -> Features:
-    """Return features with noise in training, and quantized features afterwards.
-
-    Args:
-      spec: Settings.
-      params: Parameters of the motion.
-      condition: Step and key in training. None afterwards.
-
-    Returns:
-      The features.
-    """
+    """Return features with noise in training, and quantized features afterwards."""
     features, net = params
     if spec.rate is None:
         return features
@@ -242,7 +213,7 @@ def features_of(
 
 def _derive_rows(spec, scene, condition):
     params = MotionParams(scene.rows[NAME], scene.nets[NAME])
-    features = features_of(spec, params, condition)
+    features = _features_of(spec, params, condition)
     rows = scene.rows["splats"]
     params = make_children(scene.nets[NAME], spec, features, rows.sh_rest.shape[1])
     return carried.canonical_children(rows, params), (params, features)
@@ -252,14 +223,14 @@ def _derive(spec, scene, derived, rows, condition):
     """Return the children, with fine motion after the warm-up."""
     net = scene.nets[NAME]
     if not spec.moves:
-        return pose_children(net, spec, derived, rows, None)
+        return _pose_children(net, spec, derived, rows, None)
     code = codes.at_time(net.times, condition.time)
     if not spec.warm_up or condition.step is None:
-        return pose_children(net, spec, derived, rows, code)
+        return _pose_children(net, spec, derived, rows, code)
     return jax.lax.cond(
         condition.step < spec.warm_up,
-        lambda net, derived, rows: pose_children(net, spec, derived, rows, None),
-        lambda net, derived, rows: pose_children(net, spec, derived, rows, code),
+        lambda net, derived, rows: _pose_children(net, spec, derived, rows, None),
+        lambda net, derived, rows: _pose_children(net, spec, derived, rows, code),
         net,
         derived,
         rows,
@@ -283,7 +254,7 @@ def penalty(spec: AnchorMotionSpec, context: PenaltyContext) -> dict[str, Term]:
 
     def evaluate(scene):
         motion_params = MotionParams(scene.rows[NAME], scene.nets[NAME])
-        features = features_of(spec, motion_params, context.condition)
+        features = _features_of(spec, motion_params, context.condition)
         first, others = bits(features, scene.nets[NAME].law, spec)
         total = jnp.sum(first, axis=1) + jnp.sum(others, axis=(1, 2))
         count = jnp.maximum(jnp.sum(active), 1) * numbers
@@ -348,7 +319,7 @@ class Bound(BoundMotion):
         code = codes.at_time(net.times, frame.time)
         residuals = in_blocks(
             lambda reference: offsets(net.coarse, coarse_spec(spec), reference, code),
-            (features_of(spec, params, frame).reference,),
+            (_features_of(spec, params, frame).reference,),
             splats.in_use(gaussians),
             spec.block,
         )
@@ -378,4 +349,4 @@ class Bound(BoundMotion):
 
     def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:
         """Return anchors at the points of the paths, to start a fit from."""
-        return fit_to_paths(self.spec, self.frames, paths, key)
+        return _fit_to_paths(self.spec, self.frames, paths, key)

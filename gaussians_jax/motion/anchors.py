@@ -97,7 +97,7 @@ class AnchorMotionSpec:
             )
         for name in ("feature_rate", "make_rate", "learning_rate"):
             schedules.check_falling(getattr(self, name), getattr(self, f"{name}_end"))
-        for network in (make_spec, coarse_spec, fine_spec):
+        for network in (_make_spec, coarse_spec, fine_spec):
             network(self)  # validates the sizes
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> Any:
@@ -139,7 +139,7 @@ def residual_width(spec: AnchorMotionSpec) -> int:
     return spec.residual if spec.moves else spec.residual // 2
 
 
-def make_spec(spec: AnchorMotionSpec) -> MLPSpec:
+def _make_spec(spec: AnchorMotionSpec) -> MLPSpec:
     """Settings of the network from [reference, half of residual] to a child."""
     heads = (
         ("offset", HeadSpec(3)),
@@ -167,7 +167,7 @@ def _moving_spec(spec, inputs):
     return MLPSpec(inputs + spec.time_code, 2, spec.width, heads, (), "relu", "he")
 
 
-def context_spec(spec: AnchorMotionSpec) -> MLPSpec:
+def _context_spec(spec: AnchorMotionSpec) -> MLPSpec:
     """Settings of the network from reference features to the prior of residual ones."""
     each = spec.count * residual_width(spec)
     heads = (("mean", HeadSpec(each, "zero")), ("log_scale", HeadSpec(each, "zero")))
@@ -213,7 +213,7 @@ def init(
       Shared parameters.
     """
     times_key, make_key, coarse_key, fine_key, law_key = jax.random.split(key, 5)
-    make = mlp.init(make_spec(spec), make_key, dtype)
+    make = mlp.init(_make_spec(spec), make_key, dtype)
     law = None if spec.rate is None else _init_law(law_key, spec, dtype)
     if not spec.moves:
         return Anchors(None, make, None, None, law)
@@ -230,7 +230,7 @@ def init(
 
 
 def _init_law(key, spec, dtype):
-    context = mlp.init(context_spec(spec), key, dtype)
+    context = mlp.init(_context_spec(spec), key, dtype)
     log_spread = math.log(spec.spread)
     head = context.heads["log_scale"]
     context.heads["log_scale"] = head._replace(
@@ -246,23 +246,16 @@ def _init_law(key, spec, dtype):
     )
 
 
-def law_of_residual(
+def _law_of_residual(
     law: Law, spec: AnchorMotionSpec, reference: Float[Array, "anchors reference"]
 ) -> tuple[
     Float[Array, "anchors children residual"], Float[Array, "anchors children residual"]
 ]:
-    """Compute the prior of the residual features.
+    """Compute means and logarithms of deviations of the residual features.
 
-    Args:
-      law: The prior. It may have more residual features than `spec`, if a scene with
-        motion is rendered without.
-      spec: Settings.
-      reference: Reference features.
-
-    Returns:
-      Means and logarithms of the standard deviations.
+    The prior has more features than `spec` if a scene is rendered without its motion.
     """
-    outputs = mlp.apply(context_spec(spec), law.context, reference)
+    outputs = mlp.apply(_context_spec(spec), law.context, reference)
     shape = (len(reference), spec.count, len(law.residual_log_step))
     return outputs["mean"].reshape(shape), outputs["log_scale"].reshape(shape)
 
@@ -282,7 +275,7 @@ def quantize(features: Features, law: Law, spec: AnchorMotionSpec) -> Features:
     reference = _straight_through(
         features.reference, entropy.rounded(features.reference, law.mean, step)
     )
-    mean, _ = law_of_residual(law, spec, reference)
+    mean, _ = _law_of_residual(law, spec, reference)
     quantized = entropy.rounded(features.residual, mean, residual_step)
     return Features(reference, _straight_through(features.residual, quantized))
 
@@ -337,7 +330,7 @@ def bits(
     """
     step, residual_step = _steps(law)
     first = entropy.bits(features.reference, law.mean, law.log_scale, step)
-    mean, log_scale = law_of_residual(law, spec, features.reference)
+    mean, log_scale = _law_of_residual(law, spec, features.reference)
     return first, entropy.bits(features.residual, mean, log_scale, residual_step)
 
 
@@ -359,7 +352,7 @@ def make_children(
     shape = (*features.residual.shape[:2], spec.reference)
     reference = jnp.broadcast_to(features.reference[:, None], shape)
     inputs = jnp.concatenate([reference, features.residual[..., :half]], axis=-1)
-    heads = mlp.apply(make_spec(spec), net.make, inputs)
+    heads = mlp.apply(_make_spec(spec), net.make, inputs)
     turn = jax.vmap(jax.vmap(quaternion.exp))(heads["turn"])
     return Carried(
         offset=heads["offset"],

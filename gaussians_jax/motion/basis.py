@@ -88,10 +88,10 @@ class BasisMotionSpec:
                 f"block={self.block} and warm_up={self.warm_up}"
             )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
-        base_spec(self)  # these validate sizes, layers and activation
-        weights_spec(self)
+        _base_spec(self)  # these validate sizes, layers and activation
+        _weights_spec(self)
         if self.count is not None:
-            basis_spec(self)
+            _basis_spec(self)
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
         """Return the motion for a run of `run_steps` on this capture."""
@@ -127,7 +127,7 @@ class Offsets(NamedTuple):
     log_scale: Float[Array, "*gaussians 3"]  # added to the logarithm
 
 
-def base_spec(spec: BasisMotionSpec) -> MLPSpec:
+def _base_spec(spec: BasisMotionSpec) -> MLPSpec:
     """Settings of the network from [mean, time], encoded, to the slow displacement."""
     inputs = spec.position.width(3) + spec.base_time.width(1)
     heads = (("mean", HeadSpec(3, "small")),)
@@ -136,18 +136,12 @@ def base_spec(spec: BasisMotionSpec) -> MLPSpec:
     )
 
 
-def basis_spec(spec: BasisMotionSpec) -> MLPSpec:
+def _basis_spec(spec: BasisMotionSpec) -> MLPSpec:
     """Settings of the network from the encoded mean to K directions.
 
     Directions have a length of about one at first. One hidden layer and the output are
     the paper's "2 layers": its storage column leaves room for 570k to 590k numbers in
     all networks, and this gives 589k.
-
-    Args:
-      spec: Settings of the motion.
-
-    Returns:
-      Settings of the network.
     """
     assert spec.count is not None
     heads = (("directions", HeadSpec(3 * spec.count)),)
@@ -155,19 +149,13 @@ def basis_spec(spec: BasisMotionSpec) -> MLPSpec:
     return MLPSpec(inputs, 1, spec.basis_width, heads, (), spec.activation, "he")
 
 
-def weights_spec(spec: BasisMotionSpec) -> MLPSpec:
+def _weights_spec(spec: BasisMotionSpec) -> MLPSpec:
     """Settings of the network from [encoded p', encoded time] to weights and others.
 
     The other outputs are rotation and scale.
 
     All heads are initialized near zero, so that a Gaussian starts in its canonical
     state, but directions are not. If both were zero, neither would get a gradient.
-
-    Args:
-      spec: Settings of the motion.
-
-    Returns:
-      Settings of the network.
     """
     heads = (
         ("weights", HeadSpec(spec.count or 3, "small")),
@@ -201,11 +189,11 @@ def init(key: Key[Array, ""], spec: BasisMotionSpec, dtype=jnp.float32) -> Basis
     base_key, basis_key, weights_key = jax.random.split(key, 3)
     basis = None
     if spec.count is not None:
-        basis = mlp.init(basis_spec(spec), basis_key, dtype)
+        basis = mlp.init(_basis_spec(spec), basis_key, dtype)
     return BasisMotion(
-        mlp.init(base_spec(spec), base_key, dtype),
+        mlp.init(_base_spec(spec), base_key, dtype),
         basis,
-        mlp.init(weights_spec(spec), weights_key, dtype),
+        mlp.init(_weights_spec(spec), weights_key, dtype),
     )
 
 
@@ -224,7 +212,7 @@ def basis_vectors(
     basis: MLP, spec: BasisMotionSpec, encoded: Float[Array, " features"]
 ) -> Float[Array, "3 count"]:
     """Compute V(p), equation 4, for one encoded canonical mean."""
-    directions = mlp.apply(basis_spec(spec), basis, encoded)["directions"]
+    directions = mlp.apply(_basis_spec(spec), basis, encoded)["directions"]
     directions = directions.reshape(3, spec.count)
     if spec.basis_form == "free":
         return directions
@@ -241,37 +229,29 @@ class AtTime(NamedTuple):
     weights: MLP
 
 
-def fold_time(
+def _fold_time(
     params: BasisMotion, spec: BasisMotionSpec, time: Float[Array, ""]
 ) -> AtTime:
     """Evaluate the contribution of the time to the first layers of both networks.
 
     It is the same for all Gaussians and is computed once.
-
-    Args:
-      params: Shared parameters.
-      spec: Settings.
-      time: Normalized time.
-
-    Returns:
-      The networks at that time.
     """
     slow = encoding.encode(spec.base_time, time[None], None)
     fast = encoding.encode(spec.time, time[None], None)
     return AtTime(
-        mlp.with_known(base_spec(spec), params.base, slow),
-        mlp.with_known(weights_spec(spec), params.weights, fast),
+        mlp.with_known(_base_spec(spec), params.base, slow),
+        mlp.with_known(_weights_spec(spec), params.weights, fast),
     )
 
 
-def base_displacement(
+def _base_displacement(
     base: MLP, spec: BasisMotionSpec, first_layer: Float[Array, " width"]
 ) -> Float[Array, "3"]:
     """Compute D(p, t), equation 3, of one Gaussian from its cached first layer."""
     first, *others = base.hidden
     hidden = mlp.ACTIVATIONS[spec.activation](first_layer + first.bias)
     remaining = dataclasses.replace(
-        base_spec(spec), inputs=spec.base_width, depth=spec.base_depth - 1
+        _base_spec(spec), inputs=spec.base_width, depth=spec.base_depth - 1
     )
     return mlp.apply(remaining, MLP(tuple(others), base.heads), hidden)["mean"]
 
@@ -281,15 +261,15 @@ def residual(
 ) -> dict[str, Float[Array, " outputs"]]:
     """Compute w(p', t), equation 5, with rotation and scale, of one Gaussian."""
     encoded = encoding.encode(spec.position, slow_mean, None)
-    position_only = dataclasses.replace(weights_spec(spec), inputs=len(encoded))
+    position_only = dataclasses.replace(_weights_spec(spec), inputs=len(encoded))
     return mlp.apply(position_only, weights, encoded)
 
 
-def offsets_at_time(
+def _offsets_at_time(
     at_time: AtTime, spec: BasisMotionSpec, point: Float[Array, "3"], prepared: Prepared
 ) -> Offsets:
     """Evaluate equations 3, 5 and 6 for one Gaussian."""
-    slow = base_displacement(at_time.base, spec, prepared.base)
+    slow = _base_displacement(at_time.base, spec, prepared.base)
     heads = residual(at_time.weights, spec, point + slow)
     fast = heads["weights"]
     if prepared.basis is not None:
@@ -346,9 +326,9 @@ def deform(
     Returns:
       The residuals.
     """
-    at_time = fold_time(params, spec, time)
+    at_time = _fold_time(params, spec, time)
     return in_blocks(
-        jax.vmap(lambda point, row: offsets_at_time(at_time, spec, point, row)),
+        jax.vmap(lambda point, row: _offsets_at_time(at_time, spec, point, row)),
         (_network_input(spec, mean), prepared),
         active,
         spec.block,

@@ -125,17 +125,8 @@ class Carried(NamedTuple):
     sh_rest: Float[Array, "cores children rest 3"]  # added to the core's
 
 
-def init_rows(key: Key[Array, ""], spec: CarriedSpec, rows: Splats) -> Carried:
-    """Initialize children as smaller copies of their core, spread around it.
-
-    Args:
-      key: PRNG key.
-      spec: Settings.
-      rows: Raw parameters of the cores.
-
-    Returns:
-      Parameters of the children.
-    """
+def _init_rows(key: Key[Array, ""], spec: CarriedSpec, rows: Splats) -> Carried:
+    """Initialize children as smaller copies of their core, spread around it."""
     shape, dtype = (len(rows.mean), spec.count), rows.mean.dtype
     noise = jax.random.normal(key, (*shape, 3), jnp.float32).astype(dtype)
     return Carried(
@@ -316,7 +307,7 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> SplatRecord:
 
     def init(key, gaussians):
         rows_key, shared_key = jax.random.split(key)
-        children = init_rows(rows_key, spec, gaussians)
+        children = _init_rows(rows_key, spec, gaussians)
         if spec.turns is None:
             return MotionParams(children)
         return MotionParams(children, mlp.init(network_spec(spec.turns), shared_key))

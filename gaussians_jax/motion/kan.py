@@ -166,7 +166,7 @@ def field_spec(spec: KanMotionSpec) -> KANSpec | MLPSpec:
         return kan_spec
     width = spec.mlp_width
     if width is None:
-        width = equal_width(kan_spec)
+        width = _equal_width(kan_spec)
     return _mlp_spec(kan_spec, width)
 
 
@@ -197,15 +197,8 @@ def _mlp_spec(spec: KANSpec, width):
     )
 
 
-def equal_width(spec: KANSpec) -> int:
-    """Find the width of an MLP with the KAN's depth and about as many parameters.
-
-    Args:
-      spec: Settings of the KAN.
-
-    Returns:
-      The width.
-    """
+def _equal_width(spec: KANSpec) -> int:
+    """Find the width of an MLP with the KAN's depth and about as many parameters."""
     goal = parameter_count(spec)
     width = 1
     while parameter_count(_mlp_spec(spec, width + 1)) <= goal:

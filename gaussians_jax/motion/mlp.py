@@ -135,7 +135,7 @@ def trunk_spec(spec: MotionSpec) -> MLPSpec:
     return MLPSpec(inputs, spec.depth, spec.width, heads, spec.skips, "relu", "he")
 
 
-def time_spec(spec: MotionSpec) -> MLPSpec:
+def _time_spec(spec: MotionSpec) -> MLPSpec:
     """Settings of the network from the encoded time to its code."""
     assert spec.time_code is not None
     heads = (("code", HeadSpec(spec.time_code)),)
@@ -152,7 +152,7 @@ def init(key: Key[Array, ""], spec: MotionSpec, dtype=jnp.float32) -> Motion:
     trunk = mlp.init(trunk_spec(spec), trunk_key, dtype)
     if spec.time_code is None:
         return Motion(trunk, None)
-    return Motion(trunk, mlp.init(time_spec(spec), time_key, dtype))
+    return Motion(trunk, mlp.init(_time_spec(spec), time_key, dtype))
 
 
 def deform(
@@ -204,7 +204,7 @@ def fold_time(params: Motion, spec: MotionSpec, time: Float[Array, ""]) -> mlp.M
     """
     features = encoding.encode(spec.time, time[None], None)
     if params.time is not None:
-        features = mlp.apply(time_spec(spec), params.time, features)["code"]
+        features = mlp.apply(_time_spec(spec), params.time, features)["code"]
     return mlp.with_known(trunk_spec(spec), params.trunk, features)
 
 

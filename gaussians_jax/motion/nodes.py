@@ -191,7 +191,7 @@ SMALL_NODE_MOTION = NodeMotionSpec(
 
 
 def init(key: Key[Array, ""], spec: NodeMotionSpec, dtype=jnp.float32) -> Nodes:
-    """Initialize nodes that hardly move anything, all at the origin (`place_nodes`)."""
+    """Initialize nodes that hardly move anything, all at the origin (`_place_nodes`)."""
     return Nodes(
         position=jnp.zeros((spec.nodes, 3), dtype),
         log_radius=jnp.zeros(spec.nodes, dtype),
@@ -218,16 +218,10 @@ def openness(mask: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
     return jnp.clip(STRETCH * jax.nn.sigmoid(mask) - (STRETCH - 1) / 2, 0, 1)
 
 
-def place_nodes(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes:
+def _place_nodes(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes:
     """Initialize nodes at positions, with the distance to their neighbors as radius.
 
-    Args:
-      nodes: Parameters of the nodes.
-      position: Positions. They are repeated if there are fewer than nodes, and
-        coincident nodes share their influence.
-
-    Returns:
-      Parameters of the nodes.
+    Positions are repeated if there are fewer than nodes.
     """
     count, dtype = len(nodes.position), nodes.position.dtype
     positions = position[np.arange(count) % len(position)]
@@ -274,25 +268,14 @@ def moves(
     return Moves(jax.vmap(quaternion.exp)(turn), extent * shift)
 
 
-def find(
+def _find(
     nodes: Nodes,
     spec: NodeMotionSpec,
     extent: float,
     mean: Float[Array, "gaussians 3"],
     linked: bool = True,
 ) -> Neighborhoods:
-    """Find the nodes near each Gaussian, and the links between nodes.
-
-    Args:
-      nodes: Parameters of the nodes.
-      spec: Settings.
-      extent: Scene extent in scene units.
-      mean: Canonical means of the Gaussians.
-      linked: False to omit the links.
-
-    Returns:
-      The neighborhoods.
-    """
+    """Find the nodes near each Gaussian, and the links between nodes."""
     near = skinning.nearest(mean, nodes.position, spec.near)
     moving = None
     if spec.mask is not None:
@@ -336,25 +319,14 @@ def displace(
     )
 
 
-def arap_loss(
+def _arap_loss(
     nodes: Nodes,
     spec: NodeMotionSpec,
     extent: float,
     linked: Links,
     times: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> Float[Array, ""]:
-    """Compute the deviation of linked nodes from rigid motion, in squared extents.
-
-    Args:
-      nodes: Parameters of the nodes.
-      spec: Settings.
-      extent: Scene extent in scene units.
-      linked: Links between nodes.
-      times: Two normalized times.
-
-    Returns:
-      The loss.
-    """
+    """Compute the deviation of linked nodes from rigid motion, in squared extents."""
     before, after = (
         (nodes.position + moves(nodes, spec, extent, time).shift) / extent
         for time in times
@@ -390,7 +362,7 @@ def fit_to_paths(
     static_nodes = static_points[
         skinning.farthest_points(static_points, spec.nodes - len(moving_nodes))
     ]
-    nodes = place_nodes(init(key, spec), np.concatenate([moving_nodes, static_nodes]))
+    nodes = _place_nodes(init(key, spec), np.concatenate([moving_nodes, static_nodes]))
     static_rows = slice(len(moving_nodes), len(moving_nodes) + len(static_nodes))
     if spec.mask is not None:
         assert nodes.mask is not None
@@ -441,17 +413,17 @@ class Bound(BoundMotion):
         _, shared_key = jax.random.split(key)
         means = np.asarray(gaussians.mean)
         places = means[skinning.farthest_points(means, self.spec.nodes)]
-        return MotionParams(shared=place_nodes(init(shared_key, self.spec), places))
+        return MotionParams(shared=_place_nodes(init(shared_key, self.spec), places))
 
     def precompute(self, params: MotionParams, gaussians: Splats) -> Neighborhoods:
         """Find the nodes near each Gaussian."""
         mean = gaussians.mean
-        return find(params.shared, self.spec, self.extent, mean, linked=False)
+        return _find(params.shared, self.spec, self.extent, mean, linked=False)
 
     @functools.partial(jax.jit, static_argnums=0)
     def refresh(self, params: MotionParams, gaussians: Splats) -> Neighborhoods:
         """Find nodes near Gaussians and each other, for a new set of Gaussians."""
-        return find(params.shared, self.spec, self.extent, gaussians.mean)
+        return _find(params.shared, self.spec, self.extent, gaussians.mean)
 
     def apply(
         self,
@@ -471,7 +443,7 @@ class Bound(BoundMotion):
         terms = {}
         if spec.rigidity is not None:
             times = time, jax.random.uniform(context.key, (), time.dtype)
-            value = arap_loss(nodes, spec, self.extent, context.state.links, times)
+            value = _arap_loss(nodes, spec, self.extent, context.state.links, times)
             terms["unrigidity"] = Term(value, spec.rigidity)
         if spec.mask is not None and spec.mask.sparsity > 0:
             used = jnp.mean(jax.nn.sigmoid(nodes.mask))

@@ -121,18 +121,10 @@ def init(key: Key[Array, ""], spec: PlaneMotionSpec, dtype=jnp.float32) -> Motio
     )
 
 
-def in_unit_cube(
+def _in_unit_cube(
     box: tuple[Corner, Corner], mean: Float[Array, "gaussians 3"]
 ) -> Float[Array, "gaussians 3"]:
-    """Map means to the unit cube over a box.
-
-    Args:
-      box: Minimum and maximum corner in scene units.
-      mean: Means in scene units.
-
-    Returns:
-      Positions in the unit cube.
-    """
+    """Map means to the unit cube over a box."""
     low, high = (jnp.asarray(corner, mean.dtype) for corner in box)
     return (mean - low) / (high - low)
 
@@ -238,7 +230,9 @@ class Bound(BoundMotion):
     def precompute(self, params: MotionParams, gaussians: Splats) -> Features:
         """Interpolate the spatial planes."""
         assert self.box is not None
-        return prepare(params.shared, self.spec, in_unit_cube(self.box, gaussians.mean))
+        return prepare(
+            params.shared, self.spec, _in_unit_cube(self.box, gaussians.mean)
+        )
 
     def apply(
         self,
@@ -249,7 +243,7 @@ class Bound(BoundMotion):
     ) -> Gaussians:
         """Move the Gaussians to their state at a time."""
         assert self.box is not None
-        position = in_unit_cube(self.box, gaussians.mean)
+        position = _in_unit_cube(self.box, gaussians.mean)
         residuals = offsets(params.shared, self.spec, position, frame.time, cache)
         return apply(gaussians, residuals._replace(mean=self.extent * residuals.mean))
 

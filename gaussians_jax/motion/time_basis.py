@@ -121,25 +121,15 @@ def init(key: Key[Array, ""], spec: TimeBasisSpec, dtype=jnp.float32) -> MLP:
     return mlp.init(network_spec(spec), key, dtype)
 
 
-def init_coefficients(spec: TimeBasisSpec, gaussians: int, dtype=jnp.float32):
+def _init_coefficients(spec: TimeBasisSpec, gaussians: int, dtype=jnp.float32):
     """Initialize static coefficients [gaussians, count]."""
     return jnp.zeros((gaussians, spec.count), dtype)
 
 
-def at_time(
+def _at_time(
     params: MLP, spec: TimeBasisSpec, extent: float, time: Float[Array, ""]
 ) -> Trajectories:
-    """Evaluate the trajectories at a time.
-
-    Args:
-      params: Parameters of the network.
-      spec: Settings.
-      extent: Extent of the scene, the unit of translations, in scene units.
-      time: Normalized time.
-
-    Returns:
-      The trajectories.
-    """
+    """Evaluate the trajectories at a time."""
     encoded = encoding.encode(spec.time, time[None], None)
     outputs = mlp.apply(network_spec(spec), params, encoded)
     shift, turn = (outputs[name].reshape(spec.count, 3) for name in ("shift", "turn"))
@@ -214,7 +204,7 @@ class Bound(BoundMotion):
         """Initialize the network, and coefficients without motion."""
         _, shared_key = jax.random.split(key)
         mean = gaussians.mean
-        coefficients = init_coefficients(self.spec, len(mean), mean.dtype)
+        coefficients = _init_coefficients(self.spec, len(mean), mean.dtype)
         return MotionParams(coefficients, init(shared_key, self.spec))
 
     def apply(
@@ -225,7 +215,7 @@ class Bound(BoundMotion):
         frame: FrameCondition,
     ) -> Gaussians:
         """Move the Gaussians to their state at a time."""
-        trajectories = at_time(params.shared, self.spec, self.extent, frame.time)
+        trajectories = _at_time(params.shared, self.spec, self.extent, frame.time)
         return deform(trajectories, params.per_gaussian, gaussians)
 
     def loss(self, params: MotionParams, context: PenaltyContext) -> dict[str, Term]:

@@ -336,7 +336,7 @@ def _rebuild(optimizer, params, moments, rows, kind, inactive, key, shrink, revi
     params, moments = row_optimizer.gather_rows(
         optimizer, params, moments, rows, fresh, inactive
     )
-    split = split_rows(params.rows["splats"], kind == CHILD, key, shrink)
+    split = _split_rows(params.rows["splats"], kind == CHILD, key, shrink)
     if revised:
         half_logit = halve_opacity(split.opacity_logit)
         logit = jnp.where((kind == KEPT) | inactive, split.opacity_logit, half_logit)
@@ -345,23 +345,13 @@ def _rebuild(optimizer, params, moments, rows, kind, inactive, key, shrink, revi
     return params, moments, empty_stats(split)
 
 
-def split_rows(
+def _split_rows(
     rows: Splats,
     child: Bool[Array, " gaussians"],
     key: Key[Array, ""],
     shrink: float,
 ) -> Splats:
-    """Sample children from the Gaussians that they duplicate, and shrink them.
-
-    Args:
-      rows: Raw parameters.
-      child: True for the children.
-      key: PRNG key.
-      shrink: Divisor of their scale.
-
-    Returns:
-      Raw parameters.
-    """
+    """Sample children from the Gaussians that they duplicate, and shrink them."""
     activated = splats.activate(rows)
     noise = jax.random.normal(key, rows.mean.shape, rows.mean.dtype)
     offset = jax.vmap(quaternion.rotate)(rows.quaternion, activated.scale * noise)

@@ -113,7 +113,7 @@ class MCMCStrategySpec:
         learning_rate: Float[Array, ""] | float,
     ) -> Params:
         """Return the parameters with noise on the means."""
-        return inject_noise(key, params, learning_rate, self)
+        return _inject_noise(key, params, learning_rate, self)
 
 
 def compute_relocation(
@@ -355,23 +355,13 @@ def position_noise(
     return strength[:, None] * displacement
 
 
-def inject_noise(
+def _inject_noise(
     key: Key[Array, ""],
     params: Params,
     learning_rate: Float[Array, ""] | float,
     spec: MCMCStrategySpec,
 ) -> Params:
-    """Add `position_noise` to the means.
-
-    Args:
-      key: Random key.
-      params: All parameters.
-      learning_rate: Current learning rate of the means.
-      spec: Settings.
-
-    Returns:
-      Parameters with displaced means.
-    """
+    """Add `position_noise` to the means."""
     rows = params.rows["splats"]
     noise = position_noise(key, rows, learning_rate, spec)
     rows = rows._replace(mean=rows.mean + noise)

@@ -226,15 +226,8 @@ def _count_once_started(count, grads):
     return count + ((count > 0) | has_gradient).astype(count.dtype)
 
 
-def row_leaves(params: Params) -> Params:
-    """Mark the leaves that have one entry per Gaussian.
-
-    Args:
-      params: All parameters.
-
-    Returns:
-      True for the leaves of `rows`, False for those of `nets`.
-    """
+def _row_leaves(params: Params) -> Params:
+    """Mark the leaves that have one entry per Gaussian."""
     return Params(
         rows=jax.tree.map(lambda _: True, params.rows),
         nets=jax.tree.map(lambda _: False, params.nets),
@@ -302,4 +295,4 @@ def gather_rows(
         is_reset = (fresh | inactive).reshape(fresh.shape + (1,) * (moment.ndim - 1))
         return jnp.where(is_reset, jnp.zeros_like(moment[:1]), moment[rows])
 
-    return gathered, map_moments(optimizer, gather, moments, row_leaves(params))
+    return gathered, map_moments(optimizer, gather, moments, _row_leaves(params))

@@ -124,7 +124,7 @@ def compose(
 
 def _packed(at, rows, capture, seen, count):
     instants = gathered(at, rows, seen, count)
-    return instants, packing.pack(instants, still_distance(instants, capture))
+    return instants, packing.pack(instants, _still_distance(instants, capture))
 
 
 def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict:
@@ -175,16 +175,8 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
     }
 
 
-def still_distance(instants: Instants, capture: Capture) -> np.ndarray:
-    """Compute the displacement that is invisible: a tenth of a pixel.
-
-    Args:
-      instants: Gaussians at several times.
-      capture: The capture, whose training camera nearest to each Gaussian counts.
-
-    Returns:
-      [gaussians] distance in scene units.
-    """
+def _still_distance(instants: Instants, capture: Capture) -> np.ndarray:
+    """Compute the displacement that is invisible: a tenth of a pixel."""
     train = cameras.take(capture.cameras, capture.train)
     nearest = np.full(instants.mean.shape[1], np.inf)
     for position, focal in zip(train.position, train.focal_px, strict=True):

@@ -106,9 +106,9 @@ def project(
     x, y, z = (dot(world[i], offset) for i in range(3))
     x, y = x / z, y / z
     focal_x, focal_y = camera.focal_px, camera.focal_px * camera.pixel_aspect
-    bent_x, bent_y = linearized(camera, x, y).bent
+    bent_x, bent_y = _linearized(camera, x, y).bent
     pixel = jnp.stack([focal_x * bent_x + camera.skew_px * bent_y, focal_y * bent_y])
-    near = linearized(
+    near = _linearized(
         camera,
         jnp.clip(x, bounds.low[0], bounds.high[0]),
         jnp.clip(y, bounds.low[1], bounds.high[1]),
@@ -130,17 +130,8 @@ def project(
     return pixel + camera.principal_point_px, z, (first, second)
 
 
-def linearized(camera: Camera, x: Float[Array, ""], y: Float[Array, ""]) -> LinearLens:
-    """Distort one point of the image plane, with the Jacobian of the distortion.
-
-    Args:
-      camera: One camera.
-      x: Undistorted tangent to the right.
-      y: Undistorted tangent down.
-
-    Returns:
-      The distorted position and the Jacobian.
-    """
+def _linearized(camera: Camera, x: Float[Array, ""], y: Float[Array, ""]) -> LinearLens:
+    """Distort one point of the image plane, with the Jacobian of the distortion."""
     squared = x * x + y * y
     if camera.fisheye is not None:
         ratio, change, along = fisheye.stretch(camera.fisheye, squared)

@@ -67,10 +67,10 @@ def render(
     Raises:
       ValueError: An array has another shape, or the camera has lens distortion without
         `spec.distorted`. The distortion of a traced camera cannot be checked
-        (`refuse_distortion` on the host).
+        (`_refuse_distortion` on the host).
     """
     if not (spec.distorted or isinstance(camera.radial, jax.core.Tracer)):
-        refuse_distortion(camera)
+        _refuse_distortion(camera)
     footprints = projection.project(gaussians, camera, size, spec)
     drawn = footprints
     if mean2d_offset is not None:
@@ -124,7 +124,7 @@ def render_harmonics(
     return render(gaussians, colors, camera, size, spec, *extras)
 
 
-def refuse_distortion(camera: Camera) -> None:
+def _refuse_distortion(camera: Camera) -> None:
     """Raise where `camera` (host values) has radial or tangential distortion."""
     for name in ("radial", "tangential"):
         value = np.asarray(getattr(camera, name))

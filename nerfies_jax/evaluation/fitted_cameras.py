@@ -89,7 +89,7 @@ def photometric_loss(
     return loss
 
 
-def fit_camera(
+def _fit_camera(
     model: Model,
     state: TrainState,
     view: View,
@@ -100,21 +100,8 @@ def fit_camera(
 ) -> Fit:
     """Refine the camera of a view so that its rendering matches an image.
 
-    It can run under `jit`.
-
-    Args:
-      model: The model.
-      state: Trained state.
-      view: View of the frame with its initial camera.
-      picture: The frame, [height, width, 3].
-      valid: True for observed pixels, [height, width], or None for all.
-      depth: z-depth in scene units at which twists are measured in pixels.
-      spec: Settings.
-
-    Returns:
-      The fit, with the camera as `value`. `residual` is the norm of the gradient in
-      squared gray levels per pixel. An image that does not depend on the camera never
-      converges.
+    `residual` is the norm of the gradient in squared gray levels per pixel. An image
+    that does not depend on the camera never converges.
     """
     loss = photometric_loss(model, state, view, picture, valid, depth)
     start = jnp.zeros(6, view.camera.position.dtype)
@@ -160,7 +147,7 @@ def fit_cameras(
     # The smaller image does not contain the remaining pixels at the right and bottom.
     cropped = size[0] * factor, size[1] * factor
     program = jax.jit(
-        lambda params, step, view, picture, valid, depth: fit_camera(
+        lambda params, step, view, picture, valid, depth: _fit_camera(
             model,
             state._replace(params=params, step=step),
             view,

@@ -45,7 +45,7 @@ class Flow(NamedTuple):
     moving: np.ndarray | None  # [pixels] bool, True for pixels of moving objects
 
 
-def pixel_flow(
+def _pixel_flow(
     move: Move,
     state: TrainState,
     here: View,
@@ -55,19 +55,8 @@ def pixel_flow(
 ) -> np.ndarray:
     """Compute the flow of pixels from one view to another.
 
-    The point at the depth of each pixel is moved and projected to the other view.
-
-    Args:
-      move: Motion of points.
-      state: Trained state.
-      here: View of the pixels.
-      there: The other view.
-      pixels: Pixel positions (x, y) with centers at +0.5, [pixels, 2].
-      depth: z-depths in scene units, [pixels].
-
-    Returns:
-      Flow in pixels [pixels, 2]. It is NaN for pixels without depth, points that are
-      not found, and points behind the other camera.
+    The point at the depth of each pixel is moved and projected to the other view. The
+    flow is NaN without depth, without the moved point, and behind the other camera.
     """
     known = np.isfinite(depth) & (depth > 0)
     pixels = np.asarray(in_default_precision(pixels))
@@ -92,11 +81,11 @@ def picture_flow(
 
     Returns:
       Flow in pixels [height, width, 2]. It is NaN if opacity is below one half or
-      `pixel_flow` has no result.
+      `_pixel_flow` has no result.
     """
     pixels = _pixels(rendering)
     depth = np.where(rendering.alpha > 0.5, np.asarray(rendering.depth), 0)
-    flow = pixel_flow(move, state, here, there, pixels, depth.ravel())
+    flow = _pixel_flow(move, state, here, there, pixels, depth.ravel())
     return flow.reshape(*rendering.alpha.shape, 2)
 
 
@@ -194,7 +183,7 @@ def heldout_flow(
         row = int(scored.rows[place])
         line, column = spread(np.argwhere(visible[place]), PIXELS).T
         predicted.append(
-            pixel_flow(
+            _pixel_flow(
                 move,
                 state,
                 view_of(capture, row),

@@ -90,7 +90,7 @@ def field(
         return _init(spec, metadata, every, key)
 
     def codes_at(params, view):
-        return look_up(tables, metadata, params, view.time, view.appearance)
+        return _look_up(tables, metadata, params, view.time, view.appearance)
 
     def displace(params, point, condition):
         return displacement(bind(params), point, condition)
@@ -114,7 +114,7 @@ def field(
             return {}
         kind = jax.tree.leaves(params["template"])[0].dtype
         time = jnp.asarray(metadata.times[0], kind)
-        frame_codes = look_up(tables, metadata, params, time, jnp.int32(0))
+        frame_codes = _look_up(tables, metadata, params, time, jnp.int32(0))
         condition = FrameCondition(time, frame_codes, step)
         return skipping.survey(Bound(spec, metadata, still, params), condition)
 
@@ -242,25 +242,14 @@ def _init(spec, metadata, effects, key):
     return params
 
 
-def look_up(
+def _look_up(
     tables: tuple[Table, ...],
     metadata: SceneMetadata,
     params: PyTree,
     time: Scalar,
     appearance: Int[Array, ""],
 ) -> Codes:
-    """Look up the codes of one frame, interpolated between the training times.
-
-    Args:
-      tables: The code tables.
-      metadata: Scene metadata.
-      params: Parameters of the field.
-      time: Time in [0, 1].
-      appearance: Appearance id.
-
-    Returns:
-      Codes by the name of their table.
-    """
+    """Look up the codes of one frame, interpolated between the training times."""
     frame_codes = {}
     for table in tables:
         rows = params["codes"][table.name]

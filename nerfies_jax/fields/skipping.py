@@ -105,7 +105,7 @@ def survey(
       Occupied cells by level.
     """
     spec, metadata = bound.spec, bound.metadata
-    cells = cells_across(bound)
+    cells = _cells_across(bound)
     asked = jnp.ones(cells**3, bool)
     if shown is not None:
         asked = occupancy.dilated(shown).ravel()
@@ -127,7 +127,7 @@ def survey(
 
         index = jnp.arange(cells**3, dtype=jnp.int32)
         point = occupancy.random_points(key, index, cells, spec.extent, dtype)
-        seen = compacted(lambda cell: jax.vmap(densities)(point[cell]), asked)
+        seen = _compacted(lambda cell: jax.vmap(densities)(point[cell]), asked)
         filled = {name: new * span > SKIPPED_DEPTH for name, new in seen.items()}
         if guided:
             most = functools.reduce(jnp.maximum, seen.values())
@@ -145,15 +145,8 @@ def survey(
     }
 
 
-def cells_across(bound: Bound) -> int:
-    """Return the number of cells of a survey along each axis.
-
-    Args:
-      bound: The field with its parameters.
-
-    Returns:
-      The number of cells.
-    """
+def _cells_across(bound: Bound) -> int:
+    """Return the number of cells of a survey along each axis."""
     return MOVING_CELLS if is_moved(bound.effects) else STILL_CELLS
 
 
@@ -181,7 +174,7 @@ def shown_cells(bound: Bound, camera: Camera, size: tuple[int, int]) -> occupanc
     border = jnp.concatenate([centers[0], centers[-1], centers[:, 0], centers[:, -1]])
     ray = seen(jax.vmap(lambda at: rays.pixel_ray(camera, at).direction)(border))
     slope = ray[:, :2] / ray[:, 2:]
-    corner = occupancy.corners(cells_across(bound), bound.spec.extent, dtype)
+    corner = occupancy.corners(_cells_across(bound), bound.spec.extent, dtype)
     world = corner / metadata.scale + jnp.asarray(metadata.center, dtype)
     place = seen(world - camera.position)
     lateral, depth = place[..., :2], place[..., 2:]
@@ -359,16 +352,16 @@ def _ask(
                 place = place_of(index)
                 return said(index, place), place if kept else None
 
-            answer, place = compacted(jax.vmap(anew), wanted)
+            answer, place = _compacted(jax.vmap(anew), wanted)
             asked = _Asked(wanted, place) if kept else None
         else:
-            more = compacted(jax.vmap(place_of), wanted & ~before.known)
+            more = _compacted(jax.vmap(place_of), wanted & ~before.known)
             place = jax.tree.map(jnp.add, before.place, more)  # one of both is zero
 
             def again(index):
                 return said(index, jax.tree.map(lambda x: x[index], place))
 
-            answer, asked = compacted(jax.vmap(again), wanted), None
+            answer, asked = _compacted(jax.vmap(again), wanted), None
         depth = answer[:, 0].reshape(spacing.shape) * spacing
         return passed + jnp.sum(depth, axis=1), (answer, asked)
 
@@ -377,18 +370,10 @@ def _ask(
     return jax.tree.map(whole, found)
 
 
-def compacted(
+def _compacted(
     ask: Callable[[Int[Array, " batch"]], PyTree], wanted: Bool[Array, " places"]
 ) -> PyTree:
-    """Evaluate a function at a subset of indices, batch by batch.
-
-    Args:
-      ask: Function of indices [batch], whose results have a leading axis [batch].
-      wanted: True for indices to evaluate, [places].
-
-    Returns:
-      Results with a leading axis [places], zero if not evaluated.
-    """
+    """Evaluate a function at a subset of indices, batch by batch."""
     places = wanted.shape[0]
     order = jnp.cumsum(wanted, dtype=jnp.int32)
     rows = math.ceil(places / BATCH) * BATCH

@@ -20,18 +20,8 @@ _LOGGER = "nerfies_jax.viewer"
 _patching = threading.Lock()
 
 
-def refusal(host: str | None, origin: str | None, port: int) -> str | None:
-    """Decide whether a request is refused.
-
-    Args:
-      host: The Host header.
-      origin: The Origin header. Browsers send it with every websocket and with requests
-        of other sites. Other programs may omit it.
-      port: Port of the viewer.
-
-    Returns:
-      The reason, or None for a request of the viewer's own page.
-    """
+def _refusal(host: str | None, origin: str | None, port: int) -> str | None:
+    """Decide whether a request is refused."""
     allowed = [f"{name}:{port}" for name in NAMES]
     if port == 80:
         allowed += NAMES
@@ -83,7 +73,7 @@ def guarded() -> Iterator[None]:
 
 
 def _checked(process_request):
-    """Wrap a request handler to answer 403 if `refusal` returns a reason."""
+    """Wrap a request handler to answer 403 if `_refusal` returns a reason."""
 
     def process(connection, request):
         headers = request.headers
@@ -92,7 +82,7 @@ def _checked(process_request):
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         host = hosts[0] if len(hosts) == 1 else None
         origin = ", ".join(origins) if origins else None
-        reason = refusal(host, origin, port)
+        reason = _refusal(host, origin, port)
         if reason is None:
             return process_request(connection, request)
         return connection.respond(http.HTTPStatus.FORBIDDEN, f"Refused: {reason}\n")

@@ -44,7 +44,7 @@ class Display:
         for shown in reversed(self._open.values()):
             if shown.name == event.get("phase"):
                 shown.done, shown.total = event["step"], event["steps"]
-                shown.text, shown.eta = training_text(event), event["eta_seconds"]
+                shown.text, shown.eta = _training_text(event), event["eta_seconds"]
                 shown.count_format = "step {:,} of {:,}"
                 self._view.update(shown)
                 return
@@ -249,15 +249,8 @@ def _remaining_seconds(shown):
     return max(0.0, shown.seconds * (shown.total / shown.done - 1))
 
 
-def training_text(event: dict[str, Any]) -> str:
-    """Describe a `train` event: speed, loss, PSNR, counts and remaining time.
-
-    Args:
-      event: The event.
-
-    Returns:
-      The text.
-    """
+def _training_text(event: dict[str, Any]) -> str:
+    """Describe a `train` event: speed, loss, PSNR, counts and remaining time."""
     parts = [f"{event['steps_per_second']:.3g} steps/s"]
     metrics = event["metrics"]
     if "loss" in metrics:

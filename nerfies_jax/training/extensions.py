@@ -27,7 +27,7 @@ class Settings(Protocol):
         ...
 
 
-def is_name(text: str) -> bool:
+def _is_name(text: str) -> bool:
     """Return whether a text has the form MODULE:NAME."""
     module, colon, name = text.partition(SEPARATOR)
     parts = [*module.split("."), *name.split(".")]
@@ -83,7 +83,7 @@ def _is_settings(value):
 
 
 def _import(name):
-    if not is_name(name):
+    if not _is_name(name):
         raise ValueError(f"{name!r}: expected MODULE:NAME, such as my_motion:Drift")
     module_name, _, attribute = name.partition(SEPARATOR)
     try:

@@ -40,8 +40,8 @@ def fields_of(spec: Any, prefix: str = "") -> Iterator[SpecField]:
         value, path = getattr(spec, field.name), prefix + field.name
         yield SpecField(
             path,
-            as_text(value),
-            "" if field.default is dataclasses.MISSING else as_text(field.default),
+            _as_text(value),
+            "" if field.default is dataclasses.MISSING else _as_text(field.default),
             _kind_text(kinds[field.name]),
             words[field.name] or _sentences_on(field.name, type(spec)),
             type(spec),
@@ -50,21 +50,14 @@ def fields_of(spec: Any, prefix: str = "") -> Iterator[SpecField]:
             yield from fields_of(value, f"{path}.")
 
 
-def as_text(value: Any) -> str:
-    """Format a value as it is written in `path.to.field=value`.
-
-    Args:
-      value: Value of a field.
-
-    Returns:
-      The text, for a spec the name of its class.
-    """
+def _as_text(value: Any) -> str:
+    """Format a value as it is written in `path.to.field=value`."""
     if value is None or isinstance(value, bool):
         return str(value).lower()
     if dataclasses.is_dataclass(value):
         return type(value).__name__
     if isinstance(value, tuple):
-        return ",".join(map(as_text, value))
+        return ",".join(map(_as_text, value))
     return str(value)
 
 

@@ -92,7 +92,7 @@ def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> C
     """
     if not largest > 0:
         raise ValueError(f"largest={largest} must be positive")
-    error = np.mean(np.abs(as_unit(image) - as_unit(truth)), axis=-1)
+    error = np.mean(np.abs(_as_unit(image) - _as_unit(truth)), axis=-1)
     known = np.isfinite(error)
     unit = np.where(known, error, 0) / largest
     return Colored(_apply_map(unit, known, ERROR_MAP), 0, largest)
@@ -333,15 +333,8 @@ def as_bytes(picture: np.ndarray) -> np.ndarray:
     )
 
 
-def as_unit(picture: np.ndarray) -> np.ndarray:
-    """Convert an image to floats.
-
-    Args:
-      picture: uint8, or floats in [0, 1].
-
-    Returns:
-      float32 values in [0, 1].
-    """
+def _as_unit(picture: np.ndarray) -> np.ndarray:
+    """Convert an image to floats."""
     if picture.dtype == np.uint8:
         return picture.astype(np.float32) / 255
     return np.clip(picture, 0, 1).astype(np.float32)

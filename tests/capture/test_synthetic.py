@@ -303,6 +303,7 @@ def test_a_specular_surface_adds_light_to_its_own_thing_alone(small):
     assert difference[inner].max() == 0
 
 
+@pytest.mark.full
 def test_lumps_merge_and_part_and_a_shutter_opens_and_shuts():
     spec = dataclasses.replace(
         presets.TOPOLOGY, size=(88, 66), frames=9, heldout_every=8, supersampling=1

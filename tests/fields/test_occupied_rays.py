@@ -78,6 +78,7 @@ def test_a_ray_that_leaves_the_cells_may_meet_anything(dtype):
         assert bool(meets(nothing, ray, 0.5)) is met
 
 
+@pytest.mark.full
 def test_a_run_surveys_and_learns_from_what_is_left():
     capture = scenes.tiny_capture()
     model = scene.build(SPEC, scene.metadata_of(capture, SPEC))

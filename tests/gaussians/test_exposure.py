@@ -58,6 +58,7 @@ def test_a_frame_is_drawn_in_its_light_and_one_never_seen_between_its_neighbors(
     assert variants.parts(SPEC, metadata).appearance
 
 
+@pytest.mark.full
 def test_a_step_teaches_the_exposure_of_its_frame_and_of_no_other(built):
     model, _, state = built
     after, _ = jax.jit(model.step)(state, evaluation.frames_of(CAPTURE))

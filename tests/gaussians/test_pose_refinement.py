@@ -102,6 +102,7 @@ def test_slopes_of_the_loss_are_those_of_differences():
         assert gradients.directional_error(loss, screws, directions=2) < 1e-4
 
 
+@pytest.mark.full
 def test_a_step_moves_the_cameras_of_its_own_frames_and_no_other():
     """Or all walk off: Adam makes a whole step of the smallest slope."""
     model = scene.build(SPEC, scene.metadata_of(EVEN))

@@ -184,6 +184,7 @@ def test_nothing_known_is_refused_by_name():
         motion_fit.fit(effect_of(MOTIONS["bases"]), paths, jax.random.key(0))
 
 
+@pytest.mark.full
 def test_gaussians_start_on_the_card_and_move_with_it():
     capture, evidence = film_and_evidence()
     effect = effect_of(MOTIONS["bases"])

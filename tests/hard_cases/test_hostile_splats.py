@@ -30,18 +30,17 @@ ENOUGH = 160
 TINY = {
     "splats-static": scenes.TINY_SPLATS,
     "sonata": scenes.TINY_SONATA,
-    "moba": scenes.TINY_MOBA,
 }
 # What moves takes longer to compile.
 PRESETS = [
     pytest.param(name, marks=() if name == "splats-static" else pytest.mark.slow)
     for name in TINY
 ]
-# What those have not: planes, embeddings, nodes that are held rigid, polynomials that
-# fade. The time basis and the splines share the code of the polynomials, masked nodes
-# that of the rigid ones. Anchors, carried Gaussians and flow have hard cases and a step
-# of a whole scene in their own tests.
-SYSTEMS = ("4dgs", "e-d3dgs", "sc-gs", "spacetime")
+# What those have not: bases, planes, embeddings, nodes that are held rigid, polynomials
+# that fade. The time basis and the splines share the code of the polynomials, masked
+# nodes that of the rigid ones. Anchors, carried Gaussians and flow have hard cases and
+# a step of a whole scene in their own tests.
+SYSTEMS = ("moba", "4dgs", "e-d3dgs", "sc-gs", "spacetime")
 # Pruned at the first event, being too large or too faint: a scene without Gaussians.
 DIE = ("huge", "needles", "transparent")
 # |dL/dq| is 1e30 times that of a unit quaternion; its square is beyond float32.
@@ -52,18 +51,16 @@ NO_DEPTHS = ("no depth known", "constant depth", "unfilmed depth not a number")
 UNREAD = {"splats-static": (*NO_DEPTHS, "one instant")}
 # Starts that only a motion, its network or its growth could spoil: the static preset
 # shows what becomes of the others.
-ROWS_OF = dict.fromkeys(
-    ("sonata", "moba"),
-    ("in one point", "needles", "about the cameras", "alone", "far away"),
-)
+ROWS_OF = {
+    "sonata": ("in one point", "needles", "about the cameras", "alone", "far away")
+}
 CAPTURES_OF = {
     "sonata": (
         *("as filmed", "one instant", "two views", "no depth known"),
         "unfilmed depth not a number",
     ),
-    "moba": ("as filmed", "one instant", "duplicated frames"),
 }
-SILENT = {"kan_motion", "motion_basis", "motion_growth"}  # add nothing to the loss
+SILENT = {"kan_motion", "motion_growth"}  # add nothing to the loss
 # The last frame's error over that of the start; 0.15 to 0.63 where Adam trains. RAdam's
 # steps are 0.03 to 0.15 of Adam's in so few updates, too short to make good what the
 # reset of the opacities at half time took: 1.12 to 1.24, as filmed, too.

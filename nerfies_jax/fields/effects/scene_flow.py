@@ -353,7 +353,7 @@ def penalty(
     medium = level.media[NAME]
     weight = flow_losses.dynamic_weights(level.spacing, medium.density)
     sides = [neighbor(spec, times, params, context, side) for side in (0, 1)]
-    mask = jnp.where(batch.valid, image_mask(spec, level, context.step), 0)
+    mask = jnp.where(batch.valid, _image_mask(spec, level, context.step), 0)
     values = {
         "dynamic": lambda: flow_losses.weighted_mean(
             jnp.square(_medium_color(level, weight, medium.color) - batch.color), mask
@@ -394,10 +394,10 @@ def penalty(
     frames = context.frames
     assert frames is not None
     if spec.weights.depth > 0 and frames.depths is not None:
-        error = depth_term(context, weight)
+        error = _depth_term(context, weight)
         terms["depth"] = Term(error, spec.weights.depth * fade)
     if spec.weights.flow > 0 and frames.flow is not None:
-        error = flow_term(context, timestamps.interval(len(times)), weight, sides)
+        error = _flow_term(context, timestamps.interval(len(times)), weight, sides)
         terms["flow"] = Term(error, spec.weights.flow * fade)
     return terms
 
@@ -408,36 +408,22 @@ def _medium_color(level, weight, color):
     return composite(weight, color, level.distances, level.background).color
 
 
-def image_mask(
+def _image_mask(
     spec: SceneFlowSpec, level: RayOutput, step: Int[Array, ""]
 ) -> Float[Array, " rays"]:
     """Compute the weight of rays in the loss of the medium alone, without gradient.
 
     It is one up to `decay_steps`, so that the medium learns geometry, and then the
     opacity of the medium in the blend.
-
-    Args:
-      spec: Settings.
-      level: Output of the last level.
-      step: Number of completed steps.
-
-    Returns:
-      Weights in [0, 1], [rays].
     """
     share = jax.lax.stop_gradient(jnp.sum(level.media_weight[NAME], axis=-1))
     return jnp.where(step < spec.decay_steps, 1, jnp.clip(share, 0, 1))
 
 
-def depth_term(context: PenaltyContext, weight: Float[Array, "rays samples"]) -> Scalar:
-    """Compare the depth of the medium alone with that of the capture, normalized.
-
-    Args:
-      context: Context of the step.
-      weight: Rendering weights of the medium alone, [rays, samples].
-
-    Returns:
-      The error, a scalar.
-    """
+def _depth_term(
+    context: PenaltyContext, weight: Float[Array, "rays samples"]
+) -> Scalar:
+    """Compare the depth of the medium alone with that of the capture, normalized."""
     batch, level = context.batch, context.levels[-1]
     assert context.frames is not None
     known = _pixels(context.frames.depths, batch.row, batch.pixel)
@@ -448,7 +434,7 @@ def depth_term(context: PenaltyContext, weight: Float[Array, "rays samples"]) ->
     )
 
 
-def flow_term(
+def _flow_term(
     context: PenaltyContext,
     gap: float,
     weight: Float[Array, "rays samples"],
@@ -458,15 +444,6 @@ def flow_term(
 
     If frames are held out, the neighboring frame may be more than one interval away.
     The flow is then scaled, which assumes motion at constant velocity.
-
-    Args:
-      context: Context of the step.
-      gap: Interval between timestamps.
-      weight: Rendering weights of the medium alone, [rays, samples].
-      sides: Samples at the next and previous timestamps.
-
-    Returns:
-      The error in pixels, a scalar.
     """
     batch, frames, level = context.batch, context.frames, context.levels[-1]
     assert frames is not None

@@ -56,7 +56,7 @@ class Bound:
     name = "smoothness"
 
     def __post_init__(self):
-        if not any(map(has_tables, self.templates.values())):
+        if not any(map(_has_tables, self.templates.values())):
             raise ValueError(
                 "smoothness regularizes grids and planes, but no template has one; set "
                 "smoothness=none, or choose a preset with a grid"
@@ -67,7 +67,7 @@ class Bound:
         with_tables = {
             name: template
             for name, template in self.templates.items()
-            if isinstance(template, TemplateSpec) and has_tables(template)
+            if isinstance(template, TemplateSpec) and _has_tables(template)
         }
         variations = []
         for number, (name, template) in enumerate(with_tables.items()):
@@ -79,7 +79,7 @@ class Bound:
         return {"variation": Term(total(variations), weight)}
 
 
-def has_tables(spec: object) -> bool:
+def _has_tables(spec: object) -> bool:
     """Return True if the template encodes points by tables."""
     return isinstance(spec, TemplateSpec) and not isinstance(
         spec.position, EncodingSpec

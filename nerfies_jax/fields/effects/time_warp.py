@@ -45,7 +45,7 @@ class TimeWarpSpec:
                 f"embedding={self.embedding} must be at least 1; with 0 the scene "
                 "would not depend on time"
             )
-        shift_network(self)  # checks depth and width
+        _shift_network(self)  # checks depth and width
 
     @property
     def features(self) -> int:
@@ -74,28 +74,14 @@ class TimeWarp(NamedTuple):
     shift: MLP  # reads [encoded point, embedding]; head "linear"
 
 
-def time_network(spec: TimeWarpSpec) -> MLPSpec:
-    """Return the settings of the network that embeds the encoded time.
-
-    Args:
-      spec: Settings.
-
-    Returns:
-      Settings of an MLP with the head "embedding".
-    """
+def _time_network(spec: TimeWarpSpec) -> MLPSpec:
+    """Return the settings of the network that embeds the encoded time."""
     heads = (("embedding", HeadSpec(spec.embedding)),)
     return MLPSpec(spec.time.width(1), 1, spec.width, heads)
 
 
-def shift_network(spec: TimeWarpSpec) -> MLPSpec:
-    """Return the settings of the network from [encoded point, embedding] to the shift.
-
-    Args:
-      spec: Settings.
-
-    Returns:
-      Settings of an MLP with the head "linear".
-    """
+def _shift_network(spec: TimeWarpSpec) -> MLPSpec:
+    """Return the settings of the network from the encoded point to the shift."""
     inputs = spec.position.width(3) + spec.embedding
     heads = (("linear", HeadSpec(3, "small")),)
     return MLPSpec(inputs, spec.depth, spec.width, heads)
@@ -113,30 +99,21 @@ def init(spec: TimeWarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> TimeWarp
       The parameters.
     """
     time_key, shift_key = jax.random.split(key)
-    network = shift_network(spec)
+    network = _shift_network(spec)
     shift = mlp.init(network, shift_key, dtype)
     head = shift.heads["linear"]
     # mlp.SMALL bounds the contribution of one feature. They add up with random signs.
     head = head._replace(weight=head.weight / math.sqrt(network.features))
     shift = shift._replace(heads={"linear": head})
-    return TimeWarp(mlp.init(time_network(spec), time_key, dtype), shift)
+    return TimeWarp(mlp.init(_time_network(spec), time_key, dtype), shift)
 
 
-def embed(
+def _embed(
     spec: TimeWarpSpec, params: TimeWarp, time: Scalar
 ) -> Float[Array, " embedding"]:
-    """Embed a time.
-
-    Args:
-      spec: Settings.
-      params: Parameters.
-      time: Time in [0, 1].
-
-    Returns:
-      The embedding, [embedding].
-    """
+    """Embed a time."""
     encoded = encoding.encode(spec.time, time[None], None)
-    return mlp.apply(time_network(spec), params.time, encoded)["embedding"]
+    return mlp.apply(_time_network(spec), params.time, encoded)["embedding"]
 
 
 def displace(
@@ -153,10 +130,10 @@ def displace(
     Returns:
       Template point minus observed point in units of the field, [3].
     """
-    network = shift_network(spec)
+    network = _shift_network(spec)
     # Under vmap over the samples of a ray, the contribution of the time is computed
     # once.
-    embedding = embed(spec, params, condition.time)
+    embedding = _embed(spec, params, condition.time)
     at_time = mlp.with_known(network, params.shift, embedding)
     encoded = encoding.encode(spec.position, point, None)
     return mlp.apply(network, at_time, encoded)["linear"]
@@ -177,4 +154,4 @@ def features(
       The encoded observed point and the embedding of the time, [features].
     """
     encoded = encoding.encode(spec.position, point, None)
-    return jnp.concatenate([encoded, embed(spec, params, condition.time)])
+    return jnp.concatenate([encoded, _embed(spec, params, condition.time)])

@@ -295,6 +295,7 @@ def test_directions_of_any_length_and_of_none(vector, dtype):
     np.testing.assert_allclose(slope, across, rtol=1e-5, atol=1e-6 / (length or 1))
 
 
+@pytest.mark.full
 @pytest.mark.hard_cases
 def test_costs_are_finite_where_density_is_level_and_where_it_is_a_wall(dtype):
     *_, code = seen(params_of(dtype), dtype)
