@@ -191,7 +191,7 @@ SMALL_NODE_MOTION = NodeMotionSpec(
 
 
 def init(key: Key[Array, ""], spec: NodeMotionSpec, dtype=jnp.float32) -> Nodes:
-    """Initialize nodes that hardly move anything, all at the origin (`_place_nodes`)."""
+    """Initialize nodes at the origin that hardly move anything (`_place_nodes`)."""
     return Nodes(
         position=jnp.zeros((spec.nodes, 3), dtype),
         log_radius=jnp.zeros(spec.nodes, dtype),

@@ -85,13 +85,14 @@ class Command:
 # In the order in which the main job imports them: pure Python before and after JAX, a
 # library of C++, and in the middle of JAX.
 MODULES = ("tyro", "jaxlib", "jax._src.core", "orbax.checkpoint")
-CORE = ("jaxlib", "jax._src.core")
 
 
 @pytest.mark.parametrize(
     ("module", "number"),
     [
-        pytest.param(module, number, marks=() if module in CORE else pytest.mark.slow)
+        pytest.param(
+            module, number, marks=() if module == "jaxlib" else pytest.mark.slow
+        )
         for module, number in zip(MODULES, itertools.cycle(SIGNALS))
     ],
 )

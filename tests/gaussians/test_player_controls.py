@@ -52,6 +52,7 @@ def test_a_mouse_orbits_about_the_target_and_reset_returns(opened):
     np.testing.assert_array_equal(image_of(page), image)
 
 
+@pytest.mark.full
 def test_a_finger_orbits_and_two_fingers_pan_and_zoom(opened):
     page = opened(PHONE)
     before = state(page)
@@ -90,6 +91,7 @@ def test_a_mouse_pans_the_target_under_the_pointer(opened, way):
     np.testing.assert_allclose(place - start, (60, -30), atol=2)
 
 
+@pytest.mark.full
 def test_the_wheel_zooms_about_the_target(opened):
     page = opened()
     before, (start, area) = state(page), place_of(image_of(page), "red")
@@ -128,6 +130,7 @@ def angle_about_up(before, after):
     return other - one
 
 
+@pytest.mark.full
 def test_keys_orbit_pan_zoom_and_reset(opened):
     page = opened()
     start, image = state(page), image_of(page)
@@ -191,6 +194,7 @@ def test_keys_play_step_and_show_help(opened):
     assert not dialog.is_visible()
 
 
+@pytest.mark.full
 def test_full_screen_by_key_and_button(opened):
     page = opened()
     full = "() => document.fullscreenElement !== null"

@@ -284,6 +284,7 @@ def test_no_gaussians_leave_the_background(dtype, rng):
     np.testing.assert_array_equal(colors, np.broadcast_to(background, colors.shape))
 
 
+@pytest.mark.full
 def test_images_and_info_are_those_of_render_bit_for_bit(dtype, rng):
     """Two scenes of spherical harmonics per camera, degree 2 of 3, as one batch."""
     scenes = [some_scene(rng, dtype) for _ in range(2)]

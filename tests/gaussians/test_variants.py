@@ -156,6 +156,7 @@ def test_what_cannot_be_drawn_otherwise_is_refused(swaying, make, words):
         make(*swaying)
 
 
+@pytest.mark.full
 def test_what_moves_may_be_left_out(swaying):
     model, state = swaying
     # Slower, so that all stay in the picture

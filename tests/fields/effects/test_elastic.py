@@ -346,6 +346,7 @@ def test_terms_and_schedule(setting):
     assert elastic.schedule(ElasticSpec()) == 1e-3
 
 
+@pytest.mark.full
 def test_a_lazy_penalty_counts_for_the_steps_that_skip_it(setting):
     """Its value, its share of folds and its slopes, through the choice of the step."""
 
