@@ -20,8 +20,12 @@ from nerfies_jax.scene import (
 )
 from nerfies_jax.training.track_start import FROM_REST
 
-# Presets between which `advise` chooses by whether the scene moves.
+# Presets between which `advise` chooses by whether the scene moves. Grids exist in the
+# small size only, where they are the best fields in equal time: after 90 processor
+# seconds on the built-in scene `d-nerf-grid-small` has 27.8 dB and `nerfies-small` 21.2
+# (docs/results/league.md).
 ADVISED = ("nerf", "nerfies")
+ADVISED_GRIDS = ("nerf-grid", "d-nerf-grid")
 MOTIONS = ("warp", "time", "scene_flow")
 # These and the effects that depend on them, in the order in which they can be removed.
 MOTION_PARTS = ("elastic", "background", "mask", "ambient", *MOTIONS)
@@ -35,26 +39,32 @@ def advise(
     Args:
       wanted: Decision for each effect, None if undecided.
       full: True for the sizes of the papers.
-      family: A preset without "-small". One that is not in `ADVISED` is kept, unless it
-        is static and motion is needed.
+      family: A preset without "-small". One that is not advised is kept, unless it is
+        static and motion is needed.
 
     Returns:
       The recommendation.
     """
     overrides, notes = [], []
     light_changes, has_transients = wanted.get(LIGHT), wanted.get(TRANSIENT)
-    preset = "nerf" if wanted.get(MOTION) is False else "nerfies"
-    if family is not None and family not in ADVISED:
-        if wanted.get(MOTION) and not _parts(_spec_of(family, full), MOTIONS):
+    moves = wanted.get(MOTION)
+    grid = not full and (family is None or family.endswith("-grid"))
+    static, dynamic = ADVISED_GRIDS if grid else ADVISED
+    preset = static if moves is False else dynamic
+    if family is not None and family not in (static, dynamic):
+        if moves and not _parts(_spec_of(family, full), MOTIONS):
             notes.append(
                 f"{MOTION}: preset {family} is static, so {preset} is used instead"
             )
         else:
             preset = family
     spec = _spec_of(preset, full)
-    is_dynamic = wanted.get(MOTION) is not False and bool(_parts(spec, MOTIONS))
+    is_dynamic = moves is not False and bool(_parts(spec, MOTIONS))
+    # Where motion is undecided, there may be no usable tracks.
+    from_rest = not is_dynamic or (moves is None and family is None)
+    if from_rest and spec.start.motion == "tracks":
+        overrides.append(FROM_REST)
     if not is_dynamic:
-        overrides += [FROM_REST] if spec.start.motion == "tracks" else []
         overrides += [f"{name}=none" for name in _parts(spec, MOTION_PARTS)]
     has_codes = spec.appearance is not None
     if light_changes and not has_codes:

@@ -24,7 +24,7 @@ def test_the_command_line_prints_the_table_and_writes_both_files(
     )
     printed = capsys.readouterr().out
     assert "splats-static-small" in printed
-    assert "nerf-small" in printed
+    assert "nerf-grid-small" in printed
     assert sheet.stat().st_size > 10_000
     assert len(list((tmp_path / "cache" / "evidence").glob("*.npz"))) == 1
     stored = json.loads(findings.read_text())
