@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing import inspection
 from nerfies_jax.preprocessing.findings import CERTAIN, DEPTH, LIGHT, Finding
 from nerfies_jax.runs import representations
 from nerfies_jax.runs.config import RunConfig
-from nerfies_jax.runs.run import Run, first_state, new_run, scene_spec, with_steps
+from nerfies_jax.runs.run import Run, initial_state, new_run, scene_spec, with_steps
 from nerfies_jax.runtime import events, stopping
 from nerfies_jax.training import loop
 
@@ -171,7 +171,7 @@ def _trained(run: Run, rows: np.ndarray):
     frames = evaluation.frames_of(capture, run.model.required_data)
     silent = rich.console.Console(file=io.StringIO())
     result = loop.fit(
-        run.model, first_state(run), frames, steps=run.spec.steps, console=silent
+        run.model, initial_state(run), frames, steps=run.spec.steps, console=silent
     )
     if result.stopped_by in stopping.NAMES:
         raise KeyboardInterrupt(f"{result.stopped_by} while an effect was tried")
