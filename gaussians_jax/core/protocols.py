@@ -319,7 +319,11 @@ def compile_regularizer(regularizer: Regularizer) -> SplatRecord:
     hooks = regularizer_hooks(regularizer)
     if hasattr(regularizer, "init"):
         hooks |= _hooks(regularizer)
-    return SplatRecord(**hooks, state=getattr(regularizer, "state", None))
+    return SplatRecord(
+        **hooks,
+        state=getattr(regularizer, "state", None),
+        reads_depth=getattr(regularizer, "reads_depth", False),
+    )
 
 
 def _hooks(part):

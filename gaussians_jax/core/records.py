@@ -56,6 +56,8 @@ class SplatRecord(Record):
     # scene -> state of arrays only. Host side, at the beginning and after each change
     # of the number or order of the Gaussians.
     state: Callable[[Any], PyTree] | None = None
+    # True if the penalty reads the depth of the rendered frame.
+    reads_depth: bool = False
     # True if training passes the state to `deform` in place of the output of `prepare`,
     # because `prepare` is expensive and its result good enough until the next change.
     ready_by_state: bool = False

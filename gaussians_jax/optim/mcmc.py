@@ -368,6 +368,26 @@ def _inject_noise(
     return params._replace(rows=params.rows | {"splats": rows})
 
 
+def mean_opacity_and_scale(
+    rows: Splats,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Compute the mean opacity and the mean scale of the active Gaussians.
+
+    Args:
+      rows: Raw parameters.
+
+    Returns:
+      The mean opacity, and the mean of all three scales in scene units. Both are zero
+      without active Gaussians.
+    """
+    activated = splats.activate(rows)
+    active = splats.active_mask(rows)
+    count = jnp.maximum(jnp.sum(active), 1).astype(activated.opacity.dtype)
+    opacity = jnp.sum(jnp.where(active, activated.opacity, 0)) / count
+    scale = jnp.sum(jnp.where(active[:, None], activated.scale, 0)) / (3 * count)
+    return opacity, scale
+
+
 def penalty(rows: Splats, spec: MCMCStrategySpec) -> Float[Array, ""]:
     """Penalize the mean opacity and scale of the active Gaussians.
 
@@ -383,9 +403,5 @@ def penalty(rows: Splats, spec: MCMCStrategySpec) -> Float[Array, ""]:
     References:
       Kheradmand et al. 2024 (3DGS-MCMC, arXiv:2404.09591), Equation 10.
     """
-    activated = splats.activate(rows)
-    active = splats.active_mask(rows)
-    count = jnp.maximum(jnp.sum(active), 1).astype(activated.opacity.dtype)
-    opacity = jnp.sum(jnp.where(active, activated.opacity, 0)) / count
-    scale = jnp.sum(jnp.where(active[:, None], activated.scale, 0)) / (3 * count)
+    opacity, scale = mean_opacity_and_scale(rows)
     return spec.opacity_reg * opacity + spec.scale_reg * scale

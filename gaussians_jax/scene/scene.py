@@ -330,6 +330,8 @@ def draws_depth(effects: tuple[SplatRecord, ...], frames: Frames) -> bool:
     Returns:
       True if depth is rendered.
     """
+    if any(effect.reads_depth for effect in effects):
+        return True
     read = any("depths" in effect.required_data for effect in effects)
     return read and frames.depths is not None
 

@@ -13,6 +13,9 @@ from gaussians_jax.losses.acceleration import AccelerationSpec
 from gaussians_jax.losses.depth import DepthSpec
 from gaussians_jax.losses.flow import FlowSpec
 from gaussians_jax.losses.neighbors import NeighborSpec
+from gaussians_jax.losses.opacity_scale import OpacityScaleSpec
+from gaussians_jax.losses.point_depth import PointDepthSpec
+from gaussians_jax.losses.smooth_depth import SmoothDepthSpec
 from gaussians_jax.losses.spectral import SpectralSpec
 from gaussians_jax.motion import carried, time_basis
 from gaussians_jax.motion import embedding as embedding_motion
@@ -116,6 +119,9 @@ class SplatScene:
     depth: DepthSpec | None = None
     exposure: ExposureSpec | Appearance | Settings | None = None
     flow: FlowSpec | None = None
+    opacity_scale: OpacityScaleSpec | None = None
+    smooth_depth: SmoothDepthSpec | None = None
+    point_depth: PointDepthSpec | None = None
     poses: PoseRefinementSpec | CameraOptimizer | Settings | None = None
     # In addition to those with a field of their own.
     regularizers: tuple[Regularizer | Settings, ...] = ()
@@ -369,7 +375,8 @@ def _regularizers(spec, metadata, motion):
     if spec.neighbors is not None and motion is not None:
         name = _embedded(spec.motion)
         early.append(neighbors.Bound(spec.neighbors, metadata.extent, name))
-    early += [spec.spectral, spec.depth]
+    early += [spec.spectral, spec.depth, spec.opacity_scale, spec.smooth_depth]
+    early += [spec.point_depth]
     if spec.flow is not None:
         starts_at_once = spec.start.motion == "tracks"  # like the motion
         flow = dataclasses.replace(spec.flow, start=0) if starts_at_once else spec.flow
