@@ -31,7 +31,10 @@ class Reconstruct:
 
     GROUPS: ClassVar = {
         "model": ("preset", "effects", "set", "trust"),
-        "training": ("steps", "seconds", "seed", "evaluate_every", "checkpoint_every"),
+        "training": (
+            *("steps", "seconds", "quality", "seed"),
+            *("evaluate_every", "checkpoint_every"),
+        ),
         "following": ("view", "log"),
     }
 
@@ -54,7 +57,10 @@ class Reconstruct:
     """Training steps. Schedules are stretched with them."""
     seconds: float | None = None
     """Train for so many seconds, without compiling: schedules stretch with the steps
-    that fit. With --steps or --resume: stop after them, whatever the step."""
+    that fit, and the number of Gaussians grows with the time if no preset is named.
+    With --steps or --resume: stop after them, whatever the step."""
+    quality: Literal["draft", "good", "best"] | None = None
+    """Short for --seconds: 30 (draft), 120 (good) or 1200 (best)."""
     out: pathlib.Path | None = None
     """Run folder (default: runs/CAPTURE-PRESET)."""
     resume: bool = False
@@ -83,6 +89,9 @@ class Reconstruct:
     more: cli.More = MoreMetrics()
     prepare: Preparation = Preparation()
     """Options for a video or a folder of images without cameras."""
+
+
+QUALITY_SECONDS = {"draft": 30.0, "good": 120.0, "best": 1200.0}
 
 
 @cli.command(Reconstruct)
@@ -121,6 +130,7 @@ def _result(outcome):
 
 def _outcome(args):
     with cli.user_errors():
+        args = _with_seconds(args)
         named = extensions.names_in_assignments(args.set)
         cli.find_code((*args.trust, *named))
         if args.resume:
@@ -162,6 +172,18 @@ def _outcome(args):
             watched=watched,
             **common,
         )
+
+
+def _with_seconds(args):
+    """Return the options with --seconds in place of --quality."""
+    if args.quality is None:
+        return args
+    if args.seconds is not None:
+        raise ValueError(
+            f"--quality {args.quality} is short for --seconds "
+            f"{QUALITY_SECONDS[args.quality]:g}; leave out one of the two"
+        )
+    return dataclasses.replace(args, seconds=QUALITY_SECONDS[args.quality])
 
 
 def _watched(args):

@@ -60,6 +60,10 @@ BASES, EXPLAINED = (8, 12, 16, 20, 24), 0.8
 LONG, MOST_TIMES = 0.5, 3.0
 # The ratio of the built-in scenes, with 20 knots for 60 frames.
 FRAMES_A_KNOT, MOST_KNOTS = 3, 60
+# Training time that the counts of the small presets are for, and the power of the time
+# with which they grow, within these bounds.
+USUAL_SECONDS, TIME_POWER = 120.0, 0.5
+LEAST_CAPACITY, MOST_CAPACITY = 0.5, 3.0
 # Presets among which `advise` chooses by the presence of motion.
 ADVISED = ("splats-static", "splats-tracked", "splats-deformable")
 # Preset for motion without usable tracks, in its small size and without them. Held-out
@@ -208,11 +212,12 @@ def _spec_of(family, full):
     return presets.PRESETS[family if full else f"{family}-small"]
 
 
-def default_preset(capture: Capture) -> Choice:
+def default_preset(capture: Capture, seconds: float | int | None = None) -> Choice:
     """Choose a small preset by the tracks of a capture, from the cache or computed.
 
     SE(3) bases are used if there are usable tracks, no motion if the scene is static,
-    and a polynomial per Gaussian otherwise.
+    and a polynomial per Gaussian otherwise. The number of Gaussians follows from the
+    image size, the length of the tracks and the planned seconds of training.
     """
     preprocessed = record.cached(capture, CACHE / "evidence")
     reason = usable_paths.unusable(preprocessed)
@@ -226,9 +231,10 @@ def default_preset(capture: Capture) -> Choice:
     spec = specs.override(presets.PRESETS[name], without_tracks)
     paths = usable_paths.known_paths(preprocessed)
     followed = 1.0 if reason else float(paths.known.mean())
-    overrides = without_tracks + capacity(spec, capture.size, followed)
+    overrides = without_tracks + capacity(spec, capture.size, followed, seconds)
     if overrides != without_tracks:
         size = "x".join(map(str, capture.size))
+        size += "" if seconds is None else f" in {seconds:g} s"
         coverage = (
             f" and tracks of {followed:.0%} of the video" if followed < LONG else ""
         )
@@ -247,25 +253,34 @@ def default_preset(capture: Capture) -> Choice:
 
 
 def capacity(
-    spec: Any, size: tuple[int, int], followed: float = 1.0
+    spec: Any,
+    size: tuple[int, int],
+    followed: float = 1.0,
+    seconds: float | int | None = None,
 ) -> tuple[str, ...]:
-    """Return overrides that allow more Gaussians for large images and short tracks.
+    """Return overrides for more Gaussians: for large images, short tracks, long runs.
 
     Counts are multiplied by the square root of the image size relative to the built-in
     scene: details grow with the number of pixels, and the time of a step with both. The
     number of moving Gaussians is also multiplied by the square root of the ratio of
-    track lengths, because each Gaussian is observed about as long as a track. Counts
-    are rounded to two digits.
+    track lengths, because each Gaussian is observed about as long as a track. All
+    numbers are multiplied by the square root of the planned time relative to
+    `USUAL_SECONDS`, so that steps and Gaussians both grow with it. Counts are rounded
+    to two digits.
 
     Args:
       spec: Settings of a small preset.
       size: (width, height) of the images in pixels.
       followed: Mean share of the video that a track covers.
+      seconds: Planned seconds of training, or None for the steps of the preset.
 
     Returns:
       Overrides such as "init.points=5000".
     """
     share = max((size[0] * size[1] / SMALL_PIXELS) ** 0.5, 1.0)
+    if seconds is not None:
+        by_time = (seconds / USUAL_SECONDS) ** TIME_POWER
+        share *= min(max(by_time, LEAST_CAPACITY), MOST_CAPACITY)
     counts = {
         "strategy.cap_max": share * spec.strategy.cap_max,
         "init.points": share * spec.init.points,
@@ -275,7 +290,8 @@ def capacity(
         count = min(max(LONG / followed, 1.0) ** 0.5, MOST_TIMES) * moving
         counts["start.moving_points"] = count
         counts["strategy.cap_max"] += count - moving
-    if share <= 1 and counts.get("start.moving_points", 0) <= spec.start.moving_points:
+    moving_points = spec.start.moving_points
+    if share == 1 and counts.get("start.moving_points", 0) <= moving_points:
         return ()
     return tuple(f"{k}={float(f'{n:.2g}'):.0f}" for k, n in counts.items())
 
@@ -304,6 +320,8 @@ GAUSSIANS = Representation(
         half_scorer=held_out_exposure.scorer,
         follow=gaussian_tracks.follow,
         mover=gaussian_tracks.mover,
+        # The flow loss reads pairs of consecutive frames.
+        validates=lambda spec: spec.exposure is spec.poses is spec.flow is None,
     ),
     products=Products(
         save=save,

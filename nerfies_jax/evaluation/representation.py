@@ -115,6 +115,9 @@ class Scoring(NamedTuple):
     fitted_rays: int = 0  # rendered to fit the codes of one frame
     follow: Follow = lambda *args: None
     mover: Mover = lambda spec, metadata: None
+    # True if a training frame that is left out can be rendered: no parameters belong to
+    # single frames.
+    validates: Callable[[Spec], bool] = lambda spec: False
 
 
 def _no_variants(spec, metadata, without, blended):
@@ -145,8 +148,8 @@ class Recommendation(NamedTuple):
     # ({effect: True if needed, None if undecided}, True for the sizes of the papers,
     # preset of the user without "-small" or None) -> recommendation
     advise: Callable[[dict[str, bool | None], bool, str | None], Choice]
-    # Preset of a capture if the user names none.
-    default_preset: Callable[[Capture], Choice] | None = None
+    # (capture, planned seconds of training or None) -> preset if the user names none
+    default_preset: Callable[[Capture, float | int | None], Choice] | None = None
     # ({effect: True if needed, None if undecided}, spec) -> overrides that enable or
     # disable effects other than motion
     effect_overrides: Callable[[dict[str, bool | None], Spec], tuple[str, ...]] = (

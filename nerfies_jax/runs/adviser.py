@@ -105,12 +105,15 @@ def advise_for(findings: tuple[Finding, ...], preset: str) -> Advice:
     return advise(findings, kind, full=family == preset, family=family)
 
 
-def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]]:
+def by_tracks(
+    config: RunConfig, capture: Capture, seconds: float | int | None = None
+) -> tuple[RunConfig, list[str]]:
     """Choose a preset from the point tracks of a capture.
 
     Args:
       config: Config without a preset.
       capture: The capture.
+      seconds: Planned seconds of training, or None.
 
     Returns:
       The config with preset and overrides, and lines of text with the reasons.
@@ -124,7 +127,7 @@ def by_tracks(config: RunConfig, capture: Capture) -> tuple[RunConfig, list[str]
             "preset=None: no installed representation can choose a preset; set one"
         )
     _, choose = choosing[0]
-    choice = choose(capture)
+    choice = choose(capture, seconds)
     words = [choice.preset, *(["--set"] if choice.overrides else []), *choice.overrides]
     lines = [f"preset: {' '.join(words)}" + "".join(f" ({n})" for n in choice.notes)]
     overrides = (*choice.overrides, *config.overrides)

@@ -100,6 +100,14 @@ class RunConfig:
     steps: int | None = None
     overrides: tuple[str, ...] = ()  # of fields of the preset, as PATH=VALUE
     seed: int = 0
+    # Number of training frames that are left out, to keep the best state.
+    validation: int = 0
+
+    def __post_init__(self):
+        if self.validation < 0:
+            raise ValueError(
+                f"validation={self.validation} must be a number of frames, at least 0"
+            )
 
     @property
     def preset_name(self) -> str:

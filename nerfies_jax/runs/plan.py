@@ -2,7 +2,7 @@
 
 import math
 
-from nerfies_jax import evaluation
+from nerfies_jax.runs import validation
 from nerfies_jax.runs.run import Run, with_steps
 from nerfies_jax.runtime import events
 from nerfies_jax.training import rate
@@ -30,7 +30,7 @@ def with_seconds(run: Run, state: TrainState, seconds: float | int) -> tuple[Run
     Returns:
       The run with its number of steps, and a line of text about the plan.
     """
-    frames = evaluation.frames_of(run.capture, run.model.required_data)
+    frames = validation.training_frames(run)
     step = rate.step_time(run.model, state, frames, run.spec.steps)
     growth = run.representation.resources.growth(run.spec, state)
     steps = rounded(seconds / (step.seconds * growth))

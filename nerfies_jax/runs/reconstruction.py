@@ -23,6 +23,7 @@ from nerfies_jax.runs import (
     run_folder,
     same_capture,
     train,
+    validation,
 )
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 from nerfies_jax.runs.following import following
@@ -111,10 +112,14 @@ def reconstruct(
             _check_spec(config)
             extra = quality.prepared(more)
             config = _with_cameras(config, out, prepare)
-            run = _new_run(config, effects)
+            run = _new_run(config, effects, seconds)
             _describe(run)
             quality.check(extra, run.capture.size)
             state = initial_state(run)
+            if seconds is not None and not run.config.validation:
+                left_out = validation.frames_to_leave_out(run, seconds)
+                new_config = dataclasses.replace(run.config, validation=left_out)
+                run = run._replace(config=new_config)
             if seconds is not None and not _sets_steps(run.config):
                 run, line = plan.with_seconds(run, state, seconds)
                 console.say(line)
@@ -247,13 +252,14 @@ def _sets_steps(config):
     return overridden or config.steps is not None
 
 
-def _new_run(config, effects):
+def _new_run(config, effects, seconds):
     if config.preset is not None and effects != "auto":
         return new_run(config)
     stored = stored_capture(config.source, config.seed)
     chosen, lines = config, []
     if config.preset is None:
-        chosen, lines = adviser.by_tracks(config, stored)
+        planned = None if _sets_steps(config) else seconds
+        chosen, lines = adviser.by_tracks(config, stored, planned)
         if effects != "preset":
             chosen, more = effect_choice.choose(chosen, stored, config.overrides)
             lines += more
@@ -313,7 +319,7 @@ def _restore(folder, run):
     """
     if checkpoint.latest(folder / run_folder.CHECKPOINTS) is None:
         return initial_state(run), None, None
-    restored = restore(folder, run)
+    restored = restore(folder, run, newest=True)
     return restored.state, restored.record, restored.step
 
 

@@ -78,7 +78,9 @@ def named(name: str) -> "Representation":
     return installed()[name]
 
 
-def choosing() -> "list[tuple[Representation, Callable[[Capture], Choice]]]":
+def choosing() -> (
+    "list[tuple[Representation, Callable[[Capture, float | int | None], Choice]]]"
+):
     """Return the representations that choose presets, with their functions."""
     pairs = []
     for each in installed().values():

@@ -25,7 +25,7 @@ from nerfies_jax.runs import representations, same_capture, trust
 from nerfies_jax.runs.config import CaptureNotFound, CaptureSource, RunConfig
 from nerfies_jax.runs.run_folder import CHECKPOINTS, CONFIG, PREPROCESSING_NOTES
 from nerfies_jax.runtime import events
-from nerfies_jax.training import checkpoint, specs
+from nerfies_jax.training import best, checkpoint, specs
 from nerfies_jax.training.model import Model, TrainState
 from nerfies_jax.training.provenance import provenance
 
@@ -493,16 +493,25 @@ def free_memory() -> int:
 
 
 @events.stage("restoring the checkpoint")
-def restore(folder: pathlib.Path, run: Run) -> checkpoint.Restored:
-    """Restore the newest checkpoint of a run.
+def restore(
+    folder: pathlib.Path, run: Run, newest: bool = False
+) -> checkpoint.Restored:
+    """Restore the best checkpoint of a run.
 
     Args:
       folder: The run folder.
       run: The run.
+      newest: True for the newest checkpoint, from which training continues.
 
     Returns:
-      The state with its metadata.
+      The state with its metadata. It is the newest one unless an earlier state was
+      better on training frames that were left out (`RunConfig.validation`).
     """
-    model = run.model
+    model, checkpoints = run.model, folder / CHECKPOINTS
     example = (model.example or model.init)(run.capture, jax.random.key(0))
-    return checkpoint.restore(folder / CHECKPOINTS, example, model.spec)
+    restored = checkpoint.restore(checkpoints, example, model.spec)
+    evaluations = (restored.record or {}).get("evaluations", ())
+    step = best.best_step(evaluations)
+    if newest or step == restored.step or step not in checkpoint.steps(checkpoints):
+        return restored
+    return checkpoint.restore(checkpoints, example, model.spec, step=step)

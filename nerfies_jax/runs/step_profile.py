@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from nerfies_jax import evaluation
+from nerfies_jax.runs import validation
 from nerfies_jax.runs.run import Run
 from nerfies_jax.training.model import TrainState
 
@@ -46,7 +46,7 @@ def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
     if step_parts is None:
         yield lambda: Profile({}, [])
         return
-    frames = evaluation.frames_of(run.capture, run.model.required_data)
+    frames = validation.training_frames(run)
     try:
         parts = step_parts(run.spec, run.metadata, run.model, state, frames)
     except Exception as error:

@@ -4,16 +4,17 @@ import dataclasses
 import pathlib
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from nerfies_jax import evaluation
 from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.representation import HalfScorer
 from nerfies_jax.evaluation.scores import Draw
-from nerfies_jax.runs import budget, run_folder
+from nerfies_jax.runs import budget, run_folder, validation
 from nerfies_jax.runs.run import Run
-from nerfies_jax.runtime import events
-from nerfies_jax.training import chunk, loop, losses
+from nerfies_jax.runtime import console, events
+from nerfies_jax.training import checkpoint, chunk, loop, losses
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult, History, Hook
 
@@ -92,7 +93,7 @@ def train(
     """
     renderer = Renderer(run.model, run.capture.size)
     rows, evaluate_every = run.capture.heldout, pace.evaluate_every
-    frames = evaluation.frames_of(run.capture, run.model.required_data)
+    frames = validation.training_frames(run)
     history = History() if record is None else History(**record)
     first = evaluation.view_of(run.capture, int(rows[0])) if len(rows) else None
     scorer = half_scorer(run)
@@ -127,6 +128,7 @@ def train(
         names = [run.capture.ids[row] for row in rows]
         events.emit("evaluation_frames", frames=names)
         hooks = (Hook("held out", held_out, every_seconds=evaluate_every), *hooks)
+    hooks = (*hooks, *validation.hooks(run, renderer))
     result = loop.fit(
         run.model,
         state,
@@ -138,6 +140,7 @@ def train(
         checkpoint_seconds=pace.checkpoint_every,
         history=history,
     )
+    result = _with_best(run, result, checkpoints)
     return Trained(result, renderer, renderer, rows, scorer)
 
 
@@ -164,6 +167,25 @@ def _fit_cost(run, scorer):
     width, height = run.capture.size
     # A gradient takes about three times as long as a render.
     return 1 + 3 * run.representation.scoring.fitted_rays / (width * height)
+
+
+def _with_best(run, result, checkpoints):
+    """Replace the last state of a complete run by a better earlier one."""
+    if result.stopped_by not in ("steps", "seconds"):
+        return result
+    outcome = validation.outcome(run, result)
+    if outcome is None:
+        return result
+    console.say(outcome.text)
+    result = result._replace(message=f"{result.message}. {outcome.text}")
+    # The checkpoint is missing if the disk was full.
+    if outcome.step not in {*checkpoint.steps(checkpoints.folder)} - {result.steps}:
+        return result
+    example = (run.model.example or run.model.init)(run.capture, jax.random.key(0))
+    kept = checkpoint.restore(
+        checkpoints.folder, example, run.model.spec, step=outcome.step
+    )
+    return result._replace(state=kept.state)
 
 
 def _compile(run, state, frames, renderer, view) -> float:

@@ -45,6 +45,8 @@ class SaveError(ValueError):
 class Checkpoints:
     """Writer of the checkpoints of one run, which keeps the newest `keep`.
 
+    The checkpoint of step `best`, if it is set, is kept as well.
+
     A directory gets its final name only when all of its contents are on disk, so a
     killed process leaves the previous checkpoint intact. Saving copies the arrays and
     writes in the background. If writing fails, SaveError is raised at the next `save`,
@@ -70,6 +72,7 @@ class Checkpoints:
             raise ValueError(f"keep={keep} must be at least 1 checkpoint")
         self.folder = pathlib.Path(folder).absolute()
         self._keep, self._beside = keep, beside
+        self.best: int | None = None
         self._about = {"format": FORMAT, "spec": as_json(spec), **provenance()}
         _check_writable(self.folder)
         present = steps(self.folder)
@@ -149,7 +152,8 @@ class Checkpoints:
             _write_text(partial / _ABOUT, json.dumps(about))
             partial.rename(self.folder / str(step))
             for old in steps(self.folder)[: -self._keep]:
-                shutil.rmtree(self.folder / str(old))
+                if old != self.best:
+                    shutil.rmtree(self.folder / str(old))
         except Exception as error:  # orbax and tensorstore raise many types
             self._remove_unfinished()
             reason = getattr(error, "strerror", None) or str(error) or repr(error)

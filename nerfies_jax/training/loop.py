@@ -15,7 +15,7 @@ from nerfies_jax.runtime import data_parallel
 from nerfies_jax.runtime import events as event_stream
 from nerfies_jax.runtime.progress import duration
 from nerfies_jax.runtime.stopping import StopRequests
-from nerfies_jax.training import chunk
+from nerfies_jax.training import best, chunk
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
 from nerfies_jax.training.model import Event, Frames, Model, TrainState
@@ -115,8 +115,11 @@ def fit(
 
     Events are applied after their step and before a checkpoint of that step, so a
     resumed run is equal to an uninterrupted one bit for bit (on XLA:CPU with the same
-    PJRT_NPROC). Progress goes to the sinks of `nerfies_jax.runtime.events`, as `train`
-    events and as `evaluation` events for hooks that return numbers.
+    PJRT_NPROC). The state with the highest PSNR of the hook `best.VALIDATION` is saved
+    as soon as it is evaluated, and kept.
+
+    Progress goes to the sinks of `nerfies_jax.runtime.events`, as `train` events and as
+    `evaluation` events for hooks that return numbers.
 
     Steps run in compiled scans. One program runs all chunks of the same shape, and a
     second one the remaining steps before events and before the end (`chunk.Program`).
@@ -140,6 +143,8 @@ def fit(
     """
     run = _Run(model, state, frames, steps, (*model.events, *events), tuple(hooks))
     run.history, run.checkpoints = history, checkpoints
+    if checkpoints is not None:
+        checkpoints.best = best.highest_step(history.evaluations)
     run.limits = (math.inf if seconds is None else seconds, checkpoint_seconds)
     run.trained_before = history.seconds
     with (
@@ -173,6 +178,7 @@ class _Run:
         self.frames = jax.tree.map(jnp.asarray, frames)
         self.device_frames = data_parallel.shared(self.frames, model.devices)
         self.saved_at = time.monotonic()
+        self.is_best = False  # the current state, by validation
         self.step_seconds = math.inf  # unknown
         self.last_calls = {hook.name: [self.step, None] for hook in hooks}
         self.last_report = -math.inf, self.step  # monotonic clock, step
@@ -344,6 +350,15 @@ class _Run:
                 if (old["hook"], old["step"]) != (hook.name, self.step)
             )
             self.history = self.history._replace(evaluations=(*other_rows, row))
+            if hook.name == best.VALIDATION:
+                self._mark_best()
+
+    def _mark_best(self) -> None:
+        """Keep the checkpoint of the best state so far."""
+        step = best.highest_step(self.history.evaluations)
+        self.is_best = step == self.step
+        if self.checkpoints is not None:
+            self.checkpoints.best = step
 
     def _report_failed_save(self, failure) -> None:
         if failure is not None:
@@ -354,13 +369,14 @@ class _Run:
         has_trained = self.step_seconds < math.inf  # in this call
         if self.checkpoints is None or not has_trained:
             return
-        if time.monotonic() - self.saved_at >= self.limits[1]:
+        if self.is_best or time.monotonic() - self.saved_at >= self.limits[1]:
             self._save(self.checkpoints)
 
     def _save(self, checkpoints: Checkpoints) -> None:
         self._report_failed_save(checkpoints.failure(wait=True))
         checkpoints.save(self.state, self.step, self.history._asdict())
         self.saved_at = time.monotonic()
+        self.is_best = False
 
     def _add_time(self, **seconds: float) -> None:
         values = {name: getattr(self.history, name) + x for name, x in seconds.items()}

@@ -51,6 +51,7 @@ TABLE = [
     ("reconstruct", "--out OUT --factor 2", "make_scene"),
     ("reconstruct", "--out OUT --max-side 2", "make_scene"),
     ("reconstruct", "--out OUT --heldout 2", "make_scene"),
+    ("reconstruct", "--quality best --seconds 9", "short for --seconds 1200"),
     ("reconstruct", "--resume", "--out"),
     ("reconstruct", "--resume --out OUT", "not a run folder"),
     ("render", "nowhere --interpolation cubic", "is for --knots"),

@@ -99,3 +99,16 @@ def test_what_is_followed_for_a_short_time_gets_more_gaussians(followed, times):
     assert short.start.moving_points == times * spec.start.moving_points
     more = short.start.moving_points - spec.start.moving_points
     assert short.strategy.cap_max == spec.strategy.cap_max + more
+
+
+@pytest.mark.parametrize(
+    ("seconds", "times"), [(20, 0.5), (30, 0.5), (120, 1), (480, 2), (5000, 3)]
+)
+def test_a_longer_time_gets_more_gaussians(seconds, times):
+    spec = PRESETS["splats-tracked-small"]
+    changes = representation.capacity(spec, (176, 132), 1.0, seconds)
+    longer = specs.override(spec, changes)
+    assert longer.strategy.cap_max == times * spec.strategy.cap_max
+    assert longer.init.points == times * spec.init.points
+    assert longer.start.moving_points == times * spec.start.moving_points
+    assert (changes == ()) == (seconds == 120)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import pathlib
 import subprocess
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nerfies_jax.training import checkpoint, loop
+from nerfies_jax.training import best, checkpoint, loop
 from nerfies_jax.training.specs import as_json, differences
 from tests.training import run_toy, toy
 from tests.training.toy import start
@@ -130,6 +131,47 @@ def test_only_the_newest_checkpoints_stay(tmp_path):
     state = start()
     save(tmp_path, *((state, step) for step in (1, 5, 9, 12)), keep=2)
     assert checkpoint.steps(tmp_path) == [9, 12]
+
+
+@pytest.mark.parametrize("cut", [12, 20])
+def test_the_best_validated_state_stays_also_after_a_resume(cut, tmp_path, straight):
+    """Saved when it is evaluated, though no other checkpoint is due or kept."""
+    scores = {4: 20.0, 8: 31.0, 12: 30.0, 16: 29.0, 20: 30.5}
+    hook = loop.Hook(
+        best.VALIDATION, lambda _, step, metrics: {"psnr": scores[step]}, every_steps=4
+    )
+    state, history, after = start(), loop.History(), None
+    for steps in (cut, 20):
+        with checkpoint.Checkpoints(tmp_path, SPEC, keep=1, after=after) as kept:
+            toy.fit(
+                toy.frames(),
+                state,
+                steps=steps,
+                checkpoints=kept,
+                hooks=[hook],
+                history=history,
+            )
+        restored = checkpoint.restore(tmp_path, start(), SPEC)
+        state, after = restored.state, restored.step
+        history = loop.History(**restored.record)
+    assert toy.same(state, straight.state)
+    assert checkpoint.steps(tmp_path) == [8, 20]
+    assert best.best_step(history.evaluations) == 8
+    best_state = checkpoint.restore(tmp_path, start(), SPEC, step=8).state
+    assert toy.same(best_state, toy.fit(toy.frames(), steps=8).state)
+
+
+def test_an_earlier_state_must_be_clearly_better():
+    def rows(*scores):
+        named = enumerate(scores, start=1)
+        return [{"hook": "validation", "step": s, "psnr": x} for s, x in named]
+
+    other = {"hook": "held out", "step": 9, "psnr": 99.0}
+    assert best.best_step([]) is best.best_step([other]) is None
+    assert best.best_step([other, *rows(30.0, 31.0, 30.95)]) == 3
+    assert best.best_step([other, *rows(30.0, 31.0, 30.8)]) == 2
+    assert best.best_step(rows(30.0, math.nan, math.nan)) == 1
+    assert best.highest_step(rows(31.0, 31.0, 30.95)) == 2
 
 
 def test_a_checkpoint_of_another_spec_lists_what_differs(tmp_path):
