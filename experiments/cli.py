@@ -60,6 +60,7 @@ SCENES: tuple[str, ...] = typing.get_args(Scene)
 ARGUMENTS = (
     *("checkpoint_every", "device", "evaluate_every", "factor", "heldout", "max_side"),
     *("missing", "out", "overwrite", "scene", "seconds", "train"),
+    *("depths", "depth_model", "masks", "segmentation_model"),
 )
 _ARGUMENT = re.compile(
     rf"\b(?P<name>{'|'.join(ARGUMENTS)})=(?P<value>\"[^\"]*\"|\.\.\.|[^\s;,)]*[^\s;:,.)])"

@@ -90,6 +90,15 @@ def _video(operation, **arguments):
     yield from getattr(video_decoding, operation)(**arguments)
 
 
+_NETWORK = "nerfies_jax.capture.network_decoding"
+
+
+def _network(operation, **arguments):
+    from nerfies_jax.capture import network_decoding
+
+    yield from getattr(network_decoding, operation)(**arguments)
+
+
 OPERATIONS: dict[str, tuple[Callable[..., Iterable], str]] = {
     "colmap": (_colmap, "nerfies_jax.capture.colmap_tables"),
     "exr": (_exr, "nerfies_jax.capture.exr_decoding"),
@@ -97,6 +106,8 @@ OPERATIONS: dict[str, tuple[Callable[..., Iterable], str]] = {
     "video_length": (functools.partial(_video, "length"), _VIDEO),
     "video_notes": (functools.partial(_video, "notes"), _VIDEO),
     "video_transfer": (functools.partial(_video, "transfer"), _VIDEO),
+    "network": (functools.partial(_network, "run"), _NETWORK),
+    "network_header": (functools.partial(_network, "header"), _NETWORK),
     "image": (_image, "nerfies_jax.capture.images"),
     "mask": (_mask, "nerfies_jax.capture.masks"),
     "photograph": (_photograph, "nerfies_jax.capture.photographs"),

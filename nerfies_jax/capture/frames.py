@@ -597,12 +597,13 @@ def colored_points(
     return PointCloud(position, color)
 
 
-def load_array(path: pathlib.Path, most: int) -> np.ndarray:
+def load_array(path: pathlib.Path, most: int, kinds: str = "fiu") -> np.ndarray:
     """Read a .npy file of numbers.
 
     Args:
       path: The file.
       most: Largest number of values.
+      kinds: NumPy's codes of the accepted types: f, i, u, and b for booleans.
 
     Returns:
       The array.
@@ -618,7 +619,7 @@ def load_array(path: pathlib.Path, most: int) -> np.ndarray:
         raise CaptureError(
             f"{path}: not a readable array ({error}); save it again with numpy.save"
         ) from None
-    if array.dtype.kind not in "fiu":
+    if array.dtype.kind not in kinds:
         raise CaptureError(f"{path}: not an array of numbers; save it with numpy.save")
     if array.size > most:
         raise CaptureError(f"{path}: {array.size} numbers; at most {most} are read")

@@ -12,7 +12,7 @@ class GivenFiles:
     """Preprocessing files of other tools (docs/formats.md), as absolute paths."""
 
     tracks: pathlib.Path | str | None = None
-    """Tracks of TAPIR or CoTracker (npz). Their 3D positions are used if it has any."""
+    """Tracks of TAPIR, BootsTAPIR, CoTracker or LocoTrack: npz, or a folder of npy."""
     masks: pathlib.Path | str | None = None
     """Folder of PNGs, white where something moves."""
     depths: pathlib.Path | str | None = None
@@ -23,8 +23,18 @@ class GivenFiles:
     times: pathlib.Path | str | None = None
     """Frame times in seconds or on any clock: text with a name and a time in each line,
     or JSON."""
+    depth_model: pathlib.Path | str | None = None
+    """Network for depth from one image, as an ONNX file (docs/networks.md)."""
+    segmentation_model: pathlib.Path | str | None = None
+    """Network that segments what may move, as an ONNX file (docs/networks.md)."""
 
     def __post_init__(self):
+        for name, model in (("depths", "depth_model"), ("masks", "segmentation_model")):
+            if None not in (getattr(self, name), getattr(self, model)):
+                raise ValueError(
+                    f"{name}={getattr(self, name)} and {model}={getattr(self, model)}: "
+                    "both provide the same; leave one out"
+                )
         for name, path in vars(self).items():
             if path is not None:
                 object.__setattr__(self, name, pathlib.Path(path).absolute())
@@ -33,18 +43,18 @@ class GivenFiles:
 class Given(NamedTuple):
     """External preprocessing results by frame, in pixels of `size`, None where absent.
 
-    Frames that the tool did not process have no visible tracks, no moving pixels, and
-    NaN.
+    Pixels are those of the images of the capture, with their lens distortion. Frames
+    that the tool did not process have no visible tracks, no moving pixels, and NaN.
     """
 
     size: tuple[int, int]  # width and height
     track_pixel: np.ndarray | None = None  # [frames, tracks, 2]; centers at +0.5
     track_seen: np.ndarray | None = None  # [frames, tracks] bool
-    track_place: np.ndarray | None = None  # [frames, tracks, 3] scene units
     moving: np.ndarray | None = None  # [frames, height, width] bool
     # [frames, height, width] depth or inverse depth of any scale and offset, NaN where
     # unknown
     depth: np.ndarray | None = None
+    inverse: bool | None = None  # True for inverse depth, None if it is not known
     # [frames, height, width, 2] from each training frame to the next and the previous
     # one in time
     forward: np.ndarray | None = None
@@ -62,8 +72,9 @@ def take(given: Given, rows: np.ndarray) -> Given:
       The results of these frames.
     """
     arrays = given._asdict()
-    del arrays["size"], arrays["forward"], arrays["backward"]
+    for name in ("size", "inverse", "forward", "backward"):
+        del arrays[name]
     selection = {
         name: None if array is None else array[rows] for name, array in arrays.items()
     }
-    return Given(given.size, **selection)
+    return Given(given.size, inverse=given.inverse, **selection)

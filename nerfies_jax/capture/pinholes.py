@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from nerfies_jax.capture import resampling
+from nerfies_jax.capture import given_lens, resampling
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import lens, rays
@@ -36,8 +36,9 @@ def as_pinholes(capture: Capture) -> Capture:
     Focal lengths are unchanged. Images grow until they contain all observed pixels, at
     most by `MOST_GROWTH` of their sides. Pixels that the lens did not observe are
     marked in `valid`. Color is sampled with a Lanczos filter, masks and depth at the
-    nearest pixel. z-depth needs no change, since a ray keeps its points. Flow is
-    dropped, since both of its ends would move.
+    nearest pixel. z-depth needs no change, since a ray keeps its points. External
+    preprocessing results (`given`) are mapped too. Flow of the capture is dropped,
+    since both of its ends would move.
 
     Args:
       capture: The capture.
@@ -60,6 +61,7 @@ def as_pinholes(capture: Capture) -> Capture:
         **arrays | {"valid": None if filmed.all() else filmed},
         cameras=cameras.crop(pinhole(capture.cameras), -wide.left, -wide.top),
         flow=None,
+        given=None if capture.given is None else _last.given(capture, wide),
         notes=(*capture.notes, note),
     )
 
@@ -76,6 +78,7 @@ class _Last:
     def _forget(self, _=None):
         self._images: Any = lambda: None
         self._others, self._arrays = (), None
+        self._given: tuple[Any, Any] = (None, None)  # external results, and undistorted
 
     def arrays(self, capture):
         others = _others(capture)
@@ -85,8 +88,17 @@ class _Last:
         return None
 
     def keep(self, capture, arrays):
+        self._forget()
         self._images = weakref.ref(capture.images, self._forget)
         self._others, self._arrays = _others(capture), arrays
+
+    def given(self, capture, wide):
+        if self.arrays(capture) is None:  # too large to be kept
+            return _undistorted_given(capture, capture.given, wide)
+        if self._given[0] is not capture.given:
+            undistorted = _undistorted_given(capture, capture.given, wide)
+            self._given = capture.given, undistorted
+        return self._given[1]
 
 
 def _others(capture):
@@ -125,6 +137,42 @@ def _undistorted(capture, wide):
                     array[row] = np.where(inside, resampling.nearest(source, place), 0)
             stage.advance()
     return {"images": images, "valid": filmed, **masks}
+
+
+def _undistorted_given(capture, given, wide):
+    camera_of = [cameras.take(capture.cameras, row) for row in range(len(capture.ids))]
+    maps = Maps(lambda camera, size: _source_pixels(camera, size, wide), capture.size)
+    order = np.argsort(capture.times[capture.train], kind="stable")
+
+    def straight(row, pixel):
+        return straight_points(camera_of[row], pixel, wide)
+
+    return given_lens.undistorted(
+        given,
+        wide.size,
+        capture.train[order],
+        lambda row: maps.of(camera_of[row]),
+        straight,
+    )
+
+
+def straight_points(
+    camera: Camera, pixel: np.ndarray, wide: Canvas
+) -> tuple[np.ndarray, np.ndarray]:
+    """Undistort positions in a captured image.
+
+    Args:
+      camera: One camera with its distortion.
+      pixel: Positions (x, y) in the captured image in pixels, [points, 2].
+      wide: The canvas of its capture.
+
+    Returns:
+      Positions in the undistorted image [points, 2], and booleans [points] that are
+      False if the lens model has no ray for the position.
+    """
+    slopes, exists = _straight(_float32(camera), _slopes_at(camera, pixel))
+    straight = _pixels_at(camera, np.asarray(slopes))
+    return straight + np.array([wide.left, wide.top]), np.asarray(exists)
 
 
 def canvas(capture: Capture) -> Canvas:
@@ -296,19 +344,26 @@ def _bent(camera, slopes):
 
 def _slopes(camera, size):
     """Image-plane positions [pixels, 2] of the pixel centers, without distortion."""
+    return _slopes_at(camera, np.asarray(rays.pixel_centers(size)).reshape(-1, 2))
+
+
+def _slopes_at(camera, pixels):
+    """Image-plane positions [points, 2] of pixel positions, without distortion."""
     focal, skew = float(camera.focal_px), float(camera.skew_px)
-    offset = np.asarray(rays.pixel_centers(size)) - np.asarray(
-        camera.principal_point_px
-    )
+    offset = pixels - np.asarray(camera.principal_point_px)
     y = offset[..., 1] / (focal * float(camera.pixel_aspect))
     x = (offset[..., 0] - skew * y) / focal
-    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
+    return np.stack([x, y], axis=-1).astype(np.float32)
 
 
 def _pixels(camera, slopes, size):
     """Pixel positions [height, width, 2] of image-plane positions [pixels, 2]."""
+    return _pixels_at(camera, slopes).reshape(size[1], size[0], 2)
+
+
+def _pixels_at(camera, slopes):
+    """Pixel positions [points, 2] of image-plane positions."""
     focal, skew = float(camera.focal_px), float(camera.skew_px)
-    slopes = slopes.reshape(size[1], size[0], 2)
     across = focal * slopes[..., 0] + skew * slopes[..., 1]
     down = focal * float(camera.pixel_aspect) * slopes[..., 1]
     return np.stack([across, down], axis=-1) + np.asarray(camera.principal_point_px)

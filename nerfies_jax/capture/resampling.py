@@ -47,14 +47,14 @@ def lanczos(image: np.ndarray, index: np.ndarray) -> np.ndarray:
 
 
 def nearest(image: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Sample a mask or depth map at the nearest pixel.
+    """Sample a mask, depth map or flow at the nearest pixel.
 
     Args:
-      image: Mask or depth map, [height, width].
+      image: Mask or depth map [height, width], or flow [height, width, 2].
       index: Array coordinates (row, column), [2, ...].
 
     Returns:
-      Values, [...].
+      Values, [...] or [..., 2].
     """
     row, column = np.round(index).astype(int)
     return image[row, column]

@@ -1,10 +1,13 @@
 """Alignment of external depth to scene units by static points.
 
-Networks predict depth or inverse depth with an unknown scale and offset for each image.
-The kind that fits the static points better is chosen. If a plane fills the image,
-neither the kind nor the offset can be determined, and depth without an offset is
-assumed.
+Networks predict depth or inverse depth with an unknown scale and offset for each image,
+and their errors vary slowly over it. Each image is corrected by a scale, an offset and
+a tilt, which are fitted to its static points. The kind that fits better is chosen. If a
+plane fills the image, neither the kind nor the offset can be determined, and depth
+without an offset is assumed.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,62 +16,120 @@ from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
 
 FEWEST = 12  # static points in an image
 ROUNDS = 8  # of reweighting
-USABLE = 0.1  # maximum of the median relative error
+# Median relative errors above which a warning is given, and depth is refused.
+DOUBTFUL, USABLE = 0.1, 0.3
 SAME = 0.002  # by which the relative error of inverse depth must be smaller
-# Penalty on the offset relative to squared depth, so that an undetermined one is zero.
-OFFSET_PENALTY = 1e-3
+# Penalties on the offset and the tilt relative to squared depth, so that undetermined
+# ones are zero. Points that cover a part of an image do not tilt the rest of it.
+OFFSET_PENALTY, TILT_PENALTY = 1e-3, 1e-2
 LEAST_TOLD = 0.1  # minimum share of the aligned depth that is not due to the offset
+# Standard deviation of normal errors in units of their median.
+PER_MEDIAN = 1.4826
+
+
+class AlignedDepth(NamedTuple):
+    """External depth in scene units, and how well it fits the static points."""
+
+    # [frames, height, width] z-depth, NaN where unknown, and in frames with too few
+    # static points or too large errors
+    depth: np.ndarray
+    miss: np.ndarray  # [frames] median relative error, NaN without static points
+    total_miss: float  # median relative error of all frames, inf if none fits
+
+    def deviation(self, least: float) -> np.ndarray:
+        """Convert the errors to relative standard deviations.
+
+        Args:
+          least: Least deviation.
+
+        Returns:
+          Deviations, [frames].
+        """
+        return np.maximum(PER_MEDIAN * np.nan_to_num(self.miss), least)
 
 
 def aligned(
-    depth: np.ndarray, tracks: Tracks, rest: RestPoints
-) -> tuple[np.ndarray, float]:
+    depth: np.ndarray,
+    tracks: Tracks,
+    rest: RestPoints,
+    inverse: bool | None = None,
+) -> AlignedDepth:
     """Align depth to static points.
 
     Args:
       depth: External depth or inverse depth, [frames, height, width].
       tracks: Tracks of static points, in the pixels of `depth`.
       rest: Static points of the tracks.
+      inverse: True for inverse depth, False for depth. None for the one that fits.
 
     Returns:
-      z-depth in scene units [frames, height, width], NaN where unknown and in frames
-      with too few static points, and its median relative error.
+      The aligned depth.
     """
-    placements, misses = [], []
-    for inverse in (False, True):
-        placed = np.full(depth.shape, np.nan, np.float32)
-        off = []
-        for frame, given in enumerate(depth):
-            here = tracks.seen[:, frame] & (rest.depth[:, frame] > 0)
-            place = pixel_of(tracks.pixel[here, frame], given.shape)
-            own, true = given[place].astype(np.float64), rest.depth[here, frame]
-            known = np.isfinite(own)
-            if known.sum() < FEWEST:
-                continue
-            wanted = 1 / true[known] if inverse else true[known]
-            scale, shift = _line(own[known], wanted)
-            if scale * np.median(own[known]) < LEAST_TOLD * np.median(wanted):
-                continue
-            mapped = scale * given + shift
-            with np.errstate(divide="ignore", invalid="ignore"):
-                placed[frame] = 1 / mapped if inverse else mapped
-                off.append(abs(placed[frame][place][known] / true[known] - 1))
-            placed[frame][~(mapped > 0)] = np.nan
-        placements.append(placed)
-        misses.append(np.nanmedian(np.concatenate(off)) if off else np.inf)
-    best = int(misses[1] + SAME < misses[0])
-    return placements[best], float(misses[best])
+    kinds = (False, True) if inverse is None else (inverse,)
+    results = [_aligned(depth, tracks, rest, kind) for kind in kinds]
+    best = results[0]
+    for other in results[1:]:
+        if other.total_miss + SAME < best.total_miss:
+            best = other
+    return best
 
 
-def _line(own, wanted):
-    """Fit scale and offset from one to the other by robust least squares."""
+def _aligned(depth, tracks, rest, inverse):
+    placed = np.full(depth.shape, np.nan, np.float32)
+    misses = np.full(len(depth), np.nan)
+    every = []
+    tilt = _tilt(depth.shape[1:])
+    for frame, given in enumerate(depth):
+        here = tracks.seen[:, frame] & (rest.depth[:, frame] > 0)
+        place = pixel_of(tracks.pixel[here, frame], given.shape)
+        own, true = given[place].astype(np.float64), rest.depth[here, frame]
+        known = np.isfinite(own)
+        if known.sum() < FEWEST:
+            continue
+        own, true = own[known], true[known]
+        place = tuple(axis[known] for axis in place)
+        wanted = 1 / true if inverse else true
+        # Errors of inverse depth in units of depth, because tracks measure parallax.
+        precision = np.ones_like(true) if inverse else (np.median(true) / true) ** 2
+        fit = _fit(own, tilt[:, *place], wanted, precision)
+        if fit[0] * np.median(own) < LEAST_TOLD * np.median(wanted):
+            # Points of one plane, or no relation at all, which the error then shows.
+            fit = np.median(wanted / own), 0.0, np.zeros(2)
+            if not (np.isfinite(fit[0]) and fit[0] > 0):
+                continue
+        scale, offset, slope = fit
+        mapped = scale * given + offset + np.tensordot(slope, tilt, 1)
+        mapped = np.where(mapped > 0, mapped, np.nan)
+        placed[frame] = 1 / mapped if inverse else mapped
+        error = abs(placed[frame][place] / true - 1)
+        error = np.where(np.isnan(error), 1.0, error)
+        every.append(error)
+        misses[frame] = np.median(error)
+        if misses[frame] > USABLE:
+            placed[frame] = np.nan
+    total = float(np.median(np.concatenate(every))) if every else np.inf
+    return AlignedDepth(placed, misses, total)
+
+
+def _tilt(shape):
+    """Positions in an image from -1 to 1, [2, height, width]."""
+    height, width = shape
+    rows, columns = np.meshgrid(
+        np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij"
+    )
+    return np.stack([columns, rows])
+
+
+def _fit(own, tilt, wanted, precision):
+    """Fit scale, offset and tilt from one to the other by robust least squares."""
     size = np.median(np.abs(own)) + 1e-30
-    columns = np.stack([own / size, np.ones_like(own)], axis=1)
+    columns = np.stack([own / size, np.ones_like(own), *tilt], axis=1)
+    penalty = np.array([0, OFFSET_PENALTY, TILT_PENALTY, TILT_PENALTY])
     weight = np.ones(len(own))
     for _ in range(ROUNDS):
-        matrix = (columns * weight[:, None]).T @ columns
-        matrix[1, 1] += OFFSET_PENALTY * weight.sum()
-        fit = np.linalg.solve(matrix, (columns * weight[:, None]).T @ wanted)
-        miss = np.abs(columns @ fit - wanted)
+        weighted = columns * (weight * precision**2)[:, None]
+        matrix = weighted.T @ columns + np.diag(penalty * weight.sum())
+        fit = np.linalg.solve(matrix, weighted.T @ wanted)
+        miss = precision * np.abs(columns @ fit - wanted)
         weight = 1 / (1 + (miss / (np.median(miss) + 1e-12)) ** 2)
-    return fit[0] / size, fit[1]
+    return fit[0] / size, fit[1], fit[2:]

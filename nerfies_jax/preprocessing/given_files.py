@@ -1,6 +1,7 @@
 """External tracks, masks, depth and flow in files, checked against a capture.
 
-Each has as many frames as the capture, or as its training frames, in temporal order.
+Each has as many frames as the capture, or as its training frames, in temporal order,
+and is in pixels of the images as they were captured, with their lens distortion.
 """
 
 import dataclasses
@@ -16,53 +17,42 @@ from nerfies_jax.capture import (
     frames,
     images,
     masks,
-    npz_files,
-    pinholes,
     safe_files,
 )
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.given import Given, GivenFiles
+from nerfies_jax.preprocessing import given_arrays, given_tracks, networks
 
-MOST_NUMBERS = 2_000_000_000  # of one file
-# Names of the positions and visibilities of tracks, the axis of the frames if the shape
-# is ambiguous, and the coordinate of the center of the first pixel: for TAPIR, whose
-# images begin at 0, and for CoTracker, which aligns corners.
-TRACK_NAMES = (
-    ("tracks", "visibles", 1, 0.5),
-    ("pred_tracks", "pred_visibility", 0, 0.0),
-)
-LEAST_INSIDE = 0.5  # minimum share of visible positions inside the images
-SEEN = 0.5  # threshold of visibilities in [0, 1]
 FLO_MAGIC = 202021.25  # of Middlebury's .flo
 PICTURES, DEPTHS = (".png",), (".exr", ".png", ".npy")
 
 
 @decoder.session()
-def attached(capture: Capture, files: GivenFiles) -> Capture:
+def attached(
+    capture: Capture, files: GivenFiles, folder: pathlib.Path = networks.FOLDER
+) -> Capture:
     """Read external files, except for times, and attach them to a capture.
+
+    Networks are run on the training images.
 
     Args:
       capture: The capture.
       files: The files.
+      folder: Cache folder for results of networks.
 
     Returns:
       The capture with `given` set.
 
     Raises:
-      CaptureError: If a file does not fit.
+      CaptureError: If a file does not fit, or a network cannot be run.
+      MissingExtra: If a network needs a package that is not installed.
     """
     if files == GivenFiles(times=files.times):  # times are read with the capture
         return capture
-    if pinholes.has_lens(capture.cameras):
-        raise CaptureError(
-            f"{capture.path or capture.name}: files of other tools cannot be used for "
-            "images with lens distortion; undistort the capture first, for example "
-            "with image_undistorter of COLMAP"
-        )
     parts: dict[str, Any] = {}
     notes = capture.notes
     if files.tracks is not None:
-        parts |= _tracks(files.tracks, capture)
+        parts |= given_tracks.read(pathlib.Path(files.tracks), capture)
     if files.masks is not None:
         parts["moving"], more = _masks(files.masks, capture)
         notes += more
@@ -70,83 +60,22 @@ def attached(capture: Capture, files: GivenFiles) -> Capture:
         parts["depth"] = _depths(files.depths, capture)
     if files.flow is not None:
         parts |= _flow(files.flow, capture)
-    return dataclasses.replace(capture, given=Given(capture.size, **parts), notes=notes)
-
-
-def _rows(count, capture, path, what):
-    """Return the rows of the capture that a number of frames refers to."""
-    learned = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-    every = np.argsort(capture.times, kind="stable")
-    for rows in (learned, every):
-        if count == len(rows):
-            return rows
-    raise CaptureError(
-        f"{path}: {what} of {count} frames, but the capture has {len(every)} frames "
-        f"({len(learned)} training frames); provide one for each, in temporal order"
-    )
-
-
-def _arrays(path):
-    try:
-        arrays = npz_files.read_arrays(path)
-    except CaptureError:
-        raise
-    except ValueError as error:
-        raise CaptureError(
-            f"{path}: not a readable npz ({error}); save it with numpy.savez"
-        ) from None
-    for name, array in arrays.items():
-        if array.dtype.kind not in "fiub" or array.size > MOST_NUMBERS:
-            raise CaptureError(
-                f"{path}: {name} is {array.dtype} of shape {array.shape}; expected at "
-                f"most {MOST_NUMBERS} numbers"
+    if files.depth_model is not None:
+        found = networks.depths(capture, files.depth_model, folder=folder)
+        parts |= found._asdict()
+    if files.segmentation_model is not None:
+        moving = networks.segments(capture, files.segmentation_model, folder=folder)
+        share = moving[capture.train].mean()
+        note = f"{share:.1%} of the pixels are segmented by a network: moving"
+        if 0 < share < 1:
+            parts["moving"] = moving
+        else:
+            note = (
+                f"the segmentation network marks {'all' if share else 'none'} of the "
+                "pixels, and is not used"
             )
-    return arrays
-
-
-def _tracks(path, capture):
-    arrays = _arrays(path)
-    for names in TRACK_NAMES:
-        if names[0] in arrays and names[1] in arrays:
-            break
-    else:
-        wanted = " or ".join(f"{one} and {two}" for one, two, *_ in TRACK_NAMES)
-        raise CaptureError(
-            f"{path}: holds {', '.join(arrays) or 'nothing'}; expected {wanted}"
-        )
-    pixel, seen = arrays[names[0]], arrays[names[1]]
-    if pixel.ndim == 4 and len(pixel) == 1:  # CoTracker's batch
-        pixel, seen = pixel[0], seen.reshape(seen.shape[1:])
-    if pixel.ndim != 3 or pixel.shape[2] != 2 or seen.shape[:2] != pixel.shape[:2]:
-        raise CaptureError(
-            f"{path}: {names[0]} of shape {pixel.shape} and {names[1]} of "
-            f"{seen.shape}; expected [tracks, frames, 2] and [tracks, frames], or "
-            "frames first"
-        )
-    seen = seen.reshape(pixel.shape[:2])
-    counts = {len(capture.train), len(capture.ids)}
-    fits = [axis for axis in (0, 1) if pixel.shape[axis] in counts]
-    if len(fits) != 1:
-        fits = [names[2]]
-    pixel, seen = np.moveaxis(pixel, fits[0], 0), np.moveaxis(seen, fits[0], 0)
-    rows = _rows(len(pixel), capture, path, "tracks")
-    pixel = pixel.astype(np.float32) + np.float32(0.5 - names[3])
-    seen = (seen > SEEN) & np.isfinite(pixel).all(-1)
-    if "size" in arrays:
-        pixel = pixel * (np.asarray(capture.size) / arrays["size"]).astype(np.float32)
-    inside = ((pixel > 0) & (pixel < np.asarray(capture.size))).all(-1)
-    if not seen.any() or (inside & seen).sum() < LEAST_INSIDE * seen.sum():
-        width, height = capture.size
-        raise CaptureError(
-            f"{path}: {(inside & seen).sum()} of {seen.sum()} visible positions are "
-            f"inside the images of {width}x{height}, at least half must be; if images "
-            "of another size were tracked, add their width and height as an array size"
-        )
-    seen &= inside
-    pixels = np.zeros((len(capture.ids), pixel.shape[1], 2), np.float32)
-    there = np.zeros(pixels.shape[:2], bool)
-    pixels[rows], there[rows] = np.where(seen[..., None], pixel, 0), seen
-    return {"track_pixel": pixels, "track_seen": there}
+        notes += (note,)
+    return dataclasses.replace(capture, given=Given(capture.size, **parts), notes=notes)
 
 
 def _files(folder, suffixes, capture, what):
@@ -163,7 +92,7 @@ def _files(folder, suffixes, capture, what):
         raise CaptureError(
             f"{folder}: contains no {what} ({' or '.join(suffixes)} files)"
         )
-    return paths, _rows(len(paths), capture, folder, what)
+    return paths, given_arrays.frames_of(len(paths), capture, folder, what)
 
 
 def _masks(folder, capture):
@@ -189,9 +118,12 @@ def _fitted(array, capture, path, what):
     tall, wide = array.shape[:2]
     # To within a pixel of the smaller of the two.
     if abs(wide * height - tall * width) > max(width, height, wide, tall):
+        advice = "their aspect ratios must match: export it uncropped"
+        if (wide, tall) == (height, width):
+            advice = "its rows and columns seem to be exchanged: transpose it"
         raise CaptureError(
             f"{path}: a {what} of {wide}x{tall} pixels for images of "
-            f"{width}x{height}; their aspect ratios must match: export it uncropped"
+            f"{width}x{height}; {advice}"
         )
     row = ((np.arange(height) + 0.5) * tall / height).astype(int)
     column = ((np.arange(width) + 0.5) * wide / width).astype(int)
@@ -204,7 +136,7 @@ def _depths(path, capture):
         pictures = [_depth_picture(one) for one in paths]
     else:
         paths, pictures = [path], _stack(path)
-        rows = _rows(len(pictures), capture, path, "depths")
+        rows = given_arrays.frames_of(len(pictures), capture, path, "depths")
         paths = paths * len(rows)
     depths = np.full(capture.images.shape[:3], np.nan, np.float32)
     for where, picture, row in zip(paths, pictures, rows, strict=True):
@@ -236,8 +168,10 @@ def _depth_picture(path):
 
 def _stack(path):
     if path.suffix == ".npy":
-        return _checked_stack(frames.load_array(path, MOST_NUMBERS), path, "it")
-    arrays = _arrays(path)
+        return _checked_stack(
+            frames.load_array(path, given_arrays.MOST_NUMBERS), path, "it"
+        )
+    arrays = given_arrays.read(path)
     name = "depths" if "depths" in arrays else next(iter(arrays), "depths")
     return _checked_stack(arrays.get(name, np.zeros(0)), path, name)
 
@@ -255,7 +189,7 @@ def _flow(path, capture):
     if path.is_dir():
         sides = {side: _flo_stack(path / side) for side in ("forward", "backward")}
     else:
-        arrays = _arrays(path)
+        arrays = given_arrays.read(path)
         missing = {"forward", "backward"} - set(arrays)
         if missing:
             raise CaptureError(

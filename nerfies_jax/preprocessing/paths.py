@@ -53,6 +53,7 @@ def least_acceleration(
     near: float,
     around: np.ndarray | None = None,
     measured: np.ndarray | None = None,
+    measured_deviation: np.ndarray | float = MEASURED_DEVIATION,
 ) -> Paths:
     """Fit paths along the rays of tracks, with one banded linear system each.
 
@@ -67,6 +68,8 @@ def least_acceleration(
       around: z-depths of the surroundings, [tracks, frames], NaN if unknown, or None.
       measured: z-depths of the points from depth maps, [tracks, frames], NaN if
         unknown, or None.
+      measured_deviation: Relative standard deviations of `measured`, a number or
+        [frames].
 
     Returns:
       The paths.
@@ -76,7 +79,7 @@ def least_acceleration(
     pull, target = np.zeros(tracks.seen.shape), np.zeros(tracks.seen.shape)
     for depth, deviation in (
         (around, AROUND_DEVIATION),
-        (measured, MEASURED_DEVIATION),
+        (measured, measured_deviation),
     ):
         if depth is not None:
             there = tracks.seen & np.isfinite(depth)

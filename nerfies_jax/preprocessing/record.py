@@ -14,7 +14,6 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-import scipy.ndimage as nd
 
 from nerfies_jax.capture import cache_files, pinholes
 from nerfies_jax.capture import capture as captures
@@ -24,9 +23,9 @@ from nerfies_jax.preprocessing import (
     dense_flow,
     given_depth,
     moving,
+    path_depths,
     paths,
     rest_points,
-    rigid_bodies,
     still_pictures,
     still_points,
     taken,
@@ -38,9 +37,7 @@ from nerfies_jax.preprocessing.record_file import Evidence, digest, load, save
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.preprocessing.watch import (
-    A_BODY_TERM,
     A_COMPARED_PIXEL,
-    A_PATH_FRAME,
     A_POINT_FRAME,
     A_SEARCHED_PIXEL,
     A_TRACK_FRAME,
@@ -59,15 +56,12 @@ MOST_PIXELS = 16_000_000  # of all frames together, at 17 bytes each for their f
 LEAST_CARRIED = 0.4
 # Shares of the budget above which a part is skipped.
 FOR_WIDE_STEPS, FOR_TRACKS, FOR_COLORS = 0.4, 0.5, 0.6
-FOR_BODIES, FOR_POINTS = 0.7, 0.8
-# Minimum depth of moving points as a share of the near plane, which is computed from
-# static points. Moving objects, such as a hand, may be much closer.
-AT_CAMERA = 0.1
+FOR_POINTS = 0.8
 LEAST_TEXTURED = 0.05  # minimum share of textured pixels
 MOST_UNKEPT = 2  # records in memory: of training frames, and of all frames
 
 _unkept: dict[pathlib.Path, "Evidence"] = {}  # records that could not be written
-_told_of: dict[pathlib.Path, str] = {}  # notes on records with skipped parts
+_told_of: dict[pathlib.Path, list[str]] = {}  # notes on records
 
 
 def gather(
@@ -95,6 +89,7 @@ def gather(
 
 def _gathered(capture, use_depths, watch):
     watch.begin("flow")
+    capture = pinholes.as_pinholes(capture)
     factor, given = _factor(capture), capture.given or Given(capture.size)
     capture = looked_at(capture, factor)
     views = view_set.in_time_order(capture)
@@ -124,13 +119,11 @@ def _gathered(capture, use_depths, watch):
     which = np.zeros(0, int)
     if not unusable:
         which = _moved(tracks, score, first)
-    places = taken.places(given, views)
-    if places is None:
-        depths = _depths(capture, given, views, tracks, rest, score, use_depths)
-        moved_paths = _paths(capture, views, tracks, rest, score, which, depths, watch)
-    else:
-        near, moved = AT_CAMERA * capture.near, tracks.take(which)
-        moved_paths = paths.certain(views, moved, places[which - first], near)
+    still = np.flatnonzero(score < paths.AT_REST)
+    static = tracks.take(still), rest.take(still)
+    depths = path_depths.known(capture, given, views, static, use_depths)
+    moved = tracks.take(which)
+    moved_paths = path_depths.fitted(capture, views, moved, static, depths, watch)
     watch.begin("still")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     points_work = 1e-6 * A_POINT_FRAME * still_points.work(views)
@@ -150,6 +143,7 @@ def _gathered(capture, use_depths, watch):
         told=given.moving is not None or given.track_pixel is not None,
         factor=factor,
         left_out=watch.left_out,
+        depth_miss=0.0 if given.depth is None else depths.total_miss,
         seconds=watch.seconds(),
     )
 
@@ -215,46 +209,22 @@ def _enlarged(masks, height, width):
     return np.stack(enlarged)
 
 
-def _depths(capture, given, views, tracks, rest, score, use_depths):
-    """z-depths [frames, height, width] that constrain paths, None if there are none."""
-    depth = taken.depth(given, views)
-    if depth is None:
-        own = use_depths and capture.depths is not None
-        return capture.depths[views.row] if own else None
-    still = score < paths.AT_REST
-    depth, miss = given_depth.aligned(depth, tracks.take(still), rest.take(still))
-    if not np.isfinite(miss):
-        raise ValueError(
-            f"{capture.path or capture.name}: the external depth maps fit the static "
-            "points in no frame, neither as depth nor as inverse depth; remove them"
-        )
-    if miss > given_depth.USABLE:
-        raise ValueError(
-            f"{capture.path or capture.name}: the external depth maps differ from the "
-            f"static points by {miss:.0%} (median), more than "
-            f"{given_depth.USABLE:.0%}; check that they belong to these frames, or "
-            "remove them"
-        )
-    return depth
+def depth_note(evidence: Evidence) -> str:
+    """Describe a doubtful agreement of external depth with static points.
 
+    Args:
+      evidence: Preprocessing.
 
-def _paths(capture, views, tracks, rest, score, which, depths, watch):
-    still, moved = score < paths.AT_REST, tracks.take(which)
-    watch.spend(1e-6 * A_PATH_FRAME * moved.seen.size)
-    around = paths.depth_around(
-        moved, tracks.take(still), rest.take(still), capture.near
+    Returns:
+      The text, empty if they agree or there is no external depth.
+    """
+    if evidence.depth_miss <= given_depth.DOUBTFUL:
+        return ""
+    return (
+        f"the external depth maps differ from the static points by "
+        f"{evidence.depth_miss:.0%} (median). They are used with a low weight; up to "
+        f"{given_depth.DOUBTFUL:.0%} is usual"
     )
-    least = AT_CAMERA * capture.near
-    if depths is not None:
-        measured = _measured(depths, moved)
-        return paths.least_acceleration(views, moved, least, around, measured)
-    alone = paths.least_acceleration(views, moved, least, around)
-
-    def has_room(terms):
-        what = "depths of rigid bodies"
-        return watch.has_room(FOR_BODIES, what, 1e-6 * A_BODY_TERM * terms)
-
-    return rigid_bodies.refined(views, moved, alone, has_room)
 
 
 def looked_at(capture: Capture, factor: int) -> Capture:
@@ -320,31 +290,6 @@ def _moved(tracks, score, first):
     return np.sort(which)
 
 
-def _measured(depths, tracks):
-    """Return z-depths of tracks, NaN if unknown or at a depth discontinuity."""
-    measured = np.full(tracks.seen.shape, np.nan)
-    for frame, picture in enumerate(depths):
-        here = np.flatnonzero(tracks.seen[:, frame])
-        depth = steady_depth(picture)
-        at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
-        measured[here, frame] = depth[at]
-    return measured
-
-
-def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
-    """Select known z-depths that are not at a depth discontinuity.
-
-    Args:
-      depth: z-depths, [height, width], 0 if unknown.
-      jump: Relative difference between neighbors at a discontinuity.
-
-    Returns:
-      z-depths [height, width], NaN for other pixels.
-    """
-    least, most = nd.minimum_filter(depth, 3), nd.maximum_filter(depth, 3)
-    return np.where((least > 0) & (most - least < jump * depth), depth, np.nan)
-
-
 def cached(
     capture: Capture,
     folder: pathlib.Path,
@@ -354,8 +299,8 @@ def cached(
     """Preprocess a capture, or read its results from a cache.
 
     A distorted capture is undistorted first, so that both share one record. If `folder`
-    cannot be written, this is reported and the record is kept in memory. A warning
-    lists skipped parts.
+    cannot be written, this is reported and the record is kept in memory. Warnings list
+    skipped parts, and external depth that hardly fits.
 
     Args:
       capture: The capture.
@@ -378,9 +323,11 @@ def cached(
             while len(_unkept) >= MOST_UNKEPT:
                 _unkept.pop(next(iter(_unkept)))
             _unkept[path] = evidence
-    if evidence.left_out and path not in _told_of:
-        _told_of[path] = left_out_note(evidence)
-        console.warn(f"{capture.path or capture.name}: {_told_of[path]}")
+    if path not in _told_of:
+        notes = [left_out_note(evidence), depth_note(evidence)]
+        _told_of[path] = [note for note in notes if note]
+        for note in _told_of[path]:
+            console.warn(f"{capture.path or capture.name}: {note}")
     return evidence
 
 
@@ -402,7 +349,9 @@ def left_out_note(evidence: Evidence) -> str:
 
 
 def notes_on(capture: Capture, folder: pathlib.Path) -> list[str]:
-    """List the notes of `cached` in this process on parts skipped for a capture.
+    """List the notes of `cached` in this process on a capture.
+
+    They are about parts that were skipped, and external depth that hardly fits.
 
     Args:
       capture: The capture.
@@ -412,7 +361,9 @@ def notes_on(capture: Capture, folder: pathlib.Path) -> list[str]:
       The notes.
     """
     paths = (file_of(capture, folder, use_depths) for use_depths in (False, True))
-    return list(dict.fromkeys(_told_of[path] for path in paths if path in _told_of))
+    return list(
+        dict.fromkeys(note for path in paths for note in _told_of.get(path, ()))
+    )
 
 
 def file_of(

@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.watch import Seconds
 
-VERSION = 12
+VERSION = 13
 
 
 class Evidence(NamedTuple):
@@ -35,6 +35,8 @@ class Evidence(NamedTuple):
     told: bool  # masks or tracks are external, so that even few of them are trusted
     factor: int  # by which images were downsampled
     left_out: str  # parts skipped because of the budget, or empty
+    # Median relative difference of external depth from static points, 0 without any
+    depth_miss: float
     seconds: Seconds
 
 
@@ -130,6 +132,7 @@ def load(path: pathlib.Path) -> Evidence:
             parts[name] = arrays[name]
     parts["seconds"] = Seconds(*(float(part) for part in parts["seconds"]))
     kinds_of_one = {"unusable": str, "left_out": str, "told": bool, "factor": int}
+    kinds_of_one["depth_miss"] = float
     parts |= {name: kind(parts[name]) for name, kind in kinds_of_one.items()}
     flow = parts["flow"]
     parts["flow"] = flow._replace(

@@ -45,22 +45,6 @@ def tracks(given: Given, views: Views) -> Tracks | None:
     return tracking.long_enough(_followed(given, views))
 
 
-def places(given: Given, views: Views) -> np.ndarray | None:
-    """Return the positions of the tracks from `tracks`.
-
-    Args:
-      given: External results.
-      views: The frames.
-
-    Returns:
-      Positions in scene units [tracks, frames, 3], None if there are none.
-    """
-    if given.track_place is None:
-        return None
-    long = tracking.is_long(_followed(given, views))
-    return np.moveaxis(given.track_place[views.row], 0, 1)[long]
-
-
 def _followed(given, views):
     scale = np.divide(views.size, given.size, dtype=np.float32)
     pixel = np.moveaxis(given.track_pixel[views.row], 0, 1) * scale

@@ -210,7 +210,8 @@ for name in sys.argv[1:]:
 
 WITHOUT_EXTRAS = """
 import importlib, pathlib, sys
-for name in ("av", "matplotlib", "pycolmap", "viser", "pillow_heif", "zstandard"):
+names = "av matplotlib pycolmap viser pillow_heif zstandard onnxruntime"
+for name in names.split():
     sys.modules[name] = None
 for package in ("nerfies_jax", "gaussians_jax", "experiments"):
     for path in sorted(pathlib.Path(package).rglob("*.py")):

@@ -2,17 +2,20 @@
 
 import dataclasses
 
+import jax
 import numpy as np
-import OpenEXR
-import PIL.Image
 import pytest
 
 from nerfies_jax.capture import capture as captures
-from nerfies_jax.capture import images
-from nerfies_jax.capture.given import GivenFiles
-from nerfies_jax.preprocessing import given_depth, given_files, record, usable_paths
-from nerfies_jax.preprocessing.rest_points import RestPoints
-from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
+from nerfies_jax.capture import images, pinholes
+from nerfies_jax.capture.given import Given, GivenFiles
+from nerfies_jax.geometry import camera as cameras
+from nerfies_jax.geometry import rays
+from nerfies_jax.preprocessing import (
+    given_files,
+    record,
+    usable_paths,
+)
 from tests.preprocessing import films
 from tests.preprocessing.test_summary import card_points
 from tests.preprocessing.test_tracks import MOVES, gathered
@@ -32,17 +35,41 @@ def tapir(path, **changes):
     return path, points
 
 
-@pytest.mark.parametrize("layout", ["tapir", "cotracker", "frames first"])
+LAYOUTS = ("tapir", "cotracker", "frames first", "locotrack", "folder", "pairs")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_tracks_are_read_in_each_layout(tmp_path, layout):
     path, points = tapir(tmp_path / "t.npz")
-    if layout != "tapir":
-        first = np.moveaxis(points.pixel, 0, 1)
-        seen = points.seen.T.astype(np.float32)
-        named = {"tracks": first, "visibles": seen}
-        if layout == "cotracker":
-            # Counted from the center of the first pixel.
-            named = {"pred_tracks": first[None] - 0.5, "pred_visibility": seen[None]}
+    first = np.moveaxis(points.pixel, 0, 1)
+    seen = points.seen.T.astype(np.float32)
+    # Counted from the center of the first pixel, with a batch.
+    named = {"pred_tracks": first[None] - 0.5, "pred_visibility": seen[None, ..., None]}
+    logit = np.where(points.seen, -5.0, 5.0)
+    if layout == "cotracker":
         np.savez(path, **named)
+    elif layout == "frames first":
+        np.savez(path, tracks=first, visibility=seen)
+    elif layout == "locotrack":
+        # Visible, but uncertain, is not visible either.
+        parts = {"occlusion": -5 + 0 * logit[None], "expected_dist": logit[None]}
+        np.savez(path, tracks=points.pixel[None], **parts)
+    elif layout == "folder":
+        path = tmp_path
+        path.joinpath("t.npz").unlink()
+        for name, array in named.items():
+            np.save(path / f"clip_{name}.npy", array)
+    elif (
+        layout == "pairs"
+    ):  # of query and target frames, as Shape of Motion stores them
+        path = tmp_path / "pairs"
+        path.mkdir()
+        half = len(points.pixel) // 2
+        for query, part in (("003", np.s_[:half]), ("010", np.s_[half:])):
+            for frame in range(24):
+                flag = logit[part, frame, None]
+                table = [points.pixel[part, frame], flag, -5 + 0 * flag]
+                np.save(path / f"{query}_{frame:03d}.npy", np.concatenate(table, 1))
     capture = with_files(tracks=path)
     place = np.moveaxis(capture.given.track_pixel, 0, 1)[points.seen]
     np.testing.assert_allclose(place, points.pixel[points.seen], atol=1e-4)
@@ -76,23 +103,6 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     assert len(evidence.still.position) > 2000
 
 
-def test_paths_whose_places_are_given_are_taken_as_they_are(tmp_path):
-    path, points = tapir(tmp_path / "t.npz")
-    capture = with_files(tracks=path)
-    rows = gathered()[1].row
-    place = np.zeros((len(capture.ids), *points.seen.T.shape[1:], 3), np.float32)
-    place[rows] = np.moveaxis(points.position, 0, 1)
-    given = capture.given._replace(track_place=place)
-    evidence = record.gather(dataclasses.replace(capture, given=given))
-    kept = evidence.paths.known
-    found, pixel = evidence.paths.position, evidence.tracks.pixel[evidence.moved]
-    assert kept.sum() > 0.9 * points.seen.sum()
-    for row, frame in zip(*np.nonzero(kept), strict=True):
-        which = np.abs(points.pixel[:, frame] - pixel[row, frame]).sum(1).argmin()
-        assert np.array_equal(found[row, frame], place[rows[frame], which])
-    assert not evidence.paths.depth_deviation.any()
-
-
 def test_a_mover_that_was_marked_is_no_noise_however_small():
     _, found = gathered()
     small = found._replace(moving=np.zeros_like(found.moving))
@@ -115,50 +125,80 @@ def test_tracks_of_larger_pictures_are_brought_to_those_that_are_read(tmp_path):
     np.testing.assert_allclose(place, points.pixel[points.seen], atol=1e-3)
 
 
-@pytest.mark.parametrize("inverse", [False, True])
-def test_depths_of_any_scale_are_brought_to_the_points_at_rest(inverse):
-    rng = np.random.default_rng(0)
-    true = np.float32(rng.uniform(1, 4, (3, 20, 30)))
-    given = 5 / true + 0.4 if inverse else 7 * true - 2
-    given[:, :2] = np.nan
-    pixel = np.float32(rng.uniform(0, (30, 20), (80, 1, 2)).repeat(3, 1))
-    tracks = Tracks(np.zeros(80, int), pixel, np.ones((80, 3), bool))
-    row, column = pixel_of(pixel, true.shape[1:])
-    depth = true[np.arange(3), row, column].astype(float)
-    depth[:8] *= 3  # points that are wrong
-    aligned, miss = given_depth.aligned(given, tracks, RestPoints(None, None, depth))
-    # The penalty of the offset is what is left.
-    np.testing.assert_allclose(aligned[:, 2:], true[:, 2:], rtol=0.03)
-    assert np.isnan(aligned[:, :2]).all()
-    assert miss < 0.01
-    noise = np.float32(rng.uniform(1, 4, true.shape))
-    assert given_depth.aligned(noise, tracks, RestPoints(None, None, depth))[1] > 0.1
+@jax.jit
+def directions(camera, pixel):
+    return jax.vmap(lambda one: cameras.unproject(camera, one)[0])(pixel)
 
 
-@pytest.mark.full
-def test_paths_lean_on_depths_given(tmp_path):
-    film, folders = films.film(**MOVES, frames=24), {}
-    for kind in ("exr", "png"):
-        folders[kind] = tmp_path / kind
-        folders[kind].mkdir()
-        for row, name in enumerate(film.ids):
-            depth = (7 + 0.1 * row) * film.depths[row]
-            path = folders[kind] / f"{name}.{kind}"
-            if kind == "exr":
-                OpenEXR.File({}, {"Z": depth}).write(str(path))
-            else:  # as depth cameras write it: millimeters, far below 16 bits
-                stored = np.round(100 * depth).astype(np.uint16)
-                PIL.Image.fromarray(stored).save(path)
-    captures_of = {kind: with_files(film, depths=folders[kind]) for kind in folders}
-    exr, png = (captures_of[kind].given.depth for kind in folders)
-    np.testing.assert_allclose(png / png.max(), exr / exr.max(), atol=1e-3)
-    evidence = record.gather(captures_of["png"])
-    own = gathered()[1]
-    off, without = (
-        np.abs(one.paths.depth[one.paths.known] - films.NEAR).mean()
-        for one in (evidence, own)
-    )
-    assert off < 0.5 * without
+@jax.jit
+def pixels(camera, point):
+    return jax.vmap(lambda one: cameras.project(camera, one)[0])(point)
+
+
+def test_results_for_distorted_images_are_mapped_to_undistorted_ones():
+    """The geometry is that of a wall, by projection alone."""
+    film = films.film(frames=3, blank=True)
+    lens = film.cameras._replace(radial=np.tile(np.float32([-0.2, 0.05, 0]), (3, 1)))
+    bent = dataclasses.replace(film, cameras=lens)
+    wide = pinholes.canvas(bent)
+    flat_cameras = cameras.crop(pinholes.pinhole(lens), -wide.left, -wide.top)
+
+    def on_wall(all_cameras, frame, size):
+        """Points [height, width, 3] that the pixels show, and their flow."""
+        camera = cameras.take(all_cameras, frame)
+        centers = rays.pixel_centers(size).reshape(-1, 2)
+        ray = np.asarray(directions(camera, centers), float).reshape(*size[::-1], 3)
+        return camera.position + ray * (films.FAR / ray[..., 2:])
+
+    def flow(all_cameras, frame, other, size):
+        camera = cameras.take(all_cameras, other)
+        point = np.float32(on_wall(all_cameras, frame, size)).reshape(-1, 3)
+        there = np.asarray(pixels(camera, point))
+        centers = np.asarray(rays.pixel_centers(size))
+        return there.reshape(centers.shape) - centers
+
+    def fields(all_cameras, size):
+        """Depth, mask, and flow both ways of the three frames."""
+        points = np.stack([on_wall(all_cameras, frame, size) for frame in range(3)])
+        forward, backward = np.zeros((2, 3, *size[::-1], 2), np.float32)
+        for frame in (0, 1):
+            forward[frame] = flow(all_cameras, frame, frame + 1, size)
+            backward[frame + 1] = flow(all_cameras, frame + 1, frame, size)
+        # A depth that varies over the wall shows where it was sampled.
+        return {
+            "depth": np.float32(2 + points[..., 0]),
+            "moving": points[..., 1] > 0.1,
+            "forward": forward,
+            "backward": backward,
+        }
+
+    point = np.float32([[-0.3, 0.2, films.FAR], [0.4, -0.3, films.FAR], [9, 9, 2]])
+
+    def tracks(all_cameras):
+        every = (cameras.take(all_cameras, frame) for frame in range(3))
+        return np.stack([np.asarray(pixels(camera, point)) for camera in every])
+
+    seen = np.tile([True, True, False], (3, 1))
+    filmed = fields(lens, film.size) | {"track_pixel": tracks(lens), "track_seen": seen}
+    given = pinholes.as_pinholes(
+        dataclasses.replace(bent, given=Given(film.size, **filmed))
+    ).given
+    assert given.size == wide.size
+    np.testing.assert_array_equal(given.track_seen, seen)
+    expected = tracks(flat_cameras)[:, :2]
+    np.testing.assert_allclose(given.track_pixel[:, :2], expected, atol=0.01)
+    expected = fields(flat_cameras, wide.size)
+    known = np.isfinite(given.depth)
+    assert 0.7 < known.mean() < 1
+    # Half a pixel of the sampling is 0.011 units.
+    assert np.abs(given.depth - expected["depth"])[known].max() < 0.02
+    wrong = (given.moving != expected["moving"])[known].mean()
+    assert wrong < 0.02
+    for side, frames in (("forward", np.s_[:2]), ("backward", np.s_[1:])):
+        error = np.linalg.norm(getattr(given, side) - expected[side], axis=-1)[frames]
+        # Within the image of the other frame too.
+        assert np.quantile(error[known[frames]], 0.9) < 0.1
+        assert (error[~known[frames]] > 1000).all()
 
 
 def test_flow_given_is_taken_and_checked_both_ways(tmp_path):
@@ -194,7 +234,25 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
     tapir(path, tracks=points.pixel[:, :7], visibles=points.seen[:, :7])
     refused(r"tracks of 7 frames|tracks of 16 frames", tracks=path)
     np.savez(path, points=points.pixel)
-    refused(r"holds points; expected tracks and visibles or pred_tracks", tracks=path)
+    refused(r"contains points; expected tracks or pred_tracks, and", tracks=path)
+    tapir(path, tracks=0 * points.pixel + [10, 90])
+    refused(r"0 of .* seem to be exchanged: store x \(right\)", tracks=path)
+    tapir(path, tracks=points.pixel * np.nan)
+    refused(r"0 of 0 visible positions", tracks=path)
+    tapir(path, size=np.array([0, 72]))
+    refused(r"size is \[0, 72\]; expected the width and the height", tracks=path)
+    tapir(path, visibles=points.seen[:, :9])
+    refused(r"visibles of \(\d+, 9\); expected \[tracks, frames, 2\]", tracks=path)
+    refused(r"not from \.pt files; save them with", tracks=tmp_path / "a.pt")
+    pairs = tmp_path / "pairs"
+    pairs.mkdir()
+    for name in ("000_000", "000_001", "001_001"):
+        np.save(pairs / f"{name}.npy", np.zeros((3, 4)))
+    refused(r"no 001_000\.npy \(1 of 4 pairs", tracks=pairs)
+    np.save(pairs / "001_000.npy", np.zeros((3, 2)))
+    refused(r"001_000\.npy: an array of shape \(3, 2\); expected", tracks=pairs)
+    np.save(pairs / "001_000.npy", np.zeros((2, 4)))
+    refused(r"001_001\.npy: 3 points, but 001_000\.npy has 2", tracks=pairs)
     path.write_bytes(b"cut short")
     refused(r"not a readable npz", tracks=path)
     refused(r"no such folder of masks", masks=tmp_path / "nowhere")
@@ -207,6 +265,10 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
     depths = tmp_path / "d.npz"
     np.savez(depths, depths=np.ones((24, 72, 72)))
     refused(r"a depth of 72x72 pixels for images of 96x72", depths=depths)
+    np.savez(depths, depths=np.ones((24, 96, 72)))
+    refused(r"its rows and columns seem to be exchanged", depths=depths)
+    np.savez(depths, depths=np.full((24, 72, 96), np.nan))
+    refused(r"no positive depth", depths=depths)
     np.savez(depths, depths=np.zeros((24, 72, 96)))
     refused(r"no positive depth", depths=depths)
     np.savez(depths, forward=np.zeros((23, 72, 96, 2)))
@@ -220,12 +282,9 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
             pixels = np.zeros(2 * size[0] * size[1], np.float32).tobytes()
             (tmp_path / "flow" / side / f"{number}.flo").write_bytes(head + pixels)
     refused(r"1\.flo: 3x4 pixels, but 0\.flo has 3x2", flow=tmp_path / "flow")
-    bent = films.film(**MOVES, frames=24)
-    bent.cameras.radial[:, 0] = 0.1
-    refused(r"undistort the capture first", capture=bent, tracks=path)
     rng = np.random.default_rng(0)
-    np.savez(depths, depths=rng.uniform(0.1, 9, (24, 72, 96)))
-    with pytest.raises(ValueError, match="static points"):
+    np.savez(depths, depths=np.exp(rng.normal(0, 1.5, (24, 72, 96))))
+    with pytest.raises(captures.CaptureError, match=r"static points .* more than 30%"):
         record.gather(with_files(depths=depths))
 
 

@@ -1,0 +1,87 @@
+"""External preprocessing results of distorted images, mapped to undistorted ones."""
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from nerfies_jax.capture import resampling
+from nerfies_jax.capture.given import Given
+
+NOWHERE = 1e5  # px, flow of pixels that the lens did not observe
+
+# Positions of the undistorted pixels in the distorted image of a frame, as array
+# coordinates [2, height, width], and booleans of those inside [height, width].
+Sources = Callable[[int], tuple[np.ndarray, np.ndarray]]
+# Undistorted positions of distorted ones in pixels of a frame, [points, 2], and
+# booleans of those that exist.
+Straight = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def undistorted(
+    given: Given,
+    size: tuple[int, int],
+    in_time: np.ndarray,
+    sources: Sources,
+    straight: Straight,
+) -> Given:
+    """Map external results from images as they were captured to undistorted images.
+
+    Masks, depth and flow are sampled at the nearest pixel, because they have edges.
+    z-depth needs no change, since a ray keeps its points.
+
+    Args:
+      given: External results in pixels of the captured images.
+      size: Width and height of the undistorted images in pixels.
+      in_time: Indices of the training frames in temporal order, between which flow is.
+      sources: Positions of undistorted pixels in the captured image of a frame.
+      straight: Undistorted positions of pixels of a captured image of a frame.
+
+    Returns:
+      The results in pixels of the undistorted images. Unobserved pixels are static,
+      have unknown depth, and inconsistent flow.
+    """
+    parts: dict[str, Any] = {}
+    if given.track_pixel is not None and given.track_seen is not None:
+        pixel, seen = np.zeros_like(given.track_pixel), given.track_seen.copy()
+        for frame, here in enumerate(seen):
+            place, exists = straight(frame, given.track_pixel[frame])
+            here &= exists & ((place > 0) & (place < size)).all(-1)
+            pixel[frame] = np.where(here[:, None], place, 0)
+        parts |= {"track_pixel": pixel, "track_seen": seen}
+    unknown = {"moving": False, "depth": np.nan}
+    for name, outside in unknown.items():
+        array = getattr(given, name)
+        if array is None:
+            continue
+        parts[name] = np.empty((len(array), *size[::-1]), array.dtype)
+        for frame, image in enumerate(array):
+            place, inside = sources(frame)
+            values = resampling.nearest(image, place)
+            parts[name][frame] = np.where(inside, values, outside)
+    pairs = {
+        "forward": itertools.pairwise(in_time),
+        "backward": itertools.pairwise(in_time[::-1]),
+    }
+    for name, frames in pairs.items():
+        array = getattr(given, name)
+        if array is None:
+            continue
+        parts[name] = np.full((len(array), *size[::-1], 2), NOWHERE, np.float32)
+        for one, other in frames:
+            parts[name][one] = _flow(array[one], sources(one), other, straight)
+    return given._replace(size=size, **parts)
+
+
+def _flow(flow, sources, other, straight):
+    """Undistort both ends of the flow from a frame to another one."""
+    place, inside = sources
+    start = np.moveaxis(place[::-1], 0, -1) + 0.5
+    end = (start + resampling.nearest(flow, place)).reshape(-1, 2)
+    end, exists = straight(other, end.astype(np.float32))
+    height, width = inside.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    moved = end.reshape(height, width, 2) - np.stack([x, y], -1)
+    known = inside & exists.reshape(height, width)
+    return np.where(known[..., None], moved, NOWHERE).astype(np.float32)

@@ -1,0 +1,163 @@
+"""Depth of moving points: from depth maps, or from the video alone."""
+
+import numpy as np
+import scipy.ndimage as nd
+
+from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.given import Given
+from nerfies_jax.preprocessing import (
+    given_bodies,
+    given_depth,
+    paths,
+    rigid_bodies,
+    still_points,
+    taken,
+)
+from nerfies_jax.preprocessing import tracks as tracking
+from nerfies_jax.preprocessing.given_depth import AlignedDepth
+from nerfies_jax.preprocessing.paths import Paths
+from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.tracks import Tracks
+from nerfies_jax.preprocessing.view_set import Views
+from nerfies_jax.preprocessing.watch import A_BODY_TERM, A_PATH_FRAME, Watch
+
+FOR_BODIES = 0.7  # share of the budget above which rigid bodies are not refined
+# Minimum depth of moving points as a share of the near plane, which is computed from
+# static points. Moving objects, such as a hand, may be much closer.
+AT_CAMERA = 0.1
+# Relative deviation of the depth of static points that external depth is aligned to,
+# and the share of frames that must have enough of them.
+SURE_DEPTH, MOST_FRAMES_SURE = 0.1, 0.8
+
+
+def known(
+    capture: Capture,
+    given: Given,
+    views: Views,
+    static: tuple[Tracks, RestPoints],
+    use_depths: bool,
+) -> AlignedDepth | None:
+    """Return the depth maps that constrain paths, in scene units.
+
+    Args:
+      capture: The capture.
+      given: External results.
+      views: The frames.
+      static: Static tracks and their points.
+      use_depths: True to use the depth maps of the capture, if there are no external
+        ones.
+
+    Returns:
+      The depth maps, None if there are none.
+
+    Raises:
+      CaptureError: If external depth maps do not fit the static points.
+    """
+    depth = taken.depth(given, views)
+    if depth is None:
+        if not use_depths or capture.depths is None:
+            return None
+        exact = np.zeros(len(views.row))
+        return AlignedDepth(capture.depths[views.row], exact, 0.0)
+    tracks, rest = _well_placed(views, *static)
+    aligned = given_depth.aligned(depth, tracks, rest, given.inverse)
+    miss, name = aligned.total_miss, capture.path or capture.name
+    if not np.isfinite(miss):
+        kinds = {
+            None: "neither as depth nor as inverse depth",
+            True: "as inverse depth",
+        }
+        raise CaptureError(
+            f"{name}: the external depth maps fit the static points in no frame, "
+            f"{kinds.get(given.inverse, 'as depth')}; remove them, or check that "
+            "enough of the scene is static and has texture"
+        )
+    if miss > given_depth.USABLE:
+        raise CaptureError(
+            f"{name}: the external depth maps differ from the static points by "
+            f"{miss:.0%} (median), more than {given_depth.USABLE:.0%}; check that they "
+            "belong to these frames, or remove them"
+        )
+    return aligned
+
+
+def _well_placed(views, tracks, rest):
+    """Return the static points whose depth is certain, or all if they are few."""
+    sure = still_points.depth_deviation(views, tracks, rest) < SURE_DEPTH
+    if (tracks.seen[sure].sum(0) >= given_depth.FEWEST).mean() < MOST_FRAMES_SURE:
+        return tracks, rest
+    return tracks.take(sure), rest.take(sure)
+
+
+def fitted(
+    capture: Capture,
+    views: Views,
+    moved: Tracks,
+    static: tuple[Tracks, RestPoints],
+    depths: AlignedDepth | None,
+    watch: Watch,
+) -> Paths:
+    """Fit 3D paths to moving tracks.
+
+    Args:
+      capture: The capture.
+      views: The frames.
+      moved: Moving tracks.
+      static: Static tracks and their points.
+      depths: Depth maps, or None.
+      watch: Work budget.
+
+    Returns:
+      The paths.
+    """
+    watch.spend(1e-6 * A_PATH_FRAME * moved.seen.size)
+    around = paths.depth_around(moved, *static, capture.near)
+    least = AT_CAMERA * capture.near
+    alone = paths.least_acceleration(views, moved, least, around)
+
+    def has_room(terms):
+        what = "depths of rigid bodies"
+        return watch.has_room(FOR_BODIES, what, 1e-6 * A_BODY_TERM * terms)
+
+    if depths is None:
+        return rigid_bodies.refined(views, moved, alone, has_room)
+    measured = _measured(depths.depth, moved)
+    deviation = depths.deviation(paths.MEASURED_DEVIATION)
+    if capture.given is None or capture.given.depth is None:
+        return paths.least_acceleration(
+            views, moved, least, around, measured, deviation
+        )
+    watch.spend(1e-6 * A_PATH_FRAME * moved.seen.size)
+    miss = given_depth.PER_MEDIAN * depths.total_miss
+    near, rest = _well_placed(views, *static)
+    bodies = given_bodies.scaled(views, moved, measured, alone, near, rest, miss)
+    smooth = paths.least_acceleration(
+        views, moved, least, around, bodies.depth, deviation
+    )
+    refined = rigid_bodies.refined(views, moved, smooth, has_room)
+    return refined._replace(depth_deviation=bodies.deviation)
+
+
+def _measured(depths, tracks):
+    """Return z-depths of tracks, NaN if unknown or at a depth discontinuity."""
+    measured = np.full(tracks.seen.shape, np.nan)
+    for frame, picture in enumerate(depths):
+        here = np.flatnonzero(tracks.seen[:, frame])
+        depth = steady_depth(picture)
+        at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
+        measured[here, frame] = depth[at]
+    return measured
+
+
+def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
+    """Select known z-depths that are not at a depth discontinuity.
+
+    Args:
+      depth: z-depths, [height, width], 0 if unknown.
+      jump: Relative difference between neighbors at a discontinuity.
+
+    Returns:
+      z-depths [height, width], NaN for other pixels.
+    """
+    least, most = nd.minimum_filter(depth, 3), nd.maximum_filter(depth, 3)
+    return np.where((least > 0) & (most - least < jump * depth), depth, np.nan)
