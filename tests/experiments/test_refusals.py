@@ -38,7 +38,6 @@ TABLE = [
     ("export", "nowhere tracks --points 0", "track at least one"),
     ("export", "nowhere exr --path spiral --frames 2", "has its own number of frames"),
     ("export", "nowhere colmap --path sway", "--path is not for colmap, but for path"),
-    ("speed", "player nothing.html", "nothing.html: no such file"),
     ("hard_cases", "--topics kitchen", "choose from rotations"),
     ("hard_cases", "--cases nothing", "no such case; there are screw"),
     ("hard_cases", "--numbers 0", "at least 1"),
