@@ -11,6 +11,7 @@ STUDY = "study"
 # In the order of work on a scene. Every other command is a study.
 FOR_USERS = (
     "reconstruct",
+    "download",
     "prepare",
     "inspect_scene",
     "preprocess",

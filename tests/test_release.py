@@ -49,3 +49,14 @@ def test_requirements_name_only_machines_that_have_wheels():
     assert all("platform_machine" in line for line in extras["sfm"])
     # One that is loaded without its extra would end a command there.
     assert not any("pycolmap" in line for line in project["dependencies"])
+
+
+def test_the_constraints_name_every_requirement():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    names = ("sfm", "video", "report", "view", "spz", "heic", "docs")
+    wanted = [*project["dependencies"], *(x for name in names for x in extras[name])]
+    wanted = {re.match(r"[\w.-]+", line)[0].lower() for line in wanted}
+    lines = (ROOT / "constraints.txt").read_text().splitlines()[1:]
+    listed = {line.partition("==")[0] for line in lines}
+    assert {name.replace("_", "-") for name in wanted} - {"nerfies-jax"} <= listed

@@ -1,5 +1,7 @@
 """Gaussian files: 3DGS .ply, antimatter15 .splat and Niantic .spz.
 
+Compressed PLY and OpenUSD files are written, and not read.
+
 docs/formats.md lists what each format stores. Files are written to a temporary name
 next to the target and renamed, so a crash leaves the old file or the new one.
 """
@@ -7,14 +9,15 @@ next to the target and renamed, so a crash leaves the old file or the new one.
 import os
 import pathlib
 import re
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.splats import SH_DC, Splats
-from gaussians_jax.io import spz
+from gaussians_jax.io import packed_ply, spz, usd
 from nerfies_jax.capture import ply_files, safe_files, text_files
 from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.json_files import replaced_file
@@ -22,6 +25,7 @@ from nerfies_jax.capture.json_files import replaced_file
 MOST_HEADER_BYTES = ply_files.MAX_HEADER  # 62 properties take 1.5 kB
 MOST_BYTES = 4 * 2**30  # of a .splat or .spz file: 100 million Gaussians
 SUFFIXES = (".ply", ".splat", ".spz")
+WRITTEN = (*SUFFIXES, packed_ply.SUFFIX, usd.SUFFIX)
 MOST_ROUNDING = 0.1  # of float64 coordinates, relative to the median scale
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -80,13 +84,20 @@ def load(path: str | os.PathLike, *, drop_broken: bool = False) -> Loaded:
     return Loaded(Splats(*map(jnp.asarray, rows)), dropped, notes)
 
 
-def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
+def save(
+    path: str | os.PathLike,
+    rows: Splats,
+    *,
+    spz_version: int = 3,
+    usd_up: Literal["Y", "Z"] = "Y",
+) -> int:
     """Save the active Gaussians in the format of the suffix.
 
     Args:
-      path: File to write, ending in .ply, .splat or .spz.
+      path: File to write, ending in .ply, .splat, .spz, .compressed.ply or .usda.
       rows: Raw parameters. Inactive Gaussians are left out.
       spz_version: Version of SPZ files.
+      usd_up: Axis that OpenUSD files name as up.
 
     Returns:
       Number of Gaussians written.
@@ -95,21 +106,26 @@ def save(path: str | os.PathLike, rows: Splats, *, spz_version: int = 3) -> int:
       ValueError: If a Gaussian is not finite, or the format is unknown.
     """
     path = pathlib.Path(path)
-    if path.suffix.lower() not in SUFFIXES:
+    suffix = path.suffix.lower()
+    if path.name.lower().endswith(packed_ply.SUFFIX):
+        suffix = packed_ply.SUFFIX
+    encoders: dict[str, Callable[[Splats], bytes]] = {
+        ".ply": _ply_bytes,
+        ".splat": _splat_bytes,
+        ".spz": lambda rows: spz.encode(spz.Unpacked._make((*rows, ())), spz_version),
+        packed_ply.SUFFIX: packed_ply.encode,
+        usd.SUFFIX: lambda rows: usd.encode(rows, usd_up),
+    }
+    if suffix not in encoders:
         raise ValueError(
             f"{path}: cannot write {path.suffix or 'a file without suffix'}; supported "
-            f"formats are {', '.join(SUFFIXES)}"
+            f"formats are {', '.join(WRITTEN)}"
         )
     active = splats.rows_to_write(rows, path)
     rows_to_write = Splats(*(np.asarray(leaf, np.float32)[active] for leaf in rows))
     try:
         rows_to_write, _ = _without_broken(rows_to_write, False)
-        if path.suffix.lower() == ".ply":
-            data = _ply_bytes(rows_to_write)
-        elif path.suffix.lower() == ".splat":
-            data = _splat_bytes(rows_to_write)
-        else:
-            data = spz.encode(spz.Unpacked._make((*rows_to_write, ())), spz_version)
+        data = encoders[suffix](rows_to_write)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; not written") from error
     with replaced_file(path) as partial:

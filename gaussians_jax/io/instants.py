@@ -7,6 +7,7 @@ directions. A viewer therefore shows what this package renders.
 
 import math
 import os
+import pathlib
 from collections.abc import Callable
 
 import jax
@@ -158,6 +159,7 @@ def save_sequence(
     at: Callable[[float], Splats],
     count: int,
     suffix: str,
+    save: Callable[[pathlib.Path, Splats], int] = files.save,
     *,
     overwrite: bool = False,
 ) -> np.ndarray:
@@ -170,6 +172,7 @@ def save_sequence(
       at: Function from time to raw parameters (`splats_at`).
       count: Number of files.
       suffix: File format, such as ".ply".
+      save: Writes a file of raw parameters.
       overwrite: Replace an existing folder.
 
     Returns:
@@ -190,6 +193,6 @@ def save_sequence(
         stage as s,
     ):
         for name, time in zip(names, times, strict=True):
-            files.save(partial / name, at(float(time)))
+            save(partial / name, at(float(time)))
             s.advance()
     return times

@@ -64,16 +64,10 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
     Raises:
       ValueError: If no Gaussian is visible from a training camera.
     """
-    # NaN compares false and is left out.
-    (visible,) = np.nonzero(seen.most >= LEAST_SEEN_PX)
-    if not visible.size:
-        raise ValueError(
-            f"none of the {len(seen.most)} Gaussians is visible from a training "
-            "camera; train for more steps"
-        )
+    chosen = visible(seen)
     poses = [jax.device_get(at(float(time))) for time in np.linspace(0, 1, count)]
     mean, quaternion, scale, opacity = (
-        np.stack([leaf[visible] for leaf in leaves])
+        np.stack([leaf[chosen] for leaf in leaves])
         for leaves in zip(*poses, strict=True)
     )
     return Instants(
@@ -84,9 +78,30 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
             *splats.LOG_SCALE_RANGE,
         ),
         opacity=opacity,
-        color=seen.color[visible],
-        left_out=int(splats.active_mask(rows).sum()) - visible.size,
+        color=seen.color[chosen],
+        left_out=int(splats.active_mask(rows).sum()) - int(chosen.sum()),
     )
+
+
+def visible(seen: Seen) -> np.ndarray:
+    """Select the Gaussians that a training camera saw.
+
+    Args:
+      seen: Contribution of each Gaussian to the training views.
+
+    Returns:
+      [gaussians] bool.
+
+    Raises:
+      ValueError: If no Gaussian is visible from a training camera.
+    """
+    chosen = seen.most >= LEAST_SEEN_PX  # NaN compares false and is left out
+    if not chosen.any():
+        raise ValueError(
+            f"none of the {len(seen.most)} Gaussians is visible from a training "
+            "camera; train for more steps"
+        )
+    return chosen
 
 
 def count_for(capture: Capture) -> int:

@@ -198,6 +198,18 @@ def read_keyframes(path: AnyPath, capture: Capture) -> list[Keyframe]:
         if len(entries) >= 2 and None not in entries:
             parts = _pinholes(path, entries, camera_path.size)
             camera_path = _camera_path(path, *parts)
+    return spaced_keyframes(camera_path)
+
+
+def spaced_keyframes(camera_path: CameraPath) -> list[Keyframe]:
+    """Choose evenly spaced cameras of a path as its keyframes.
+
+    Args:
+      camera_path: The path. Without times it gets those of `camera_paths.times`.
+
+    Returns:
+      All cameras of a short path, otherwise `MOST_KEYFRAMES`.
+    """
     cameras, times = camera_path.cameras, camera_path.times
     rows = np.arange(len(cameras.focal_px))
     if len(rows) > keyframes.MOST_KEYFRAMES:
@@ -259,12 +271,18 @@ def write_nerfstudio(
                 "override_transition_sec": None,
             }
         )
+    seconds = count / rate
     table = {
+        "default_fov": entries[0]["fov"],
+        "default_time": entries[0].get("render_time"),
+        "default_transition_sec": seconds / max(1, len(keyframe_entries) - 1),
+        "is_cycle": False,
+        "smoothness_value": 0.0,
         "camera_type": "perspective",
         "render_width": width,
         "render_height": height,
         "fps": rate,
-        "seconds": count / rate,
+        "seconds": seconds,
         "keyframes": keyframe_entries,
         "camera_path": entries,
     }

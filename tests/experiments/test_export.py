@@ -103,6 +103,10 @@ def test_a_path_leaves_with_its_times(splats, capsys):
     assert main(splats, "path", "--frames", 4) == 0
     table = json.loads((splats / "exports" / "path.json").read_text())
     assert [e["render_time"] for e in table["camera_path"]] == [0, 0.5, 1, 0.5]
+    # nerfstudio's viewer edits the keyframes, and takes no fov for one of their own.
+    assert [e["render_time"] for e in table["keyframes"]] == [0, 0.5, 1, 0.5]
+    assert {e["fov"] for e in table["keyframes"]} == {table["default_fov"]}
+    assert table["keyframes"][1]["matrix"] == table["camera_path"][1]["camera_to_world"]
     assert main(splats, "path", "--path", path, "--frames", 4) == 2
     error = " ".join(capsys.readouterr().err.split())
     assert "own number of frames" in error
@@ -147,6 +151,41 @@ def test_gaussians_leave_at_an_instant_and_as_a_sequence(splats, tmp_path, capsy
     assert main(splats, "ply", "--time", "0.4", "--overwrite", "--units", "world") == 0
     in_world = plyfile.PlyData.read(path)["vertex"]["x"]
     np.testing.assert_allclose(in_world, 2 * x + CENTER[0], rtol=1e-6)
+
+
+def test_a_program_decides_format_axes_and_crop(splats, tmp_path, capsys):
+    assert main(splats, "--for", "usd") == 0
+    assert re.search(r", y up, without \d+ that no camera saw", capsys.readouterr().out)
+    (path,) = (splats / "exports").glob("*.usda")
+    assert 'upAxis = "Y"' in path.read_text()
+    plain, turned = tmp_path / "a.ply", tmp_path / "b.ply"
+    assert main(splats, "ply", "--out", plain) == 0
+    assert main(splats, "ply", "--up", "z", "--out", turned) == 0
+    before, after = (
+        np.stack([plyfile.PlyData.read(path)["vertex"][axis] for axis in "xyz"], -1)
+        for path in (plain, turned)
+    )
+    capture = scenes.tiny_capture()
+    up = -capture.cameras.camera_from_world[capture.train, 1].mean(axis=0)
+    up /= np.linalg.norm(up)
+    np.testing.assert_allclose(after[:, 2], before @ up, atol=1e-4)
+    capsys.readouterr()
+    assert main(splats) == 2
+    assert "name a format (ply, " in capsys.readouterr().err
+    assert main(splats, "--for", "usd", "--up", "x") == 2
+    assert "OpenUSD has y or z up" in capsys.readouterr().err
+    assert main(splats, "transforms", "--keep", "seen") == 2
+    assert "--keep is not for transforms, but for ply" in capsys.readouterr().err
+
+
+@pytest.mark.full
+def test_a_mesh_leaves_in_world_units(splats, capsys):
+    assert main(splats, "mesh", "--voxels", 24) == 0
+    assert main(splats, "mesh", "--voxels", 24, "--units", "world", "--overwrite") == 0
+    assert "triangles at time 0" in capsys.readouterr().out
+    ply = plyfile.PlyData.read(splats / "exports" / "mesh-at-0.ply")
+    place = np.stack([ply["vertex"][axis] for axis in "xyz"], -1)
+    assert np.abs(place.mean(0) - CENTER).max() < 8  # and not around the origin
 
 
 @pytest.mark.full

@@ -1,0 +1,238 @@
+"""Writers of `nerfies export`, one for each kind of file."""
+
+import functools
+from typing import Any
+
+from experiments import cli
+
+SUFFIXES = {"compressed-ply": ".compressed.ply", "path": ".json", "tracks": ".npz"}
+SUFFIXES |= {"mesh": ".ply"}
+
+
+def _gaussians(args: Any, run: Any) -> str:
+    from gaussians_jax.core import splats
+    from gaussians_jax.core.splats import Splats
+    from gaussians_jax.io import files, instants, sampled, turned
+    from nerfies_jax import runs
+    from nerfies_jax.capture import axes
+
+    state = runs.restore(args.run, run).state
+    in_scene = instants.splats_at(run.model, state)
+    rotation = None if args.axis is None else axes.rotation_to(run.capture, args.axis)
+    seen = None
+    if args.kept == "seen":
+        seen = sampled.visible(_seen(run, state))
+        left_out = int(splats.active_mask(run.model.stages.rows(state.params)).sum())
+        left_out -= int(seen.sum())
+
+    def at(time):
+        rows = in_scene(time)
+        if seen is not None:
+            rows = Splats(*(leaf[seen] for leaf in rows))
+        if args.units == "world":
+            rows = instants.in_world(rows, run.capture)
+        return rows if rotation is None else turned.turned(rows, rotation)
+
+    save = functools.partial(files.save, usd_up="Z" if args.axis == "z" else "Y")
+    if args.frames is None:
+        count = save(args.place, at(args.time or 0.0))
+        said = f"{count} Gaussians at time {args.time or 0:g}"
+    else:
+        suffix = SUFFIXES.get(args.kind, f".{args.kind}")
+        instants.save_sequence(
+            args.place, at, args.frames, suffix, save, overwrite=args.overwrite
+        )
+        said = f"Gaussians at {args.frames} times"
+    if args.axis is not None:
+        said += f", {args.axis} up"
+    if seen is not None:
+        said += f", without {left_out} that no camera saw"
+    return said
+
+
+def _seen(run: Any, state: Any) -> Any:
+    """Return what the training cameras saw of each Gaussian."""
+    from gaussians_jax.core import splats
+    from gaussians_jax.io import instants, sampled
+    from gaussians_jax.scene.spec import raster_of
+
+    at = instants.gaussians_at(run.model, state)
+    rows = run.model.stages.rows(state.params)
+    degree = splats.active_degree(state.step, run.spec.sh_every, run.spec.sh_degree)
+    raster = raster_of(run.spec, run.metadata)
+    return sampled.seen_in_training(at, rows, raster, degree, run.capture)
+
+
+def _mesh(args: Any, run: Any) -> str:
+    import numpy as np
+
+    from nerfies_jax import evaluation, runs
+    from nerfies_jax.capture import axes, pinholes, units
+    from nerfies_jax.evaluation import mesh
+    from nerfies_jax.geometry import camera
+
+    capture = run.capture
+    rotation = None if args.axis is None else axes.rotation_to(capture, args.axis)
+    rows = evaluation.spread(capture.train, mesh.MOST_VIEWS)
+    cameras = pinholes.pinhole(camera.take(capture.cameras, rows))
+    like = evaluation.view_of(capture, int(rows[0]))
+    views = evaluation.path_views(cameras, np.full(len(rows), args.time or 0.0), like)
+    extracted = mesh.extract(
+        evaluation.Renderer(run.model, capture.size),
+        runs.restore(args.run, run).state,
+        views,
+        args.voxels or mesh.VOXELS,
+    )
+    vertices = units.places_in(args.units or "scene", capture, extracted.vertices)
+    if rotation is not None:
+        vertices = vertices @ rotation.T
+    mesh.write(args.place, extracted._replace(vertices=vertices))
+    return (
+        f"mesh of {len(vertices)} vertices and {len(extracted.faces)} triangles at "
+        f"time {args.time or 0:g}"
+    )
+
+
+def _splatv(args: Any, run: Any) -> str:
+    from gaussians_jax.io import instants, sampled, splatv
+    from gaussians_jax.scene.spec import raster_of
+    from nerfies_jax import evaluation, runs
+
+    state, spec, capture = runs.restore(args.run, run).state, run.spec, run.capture
+    at = instants.gaussians_at(run.model, state)
+    rows = run.model.stages.rows(state.params)
+    raster = raster_of(spec, run.metadata)
+    seen = _seen(run, state)
+    learned = sampled.gathered(at, rows, seen, sampled.MOST_INSTANTS)
+    curves = splatv.write(args.place, learned, capture)
+    model = run.model
+    if spec.exposure is not None:  # of which the file has none
+        neutral = ("exposure",)
+        model = run.representation.products.variant(spec, run.metadata, neutral, False)
+    draw = evaluation.Renderer(model, capture.size)
+    fit = splatv.measured(curves, learned, draw, state, raster, capture)
+    summary = (
+        f"{len(curves.position)} Gaussians on cubics in time, RMS error {fit.rms:.2g} "
+        f"scene units ({fit.most:.2g} at the 99th percentile), PSNR to renders of the "
+        f"run {fit.psnr:.1f} dB ({fit.views} views)"
+    )
+    if capture.near < splatv.NEAREST:
+        summary += (
+            f"; that viewer does not render what is nearer than {splatv.NEAREST:g} "
+            f"scene units, and this scene begins at {capture.near:.2g}"
+        )
+    return summary
+
+
+def _cameras(args: Any, run: Any) -> str:
+    """Write the capture of the run, undistorted for splats.
+
+    Viewers of Gaussians render pinhole cameras.
+    """
+    from nerfies_jax.capture import (
+        colmap_writer,
+        nerfies_format,
+        pinholes,
+        transforms_writer,
+    )
+    from nerfies_jax.capture.json_files import replaced_folder
+
+    capture = run.capture
+    if run.representation.products.splatting is not None:
+        capture = pinholes.as_pinholes(capture)
+    if args.kind == "nerfies":
+        with replaced_folder(args.place, args.overwrite) as folder:
+            nerfies_format.write(capture, folder)
+    else:
+        writer = transforms_writer if args.kind == "transforms" else colmap_writer
+        writer.write(capture, args.place, args.units or "scene", args.overwrite)
+    return f"{len(capture.ids)} frames with their cameras"
+
+
+def _path(args: Any, run: Any) -> str:
+    from nerfies_jax.capture import path_files
+
+    planned = _planned(args, run)
+    if args.kind == "path":
+        path_files.write_nerfstudio(
+            args.place,
+            planned,
+            cli.RATE,
+            args.overwrite,
+            path_files.spaced_keyframes(planned),
+        )
+    else:
+        path_files.write_nerfies(args.place, planned, run.capture, args.overwrite)
+    return f"{len(planned.times)} cameras"
+
+
+def _planned(args: Any, run: Any) -> Any:
+    """Return a path with its times, or with those of `nerfies render`."""
+    from nerfies_jax.capture import camera_paths, path_files, pinholes
+
+    planned = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)
+    if not run.representation.scoring.models_lenses(run.metadata):
+        planned = planned._replace(cameras=pinholes.pinhole(planned.cameras))
+    if planned.times is None:
+        count = len(planned.cameras.focal_px)
+        planned = planned._replace(times=camera_paths.times(count))
+    return planned
+
+
+def _tracks(args: Any, run: Any) -> str:
+    from nerfies_jax import evaluation, runs
+    from nerfies_jax.evaluation import surface_tracks
+
+    move = _mover(run)
+    if move is None:
+        raise ValueError(
+            f"{args.run}: nothing in this run moves points, so there are no tracks; it "
+            "needs a warp or motion"
+        )
+    tracks = surface_tracks.follow(
+        move,
+        evaluation.Renderer(run.model, run.capture.size),
+        runs.restore(args.run, run).state,
+        run.capture,
+        args.points or 1000,
+        args.frames or min(96, len(run.capture.train)),
+        0.5 if args.time is None else args.time,
+    )
+    surface_tracks.write(
+        args.place, tracks, run.capture, args.units or "scene", args.overwrite
+    )
+    points, frames = tracks.visible.shape
+    return f"{points} points over {frames} frames, {tracks.visible.mean():.0%} visible"
+
+
+def _mover(run: Any):
+    return run.representation.scoring.mover(run.spec, run.metadata)
+
+
+def _exr(args: Any, run: Any) -> str:
+    from nerfies_jax import evaluation, runs
+    from nerfies_jax.evaluation import exr_series
+
+    planned = _planned(args, run)
+    like = evaluation.view_of(run.capture, int(run.capture.train[0]))
+    move = _mover(run)
+    exr_series.write(
+        args.place,
+        evaluation.Renderer(run.model, planned.size),
+        runs.restore(args.run, run).state,
+        evaluation.path_views(planned.cameras, planned.times, like),
+        move,
+        args.overwrite,
+    )
+    flow = "without flow, since nothing moves points" if move is None else "and flow"
+    return f"{len(planned.times)} images: color, alpha, depth {flow}"
+
+
+WRITERS = {
+    **dict.fromkeys(("ply", "compressed-ply", "splat", "spz", "usda"), _gaussians),
+    "mesh": _mesh,
+    "splatv": _splatv,
+    **dict.fromkeys(("transforms", "colmap", "nerfies"), _cameras),
+    **dict.fromkeys(("path", "nerfies-path"), _path),
+    **{"tracks": _tracks, "exr": _exr},
+}

@@ -1,0 +1,121 @@
+"""The compressed PLY of PlayCanvas and SuperSplat, 16 bytes a Gaussian and harmonics.
+
+256 neighboring Gaussians are a chunk. Values are quantized between the minimum and the
+maximum of their chunk: positions and logarithms of scales to 11, 10 and 11 bits, colors
+and opacities to 8. Rotations have three components of 10 bits and the number of the
+fourth, largest one. Harmonics are bytes between -4 and 4.
+"""
+
+import numpy as np
+
+from gaussians_jax.core.splats import SH_DC, Splats
+
+CHUNK = 256
+SUFFIX = ".compressed.ply"
+# Of logarithms of scales, as the readers clip them.
+SCALE_RANGE = (-20.0, 20.0)
+_BITS = (11, 10, 11)
+
+
+def encode(rows: Splats) -> bytes:
+    """Encode Gaussians.
+
+    Args:
+      rows: Raw parameters of active Gaussians, finite, in NumPy.
+
+    Returns:
+      The file.
+    """
+    rows = Splats(*(np.asarray(leaf, np.float64) for leaf in rows))
+    rows = Splats(*(leaf[curve_order(rows.mean)] for leaf in rows))
+    color = 0.5 + SH_DC * rows.sh_dc[:, 0]
+    log_scale = np.clip(rows.log_scale, *SCALE_RANGE)
+    position, position_bounds = _in_chunks(rows.mean)
+    scale, scale_bounds = _in_chunks(log_scale)
+    shade, color_bounds = _in_chunks(color)
+    opacity = 1 / (1 + np.exp(-np.clip(rows.opacity_logit, -700, 700)))
+    words = np.stack(
+        [
+            _packed(position, _BITS),
+            _packed_rotations(rows.quaternion),
+            _packed(scale, _BITS),
+            _packed(np.column_stack([shade, opacity]), (8, 8, 8, 8)),
+        ],
+        axis=-1,
+    )
+    count, rest = len(words), rows.sh_rest.shape[1]
+    bounds = np.concatenate([position_bounds, scale_bounds, color_bounds], axis=1)
+    names = [
+        f"{bound}_{kind}{axis}"
+        for kind, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb"))
+        for bound in ("min", "max")
+        for axis in axes
+    ]
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"element chunk {len(bounds)}"]
+    header += [f"property float {name}" for name in names]
+    header += [f"element vertex {count}"]
+    fields = ("position", "rotation", "scale", "color")
+    header += [f"property uint packed_{field}" for field in fields]
+    parts = [bounds.astype("<f4").tobytes(), words.astype("<u4").tobytes()]
+    if rest:
+        header += [f"element sh {count}"]
+        header += [f"property uchar f_rest_{index}" for index in range(3 * rest)]
+        channels = rows.sh_rest.transpose(0, 2, 1).reshape(count, -1)
+        bytes_of = np.clip(np.floor((channels / 8 + 0.5) * 256), 0, 255)
+        parts.append(bytes_of.astype("u1").tobytes())
+    return ("\n".join([*header, "end_header\n"])).encode() + b"".join(parts)
+
+
+def curve_order(mean: np.ndarray) -> np.ndarray:
+    """Sort points along a Morton curve, so that chunks are small.
+
+    Args:
+      mean: Points [n, 3].
+
+    Returns:
+      Their order.
+    """
+    low, high = mean.min(axis=0), mean.max(axis=0)
+    cells = (mean - low) / np.where(high > low, high - low, 1) * 1023
+    code = np.zeros(len(mean), np.uint32)
+    for axis, values in enumerate(cells.astype(np.uint32).T):
+        for bit in range(10):
+            code |= ((values >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def _in_chunks(values):
+    """Values in [0, 1] between the bounds of their chunk, and these bounds."""
+    starts = np.arange(0, len(values), CHUNK)
+    # Bounds as a reader has them, in float32.
+    low = np.minimum.reduceat(values, starts).astype(np.float32)
+    high = np.maximum.reduceat(values, starts).astype(np.float32)
+    chunk = np.arange(len(values)) // CHUNK
+    extent = np.where(high > low, high.astype(np.float64) - low, 1)
+    return (values - low[chunk]) / extent[chunk], np.concatenate([low, high], axis=1)
+
+
+def _packed(values, bits):
+    """Quantize columns in [0, 1] and join them, the first in the highest bits."""
+    word = np.zeros(len(values), np.uint32)
+    for column, size in zip(values.T, bits, strict=True):
+        most = 2**size - 1
+        level = np.clip(np.floor(column * most + 0.5), 0, most).astype(np.uint32)
+        word = (word << np.uint32(size)) | level
+    return word
+
+
+def _packed_rotations(quaternion):
+    """Join the number of the largest component and the three others."""
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    unit = np.where(
+        length > 0, quaternion / np.where(length > 0, length, 1), [1, 0, 0, 0]
+    )
+    largest = np.argmax(np.abs(unit), axis=1)
+    row = np.arange(len(unit))
+    unit = unit * np.where(unit[row, largest] < 0, -1, 1)[:, None]
+    others = np.argsort(np.arange(4) == largest[:, None], axis=1, kind="stable")[:, :3]
+    # The three smaller ones are at most 1/sqrt(2).
+    level = np.take_along_axis(unit, others, axis=1) / 2**0.5 + 0.5
+    return (largest.astype(np.uint32) << np.uint32(30)) | _packed(level, (10, 10, 10))

@@ -1,0 +1,125 @@
+"""Gaussians in the formats and axes of other programs."""
+
+import re
+
+import jax
+import numpy as np
+import plyfile
+import pytest
+
+from gaussians_jax.core.splats import SH_DC
+from gaussians_jax.io import files, turned
+from gaussians_jax.splatting import harmonics
+from tests.gaussians.shared import rotations
+from tests.gaussians.test_files import opacities, same_rotation, some_splats
+
+
+def unpacked(word, bits):
+    """Numbers in [0, 1] of a packed word, the first in the highest bits."""
+    columns = []
+    for size in reversed(bits):
+        columns.insert(0, (word & (2**size - 1)) / (2**size - 1))
+        word = word >> size
+    return np.stack(columns, axis=-1)
+
+
+def decompressed(path):
+    """A compressed PLY as splat-transform 3.7 reads it, to which this was compared."""
+    ply = plyfile.PlyData.read(path)
+    vertex, chunk = ply["vertex"].data, ply["chunk"].data
+    row = np.arange(len(vertex)) // 256
+
+    def between(kind, axes, values):
+        low, high = (
+            np.stack([chunk[f"{bound}_{kind}{axis}"] for axis in axes], -1)[row]
+            for bound in ("min", "max")
+        )
+        return low + (high - low) * values
+
+    color = unpacked(vertex["packed_color"], (8, 8, 8, 8))
+    word = vertex["packed_rotation"]
+    three = (unpacked(word & 0x3FFFFFFF, (10, 10, 10)) - 0.5) * 2**0.5
+    largest = np.sqrt(1 - (three**2).sum(-1))
+    quaternion = np.stack(
+        [np.insert(a, n, b) for a, n, b in zip(three, word >> 30, largest, strict=True)]
+    )
+    rest = np.stack([ply["sh"][f"f_rest_{i}"] for i in range(45)], -1)
+    return {
+        "mean": between("", "xyz", unpacked(vertex["packed_position"], (11, 10, 11))),
+        "log_scale": between(
+            "scale_", "xyz", unpacked(vertex["packed_scale"], (11, 10, 11))
+        ),
+        "color": between("", "rgb", color[:, :3]),
+        "opacity": color[:, 3],
+        "quaternion": quaternion,
+        "sh_rest": (((rest + 0.5) / 256 - 0.5) * 8).reshape(-1, 3, 15).swapaxes(1, 2),
+    }
+
+
+def test_a_compressed_ply_holds_the_gaussians_within_its_steps(tmp_path):
+    rows = some_splats(count=700)
+    assert files.save(tmp_path / "a.compressed.ply", rows) == 700
+    read = decompressed(tmp_path / "a.compressed.ply")
+    assert len(read["mean"]) == 700  # of which the last chunk has 188
+    distance = np.linalg.norm(read["mean"][:, None] - np.asarray(rows.mean), axis=-1)
+    order = distance.argmin(axis=1)
+    assert len(set(order)) == 700
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf, float)[order], rows)
+    steps = {"mean": 6 / 1023, "log_scale": 7 / 1023, "sh_rest": 8 / 256}
+    for name, step in steps.items():  # of the coarsest axis, over the whole range
+        np.testing.assert_allclose(read[name], getattr(rows, name), atol=0.51 * step)
+    color = 0.5 + SH_DC * rows.sh_dc[:, 0]
+    np.testing.assert_allclose(read["color"], color, atol=0.51 * np.ptp(color) / 255)
+    np.testing.assert_allclose(read["opacity"], *opacities(rows), atol=0.51 / 255)
+    assert same_rotation(read["quaternion"], rows.quaternion).max() < 3e-6
+    # Neighbors share a chunk, which keeps the steps of positions small.
+    boxes = [np.ptp(read["mean"][i : i + 256], axis=0).prod() for i in (0, 256)]
+    assert max(boxes) < 0.6 * 6**3
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_usd_stage_holds_linear_values(degree, tmp_path):
+    rows = some_splats(degree=degree)
+    files.save(tmp_path / "a.usda", rows, usd_up="Z")
+    text = (tmp_path / "a.usda").read_text()
+    assert text.startswith("#usda 1.0\n")
+    assert 'upAxis = "Z"' in text
+
+    def array(name, width):
+        words = re.search(rf" {name} = \[(.*)\]", text)[1]
+        return np.array(re.findall(r"[-+.\de]+", words), float).reshape(-1, width)
+
+    names = ("positions", "orientations", "scales", "opacities")
+    mean, turn, scale, opacity = map(array, names, (3, 4, 3, 1))
+    np.testing.assert_allclose(mean, rows.mean, rtol=1e-6)
+    np.testing.assert_allclose(scale, np.exp(rows.log_scale), rtol=1e-5)
+    np.testing.assert_allclose(opacity[:, 0], *opacities(rows), rtol=1e-5)
+    assert same_rotation(turn, rows.quaternion).max() < 1e-12
+    colors = array("radiance:sphericalHarmonicsCoefficients", 3)
+    ours = np.concatenate([rows.sh_dc, rows.sh_rest], axis=1).reshape(-1, 3)
+    np.testing.assert_allclose(colors, ours, rtol=1e-6)
+    assert f"sphericalHarmonicsDegree = {degree}\n" in text
+
+
+def test_turned_gaussians_look_the_same_from_a_turned_camera():
+    rows = some_splats()
+    rotation = rotations(np.array([0.3, -0.5, 0.7, 0.4])).as_matrix()
+    after = turned.turned(rows, rotation)
+    np.testing.assert_allclose(after.mean, rows.mean @ rotation.T, atol=1e-5)
+
+    def covariance(rows):
+        axes = rotations(rows.quaternion).as_matrix()
+        return axes @ (np.exp(rows.log_scale)[:, :, None] ** 2 * axes.swapaxes(1, 2))
+
+    turn = rotation @ covariance(rows) @ rotation.T
+    np.testing.assert_allclose(covariance(after), turn, rtol=1e-4, atol=1e-6)
+    direction = np.random.default_rng(1).normal(size=(20, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    basis = jax.jit(lambda direction: harmonics.basis(direction, 3))
+
+    def rest(rows, direction):
+        values = np.stack(basis(np.float32(direction)))[1:]
+        return np.einsum("in,nic->nc", values, rows.sh_rest)
+
+    seen = rest(after, direction @ rotation.T)
+    np.testing.assert_allclose(seen, rest(rows, direction), atol=1e-5)
