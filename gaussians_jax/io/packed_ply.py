@@ -6,6 +6,8 @@ and opacities to 8. Rotations have three components of 10 bits and the number of
 fourth, largest one. Harmonics are bytes between -4 and 4.
 """
 
+from typing import Any
+
 import numpy as np
 
 from gaussians_jax.core.splats import SH_DC, Splats
@@ -26,8 +28,9 @@ def encode(rows: Splats) -> bytes:
     Returns:
       The file.
     """
-    rows = Splats(*(np.asarray(leaf, np.float64) for leaf in rows))
-    rows = Splats(*(leaf[curve_order(rows.mean)] for leaf in rows))
+    order = curve_order(np.asarray(rows.mean, np.float64))
+    leaves: Any = (np.asarray(leaf, np.float64)[order] for leaf in rows)
+    rows = Splats(*leaves)
     color = 0.5 + SH_DC * rows.sh_dc[:, 0]
     log_scale = np.clip(rows.log_scale, *SCALE_RANGE)
     position, position_bounds = _in_chunks(rows.mean)

@@ -1,6 +1,6 @@
 """OpenUSD text files with a ParticleField3DGaussianSplat (usdVol, OpenUSD 26.03)."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,7 +19,8 @@ def encode(rows: Splats, up: Literal["Y", "Z"] = "Y") -> bytes:
     Returns:
       The file. It calls a unit of length a meter, as nothing else is known.
     """
-    rows = Splats(*(np.asarray(leaf, np.float64) for leaf in rows))
+    leaves: Any = (np.asarray(leaf, np.float64) for leaf in rows)
+    rows = Splats(*leaves)
     length = np.linalg.norm(rows.quaternion, axis=1, keepdims=True)
     unit = np.where(length > 0, rows.quaternion / np.where(length > 0, length, 1), 0)
     unit[length[:, 0] == 0] = [1, 0, 0, 0]

