@@ -14,7 +14,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 SMALL = {
     "fit_a_picture": {"GAUSSIANS": 300, "STEPS": 120, "WIDTH": 64},
     "own_motion": {"STEPS": 8, "SIZE": (48, 36), "FRAMES": 8},
-    "own_nerf": {"STEPS": 300, "RAYS": 256, "WIDTH": 32, "SAMPLES": 16, "FACTOR": 4},
+    "own_nerf": {"STEPS": 500, "RAYS": 256, "WIDTH": 32, "SAMPLES": 16, "FACTOR": 4},
     "film_to_page": {
         "FRAMES": 14,
         "STEPS": 20,
