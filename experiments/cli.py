@@ -54,6 +54,8 @@ Scene = Literal[
     "rig",
     "collection",
     "collection-masked",
+    "pan",
+    "zoom",
 ]
 SCENES: tuple[str, ...] = typing.get_args(Scene)
 # Arguments of the library that have an option of the same name; "..." is any value.

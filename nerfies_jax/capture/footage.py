@@ -5,7 +5,6 @@ there are any.
 """
 
 import collections
-import math
 import os
 import pathlib
 from typing import NamedTuple
@@ -41,6 +40,9 @@ class Taken(NamedTuple):
     seconds: float | None = None  # from the first to the last frame of a video
     # Focal length over the longest side of the image, if files state it.
     focal: float | None = None
+    # Names of the images by camera model and focal length, with the focal length over
+    # the longest side or None. Images without this information are one group.
+    groups: tuple[tuple[tuple[str, ...], float | None], ...] = ()
 
 
 def kind_of(path: pathlib.Path) -> str | None:
@@ -238,7 +240,12 @@ def from_pictures(
     names = tuple(f"{_encodable(file.stem)}.png" for file in selected)
     focals = [headers[file].focal for file in selected]
     stated = [focal for focal in focals if focal is not None]
-    return Taken(names, notes, focal=float(np.median(stated)) if stated else None)
+    by_camera = collections.defaultdict(list)
+    for name, file in zip(names, selected, strict=True):
+        by_camera[headers[file].camera, headers[file].focal].append(name)
+    groups = tuple((tuple(group), focal) for (_, focal), group in by_camera.items())
+    focal = float(np.median(stated)) if stated else None
+    return Taken(names, notes, focal=focal, groups=groups)
 
 
 def _readable(folder):
@@ -299,7 +306,7 @@ def _mask_of(folder, image):
 def _factor(size, max_side):
     if max_side < 16:
         raise ValueError(f"max_side={max_side}; expected at least 16 pixels")
-    return max(1, math.ceil(max(size) / max_side))
+    return frames.least_factor(max(size), max_side)
 
 
 def _write(path, image):

@@ -81,8 +81,11 @@ def choose_source(
             raise CaptureError(
                 f"{where}: max_side={max_side}; expected at least 1 pixel"
             )
-        least = max(full_size) / max_side
-        factor = min(each * max(math.ceil(least / each), 1) for each in available)
+        side = max(full_size)
+        # Of a stored reduction the size may have been rounded up.
+        factor = min(
+            each * least_factor(math.ceil(side / each), max_side) for each in available
+        )
     if factor is None:
         return min(available), 1
     divisors = [source for source in available if factor >= 1 and factor % source == 0]
@@ -92,6 +95,21 @@ def choose_source(
             f"reductions {sorted(available)}, so use a multiple of one of them"
         )
     return max(divisors), factor // max(divisors)
+
+
+def least_factor(side: int, max_side: int) -> int:
+    """Return the smallest integer reduction to at most a number of pixels.
+
+    Incomplete blocks are cropped, so 427 pixels become 213 by a factor of two.
+
+    Args:
+      side: Length of a side in pixels.
+      max_side: Largest allowed length in pixels.
+
+    Returns:
+      The factor.
+    """
+    return side // (max_side + 1) + 1
 
 
 def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:

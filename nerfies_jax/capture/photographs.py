@@ -21,6 +21,7 @@ from nerfies_jax.capture.errors import CaptureError
 
 HEIC = (".heic", ".heif")  # read if pillow-heif is installed
 FULL_FRAME_MM = 36.0  # the longer side that the 35 mm equivalent refers to
+_MAKE, _MODEL = 0x010F, 0x0110
 _ORIENTATION, _EXIF, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 
 
@@ -37,6 +38,7 @@ class Header(NamedTuple):
 
     size: tuple[int, int]  # width and height, upright
     focal: float | None  # focal length over the longest side, if the file states it
+    camera: str | None = None  # maker and model of the camera, if the file states them
 
 
 def heic_is_read() -> bool:
@@ -64,7 +66,7 @@ def read_header(path: pathlib.Path) -> Header:
     if path.suffix.lower() not in HEIC:
         return decode_header(path)
     about = _decoded_apart(path, 0, header_only=True).about
-    return Header(tuple(about["size"]), about["focal"])
+    return Header(tuple(about["size"]), about["focal"], about["camera"])
 
 
 def read_upright(path: pathlib.Path) -> np.ndarray:
@@ -127,11 +129,14 @@ def decode_header(path: pathlib.Path) -> Header:
         is_rotated = tags.get(_ORIENTATION, 1) in (5, 6, 7, 8)  # by 90 degrees
         size = image.size[::-1] if is_rotated else image.size
         value = tags.get_ifd(_EXIF).get(_FOCAL_35MM)
+        names = [tags.get(tag) for tag in (_MAKE, _MODEL)]
     focal = None
     # The value may be anything: several numbers, text, or 0 for unknown.
     if isinstance(value, numbers.Real) and 0 < float(value) < math.inf:
         focal = float(value) / FULL_FRAME_MM
-    return Header(size, focal)
+    # Old cameras fill the text with spaces or zeros.
+    texts = [name.strip(" \0") for name in names if isinstance(name, str)]
+    return Header(size, focal, " ".join(filter(None, texts)) or None)
 
 
 def decode_upright(path: pathlib.Path) -> np.ndarray:

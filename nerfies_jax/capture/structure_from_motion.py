@@ -15,31 +15,37 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-import numpy as np
-
-from nerfies_jax.capture import extras, frames
+from nerfies_jax.capture import (
+    extras,
+    frames,
+    sfm_features,
+    sfm_ladder,
+    sfm_mapping,
+)
 from nerfies_jax.capture.capture import CaptureError
-from nerfies_jax.capture.colmap_library import MIN_TRACK, library
+from nerfies_jax.capture.colmap_library import MIN_TRACK
 from nerfies_jax.capture.json_files import AnyPath, new_folder, probe
+from nerfies_jax.capture.sfm_features import CameraGroup
+from nerfies_jax.capture.sfm_ladder import (
+    LEAST_ANGLE_DEG,
+    LEAST_PLACED,
+    MOST_ERROR_PX,
+)
 from nerfies_jax.runtime import children, console, events
 
 # Images. With more, exhaustive matching would take most of the time.
 EXHAUSTIVE_UP_TO = 40
-# Seed of RANSAC. With random seeds, between 24 and 26 of the same 30 images registered.
-SEED = 0
-MOST_JUDGED = 5000  # points of which the quality is measured
-# Limits of reliable results. Real videos of 87 and 86 frames have errors of 0.4 px and
-# triangulation angles of 6 and 9 degrees.
-MOST_ERROR_PX, LEAST_ANGLE_DEG, LEAST_PLACED = 1.5, 1.5, 0.9
 
 
 @dataclasses.dataclass(frozen=True)
 class MappingSpec:
-    """Settings of structure from motion. All images share one lens."""
+    """Settings of structure from motion."""
 
-    # OPENCV has separate horizontal and vertical focal lengths, as Nerfies' camera has.
+    # Tried first. OPENCV has separate horizontal and vertical focal lengths, as the
+    # cameras of Nerfies have.
     camera_model: str = "OPENCV"
     # Initial focal length as a multiple of the longest image side, COLMAP's default.
     focal: float = 1.2
@@ -52,13 +58,21 @@ class MappingSpec:
     # get 2.0 and 2.9 times the points, with errors of 0.42 and 0.31 px instead of 0.73
     # and 0.60, in 8 and 10 s instead of 4 and 6.
     first_octave: int = -1
+    # Smallest scale of the features to use, in pixels. `sfm_features.COARSE_PX` leaves
+    # those of octave 0.
+    least_scale: float = 0.0
+    # "one" camera for all images, or for each group of images. "each": a camera for
+    # each image. "auto" gives each image a camera if no common camera succeeds.
+    cameras: Literal["auto", "one", "each"] = "auto"
     # "auto" matches sequentially if there are more than `EXHAUSTIVE_UP_TO` images and
     # their names are in order of time.
     matcher: Literal["auto", "sequential", "exhaustive"] = "auto"
     overlap: int = 10  # following images to match in sequential matching
     in_order: bool = True  # names are in order of time, as those of video frames
     threads: int | None = None  # None for all cores
-    at_least: float = 0.5  # smallest share of the images that must register
+    # Smallest share of the images that must register. With 0, the largest piece of the
+    # video that can be reconstructed is the result.
+    at_least: float = 0.5
     seconds: float = 3600.0  # time limit
 
     def __post_init__(self):
@@ -73,12 +87,33 @@ class MappingSpec:
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads={self.threads}; use at least 1")
 
+    def is_sequential(self, count: int) -> bool:
+        """Decide whether only neighboring images are matched.
+
+        Args:
+          count: Number of images.
+
+        Returns:
+          False to match all pairs.
+        """
+        if self.matcher == "auto":
+            return self.in_order and count > EXHAUSTIVE_UP_TO
+        return self.matcher == "sequential"
+
 
 MASK = "mask moving regions (black)"
 
 
 class FewPlaced(CaptureError):
-    """Too few of the images were registered."""
+    """Too few of the images were registered.
+
+    Attributes:
+      placed: Number of images that were.
+    """
+
+    def __init__(self, message: str, placed: int = 0):
+        super().__init__(message)
+        self.placed = placed
 
 
 class Poses(NamedTuple):
@@ -90,6 +125,8 @@ class Poses(NamedTuple):
     points: int  # observed in at least `MIN_TRACK` images
     error_px: float  # median over the points of their mean reprojection errors
     angle_deg: float  # median over the points of their largest triangulation angles
+    # Text about the choice of the camera model, and doubts about it.
+    notes: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """Describe the result and how far it can be trusted.
@@ -100,7 +137,8 @@ class Poses(NamedTuple):
         lines = [
             f"cameras: {self.placed} of {self.pictures} images registered; "
             f"{self.points:,} static points, reprojection error {self.error_px:.2f} "
-            f"px, triangulation angle {self.angle_deg:.1f} degrees"
+            f"px, triangulation angle {self.angle_deg:.1f} degrees",
+            *self.notes,
         ]
         if self.error_px > MOST_ERROR_PX:
             lines.append(
@@ -133,10 +171,15 @@ def run_sfm(
     out: AnyPath,
     masks: AnyPath | None = None,
     spec: MappingSpec = MappingSpec(),
+    *,
+    groups: Sequence[CameraGroup] | None = None,
+    features: AnyPath | None = None,
 ) -> Poses:
     """Reconstruct cameras from the images in a folder.
 
-    Progress is emitted as events. Moving regions need masks: with 15 % of the image
+    The same images and settings give the same cameras, with any number of threads.
+    Several camera models are tried until one is plausible. Progress is emitted as
+    events. Moving regions need masks: with 15 % of the image
     moving and no masks, all images registered with a low reprojection error, but the
     error of the camera path was 250 times larger.
 
@@ -145,8 +188,11 @@ def run_sfm(
       out: Folder to write, with `sparse/0` and a copy of the images in `images`, so
         that it can be loaded as a capture.
       masks: Folder with `<image name>.png`, black where something moves. No features
-        are extracted there.
+        are used there.
       spec: Settings.
+      groups: Images by camera, each image once. None for one camera.
+      features: File that keeps the features and matches of all images. If it exists,
+        they are read from it, otherwise it is written.
 
     Returns:
       The registered cameras.
@@ -176,25 +222,38 @@ def run_sfm(
                 f"{masks}: no mask {absent[0]}.png ({len(absent)} missing); name each "
                 "after its image"
             )
+    if groups is None:
+        groups = [CameraGroup(tuple(names), spec.focal)]
+    if sorted(name for group in groups for name in group.names) != sorted(names):
+        raise ValueError("groups must contain each image of the folder once")
+    request = {
+        "features": None if features is None else str(pathlib.Path(features).resolve()),
+        "masked": masks is not None,
+        "groups": [(group.names, group.focal) for group in groups],
+        "spec": dataclasses.asdict(spec),
+    }
     with new_folder(out) as folder:
         shutil.copytree(images, folder / "images")
         if masks is not None:
             shutil.copytree(masks, folder / "masks")
-        measures = _run_child(folder, masks is not None, spec, len(names))
+        measures = _run_child(folder, request, spec, len(names))
+        span = measures.pop("span", None)
         poses = Poses(out, len(names), **measures)
-        if poses.placed < max(2, spec.at_least * len(names)):
+        if poses.placed < max(MIN_TRACK, spec.at_least * len(names)):
+            piece = ""
+            if poses.placed >= MIN_TRACK:
+                piece = f" ({span[0]} to {span[1]}; use them alone with piece=True)"
             raise FewPlaced(
                 f"{images}: only {poses.placed} of {len(names)} images could be "
-                f"registered; {_more_overlap(len(names))}"
+                f"registered{piece}; {_more_overlap(len(names))}",
+                poses.placed,
             )
     return poses
 
 
 @events.stage("structure from motion")
-def _run_child(folder, masked, spec, images):
-    request = json.dumps(
-        {"folder": str(folder), "masked": masked, "spec": dataclasses.asdict(spec)}
-    )
+def _run_child(folder, request, spec, images):
+    request = json.dumps({"folder": str(folder), **request})
     command = [sys.executable, "-m", "nerfies_jax.capture.structure_from_motion"]
     root = pathlib.Path(__file__).resolve().parents[2]
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
@@ -231,9 +290,12 @@ def _run_child(folder, masked, spec, images):
             f"{folder.name}: COLMAP ended with code {child.returncode} "
             f"({' '.join(list(log)[-1:])[:200]}); try fewer or smaller images"
         )
-    return json.loads(last_line)
+    measures = json.loads(last_line)
+    return {**measures, "notes": tuple(measures.get("notes", ()))}
 
 
+# The child begins an attempt with another camera model.
+ATTEMPT = re.compile(r"camera model \d+: ")
 # Progress in COLMAP's log, and the names of the stages.
 STAGES = (
     (re.compile(r"Processed file \[(\d+)/(\d+)\]"), "extracting features"),
@@ -249,6 +311,9 @@ def _follow(lines, log, images):
     with contextlib.ExitStack() as stack:
         for line in filter(None, map(str.strip, lines)):
             log.append(line)
+            if ATTEMPT.match(line):  # its images are counted from zero again
+                stack.close()
+                current = ""
             for pattern, name in STAGES:
                 match = pattern.search(line)
                 if not match:
@@ -261,95 +326,49 @@ def _follow(lines, log, images):
                 stage.reach(done, total)
 
 
-def _reconstruct(folder: pathlib.Path, masked: bool, spec: MappingSpec) -> dict:
+def _reconstruct(
+    folder: pathlib.Path, features: str | None, masked: bool, groups, spec
+):
     """Write folder/sparse/0 in the child process, and return fields of `Poses`."""
-    pycolmap = library()
     threads = spec.threads or os.cpu_count() or 1
-    database, images = folder / "database.db", folder / "images"
-    reading = pycolmap.ImageReaderOptions()
-    reading.camera_model = spec.camera_model
-    reading.default_focal_length_factor = spec.focal
-    if masked:
-        reading.mask_path = str(folder / "masks")
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.num_threads = threads
-    extraction.sift.max_num_features = spec.features
-    extraction.sift.first_octave = spec.first_octave
-    pycolmap.extract_features(
-        database,
-        images,
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reading,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
+    images = folder / "images"
+    database = folder / "features.db" if features is None else pathlib.Path(features)
+    if not database.is_file():
+        partial = folder / "extracted.db"
+        sfm_features.extract(partial, images, spec, threads)
+        partial.replace(database)
+    groups = [CameraGroup(tuple(names), focal) for names, focal in groups]
+    mapped = sfm_mapping.climb(
+        database, images, folder, groups, spec, folder / "masks" if masked else None
     )
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = threads
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
-    count = sum(1 for _ in images.iterdir())
-    is_long_video = spec.in_order and count > EXHAUSTIVE_UP_TO
-    if spec.matcher == "sequential" or (spec.matcher == "auto" and is_long_video):
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap = spec.overlap
-        pycolmap.match_sequential(
-            database,
-            matching_options=matching,
-            verification_options=verification,
-            pairing_options=pairing,
-            device=pycolmap.Device.cpu,
-        )
-    else:
-        pycolmap.match_exhaustive(
-            database,
-            matching_options=matching,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = threads
-    options.random_seed = SEED
-    models = pycolmap.incremental_mapping(database, images, folder / "models", options)
-    # If mapping fails, the dict is empty.
-    best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-    if best is not None:
-        target = folder / "sparse" / "0"
-        target.mkdir(parents=True)
-        best.write(str(target))
-    shutil.rmtree(folder / "models", ignore_errors=True)
-    database.unlink(missing_ok=True)
-    if best is None:
+    (folder / "features.db").unlink(missing_ok=True)
+    if mapped is None:
         return {"placed": 0, "points": 0, "error_px": 0.0, "angle_deg": 0.0}
-    return {"placed": best.num_reg_images(), **_quality(best)}
-
-
-def _quality(model) -> dict:
-    """Reprojection errors and triangulation angles of reliable points."""
-    points = [p for p in model.points3D.values() if p.track.length() >= MIN_TRACK]
-    if not points:
-        return {"points": 0, "error_px": 0.0, "angle_deg": 0.0}
-    center = {
-        number: image.projection_center()
-        for number, image in model.images.items()
-        if image.has_pose
-    }
-    sample = points[:: -(-len(points) // MOST_JUDGED)]
-    angles = []
-    for point in sample:
-        rays = np.array([center[each.image_id] for each in point.track.elements])
-        rays = point.xyz - rays
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles.append(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1).min())))
+    target = folder / "sparse" / "0"
+    target.mkdir(parents=True)
+    mapped.model.write(str(target))
+    best = mapped.summary
+    names = sorted(
+        mapped.model.image(number).name for number in mapped.model.reg_image_ids()
+    )
     return {
-        "points": len(points),
-        "error_px": float(np.median([point.error for point in sample])),
-        "angle_deg": float(np.median(angles)),
+        "placed": best.placed,
+        "points": best.points,
+        "error_px": best.error_px,
+        "angle_deg": best.angle_deg,
+        "notes": sfm_ladder.notes(best, mapped.tried, mapped.pieces),
+        "span": [names[0], names[-1]],
     }
 
 
 if __name__ == "__main__":
     children.end_with_parent()
     job = json.load(sys.stdin)
-    spec = MappingSpec(**job["spec"])
-    measures = _reconstruct(pathlib.Path(job["folder"]), job["masked"], spec)
+    measures = _reconstruct(
+        pathlib.Path(job["folder"]),
+        job["features"],
+        job["masked"],
+        job["groups"],
+        MappingSpec(**job["spec"]),
+    )
     console.say(json.dumps(measures))

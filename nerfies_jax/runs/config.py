@@ -144,7 +144,15 @@ class Preparation:
     camera_model: Literal[
         "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
     ] = "OPENCV"
-    """COLMAP camera model, the same for all images."""
+    """COLMAP camera model to try first. If its result is implausible, simpler models
+    are tried, and one whose focal length is held until all images are registered."""
+    cameras: Literal["auto", "one", "each"] = "auto"
+    """one: all images share one camera. each: every image has its own focal length.
+    auto: one camera for each camera model and focal length in the headers of
+    photographs, and one for each image if no shared camera succeeds."""
+    piece: bool = False
+    """If most images cannot be registered, use the largest piece of the video or set of
+    images that can."""
     matcher: Literal["auto", "sequential", "exhaustive"] = "auto"
     """Image pairs to match: neighboring images (sequential) or all (exhaustive). auto
     is sequential for more than 40 images."""

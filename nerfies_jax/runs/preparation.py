@@ -14,6 +14,7 @@ Each took some 30 to 60 s on two busy cores.
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -31,6 +32,7 @@ from nerfies_jax.capture.capture import Capture, CaptureError, describe
 from nerfies_jax.capture.footage import Taken
 from nerfies_jax.capture.images import write_png
 from nerfies_jax.capture.json_files import AnyPath, scratch_folder, write_json
+from nerfies_jax.capture.sfm_features import COARSE_PX, CameraGroup
 from nerfies_jax.capture.structure_from_motion import (
     FewPlaced,
     MappingSpec,
@@ -163,25 +165,36 @@ def _taken(kind, source, scratch, how) -> Taken:
 def _solve(scratch, taken, how, tell) -> Solved:
     """Estimate the cameras of the images in `scratch/images`, in one pass or two."""
     spec = MappingSpec(
-        camera_model=how.camera_model, matcher=how.matcher, threads=how.threads
+        camera_model=how.camera_model,
+        matcher=how.matcher,
+        threads=how.threads,
+        cameras=how.cameras,
     )
     if taken.focal is not None:
         spec = dataclasses.replace(spec, focal=taken.focal)
+    groups = _camera_groups(taken, how, spec)
+    if len(groups) > 1:  # photographs of several cameras are in no order
+        spec = dataclasses.replace(spec, in_order=False)
+        if how.cameras == "auto":
+            tell(f"{len(groups)} camera models or focal lengths, each with its camera")
+    # Features and matches are computed once for all passes.
     images = scratch / "images"
+    register = functools.partial(
+        run_sfm, images, groups=groups, features=scratch / "features.db"
+    )
     if how.masks is not None:
-        poses = run_sfm(images, scratch / "only", scratch / "masks", spec)
+        poses = register(scratch / "only", scratch / "masks", _accepted(spec, how))
         return Solved(poses, True, tuple(poses.lines()))
+    if how.passes == 1:
+        poses = register(scratch / "first", None, _accepted(spec, how))
+        return Solved(poses, False, tuple(poses.lines()))
     # The first pass uses coarse features, because most fine features of some images lie
     # on moving objects.
-    coarse = spec if how.passes == 1 else dataclasses.replace(spec, first_octave=0)
+    coarse = dataclasses.replace(spec, least_scale=COARSE_PX)
     try:
-        first = run_sfm(images, scratch / "first", None, coarse)
+        first = register(scratch / "first", None, coarse)
     except FewPlaced as error:
-        if how.passes == 1:
-            raise
-        return _solve_masked(scratch, spec, error, tell)
-    if how.passes == 1:
-        return Solved(first, False, tuple(first.lines()))
+        return _solve_masked(scratch, register, _accepted(spec, how), error, tell)
     tell(f"{first.lines()[0]}; detecting moving objects")
     capture = colmap.read(first.folder)
     moving = movers.masks_of(capture)
@@ -198,7 +211,7 @@ def _solve(scratch, taken, how, tell) -> Solved:
             "cameras again with these masked"
         )
     try:
-        second = run_sfm(images, scratch / "second", masks, spec)
+        second = register(scratch / "second", masks, spec)
     except CaptureError as error:
         reason = str(error).partition(": ")[2]
         note = f"the second pass failed ({reason}); using the cameras of the first"
@@ -212,22 +225,42 @@ def _solve(scratch, taken, how, tell) -> Solved:
     return Solved(second, masks is not None, tuple(second.lines()))
 
 
-def _solve_masked(scratch, spec, error, tell):
+def _camera_groups(taken, how, spec):
+    """Images by camera."""
+    if how.cameras == "auto" and len(taken.groups) > 1:
+        return [
+            CameraGroup(names, spec.focal if focal is None else focal)
+            for names, focal in taken.groups
+        ]
+    return [CameraGroup(taken.names, spec.focal)]
+
+
+def _accepted(spec, how):
+    """Settings of the last pass, which accept any piece of the images if requested."""
+    return dataclasses.replace(spec, at_least=0.0) if how.piece else spec
+
+
+def _solve_masked(scratch, register, spec, error, tell):
     """Retry structure from motion with moving objects masked, detected from flow."""
     tell(f"{str(error).partition(': ')[2]}; detecting moving objects")
-    try:
+    moving, share = None, 0.0
+    with contextlib.suppress(ValueError):
         moving = masks_without_cameras.moving_in(scratch / "images")
-    except ValueError as reason:
-        raise error from reason
-    share = np.mean([mask.mean() for mask in moving.values()])
+        share = np.mean([mask.mean() for mask in moving.values()])
     if share == 0:
-        raise error
+        if spec.at_least > 0:
+            raise error
+        poses = register(scratch / "second", None, spec)
+        return Solved(poses, False, tuple(poses.lines()))
     masks = _write_masks(scratch, moving)
     tell(
         f"{share:.1%} of the pixels seem to show moving objects; estimating the "
         "cameras again with these masked"
     )
-    poses = run_sfm(scratch / "images", scratch / "second", masks, spec)
+    poses = register(scratch / "second", masks, spec)
+    if poses.placed < error.placed and spec.at_least == 0:
+        poses = register(scratch / "third", None, spec)
+        return Solved(poses, False, tuple(poses.lines()))
     return Solved(poses, True, tuple(poses.lines()))
 
 

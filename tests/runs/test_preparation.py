@@ -6,12 +6,14 @@ import shutil
 import types
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from nerfies_jax import capture as room
 from nerfies_jax.capture import images, video
 from nerfies_jax.capture import masks as mask_files
 from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.sfm_features import COARSE_PX
 from nerfies_jax.capture.structure_from_motion import FewPlaced, Poses
 from nerfies_jax.preprocessing import masks_without_cameras
 from nerfies_jax.runs import movers, preparation, reconstruction
@@ -31,9 +33,10 @@ def mapper(monkeypatch):
 
     Where it `fails`, the second call places three pictures fewer.
     """
-    calls = []
+    calls, kept = [], []
 
-    def run_sfm(pictures, out, masks, spec):
+    def run_sfm(pictures, out, masks, spec, *, groups, features):
+        kept.append((groups, features))
         names = sorted(path.name for path in pictures.iterdir())
         models.make(out, count=len(names))
         text = (out / "sparse/0/images.txt").read_text()
@@ -50,7 +53,7 @@ def mapper(monkeypatch):
         placed = len(names) - (3 if len(calls) == 2 and run_sfm.fails else 0)
         return Poses(out, len(names), placed, 40, 0.5, 6.0)
 
-    run_sfm.fails, run_sfm.calls = False, calls
+    run_sfm.fails, run_sfm.calls, run_sfm.kept = False, calls, kept
     monkeypatch.setattr(preparation, "run_sfm", run_sfm)
     return run_sfm
 
@@ -80,7 +83,9 @@ def test_the_second_pass_goes_without_what_the_first_saw_move(
     capture = preparation.prepare(pictures, tmp_path / "out", how)
     (spec, black), (second, masked) = mapper.calls
     assert black is None
-    assert (spec.first_octave, second.first_octave) == (0, -1)
+    assert (spec.least_scale, second.least_scale) == (COARSE_PX, 0)
+    # Features are computed once.
+    assert len({features for _, features in mapper.kept}) == 1
     assert (spec.camera_model, spec.matcher, spec.threads) == (
         "RADIAL",
         "exhaustive",
@@ -139,10 +144,10 @@ def test_where_too_few_are_placed_what_moves_is_masked_before(
     moves["p2.png"][10:, 15:] = True
     monkeypatch.setattr(masks_without_cameras, "moving_in", lambda folder: moves)
 
-    def too_few_unmasked(pictures, out, masks, spec):
-        if masks is None:
-            raise FewPlaced(f"{pictures}: only 1 of 9 images could be registered")
-        return mapper(pictures, out, masks, spec)
+    def too_few_unmasked(pictures, out, masks, spec, **rest):
+        if masks is None and spec.at_least > 0:
+            raise FewPlaced(f"{pictures}: only 1 of 9 images could be registered", 1)
+        return mapper(pictures, out, masks, spec, **rest)
 
     monkeypatch.setattr(preparation, "run_sfm", too_few_unmasked)
     log = []
@@ -156,6 +161,42 @@ def test_where_too_few_are_placed_what_moves_is_masked_before(
     for how in (Preparation(), Preparation(passes=1)):
         with pytest.raises(CaptureError, match="only 1 of 9"):
             preparation.prepare(pictures, tmp_path / "again", how)
+    # A piece of the images is used on request.
+    for row, passes in enumerate((1, 2)):
+        how = Preparation(passes=passes, piece=True)
+        preparation.prepare(pictures, tmp_path / f"piece{row}", how)
+    assert [black is None for _, black in mapper.calls] == [False, True, True]
+
+
+def test_photographs_of_several_cameras_have_a_camera_each(
+    tmp_path, mapper, monkeypatch
+):
+    monkeypatch.setattr(movers, "masks_of", lambda capture: None)
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    lenses = (("One", 36), ("One", 72), ("Two", 36), (None, None))
+    for row in range(9):
+        exif = PIL.Image.Exif()
+        name, focal = lenses[row % 4]
+        if name:
+            exif[0x0110] = name
+            exif.get_ifd(0x8769)[0xA405] = focal
+        picture = PIL.Image.fromarray(models.picture(row))
+        picture.save(folder / f"p{row}.png", exif=exif)
+    preparation.prepare(folder, tmp_path / "auto")
+    groups, _ = mapper.kept[0]
+    assert [(group.names[0], group.focal) for group in groups] == [
+        ("p0.png", 1.0),
+        ("p1.png", 2.0),
+        ("p2.png", 1.0),
+        ("p3.png", 1.0),  # the median of the others
+    ]
+    assert sorted(name for group in groups for name in group.names) == [
+        f"p{row}.png" for row in range(9)
+    ]
+    assert not mapper.calls[0][0].is_sequential(500)
+    preparation.prepare(folder, tmp_path / "one", Preparation(cameras="one"))
+    assert len(mapper.kept[-1][0]) == 1
 
 
 def test_given_masks_take_one_pass_and_are_kept(pictures, tmp_path, mapper):

@@ -231,6 +231,17 @@ FISHEYE = dataclasses.replace(
     cameras=Cameras(field_of_view_rad=1.4),
     lens=Lens("fisheye", (-0.02, 0.01, -0.003, 0.0005)),
 )
+# The view turns by 40 degrees to either side of the moving objects, while the camera
+# itself moves by a tenth of their distance only.
+PAN = dataclasses.replace(
+    DEFAULT,
+    name="pan",
+    cameras=Cameras(arc_rad=0.06, forward=0.03, sweeps=1.25, pan_rad=0.7),
+    size=(320, 240),
+)
+ZOOM = dataclasses.replace(
+    DEFAULT, name="zoom", cameras=Cameras(sweeps=1.25, zoom=1.6), size=(320, 240)
+)
 # Between neighboring frames, whose views differ by 9 degrees, it rotates by 24 degrees
 # and moves by a tenth of the image width. Dense flow fails on it in a third of them.
 BALLOON = Thing(
@@ -359,4 +370,6 @@ PRESETS = {
     "collection-masked": dataclasses.replace(
         COLLECTION, collection=Collection(masked=True)
     ),
+    "pan": PAN,
+    "zoom": ZOOM,
 }

@@ -153,6 +153,10 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
     for effect in (spec.pose_error, spec.lens, spec.rig, spec.collection):
         if effect is not None:
             text += f" {effect!r}"
+    if spec.cameras.pan_rad:
+        text += f" pan_rad={spec.cameras.pan_rad!r}"
+    if spec.cameras.zoom != 1:
+        text += f" zoom={spec.cameras.zoom!r}"
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -279,11 +279,21 @@ def _arc(spec, times, seed, is_second):
     if is_second:
         offset_right, offset_up, offset_back = setting.beside
         position = position + offset_right * right + offset_up * up + offset_back * back
+    if setting.pan_rad:
+        target = position + _turned(target - position, setting.pan_rad * np.sin(sweep))
     focal_px = spec.size[0] / 2 / np.tan(setting.field_of_view_rad / 2)
+    focals_px = focal_px * setting.zoom ** np.sin(np.pi * times) ** 2
     return [
-        cameras.look_at(eye, aim, up, focal_px, spec.size)
-        for eye, aim in zip(position, target, strict=True)
+        cameras.look_at(eye, aim, up, focal, spec.size)
+        for eye, aim, focal in zip(position, target, focals_px, strict=True)
     ]
+
+
+def _turned(vectors, angles):
+    """Rotate vectors [n, 3] about the vertical by angles [n], in radians."""
+    x, y, z = vectors.T
+    cos, sin = np.cos(angles), np.sin(angles)
+    return np.stack([cos * x + sin * z, y, cos * z - sin * x], axis=-1)
 
 
 def _light_gain(spec, times, seed):

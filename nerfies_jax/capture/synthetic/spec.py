@@ -48,8 +48,18 @@ class Cameras:
     field_of_view_rad: float = 0.85  # horizontal
     # Offset of the second camera to the right, up and back, scene units.
     beside: Vector = (0.09, 0.05, 0.0)
+    # The next two are not in `repr`, which identifies cached scenes, so that scenes
+    # without them keep their identity.
+    # Largest rotation of the view to either side of the target, about the vertical.
+    pan_rad: float = dataclasses.field(default=0.0, repr=False)
+    # Ratio of the longest focal length, in the middle of the capture, to the shortest.
+    zoom: float = dataclasses.field(default=1.0, repr=False)
 
     def __post_init__(self):
+        if not abs(self.pan_rad) < 1.5:
+            raise ValueError(f"pan_rad={self.pan_rad} must lie between -1.5 and 1.5")
+        if not 0 < self.zoom < 100:
+            raise ValueError(f"zoom={self.zoom} must be positive and below 100")
         if not self.distance - self.forward > 0:
             raise ValueError(
                 f"forward={self.forward} must stay below distance={self.distance}, or "
