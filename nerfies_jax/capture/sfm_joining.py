@@ -33,19 +33,18 @@ def join(models: list[Any], database, images, folder, options) -> tuple[Any, lis
     """
     pycolmap = library()
     base, others = models[0], models[1:]
-    joined = True
-    while joined:
-        joined = [other for other in others if _append(base, other)]
-        others = [other for other in others if other not in joined]
-        if joined:
-            target = folder / "joined"
-            target.mkdir(exist_ok=True)
-            base = pycolmap.triangulate_points(
-                base, database, images, target, True, options
-            )
-            adjust(base, options)
-            _drop_unsupported(base)
-    return base, [each.num_reg_images() for each in (base, *others)]
+    while True:
+        apart = [other for other in others if not _append(base, other)]
+        if len(apart) == len(others):
+            return base, [each.num_reg_images() for each in (base, *others)]
+        others = apart
+        target = folder / "joined"
+        target.mkdir(exist_ok=True)
+        base = pycolmap.triangulate_points(
+            base, database, images, target, True, options
+        )
+        adjust(base, options)
+        _drop_unsupported(base)
 
 
 def adjust(model, options, distortion: bool | None = None):

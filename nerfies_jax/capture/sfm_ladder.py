@@ -119,9 +119,9 @@ def next_rung(results: Sequence[Summary], cameras: str = "auto") -> Rung | None:
       The model, or None if no further attempt is needed.
     """
     if cameras == "each":
-        rungs = (EACH, HELD)
+        rungs = [EACH, HELD]
     else:
-        rungs = (FREE, RADIAL, HELD) + ((EACH,) if cameras == "auto" else ())
+        rungs = [FREE, RADIAL, HELD] + ([EACH] if cameras == "auto" else [])
     tried = [result.rung for result in results]
     if any(not faults(result) for result in results):
         return None

@@ -95,7 +95,7 @@ def _attempt(rung: Rung, features, images, work, groups, spec, masks):
             database, images, folder / "models", options
         )
         models = sorted(models.values(), key=lambda one: -one.num_reg_images())
-        model, pieces = None, []
+        model, pieces = None, list[int]()
         if models:
             model, pieces = sfm_joining.join(models, database, images, folder, options)
             if rung.hold:
@@ -158,11 +158,14 @@ def summarize(model, rung: Rung, images: int) -> Summary:
     used = {model.image(number).camera_id for number in model.reg_image_ids()}
     lenses = [_lens(model.camera(number)) for number in sorted(used)]
     focals = [focal for focal, _, _ in lenses]
+    points, error_px, angle_deg = _quality(model)
     return Summary(
         rung,
         images,
         model.num_reg_images(),
-        *_quality(model),
+        points,
+        error_px,
+        angle_deg,
         (min(focals, default=math.nan), max(focals, default=math.nan)),
         max((aspect for _, aspect, _ in lenses), default=1.0),
         any(folds for _, _, folds in lenses),

@@ -1,5 +1,7 @@
 """Cameras from pictures of a textured room, in a process of their own."""
 
+import dataclasses
+
 import numpy as np
 import PIL.Image
 import pytest
@@ -74,7 +76,9 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the child runs elsewhere
     received = []
     with events.subscribe(received.append):
-        poses = mapping.run_sfm("pictures", "out", "masks", spec)
+        poses = mapping.run_sfm(
+            "pictures", "out", "masks", spec, features="features.db"
+        )
     capture = room.load(poses.folder)
     assert len(capture.ids) == 8
     true = np.array([one.position for one in cameras], float)
@@ -90,6 +94,19 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
     assert 5 < poses.angle_deg < 40
     assert len(poses.lines()) == 1
     ended = [one for one in received if one.get("status") == "done"]
+    # The features are kept, and the result does not depend on the number of threads.
+    later = []
+    with events.subscribe(later.append):
+        again = mapping.run_sfm(
+            "pictures",
+            "again",
+            "masks",
+            dataclasses.replace(spec, threads=1),
+            features="features.db",
+        )
+    assert "extracting features" not in {one.get("name") for one in later}
+    model = "sparse/0/images.bin"
+    assert (again.folder / model).read_bytes() == (poses.folder / model).read_bytes()
     names = [one["name"] for one in ended]
     inner = ["extracting features", "matching features", "placing cameras"]
     assert names == [*inner, "structure from motion"]
@@ -105,12 +122,15 @@ def test_pictures_without_texture_are_refused_and_leave_nothing(tmp_path):
 
 
 def test_what_cannot_work_is_said_before_it_starts(tmp_path):
+    lost = [mapping.CameraGroup(("f00.png", "f01.png"), 1.0)]
     with pytest.raises(CaptureError, match="no such folder"):
         mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
     film(tmp_path / "pictures", 2)
     with pytest.raises(CaptureError, match="2 images"):
         mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
     film(tmp_path / "more", 3)
+    with pytest.raises(ValueError, match="each image of the folder once"):
+        mapping.run_sfm(tmp_path / "more", tmp_path / "out", groups=lost)
     (tmp_path / "masks").mkdir()
     with pytest.raises(CaptureError, match=r"no mask f00\.png\.png"):
         mapping.run_sfm(tmp_path / "more", tmp_path / "out", tmp_path / "masks")

@@ -424,6 +424,30 @@ def test_the_cameras_of_a_rig_take_turns_in_wide_steps():
     assert ((turn > 7) & (turn < 11)).all()
 
 
+def test_a_pan_turns_the_view_and_a_zoom_changes_the_focal_length():
+    plan = rendering.schedule(synthetic.PRESETS["pan"], seed=0)
+    rows = plan.camera_id == 0
+    view = plan.cameras.camera_from_world[rows, 2]
+    turn = np.degrees(np.arctan2(view[:, 0], -view[:, 2]))
+    assert turn.min() < -35
+    assert turn.max() > 35
+    position = plan.cameras.position[rows]
+    assert np.ptp(position, axis=0).max() < 0.1
+    assert np.ptp(plan.cameras.focal_px) == 0
+    plan = rendering.schedule(synthetic.PRESETS["zoom"], seed=0)
+    focal_px = plan.cameras.focal_px[plan.camera_id == 0]
+    assert focal_px[0] == pytest.approx(focal_px[-1])
+    assert focal_px.max() / focal_px.min() == pytest.approx(1.6, rel=0.01)
+    still = synthetic.PRESETS["default"]
+    for change in ({"pan_rad": 0.1}, {"zoom": 2.0}):
+        moved = dataclasses.replace(still.cameras, **change)
+        changed = dataclasses.replace(still, cameras=moved)
+        assert synthetic.digest(changed) != synthetic.digest(still)
+    for wrong in ({"pan_rad": 2.0}, {"zoom": 0.0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            synthetic.Cameras(**wrong)
+
+
 @pytest.mark.parametrize("settings", [{"count": 1}, {"count": 40}, {"step_rad": 0.0}])
 def test_a_rig_without_an_arc_is_refused(settings):
     with pytest.raises(ValueError, match=r"(two cameras|arc of .* between 0 and 3)"):
