@@ -15,6 +15,8 @@ from nerfies_jax.capture.sfm_ladder import Rung, Summary
 from nerfies_jax.runtime import console
 
 MOST_JUDGED = 5000  # points of which the quality is measured
+# Images of which single focal lengths are fitted, and their smallest number of points.
+MOST_FITTED, LEAST_FITTED = 40, 30
 # Smallest triangulation angle of points in degrees. COLMAP's default of 1.5 leaves
 # images of a camera that mostly turns without points: 42 of 60 register instead of 60.
 LEAST_ANGLE_DEG = 0.5
@@ -169,6 +171,7 @@ def summarize(model, rung: Rung, images: int) -> Summary:
         (min(focals, default=math.nan), max(focals, default=math.nan)),
         max((aspect for _, aspect, _ in lenses), default=1.0),
         any(folds for _, _, folds in lenses),
+        0.0 if rung.each else _focal_spread(model),
     )
 
 
@@ -184,6 +187,41 @@ def _lens(camera):
     radial = [camera.params[i] for i in camera.extra_params_idxs()][:2]
     focal, aspect = math.sqrt(abs(x * y)) / side, max(x / y, y / x)
     return focal, aspect, sfm_ladder.folds_inside(radial, corner)
+
+
+def _focal_spread(model):
+    """Relative spread of the focal lengths that fit single images best.
+
+    The points are fixed. Images of a zoom fit best with different focal lengths even if
+    the reconstruction has a common one. For groups of cameras, the spread is relative
+    to the focal length of each.
+    """
+    pycolmap = library()
+    options = pycolmap.AbsolutePoseRefinementOptions()
+    options.refine_focal_length, options.refine_extra_params = True, False
+    numbers = sorted(model.reg_image_ids())
+    ratios = []
+    for number in numbers[:: -(-len(numbers) // MOST_FITTED)]:
+        image = model.image(number)
+        observed = [point for point in image.points2D if point.has_point3D()]
+        if len(observed) < LEAST_FITTED:
+            continue
+        camera = copy.deepcopy(model.camera(image.camera_id))
+        before = camera.mean_focal_length()
+        fitted = pycolmap.refine_absolute_pose(
+            image.cam_from_world(),
+            np.array([point.xy for point in observed]),
+            np.array([model.point3D(point.point3D_id).xyz for point in observed]),
+            np.ones(len(observed), bool),
+            camera,
+            options,
+        )
+        if fitted is not None:
+            ratios.append(camera.mean_focal_length() / before)
+    if len(ratios) < MIN_TRACK:
+        return 0.0
+    low, high = np.percentile(ratios, (10, 90))
+    return float(high / low - 1) if low > 0 else math.inf
 
 
 def _quality(model):

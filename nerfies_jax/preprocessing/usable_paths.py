@@ -14,7 +14,11 @@ from nerfies_jax.training.track_start import TrackStartSpec
 LEAST_SEEN = 6  # minimum number of frames in which a path is known
 LEAST_PATHS = 12
 LEAST_MOVING = 0.005  # of the pixels. In static videos, up to 0.4 % are marked.
-MARKED = 0.01  # of the pixels. Above this something moves, even if not tracked.
+# Of the pixels. Above the first, something may move even if no path is known, unless
+# hardly any of `LEAST_TRACKS` tracks or more moves. Above the second, something moves.
+MARKED, MOST_MARKED = 0.01, 0.1
+LEAST_TRACKS = 100
+FALSE_SHARE = 0.001  # of the tracks. Static built-in scenes have 0.03 % that move.
 
 
 class KnownPaths(NamedTuple):
@@ -83,9 +87,15 @@ def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
     """
     if np.ptp(times[evidence.row]) == 0:
         return True
-    # If more pixels are marked, objects may be too fast to be tracked.
-    unmarked = not evidence.told and float(evidence.moving.mean()) < MARKED
-    return bool(unmarked and not evidence.unusable and unusable(evidence))
+    if evidence.told or evidence.unusable or not unusable(evidence):
+        return False
+    marked = float(evidence.moving.mean())
+    if marked < MARKED:
+        return True
+    # Objects may be too fast to be tracked, but then some of many tracks start on them.
+    followed = len(evidence.score) >= LEAST_TRACKS
+    moves = float((evidence.score > record.MOVES).mean()) > FALSE_SHARE
+    return followed and not moves and marked < MOST_MARKED
 
 
 def known_paths(evidence: Evidence) -> KnownPaths:

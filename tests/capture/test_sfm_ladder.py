@@ -49,6 +49,14 @@ def test_models_are_tried_in_order_until_one_succeeds(cameras, rungs):
     assert [result.rung for result in results] == rungs
 
 
+def test_a_spread_of_single_focal_lengths_asks_for_a_camera_for_each_image():
+    zoom = GOOD._replace(spread=0.3)
+    assert ladder.next_rung([zoom]) == ladder.EACH
+    assert ladder.next_rung([zoom], "one") is None
+    each = zoom._replace(rung=ladder.EACH, spread=0.0, placed=20)
+    assert ladder.next_rung([zoom, each]) is None
+
+
 def test_the_best_of_any_two_results_follows_the_order_of_the_criteria():
     """All pairs of results that differ in any of the criteria."""
     rungs = (ladder.FREE, ladder.HELD, ladder.EACH)

@@ -21,7 +21,8 @@ def render(one, textures):
     """Two textured planes, z = 4 behind and z = 3 for x > 0, by intersecting rays."""
     width, height = SIZE
     y, x = np.mgrid[:height, :width] + 0.5
-    inner = np.stack([(x - width / 2) / FOCAL, (y - height / 2) / FOCAL, x * 0 + 1], -1)
+    focal = float(one.focal_px)
+    inner = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, x * 0 + 1], -1)
     ray = inner @ one.camera_from_world.astype(float)
     picture = None
     for depth, texture in zip((4.0, 3.0), textures, strict=True):
@@ -34,7 +35,16 @@ def render(one, textures):
     return np.repeat(np.clip(picture, 0, 255).astype(np.uint8)[..., None], 3, -1)
 
 
-def film(folder, count, plain=False):
+def walk(count):
+    """Cameras on a path of 1.8 units, 3 to 4 units from the planes."""
+    return [
+        ((0.9 * np.sin(0.5 * row), -0.4 * np.cos(0.7 * row), 0.1 * row), 0.0, FOCAL)
+        for row in range(count)
+    ]
+
+
+def film(folder, count, plain=False, views=walk):
+    """Write images, and return their cameras."""
     rng = np.random.default_rng(0)
     textures = [
         np.full((800, 800), 128.0)
@@ -45,9 +55,9 @@ def film(folder, count, plain=False):
     ]
     folder.mkdir(parents=True)
     cameras = []
-    for row in range(count):
-        place = [0.9 * np.sin(0.5 * row), -0.4 * np.cos(0.7 * row), 0.1 * row]
-        one = camera.look_at(place, [0.1, 0, 3.5], [0, -1, 0], FOCAL, SIZE)
+    for row, (place, turn, focal) in enumerate(views(count)):
+        target = [0.1 + 3.5 * np.tan(turn), 0, 3.5]
+        one = camera.look_at(place, target, [0, -1, 0], focal, SIZE)
         cameras.append(one)
         PIL.Image.fromarray(render(one, textures)).save(folder / f"f{row:02d}.png")
     return cameras
@@ -111,6 +121,39 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
     inner = ["extracting features", "matching features", "placing cameras"]
     assert names == [*inner, "structure from motion"]
     assert ended[0]["done"] == ended[0]["total"] == 8
+
+
+def zoom(count):
+    """The walk, with a focal length that grows by half and shrinks again."""
+    return [
+        (place, turn, FOCAL * 1.5 ** np.sin(np.pi * row / (count - 1)) ** 2)
+        for row, (place, turn, _) in enumerate(walk(count))
+    ]
+
+
+def pan(count):
+    """A camera that turns by 34 degrees to either side and moves by 0.3 units."""
+    time = np.linspace(0, 1, count)
+    return [
+        ((0.15 * np.sin(7 * t), 0.1 * np.cos(5 * t), 0.1 * t), 1.2 * t - 0.6, FOCAL)
+        for t in time
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("views", "count"), [(zoom, 12), (pan, 16)])
+def test_cameras_that_zoom_or_turn_are_found(views, count, tmp_path):
+    cameras = film(tmp_path / "pictures", count, views=views)
+    spec = mapping.MappingSpec(threads=2, features=1500)
+    poses = mapping.run_sfm(tmp_path / "pictures", tmp_path / "out", spec=spec)
+    assert poses.placed == count
+    capture = room.load(poses.folder)
+    true = np.array([one.position for one in cameras], float)
+    assert aligned(capture.cameras.position.astype(float), true) < 0.005
+    focal = np.array([float(one.focal_px) for one in cameras])
+    np.testing.assert_allclose(capture.cameras.focal_px, focal, rtol=0.01)
+    chosen = "a focal length for each image" in " ".join(poses.lines())
+    assert chosen == (views is zoom)
 
 
 @pytest.mark.slow

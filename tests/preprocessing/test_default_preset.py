@@ -7,7 +7,7 @@ import pytest
 
 from gaussians_jax import representation
 from gaussians_jax.scene.presets import PRESETS
-from nerfies_jax.preprocessing import rigid_groups, usable_paths
+from nerfies_jax.preprocessing import record, rigid_groups, usable_paths
 from nerfies_jax.training import specs
 from tests.preprocessing import films
 from tests.preprocessing.test_tracks import MOVES
@@ -52,6 +52,27 @@ def test_what_moves_and_cannot_be_followed_is_no_still_scene(monkeypatch):
     choice = representation.default_preset(films.film(**MOVES, frames=24))
     assert choice.preset == UNTRACKED
     assert "are long enough to fit a motion" in "".join(choice.notes)
+
+
+def test_a_scene_of_which_no_track_moves_is_static():
+    film = films.film(frames=24)
+    evidence = record.gather(film)
+    assert len(evidence.score) >= usable_paths.LEAST_TRACKS
+    moving = np.zeros_like(evidence.moving)
+    moving[:, :3] = True  # marked where flow fails, as at occlusions
+    assert usable_paths.MARKED < moving.mean() < usable_paths.MOST_MARKED
+    score = np.zeros_like(evidence.score)
+    static = evidence._replace(moving=moving, score=score)
+    assert usable_paths.unusable(static)
+    assert usable_paths.stands_still(static, film.times)
+    score[: 1 + len(score) // 200] = 1
+    for change in (
+        {"score": score},
+        {"moving": np.ones_like(moving)},
+        {"score": score[:9] * 0},
+        {"unusable": "too little texture"},
+    ):
+        assert not usable_paths.stands_still(static._replace(**change), film.times)
 
 
 @pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (8, ())])
