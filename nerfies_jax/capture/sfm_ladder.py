@@ -28,7 +28,7 @@ SAME_PLACED = 0.03
 # 14 images of a zoom by 1.5 all register at 0.45 px, with a camera path that is 27 %
 # off, and fitted one by one their focal lengths spread by 32 %. With a camera for each
 # image, the error is 0.04 px and the path 0.1 % off.
-ZOOM_SPREAD, ZOOM_ERROR = 0.08, 0.8
+ZOOM_SPREAD, ZOOM_ERROR = 0.05, 0.8
 
 
 class Rung(NamedTuple):
