@@ -103,10 +103,16 @@ def save(
     effects = scene.all_effects(spec, metadata)
     rendered = deformation.rendered_rows(effects, state.params)
     files.save(folder / "gaussians.ply", rendered)
+    notes = []
+    if spec.raster.antialiased:
+        notes.append(
+            "The Gaussians were trained with antialiased rendering, which viewers of "
+            "gaussians.ply should enable as well."
+        )
     if all(effect.deform is None for effect in effects):
-        return Saved(size)
+        return Saved(size, tuple(notes))
     coded = None
-    notes = ["gaussians.ply holds the canonical Gaussians, without their motion."]
+    notes.append("gaussians.ply holds the canonical Gaussians, without their motion.")
     if isinstance(spec.motion, AnchorMotionSpec):
         features, others = anchor_motion.coded_bytes(state.params, spec.motion)
         coded = features + others
