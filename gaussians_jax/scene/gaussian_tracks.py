@@ -56,11 +56,11 @@ def follow(
     )
     first = deform(state.params, prepared, times[known.start])
     opacity = np.asarray(first.opacity)
-    path = move_with_gaussians(known.start_points, means, opacity, known.start)
+    path = _move_with_gaussians(known.start_points, means, opacity, known.start)
     drift = float("nan")
     if capture.points is not None:
         static = capture.points.position[:STATIC_POINTS]
-        static = move_with_gaussians(static, means, opacity, known.start)
+        static = _move_with_gaussians(static, means, opacity, known.start)
         offset = static - static.mean(axis=1, keepdims=True)
         drift = float(np.linalg.norm(offset, axis=-1).mean())
     return PointTracks(
@@ -89,27 +89,16 @@ def mover(spec, metadata) -> Move | None:
     def move(state, points, source, target):
         first, last = (deform(state.params, view.time) for view in (source, target))
         means = np.stack([np.asarray(first.mean), np.asarray(last.mean)])
-        path = move_with_gaussians(points, means, np.asarray(first.opacity), 0)
+        path = _move_with_gaussians(points, means, np.asarray(first.opacity), 0)
         return Moved(path[:, 1].astype(points.dtype), np.ones(len(points), bool))
 
     return move
 
 
-def move_with_gaussians(
+def _move_with_gaussians(
     points: np.ndarray, means: np.ndarray, opacity: np.ndarray, start: int
 ) -> np.ndarray:
-    """Move points with Gaussians. Without visible Gaussians, points stay.
-
-    Args:
-      points: [points, 3] positions at the start time.
-      means: [times, gaussians, 3] means of the Gaussians.
-      opacity: [gaussians] opacities at the start time. Those of inactive Gaussians are
-        zero, so they move nothing.
-      start: Index of the start time.
-
-    Returns:
-      [points, times, 3] positions.
-    """
+    """Move points with Gaussians. Without visible Gaussians, points stay."""
     rows = np.flatnonzero(opacity > LEAST_OPACITY)
     path = np.repeat(points[:, None].astype(float), len(means), axis=1)
     if not len(rows):

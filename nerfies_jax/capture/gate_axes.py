@@ -42,7 +42,7 @@ def findings(capture: Capture) -> list[Finding]:
     rotates = len(position) >= LEAST_FRAMES and np.ptp(rotation, axis=0).max() > TURNS
     if fixed and not rotates:
         return []
-    look = look_of(rotation[:, 2], position)
+    look = _look_of(rotation[:, 2], position)
     subject = "common point"
     value = f"{look.ahead:.0%} of the cameras look toward it"
     if look.crosses < CROSSES:
@@ -51,7 +51,7 @@ def findings(capture: Capture) -> list[Finding]:
         return [Finding(subject, value)]
     readings = _other_conventions(capture, rotation, position)
     for reason, (other_rotation, other_position) in readings.items():
-        other = look_of(other_rotation[:, 2], other_position)
+        other = _look_of(other_rotation[:, 2], other_position)
         if other.ahead >= AHEAD and other.passes <= PASSES and other.crosses >= CROSSES:
             problem = (
                 f"{look.ahead:.0%} of the cameras look toward a common point, and "
@@ -62,16 +62,8 @@ def findings(capture: Capture) -> list[Finding]:
     return [Finding(subject, value)]
 
 
-def look_of(axes: np.ndarray, position: np.ndarray) -> Look:
-    """Measure how cameras look at the point nearest to all their axes.
-
-    Args:
-      axes: Viewing directions, [frames, 3].
-      position: Positions, [frames, 3].
-
-    Returns:
-      The measures.
-    """
+def _look_of(axes: np.ndarray, position: np.ndarray) -> Look:
+    """Measure how cameras look at the point nearest to all their axes."""
     across = across_ray(axes)
     matrix, origin = across.sum(0), position.mean(0)
     right = np.einsum("nij,nj->i", across, position - origin)

@@ -39,9 +39,9 @@ def convert(
       ValueError: If the rows are not valid.
     """
     images, poses, times, focal = read_npz(pathlib.Path(file))
-    train, heldout, note = rows_of(poses, heldout, train, str(file))
+    train, heldout, note = _rows_of(poses, heldout, train, str(file))
     common = {"camera_angle_x": 2 * math.atan(images.shape[2] / 2 / focal)}
-    background = background_of(images)
+    background = _background_of(images)
     if background is not None:
         common["background"] = background
     with new_folder(out) as folder:
@@ -134,21 +134,8 @@ def read_npz(path):
     return images, poses.astype(float), times, focal
 
 
-def rows_of(poses, heldout, train, where):
-    """Split rows into training and held-out ones.
-
-    Args:
-      poses: Camera-to-world matrices, [rows, 4, 4] or [rows, 3, 4].
-      heldout: Rows to hold out, as "first:last+1", or None.
-      train: Rows for training, as "first:last+1", or None.
-      where: Name of the archive in error messages.
-
-    Returns:
-      Training rows, held-out rows and the reason.
-
-    Raises:
-      ValueError: If the rows overlap or are out of range.
-    """
+def _rows_of(poses, heldout, train, where):
+    """Split rows into training and held-out ones."""
     count = len(poses)
     if heldout is not None:
         heldout_rows = _range(heldout, count, "heldout")
@@ -197,15 +184,8 @@ def _range(text, count, name):
     return np.arange(first, last)
 
 
-def background_of(images):
-    """Find the background color, if nearly all image corners have the same color.
-
-    Args:
-      images: uint8 images, [rows, height, width, 3].
-
-    Returns:
-      sRGB color in [0, 1], or None.
-    """
+def _background_of(images):
+    """Find the background color, if nearly all image corners have the same color."""
     corners = images[:, [0, 0, -1, -1], [0, -1, 0, -1]].reshape(-1, 3)
     median = np.median(corners, axis=0)
     if (corners == median).all(1).mean() < 0.95:

@@ -84,7 +84,7 @@ class Archive:
         member = self._members[name]
         with self._archive.open(member) as stream:
             assert isinstance(stream, io.BufferedIOBase)  # as ZipExtFile is
-            return read_array(stream, member.file_size)
+            return _read_array(stream, member.file_size)
 
 
 @contextlib.contextmanager
@@ -154,25 +154,13 @@ def read_npy(path: AnyPath, most: int = MAX_BYTES) -> np.ndarray:
         if size > most:
             raise ValueError(f"{size} bytes; at most {most} are read")
         try:
-            return read_array(file, size)
+            return _read_array(file, size)
         except OSError as error:
             raise ValueError(str(error.strerror or error)) from None
 
 
-def read_array(stream: io.BufferedIOBase, size: int) -> np.ndarray:
-    """Read one array in NumPy's format.
-
-    Args:
-      stream: Stream that begins with the header of the array.
-      size: Number of bytes of the stream, including the header.
-
-    Returns:
-      The array.
-
-    Raises:
-      ValueError: If the header is missing, specifies Python objects, or does not match
-        the number of bytes.
-    """
+def _read_array(stream: io.BufferedIOBase, size: int) -> np.ndarray:
+    """Read one array in NumPy's format."""
     shape, column_major, dtype, header_bytes = _header(stream)
     count = math.prod(shape)
     if count * dtype.itemsize != size - header_bytes:

@@ -29,17 +29,11 @@ _folder: contextvars.ContextVar[str | None] = contextvars.ContextVar(
 
 
 @contextlib.contextmanager
-def confined(folder: AnyPath) -> Iterator[None]:
+def _confined(folder: AnyPath) -> Iterator[None]:
     """Refuse to open files outside of a folder within the block.
 
     The restriction does not extend to other threads. Wrap their functions with
     `carried`.
-
-    Args:
-      folder: The folder.
-
-    Yields:
-      None.
     """
     token = _folder.set(os.path.realpath(folder))
     try:
@@ -66,7 +60,7 @@ def confines(
         path: AnyPath, *args: Parameters.args, **options: Parameters.kwargs
     ) -> Content:
         folder = path if os.path.isdir(path) else pathlib.Path(path).parent
-        with confined(folder), decoder.session():
+        with _confined(folder), decoder.session():
             return read(path, *args, **options)
 
     return confined_read

@@ -47,7 +47,7 @@ def write(
             for name, valid in zip(capture.ids, capture.valid, strict=True):
                 image_files.write_png(folder / "masks" / f"{name}.png", valid)
         if capture.points is not None:
-            write_points(folder / POINTS, capture, units)
+            _write_points(folder / POINTS, capture, units)
         write_json(folder / "transforms.json", _transforms(capture, units))
 
 
@@ -87,14 +87,8 @@ def refuse_skew(capture: Capture, path: AnyPath, what: str) -> None:
         )
 
 
-def write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
-    """Write the points of a capture with their colors as .ply.
-
-    Args:
-      path: The file.
-      capture: The capture, which has points.
-      units: "scene" or "world" units.
-    """
+def _write_points(path: pathlib.Path, capture: Capture, units: Units) -> None:
+    """Write the points of a capture with their colors as .ply."""
     cloud = capture.points
     assert cloud is not None
     # World coordinates may be large. Those of a map in meters exceed float32 precision.

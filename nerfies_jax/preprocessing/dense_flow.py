@@ -130,16 +130,8 @@ def reduced(shift: np.ndarray, times: int) -> np.ndarray:
     return cv2.resize(shift, size, interpolation=cv2.INTER_AREA) / times
 
 
-def enlarged_flow(shift: np.ndarray, times: int) -> np.ndarray:
-    """Convert flow to flow between enlarged images. Inverts `reduced`.
-
-    Args:
-      shift: Flow in pixels, [height, width, 2].
-      times: Integer factor of the enlargement.
-
-    Returns:
-      Flow in pixels of the enlarged images, [times height, times width, 2].
-    """
+def _enlarged_flow(shift: np.ndarray, times: int) -> np.ndarray:
+    """Convert flow to flow between enlarged images. Inverts `reduced`."""
     size = times * shift.shape[1], times * shift.shape[0]
     return times * cv2.resize(np.ascontiguousarray(shift), size)
 
@@ -217,7 +209,7 @@ def between_neighbors(
             tuple(_smaller(picture, times) for picture in pair),
             step,
             place(step),
-            lambda guess: reduced(search(*pair, enlarged_flow(guess, times)), times),
+            lambda guess: reduced(search(*pair, _enlarged_flow(guess, times)), times),
             span,
         )
 
@@ -292,7 +284,7 @@ def _go_on(flow, frame, pictures, search):
     times = pictures.shape[2] // width
 
     def again(one, other, guess):
-        guess = enlarged_flow(guess, times)
+        guess = _enlarged_flow(guess, times)
         return reduced(search(pictures[one], pictures[other], guess), times)
 
     there = again(frame, frame + 1, -flow.backward[frame])

@@ -39,7 +39,7 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
             f"{len(points)} static points; {GROUPS * MIN_POINTS} are needed",
             threshold,
         )
-    light = sightings(view_set.smaller(views, view_set.times_smaller(views)), points)
+    light = _sightings(view_set.smaller(views, view_set.times_smaller(views)), points)
     groups = np.array_split(np.argsort(_along_widest(points)), GROUPS)
     each = np.stack([gains(light[:, group]) for group in groups])
     known = np.isfinite(each).all(-1).sum(0) >= GROUPS // 2
@@ -102,16 +102,8 @@ def common_drift(gain: np.ndarray) -> tuple[float, float]:
     return float(drift), float(abs(bound - drift) / DEVIATIONS)
 
 
-def sightings(views: Views, points: np.ndarray) -> np.ndarray:
-    """Measure the linear light of points in all frames.
-
-    Args:
-      views: The frames.
-      points: Static points in scene units, [points, 3].
-
-    Returns:
-      log2 of linear light [frames, points, 3], NaN where a point is not measured.
-    """
+def _sightings(views: Views, points: np.ndarray) -> np.ndarray:
+    """Measure the linear light of points in all frames."""
     light = np.full((len(views.row), len(points), 3), np.nan)
     for index in range(len(views.row)):
         pixel, depth = view_set.project(views, index, points)

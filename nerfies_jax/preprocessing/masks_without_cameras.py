@@ -29,17 +29,11 @@ AS_GOOD = 0.9
 RIM_SHARE = 0.02  # margin of masks relative to the width, because features have a size
 
 
-def moving_masks(images: np.ndarray) -> np.ndarray:
+def _moving_masks(images: np.ndarray) -> np.ndarray:
     """Segment moving pixels of a video.
 
     In built-in scenes of 60 frames, 68 % (`default`) to 100 % (`rigid`) of moving
     pixels are masked, and 81 to 94 % of static pixels are not.
-
-    Args:
-      images: uint8 images in order of time, [frames, height, width, 3].
-
-    Returns:
-      Booleans, [frames, height, width].
     """
     whole = view_set.without_cameras(images)
     views = view_set.smaller(whole, view_set.times_smaller(whole))
@@ -88,7 +82,7 @@ def moving_in(pictures: pathlib.Path) -> dict[str, np.ndarray]:
             f"{pictures}: images of {len(sizes)} sizes; frames of a video must have "
             "one size: resize them"
         )
-    return dict(zip(names, moving_masks(np.stack(read)), strict=True))
+    return dict(zip(names, _moving_masks(np.stack(read)), strict=True))
 
 
 def _off_the_camera_motion(tracks, within):

@@ -55,7 +55,7 @@ def motion(views: Views, shapes: np.ndarray) -> Finding:
     """
     threshold = f"{BARE_SHARE:.0%} of the outlines not explained by a static object"
     box = _box(views, shapes)
-    bare = np.array([]) if box is None else uncovered(views, shapes, box)
+    bare = np.array([]) if box is None else _uncovered(views, shapes, box)
     if not bare.size:
         return cannot_tell(EFFECT, "the outlines have no common volume", "")
     value = float(bare.mean())
@@ -72,21 +72,13 @@ def motion(views: Views, shapes: np.ndarray) -> Finding:
     return Finding(EFFECT, evidence, threshold, wanted, confidence, numbers)
 
 
-def uncovered(
+def _uncovered(
     views: Views, shapes: np.ndarray, box: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
     """Compute the share of each silhouette that the visual hull does not fill.
 
     The hull is computed from silhouettes dilated by `SLACK_PX`, and must fill those
     eroded by `SLACK_PX`. Cells outside of an image are not cut by it.
-
-    Args:
-      views: The frames.
-      shapes: Silhouettes, [frames, height, width].
-      box: Lower and upper corner of the volume in scene units.
-
-    Returns:
-      Shares, [frames].
     """
     low, high = box
     side = (high - low).max() / SIDE

@@ -31,16 +31,8 @@ DEPTH_KNOWN, DEPTH_AGREES = 0.05, 0.2
 STILL_SHARE = 0.8  # of the points that can be checked
 
 
-def coverage(views: Views, points: np.ndarray) -> float:
-    """Compute the share of image cells with observed pixels that contain a point.
-
-    Args:
-      views: The frames.
-      points: Points in scene units, [points, 3].
-
-    Returns:
-      The share.
-    """
+def _coverage(views: Views, points: np.ndarray) -> float:
+    """Compute the share of image cells with observed pixels that contain a point."""
     across, down = CELLS
     width, height = views.size
     held = shown = 0
@@ -62,17 +54,8 @@ def coverage(views: Views, points: np.ndarray) -> float:
     return held / shown if shown else 0.0
 
 
-def moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> float:
-    """Compute the share of cells with moving pixels that contain a point.
-
-    Args:
-      views: The frames.
-      evidence: Their preprocessing.
-      points: Points in scene units, [points, 3].
-
-    Returns:
-      The share, NaN if nothing moves.
-    """
+def _moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> float:
+    """Compute the share of cells with moving pixels that contain a point."""
     across, down = CELLS
     width, height = views.size
     size = height // down, width // across
@@ -120,8 +103,8 @@ def start(
     if count == 0:
         measurement = "the capture has no points: Gaussians are initialized at random"
         return Finding(START, measurement, threshold, False, CERTAIN, {"points": 0.0})
-    covered = coverage(views, points)
-    inside = moving_coverage(views, evidence, points)
+    covered = _coverage(views, points)
+    inside = _moving_coverage(views, evidence, points)
     enough = judge(count, MIN_POINTS, np.sqrt(count))
     spread = judge(covered, COVERED, 0.02)
     # Both conditions must hold. The confidence is that of the less certain one.

@@ -59,7 +59,7 @@ def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
         if not len(tracks.seen):
             continue
         rest = rest_points.fit(near, tracks)
-        kept = placed(near, tracks, rest)
+        kept = _placed(near, tracks, rest)
         places.append(rest.position[kept])
         pixel = starts[enough][kept, 1:].astype(int)
         colors.append(views.image[center][pixel[:, 1], pixel[:, 0]])
@@ -107,17 +107,8 @@ def without(tracks: Tracks, moving: np.ndarray) -> Tracks:
     return tracks._replace(seen=tracks.seen & ~moving[frames, row, column])
 
 
-def placed(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
-    """Select tracks that fit their static point and determine its depth.
-
-    Args:
-      views: The frames.
-      tracks: The tracks.
-      rest: Their static points.
-
-    Returns:
-      Booleans, [tracks].
-    """
+def _placed(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
+    """Select tracks that fit their static point and determine its depth."""
     explained = rest_points.miss(rest) < MISS_PX
     return explained & (depth_deviation(views, tracks, rest) < DEPTH_DEVIATION)
 

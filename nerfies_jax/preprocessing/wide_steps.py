@@ -71,31 +71,22 @@ def improved(
     Returns:
       Flow in pixels, [height, width, 2].
     """
-    near, far = (plane_flow(views, pair, depth) for depth in span)
+    near, far = (_plane_flow(views, pair, depth) for depth in span)
     apart = float(np.median(np.linalg.norm(near - far, axis=-1)))
     count = int(np.clip(np.ceil(apart / (STEP_SHARE * flow.shape[1])), 1, MOST_PLANES))
     share = (np.arange(count) + 0.5) / count
     inverse = share / span[0] + (1 - share) / span[1]
     best, lowest = flow.copy(), OWN * unlike(pictures, flow)
     for depth in 1 / inverse:
-        guided = search(plane_flow(views, pair, depth))
+        guided = search(_plane_flow(views, pair, depth))
         cost = unlike(pictures, guided)
         better = cost < lowest
         best[better], lowest[better] = guided[better], cost[better]
     return best
 
 
-def plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray:
-    """Compute the flow of a static plane at a z-depth of the first frame.
-
-    Args:
-      views: The frames.
-      pair: Indices of the two frames.
-      depth: z-depth in scene units.
-
-    Returns:
-      Flow in pixels, [height, width, 2].
-    """
+def _plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray:
+    """Compute the flow of a static plane at a z-depth of the first frame."""
     one, other = pair
     width, height = views.size
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)

@@ -72,7 +72,7 @@ class Path:
             for value in (self.cycles, self.phase, self.sway, place)
         )
         shift = sway * jnp.sin(2 * jnp.pi * (cycles * time + phase))
-        rotation = axis_rotation(self.axis, 2 * jnp.pi * self.turns * time)
+        rotation = _axis_rotation(self.axis, 2 * jnp.pi * self.turns * time)
         return Pose(rotation, origin + shift)
 
 
@@ -119,7 +119,7 @@ class Arm:
         position = jnp.asarray(place, time.dtype)
         for hinge in reversed(self.hinges):
             swing = jnp.sin(2 * jnp.pi * (hinge.cycles * time + hinge.phase))
-            joint = axis_rotation(hinge.axis, hinge.rest_rad + hinge.swing_rad * swing)
+            joint = _axis_rotation(hinge.axis, hinge.rest_rad + hinge.swing_rad * swing)
             pivot = jnp.asarray(hinge.pivot, time.dtype)
             rotation = exact_product(joint, rotation)
             position = exact_product(joint, position - pivot) + pivot
@@ -201,17 +201,10 @@ def to_body(pose: Pose, point: Float[Array, "3"]) -> Float[Array, "3"]:
     return exact_product(pose.rotation.T, point - pose.position)
 
 
-def axis_rotation(axis: Vector, angle_rad: Float[Array, ""]) -> Float[Array, "3 3"]:
+def _axis_rotation(axis: Vector, angle_rad: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Return the rotation about a fixed axis (Rodrigues' formula).
 
     It is a smooth function of the angle everywhere.
-
-    Args:
-      axis: The axis, of any length.
-      angle_rad: Angle in radians.
-
-    Returns:
-      Rotation matrix, [3, 3].
     """
     x, y, z = unit_axis(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

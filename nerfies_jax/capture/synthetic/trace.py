@@ -164,7 +164,7 @@ def shade(
     """
     dtype = direction.dtype
     toward_light = jnp.asarray(motion.unit_axis(spec.light), dtype)
-    base = surface_color(spec, jnp.maximum(hit.thing, 0), hit.material)
+    base = _surface_color(spec, jnp.maximum(hit.thing, 0), hit.material)
     lambert = jnp.maximum(jnp.sum(hit.normal * toward_light), 0)
     # Ambient light is stronger from above, which gives shaded surfaces some shading.
     sky = 0.75 + 0.25 * hit.normal[1]
@@ -179,19 +179,10 @@ def shade(
     return light_gain * jnp.where(hit.thing == NOTHING, background, color)
 
 
-def surface_color(
+def _surface_color(
     spec: SceneSpec, thing: Int[Array, ""], material: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """Evaluate the linear albedo of a material point.
-
-    Args:
-      spec: The scene.
-      thing: Id of the object, traced.
-      material: Material point, [3].
-
-    Returns:
-      Albedo for each channel, [3].
-    """
+    """Evaluate the linear albedo of a material point."""
     textures = [body.texture for body in spec.all_things()]
     return texture.albedo(textures, thing, material)
 
