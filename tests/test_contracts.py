@@ -174,7 +174,7 @@ SETTINGS = {
     "compositing.intervals": {"last": 1e10},
     **{
         f"sampling.{name}": {"key": None, "count": 4}
-        for name in ("stratified", "sample_pdf", "refine")
+        for name in ("stratified", "sample_pdf", "refine", "centered")
     },
     "sampling.among": {"key": None, "count": 4, "empty": 0.05},
     **{

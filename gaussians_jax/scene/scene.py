@@ -13,6 +13,7 @@ from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Params, Splats
 from gaussians_jax.init import points as initialization
 from gaussians_jax.init.points import StartSpec
+from gaussians_jax.losses import transients
 from gaussians_jax.motion import deformation
 from gaussians_jax.optim import phases
 from gaussians_jax.scene import growth, update
@@ -361,7 +362,12 @@ def loss_of(
     assert observation.rendering is not None
     assert condition.step is not None
     assert condition.key is not None
-    color = observation.rendering.color
+    color, logged = observation.rendering.color, {}
+    if spec.transients is not None:
+        valid, share = transients.static_pixels(
+            spec.transients, color, truth, valid, condition.step
+        )
+        logged = {transients.SHARE: share}
     photometric = losses.photometric(
         color, truth, valid, dssim_weight=spec.dssim_weight
     )
@@ -378,7 +384,7 @@ def loss_of(
     if strategy is not None and hasattr(strategy, "loss"):
         for name, term in as_terms(strategy.loss(params, context)).items():
             terms[f"{name_of(strategy)}/{name}"] = term
-    metrics = {"mse": losses.mse(color, truth, valid)} | values(terms)
+    metrics = {"mse": losses.mse(color, truth, valid)} | logged | values(terms)
     return weighted_sum(terms, photometric), metrics
 
 

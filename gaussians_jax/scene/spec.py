@@ -17,6 +17,7 @@ from gaussians_jax.losses.opacity_scale import OpacityScaleSpec
 from gaussians_jax.losses.point_depth import PointDepthSpec
 from gaussians_jax.losses.smooth_depth import SmoothDepthSpec
 from gaussians_jax.losses.spectral import SpectralSpec
+from gaussians_jax.losses.transients import TransientMaskSpec
 from gaussians_jax.motion import carried, time_basis
 from gaussians_jax.motion import embedding as embedding_motion
 from gaussians_jax.motion import kan as kan_motion
@@ -122,6 +123,7 @@ class SplatScene:
     opacity_scale: OpacityScaleSpec | None = None
     smooth_depth: SmoothDepthSpec | None = None
     point_depth: PointDepthSpec | None = None
+    transients: TransientMaskSpec | None = None
     poses: PoseRefinementSpec | CameraOptimizer | Settings | None = None
     # In addition to those with a field of their own.
     regularizers: tuple[Regularizer | Settings, ...] = ()

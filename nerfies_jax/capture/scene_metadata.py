@@ -6,10 +6,13 @@ import itertools
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture, point_depths
+from nerfies_jax.geometry import camera as cameras
 
 MIN_POINTS = 100  # fewer points do not determine the bounds of the scene
 # Share of points at either end taken for outliers of structure from motion.
 OUTLIERS = 0.02
+SHOWN_BY = 0.7  # share of the images that show the most visible points
+SUBJECT_MARGIN = 1.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,19 +32,25 @@ class SceneMetadata:
     available_data: frozenset[str] = frozenset()  # of "depths", "points", "flow"
 
 
-def metadata_of(capture: Capture, extent: float | None) -> SceneMetadata:
+def metadata_of(
+    capture: Capture, extent: float | None, volume: str = "frustums"
+) -> SceneMetadata:
     """Compute the scene metadata of a capture, on the host.
 
     Args:
       capture: The capture.
       extent: Longest half side of the captured volume in units of the field. None keeps
         the capture's own coordinates.
+      volume: "frustums" for all that the cameras may see, or "subject" for what most
+        of them look at.
 
     Returns:
       The metadata.
     """
     near, far = _span(capture)
     center, half_side = _box(capture, near, far)
+    if volume == "subject":
+        center, half_side = _subject(capture) or (center, half_side)
     if extent is None:
         center, scale = (0.0, 0.0, 0.0), 1.0
     else:
@@ -99,25 +108,48 @@ def _box(capture, near, far):
     return (low + high) / 2, half_side
 
 
+def _subject(capture):
+    """Center and longest half side of the points that most images show.
+
+    The cameras of a photo collection stand at several times the size of what they look
+    at, and a box around them all leaves it few cells of a grid.
+    """
+    if capture.points is None or len(capture.points.position) < MIN_POINTS:
+        return None
+    position = capture.points.position
+    width, height = capture.size
+    shown = np.zeros(len(position), int)
+    for row in capture.train:
+        camera = cameras.take(capture.cameras, row)
+        x, y, z = camera.camera_from_world @ (position - camera.position).T
+        focal = camera.focal_px * np.array([1, camera.pixel_aspect])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = focal[0] * x / z + camera.principal_point_px[0]
+            v = focal[1] * y / z + camera.principal_point_px[1]
+        shown += (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    often = shown >= SHOWN_BY * np.quantile(shown, 1 - OUTLIERS)
+    low, high = np.quantile(position[often], (OUTLIERS, 1 - OUTLIERS), axis=0)
+    half_side = SUBJECT_MARGIN * float(np.max(high - low)) / 2
+    return ((low + high) / 2, half_side) if half_side > 0 else None
+
+
 def _frustum_points(capture, near, far, depths=8):
     """Corners, edge midpoints and centers of the images at some depths, in scene units.
 
     Skew and distortion are ignored, since the bounds are approximate.
     """
-    cameras = capture.cameras
-    rows = capture.train
+    views = cameras.take(capture.cameras, capture.train)
     width, height = capture.size
-    rotation = cameras.camera_from_world[rows]
-    focal = cameras.focal_px[rows]
-    focal = np.stack([focal, focal * cameras.pixel_aspect[rows]], axis=1)
-    middle = cameras.principal_point_px[rows]
+    rotation, focal = views.camera_from_world, views.focal_px
+    focal = np.stack([focal, focal * views.pixel_aspect], axis=1)
+    middle = views.principal_point_px
     points = []
     for x, y in itertools.product((0.0, width / 2, width), (0.0, height / 2, height)):
         offset = (np.array([x, y]) - middle) / focal
-        ray = np.concatenate([offset, np.ones((len(rows), 1))], axis=1)
+        ray = np.concatenate([offset, np.ones((len(capture.train), 1))], axis=1)
         world = np.einsum("fki,fk->fi", rotation, ray)
         for depth in np.linspace(near, far, depths):
-            points.append(cameras.position[rows] + depth * world)
+            points.append(views.position + depth * world)
     return np.concatenate(points)
 
 

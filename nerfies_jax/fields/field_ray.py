@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from nerfies_jax.capture.scene_metadata import SceneMetadata
 from nerfies_jax.fields import occupancy, sampling
-from nerfies_jax.fields.spec import RadianceScene
+from nerfies_jax.fields.spec import CENTER, RadianceScene
 from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 
@@ -95,7 +95,9 @@ def first_distances(
     key: Key[Array, ""] | None,
     guide: occupancy.Cells | None,
 ) -> Float[Array, " coarse"]:
-    """Sample distances for the first level, uniformly or mostly in occupied cells.
+    """Sample distances for the first level.
+
+    They are uniform, dense in the captured volume, or mostly in occupied cells.
 
     Args:
       spec: The scene.
@@ -107,6 +109,13 @@ def first_distances(
       Sorted distances, [coarse].
     """
     plan = spec.sampling
+    if plan.spacing == CENTER:
+        assert spec.extent is not None
+        # Field coordinates have their origin at the center of the volume.
+        middle = -jnp.sum(ray.origin * ray.direction)
+        miss_sq = jnp.sum(jnp.square(ray.origin + middle * ray.direction))
+        width = jnp.sqrt(spec.extent**2 + miss_sq)
+        return sampling.centered(key, ray.near, ray.far, plan.coarse, middle, width)
     if guide is None:
         return sampling.stratified(key, ray.near, ray.far, plan.coarse, plan.spacing)
     assert spec.extent is not None

@@ -11,6 +11,7 @@ from nerfies_jax.geometry.precision import near_one, widened
 
 SPACINGS = ("linear", "disparity")
 COUNTED = 65  # maximum number of bins for counting instead of searching
+WIDTHS = 1e4  # distance from the middle up to which centered samples are drawn
 NERF_FLOOR = 1e-5  # added to every weight in the published codes
 
 
@@ -73,6 +74,42 @@ def stratified(
     upper = jnp.concatenate([halfway, even[-1:]])
     jitter = jax.random.uniform(key, (count,), near.dtype)
     return jnp.minimum(lower + (upper - lower) * jitter, upper)
+
+
+def centered(
+    key: Key[Array, ""] | None,
+    near: Float[Array, ""],
+    far: Float[Array, ""],
+    count: int,
+    middle: Float[Array, ""],
+    width: Float[Array, ""],
+) -> Float[Array, " count"]:
+    """Sample distances in [near, far] that are dense around a middle.
+
+    The density is 1 / (width² + (t - middle)²). Samples are at equal angles as seen
+    from a point at the distance `width` from the middle of the ray. They have no
+    gradient.
+
+    Args:
+      key: PRNG key, or None.
+      near: Distance of the first sample.
+      far: Distance of the last sample.
+      count: Number of samples, at least 2.
+      middle: Distance of the largest density.
+      width: Half width of the density at half of its maximum, positive.
+
+    Returns:
+      Sorted distances, [count].
+    """
+    near, far, middle, width = jax.lax.stop_gradient((near, far, middle, width))
+    width = jnp.where(width > 0, width, 1)  # finite also for a width of zero
+    # Farther away, angles round to a right one.
+    start, end = (
+        jnp.arctan(jnp.clip((side - middle) / width, -WIDTHS, WIDTHS))
+        for side in (near, far)
+    )
+    angle = stratified(key, start, end, count)
+    return jnp.clip(middle + width * jnp.tan(angle), near, far)
 
 
 def among(

@@ -7,6 +7,7 @@ from typing import TypeVar
 import optax
 
 from nerfies_jax.capture.scene_metadata import SceneMetadata
+from nerfies_jax.fields import sampling
 from nerfies_jax.fields.effects import moving_mask, records, smoothness, surface
 from nerfies_jax.fields.effects.ambient import AmbientSpec
 from nerfies_jax.fields.effects.appearance import AppearanceSpec
@@ -31,6 +32,8 @@ from nerfies_jax.training.protocols import Optimizer, Regularizer
 from nerfies_jax.training.track_start import FieldStartSpec
 
 OPTIMIZERS = {"adam": optax.scale_by_adam}
+CENTER = "center"  # spacing of samples around the captured volume
+VOLUMES = ("frustums", "subject")
 PROTOCOLS = {"transient": Medium, "warp": Warp}
 
 
@@ -43,11 +46,15 @@ class SamplingSpec:
     samples. Otherwise the larger network evaluates half as many samples, few of them in
     empty space. `block` is the number of rays that are rendered at a time, which makes
     memory independent of the image size.
+
+    With the spacing "center" the first samples of a ray are dense in the captured
+    volume and get sparser with the distance from it. This suits cameras that look at
+    one subject from various distances.
     """
 
     coarse: int = 64
     fine: int = 128
-    spacing: str = "linear"  # or "disparity"
+    spacing: str = "linear"  # or "disparity", or "center"
     jitter: bool = True  # while training
     shared: bool = False  # one network for both levels (D-NeRF)
     union: bool = True  # the fine level also evaluates the coarse samples
@@ -60,9 +67,9 @@ class SamplingSpec:
                 "sampling needs coarse >= 3, fine >= 0 and block >= 1, got "
                 f"coarse={self.coarse}, fine={self.fine}, block={self.block}"
             )
-        if self.spacing not in ("linear", "disparity"):
+        if self.spacing not in (*sampling.SPACINGS, CENTER):
             raise ValueError(
-                f"spacing={self.spacing!r} must be 'linear' or 'disparity'"
+                f"spacing={self.spacing!r} must be 'linear', 'disparity' or 'center'"
             )
         if self.spacing != "linear" and self.occupancy is not None:
             raise ValueError(
@@ -89,6 +96,9 @@ class RadianceScene:
     # Longest half side of the captured volume in units of the field. None to keep the
     # coordinates of the capture.
     extent: float | None = 1.0
+    # The captured volume: all that cameras may see ("frustums"), or a box around the
+    # points that most images show ("subject"), for photographs from various distances.
+    volume: str = "frustums"
     # Decays log-linearly to `learning_rate_end`.
     learning_rate: float = 5e-4
     learning_rate_end: float = 5e-5
@@ -159,6 +169,13 @@ class RadianceScene:
         if self.extent is not None and not 0 < self.extent < math.inf:
             raise ValueError(
                 f"extent={self.extent} must be positive and finite, or none"
+            )
+        if self.volume not in VOLUMES:
+            raise ValueError(f"volume={self.volume!r} must be one of {VOLUMES}")
+        if self.sampling.spacing == CENTER and self.extent is None:
+            raise ValueError(
+                "spacing='center' is relative to the captured volume; set extent=1.0, "
+                "or spacing='linear'"
             )
         schedules.check_falling(self.learning_rate, self.learning_rate_end)
         for name in ("elastic", "background"):

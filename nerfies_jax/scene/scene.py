@@ -65,7 +65,7 @@ def metadata_of(capture: Capture, spec: RadianceScene) -> SceneMetadata:
     Returns:
       The metadata.
     """
-    return scene_metadata.metadata_of(capture, spec.extent)
+    return scene_metadata.metadata_of(capture, spec.extent, spec.volume)
 
 
 def build(

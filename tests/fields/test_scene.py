@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from nerfies_jax import evaluation
+from nerfies_jax.capture import synthetic
+from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.capture.scene_metadata import SceneMetadata
+from nerfies_jax.capture.synthetic import rendering
 from nerfies_jax.fields import compositing, field_ray
 from nerfies_jax.fields.effects.ambient import AmbientSpec
 from nerfies_jax.fields.effects.appearance import AppearanceSpec
@@ -20,6 +23,7 @@ from nerfies_jax.fields.effects.transient import TransientSpec
 from nerfies_jax.fields.effects.warp import WarpSpec
 from nerfies_jax.fields.spec import SamplingSpec
 from nerfies_jax.fields.template import TemplateSpec
+from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.nn.planes import PlanesSpec
 from nerfies_jax.scene import presets, scene
@@ -291,6 +295,40 @@ def test_the_filmed_volume_fills_the_box():
     own = scene.metadata_of(capture, dataclasses.replace(STATIC, extent=None))
     assert own.scale == 1
     assert own.center == (0, 0, 0)
+
+
+def test_the_subject_of_scattered_photographs_fills_the_box():
+    capture = scenes.tiny_capture()
+    photographs = dataclasses.replace(
+        synthetic.PRESETS["collection"],
+        size=capture.size,
+        frames=len(capture.train),
+        heldout_every=len(capture.train) // len(capture.heldout),
+    )
+    views = rendering.schedule(photographs, seed=0).cameras
+    views = cameras.take(views, np.arange(len(capture.ids)))
+    capture = dataclasses.replace(capture, cameras=views)
+    rng = np.random.default_rng(0)
+    subject = rng.uniform(-0.05, 0.05, (400, 3)).astype(np.float32)
+    around = rng.uniform(-2, 2, (400, 3)).astype(np.float32)
+    position = np.concatenate([subject, around])
+    points = PointCloud(position, np.zeros((800, 3), np.uint8))
+    capture = dataclasses.replace(capture, points=points)
+    spec = dataclasses.replace(STATIC, volume="subject")
+    metadata = scene.metadata_of(capture, spec)
+    inside = (subject - np.asarray(metadata.center)) * metadata.scale
+    assert 0.3 < np.abs(inside).max() < 1
+    assert scene.metadata_of(capture, STATIC).scale < metadata.scale / 3
+    # Samples of the first level are dense there, and those of a video are even.
+    view = jax.tree.map(jnp.asarray, cameras.take(views, 0))
+    whole = dataclasses.replace(metadata, near=0.3, far=4.0)
+    field_ray_, _ = field_ray.field_ray_through(whole, view, jnp.float32([20, 15]))
+    centered = dataclasses.replace(
+        spec, sampling=dataclasses.replace(spec.sampling, coarse=32, spacing="center")
+    )
+    distance = field_ray.first_distances(centered, field_ray_, None, None)
+    point = field_ray_.origin + distance[:, None] * field_ray_.direction
+    assert np.mean(np.abs(point).max(axis=1) < 1.5) > 0.4
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from nerfies_jax.training.effects import (
     Table,
     Term,
 )
+from nerfies_jax.training.step_counts import steps
 
 NAME = TABLE = "transient"
 
@@ -40,6 +41,10 @@ class TransientSpec:
     likelihood. `density_weight` is lambda_u of the paper, which keeps the static scene
     out of the transient medium. `beta_power` is that of `photometric`. Zero is the loss
     of the paper. With one, short runs also learn regions of high uncertainty.
+
+    The medium is absent for `hold_steps`, so that the static scene explains what it
+    can before. `density_bias` is added to the density before its activation. Negative
+    values start with less density, and the static scene is visible through it.
     """
 
     code_width: int = 16
@@ -48,6 +53,8 @@ class TransientSpec:
     beta_min: float = 0.03
     density_weight: float = 0.01
     beta_power: float = 0.0
+    density_bias: float = 0.0
+    hold_steps: int = steps(0)
 
     name = NAME
 
@@ -70,6 +77,13 @@ class TransientSpec:
             raise ValueError(
                 f"beta_power={self.beta_power} must be in [0, 2]: 0 is the likelihood, "
                 "at 2 colors learn as from a squared error"
+            )
+        if not math.isfinite(self.density_bias):
+            raise ValueError(f"density_bias={self.density_bias} must be finite")
+        if self.hold_steps < 0:
+            raise ValueError(
+                f"hold_steps={self.hold_steps} must not be negative; 0 starts with the "
+                "medium"
             )
         network(self, 1)  # refuses wrong depths and widths
 
@@ -148,8 +162,14 @@ def medium(
     """
     inputs = jnp.concatenate([sample.features, condition.codes[TABLE]])
     raw = mlp.apply(network(spec, sample.features.shape[-1]), params, inputs)
+    density = raw["density"][0]
+    if spec.density_bias:
+        density = density + spec.density_bias
+    density = jax.nn.softplus(density)
+    if spec.hold_steps and condition.step is not None:
+        density = jnp.where(condition.step < spec.hold_steps, 0, density)
     return Medium(
-        density=jax.nn.softplus(raw["density"][0]),
+        density=density,
         color=jax.nn.sigmoid(raw["color"]),
         beta=jax.nn.softplus(raw["beta"][0]),
     )
@@ -236,8 +256,11 @@ def penalty(spec: TransientSpec, context: PenaltyContext) -> dict[str, Term]:
       context: Context of the step.
 
     Returns:
-      The term "density".
+      The terms "density", and "share": the mean opacity of the medium, which is not
+      part of the loss.
     """
-    density = context.levels[-1].media[NAME].density
-    value = losses.masked_mean(density, context.batch.valid)
-    return {"density": Term(value, spec.density_weight)}
+    level = context.levels[-1]
+    value = losses.masked_mean(level.media[NAME].density, context.batch.valid)
+    explained = jnp.sum(level.media_weight[NAME], axis=-1)
+    share = losses.masked_mean(explained[..., None], context.batch.valid)
+    return {"density": Term(value, spec.density_weight), "share": Term(share, None)}

@@ -1,5 +1,6 @@
 """The transient medium and its loss, against loops in NumPy and closed forms."""
 
+import dataclasses
 import math
 
 import jax
@@ -209,9 +210,11 @@ def test_photometric_has_its_slopes(float64, rng):
 def context(dtype, density, valid):
     medium = Medium(density, jnp.zeros((*density.shape, 3), dtype))
     nothing = RayOutput(**dict.fromkeys(RayOutput._fields))
+    weight = {"transient": jnp.full(density.shape, 0.5 / density.shape[-1], dtype)}
+    fine = nothing._replace(media={"transient": medium}, media_weight=weight)
     batch = Batch(**dict.fromkeys(Batch._fields))
     return PenaltyContext(**dict.fromkeys(PenaltyContext._fields))._replace(
-        levels=(nothing, nothing._replace(media={"transient": medium})),
+        levels=(nothing, fine),
         batch=batch._replace(valid=jnp.asarray(valid)),
     )
 
@@ -223,8 +226,25 @@ def test_the_penalty_is_the_mean_density_of_the_fine_samples(dtype):
 
     density = np.array([[0.0, 1.0, 2.0], [5.0, 4.0, 0.0], [1e6, 1.0, 1.0]], dtype)
     terms = penalty(density)
-    assert set(terms) == {"density"}
+    assert set(terms) == {"density", "share"}
     # 12 over six samples; the third ray was not filmed
     assert terms["density"].value == 2.0
     assert terms["density"].value.dtype == dtype
     np.testing.assert_allclose(terms["density"].weight, 0.01)
+    # The share of the pixels that it explains is logged only.
+    assert terms["share"].weight is None
+    np.testing.assert_allclose(terms["share"].value, 0.5)
+
+
+def test_a_held_medium_is_absent_at_first_and_can_start_thin(dtype):
+    spec = dataclasses.replace(SPEC, density_bias=-6.0, hold_steps=10)
+    params, met, when = params_of(dtype), sample(dtype), condition(dtype)
+    usual = medium_of(SPEC, params, met, when)
+
+    def at(step):
+        return medium_of(spec, params, met, when._replace(step=jnp.int32(step)))
+
+    assert at(9).density == 0
+    thin = math.log1p(math.expm1(float(usual.density)) * math.exp(-6))
+    np.testing.assert_allclose(at(10).density, thin, rtol=1e-4)
+    np.testing.assert_array_equal(at(10).color, usual.color)
