@@ -4,7 +4,7 @@ NeRF-W (Martin-Brualla et al. 2021, arXiv:2008.02268, "transient objects"): next
 static field each photograph has its own medium with density, color and an uncertainty
 `beta`, which represents people and cars. Renders include it. Held-out frames use codes
 interpolated between those of their neighbors in time. It is left out by
-`variants.without_effects`, and in the evaluation of `held_out_codes.score`, as in the
+`variants.without_effects`, and in the evaluation of `held_out_codes.scorer`, as in the
 paper.
 """
 
