@@ -41,6 +41,9 @@ from nerfies_jax.training.step_counts import steps
 NAME = "se3_bases"
 MEMBER_LOGIT, STILL_LOGIT = 3.0, -6.0  # of a moving point, before the fit to tracks
 SMOOTHNESS, TURN_SMOOTHNESS = 0.02, 0.002  # weights of second differences of knots
+# Weights of first differences of knots between which no path of a basis is known. With
+# second differences alone, the last velocity would continue beyond the last track.
+HOLD, TURN_HOLD = 0.2, 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,6 +226,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     logits[:, 0] = STILL_LOGIT
     logits[np.arange(len(position)), 1 + label] = MEMBER_LOGIT
     guess = Points(jnp.asarray(canonical, jnp.float32), jnp.asarray(logits), bases)
+    unknown = jnp.asarray(~_supported(times, known, label, spec), jnp.float32)
 
     def penalty(points, _times):
         def bend(table):
@@ -232,12 +236,36 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
 
         fine = points.nets.fine
         shift, turn = bend(fine.shift) / unit, bend(fine.turn)
-        return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn
+        return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn + held(fine)
+
+    def held(fine):
+        def steps(table):
+            return jnp.mean(unknown[..., None] * jnp.abs(jnp.diff(table, axis=1)))
+
+        return HOLD * steps(fine.shift) / unit + TURN_HOLD * steps(fine.turn)
 
     fine_rates, coarse_rates = Poses._make((3.0, unit)), Poses._make((0.0, 0.0))
     base_rates = Bases._make((fine_rates, coarse_rates, 0.0))
     rates = Points._make((unit, 10.0, base_rates, None))
     return Guess(guess, rates, penalty, rigid=True)
+
+
+def _supported(times, known, label, spec):
+    """Find the intervals between knots in which a path of each basis is known.
+
+    An interval that contains no frame time belongs to the frame nearest to its middle.
+
+    Returns booleans [bases, knots - 1]. Bases without paths are not restricted.
+    """
+    edges = np.linspace(0, 1, spec.knots)
+    middle = (edges[1:] + edges[:-1]) / 2
+    inside = np.abs(times - middle[:, None]) <= (edges[1] - edges[0]) / 2 + 1e-6
+    nearest = np.argmin(np.abs(times - middle[:, None]), axis=1)
+    inside[np.arange(len(middle)), nearest] = True
+    supported = np.ones((spec.bases, spec.knots - 1), bool)
+    for group in np.unique(label):
+        supported[group] = (inside & known[label == group].any(0)).any(1)
+    return supported
 
 
 def _at_knots(track, times, spec):

@@ -48,6 +48,8 @@ class Choice(NamedTuple):
     preset: str
     overrides: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()  # on undecided or unsupported effects
+    # Choice to compare this one with on frames left out of training, if in doubt.
+    alternative: "Choice | None" = None
 
 
 class Pair(NamedTuple):

@@ -3,16 +3,22 @@
 import warnings
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.preprocessing import record
+from nerfies_jax.preprocessing import tracks as tracking
+from nerfies_jax.preprocessing.moving import picture_scale
 from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.training.track_start import TrackStartSpec
 
 LEAST_SEEN = 6  # minimum number of frames in which a path is known
-LEAST_PATHS = 12
+# Minimum share of the moving pixels of all frames that have a known path near them.
+# With less, most of what moves would have a motion that nothing determines.
+LEAST_COVERAGE = 0.1
+NEAR_PX = 8.0  # at a width of 176 px, more in larger images
 LEAST_MOVING = 0.005  # of the pixels. In static videos, up to 0.4 % are marked.
 # Of the pixels. Above the first, something may move even if no path is known, unless
 # hardly any of `LEAST_TRACKS` tracks or more moves. Above the second, something moves.
@@ -69,10 +75,43 @@ def unusable(evidence: Evidence) -> str:
         return evidence.unusable
     if not evidence.told and evidence.moving.mean() < LEAST_MOVING:
         return f"only {evidence.moving.mean():.1%} of the pixels show moving objects"
-    count = len(known_paths(evidence).known)
-    if count < LEAST_PATHS:
-        return f"only {count} tracks of moving objects are long enough to fit a motion"
+    covered = coverage(evidence)
+    if covered < LEAST_COVERAGE:
+        return (
+            f"only {covered:.0%} of the moving pixels are near a track that is long "
+            f"enough to fit a motion (at least {LEAST_COVERAGE:.0%} are needed)"
+        )
     return ""
+
+
+def coverage(evidence: Evidence) -> float:
+    """Compute the share of moving pixels, over all frames, near a known path.
+
+    A path covers pixels only in frames in which it is known, so the share also measures
+    the part of the time that paths are known.
+
+    Args:
+      evidence: Preprocessing.
+
+    Returns:
+      The share, 0 if nothing moves.
+    """
+    kept = _is_known(evidence)
+    pixel = evidence.tracks.pixel[evidence.moved[kept]]
+    known = evidence.paths.known[kept]
+    shape = evidence.moving.shape[1:]
+    reach, near = NEAR_PX * picture_scale(shape[1]), 0
+    for frame in np.flatnonzero(known.any(0)):
+        away = np.ones(shape, np.uint8)
+        away[tracking.pixel_of(pixel[known[:, frame], frame], shape)] = 0
+        distance = cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        near += int((evidence.moving[frame] & (distance <= reach)).sum())
+    return near / max(int(evidence.moving.sum()), 1)
+
+
+def _is_known(evidence):
+    """Find the paths that are known in enough frames."""
+    return evidence.paths.known.sum(1) >= LEAST_SEEN
 
 
 def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
@@ -107,7 +146,7 @@ def known_paths(evidence: Evidence) -> KnownPaths:
     Returns:
       The paths.
     """
-    kept = evidence.paths.known.sum(1) >= LEAST_SEEN
+    kept = _is_known(evidence)
     paths = evidence.paths
     return KnownPaths(
         paths.position[kept], paths.known[kept], paths.depth_deviation[kept]

@@ -1,12 +1,15 @@
 """Recommended preset and overrides for a capture, for each representation."""
 
 import dataclasses
+from collections.abc import Callable
 
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.preprocessing.findings import Finding, table
 from nerfies_jax.runs import prices, representations
 from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runs.effect_choice import Trial
+from nerfies_jax.runs.run import scene_spec
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,14 +109,22 @@ def advise_for(findings: tuple[Finding, ...], preset: str) -> Advice:
 
 
 def by_tracks(
-    config: RunConfig, capture: Capture, seconds: float | int | None = None
+    config: RunConfig,
+    capture: Capture,
+    seconds: float | int | None = None,
+    try_out: Callable[[RunConfig, RunConfig, Capture, str], Trial] | None = None,
 ) -> tuple[RunConfig, list[str]]:
     """Choose a preset from the point tracks of a capture.
+
+    If tracks cover little of what moves, the choice is compared with a static preset on
+    frames left out of training, and the better one is kept.
 
     Args:
       config: Config without a preset.
       capture: The capture.
       seconds: Planned seconds of training, or None.
+      try_out: Function that compares two configs. None trains nothing, and keeps the
+        first choice.
 
     Returns:
       The config with preset and overrides, and lines of text with the reasons.
@@ -128,11 +139,35 @@ def by_tracks(
         )
     _, choose = choosing[0]
     choice = choose(capture, seconds)
+    changed, lines = _chosen(config, choice), []
+    other = choice.alternative
+    if other is not None and try_out is not None and _accepted(config, other):
+        trial = try_out(changed, _chosen(config, other), capture, other.preset)
+        lines = [
+            f"motion: after {trial.steps} steps {trial.without:.2f} dB with "
+            f"{choice.preset} and {trial.with_effect:.2f} dB with {other.preset} on "
+            f"{trial.frames} frames left out"
+        ]
+        if trial.pays:
+            lines[0] += "; motion is worth less than nothing, so the scene is static"
+            choice, changed = other, _chosen(config, other)
     words = [choice.preset, *(["--set"] if choice.overrides else []), *choice.overrides]
-    lines = [f"preset: {' '.join(words)}" + "".join(f" ({n})" for n in choice.notes)]
+    line = f"preset: {' '.join(words)}" + "".join(f" ({n})" for n in choice.notes)
+    return changed, [*lines, line]
+
+
+def _chosen(config, choice):
     overrides = (*choice.overrides, *config.overrides)
-    changed = dataclasses.replace(config, preset=choice.preset, overrides=overrides)
-    return changed, lines
+    return dataclasses.replace(config, preset=choice.preset, overrides=overrides)
+
+
+def _accepted(config, choice):
+    """Test if a preset has all components that the user's overrides set."""
+    try:
+        scene_spec(_chosen(config, choice))
+    except ValueError:
+        return False
+    return True
 
 
 def follow(

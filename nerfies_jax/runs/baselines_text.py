@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from nerfies_jax.metrics.metric_table import main_key
 
 # A static model loses a little to rounding: -0.0017 dB was measured.
-_WORSE_DB = -0.05
+WORSE_DB = -0.05
+MOSTLY_TRACKED = 0.5  # share of moving pixels near tracks. Built-in scenes have more.
 
 
 def lines(numbers: Mapping[str, float]) -> list[str]:
@@ -40,11 +41,15 @@ def lines(numbers: Mapping[str, float]) -> list[str]:
     return text
 
 
-def warnings(numbers: Mapping[str, float]) -> list[str]:
+def warnings(
+    numbers: Mapping[str, float], tracked_share: float | None = None
+) -> list[str]:
     """Warn of each baseline that the run scores below.
 
     Args:
       numbers: Metrics by key.
+      tracked_share: Share of the moving pixels near a track that the motion was
+        initialized from. None without such an initialization.
 
     Returns:
       One line for each of these baselines.
@@ -57,14 +62,27 @@ def warnings(numbers: Mapping[str, float]) -> list[str]:
             "neighboring frames; train for more steps, or use the preset that "
             "nerfies inspect_scene recommends"
         )
-    if numbers.get("motion.gain", 0.0) < _WORSE_DB:
+    if numbers.get("motion.gain", 0.0) < WORSE_DB:
         sentences.append(
             f"warning: held-out frames score {-numbers['motion.gain']:.2f} dB less "
-            "than renders of the model averaged over time, so its motion is wrong; "
-            "train for more steps, or use another preset, such as a static one "
-            "(splats-static, nerf) if nothing moves"
+            "than renders of the model averaged over time, so its motion is wrong"
+            f"{_cause(tracked_share)}; more steps do not correct it. A static preset "
+            "(splats-static, nerf) is more accurate, and external tracks and masks of "
+            "what moves, or smaller steps between frames, make motion possible"
         )
     return sentences
+
+
+def _cause(tracked_share):
+    """Name what the motion lacked, as the continuation of a sentence."""
+    if tracked_share is None:
+        return ": it was not initialized from tracks"
+    if tracked_share < MOSTLY_TRACKED:
+        return (
+            f": tracks were found near only {tracked_share:.0%} of the moving pixels, "
+            "so most of what moves was not followed"
+        )
+    return f", although tracks were found near {tracked_share:.0%} of the moving pixels"
 
 
 def _signed(decibels):

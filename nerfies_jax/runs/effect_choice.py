@@ -133,7 +133,27 @@ def compare(config: RunConfig, overrides: tuple[str, ...], capture: Capture) -> 
       KeyboardInterrupt: If the process was asked to stop.
     """
     changed = dataclasses.replace(config, overrides=(*config.overrides, *overrides))
-    with events.stage(f"trying {' '.join(overrides)}"):
+    return compare_configs(config, changed, capture, " ".join(overrides))
+
+
+def compare_configs(
+    config: RunConfig, changed: RunConfig, capture: Capture, name: str
+) -> Trial:
+    """Train two configs for a few steps, and score both like `compare`.
+
+    Args:
+      config: Config with a preset.
+      changed: Another config with a preset.
+      capture: The capture, as `stored_capture` returns it.
+      name: Name of the change, for messages about progress.
+
+    Returns:
+      The scores.
+
+    Raises:
+      KeyboardInterrupt: If the process was asked to stop.
+    """
+    with events.stage(f"trying {name}"):
         short = [_short_run(each, capture) for each in (config, changed)]
         rows = left_out(short[0].capture.train)
         without, with_effect = (

@@ -138,7 +138,7 @@ def make(
             metrics += [*fitted, *model_size(saved)]
             attempt(None, save_metrics, target / METRICS, metrics)
             main = {each.key: each.value for each in metrics}
-            warnings = baselines_text.warnings(main)
+            warnings = baselines_text.warnings(main, quality.tracked_share(run, main))
             notes = [*warnings, trained.result.message, *skipped_frames]
             notes += _capture_notes(run, folder)
             notes += [*quality_notes, *fit_notes, *saved.notes, *player_notes]

@@ -1,5 +1,6 @@
 """Quality metrics of the held-out frames of a finished run."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,8 @@ from nerfies_jax.evaluation.baseline_images import Baselines
 from nerfies_jax.evaluation.heldout import Lpips
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.metrics import perceptual
-from nerfies_jax.runs import budget
+from nerfies_jax.preprocessing import record, usable_paths
+from nerfies_jax.runs import baselines_text, budget
 from nerfies_jax.runs.config import MoreMetrics
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runtime import events
@@ -152,6 +154,28 @@ def _baselines(run, state, draw, rows, frame_seconds):
         baseline_images.neighbor_means(run.observed, rows),
         baseline_images.time_averages(draw, state, run.observed, rows, *counts),
     )
+
+
+def tracked_share(run: Run, numbers: Mapping[str, float]) -> float | None:
+    """Return the share of moving pixels near the tracks that a run started from.
+
+    Preprocessing is read from the cache, in which the initialization stored it.
+
+    Args:
+      run: The run.
+      numbers: Its metrics by key.
+
+    Returns:
+      The share. None if the motion improves the held-out frames, so that no cause is
+      needed, or if it was not initialized from tracks.
+    """
+    start = getattr(run.spec, "start", None)
+    if numbers.get("motion.gain", 0.0) >= baselines_text.WORSE_DB:
+        return None
+    if start is None or start.motion != "tracks":
+        return None
+    evidence = record.cached(run.capture, CACHE / "evidence", start.use_depths)
+    return None if usable_paths.unusable(evidence) else usable_paths.coverage(evidence)
 
 
 def check_learned(history: History, scored: Scored) -> None:

@@ -259,7 +259,8 @@ def _new_run(config, effects, seconds):
     chosen, lines = config, []
     if config.preset is None:
         planned = None if _sets_steps(config) else seconds
-        chosen, lines = adviser.by_tracks(config, stored, planned)
+        try_out = None if effects == "preset" else effect_choice.compare_configs
+        chosen, lines = adviser.by_tracks(config, stored, planned, try_out)
         if effects != "preset":
             chosen, more = effect_choice.choose(chosen, stored, config.overrides)
             lines += more

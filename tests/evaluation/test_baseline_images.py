@@ -123,6 +123,13 @@ def test_a_run_below_a_baseline_is_told_what_to_do():
     assert "0.25 dB less" in worse
     assert "more steps" in below
     assert "splats-static" in worse
+    assert "not initialized from tracks" in worse
+    assert "train for more steps" not in worse
+    (lost,) = baselines_text.warnings(numbers | {"motion.gain": -2.0}, 0.07)
+    assert "only 7% of the moving pixels" in lost
+    assert "was not followed" in lost
+    (found,) = baselines_text.warnings(numbers | {"motion.gain": -2.0}, 0.7)
+    assert "not followed" not in found
     assert baselines_text.lines({"heldout.psnr": 20.0}) == []
     assert baselines_text.warnings({"heldout.psnr": 20.0}) == []
     coded = numbers | {"heldout.psnr": 18.0}  # and 20 dB with fitted codes

@@ -93,6 +93,22 @@ def test_every_motion_can_be_fitted_to_paths(name):
     assert np.median(off) < 0.03
 
 
+def test_bases_are_held_outside_the_time_of_their_tracks():
+    time = np.linspace(0, 1, FRAMES).astype(np.float32)
+    points = np.random.default_rng(0).normal(0, 0.1, (30, 1, 3))
+    position = points + time[:, None] * np.array([0.5, 0, 0]) + [0, 0, 1]
+    known = np.tile((time > 0.3) & (time < 0.7), (30, 1))
+    effect = effect_of(SE3BasesSpec(bases=1, knots=12))
+    paths = Paths(time, position.astype(np.float32), known, 1.0)
+    fitted = motion_fit.fit(effect, paths, jax.random.key(0), steps=600)
+    places = places_of(effect, fitted.points, time)[..., 0]
+    speed = np.median(np.diff(places, axis=0), axis=1) * (FRAMES - 1)
+    np.testing.assert_allclose(speed[9:13], 0.5, atol=0.05)
+    # Two knots beyond the last known frame, where a cubic spline is constant again.
+    assert np.abs(speed[:3]).max() < 0.05
+    assert np.abs(speed[-3:]).max() < 0.05
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("name", ["mlp", "embedding"])  # the latter has rows
 def test_networks_that_are_fitted_leave_the_wall_where_it_is(name, monkeypatch):

@@ -35,7 +35,7 @@ def noisy():
     [
         (lambda: films.film(**MOVES, frames=24), "splats-tracked-small", ""),
         (lambda: films.film(frames=24), "splats-static-small", "show moving objects"),
-        (noisy, UNTRACKED, "only 0 tracks of moving objects"),
+        (noisy, UNTRACKED, "only 0% of the moving pixels are near a track"),
     ],
 )
 def test_motion_is_chosen_by_what_tracks_say(make, preset, words):
@@ -48,10 +48,30 @@ def test_motion_is_chosen_by_what_tracks_say(make, preset, words):
 
 
 def test_what_moves_and_cannot_be_followed_is_no_still_scene(monkeypatch):
-    monkeypatch.setattr(usable_paths, "LEAST_PATHS", 10**6)
+    monkeypatch.setattr(usable_paths, "LEAST_COVERAGE", 1.01)
     choice = representation.default_preset(films.film(**MOVES, frames=24))
     assert choice.preset == UNTRACKED
-    assert "are long enough to fit a motion" in "".join(choice.notes)
+    assert "of the moving pixels are near a track" in "".join(choice.notes)
+
+
+def test_coverage_is_the_share_of_moving_pixels_near_known_paths():
+    folder = representation.CACHE / "evidence"
+    evidence = record.cached(films.film(**MOVES, frames=24), folder)
+    assert 0.5 < usable_paths.coverage(evidence) <= 1
+    # Pixel by pixel, with one path that is known in a single frame too few.
+    known = np.zeros_like(evidence.paths.known)
+    known[0, :8], known[1, :5] = True, True
+    paths = evidence.paths._replace(known=known)
+    pixel = evidence.tracks.pixel[evidence.moved[0]]
+    near = total = 0
+    for frame, mask in enumerate(evidence.moving):
+        for row, column in np.argwhere(mask):
+            total += 1
+            if frame < 8:
+                away = np.floor(pixel[frame]) - [column, row]
+                near += np.hypot(*away) <= usable_paths.NEAR_PX
+    share = usable_paths.coverage(evidence._replace(paths=paths))
+    np.testing.assert_allclose(share, near / total)
 
 
 def test_a_scene_of_which_no_track_moves_is_static():

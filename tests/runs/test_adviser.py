@@ -8,16 +8,20 @@ import pytest
 
 from gaussians_jax.per_frame.exposure import ExposureSpec
 from gaussians_jax.scene.spec import refuse_what_cannot_train
+from nerfies_jax.evaluation.representation import Choice
 from nerfies_jax.fields.effects.appearance import AppearanceSpec
 from nerfies_jax.preprocessing.findings import CANNOT_TELL, CERTAIN, Finding
 from nerfies_jax.runs import adviser, representations
 from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runs.effect_choice import Trial
 from nerfies_jax.runs.run import scene_spec
 from nerfies_jax.training import specs
 from tests import scenes
+from tests.preprocessing import films
 
 EFFECTS = ("motion", "appearance_codes", "transient_objects")
 EFFECTS += ("start_from_points", "background_points", "depth")
+TRACKED, STATIC = "splats-tracked-small", "splats-static-small"
 
 
 def findings(**wanted):
@@ -161,3 +165,32 @@ def test_no_medium_is_brought_in_beside_a_warp():
     spec, advice = spec_of("radiance", motion=True, transient_objects=True)
     assert spec.transient is None
     assert any("lowers scores next to a warp" in note for note in advice.notes)
+
+
+@pytest.mark.parametrize(("gain", "preset"), [(0.4, STATIC), (0.0, TRACKED)])
+def test_a_doubtful_motion_is_compared_with_a_static_scene(gain, preset, monkeypatch):
+    other = Choice(STATIC, ("init.points=5000",))
+    choice = Choice(TRACKED, ("motion.bases=12",), ("a reason",), other)
+    kinds = [(None, lambda capture, seconds: choice)]
+    monkeypatch.setattr(adviser.representations, "choosing", lambda: kinds)
+    tried, capture = [], films.film(frames=2)
+
+    def try_out(config, changed, capture, name):
+        tried.append((config.preset, changed.preset, name))
+        return Trial(300, 8, 20.0, 20.0 + gain)
+
+    config = RunConfig(overrides=("sh_degree=1",))
+    chosen, lines = adviser.by_tracks(config, capture, None, try_out)
+    assert tried == [(TRACKED, STATIC, STATIC)]
+    assert chosen.preset == preset
+    expected = other if gain else choice
+    assert chosen.overrides == (*expected.overrides, "sh_degree=1")
+    assert f"20.00 dB with {TRACKED} and {20 + gain:.2f} dB with {STATIC}" in lines[0]
+    assert ("less than nothing" in lines[0]) == (gain > 0)
+    assert lines[-1].startswith(f"preset: {preset} --set {expected.overrides[0]}")
+    # Not if a setting of the user needs the motion, or if nothing may be trained.
+    config = RunConfig(overrides=("motion.knots=30",))
+    assert adviser.by_tracks(config, capture, None, try_out)[0].preset == TRACKED
+    config = RunConfig()
+    assert adviser.by_tracks(config, capture)[0].preset == TRACKED
+    assert len(tried) == 1
