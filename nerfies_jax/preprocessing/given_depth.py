@@ -25,6 +25,10 @@ OFFSET_PENALTY, TILT_PENALTY = 1e-3, 1e-2
 LEAST_TOLD = 0.1  # minimum share of the aligned depth that is not due to the offset
 # Standard deviation of normal errors in units of their median.
 PER_MEDIAN = 1.4826
+# Factor on the deviation of depth along a path, because the errors of neighboring
+# frames and points are alike. In the built-in scene `fast` with noisy depth, the median
+# error of paths is 1.16 % with 1, and 0.97 % with 3 and with 6.
+CORRELATION = 4.0
 
 
 class AlignedDepth(NamedTuple):
@@ -37,7 +41,7 @@ class AlignedDepth(NamedTuple):
     total_miss: float  # median relative error of all frames, inf if none fits
 
     def deviation(self, least: float) -> np.ndarray:
-        """Convert the errors to relative standard deviations.
+        """Convert the errors to relative standard deviations of independent depths.
 
         Args:
           least: Least deviation.
@@ -45,7 +49,7 @@ class AlignedDepth(NamedTuple):
         Returns:
           Deviations, [frames].
         """
-        return np.maximum(PER_MEDIAN * np.nan_to_num(self.miss), least)
+        return np.maximum(CORRELATION * PER_MEDIAN * np.nan_to_num(self.miss), least)
 
 
 def aligned(
