@@ -95,10 +95,12 @@ def test_what_a_decision_switches_on_has_a_price(name, effect):
 def _effects(kind, effect, wanted):
     """Names of the effects in the scene that is advised, the other decisions alike."""
     choices = {MOTION: True, LIGHT: False, TRANSIENT: False, BACKGROUND: True}
-    choices[MOTION] = effect != TRANSIENT  # which is not advised beside a warp
+    # A transient medium is not advised next to a warp, nor a depth loss next to tracks.
+    choices[MOTION] = effect not in (TRANSIENT, DEPTH)
     choices[effect] = wanted
     findings = tuple(Finding(x, "", "", y, CERTAIN) for x, y in choices.items())
-    advice = adviser.advise(findings, kind)
+    family = "nerfies" if kind.name == "radiance" else None  # grids need no background
+    advice = adviser.advise(findings, kind, family=family)
     spec = specs.override(kind.presets[advice.preset], advice.overrides)
     return [
         field.name
