@@ -30,7 +30,7 @@ from nerfies_jax.capture.colmap_library import MIN_TRACK
 from nerfies_jax.capture.json_files import AnyPath, new_folder, probe
 from nerfies_jax.capture.sfm_features import CameraGroup
 from nerfies_jax.capture.sfm_ladder import (
-    LEAST_ANGLE_DEG,
+    DOUBTED_ANGLE_DEG,
     LEAST_PLACED,
     MOST_ERROR_PX,
 )
@@ -145,10 +145,10 @@ class Poses(NamedTuple):
                 f"doubtful: the reprojection error of {self.error_px:.2f} px is above "
                 f"{MOST_ERROR_PX:g}; {MASK}, or record again without motion blur"
             )
-        if self.angle_deg < LEAST_ANGLE_DEG:
+        if self.angle_deg < DOUBTED_ANGLE_DEG:
             lines.append(
                 f"doubtful: the triangulation angle of {self.angle_deg:.1f} degrees is "
-                f"below {LEAST_ANGLE_DEG:g}, so depth is unreliable; walk while "
+                f"below {DOUBTED_ANGLE_DEG:g}, so depth is unreliable; walk while "
                 "recording"
             )
         if self.placed < LEAST_PLACED * self.pictures:

@@ -134,5 +134,8 @@ def test_the_choice_is_explained_and_a_weak_focal_length_is_doubted():
     assert doubt.startswith("doubtful")
     assert "1.10 image sides" in doubt
     assert "12, 5 images" in pieces
+    each = GOOD._replace(rung=ladder.EACH, focal=(1.0, 1.6))
+    _, doubt = ladder.notes(each, [GOOD, each], [80])
+    assert doubt.startswith("doubtful: the focal length and the distance")
     _, doubt = ladder.notes(lost, [lost, held._replace(placed=0)], [28])
     assert doubt.startswith("doubtful: focal length of 5.00")

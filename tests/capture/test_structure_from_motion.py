@@ -194,6 +194,8 @@ def test_doubtful_cameras_say_what_to_do():
     ):
         assert words in doubt
     assert "200 frames" in doubts[2]
+    _, doubt = good._replace(angle_deg=1.7).lines()  # of a camera that mostly turns
+    assert "walk while recording" in doubt
 
 
 def test_a_child_that_dies_is_an_error_not_our_end(tmp_path, monkeypatch):
