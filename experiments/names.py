@@ -19,6 +19,7 @@ FOR_USERS = (
     "render",
     "export",
     "compare",
+    "batch",
     "settings",
     "make_scene",
 )

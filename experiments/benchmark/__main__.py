@@ -23,10 +23,12 @@ import pathlib
 import re
 import shlex
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 from experiments import cli, records
-from experiments.benchmark import jobs, suites
+from experiments.batch import engines
+from experiments.batch import task as tasks
+from experiments.benchmark import suites
 from nerfies_jax.runs import representations
 from nerfies_jax.runtime import console
 
@@ -115,6 +117,14 @@ class Benchmark:
         return " ".join([*words, *(["--set", *self.set] if self.set else ())])
 
 
+class Run(NamedTuple):
+    """One run: a method and a seed."""
+
+    method: str
+    seed: int
+    task: tasks.Task
+
+
 @cli.command(Benchmark)
 def main(args):
     """Run what is missing and store all results. Failed runs end with exit code 1."""
@@ -127,14 +137,14 @@ def main(args):
         args.out.mkdir(parents=True, exist_ok=True)
         runs = planned(args)
         failures = _execute(args, runs)
-    results = {run: jobs.result(run) for run in runs}
+    results = {run: tasks.result(run.task) for run in runs}
     finished = {run: result for run, result in results.items() if result is not None}
     if finished:
         keep(args, finished)
     return cli.Ended(cli.stored(args.out / STORED), 1 if failures else 0)
 
 
-def planned(args: Benchmark) -> list[jobs.Run]:
+def planned(args: Benchmark) -> list[Run]:
     """List all runs, those of the first seed first.
 
     Args:
@@ -144,18 +154,21 @@ def planned(args: Benchmark) -> list[jobs.Run]:
       The runs.
     """
     stem = re.sub(r"[^\w.=]+", "-", args.label).strip("-")
+    folder = args.out.absolute() / stem
     source = cli.plain(args.source).arguments
-    return [
-        jobs.Run(
-            method,
-            seed,
-            args.out / stem / f"{method}-{seed}",
-            jobs.words(source, settings, seed, args.steps),
-            args.seconds,
-        )
-        for seed in range(args.seeds)
-        for method, settings in args.chosen.items()
-    ]
+    runs = []
+    for seed in range(args.seeds):
+        for method, settings in args.chosen.items():
+            words = tasks.options(source, *suites.parsed(settings), seed, args.steps)
+            task = tasks.Task(
+                f"{method}, seed {seed}",
+                folder / f"{method}-{seed}",
+                words,
+                args.seconds,
+                one_core=args.jobs > 1,
+            )
+            runs.append(Run(method, seed, task))
+    return runs
 
 
 def _execute(args, runs):
@@ -164,28 +177,20 @@ def _execute(args, runs):
     Wrong input, which is that of all runs, raises ValueError.
     """
     failures = []
-    missing = [run for run in runs if jobs.result(run) is None]
-    for run, code in jobs.execute(missing, args.jobs):
-        result = jobs.result(run)
+    missing = [run.task for run in runs if tasks.result(run.task) is None]
+    for task, ending in engines.local(missing, args.jobs):
+        result = tasks.result(task)
         if result is not None:
-            console.say(f"{run.name}: {_line(result.metrics)}")
+            console.say(f"{task.name}: {tasks.summary(result.metrics)}")
             continue
-        reason = jobs.last_line(run)
-        if code == 2:
-            raise ValueError(reason.removeprefix("error: "))
-        console.say(f"{run.name}: failed with exit code {code}: {reason} ({run.log})")
-        failures.append(run)
+        if ending.code == 2:
+            raise ValueError(ending.reason.removeprefix("error: "))
+        console.say(tasks.failure(task, ending))
+        failures.append(task)
     return failures
 
 
-def _line(metrics):
-    moving = metrics.get("heldout.moving_psnr")
-    words = [f"{metrics['heldout.psnr']:.2f} dB"]
-    words += [f"{moving:.2f} dB in dynamic regions"] if moving is not None else []
-    return ", ".join([*words, f"{metrics['train.seconds']:.0f} s"])
-
-
-def keep(args: Benchmark, results: Mapping[jobs.Run, jobs.Result]) -> None:
+def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
     """Add the results of a benchmark to OUT/benchmark.json and print its page.
 
     Args:
@@ -214,9 +219,9 @@ def keep(args: Benchmark, results: Mapping[jobs.Run, jobs.Result]) -> None:
     stored["benchmarks"][args.label] = benchmark
     records.write(path, stored, *(result.machine for result in results.values()))
     console.say(page.page({"benchmarks": {args.label: benchmark}}))
-    folders = [run.folder for run in results if run.seed == 0]
+    folders = [tasks.shown(run.task.folder) for run in results if run.seed == 0]
     if len(folders) > 1:
-        words = shlex.join(map(str, folders))
+        words = shlex.join(folders)
         console.say(f"images: nerfies compare {words}")
     console.say(f"stored in {path}")
 

@@ -3,7 +3,6 @@
 import json
 import math
 import signal
-import sys
 import threading
 import time
 
@@ -12,55 +11,23 @@ import pytest
 import scipy.stats
 
 from experiments import cli
+from experiments.batch import task
 from experiments.benchmark import __main__ as benchmark
-from experiments.benchmark import jobs, page, suites, verdicts
+from experiments.benchmark import page, suites, verdicts
 from experiments.benchmark.suites import SUITES, Claim
 from nerfies_jax.metrics.metric_table import METRICS
 from nerfies_jax.runs import representations
 from nerfies_jax.training import specs
-
-MACHINE = {"cpu": "one", "backend": "cpu", "jax": "0"}
-# Stands for `reconstruct`: a process that writes what a run writes.
-RUN = """
-import json, pathlib, sys, time
-words = sys.argv[1:]
-out = pathlib.Path(words[words.index("--out") + 1])
-log = out.with_suffix(".calls")
-log.write_text((log.read_text() if log.exists() else "") + " ".join(words) + "\\n")
-out.mkdir(exist_ok=True)
-preset = words[words.index("--preset") + 1] if "--preset" in words else "nerf-small"
-config = {"preset": preset}
-(out / "config.json").write_text(json.dumps({"config": config}))
-print("at work", flush=True)
-time.sleep(float(WAIT))
-if "rays=-1" in words:
-    sys.exit(print("error: rays=-1") or 2)
-if out.name.startswith("sonata"):
-    sys.exit("no such luck")
-seed = int(words[words.index("--seed") + 1])
-metrics = {"heldout.psnr": 20.0 + seed, "train.seconds": 1.0, "tracks.epe": None}
-(out / "metrics.json").write_text(json.dumps(metrics))
-curve = {"evaluations": [], "frames": [], "compile_seconds": 1, "machine": MACHINE}
-(out / "curve.json").write_text(json.dumps(curve))
-"""
+from tests.experiments import stand_in_run
 
 
 @pytest.fixture
-def stand_in(tmp_path, monkeypatch):
-    """Let processes run `RUN` instead of `reconstruct`."""
+def stand_in(monkeypatch):
+    """Run `stand_in_run` instead of `reconstruct`."""
 
     def use(wait=0.0):
-        path = tmp_path / "run.py"
-        text = RUN.replace("WAIT", str(wait)).replace("MACHINE", json.dumps(MACHINE))
-        path.write_text(text)
-        start = jobs.children.start
-        monkeypatch.setattr(
-            jobs.children,
-            "start",
-            lambda command, **more: start(
-                [sys.executable, str(path), *command[3:]], **more
-            ),
-        )
+        monkeypatch.setenv("WAIT", str(wait))
+        monkeypatch.setattr(task.Task, "command", stand_in_run.command)
 
     return use
 
@@ -77,14 +44,15 @@ def test_a_benchmark_is_named_without_where_it_lies(tmp_path):
     args = cli.parse(benchmark.Benchmark, words)
     assert args.label == "film --max-side 256 --steps 20"
     planned = benchmark.planned(args)
-    assert [run.folder.name for run in planned] == [f"default-{k}" for k in range(3)]
-    assert planned[0].folder.parent.name == "film-max-side-256-steps-20"
+    folders = [run.task.folder for run in planned]
+    assert [folder.name for folder in folders] == [f"default-{k}" for k in range(3)]
+    assert folders[0].parent.name == "film-max-side-256-steps-20"
 
 
 def test_a_run_is_one_of_reconstruct():
     words = "--scene fast --suite sonata --methods no-depth --set sh_degree=0"
     args = cli.parse(benchmark.Benchmark, [*words.split(), "--seconds", "9"])
-    first = benchmark.planned(args)[0]
+    first = benchmark.planned(args)[0].task
     changes = ("depth=none", suites.TRACKS, "sh_degree=0")
     assert first.words == (
         *("--scene", "fast", "--seed", "0", "--preset", "sonata-small"),
@@ -100,7 +68,7 @@ def test_interrupted_runs_continue_and_finished_ones_are_not_repeated(
     words = ("--scene", "fast", "--preset", "nerf-small", "--seconds", "9")
     out = ("--jobs", "2", "--out", tmp_path / "out")
     args = cli.parse(benchmark.Benchmark, [*words, "--out", str(tmp_path / "out")])
-    first, second, _ = benchmark.planned(args)
+    first, second, _ = (run.task for run in benchmark.planned(args))
     first.folder.mkdir(parents=True)
     (first.folder / "config.json").write_text("{}")
     assert run(*words, *out) == 0
@@ -110,7 +78,7 @@ def test_interrupted_runs_continue_and_finished_ones_are_not_repeated(
     assert run(*words, *out) == 0
     assert second.folder.with_suffix(".calls").read_text() == calls
     stored = json.loads((tmp_path / "out" / "benchmark.json").read_text())
-    assert stored["machine"] == MACHINE
+    assert stored["machine"] == stand_in_run.MACHINE
     (method,) = stored["benchmarks"][args.label]["methods"].values()
     assert method["settings"] == "nerf-small"
     assert method["mean"] == {"heldout.psnr": 21.0, "train.seconds": 1.0}
@@ -151,13 +119,13 @@ def test_wrong_input_of_one_run_ends_all(tmp_path, stand_in, capsys, monkeypatch
 def test_a_signal_ends_every_run(tmp_path, stand_in, number, code, monkeypatch):
     stand_in(wait=60.0)
     started = []
-    start = jobs._start
+    start = task.children.start
 
     def noted(*arguments, **more):
         started.append(start(*arguments, **more))
         return started[-1]
 
-    monkeypatch.setattr(jobs, "_start", noted)
+    monkeypatch.setattr(task.children, "start", noted)
 
     def interrupt():
         while len(list(tmp_path.rglob("config.json"))) < 2:

@@ -210,8 +210,8 @@ for name in sys.argv[1:]:
 
 WITHOUT_EXTRAS = """
 import importlib, pathlib, sys
-names = "av matplotlib pycolmap viser pillow_heif zstandard onnxruntime"
-for name in names.split():
+names = "av matplotlib pycolmap viser pillow_heif zstandard onnxruntime submitit"
+for name in [*names.split(), "distributed"]:
     sys.modules[name] = None
 for package in ("nerfies_jax", "gaussians_jax", "experiments"):
     for path in sorted(pathlib.Path(package).rglob("*.py")):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from experiments import records
-from experiments.benchmark.jobs import COMPLETE
+from experiments.batch.task import COMPLETE
 from nerfies_jax.capture import cache_files, synthetic
 from nerfies_jax.capture.synthetic import record as scenes_record
 from nerfies_jax.preprocessing import record

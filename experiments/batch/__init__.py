@@ -1,0 +1,1 @@
+"""Many captures: one process a run, on this machine, Dask or Slurm."""
