@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
+import filelock
 import numpy as np
 
 from nerfies_jax.capture import npz_files
@@ -68,6 +69,73 @@ def read(
         _reported.add(key)
         console.warn(message)
     return None
+
+
+@contextlib.contextmanager
+def making(path: pathlib.Path) -> Iterator[None]:
+    """Wait until no other process makes the same file, which may exist afterwards.
+
+    Args:
+      path: The file. Its folder is created if needed. If it cannot be written, nothing
+        is locked.
+
+    Yields:
+      None, to read the file or to make it.
+    """
+    lock_path = path.with_name(f".{path.name}.lock")
+    lock = filelock.FileLock(lock_path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except (OSError, NotImplementedError):  # a file system without locks
+        yield
+        return
+    try:
+        yield
+    finally:
+        lock.release()
+        # Whoever waits for the removed file finds what has been made.
+        with contextlib.suppress(OSError):
+            lock_path.unlink(missing_ok=True)
+
+
+def mark_used(path: pathlib.Path) -> None:
+    """Set the time of last use of a file, by which `evict` orders files."""
+    with contextlib.suppress(OSError):
+        os.utime(path)
+
+
+def evict(folder: pathlib.Path, most_bytes: float | int) -> list[pathlib.Path]:
+    """Remove the least recently used files of a cache above a size.
+
+    A process that has opened a removed file can read it to the end. One that opens it
+    later finds no file, and recreates it. The newest file always stays.
+
+    Args:
+      folder: The folder. Its subfolders and hidden files do not count.
+      most_bytes: Size of all files above which some are removed.
+
+    Returns:
+      The files that were removed.
+    """
+    files = []
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            # Another process may have removed it.
+            with contextlib.suppress(OSError):
+                if entry.is_file(follow_symlinks=False) and entry.name[0] != ".":
+                    status = entry.stat(follow_symlinks=False)
+                    used = max(status.st_atime_ns, status.st_mtime_ns)
+                    files.append((used, entry.path, status.st_size))
+    total, removed = sum(size for *_, size in files), []
+    for _, path, size in sorted(files)[:-1]:
+        if total <= most_bytes:
+            break
+        with contextlib.suppress(OSError):  # Windows keeps files that are open
+            os.unlink(path)
+            total -= size
+            removed.append(pathlib.Path(path))
+    return removed
 
 
 def _state(path):

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from nerfies_jax.capture import cache_files, pinholes
+from nerfies_jax.capture import cache, cache_files, pinholes
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.given import Given
@@ -298,9 +298,11 @@ def cached(
 ) -> Evidence:
     """Preprocess a capture, or read its results from a cache.
 
-    A distorted capture is undistorted first, so that both share one record. If `folder`
-    cannot be written, this is reported and the record is kept in memory. Warnings list
-    skipped parts, and external depth that hardly fits.
+    A distorted capture is undistorted first, so that both share one record. Processes
+    that need the same record at once make it once. Above `cache.limit_bytes`, records
+    that were not used for longest are removed. If `folder` cannot be written, this is
+    reported and the record is kept in memory. Warnings list skipped parts, and external
+    depth that hardly fits.
 
     Args:
       capture: The capture.
@@ -315,19 +317,31 @@ def cached(
     path = file_of(capture, folder, use_depths)
     evidence = _unkept.get(path) or cache_files.read(path, load)
     if evidence is None:
-        evidence = gather(capture, use_depths, tell)
-        try:
-            save(path, evidence)
-        except (OSError, CaptureError) as error:
-            tell(f"results of preprocessing could not be cached: {error}")
-            while len(_unkept) >= MOST_UNKEPT:
-                _unkept.pop(next(iter(_unkept)))
-            _unkept[path] = evidence
+        with cache_files.making(path):
+            evidence = cache_files.read(path, load)
+            if evidence is None:
+                evidence = _made(path, capture, use_depths, tell)
+    cache_files.mark_used(path)
     if path not in _told_of:
         notes = [left_out_note(evidence), depth_note(evidence)]
         _told_of[path] = [note for note in notes if note]
         for note in _told_of[path]:
             console.warn(f"{capture.path or capture.name}: {note}")
+    return evidence
+
+
+def _made(path, capture, use_depths, tell):
+    """Preprocess a capture and write the results to a file of the cache."""
+    limit = cache.limit_bytes()
+    evidence = gather(capture, use_depths, tell)
+    try:
+        save(path, evidence)
+        cache_files.evict(path.parent, limit)
+    except (OSError, CaptureError) as error:
+        tell(f"results of preprocessing could not be cached: {error}")
+        while len(_unkept) >= MOST_UNKEPT:
+            _unkept.pop(next(iter(_unkept)))
+        _unkept[path] = evidence
     return evidence
 
 
