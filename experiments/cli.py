@@ -60,7 +60,15 @@ Scene = Literal[
 SCENES: tuple[str, ...] = typing.get_args(Scene)
 # Arguments of the library that have an option of the same name; "..." is any value.
 ARGUMENTS = (
-    *("checkpoint_every", "device", "evaluate_every", "factor", "heldout", "max_side"),
+    *(
+        "checkpoint_every",
+        "device",
+        "devices",
+        "evaluate_every",
+        "factor",
+        "heldout",
+        "max_side",
+    ),
     *("missing", "out", "overwrite", "scene", "seconds", "train"),
     *("depths", "depth_model", "masks", "segmentation_model"),
 )

@@ -68,6 +68,10 @@ class Reconstruct:
     of the given capture or video in the folder runs."""
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Device to compute on."""
+    devices: int | None = None
+    """Number of devices that share a training step: the views of splats (batch_size) or
+    the rays of a field (micro_batches). The result is that of one device up to rounding
+    (default: all; of a CPU, as many as it has cores and the step has parts)."""
     seed: int | None = None
     """Seed of all random numbers (default: 0)."""
     set: cli.Overrides = ()
@@ -137,7 +141,8 @@ def _outcome(args):
             args = _with_folder(args)
             _check_resumed(args)
         wide = not (args.trust or named)
-        platform.start_jax(args.device, *_cores(args), wide=wide)
+        cores = _cores(args)
+        platform.start_jax(args.device, *cores, devices=args.devices, wide=wide)
         watched = _watched(args)
     from nerfies_jax import runs
 

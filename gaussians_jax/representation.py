@@ -332,6 +332,7 @@ GAUSSIANS = Representation(
         # number of cores.
         threads="one",
         shares=lambda spec: spec.batch_size,
+        share_setting="batch_size",
         estimate_memory_bytes=first_state.estimate_memory_bytes,
         memory_hint="lower init.points, init.random or raster.capacity",
         growth=growth,

@@ -110,6 +110,7 @@ RADIANCE = Representation(
     resources=Resources(
         threads="all",  # matrix products scale with the number of cores
         shares=lambda spec: spec.micro_batches,
+        share_setting="micro_batches",
         estimate_memory_bytes=scene.estimate_memory_bytes,
         memory_hint="lower rays, sampling.coarse or sampling.fine",
         step_parts=step_time.parts,

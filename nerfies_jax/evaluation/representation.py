@@ -92,6 +92,7 @@ class Resources(NamedTuple):
     threads: Literal["one", "all"] = "all"
     # Number of equal shares that a step of a spec can be divided into, one per device.
     shares: Callable[[Spec], int] = lambda spec: 1
+    share_setting: str = ""  # field of the spec that sets this number
     # (spec, capture) -> bytes of training frames, initial state and step. None disables
     # the check.
     estimate_memory_bytes: Callable[[Spec, Capture], int] | None = None

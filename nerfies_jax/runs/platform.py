@@ -10,6 +10,7 @@ from typing import Literal
 
 import psutil
 
+from nerfies_jax.capture import cache
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.runtime import events
 from nerfies_jax.runtime.compiler import UNDIVIDED
@@ -27,6 +28,7 @@ def start_jax(
     threads: Threads = "one",
     shares: int = 1,
     *,
+    devices: int | None = None,
     wide: bool = True,
 ) -> None:
     """Choose the platform, the number of cores that XLA:CPU sees, and the cache.
@@ -34,20 +36,22 @@ def start_jax(
     Call it before the first array is created. If each CPU device sees one core, the
     compiler pass that parallelizes loops is disabled. The vector width is 512 bits if
     the processor supports it and `wide` is true. The environment variables
-    `PJRT_NPROC`, `JAX_NUM_CPU_DEVICES` and `XLA_FLAGS` take precedence over these
-    choices.
+    `PJRT_NPROC`, `JAX_NUM_CPU_DEVICES` and `XLA_FLAGS`, with the number of devices of
+    `--xla_force_host_platform_device_count`, take precedence over these choices.
 
     Args:
       device: Platform, or "auto" for the default of JAX.
       threads: "one" or "all" cores for XLA:CPU.
       shares: Number of equal parts that a step is divided into, each with a CPU device
         of its own if there are enough cores (`data_parallel`).
+      devices: Number of devices to compute on. None for all, and on a CPU for as many
+        as there are shares and cores.
       wide: False for processes that compile code of other packages. With vectors of 512
         bits, `jnp.arctan(x)` and `jnp.arctan2(x, 1)` are wrong for long arrays (JAX
         0.10.2, errors of 1 rad). The functions of this package do not use them.
 
     Raises:
-      ValueError: If the device is not available.
+      ValueError: If the devices are not available, or the limit of the cache is wrong.
     """
     if threads == "one" and os.environ.setdefault("PJRT_NPROC", "1") == "1":
         # XLA has a thread for each device and would divide the loops of every device
@@ -60,10 +64,16 @@ def start_jax(
         _set_flag(VECTOR_WIDTH, "512")
     import jax
 
-    if shares > 1 and "JAX_NUM_CPU_DEVICES" not in os.environ:
+    # These load JAX.
+    from nerfies_jax.capture import cache_files
+    from nerfies_jax.runtime import data_parallel
+
+    wanted = min(shares, cores()) if devices is None else devices
+    forced = "--xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if wanted > 1 and not forced and "JAX_NUM_CPU_DEVICES" not in os.environ:
         # The number of devices cannot change if JAX has already been initialized.
         with contextlib.suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", min(shares, cores()))
+            jax.config.update("jax_num_cpu_devices", wanted)
     if device != "auto":
         name = {"gpu": "cuda"}.get(device, device)
         os.environ["JAX_PLATFORMS"] = name  # for child processes
@@ -76,12 +86,16 @@ def start_jax(
             f"device={device} is not available ({reason}); choose device=cpu, or "
             "install a version of JAX for that device"
         ) from error
+    data_parallel.limit_devices(devices)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         folder = CACHE / "compiled"
         with contextlib.suppress(OSError):  # JAX also works without a cache
             folder.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(folder))
+            # Not `jax_compilation_cache_max_size`: a process that is killed between the
+            # two files of an entry would make all later writes fail (JAX 0.10).
+            cache_files.evict(folder, cache.limit_bytes())
 
 
 def cores() -> int:

@@ -39,7 +39,7 @@ from nerfies_jax.runs.run import (
     stored_capture,
 )
 from nerfies_jax.runs.train import Pace
-from nerfies_jax.runtime import console, stopping
+from nerfies_jax.runtime import console, data_parallel, stopping
 from nerfies_jax.training import checkpoint
 from nerfies_jax.training.loop import FitResult, Hook
 
@@ -272,7 +272,10 @@ def _new_run(config, effects, seconds):
 
 
 def _describe(run):
-    for line in describe(run.capture):
+    resources = run.representation.resources
+    shares, setting = resources.shares(run.spec), resources.share_setting
+    idle = data_parallel.idle_note(run.model.devices, shares, setting)
+    for line in (*describe(run.capture), *idle):
         console.say(line)
 
 

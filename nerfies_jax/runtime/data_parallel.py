@@ -14,11 +14,62 @@ PyTree = Any
 
 AXIS = "shares"
 
+_limit: int | None = None  # of `limit_devices`
+
+
+def limit_devices(count: int | None) -> None:
+    """Limit the number of devices that this process computes on.
+
+    Args:
+      count: Number of devices. None for all.
+
+    Raises:
+      ValueError: If there are fewer.
+    """
+    global _limit
+    present = jax.local_device_count()
+    if count is not None and not 1 <= count <= present:
+        kind = jax.local_devices()[0].platform
+        raise ValueError(
+            f"devices={count}: this process has {present} of kind {kind}; choose 1 to "
+            f"{present}"
+        )
+    _limit = count
+
+
+def available() -> int:
+    """Return the number of local devices, within the limit of `limit_devices`."""
+    return jax.local_device_count() if _limit is None else _limit
+
+
+def idle_note(used: int, shares: int, setting: str) -> list[str]:
+    """Describe the devices that a training step does not use, with a way to use them.
+
+    Args:
+      used: Number of devices that a step uses.
+      shares: Number of its equal shares.
+      setting: Name of the setting of this number, empty if there is none.
+
+    Returns:
+      One line, or none if every device is used.
+    """
+    present = available()
+    if used >= present:
+        return []
+    line = f"{used} of {present} devices train, and {present - used} stay idle"
+    if setting:
+        line += (
+            f": a step has {shares} equal part(s); set {setting} to a multiple of "
+            f"{present} to use them all"
+        )
+    return [line]
+
 
 def device_count(shares: int) -> int:
     """Return the number of local devices that equal shares of a step can use.
 
-    A CPU is one device unless `jax_num_cpu_devices` is larger.
+    A CPU is one device unless `jax_num_cpu_devices` is larger. `limit_devices` may
+    exclude some.
 
     Args:
       shares: Number of shares.
@@ -26,7 +77,7 @@ def device_count(shares: int) -> int:
     Returns:
       The largest divisor of `shares` that is at most the number of devices.
     """
-    most = min(shares, jax.local_device_count())
+    most = min(shares, available())
     return next(count for count in range(most, 0, -1) if shares % count == 0)
 
 
@@ -118,7 +169,7 @@ def lower_rows(
 
 
 def _devices_of(count):
-    return min(jax.local_device_count(), max(count, 1))
+    return min(available(), max(count, 1))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
