@@ -54,7 +54,6 @@ def test_idle_devices_are_named(present, used, lines, monkeypatch):
 
 SCENES = {
     "splats": scenes.TINY_DEFORMABLE,
-    "sonata": scenes.TINY_SONATA,
     "field": scenes.TINY_FIELD,
 }
 

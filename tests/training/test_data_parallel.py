@@ -11,7 +11,7 @@ from tests.training import toy
 
 
 def shared_step(devices):
-    """The toy's step from the mean of four noisy slopes."""
+    """Return the step of the toy from the mean of eight noisy gradients."""
 
     def part(index, state, frames):
         key = jax.random.fold_in(state.key, index)
@@ -20,7 +20,7 @@ def shared_step(devices):
         return jax.value_and_grad(toy.loss)(state.params, target, noise)
 
     def step(state, frames):
-        each = data_parallel.on_devices(part, 4, devices, state, frames)
+        each = data_parallel.on_devices(part, 8, devices, state, frames)
         value, grad = jax.tree.map(lambda leaf: leaf.mean(0), each)
         params = jax.tree.map(lambda p, g: p - 0.1 * g, state.params, grad)
         state = state._replace(params=params, step=state.step + 1)
@@ -82,9 +82,11 @@ def test_a_share_counts_on_from_the_steps_where_x64_is_on():
 
 
 @pytest.mark.slow
-def test_two_devices_train_what_one_does():
+def test_eight_devices_train_what_one_does():
+    """The devices of the flag of XLA, which precedes the choice of `start_jax`."""
     fresh_process.run(
-        "import jax; jax.config.update('jax_num_cpu_devices', 2);"
-        "jax.config.update('jax_numpy_dtype_promotion', 'strict');"
-        "from tests.training import test_data_parallel as t; t.both(2)"
+        "import os; os.environ.pop('JAX_NUM_CPU_DEVICES', None);"
+        "os.environ['XLA_FLAGS'] = '--xla_force_host_platform_device_count=8';"
+        "from nerfies_jax.runs import platform; platform.start_jax('cpu', 'one', 2);"
+        "from tests.training import test_data_parallel as t; t.both(8)"
     )
