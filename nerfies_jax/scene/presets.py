@@ -360,29 +360,6 @@ STILL_NERF_GRID = dataclasses.replace(
     coarse=dataclasses.replace(COARSE_GRID_TEMPLATE, density_bias=EMPTIER),
 )
 
-# Photographs of one subject from various distances. In a box around all cameras, the
-# subject has few cells of a grid and few samples of a ray, and densities of the usual
-# start are opaque in front of it. The transient medium starts late and thin, or it
-# explains the static scene before that has formed.
-THIN = -4.0
-SMALL_NERF_W_GRID = dataclasses.replace(
-    _on_grid(SMALL_NERF_W),
-    steps=6000,
-    rays=512,
-    volume="subject",
-    sampling=SamplingSpec(24, 24, spacing="center"),
-    template=dataclasses.replace(GRID_TEMPLATE, density_bias=THIN),
-    coarse=dataclasses.replace(COARSE_GRID_TEMPLATE, density_bias=THIN),
-    transient=TransientSpec(
-        code_width=8,
-        depth=2,
-        width=48,
-        beta_power=1.0,
-        density_bias=THIN,
-        hold_steps=1500,
-    ),
-)
-
 PRESETS = {
     "nerf": NERF,
     "nerf-w": NERF_W,
@@ -403,7 +380,7 @@ PRESETS = {
     "tineuvox-small": SMALL_TINEUVOX,
     "nerf-ds-small": SMALL_NERF_DS,
     "nerf-grid-small": STILL_NERF_GRID,
-    "nerf-w-grid-small": SMALL_NERF_W_GRID,
+    "nerf-w-grid-small": _on_grid(SMALL_NERF_W),
     "d-nerf-grid-small": _on_grid(SMALL_D_NERF),
     "nerfies-grid-small": _on_grid(SMALL_NERFIES),
     "hypernerf-grid-small": _on_grid(SMALL_HYPERNERF),
