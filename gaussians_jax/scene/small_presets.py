@@ -104,8 +104,9 @@ SMALL_FROM_TRACKS = dataclasses.replace(
 # cost in time. Over three seeds, 2000 steps end at the same PSNR without them (32.55 ±
 # 0.03 / 29.95 ± 0.18 dB, all and moving) and with them (32.53 ± 0.07 / 29.89 ± 0.09),
 # and the median depth error of moving pixels rises from 0.006 to 0.011. Built-in scene,
-# one seed, held-out PSNR in all, in moving and in static pixels that a training view shows (2.6 % of the static pixels, with half of their error, are
-# in none), 2000 steps: 32.42 / 30.06 / 34.96 -> 32.56 / 29.83 / 35.85 dB. With 4500
+# one seed, held-out PSNR in all, in moving and in static pixels that a training view
+# shows (2.6 % of the static pixels, with half of their error, are in none), 2000 steps:
+# 32.42 / 30.06 / 34.96 -> 32.56 / 29.83 / 35.85 dB. With 4500
 # steps and 30,000 Gaussians, all static pixels: 33.62 / 30.68 / 35.52 -> 34.23 / 30.88
 # / 36.57. A smooth depth (weight 0.1) near the points (0.3) in addition reduces the
 # relative depth error that nine in ten pixels stay below from 4 to 1 %, but not the
