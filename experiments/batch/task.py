@@ -41,7 +41,7 @@ class Result(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """How a process ended."""
+    """End of a process."""
 
     code: int  # exit code, negative for a signal
     reason: str  # last line of its log, or the limit that it exceeded
