@@ -115,3 +115,19 @@ def test_a_signal_that_was_ignored_still_is():
     process = begun("time.sleep(1); print('done')", ignore)
     process.send_signal(signal.SIGHUP)
     assert outcome(process) == (0, ["done"])
+
+
+def test_pycolmap_leaves_the_handler_of_sigterm_alone():
+    pytest.importorskip("pycolmap")
+    code = (
+        "from nerfies_jax.capture import colmap_library\n"
+        "library = threading.Thread(target=colmap_library.library)\n"
+        "library.start()\n"
+        "library.join()\n"
+        "os.kill(os.getpid(), 15)\n"
+        "stopping.check()\n"
+    )
+    words = [sys.executable, "-c", SETUP + code]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 128 + signal.SIGTERM
+    assert "SIGTERM received" not in done.stderr  # a stack trace of C++

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerfies_jax.capture.errors import FileError
-from nerfies_jax.runtime import children
+from nerfies_jax.runtime import children, stopping
 
 CPU_SECONDS = 5.0  # for a file of any size, in addition to that of the request
 # Without an answer. Long, since other programs may use the processor.
@@ -125,7 +125,10 @@ class Decoder:
                 reported.has_advice = error.has_advice
                 raise reported from None
             except (OSError, ValueError, EOFError, KeyError, TypeError) as error:
-                raise DecoderError(self._ending(error)) from None
+                reason = self._ending(error)
+                # A signal to the process group ended the child as well.
+                stopping.check()
+                raise DecoderError(reason) from None
             finally:
                 if not complete:  # its remaining answers would confuse the next request
                     self.close()

@@ -34,7 +34,7 @@ from nerfies_jax.capture.sfm_ladder import (
     LEAST_PLACED,
     MOST_ERROR_PX,
 )
-from nerfies_jax.runtime import children, console, events
+from nerfies_jax.runtime import children, console, events, stopping
 
 # Images. With more, exhaustive matching would take most of the time.
 EXHAUSTIVE_UP_TO = 40
@@ -285,6 +285,7 @@ def _run_child(folder, request, spec, images):
             "images"
         )
     if child.returncode != 0 or not last_line.startswith("{"):
+        stopping.check()  # a signal to the process group ended the child as well
         probe(folder)  # raises if the disk is full, which COLMAP does not report
         raise CaptureError(
             f"{folder.name}: COLMAP ended with code {child.returncode} "
