@@ -4,6 +4,7 @@ nerfies export RUN ply --time 0.4          # the scene at one time
 nerfies export RUN ply --frames 48         # a numbered sequence
 nerfies export RUN splat
 nerfies export RUN spz --units world
+nerfies export RUN sog --up -y            # compressed, for PlayCanvas
 nerfies export RUN splatv                  # all times in one file
 nerfies export RUN transforms              # cameras, images, points
 nerfies export RUN colmap --units world
@@ -34,7 +35,7 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 MOST_VOXELS = 512  # 5 GB along all three sides
 OPTIONS = {
     **{"ply": GAUSSIANS, "splat": GAUSSIANS, "spz": GAUSSIANS},
-    **{"compressed-ply": GAUSSIANS, "usda": GAUSSIANS},
+    **{"compressed-ply": GAUSSIANS, "sog": GAUSSIANS, "usda": GAUSSIANS},
     "mesh": ("time", "units", "up", "voxels"),
     **{"splatv": (), "nerfies": ()},
     **{"transforms": ("units",), "colmap": ("units",)},
@@ -64,6 +65,7 @@ class Export:
             "compressed-ply",
             "splat",
             "spz",
+            "sog",
             "usda",
             "splatv",
             "mesh",
@@ -77,12 +79,12 @@ class Export:
         ]
         | None
     ] = None
-    """Gaussians as ply, compressed-ply (SuperSplat), splat, spz or usda (OpenUSD), or
-    with their motion, on cubics, as splatv. A mesh with vertex colors (ply). Training
-    images with cameras and points as nerfstudio's transforms, a colmap model or a
-    nerfies directory. A camera path as nerfstudio's camera_path.json (path) or Nerfies'
-    folder (nerfies-path). Tracks of points of a dynamic scene (npz). exr images with
-    camera and motion."""
+    """Gaussians as ply, compressed-ply (SuperSplat), splat, spz, sog (PlayCanvas) or
+    usda (OpenUSD), or with their motion, on cubics, as splatv. A mesh with vertex
+    colors (ply). Training images with cameras and points as nerfstudio's transforms, a
+    colmap model or a nerfies directory. A camera path as nerfstudio's camera_path.json
+    (path) or Nerfies' folder (nerfies-path). Tracks of points of a dynamic scene (npz).
+    exr images with camera and motion."""
     program: Annotated[
         Literal["supersplat", "blender", "usd", "gsplat", "nerfstudio"] | None,
         tyro.conf.arg(name="for"),

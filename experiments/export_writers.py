@@ -229,7 +229,9 @@ def _exr(args: Any, run: Any) -> str:
 
 
 WRITERS = {
-    **dict.fromkeys(("ply", "compressed-ply", "splat", "spz", "usda"), _gaussians),
+    **dict.fromkeys(
+        ("ply", "compressed-ply", "splat", "spz", "sog", "usda"), _gaussians
+    ),
     "mesh": _mesh,
     "splatv": _splatv,
     **dict.fromkeys(("transforms", "colmap", "nerfies"), _cameras),

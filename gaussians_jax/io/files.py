@@ -1,6 +1,6 @@
 """Gaussian files: 3DGS .ply, antimatter15 .splat and Niantic .spz.
 
-Compressed PLY and OpenUSD files are written, and not read.
+Compressed PLY, SOG and OpenUSD files are written, and not read.
 
 docs/formats.md lists what each format stores. Files are written to a temporary name
 next to the target and renamed, so a crash leaves the old file or the new one.
@@ -17,7 +17,7 @@ import numpy as np
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.splats import SH_DC, Splats
-from gaussians_jax.io import packed_ply, spz, usd
+from gaussians_jax.io import packed_ply, sog, spz, usd
 from nerfies_jax.capture import ply_files, safe_files, text_files
 from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.json_files import replaced_file
@@ -25,7 +25,7 @@ from nerfies_jax.capture.json_files import replaced_file
 MOST_HEADER_BYTES = ply_files.MAX_HEADER  # 62 properties take 1.5 kB
 MOST_BYTES = 4 * 2**30  # of a .splat or .spz file: 100 million Gaussians
 SUFFIXES = (".ply", ".splat", ".spz")
-WRITTEN = (*SUFFIXES, packed_ply.SUFFIX, usd.SUFFIX)
+WRITTEN = (*SUFFIXES, packed_ply.SUFFIX, sog.SUFFIX, usd.SUFFIX)
 MOST_ROUNDING = 0.1  # of float64 coordinates, relative to the median scale
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -94,7 +94,7 @@ def save(
     """Save the active Gaussians in the format of the suffix.
 
     Args:
-      path: File to write, ending in .ply, .splat, .spz, .compressed.ply or .usda.
+      path: File to write, ending in .ply, .splat, .spz, .compressed.ply, .sog or .usda.
       rows: Raw parameters. Inactive Gaussians are left out.
       spz_version: Version of SPZ files.
       usd_up: Axis that OpenUSD files name as up.
@@ -114,6 +114,7 @@ def save(
         ".splat": _splat_bytes,
         ".spz": lambda rows: spz.encode(spz.Unpacked._make((*rows, ())), spz_version),
         packed_ply.SUFFIX: packed_ply.encode,
+        sog.SUFFIX: sog.encode,
         usd.SUFFIX: lambda rows: usd.encode(rows, usd_up),
     }
     if suffix not in encoders:

@@ -112,6 +112,28 @@ def test_transforms_come_back_with_times_splits_masks_and_points(units, tmp_path
 
 
 @pytest.mark.parametrize("bent", [True, False, "fisheye"])
+def test_transforms_have_what_the_parser_of_nerfstudio_requires(bent, tmp_path):
+    """Its rules as of 1.1, `nerfstudio/data/dataparsers/nerfstudio_dataparser.py`."""
+    capture = filmed(bent)
+    transforms_writer.write(capture, tmp_path / "out")
+    meta = json.loads((tmp_path / "out/transforms.json").read_text())
+    model = {True: "OPENCV", False: "PINHOLE", "fisheye": "OPENCV_FISHEYE"}[bent]
+    assert meta["camera_model"] == model
+    names = [frame["file_path"] for frame in meta["frames"]]
+    for frame in meta["frames"]:
+        # Each of these is in the file or in every frame.
+        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            assert key in meta or isinstance(frame[key], float)
+        assert np.shape(frame["transform_matrix"]) == (4, 4)
+        for key in ("file_path", "mask_path"):  # masks for all frames or for none
+            assert (tmp_path / "out" / frame[key]).is_file()
+    # If there is a list of any split, there must be one of each, of known names.
+    for split in ("train", "val", "test"):
+        assert set(meta[f"{split}_filenames"]) <= set(names)
+    assert (tmp_path / "out" / meta["ply_file_path"]).is_file()
+
+
+@pytest.mark.parametrize("bent", [True, False, "fisheye"])
 def test_a_colmap_model_comes_back_through_colmap(bent, tmp_path):
     capture = filmed(bent, frames=20)
     moving = np.zeros(capture.images.shape[:3], bool)
