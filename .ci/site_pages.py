@@ -2,10 +2,12 @@
 
 A hook of mkdocs (mkdocs.yml). README is the first page, notebooks and the API reference
 are made into pages, and links out of docs lead to their copies on the site. With
-PLAYERS=FOLDER, the player.html files there (NAME.html) are in the gallery.
+PLAYERS=FOLDER, the player.html files there (NAME.html) are in the gallery. With
+REPOSITORY=https://github.com/OWNER/NAME, pages of notebooks link to Colab.
 """
 
 import ast
+import importlib.util
 import os
 import pathlib
 import re
@@ -15,6 +17,9 @@ import jupytext
 from mkdocs.structure.files import File
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
+_SPEC = importlib.util.spec_from_file_location("notebooks", ROOT / ".ci/notebooks.py")
+colab = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(colab)
 # Files beside docs that pages link, with their place on the site.
 PAGES = {
     "README.md": "index.md",
@@ -94,7 +99,11 @@ def linked(text, name):
 
 def notebook(path):
     """Return a notebook as a page."""
+    repository = os.environ.get("REPOSITORY")
     parts = []
+    if repository:
+        target = colab.address(repository, path.stem)
+        parts.append(f"[![Open in Colab]({colab.BADGE})]({target})")
     for cell in jupytext.read(path).cells:
         code = cell.cell_type == "code"
         parts.append(f"```python\n{cell.source}\n```" if code else cell.source)

@@ -17,8 +17,10 @@
 # way: sharp frames, poses by COLMAP in two passes (the second with moving objects
 # masked), a look at the results of preprocessing, dynamic Gaussians, held-out metrics,
 # and `player.html`, which shows the scene from any viewpoint. `nerfies reconstruct
-# clip.mp4` does all of it in one command. Here the steps are separate. (Extras `sfm`,
-# `video` and `report`.)
+# clip.mp4` does all of it in one command. Here the steps are separate.
+
+# %%
+# %pip install --quiet "nerfies-jax[sfm,video,report]"
 
 # %%
 import dataclasses

@@ -19,6 +19,9 @@
 # loop of every `splats-*` preset, without moving cameras, time and densification.
 
 # %%
+# %pip install --quiet "nerfies-jax[report]"
+
+# %%
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt

@@ -19,6 +19,9 @@
 # trained on a scene that moves, and it is compared with the same scene without motion.
 
 # %%
+# %pip install --quiet "nerfies-jax[report]"
+
+# %%
 import dataclasses
 
 import jax

@@ -18,8 +18,9 @@
 # yours. Here it is a `flax.linen` module with the layout of NeRF (Mildenhall et al.
 # 2020, arXiv:2003.08934): density from the position, color from the direction as well.
 # It is trained on the static built-in scene and scored on views that it has not seen.
-#
-# Install `nerfies-jax[flax]`.
+
+# %%
+# %pip install --quiet "nerfies-jax[flax,report]"
 
 # %%
 import flax.linen as nn

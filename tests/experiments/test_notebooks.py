@@ -1,10 +1,12 @@
 """The notebooks run to their end, and their own checks hold, made small."""
 
+import importlib.util
 import os
 import pathlib
 import re
 import subprocess
 import sys
+import tomllib
 
 import pytest
 
@@ -28,6 +30,30 @@ SMALL = {
 def test_every_notebook_is_run_somewhere():
     found = {path.stem for path in (ROOT / "docs/notebooks").glob("*.py")}
     assert found == {*SMALL}
+
+
+@pytest.mark.parametrize("notebook", SMALL)
+def test_colab_gets_a_notebook_that_installs_what_it_imports(notebook, tmp_path):
+    pytest.importorskip("jupytext")
+    nbformat = pytest.importorskip("nbformat")
+    spec = importlib.util.spec_from_file_location("colab", ROOT / ".ci/notebooks.py")
+    colab = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(colab)
+    colab.main("https://github.com/owner/name/", tmp_path)
+    made = nbformat.read(tmp_path / f"{notebook}.ipynb", as_version=4)
+    nbformat.validate(made)
+    first, *others = [cell.source for cell in made.cells if cell.cell_type == "code"]
+    pattern = r'%pip install --quiet "nerfies-jax\[(.*)\] @ git\+(.*)"'
+    extras, source = re.fullmatch(pattern, first).groups()
+    assert source == "https://github.com/owner/name"
+    assert not any(line.startswith("# %") for line in "\n".join(others).splitlines())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = {"matplotlib": "report", "flax": "flax"}
+    modules = set(re.findall(r"^(?:import|from) (\w+)", "\n".join(others), re.M))
+    assert {needed[each] for each in modules & needed.keys()} <= {*extras.split(",")}
+    assert {*extras.split(",")} <= project["optional-dependencies"].keys()
+    target = colab.address("https://github.com/owner/name", notebook)
+    assert target.endswith(f"/github/owner/name/blob/colab/{notebook}.ipynb")
 
 
 @pytest.mark.slow
