@@ -60,7 +60,7 @@ EXCUSED = {
     **dict.fromkeys(["splats.random_in_views", "splats.scene_extent"], "host"),
     **dict.fromkeys(["splats.capacity_for", "harmonics.degree_of"], "sizes"),
     **dict.fromkeys(["kan.spacing", "kan.width", "kan.centers"], "settings"),
-    **dict.fromkeys(["template.trunk_spec", "template.color_spec"], "settings"),
+    "template.trunk_spec": "settings",
     **dict.fromkeys(["quaternion.identity", "rays.pixel_centers"], "constants"),
     **dict.fromkeys(["codes.init", "kan.init", "mlp.init", "mlp.init_layer"], "draws"),
     **dict.fromkeys(["template.init", "grids.init", "planes.init"], "draws"),
@@ -340,7 +340,8 @@ DEAR = {
     *("matrix3.displacement_log_energy", "matrix3.signed_log_energy"),
     "camera.move",
     *("camera.unproject", "rays.pixel_ray", "rays.pixel_rays", "projection.project"),
-    *("distortion.undistort", "losses.dssim_map"),
+    *("distortion.undistort", "losses.dssim_map", "faces.gaussians"),
+    *("planes.encode", "planes.space_features", "matrix3.log_energy"),
 }
 # 9 s to compile for 24, with the same rewriting of the program.
 QUICK = {

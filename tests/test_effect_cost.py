@@ -171,7 +171,7 @@ def check_removed(run, start, owner, make):
 BASES = ("appearance", "warp", "scene_flow", "motion")
 
 
-def removals(presets, quick):
+def removals(presets):
     """Each part once, with the others of the first paper's preset that has it.
 
     Each removal traces two programs, and what is left of one of several effects shows
@@ -185,25 +185,20 @@ def removals(presets, quick):
     for part, name in of.items():
         groups.setdefault((name, part if part in BASES else ""), []).append(part)
     return [
-        pytest.param(
-            name,
-            parts,
-            marks=() if parts == [quick] else pytest.mark.slow,
-            id=f"{name}-{'-'.join(parts)}",
-        )
+        pytest.param(name, parts, id=f"{name}-{'-'.join(parts)}")
         for (name, _), parts in groups.items()
     ]
 
 
-@pytest.mark.parametrize(
-    ("preset", "parts"), removals(field_presets.PRESETS, "appearance")
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("preset", "parts"), removals(field_presets.PRESETS))
 def test_a_field_without_effects_is_one_that_never_had_them(preset, parts):
     run = started_field(without(bare_scenes.tiny_field(preset), *parts))
     check_removed(run, started_field, field_spec, hand_made_effects.of_field)
 
 
-@pytest.mark.parametrize(("preset", "parts"), removals(splat_presets.PRESETS, None))
+@pytest.mark.slow
+@pytest.mark.parametrize(("preset", "parts"), removals(splat_presets.PRESETS))
 def test_splats_without_effects_are_some_that_never_had_them(preset, parts):
     run = started_splats(without(bare_scenes.tiny_splats(preset), *parts))
     check_removed(run, started_splats, splat_scene, hand_made_effects.of_splats)

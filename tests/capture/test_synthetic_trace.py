@@ -235,6 +235,7 @@ def test_value_noise_is_the_blend_of_hashed_corners(dtype, rng):
     assert np.std(exact) > 0.2
 
 
+@pytest.mark.full
 def test_albedo_is_smooth_and_lies_between_black_and_white(float64, rng):
     textures = [thing.texture for thing in SPEC.things]
     points = rng.uniform(-0.2, 0.2, (500, 3))

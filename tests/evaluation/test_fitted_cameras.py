@@ -92,12 +92,9 @@ def displaced(film, rng, turn, shift):
     return dataclasses.replace(film, cameras=moved)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
-    ("turn", "shift", "most_pixels"),
-    [
-        (0.02, 0.01, 400),
-        pytest.param(0.02, 0.0, 5000, marks=pytest.mark.full),
-    ],
+    ("turn", "shift", "most_pixels"), [(0.02, 0.01, 400), (0.02, 0.0, 5000)]
 )
 def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixels):
     film = displaced(capture, rng, turn, shift)

@@ -17,6 +17,7 @@ from nerfies_jax.scene import scene as radiance
 from tests.capture.test_capture import make
 
 
+@pytest.mark.full
 def test_large_captures_are_trained_on_where_they_lie(monkeypatch):
     capture = make(frames=6)
     images = frame_memory.aligned_empty(capture.images.shape, np.uint8)

@@ -205,6 +205,7 @@ def test_flow_is_scored_where_there_is_an_answer(double):
     assert scored["flow.missing"] == pytest.approx(1 / 5)
 
 
+@pytest.mark.full
 def test_the_flow_of_a_known_motion_is_the_true_one():
     """Points moved as the scene moves them, at the true depths: the true flow."""
     capture, truth = synthetic.make(FILM)

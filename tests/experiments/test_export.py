@@ -202,6 +202,7 @@ def test_a_scene_leaves_with_all_its_motion_and_how_far_it_is_off(splats, capsys
     assert "--frames is not for splatv" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_pictures_leave_with_their_camera_and_motion(splats, capsys, monkeypatch):
     path = ("--path", "captured", "--frames", 3)
     assert main(splats, "exr", *path) == 0
@@ -234,6 +235,7 @@ def test_pictures_leave_with_their_camera_and_motion(splats, capsys, monkeypatch
     np.testing.assert_allclose(place, [0, 0, 0, 1], atol=1e-6)
 
 
+@pytest.mark.full
 def test_tracks_leave_in_the_units_that_are_wanted(splats, capsys):
     assert main(splats, "tracks", "--points", 30, "--frames", 3) == 0
     with np.load(splats / "exports" / "tracks.npz") as stored:

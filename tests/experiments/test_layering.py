@@ -1,6 +1,7 @@
 """A package imports only from the layers below it, and modules form no circles."""
 
 import ast
+import functools
 import graphlib
 import pathlib
 
@@ -72,8 +73,13 @@ def readable(package):
     return [*SHARED, *own]
 
 
+@functools.cache
 def imports(path):
     """Names of modules read by a file, with whether at its top level."""
+    return list(_imports(path))
+
+
+def _imports(path):
     tree = ast.parse(path.read_text())
     inner = {
         id(node)

@@ -144,17 +144,6 @@ def test_a_resumed_run_completes_whatever_reads_it(undisturbed, tmp_path):
     check_whole(folder, whole)
 
 
-def test_a_preparation_completes_whatever_reads_it(tmp_path):
-    pytest.importorskip("pycolmap")
-    from tests.capture import test_structure_from_motion as room
-
-    room.film(tmp_path / "pictures", 8)
-    words = ("pictures", tmp_path / "pictures", tmp_path / "out", "--passes", "1")
-    assert command("prepare", *words, output="2>&1 | head -1") == 0
-    assert (tmp_path / "out" / "prepared.json").is_file()
-    assert len(list((tmp_path / "out" / "camera").glob("*.json"))) == 8
-
-
 @pytest.mark.parametrize(("output", "code"), [("| true", 1), ("2>&-", 0)])
 def test_a_document_that_is_lost_is_a_failure(output, code, undisturbed, tmp_path):
     whole, _ = undisturbed

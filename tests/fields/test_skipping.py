@@ -92,11 +92,11 @@ occupied_at = jax.jit(occupancy.at, static_argnums=2)
 @pytest.mark.parametrize(
     ("spec", "background", "row"),
     [
-        # Each compiles three programs. Of warped fields these are the longest.
+        # Each field compiles three programs; a static one is the quickest.
         pytest.param(GUIDED, ORANGE, 3, marks=pytest.mark.full),
         pytest.param(WARPED_TWO_LEVELS, ORANGE, 3, marks=pytest.mark.full),
         (ONE_LEVEL, ORANGE, 3),
-        *((MOVING, ORANGE, n) for n in range(3)),
+        *(pytest.param(MOVING, ORANGE, n, marks=pytest.mark.full) for n in range(3)),
     ],
     ids=[
         "guided",
@@ -210,6 +210,7 @@ def test_a_survey_finds_a_small_thing_whichever_cell_it_is_in():
     assert occupied_at(np.zeros((cells,) * 3, bool), far, 0.3).all()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("bend", [0.0, -0.2])
 def test_a_survey_of_what_is_shown_is_that_of_everything_there(bend):
     capture = scenes.tiny_capture()

@@ -134,6 +134,7 @@ def test_planes_say_where_a_point_is(point, place, dtype):
     np.testing.assert_allclose(at(jnp.int32(20)), shut, rtol=0, atol=atol)
 
 
+@pytest.mark.full
 def test_gradients_of_planes(float64):
     params, point = planes_drawn("float64"), np.array([0.31, -0.23, 1.7])
 
@@ -155,6 +156,7 @@ def test_planes_of_moments_say_when_as_well(dtype):
         at(None)
 
 
+@pytest.mark.full
 def test_gradients_of_planes_of_moments(float64):
     params = planes_drawn("float64", TIMED)
     point, time = np.array([0.31, -0.23, 1.7]), np.asarray(0.41)

@@ -48,6 +48,7 @@ def test_a_field_without_its_warp_is_the_template():
     assert np.abs(picture - drawn(view)).max() > 1e-3
 
 
+@pytest.mark.full
 def test_a_blend_starts_at_one_appearance_and_ends_at_the_other():
     view = scenes.tiny_field()[2]
     first, last = (

@@ -155,6 +155,7 @@ def test_all_is_made_of_features_as_they_are_kept(time, dtype):
     assert {leaf.dtype for leaf in found} == {np.dtype(dtype)}
 
 
+@pytest.mark.full
 def test_bits_are_those_of_the_law_and_the_file_says_bytes(float64):
     params = params_of("float64")
     off = params.rows["splats"]
@@ -170,6 +171,7 @@ def test_bits_are_those_of_the_law_and_the_file_says_bytes(float64):
     assert anchor_motion.coded_bytes(bare, plain)[0] == 4 * 3 * (3 + EACH * 4)
 
 
+@pytest.mark.full
 def test_slopes_are_those_of_differences(float64):
     """With the noise of training: rounding has slopes of its own making."""
     params = params_of("float64")

@@ -119,6 +119,7 @@ def test_rows_of_what_is_carried_are_what_is_drawn_at_rest(dtype):
     np.testing.assert_array_equal(still.sh_rest, looks.reshape(-1, 3, 3))
 
 
+@pytest.mark.full
 def test_slopes_of_what_is_carried_are_those_of_differences(float64):
     params, moved = params_of("float64"), some_gaussians(ROWS, "float64", seed=4)
     weights = np.random.default_rng(1).normal(size=(ROWS * EACH, 11))

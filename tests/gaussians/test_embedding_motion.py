@@ -190,6 +190,7 @@ def test_codes_at_their_edges_have_the_values_and_slopes_of_the_network(
         np.testing.assert_allclose(along, difference, rtol=0, atol=bound)
 
 
+@pytest.mark.full
 def test_all_but_the_number_of_rows_has_its_slope(float64, rng):
     params, embedding = filled("float64"), rng.normal(size=(3, 3))
 

@@ -31,6 +31,7 @@ def columns(path, *names):
     return np.stack([vertex[name] for name in names], axis=-1)
 
 
+@pytest.mark.full
 def test_the_file_of_an_instant_is_drawn_as_the_scene_is_then(swaying):
     model, state = swaying
     rows = instants.splats_at(model, state)(0.4)

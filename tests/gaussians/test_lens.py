@@ -124,7 +124,9 @@ def test_a_pinhole_s_program_reads_no_lens(rng):
     assert used(LENS)[0] > used(GSPLAT)[0]
 
 
-@pytest.mark.parametrize("name", ["tangential", "fisheye"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("tangential", marks=pytest.mark.full), "fisheye"]
+)
 def test_projection_gradient_equals_central_differences(name, float64, rng):
     gaussians = some_gaussians(rng, 6, float64)
     camera = camera_at(*LENSES[name], float64, position=(0.2, 0.1, -4.0))
@@ -233,9 +235,8 @@ def arguments(rng, dtype, count=60):
     return (*gaussians, colors, views, intrinsics)
 
 
-@pytest.mark.parametrize(
-    "name", ["barrel", pytest.param("fisheye", marks=pytest.mark.full)]
-)
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["barrel", "fisheye"])
 def test_rasterization_through_a_lens_is_a_large_pinhole_image_resampled(name, rng):
     """Pixel by pixel, from a pinhole image of four times the resolution."""
     model, coefficients = LENSES[name]

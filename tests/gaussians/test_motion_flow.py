@@ -279,6 +279,7 @@ def test_flow_pulls_both_cameras_by_how_they_move_and_no_weight(float64):
 SCENE = dataclasses.replace(scenes.TINY_DEFORMABLE, flow=FlowSpec(start=3))
 
 
+@pytest.mark.full
 def test_a_penalty_compares_frames_with_the_next_and_begins_at_its_start():
     capture = scenes.tiny_capture()
     model = scene.build(SCENE, scene.metadata_of(capture))

@@ -138,7 +138,8 @@ def test_a_trained_scene_is_drawn_from_what_was_prepared_without_noise(name, flo
     close(rows, jitted(motion.apply)(canonical, offsets), 1e-13)
 
 
-@pytest.mark.parametrize("name", ["basis", *full("mlp", "kan")])
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["basis", "mlp", "kan"])
 def test_a_scene_in_training_moves_with_noise_after_its_warm_up(name, float64):
     params, effects = scene_and_effect(name)
 

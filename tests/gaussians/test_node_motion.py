@@ -123,6 +123,7 @@ def test_gaussians_go_where_the_nodes_near_them_carry_them(time, name, dtype):
     assert {leaf.dtype for leaf in there} == {np.dtype(dtype)}
 
 
+@pytest.mark.full
 @by_name
 def test_slopes_are_those_of_differences(name, float64):
     gaussians = some_gaussians(ROWS, "float64")

@@ -87,6 +87,7 @@ def test_gaussians_move_as_the_network_makes_of_the_planes(time, dtype):
     assert {leaf.dtype for leaf in there} == {np.dtype(dtype)}
 
 
+@pytest.mark.full
 def test_slopes_are_those_of_differences(float64):
     gaussians = some_gaussians(ROWS, "float64")
     params = params_of(gaussians, "float64")

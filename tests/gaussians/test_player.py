@@ -317,6 +317,7 @@ def test_a_browser_draws_what_the_model_does(opened, time):
     assert psnr(image, drawn(0, 1.0 - time)) < 30
 
 
+@pytest.mark.full
 def test_what_moves_does_not_hide_what_stands_behind_it():
     """The thing behind keeps a color of its own, though no view shows it."""
     capture = scenes.tiny_capture()

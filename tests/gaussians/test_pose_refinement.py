@@ -82,6 +82,7 @@ def test_one_frame_alone_keeps_its_camera(dtype):
     jax.tree.map(np.testing.assert_array_equal, moved, given)
 
 
+@pytest.mark.full
 def test_slopes_of_the_loss_are_those_of_differences():
     with jax.enable_x64(True):
         metadata = scene.metadata_of(EVEN)

@@ -66,6 +66,7 @@ def picture_and_slopes(*args):
     return jax.tree.map(np.asarray, compiled_slopes(*args))
 
 
+@pytest.mark.full
 def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     footprints, _ = some_footprints(rng, COUNT, SIZE, "float64")
     # Three Gaussians cover every tile, 6 of them, more than a chunk of 5 pairs holds.

@@ -175,6 +175,7 @@ def test_random_points_lie_where_a_camera_sees_them(rng):
     assert seen.all()
 
 
+@pytest.mark.full
 def test_random_points_fill_the_corners_that_a_lens_sees(rng):
     cameras = ring_of_cameras(2)
     cameras = cameras._replace(radial=np.tile([-0.3, 0.0, 0.0], (2, 1)))

@@ -208,6 +208,7 @@ def test_static_rows_are_stored_once_and_stay_within_the_tolerance(static_thresh
     )
 
 
+@pytest.mark.full
 def test_gradients_in_time_and_in_the_knots(float64):
     knots = time_knots.bake(lambda t: moving(t, "float64"), 7, dtype=float64)
 

@@ -1,7 +1,6 @@
 """Motions fitted to paths, and the Gaussians that they carry."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +22,7 @@ from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import hidden_points, record, usable_paths
 from tests.gradients import directional_error
 from tests.preprocessing import films
-from tests.preprocessing.test_tracks import MOVES
+from tests.preprocessing.test_tracks import MOVES, gathered
 
 FRAMES = 24
 MOTIONS = {
@@ -39,12 +38,6 @@ MOTIONS = {
     "anchors": presets.SMALL_ADC_GS.motion,
 }
 BOX = ((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0))
-
-
-@functools.cache
-def film_and_evidence():
-    capture = films.film(**MOVES, frames=FRAMES)
-    return capture, record.gather(capture)
 
 
 def turning_body():
@@ -93,6 +86,7 @@ def test_every_motion_can_be_fitted_to_paths(name):
     assert np.median(off) < 0.03
 
 
+@pytest.mark.full
 def test_bases_are_held_outside_the_time_of_their_tracks():
     time = np.linspace(0, 1, FRAMES).astype(np.float32)
     points = np.random.default_rng(0).normal(0, 0.1, (30, 1, 3))
@@ -145,6 +139,7 @@ def test_a_motion_of_two_knots_is_straight_and_costs_nothing():
     assert guess.penalty(guess.points, None) == 0
 
 
+@pytest.mark.full
 def test_wrong_paths_bend_nothing():
     position, time = turning_body()
     position = position.copy()
@@ -170,7 +165,8 @@ def test_slopes_of_carried_points_are_those_of_differences(float64):
     assert directional_error(value, points) < 1e-7
 
 
-@pytest.mark.parametrize("deviation", [0.02, pytest.param(1.0, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("deviation", [0.02, 1.0])
 def test_a_thing_tells_its_depth_better_than_each_of_its_tracks(deviation):
     """Where the film tells depth; where it does not, tracks count as they are."""
     position, time = turning_body()
@@ -202,7 +198,7 @@ def test_nothing_known_is_refused_by_name():
 
 @pytest.mark.full
 def test_gaussians_start_on_the_card_and_move_with_it():
-    capture, evidence = film_and_evidence()
+    capture, evidence = gathered()
     effect = effect_of(MOTIONS["bases"])
     start = StartSpec(motion="tracks", moving_points=200, fit_steps=300)
     started = track_start.start(start, effect, evidence, capture, jax.random.key(0))
@@ -222,7 +218,7 @@ def test_gaussians_start_on_the_card_and_move_with_it():
 
 def test_where_no_moving_pixel_has_a_depth_the_motion_starts_alone(monkeypatch):
     """As where fewer than six tracks are known in every frame."""
-    capture, evidence = film_and_evidence()
+    capture, evidence = gathered()
     nowhere = np.zeros(evidence.moving.shape, np.float32)
     monkeypatch.setattr(track_start, "moving_depths", lambda _: nowhere)
     effects = (effect_of(MOTIONS["bases"]),)
@@ -245,7 +241,7 @@ def small_scene(**changes):
 
 
 def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
-    capture, evidence = film_and_evidence()
+    capture, evidence = gathered()
     monkeypatch.setattr(usable_paths, "CACHE", tmp_path)
     record.save(tmp_path / "evidence" / f"{record.digest(capture)}.npz", evidence)
     places = np.float32([[7, 0, 2], [8, 0, 2], [9, 0, 2]])

@@ -122,6 +122,7 @@ def test_slerp_matches_scipy(dtype, rng):
     assert error.max() < {"float32": 1e-6, "float64": 3e-15}[dtype]
 
 
+@pytest.mark.full
 def test_gradients(float64, rng):
     one, other = drawn(rng, 2)
     weight, vector = (jnp.asarray(rng.normal(size=size)) for size in ((3, 3), 3))

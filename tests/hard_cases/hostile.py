@@ -31,13 +31,6 @@ def frames_of(capture, required_data=frozenset()):
     return frames
 
 
-def _filled(level):
-    def change(frames):
-        return frames._replace(images=np.full_like(frames.images, level))
-
-    return change
-
-
 def _first(frames, *names):
     """The given arrays (a camera counts as one) with the first row in every place."""
 
@@ -100,11 +93,8 @@ def unfilmed_depth_nan(frames):
 
 CAPTURES = {
     "as filmed": lambda frames: frames,
-    "black images": _filled(0),
-    "white images": _filled(255),
-    "static scene": lambda frames: _first(frames, "images", "cameras"),
+    "black images": lambda frames: frames._replace(images=0 * frames.images),
     "one instant": lambda frames: _first(frames, "times"),
-    "identical cameras": lambda frames: _first(frames, "cameras"),
     "duplicated frames": duplicated,
     "two views": two_views,
     "unfilmed frames": unfilmed,

@@ -132,10 +132,6 @@ def one_point(rows):
     return rows._replace(mean=np.zeros_like(rows.mean) + rows.mean[:1])
 
 
-def one_color(rows):
-    return rows._replace(sh_dc=np.zeros_like(rows.sh_dc))
-
-
 def alone(rows):
     return splats.deactivate(jax.device_put(rows), jnp.arange(len(rows.mean)) > 0)
 
@@ -173,7 +169,6 @@ ROWS = {
     ),
     "opaque": lambda rows: with_logit(rows, 100.0),
     "transparent": lambda rows: with_logit(rows, -100.0),
-    "of one color": one_color,
     "about the cameras": about_the_cameras,
     "alone": alone,
     "far away": lambda rows: rows._replace(mean=rows.mean * np.float32(1e6)),

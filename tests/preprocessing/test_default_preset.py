@@ -74,6 +74,7 @@ def test_coverage_is_the_share_of_moving_pixels_near_known_paths():
     np.testing.assert_allclose(share, near / total)
 
 
+@pytest.mark.full
 def test_a_scene_of_which_no_track_moves_is_static():
     film = films.film(frames=24)
     evidence = record.gather(film)

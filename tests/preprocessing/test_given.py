@@ -135,6 +135,7 @@ def pixels(camera, point):
     return jax.vmap(lambda one: cameras.project(camera, one)[0])(point)
 
 
+@pytest.mark.full
 def test_results_for_distorted_images_are_mapped_to_undistorted_ones():
     """The geometry is that of a wall, by projection alone."""
     film = films.film(frames=3, blank=True)
@@ -201,6 +202,7 @@ def test_results_for_distorted_images_are_mapped_to_undistorted_ones():
         assert (error[~known[frames]] > 1000).all()
 
 
+@pytest.mark.full
 def test_flow_given_is_taken_and_checked_both_ways(tmp_path):
     capture, own = gathered()
     forward, backward = own.flow.forward[:-1], own.flow.backward[1:].copy()

@@ -89,6 +89,7 @@ def test_a_static_camera_sees_motion_and_stillness():
     assert verdict(inspect_job.inspect(quiet), "motion") == (False, CERTAIN)
 
 
+@pytest.mark.full
 def test_a_drifting_exposure_is_told_from_motion():
     film = films.film(gain=lambda time: 2 ** (0.5 * np.sin(7 * time)) / 1.5)
     inspected = inspect_job.inspect(film)
@@ -166,6 +167,7 @@ def test_frames_of_one_moment_ask_for_no_motion():
     assert "same time" in inspected.finding("motion").evidence
 
 
+@pytest.mark.full
 def test_a_card_that_comes_and_goes_is_transient_and_one_that_sways_is_not():
     film = films.film(
         card=lambda time: (0.2 * (time - 0.5), 0.0),
@@ -179,6 +181,7 @@ def test_a_card_that_comes_and_goes_is_transient_and_one_that_sways_is_not():
     assert verdict(still(), "transient objects")[0] is False
 
 
+@pytest.mark.full
 def test_depth_is_held_against_parallax():
     film = films.film()
     scene = np.full(film.images.shape[:3], films.FAR, np.float32)

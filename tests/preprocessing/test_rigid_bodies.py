@@ -89,6 +89,7 @@ def test_a_thing_that_swings_faster_than_the_camera_is_placed_by_its_own_size():
     np.testing.assert_array_equal(hasty.position, alone.position)
 
 
+@pytest.mark.full
 def test_of_a_long_film_a_thing_is_adjusted_in_some_frames_and_posed_in_all(
     monkeypatch,
 ):
@@ -103,6 +104,7 @@ def test_of_a_long_film_a_thing_is_adjusted_in_some_frames_and_posed_in_all(
     assert np.std((some.depth / true)[some.known]) < 0.01
 
 
+@pytest.mark.full
 def test_what_bends_keeps_its_own_paths():
     seen_from, world = views(), turning_body()
     time = np.linspace(0, 1, FRAMES)

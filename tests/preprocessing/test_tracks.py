@@ -244,6 +244,7 @@ def test_nothing_moves_in_a_still_film():
     assert len(evidence.moved) < 0.01 * len(evidence.score)
 
 
+@pytest.mark.full
 def test_cameras_that_are_off_by_a_pixel_set_no_wall_in_motion():
     capture = films.film(**MOVES, frames=24)
     noise = np.random.default_rng(0).normal(0, 0.7 * films.FAR / films.FOCAL, (24, 3))
@@ -388,6 +389,7 @@ def test_the_card_is_where_it_is():
     assert speed["speed_px"] == pytest.approx(step / films.NEAR * films.FOCAL, rel=0.1)
 
 
+@pytest.mark.full
 def test_what_moves_before_the_near_plane_of_the_wall_is_known():
     """Structure from motion gives the plane, and no point of what moves."""
     near = 0.8 * films.FAR

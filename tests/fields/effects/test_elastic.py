@@ -262,6 +262,7 @@ def slow(spec, setting):
     return total, folded / float(setting.weight.sum())
 
 
+@pytest.mark.full
 def test_energy_of_all_samples_in_a_loop(setting):
     spec = ElasticSpec(points=None, robust_width=0.5)
     unfolded = dataclasses.replace(spec, fold_cost=0.0)
@@ -284,7 +285,8 @@ def test_as_many_points_as_samples_take_each_once(setting):
     np.testing.assert_array_equal(weight, setting.weight)
 
 
-@pytest.mark.parametrize("points", [2, pytest.param(None, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("points", [2, None])
 def test_gradients_reach_the_warp_and_not_the_weights(points, setting):
     spec = ElasticSpec(points=points)
 

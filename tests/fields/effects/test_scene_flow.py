@@ -56,7 +56,8 @@ def test_weights_are_the_spec_s_and_the_capture_s_own_terms_fade(dtype):
             np.testing.assert_allclose(term.weight, expected, rtol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("step", [pytest.param(0, marks=pytest.mark.full), 250])
+@pytest.mark.full
+@pytest.mark.parametrize("step", [0, 250])
 def test_the_whole_penalty_has_the_slope_of_its_differences(float64, step):
     params, frames, batch, arrays = scenario("float64")
     # What is held fixed on purpose has no slope to compare: left out, or its weight is
@@ -94,6 +95,7 @@ def test_terms_without_a_weight_or_data_are_not_there():
 NAMES = tuple(field.name for field in dataclasses.fields(FlowWeights))
 
 
+@pytest.mark.full
 def test_a_flow_with_a_trunk_of_its_own_reads_nothing_of_the_medium_s(dtype):
     own = dataclasses.replace(TINY, flow_trunk=True)
     key, at = jax.random.key(0), jnp.asarray([0.1, -0.2, 0.3], dtype)
@@ -117,6 +119,7 @@ def test_a_flow_with_a_trunk_of_its_own_reads_nothing_of_the_medium_s(dtype):
 # --- edges of time
 
 
+@pytest.mark.full
 def test_a_medium_on_planes_is_finite_where_there_is_no_moment(dtype):
     """As neighbors of the first and the last are, at any distance."""
     network = dataclasses.replace(
@@ -160,6 +163,7 @@ def slopes_of(params, frames, batch, arrays, times):
     return jax.grad(total, (0, 1), has_aux=True)(params, shift)
 
 
+@pytest.mark.full
 def test_the_first_and_the_last_moment_have_one_neighbor(float64):
     (_, grad), _ = slopes_of(*scenario("float64"), TIMES)
     strength = {name: np.abs(np.asarray(x)).sum((1, -1)) for name, x in grad.items()}

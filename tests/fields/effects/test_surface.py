@@ -171,6 +171,7 @@ def test_float32_normals_are_those_of_float64():
         np.testing.assert_allclose(found, value, rtol=0, atol=2e-4, err_msg=key)
 
 
+@pytest.mark.full
 def test_a_rigid_warp_turns_normals_as_it_turns_back(float64, rng):
     """The transpose of a rotation is what the paper takes."""
     angle = rng.normal(size=3)
