@@ -48,15 +48,15 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _main(arguments):
     words = sys.argv[1:] if arguments is None else arguments
-    known = commands()
+    by_name = commands()
     studies = names.studies()
     if words[:1] == [STUDY]:
         if words[1:2] in ([], ["-h"], ["--help"]):
             console.say(STUDIES.format(commands=_table(studies)))
             return
-        _run(words[1:], known, STUDY, studies)
+        _run(words[1:], by_name, STUDY, studies)
         return
-    for_users = {name: text for name, text in known.items() if name not in studies}
+    for_users = {name: text for name, text in by_name.items() if name not in studies}
     if not words or words[0] in ("-h", "--help"):
         console.say(USAGE.format(commands=_table(for_users)))
         return
@@ -66,15 +66,15 @@ def _main(arguments):
     if words[0].startswith(options.COMPLETION):
         print_completion(words)
         return
-    _run(words, known, "command", [*for_users, STUDY])
+    _run(words, by_name, "command", [*for_users, STUDY])
 
 
 def _run(words, known, kind, shown):
-    name, *rest = words
+    name, *arguments = words
     if name not in known:
         console.error(f"no {kind} {name!r}; {known_names(name, shown)}")
         raise SystemExit(2)
-    main_of(name)(rest)
+    main_of(name)(arguments)
 
 
 def _table(summaries):

@@ -184,12 +184,12 @@ def find_code(names: Iterable[str]) -> None:
     """
     for name in names:
         module = name.partition(":")[0].partition(".")[0]
-        known = module in sys.modules or not module.isidentifier()
-        if known or importlib.util.find_spec(module) is not None:
+        is_importable = module in sys.modules or not module.isidentifier()
+        if is_importable or importlib.util.find_spec(module) is not None:
             continue
-        here = pathlib.Path.cwd()
-        if (here / f"{module}.py").is_file() or (here / module).is_dir():
-            sys.path.append(str(here))
+        folder = pathlib.Path.cwd()
+        if (folder / f"{module}.py").is_file() or (folder / module).is_dir():
+            sys.path.append(str(folder))
             return
 
 
@@ -241,13 +241,13 @@ def command(settings: Any) -> Callable[[Callable], options.Command]:
             aside = _words_aside() if as_json else contextlib.nullcontext()
             with aside, user_errors((MissingExtra,)):
                 result = _interruptible(run, args)
-            ended = result if isinstance(result, Ended) else None
-            result = result if ended is None else ended.result
+            end = result if isinstance(result, Ended) else None
+            result = result if end is None else end.result
             if as_json:
                 document = json.dumps(result, indent=1, allow_nan=False, default=str)
                 session.deliver(document)
-            if ended is not None:
-                raise SystemExit(ended.code)
+            if end is not None:
+                raise SystemExit(end.code)
             return result
 
         main.settings = settings
@@ -310,8 +310,8 @@ def _called(run):
     if name != "__main__":
         name = name.removesuffix(".__main__").removeprefix("experiments.")
         return names.line(name)
-    found = sys.modules[name].__spec__
-    name = pathlib.Path(sys.argv[0]).stem if found is None else found.name
+    spec = sys.modules[name].__spec__
+    name = pathlib.Path(sys.argv[0]).stem if spec is None else spec.name
     return f"python -m {name.removesuffix('.__main__')}"
 
 
@@ -319,14 +319,14 @@ def _called(run):
 def _words_aside() -> Iterator[None]:
     """Standard output is standard error, for this process and those it starts."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    stdout = os.dup(1)
     os.dup2(2, 1)
     try:
         with contextlib.redirect_stdout(sys.stderr):
             yield
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(stdout, 1)
+        os.close(stdout)
 
 
 def stored(path: pathlib.Path) -> Any:
@@ -417,8 +417,8 @@ def as_options(text: str, error: Exception) -> str:
 
     def option(match):
         value = match["value"].strip("'\"")
-        shown = "" if value in ("...", "True") else f" {value}"
-        return f"--{match['name'].replace('_', '-')}{shown}"
+        text = "" if value in ("...", "True") else f" {value}"
+        return f"--{match['name'].replace('_', '-')}{text}"
 
     text = _ARGUMENT.sub(option, text)
     text = _RESUME.sub(

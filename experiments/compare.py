@@ -123,14 +123,14 @@ def read(folders, trusted=None) -> list[Compared]:
         curve = curves.read(folder)
         try:
             metrics, remark = _progress(folder, name)
-            stored = json.loads((folder / run_folder.CONFIG).read_text())
-            config = stored["config"]
+            content = json.loads((folder / run_folder.CONFIG).read_text())
+            config = content["config"]
             source = config["source"]
-            kind = representations.named(stored["representation"])
+            kind = representations.named(content["representation"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{folder}: not a run ({error!r})") from error
         if trusted is not None:
-            trust.check(folder, stored, kind.spec_type, trusted)
+            trust.check(folder, content, kind.spec_type, trusted)
         compared.append(Compared(name, folder, metrics, curve, remark))
         same = {key: source.get(key) for key in SAME}
         if source.get("capture") is None:  # a built-in scene is made from the seed
@@ -221,12 +221,12 @@ def _legend(compared) -> list[str]:
 
 def table(compared, goals) -> str:
     """One line for each run."""
-    known = _columns(compared)
-    heads = ["run", *(c[1] for c in known), *(f"s to {goal:g} dB" for goal in goals)]
+    columns = _columns(compared)
+    heads = ["run", *(c[1] for c in columns), *(f"s to {goal:g} dB" for goal in goals)]
     lines = [heads]
     for run, reached in zip(compared, times(compared, goals), strict=True):
         cells = [
-            _cell(_value(run, key), digits, unit) for key, _, digits, unit in known
+            _cell(_value(run, key), digits, unit) for key, _, digits, unit in columns
         ]
         cells += ["never" if x is None else f"{x:.0f}" for x in reached]
         lines.append([run.name, *cells])
@@ -257,19 +257,19 @@ def remarks(compared) -> list[str]:
         )
     first = compared[0]
     for run in compared:
-        scored, drawn = run.metrics.get("heldout.frames"), len(run.curve.frames)
-        if scored is not None and drawn < scored:
+        scored, frames = run.metrics.get("heldout.frames"), len(run.curve.frames)
+        if scored is not None and frames < scored:
             sentences.append(
-                f"The curve of {run.name} and its times to a PSNR are of {drawn} "
+                f"The curve of {run.name} and its times to a PSNR are of {frames} "
                 f"held-out frames, its scores in the table of {scored:.0f}."
             )
     for run in compared[1:]:
         for key in ("cpu", "cores", "xla_cores", "jax"):
-            here, there = run.curve.machine.get(key), first.curve.machine.get(key)
-            if here != there:
+            value, reference = run.curve.machine.get(key), first.curve.machine.get(key)
+            if value != reference:
                 sentences.append(
-                    f"Seconds do not compare: {key} is {there} in {first.name} and "
-                    f"{here} in {run.name}."
+                    f"Seconds do not compare: {key} is {reference} in {first.name} and "
+                    f"{value} in {run.name}."
                 )
         if run.curve.frames != first.curve.frames:
             sentences.append(

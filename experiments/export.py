@@ -217,9 +217,9 @@ def main(args):
             run = runs.with_found_cameras(run, runs.restore(args.run, run).state)
         args.place.parent.mkdir(parents=True, exist_ok=True)
         with events.stage(f"exporting {args.kind}"):
-            said = export_writers.WRITERS[args.kind](args, run)
-        console.say(f"{said}: {args.place}")
-    return {"written": str(args.place), "format": args.kind, "said": said}
+            summary = export_writers.WRITERS[args.kind](args, run)
+        console.say(f"{summary}: {args.place}")
+    return {"written": str(args.place), "format": args.kind, "said": summary}
 
 
 if __name__ == "__main__":

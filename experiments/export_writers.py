@@ -19,16 +19,16 @@ def _gaussians(args: Any, run: Any) -> str:
     state = runs.restore(args.run, run).state
     in_scene = instants.splats_at(run.model, state)
     rotation = None if args.axis is None else axes.rotation_to(run.capture, args.axis)
-    seen = None
+    visible = None
     if args.kept == "seen":
-        seen = sampled.visible(_seen(run, state))
+        visible = sampled.visible(_seen(run, state))
         left_out = int(splats.active_mask(run.model.stages.rows(state.params)).sum())
-        left_out -= int(seen.sum())
+        left_out -= int(visible.sum())
 
     def at(time):
         rows = in_scene(time)
-        if seen is not None:
-            rows = Splats(*(leaf[seen] for leaf in rows))
+        if visible is not None:
+            rows = Splats(*(leaf[visible] for leaf in rows))
         if args.units == "world":
             rows = instants.in_world(rows, run.capture)
         return rows if rotation is None else turned.turned(rows, rotation)
@@ -36,18 +36,18 @@ def _gaussians(args: Any, run: Any) -> str:
     save = functools.partial(files.save, usd_up="Z" if args.axis == "z" else "Y")
     if args.frames is None:
         count = save(args.place, at(args.time or 0.0))
-        said = f"{count} Gaussians at time {args.time or 0:g}"
+        summary = f"{count} Gaussians at time {args.time or 0:g}"
     else:
         suffix = SUFFIXES.get(args.kind, f".{args.kind}")
         instants.save_sequence(
             args.place, at, args.frames, suffix, save, overwrite=args.overwrite
         )
-        said = f"Gaussians at {args.frames} times"
+        summary = f"Gaussians at {args.frames} times"
     if args.axis is not None:
-        said += f", {args.axis} up"
-    if seen is not None:
-        said += f", without {left_out} that no camera saw"
-    return said
+        summary += f", {args.axis} up"
+    if visible is not None:
+        summary += f", without {left_out} that no camera saw"
+    return summary
 
 
 def _seen(run: Any, state: Any) -> Any:
@@ -102,8 +102,8 @@ def _splatv(args: Any, run: Any) -> str:
     at = instants.gaussians_at(run.model, state)
     rows = run.model.stages.rows(state.params)
     raster = raster_of(spec, run.metadata)
-    seen = _seen(run, state)
-    learned = sampled.gathered(at, rows, seen, sampled.MOST_INSTANTS)
+    visible = _seen(run, state)
+    learned = sampled.gathered(at, rows, visible, sampled.MOST_INSTANTS)
     curves = splatv.write(args.place, learned, capture)
     model = run.model
     if spec.exposure is not None:  # of which the file has none

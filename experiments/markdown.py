@@ -39,9 +39,12 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -
       Markdown.
     """
     rows = [[cell.replace("|", r"\|") for cell in row] for row in rows]
-    kept = [k for k in range(len(heads)) if not k or any(row[k] for row in rows)]
-    lines = [[heads[k] for k in kept], ["---" if k < words else "---:" for k in kept]]
-    lines += [[row[k] for k in kept] for row in rows]
+    columns = [k for k in range(len(heads)) if not k or any(row[k] for row in rows)]
+    lines = [
+        [heads[k] for k in columns],
+        ["---" if k < words else "---:" for k in columns],
+    ]
+    lines += [[row[k] for k in columns] for row in rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 

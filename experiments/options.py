@@ -126,9 +126,9 @@ def _group(heading, entries):
 
 
 def _made(name, parts, doc):
-    made = dataclasses.make_dataclass(name, parts, frozen=True, kw_only=True)
-    made.__doc__ = doc
-    return made
+    record = dataclasses.make_dataclass(name, parts, frozen=True, kw_only=True)
+    record.__doc__ = doc
+    return record
 
 
 def _fields(settings):
@@ -148,10 +148,10 @@ def _headings(settings):
 
 def _plain(kind, marks, offering):
     """Return the type on a command line: of a path or a string, the path."""
-    known = next((mark for mark in marks if isinstance(mark, Known)), None)
+    choices = next((mark for mark in marks if isinstance(mark, Known)), None)
     several = typing.get_origin(kind) is tuple
-    if offering and known is not None:
-        name = Literal[known.names]
+    if offering and choices is not None:
+        name = Literal[choices.names]
         return tuple[name, ...] if several else name | None
     parts = typing.get_args(kind)
     if pathlib.Path in parts and str in parts:
@@ -163,10 +163,10 @@ def _plain(kind, marks, offering):
 
 def _words(doc, field):
     """Help and default of an option, for `tyro.conf.arg`."""
-    said = DEFAULT.search(doc)
+    default = DEFAULT.search(doc)
     words = {"help": DEFAULT.sub("", doc)}
-    if said is not None:
-        words["help_behavior_hint"] = f"({said[1]})"
+    if default is not None:
+        words["help_behavior_hint"] = f"({default[1]})"
     elif field.default in (None, (), False):
         words["help_behavior_hint"] = ""
     return words

@@ -60,16 +60,16 @@ def main(args):
         views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
         numbers = summary.of(views, evidence)
         console.say("\n".join(summary.lines(numbers, evidence)))
-        stored = {"capture": capture.name, "found": _as_json(numbers._asdict())}
+        document = {"capture": capture.name, "found": _as_json(numbers._asdict())}
         errors = _errors(capture, evidence)
         if errors is not None:
-            stored["errors"] = _as_json(errors._asdict())
+            document["errors"] = _as_json(errors._asdict())
             console.say("\n".join(_error_lines(errors)))
         panels.save(contact_sheet.followed(views, evidence), out / "tracks.png")
-        write_json(out / "preprocessing.json", stored)
+        write_json(out / "preprocessing.json", document)
     console.say(f"frames with tracks: {out / 'tracks.png'}")
     console.say(f"stored result: {path if path.exists() else 'none'}")
-    return stored
+    return document
 
 
 def _errors(capture, evidence):

@@ -135,12 +135,12 @@ def _result(outcome):
 def _outcome(args):
     with cli.user_errors():
         args = _with_seconds(args)
-        named = extensions.names_in_assignments(args.set)
-        cli.find_code((*args.trust, *named))
+        names = extensions.names_in_assignments(args.set)
+        cli.find_code((*args.trust, *names))
         if args.resume:
             args = _with_folder(args)
             _check_resumed(args)
-        wide = not (args.trust or named)
+        wide = not (args.trust or names)
         cores = _cores(args)
         platform.start_jax(args.device, *cores, devices=args.devices, wide=wide)
         watched = _watched(args)

@@ -58,10 +58,10 @@ def _read(path, kinds, aside=False):
 
 
 def _object(path, kinds):
-    stored = json.loads(path.read_bytes())
-    if not isinstance(stored, dict):
-        raise ValueError(f"it holds a {type(stored).__name__}")
+    content = json.loads(path.read_bytes())
+    if not isinstance(content, dict):
+        raise ValueError(f"it holds a {type(content).__name__}")
     for name, kind in kinds.items():
-        if name not in stored or not isinstance(stored[name], kind):
+        if name not in content or not isinstance(content[name], kind):
             raise ValueError(f"it has no {name}")
-    return stored
+    return content

@@ -33,19 +33,19 @@ def main(args):
     render.configure(docformat="markdown", math=True)
     names = _public_names()
     # A package without a face of its own brings its modules along.
-    shown = [module for module in names if _has_face(module.rpartition(".")[0])]
-    pdoc.pdoc(*shown, output_directory=args.out)
-    missing = [
+    documented = [module for module in names if _has_face(module.rpartition(".")[0])]
+    pdoc.pdoc(*documented, output_directory=args.out)
+    undocumented = [
         f"{module}.{name}"
-        for module, there in names.items()
-        for name in there
+        for module, present in names.items()
+        for name in present
         if f'id="{name}"' not in page(args.out, module).read_text()
     ]
-    for name in missing:
+    for name in undocumented:
         console.error(f"{name} is on no page of the reference")
     console.say(f"{len(names)} modules: {args.out / 'index.html'}")
-    result = {"folder": str(args.out), "modules": len(names), "missing": missing}
-    return cli.Ended(result, 1 if missing else 0)
+    result = {"folder": str(args.out), "modules": len(names), "missing": undocumented}
+    return cli.Ended(result, 1 if undocumented else 0)
 
 
 def page(folder: pathlib.Path, module: str) -> pathlib.Path:

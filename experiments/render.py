@@ -329,9 +329,9 @@ class _Pictures:
             return evaluation.as_picture(rendering.color)
         if self.show == "flow":
             return self._drawn_flow(rendering, place)
-        known = rendering.alpha > 0.5
-        colored = panels.color_depth(rendering.depth, known, self.limits)
-        if known.any():
+        opaque = rendering.alpha > 0.5
+        colored = panels.color_depth(rendering.depth, opaque, self.limits)
+        if opaque.any():
             self.limits = colored.low, colored.high
         return colored.picture
 
@@ -340,8 +340,8 @@ class _Pictures:
         from nerfies_jax.evaluation import model_flow
         from nerfies_jax.visualization import panels
 
-        here, there = self._views[place], self._views[place : place + 2][-1]
-        flow = model_flow.picture_flow(self._move, self._state, here, there, rendering)
+        start, end = self._views[place], self._views[place : place + 2][-1]
+        flow = model_flow.picture_flow(self._move, self._state, start, end, rendering)
         colored = panels.color_flow(flow, self.limits)
         if np.nanmax(np.abs(flow), initial=0) > 0:
             self.limits = colored.high

@@ -160,8 +160,8 @@ def refuse_early(out: pathlib.Path, args: Any) -> None:
     if earlier is None:
         refuse_existing(out, args.overwrite)
     elif not args.overwrite:
-        made = Made(request(args), earlier["run"], earlier["revision"])
-        _refuse_other(out, made, earlier)
+        record = Made(request(args), earlier["run"], earlier["revision"])
+        _refuse_other(out, record, earlier)
 
 
 def _earlier(out):
@@ -191,9 +191,9 @@ def _differs(made, earlier):
     """Describe the first difference from an earlier render, or return ''."""
     for place, now in (("request", made.request), ("run", made.run)):
         for key in dict.fromkeys((*now, *earlier[place])):
-            before, wanted = earlier[place].get(key), now.get(key)
-            if before != wanted:
-                return f"{key} is {_words(before)} there and {_words(wanted)} here"
+            before, after = earlier[place].get(key), now.get(key)
+            if before != after:
+                return f"{key} is {_words(before)} there and {_words(after)} here"
     if earlier["revision"] != made.revision:
         return f"made by revision {earlier['revision']}, and this is {made.revision}"
     return ""

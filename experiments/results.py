@@ -173,12 +173,12 @@ def main(args):
     with cli.user_errors():
         if args.measured is not None:
             keep(args.pages[0], args.measured)
-        written = {name: PAGES / f"{name}.md" for name in args.pages or kept()}
-        for name, path in written.items():
+        pages = {name: PAGES / f"{name}.md" for name in args.pages or kept()}
+        for name, path in pages.items():
             _write(path, page(name))
             console.say(path)
         _write(PAGES / "README.md", index())
-    return {"pages": {name: str(path) for name, path in written.items()}}
+    return {"pages": {name: str(path) for name, path in pages.items()}}
 
 
 def _write(path, text):
@@ -227,12 +227,12 @@ def keep(name: str, measured: pathlib.Path) -> None:
       ValueError: If no page can be written from the file.
     """
     try:
-        stored = json.loads(measured.read_text())
+        record = json.loads(measured.read_text())
     except json.JSONDecodeError as error:
         raise ValueError(f"--measured {measured}: not JSON ({error})") from None
-    _check_of(name, stored, measured)
+    _check_of(name, record, measured)
     try:
-        _page_of(name, stored)
+        _page_of(name, record)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
             f"--measured {measured}: not what {STUDIES[name].line} writes ({error!r})"
@@ -250,12 +250,12 @@ def _check_of(name, stored, measured):
     words = STUDIES[name].command.split()
     for option in ("--suite", "--scene"):
         if option in words:
-            wanted = " ".join(words[words.index(option) :][:2])
-            others = [x for x in stored.get("benchmarks", ()) if wanted not in x]
+            option_words = " ".join(words[words.index(option) :][:2])
+            others = [x for x in stored.get("benchmarks", ()) if option_words not in x]
             if others:
                 raise ValueError(
                     f"--measured {measured}: of {others[0]}, and the page {name} is of "
-                    f"{wanted}"
+                    f"{option_words}"
                 )
 
 
@@ -288,12 +288,12 @@ def index() -> str:
         for name, study in STUDIES.items()
         if path_of(name).exists()
     ]
-    missing = [
+    absent = [
         f"`{study.line}`" for name, study in STUDIES.items() if name not in kept()
     ]
     return INDEX.format(
         pages=markdown.table(("page", "subject", "measured by"), rows, words=3),
-        missing=MISSING.format(commands=markdown.bullets(missing)) if missing else "",
+        missing=MISSING.format(commands=markdown.bullets(absent)) if absent else "",
         finished=markdown.bullets(
             f"[{name}.md]({name}.md): {about}" for name, about in FINISHED.items()
         ),

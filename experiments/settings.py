@@ -65,13 +65,13 @@ def lines(described: dict[str, Any]) -> list[str]:
     for path, field in described["fields"].items():
         above = path.rpartition(".")[0]
         groups.setdefault((above, field["source"]), []).append((path, field))
-    shown = [f"{described['preset']}, as --set takes it:"]
+    text = [f"{described['preset']}, as --set takes it:"]
     for (above, source), fields in groups.items():
         title = f"{above or 'the scene'}: {fields[0][1]['of']}"
-        shown += ["", *textwrap.wrap(title, WIDTH), f"({source})"]
+        text += ["", *textwrap.wrap(title, WIDTH), f"({source})"]
         for path, field in fields:
-            shown += _entry(f"{path}={field['value']}", field)
-    return shown
+            text += _entry(f"{path}={field['value']}", field)
+    return text
 
 
 def _entry(assignment, field):

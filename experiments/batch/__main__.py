@@ -153,17 +153,17 @@ def main(args):
         args.out.mkdir(parents=True, exist_ok=True)
         _check_settings(args)
         runs = planned(args)
-    missing = [run.task for run in runs if tasks.result(run.task) is None]
+    unfinished = [run.task for run in runs if tasks.result(run.task) is None]
     endings = {}
-    for task, ending in engines.execute(missing, engine, args.retries):
+    for task, ending in engines.execute(unfinished, engine, args.retries):
         result = tasks.result(task)
         if result is None:
             endings[task] = ending
             console.say(tasks.failure(task, ending))
         else:
             console.say(f"{task.name}: {tasks.summary(result.metrics)}")
-    stored = keep(args, runs, endings)
-    return cli.Ended(stored, 1 if endings else 0)
+    record = keep(args, runs, endings)
+    return cli.Ended(record, 1 if endings else 0)
 
 
 def _engine(args) -> engines.Engine:
@@ -188,8 +188,8 @@ def _engine(args) -> engines.Engine:
 
 def _check_settings(args):
     """Raise ValueError if the folder holds a batch with other settings."""
-    stored = records.rows(args.out / STORED)
-    earlier = stored.get("settings", args.settings)
+    record = records.rows(args.out / STORED)
+    earlier = record.get("settings", args.settings)
     changed = [name for name in args.settings if earlier[name] != args.settings[name]]
     if changed:
         name = changed[0]
@@ -197,7 +197,7 @@ def _check_settings(args):
             f"--out {args.out}: holds a batch with {name}={earlier[name]}, and this "
             f"one has {args.settings[name]}; choose another folder"
         )
-    records.write(args.out / STORED, {**stored, "settings": args.settings})
+    records.write(args.out / STORED, {**record, "settings": args.settings})
 
 
 def planned(args: Batch) -> list[Run]:
@@ -292,14 +292,14 @@ def keep(
         }
         for task, ending in endings.items()
     ]
-    stored = {"settings": args.settings, "rows": rows, "failures": failures}
-    records.write(path, stored, *(result.machine for result in finished.values()))
-    page.write(args.out / "index.html", stored)
-    console.say(page.table(stored))
+    record = {"settings": args.settings, "rows": rows, "failures": failures}
+    records.write(path, record, *(result.machine for result in finished.values()))
+    page.write(args.out / "index.html", record)
+    console.say(page.table(record))
     if failures:
         console.say(f"{len(failures)} of {len(runs)} runs failed")
     console.say(f"stored in {path} and {args.out / 'index.html'}")
-    return stored
+    return record
 
 
 if __name__ == "__main__":

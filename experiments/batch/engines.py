@@ -75,10 +75,10 @@ def local(tasks: Iterable[Task], jobs: int = 1) -> Iterator[tuple[Task, Ending]]
                 running[pool.submit(task, stop)] = task
             if not running:
                 return
-            ended, _ = concurrent.futures.wait(
+            done, _ = concurrent.futures.wait(
                 running, POLL_SECONDS, concurrent.futures.FIRST_COMPLETED
             )
-            for one in ended:
+            for one in done:
                 yield running.pop(one), one.result()
             stopping.check()
     finally:

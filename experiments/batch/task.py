@@ -226,8 +226,8 @@ def result(task: Task) -> Result | None:
     if metrics is None:
         return None
     config = json.loads((task.folder / run_folder.CONFIG).read_text())["config"]
-    known = {key: value for key, value in metrics.items() if value is not None}
-    return Result(config["preset"], known, curves.read(task.folder).machine)
+    values = {key: value for key, value in metrics.items() if value is not None}
+    return Result(config["preset"], values, curves.read(task.folder).machine)
 
 
 def summary(metrics: Mapping[str, float]) -> str:

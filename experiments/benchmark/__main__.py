@@ -177,8 +177,8 @@ def _execute(args, runs):
     Wrong input, which is that of all runs, raises ValueError.
     """
     failures = []
-    missing = [run.task for run in runs if tasks.result(run.task) is None]
-    for task, ending in engines.local(missing, args.jobs):
+    unfinished = [run.task for run in runs if tasks.result(run.task) is None]
+    for task, ending in engines.local(unfinished, args.jobs):
         result = tasks.result(task)
         if result is not None:
             console.say(f"{task.name}: {tasks.summary(result.metrics)}")
@@ -200,7 +200,7 @@ def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
     from experiments.benchmark import page, verdicts  # load JAX
 
     path = args.out / STORED
-    stored = records.rows(path, benchmarks=dict) or {"benchmarks": {}}
+    record = records.rows(path, benchmarks=dict) or {"benchmarks": {}}
     numbers = {(run.method, run.seed): one.metrics for run, one in results.items()}
     methods = {}
     for method, settings in args.chosen.items():
@@ -216,8 +216,8 @@ def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
         "methods": methods,
         "claims": [one._asdict() for one in verdicts.judge(numbers, claims)],
     }
-    stored["benchmarks"][args.label] = benchmark
-    records.write(path, stored, *(result.machine for result in results.values()))
+    record["benchmarks"][args.label] = benchmark
+    records.write(path, record, *(result.machine for result in results.values()))
     console.say(page.page({"benchmarks": {args.label: benchmark}}))
     folders = [tasks.shown(run.task.folder) for run in results if run.seed == 0]
     if len(folders) > 1:

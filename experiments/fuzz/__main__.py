@@ -63,31 +63,31 @@ def main(args):
             raise ValueError(f"--only {args.only}: choose one of {', '.join(TARGETS)}")
         args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / STORED
-    stored = cli.stored(path) or {"seed": args.seed, "targets": {}}
-    stored["machine"] = clock.machine()
+    record = cli.stored(path) or {"seed": args.seed, "targets": {}}
+    record["machine"] = clock.machine()
     # A campaign that goes on may have begun with earlier readers.
-    stored["revisions"] = [*dict.fromkeys([*stored.get("revisions", []), revision()])]
+    record["revisions"] = [*dict.fromkeys([*record.get("revisions", []), revision()])]
     names = [args.only] if args.only else [*TARGETS]
-    begun, rounds = time.monotonic(), 1
-    while (left := args.mutations - _done(stored)) > 0:
+    start, rounds = time.monotonic(), 1
+    while (remaining := args.mutations - _done(record)) > 0:
         for name in names:
-            spent = time.monotonic() - begun
+            spent = time.monotonic() - start
             if args.seconds is not None and spent > args.seconds:
-                left = 0
+                remaining = 0
                 break
             stopping.check()
             # Few at first, so that a short run has seen every reader.
             share = sum(TARGETS[each].weight for each in names)
-            count = min(TARGETS[name].weight * rounds, max(left, 1))
-            count = max(1, min(count, left * TARGETS[name].weight // share + 1))
-            _extend(stored, name, count, args)
-            write_json(path, stored)
-        if left <= 0:
+            count = min(TARGETS[name].weight * rounds, max(remaining, 1))
+            count = max(1, min(count, remaining * TARGETS[name].weight // share + 1))
+            _extend(record, name, count, args)
+            write_json(path, record)
+        if remaining <= 0:
             break
         rounds = min(4 * rounds, 32)
-    failures = sum(sum(one["failures"].values()) for one in stored["targets"].values())
-    console.say(f"{_done(stored)} mutations, {failures} failures; kept in {path}")
-    return cli.Ended(stored, 1 if failures else 0)
+    failures = sum(sum(one["failures"].values()) for one in record["targets"].values())
+    console.say(f"{_done(record)} mutations, {failures} failures; kept in {path}")
+    return cli.Ended(record, 1 if failures else 0)
 
 
 def _done(stored):
@@ -102,13 +102,13 @@ def _extend(stored, name, count, args):
         | {"seconds": 0.0, "bytes": 0, "examples": []},
     )
     first = one["mutations"]
-    seen = _run(args.out.resolve(), name, first, first + count, stored["seed"])
+    counts = _run(args.out.resolve(), name, first, first + count, stored["seed"])
     for key in ("read", "refused"):
-        one[key] += seen[key]
+        one[key] += counts[key]
     for key in ("seconds", "bytes"):
-        one[key] = max(one[key], seen[key])
-    one["mutations"] = first + seen["mutations"]
-    for failed in seen["failures"]:
+        one[key] = max(one[key], counts[key])
+    one["mutations"] = first + counts["mutations"]
+    for failed in counts["failures"]:
         words = failed["failure"]
         if words not in one["failures"]:
             console.say(f"{name}: {words} (mutation {failed['number']})")
@@ -143,8 +143,8 @@ def _run(out, name, first, last, seed):
                     words = f"no end within {SILENCE:.0f} s"
                     child.kill()
     if child.returncode == 0:
-        seen = json.loads(answer.splitlines()[-1])
-        return seen | {"mutations": last - first}
+        counts = json.loads(answer.splitlines()[-1])
+        return counts | {"mutations": last - first}
     place = worker.current(out)
     if place < 0:
         raise ValueError(

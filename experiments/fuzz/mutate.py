@@ -102,8 +102,8 @@ def _repeat(data, draw):
 
 def _noise(data, draw):
     at, size = draw.randrange(len(data) + 1), draw.choice((1, 4, 32))
-    kept = at + size * draw.randint(0, 1)
-    return data[:at] + draw.randbytes(size) + data[kept:]
+    end = at + size * draw.randint(0, 1)
+    return data[:at] + draw.randbytes(size) + data[end:]
 
 
 def _replace_token(data, draw):

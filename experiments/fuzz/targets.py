@@ -132,9 +132,9 @@ def _colmap(folder):
     model.mkdir(parents=True)
     (model / "cameras.txt").write_text("1 OPENCV 12 8 11 11.5 6 4 0.01 0 0 0\n")
     points = np.random.default_rng(3).uniform((-1, -1, 5), (1, 1, 7), (12, 3))
-    seen = " ".join(f"1 1 {row + 1}" for row in range(12))
+    observations = " ".join(f"1 1 {row + 1}" for row in range(12))
     lines = [
-        f"{row + 1} 1 0 0 0 {-0.2 * row} 0 0 1 f_{row}.png\n{seen}\n"
+        f"{row + 1} 1 0 0 0 {-0.2 * row} 0 0 1 f_{row}.png\n{observations}\n"
         for row in range(6)
     ]
     (model / "images.txt").write_text("".join(lines))

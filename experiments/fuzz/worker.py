@@ -49,8 +49,8 @@ def run(
     work.mkdir(parents=True)
     target.make(work)
     paths = sorted(path for path in work.rglob("*") if path.is_file())
-    whole = {path: path.read_bytes() for path in paths}
-    seen = {"read": 0, "refused": 0, "failures": [], "seconds": 0.0, "bytes": 0}
+    originals = {path: path.read_bytes() for path in paths}
+    counts = {"read": 0, "refused": 0, "failures": [], "seconds": 0.0, "bytes": 0}
     with decoder.session():
         target.read(work)  # compiles, and shows that it is valid
         before = _peak(resource)
@@ -61,21 +61,21 @@ def run(
                 progress.flush()
                 draw = random.Random(f"{seed}-{name}-{number}")
                 path = draw.choice(paths)
-                damaged = mutate.mutate(whole[path], path.name, draw)
+                damaged = mutate.mutate(originals[path], path.name, draw)
                 path.write_bytes(damaged)
-                failure, spent = _read(target, work, seen)
+                failure, spent = _read(target, work, counts)
                 grown = max(_peak(resource) - before, 0)
                 before += grown
-                seen["seconds"] = max(seen["seconds"], spent)
-                seen["bytes"] = max(seen["bytes"], grown)
+                counts["seconds"] = max(counts["seconds"], spent)
+                counts["bytes"] = max(counts["bytes"], grown)
                 if spent > MOST_SECONDS:
                     failure = f"took {spent:.1f} s"
                 elif grown > MOST_BYTES:
                     failure = f"grew by {grown / 2**20:.0f} MB"
                 if failure:
-                    _keep(folder, name, number, path, damaged, failure, seen)
-                path.write_bytes(whole[path])
-    return seen
+                    _keep(folder, name, number, path, damaged, failure, counts)
+                path.write_bytes(originals[path])
+    return counts
 
 
 def _peak(resource):
@@ -86,7 +86,7 @@ def _read(target, work, seen):
     """Read an input, and return the failure or None, and the processor time."""
     from nerfies_jax.capture.errors import FileError
 
-    begun = time.process_time()
+    start = time.process_time()
     failure = None
     try:
         target.read(work)
@@ -100,7 +100,7 @@ def _read(target, work, seen):
     # What is looked for is anything that a reader lets out.
     except (Exception, RecursionError) as error:
         failure = f"{type(error).__name__} in {_place(error)}"
-    return failure, time.process_time() - begun
+    return failure, time.process_time() - start
 
 
 def _place(error):
@@ -118,10 +118,10 @@ def _place(error):
 def _keep(folder, name, number, path, damaged, failure, seen):
     same = [one for one in seen["failures"] if one["failure"] == failure]
     if len(same) < KEPT:
-        kept = folder / "failures"
-        kept.mkdir(exist_ok=True)
+        failures = folder / "failures"
+        failures.mkdir(exist_ok=True)
         label = "".join(c if c.isalnum() else "_" for c in f"{name}-{number}")
-        (kept / f"{label}-{path.name}").write_bytes(damaged)
+        (failures / f"{label}-{path.name}").write_bytes(damaged)
     seen["failures"].append({"number": number, "file": path.name, "failure": failure})
 
 
@@ -136,8 +136,8 @@ def main() -> None:
     limit = int(os.environ.get("FUZZ_MEMORY", 0))
     if limit:
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    seen = run(pathlib.Path(folder), name, int(first), int(last), int(seed))
-    console.say(json.dumps(seen))
+    counts = run(pathlib.Path(folder), name, int(first), int(last), int(seed))
+    console.say(json.dumps(counts))
 
 
 if __name__ == "__main__":

@@ -126,13 +126,13 @@ OPENED = 6
 
 def _by_cosine(alpha):
     """Equation 14 of Nerfies as printed."""
-    opened = jnp.clip(alpha[0] - jnp.arange(OPENED, dtype=alpha.dtype), 0, 1)
-    return (1 - jnp.cos(jnp.pi * opened)) / 2
+    share = jnp.clip(alpha[0] - jnp.arange(OPENED, dtype=alpha.dtype), 0, 1)
+    return (1 - jnp.cos(jnp.pi * share)) / 2
 
 
 def _exact_window(alpha):
-    opened = [min(max(alpha[0] - k, 0), 1) for k in range(OPENED)]
-    return [mpmath.sinpi(x / 2) ** 2 for x in opened]
+    share = [min(max(alpha[0] - k, 0), 1) for k in range(OPENED)]
+    return [mpmath.sinpi(x / 2) ** 2 for x in share]
 
 
 _OPENING = np.array(

@@ -171,14 +171,14 @@ def _mean_px(x):
 def _mean_px_textbook(x):
     turn = constant(_ROTATION, x.dtype)
     shift = -turn @ x[:3]
-    here = turn @ x[3:] + shift
-    return FOCAL * here[:2] / here[2] + constant([32, 24], x.dtype)
+    point = turn @ x[3:] + shift
+    return FOCAL * point[:2] / point[2] + constant([32, 24], x.dtype)
 
 
 def _exact_mean_px(x):
     offset = [p - c for p, c in zip(x[3:], x[:3], strict=True)]
-    here = [mpmath.fdot(row, offset) for row in _ROTATION.tolist()]
-    return [FOCAL * here[0] / here[2] + 32, FOCAL * here[1] / here[2] + 24]
+    point = [mpmath.fdot(row, offset) for row in _ROTATION.tolist()]
+    return [FOCAL * point[0] / point[2] + 32, FOCAL * point[1] / point[2] + 24]
 
 
 FAR_MEAN = Case(

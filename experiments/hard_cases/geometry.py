@@ -35,8 +35,8 @@ def _far_pixel(both):
 def _textbook_far_pixel(both):
     """K [R | t], with t = -R c."""
     rotation = constant(TURN, both.dtype)
-    seen = rotation @ both[:3] + -rotation @ both[3:]
-    return _on_plane(seen[:2], seen[2])
+    point = rotation @ both[:3] + -rotation @ both[3:]
+    return _on_plane(point[:2], point[2])
 
 
 def _on_plane(lateral, depth):

@@ -58,8 +58,8 @@ def _visible(x):
 
 
 def _exact_visible(x):
-    held = max(min(x[1], mpmath.mpf(_HIGH)), mpmath.mpf(_LOW))
-    return [mpmath.exp(-((x[0] * mpmath.exp(-held)) ** 2))]
+    clamped = max(min(x[1], mpmath.mpf(_HIGH)), mpmath.mpf(_LOW))
+    return [mpmath.exp(-((x[0] * mpmath.exp(-clamped)) ** 2))]
 
 
 VISIBLE = Case(
@@ -113,8 +113,8 @@ def _quotients(x):
 def _exact_shares(x):
     scores = []
     for place, slant in zip(_ROW, _SLANT, strict=True):
-        held = max(x[1] + mpmath.mpf(slant), mpmath.mpf(-20))
-        scores.append(-(((x[0] + mpmath.mpf(place)) * mpmath.exp(-held)) ** 2) / 2)
+        clamped = max(x[1] + mpmath.mpf(slant), mpmath.mpf(-20))
+        scores.append(-(((x[0] + mpmath.mpf(place)) * mpmath.exp(-clamped)) ** 2) / 2)
     shares = [mpmath.exp(one - max(scores)) for one in scores]
     return [one / mpmath.fsum(shares) for one in shares]
 

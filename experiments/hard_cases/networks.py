@@ -39,10 +39,10 @@ def _exact_edge(x, first=0):
     low, high, sigma = first, first + KERNELS - 1, mpmath.sqrt(mpmath.mpf(0.5))
     excess = max(low - x, x - high, 0) / sigma
     beyond = sigma * (1 - 1 / mpmath.sqrt(1 + 2 * excess + 3 * excess**2))
-    held = low - beyond if x < low else high + beyond if x > high else x
+    clamped = low - beyond if x < low else high + beyond if x > high else x
     return [
         mpmath.fsum(
-            mpmath.mpf(w) * mpmath.exp(-((held - first - g) ** 2))
+            mpmath.mpf(w) * mpmath.exp(-((clamped - first - g) ** 2))
             for g, w in enumerate(WEIGHTS)
         )
     ]
@@ -223,14 +223,14 @@ B1, B2 = 0.9, 0.999
 
 def _length_as_printed(x):
     """Algorithm 2 of Liu et al. 2020."""
-    seen = constant(B2, x.dtype) ** x
-    return 2 / (1 - B2) - 1 - 2 * x * seen / (1 - seen)
+    power = constant(B2, x.dtype) ** x
+    return 2 / (1 - B2) - 1 - 2 * x * power / (1 - power)
 
 
 def _exact_length(x):
     b2 = mpmath.mpf(B2)
-    seen = b2 ** x[0]
-    return [2 / (1 - b2) - 1 - 2 * x[0] * seen / (1 - seen)]
+    power = b2 ** x[0]
+    return [2 / (1 - b2) - 1 - 2 * x[0] * power / (1 - power)]
 
 
 # The series ends at t = -1 / log b2 = 999.5.

@@ -17,10 +17,10 @@ def number(values) -> str:
     """Format the worst error: 0, 3e-07, or not finite and the worst finite one."""
     finite = [value for value in values if np.isfinite(value)]
     largest = max(finite, default=0.0)
-    shown = "0" if largest == 0 else f"{largest:.0e}"
+    text = "0" if largest == 0 else f"{largest:.0e}"
     if len(finite) == len(values):
-        return shown
-    return f"not finite, {shown}" if finite else "not finite"
+        return text
+    return f"not finite, {text}" if finite else "not finite"
 
 
 def block(row) -> str:

@@ -23,11 +23,11 @@ def _rodrigues(w):
     angle = jnp.sqrt(jnp.sum(w**2))
     sine = jnp.sin(angle) / angle
     versine = (1 - jnp.cos(angle)) / angle**2
-    rest = (angle - jnp.sin(angle)) / angle**3
+    quotient = (angle - jnp.sin(angle)) / angle**3
     turned = point + sine * jnp.cross(w, point)
     turned = turned + versine * jnp.cross(w, jnp.cross(w, point))
-    moved = linear + versine * jnp.cross(w, linear)
-    return turned + moved + rest * jnp.cross(w, jnp.cross(w, linear))
+    result = linear + versine * jnp.cross(w, linear)
+    return turned + result + quotient * jnp.cross(w, jnp.cross(w, linear))
 
 
 def _exact_screw(w):
@@ -167,16 +167,16 @@ def _inverse_jacobian(w):
 def _textbook_inverse_jacobian(w):
     angle, v = jnp.sqrt(jnp.sum(w**2)), constant(LINEAR, w.dtype)
     twice = jnp.cross(w, jnp.cross(w, v))
-    rest = (1 - angle / 2 / jnp.tan(angle / 2)) / angle**2
-    return v - jnp.cross(w, v) / 2 + rest * twice
+    quotient = (1 - angle / 2 / jnp.tan(angle / 2)) / angle**2
+    return v - jnp.cross(w, v) / 2 + quotient * twice
 
 
 def _exact_inverse_jacobian(w):
     w, v = mpmath.matrix(w), _column(LINEAR)
     hat, squared = _hat(w), _square(w)
     two, three, four = (_exact_stumpff(k, squared) for k in (2, 3, 4))
-    rest = (three - 2 * four) / (2 * two)
-    return list(v - hat * v / 2 + rest * (hat * (hat * v)))
+    quotient = (three - 2 * four) / (2 * two)
+    return list(v - hat * v / 2 + quotient * (hat * (hat * v)))
 
 
 _TO_TURN = np.array([0, 1e-20, 1e-8, 1e-4, 1e-3, 1e-2, 0.3, *_SEAM, 4, 5, 6])

@@ -122,9 +122,9 @@ def _quotient(weights):
 
 def _exact_expected(weights):
     alpha = sum(weights)
-    missing = max(EMPTY_BELOW - alpha, 0)
+    deficit = max(EMPTY_BELOW - alpha, 0)
     along = sum(w * d for w, d in zip(weights, DISTANCES, strict=True))
-    return [(along + missing * FAR) / (alpha + missing)]
+    return [(along + deficit * FAR) / (alpha + deficit)]
 
 
 _EDGE = EMPTY_BELOW / 4
@@ -240,16 +240,16 @@ def _exact_samples(weights):
     total = sum(weights)
     if total == 0:
         weights, total = [mpmath.mpf(1)] * len(weights), mpmath.mpf(len(weights))
-    drawn = []
+    samples = []
     for k in range(1, DRAWN - 1):
-        left = total * k / (DRAWN - 1)
+        target = total * k / (DRAWN - 1)
         index = 0
-        while left > weights[index]:
-            left -= weights[index]
+        while target > weights[index]:
+            target -= weights[index]
             index += 1
         start, stop = EDGES[index], EDGES[index + 1]
-        drawn.append(start + left / weights[index] * (stop - start))
-    return [mpmath.mpf(EDGES[0]), *drawn, mpmath.mpf(EDGES[-1])]
+        samples.append(start + target / weights[index] * (stop - start))
+    return [mpmath.mpf(EDGES[0]), *samples, mpmath.mpf(EDGES[-1])]
 
 
 _UNEVEN = np.array([0.2, 1.3, 0.7, 2.1, 0.45, 0.9, 0.31, 1.1])

@@ -59,7 +59,9 @@ def main(args):
     from nerfies_jax.metrics import clock
 
     rows = _stored(args.out, args.seed)
-    left = [fault for fault in faults if not any(_is_row_of(fault, r) for r in rows)]
+    remaining = [
+        fault for fault in faults if not any(_is_row_of(fault, r) for r in rows)
+    ]
     copies = queue.SimpleQueue()
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -79,13 +81,13 @@ def main(args):
         seconds = 60 * args.minutes
         tries = workers.map(
             lambda fault: with_copy(lambda copy: tried(fault, copy, reached, seconds)),
-            left,
+            remaining,
         )
         for row in tries:
             rows.append(row)
             console.say(f"{row['at']} | {row['after']} | {row['caught_by']}")
-            stored = {"machine": clock.machine(), "seed": args.seed, "rows": rows}
-            write_json(args.out, stored)
+            record = {"machine": clock.machine(), "seed": args.seed, "rows": rows}
+            write_json(args.out, record)
     console.say(page({"rows": rows, "seed": args.seed}))
     return cli.stored(args.out)
 
@@ -100,14 +102,14 @@ def _reached(out, workers, with_copy):
     digest = hashlib.blake2b(
         b"".join(sorted(map(_name_and_bytes, _files())))
     ).hexdigest()
-    stored = records.rows(path, reached=dict)
-    entered = stored["reached"] if stored.get("digest") == digest else {}
+    record = records.rows(path, reached=dict)
+    entered = record["reached"] if record.get("digest") == digest else {}
 
     def run(test):
         return test, with_copy(lambda copy: reached_by(test, copy))
 
-    left = [test for test in default_tests(ROOT) if test not in entered]
-    jobs = [workers.submit(run, test) for test in left]
+    remaining = [test for test in default_tests(ROOT) if test not in entered]
+    jobs = [workers.submit(run, test) for test in remaining]
     try:
         for job in concurrent.futures.as_completed(jobs):
             test, places = job.result()
@@ -137,8 +139,8 @@ def _is_row_of(fault, row):
 
 
 def _stored(path, seed):
-    stored = records.rows(path, rows=list)
-    return stored["rows"] if stored.get("seed") == seed else []
+    record = records.rows(path, rows=list)
+    return record["rows"] if record.get("seed") == seed else []
 
 
 def _copied(folder):

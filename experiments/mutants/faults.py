@@ -50,11 +50,11 @@ def drawn(count: int, seed: int, only: str = "") -> list[Fault]:
             if faults:
                 by_module.append(faults)
     chance.shuffle(by_module)
-    chosen: list[Fault] = []
-    while by_module and len(chosen) < count:
-        chosen += [faults.pop() for faults in by_module]
+    sample: list[Fault] = []
+    while by_module and len(sample) < count:
+        sample += [faults.pop() for faults in by_module]
         by_module = [faults for faults in by_module if faults]
-    return chosen[:count]
+    return sample[:count]
 
 
 def places(path: str, source: str) -> list[Fault]:

@@ -73,10 +73,10 @@ def _line(source, line):
 
 def _tests_that_enter(fault: Fault, reached: dict[str, set[str]]) -> list[str]:
     """Files of tests that enter the function, those named after its module first."""
-    named = f"test_{pathlib.Path(fault.path).stem.strip('_')}"
+    test_name = f"test_{pathlib.Path(fault.path).stem.strip('_')}"
     place = f"{fault.path}:{fault.function}"
     entering = sorted(test for test, places in reached.items() if place in places)
-    entering.sort(key=lambda test: not pathlib.Path(test).name.startswith(named))
+    entering.sort(key=lambda test: not pathlib.Path(test).name.startswith(test_name))
     return entering
 
 

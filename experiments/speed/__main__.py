@@ -115,13 +115,13 @@ def main(args):
         args.out.mkdir(parents=True, exist_ok=True)
         path = MEASURES[type(args)](args)
     console.say(f"stored in {path}")
-    stored, worse = cli.stored(path), []
+    record, worse = cli.stored(path), []
     if before is not None:
         from nerfies_jax.metrics import clock
 
         worse = baselines.changes([*clock.read_metrics(path).values()], before)
         console.say("\n".join(worse) or f"nothing is worse than in {check}")
-    return cli.Ended(stored, 1 if worse else 0)
+    return cli.Ended(record, 1 if worse else 0)
 
 
 def _check_files(args):
@@ -151,13 +151,13 @@ def keep(
     from experiments.speed import tolerances
     from nerfies_jax.metrics import clock
 
-    stored = records.rows(path)
-    place = stored
+    content = records.rows(path)
+    place = content
     for key in keys[:-1]:
         place = place.setdefault(key, {})
     place[keys[-1]] = record
-    stored["metrics"] = clock.metric_rows(tolerances.metrics(stored))
-    records.write(path, stored, machine)
+    content["metrics"] = clock.metric_rows(tolerances.metrics(content))
+    records.write(path, content, machine)
     return path
 
 

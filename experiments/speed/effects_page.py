@@ -126,8 +126,8 @@ def tables(metrics: Mapping[str, Metric]) -> list[str]:
     """
     scenes: dict[str, list[str]] = {}
     for key in metrics:
-        preset, scene, *rest = key.split(".")
-        if rest == ["parameters"]:
+        preset, scene, *parts = key.split(".")
+        if parts == ["parameters"]:
             scenes.setdefault(preset, []).append(scene)
     lines = []
     for preset, names in scenes.items():

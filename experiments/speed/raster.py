@@ -85,10 +85,10 @@ def compiled(text: str, scene: dict) -> tuple:
         return raster.rasterize(footprints, colors, size, spec)
 
     def loss(mean_px, whitening, opacity, colors, footprints):
-        moved = footprints._replace(
+        displaced = footprints._replace(
             mean_px=mean_px, whitening=whitening, opacity=opacity
         )
-        image, transmittance = raster.rasterize(moved, colors, size, spec)
+        image, transmittance = raster.rasterize(displaced, colors, size, spec)
         return jnp.sum(image) + jnp.sum(transmittance)
 
     gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3)))
@@ -180,13 +180,13 @@ def time_case(text: str, reference: pathlib.Path | None) -> dict:
         with tempfile.TemporaryDirectory() as folder:
             file = str(pathlib.Path(folder) / "scene.npz")
             theirs.append(_reference_times(reference, text, file))
-            with np.load(file) as stored:
-                scene = {name: stored[name] for name in stored.files}
-    forward, both = compiled(text, scene)
+            with np.load(file) as arrays:
+                scene = {name: arrays[name] for name in arrays.files}
+    forward, with_gradient = compiled(text, scene)
     row: dict[str, Any] = {
         "case": text,
         "forward_ms": _median_ms(forward),
-        "forward_backward_ms": _median_ms(both),
+        "forward_backward_ms": _median_ms(with_gradient),
     }
     if reference is not None:
         with tempfile.TemporaryDirectory() as folder:

@@ -42,8 +42,8 @@ def measure(preset: str, all_cores: bool) -> dict[str, Any]:
     Returns:
       Measurements by name.
     """
-    wanted = representations.cores(preset)
-    platform.start_jax("cpu", *(wanted if all_cores else ("one",)))
+    count = representations.cores(preset)
+    platform.start_jax("cpu", *(count if all_cores else ("one",)))
     import jax
 
     # Compilation is measured, too.

@@ -205,19 +205,11 @@ def combination(
     return np.linalg.solve(normal, moment) + constant[:, None] * middle
 
 
-def guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
+def _guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
     """Return the motion's own initialization, or points in the middle of the video.
 
     If the motion has shared parameters, motion of static points is penalized. Otherwise
     they would move as well, and the scene would deform to compensate.
-
-    Args:
-      effect: The motion.
-      paths: The paths.
-      key: PRNG key.
-
-    Returns:
-      The initialization of a fit.
     """
     if effect.fit_to_paths is not None:
         return effect.fit_to_paths(paths, key)
@@ -347,7 +339,7 @@ def fit(
     times, position, known, unit, _, depth = paths
     if not known.any():
         raise ValueError("no path has a known position; a motion cannot be fitted")
-    start, rates, penalty, rigid = guess(effect, paths, key)
+    start, rates, penalty, rigid = _guess(effect, paths, key)
     rates = jax.tree.map(lambda relative: rate * relative, rates)
     target = jnp.asarray(np.moveaxis(np.where(known[..., None], position, 0), 1, 0))
     target = target.astype(start.canonical.dtype)

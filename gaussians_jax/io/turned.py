@@ -29,7 +29,7 @@ def turned(rows: Splats, rotation: np.ndarray) -> Splats:
     quaternion = np.asarray(rows.quaternion, np.float64) @ left.T
     rest = rows.sh_rest
     if rest.shape[1]:
-        matrix = harmonics_matrix(rotation, harmonics.degree_of(rest.shape[1] + 1))
+        matrix = _harmonics_matrix(rotation, harmonics.degree_of(rest.shape[1] + 1))
         rest = np.einsum("ij,njc->nic", matrix, np.asarray(rest, np.float64))
     dtype = rows.mean.dtype
     return rows._replace(
@@ -39,18 +39,11 @@ def turned(rows: Splats, rotation: np.ndarray) -> Splats:
     )
 
 
-def harmonics_matrix(rotation: np.ndarray, degree: int) -> np.ndarray:
+def _harmonics_matrix(rotation: np.ndarray, degree: int) -> np.ndarray:
     """Return the matrix that rotates the coefficients of degrees 1 and higher.
 
     It is fitted at more directions than there are coefficients. The harmonics of a
     degree are closed under rotation, so the fit is exact.
-
-    Args:
-      rotation: Rotation matrix [3, 3].
-      degree: Highest degree.
-
-    Returns:
-      Matrix [n, n] with n = (degree + 1)^2 - 1.
     """
     # A Fibonacci lattice, evenly spread over the sphere.
     z = 1 - (2 * np.arange(DIRECTIONS) + 1) / DIRECTIONS

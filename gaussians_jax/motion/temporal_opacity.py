@@ -97,21 +97,12 @@ def always(gaussians: int, dtype) -> Fading:
     return Fading(center, jnp.full(gaussians, ALWAYS, dtype))
 
 
-def around(
+def _around(
     spec: TemporalOpacitySpec,
     time: Float[np.ndarray, " gaussians"],
     followed: Float[np.ndarray, " gaussians"],
 ) -> Fading:
-    """Initialize visibility around a time, for as long as nearby tracks, on the host.
-
-    Args:
-      spec: Settings.
-      time: Normalized times.
-      followed: Durations of nearby tracks, in units of the video.
-
-    Returns:
-      Per-Gaussian parameters.
-    """
+    """Initialize visibility around a time, as long as nearby tracks, on the host."""
     least = math.exp(LOG_WIDTH_RANGE[0])
     width = np.log(np.maximum(spec.width * followed, least))
     return Fading._make((time, width))
@@ -152,4 +143,4 @@ class Bound:
         followed: Float[np.ndarray, " gaussians"],
     ) -> Fading:
         """Return the times and widths of Gaussians lifted from moving pixels."""
-        return around(self.spec, time, followed)
+        return _around(self.spec, time, followed)

@@ -12,18 +12,8 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 LEAST_AGREEMENT = 0.2
 
 
-def up_of(capture: Capture) -> np.ndarray:
-    """Estimate the direction that is up, as the mean of what is up in the images.
-
-    Args:
-      capture: The capture.
-
-    Returns:
-      A unit vector in scene axes.
-
-    Raises:
-      ValueError: If the training cameras have no common upward direction.
-    """
+def _up_of(capture: Capture) -> np.ndarray:
+    """Estimate the direction that is up, as the mean of what is up in the images."""
     rows = np.asarray(capture.cameras.camera_from_world, np.float64)[capture.train]
     mean = -rows[:, 1].mean(axis=0)
     length = np.linalg.norm(mean)
@@ -52,5 +42,5 @@ def rotation_to(capture: Capture, axis: Axis) -> np.ndarray:
     """
     target = np.zeros(3)
     target["xyz".index(axis[-1])] = -1 if axis.startswith("-") else 1
-    rotation, _ = Rotation.align_vectors(target[None], up_of(capture)[None])
+    rotation, _ = Rotation.align_vectors(target[None], _up_of(capture)[None])
     return rotation.as_matrix()

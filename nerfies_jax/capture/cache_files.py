@@ -155,7 +155,7 @@ def write_arrays(
       arrays: Arrays by name. The name `SEAL` is reserved.
       identity: Identity of the content, with the version of the code that made it.
     """
-    seal = json.dumps({"identity": identity, "crc32": checksum(arrays)})
+    seal = json.dumps({"identity": identity, "crc32": _checksum(arrays)})
     _make_way(path)
     contents: dict[str, Any] = {**arrays, SEAL: np.array(seal)}
     with replaced_file(path) as partial:
@@ -178,19 +178,12 @@ def read_arrays(path: pathlib.Path, identity: str) -> dict[str, np.ndarray]:
     """
     arrays = npz_files.read_arrays(path)
     seal = arrays.pop(SEAL, None)
-    _check(seal is not None and json.loads(str(seal)), identity, checksum(arrays))
+    _check(seal is not None and json.loads(str(seal)), identity, _checksum(arrays))
     return arrays
 
 
-def checksum(arrays: Mapping[str, np.ndarray]) -> int:
-    """Compute the CRC-32 of arrays: their names, types, shapes and bytes.
-
-    Args:
-      arrays: Arrays by name.
-
-    Returns:
-      The checksum.
-    """
+def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
+    """Compute the CRC-32 of arrays: their names, types, shapes and bytes."""
     total = 0
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])

@@ -74,18 +74,8 @@ class Downloaded(NamedTuple):
     bytes: int
 
 
-def source_of(name: str) -> str:
-    """Return the address of a published capture.
-
-    Args:
-      name: Name of a source, or an http(s) address of a zip archive.
-
-    Returns:
-      The address.
-
-    Raises:
-      CaptureError: If it is neither.
-    """
+def _source_of(name: str) -> str:
+    """Return the address of a published capture."""
     if name in SOURCES:
         return SOURCES[name].address
     if urllib.parse.urlsplit(name).scheme in ("http", "https"):
@@ -111,7 +101,7 @@ def download(name: str, folder: AnyPath, sha256: str | None = None) -> Downloade
       CaptureError: If the archive cannot be loaded, is not what was expected or would
         unpack to unsafe or too many files, or if the folder holds something else.
     """
-    address, folder = source_of(name), pathlib.Path(folder)
+    address, folder = _source_of(name), pathlib.Path(folder)
     if folder.exists() and any(folder.iterdir()):
         return _already(folder, address, sha256)
     with scratch_folder(folder.parent / f"{folder.name}.zip") as scratch:
@@ -126,18 +116,11 @@ def download(name: str, folder: AnyPath, sha256: str | None = None) -> Downloade
             _unpack(address, archive, partial)
             about = {"address": address, "sha256": digest, "bytes": size}
             write_json(partial / RECORD, about)
-    return Downloaded(folder, captures_in(folder), digest, size)
+    return Downloaded(folder, _captures_in(folder), digest, size)
 
 
-def captures_in(folder: pathlib.Path) -> list[pathlib.Path]:
-    """List the folders that hold a capture of a format that is read.
-
-    Args:
-      folder: Folder to search, three levels deep.
-
-    Returns:
-      Folders, of nested ones the outer.
-    """
+def _captures_in(folder: pathlib.Path) -> list[pathlib.Path]:
+    """List the folders that hold a capture of a format that is read."""
     from nerfies_jax.capture import formats
 
     found: list[pathlib.Path] = []
@@ -168,7 +151,7 @@ def _already(folder, address, sha256):
             f"{folder}: its archive had SHA-256 {digest}, but {sha256.lower()} was "
             "expected; choose another folder to download it again"
         )
-    return Downloaded(folder, captures_in(folder), digest, int(about.get("bytes", 0)))
+    return Downloaded(folder, _captures_in(folder), digest, int(about.get("bytes", 0)))
 
 
 def _fetch(address, path):

@@ -145,7 +145,7 @@ def _undistorted_given(capture, given, wide):
     order = np.argsort(capture.times[capture.train], kind="stable")
 
     def straight(row, pixel):
-        return straight_points(camera_of[row], pixel, wide)
+        return _straight_points(camera_of[row], pixel, wide)
 
     return given_lens.undistorted(
         given,
@@ -156,20 +156,10 @@ def _undistorted_given(capture, given, wide):
     )
 
 
-def straight_points(
+def _straight_points(
     camera: Camera, pixel: np.ndarray, wide: Canvas
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Undistort positions in a captured image.
-
-    Args:
-      camera: One camera with its distortion.
-      pixel: Positions (x, y) in the captured image in pixels, [points, 2].
-      wide: The canvas of its capture.
-
-    Returns:
-      Positions in the undistorted image [points, 2], and booleans [points] that are
-      False if the lens model has no ray for the position.
-    """
+    """Undistort positions in a captured image."""
     slopes, exists = _straight(_float32(camera), _slopes_at(camera, pixel))
     straight = _pixels_at(camera, np.asarray(slopes))
     return straight + np.array([wide.left, wide.top]), np.asarray(exists)

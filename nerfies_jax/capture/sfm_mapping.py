@@ -104,7 +104,7 @@ def _attempt(rung: Rung, features, images, work, groups, spec, masks):
                 model = _refined(model, options)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    return model, summarize(model, rung, count), pieces
+    return model, _summarize(model, rung, count), pieces
 
 
 def _model(rung, spec):
@@ -137,24 +137,15 @@ def _refined(model, options):
     for distortion in (False, True):
         refined = copy.deepcopy(model)
         sfm_joining.adjust(refined, options, distortion)
-        lens = summarize(refined, sfm_ladder.HELD, refined.num_reg_images())
+        lens = _summarize(refined, sfm_ladder.HELD, refined.num_reg_images())
         if sfm_ladder.implausible_lens(lens):
             break
         model = refined
     return model
 
 
-def summarize(model, rung: Rung, images: int) -> Summary:
-    """Measure the quality of a reconstruction and of its intrinsics.
-
-    Args:
-      model: A pycolmap.Reconstruction, or None.
-      rung: The camera model that it was made with.
-      images: Number of images, registered or not.
-
-    Returns:
-      The measures.
-    """
+def _summarize(model, rung: Rung, images: int) -> Summary:
+    """Measure the quality of a reconstruction and of its intrinsics."""
     if model is None:
         return Summary(rung, images, 0, 0, 0.0, 0.0, (1.0, 1.0), 1.0, folds=False)
     used = {model.image(number).camera_id for number in model.reg_image_ids()}

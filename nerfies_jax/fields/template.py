@@ -140,16 +140,8 @@ def trunk_spec(spec: TemplateSpec, inputs: int) -> MLPSpec:
     return MLPSpec(inputs, spec.depth, spec.width, heads, spec.skips)
 
 
-def color_spec(spec: TemplateSpec, condition: int) -> MLPSpec:
-    """Return the settings of the color branch.
-
-    Args:
-      spec: Settings of the template.
-      condition: Number of features of a ray, which are read after the bottleneck.
-
-    Returns:
-      Settings of an MLP with the head "color".
-    """
+def _color_spec(spec: TemplateSpec, condition: int) -> MLPSpec:
+    """Return the settings of the color branch."""
     inputs = spec.width + condition
     return MLPSpec(inputs, 1, spec.color_width, (("color", HeadSpec(3)),))
 
@@ -181,7 +173,7 @@ def init(
         tables = grid.init(spec.position, tables_key, dtype)
     return Template(
         mlp.init(trunk_spec(spec, inputs), trunk_key, dtype),
-        mlp.init(color_spec(spec, condition), color_key, dtype),
+        mlp.init(_color_spec(spec, condition), color_key, dtype),
         tables,
     )
 

@@ -41,7 +41,7 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
         )
     light = _sightings(view_set.smaller(views, view_set.times_smaller(views)), points)
     groups = np.array_split(np.argsort(_along_widest(points)), GROUPS)
-    each = np.stack([gains(light[:, group]) for group in groups])
+    each = np.stack([_gains(light[:, group]) for group in groups])
     known = np.isfinite(each).all(-1).sum(0) >= GROUPS // 2
     if known.sum() < max(3, 0.5 * len(views.row)):
         return cannot_tell(
@@ -122,19 +122,8 @@ def _sightings(views: Views, points: np.ndarray) -> np.ndarray:
     return light
 
 
-def gains(light: np.ndarray) -> np.ndarray:
-    """Estimate the gain of each frame by median polish.
-
-    Args:
-      light: log2 of linear light, [frames, points, 3], which is a frame's gain plus a
-        point's color, except where the point is occluded.
-
-    Returns:
-      Gains in stops [frames, 3], NaN for frames that show too few points.
-
-    References:
-      Tukey 1977.
-    """
+def _gains(light: np.ndarray) -> np.ndarray:
+    """Estimate the gain of each frame by median polish."""
     gain = np.zeros((len(light), 3))
     seen = np.isfinite(light).all(-1)
     enough = seen.sum(1) >= MIN_POINTS

@@ -75,7 +75,7 @@ def depths(
       CaptureError: If the network cannot be run, or its output is no depth.
       MissingExtra: If ONNX Runtime is not installed.
     """
-    network = described(path, settings)
+    network = _described(path, settings)
     result = np.full(capture.images.shape[:3], np.nan, np.float32)
 
     def depth_of(output, row):
@@ -123,7 +123,7 @@ def segments(
       CaptureError: If the network cannot be run, or its output is no segmentation.
       MissingExtra: If ONNX Runtime is not installed.
     """
-    network = described(path, settings)
+    network = _described(path, settings)
     result = np.zeros(capture.images.shape[:3], bool)
 
     def share_of(output, _):
@@ -174,22 +174,10 @@ def _logits(values, settings):
     return bool(((values < 0) | (values > 1)).any())
 
 
-def described(
+def _described(
     path: pathlib.Path | str, settings: NetworkSettings | None = None
 ) -> Network:
-    """Read how to run a network.
-
-    Args:
-      path: ONNX file.
-      settings: Settings, None to read them from the files.
-
-    Returns:
-      The network.
-
-    Raises:
-      CaptureError: If it is no network of one image.
-      MissingExtra: If ONNX Runtime is not installed.
-    """
+    """Read how to run a network."""
     extras.check("onnxruntime", "onnx")
     path = pathlib.Path(path).absolute()
     if not path.is_file():

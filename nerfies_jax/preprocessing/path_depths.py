@@ -143,21 +143,13 @@ def _measured(depths, tracks):
     measured = np.full(tracks.seen.shape, np.nan)
     for frame, picture in enumerate(depths):
         here = np.flatnonzero(tracks.seen[:, frame])
-        depth = steady_depth(picture)
+        depth = _steady_depth(picture)
         at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
         measured[here, frame] = depth[at]
     return measured
 
 
-def steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
-    """Select known z-depths that are not at a depth discontinuity.
-
-    Args:
-      depth: z-depths, [height, width], 0 if unknown.
-      jump: Relative difference between neighbors at a discontinuity.
-
-    Returns:
-      z-depths [height, width], NaN for other pixels.
-    """
+def _steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:
+    """Select known z-depths that are not at a depth discontinuity."""
     least, most = nd.minimum_filter(depth, 3), nd.maximum_filter(depth, 3)
     return np.where((least > 0) & (most - least < jump * depth), depth, np.nan)

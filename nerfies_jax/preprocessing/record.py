@@ -209,15 +209,8 @@ def _enlarged(masks, height, width):
     return np.stack(enlarged)
 
 
-def depth_note(evidence: Evidence) -> str:
-    """Describe a doubtful agreement of external depth with static points.
-
-    Args:
-      evidence: Preprocessing.
-
-    Returns:
-      The text, empty if they agree or there is no external depth.
-    """
+def _depth_note(evidence: Evidence) -> str:
+    """Describe a doubtful agreement of external depth with static points."""
     if evidence.depth_miss <= given_depth.DOUBTFUL:
         return ""
     return (
@@ -323,7 +316,7 @@ def cached(
                 evidence = _made(path, capture, use_depths, tell)
     cache_files.mark_used(path)
     if path not in _told_of:
-        notes = [left_out_note(evidence), depth_note(evidence)]
+        notes = [left_out_note(evidence), _depth_note(evidence)]
         _told_of[path] = [note for note in notes if note]
         for note in _told_of[path]:
             console.warn(f"{capture.path or capture.name}: {note}")

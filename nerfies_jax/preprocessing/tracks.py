@@ -161,20 +161,13 @@ def long_enough(tracks: Tracks) -> Tracks:
       tracks: The tracks.
 
     Returns:
-      The long ones, by `is_long`.
+      The long ones, by `_is_long`.
     """
-    return tracks.take(is_long(tracks))
+    return tracks.take(_is_long(tracks))
 
 
-def is_long(tracks: Tracks) -> np.ndarray:
-    """Find tracks visible in at least `SHORTEST` frames, or in all of a shorter video.
-
-    Args:
-      tracks: The tracks.
-
-    Returns:
-      Booleans, [tracks].
-    """
+def _is_long(tracks: Tracks) -> np.ndarray:
+    """Find tracks of at least `SHORTEST` frames, or of a whole shorter video."""
     return tracks.seen.sum(1) >= min(SHORTEST, tracks.seen.shape[1])
 
 

@@ -53,7 +53,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
     )
     if evidence.unusable:
         return cannot_tell(EFFECT, evidence.unusable, threshold)
-    gone, carried = jumps(views, evidence.flow)
+    gone, carried = _jumps(views, evidence.flow)
     apart = float((carried < LEAST_CARRIED).mean())
     if apart > MOST_APART:
         return cannot_tell(
@@ -104,17 +104,8 @@ def _always_there(evidence):
     return there.mean() > 0.5 or not there.any()
 
 
-def jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the share of pixels that only one of two neighboring frames shows.
-
-    Args:
-      views: The frames.
-      flow: Their flow.
-
-    Returns:
-      The smaller share of both directions (an appearing object occludes others), and
-      the share of textured pixels that flow carries to the next frame, both [pairs].
-    """
+def _jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the share of pixels that only one of two neighboring frames shows."""
     part = view_set.times_smaller(views)
     shown = views.textured[:-1] & flow.forward_seen[:-1]
     carried = shown.sum((1, 2)) / np.maximum(views.textured[:-1].sum((1, 2)), 1)

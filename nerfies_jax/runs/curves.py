@@ -67,15 +67,8 @@ class Course(NamedTuple):
         return text
 
 
-def course(events: Iterable[Event]) -> Course:
-    """Summarize the events of a run.
-
-    Args:
-      events: Events, from `event_log.read_events`.
-
-    Returns:
-      Rows of training and of evaluations, and the progress of the run.
-    """
+def _course(events: Iterable[Event]) -> Course:
+    """Summarize the events of a run."""
     training: list[dict[str, Any]] = []
     evaluations: list[dict[str, Any]] = []
     numbers: dict[str, Any] = {}
@@ -112,7 +105,7 @@ def course_of(folder: pathlib.Path) -> Course | None:
       The summary, or None if there are no events.
     """
     try:
-        return course(event_log.read_events(folder))
+        return _course(event_log.read_events(folder))
     except ValueError:
         return None
 
@@ -186,11 +179,11 @@ def read(folder: pathlib.Path) -> Curve:
                 "without further steps"
             )
         return _curve_of(logged)
-    stored = _stored(folder / CURVE)
-    last_step = max(stored.steps, default=0)
+    curve = _stored(folder / CURVE)
+    last_step = max(curve.steps, default=0)
     if logged is not None and not logged.ended and logged.step > last_step:
         return _curve_of(logged)
-    return stored
+    return curve
 
 
 def _curve_of(logged):
@@ -208,16 +201,16 @@ def _curve_of(logged):
 
 def _stored(path):
     try:
-        stored = read_json(path, dict[str, Any])
-        rows = stored["evaluations"]
+        content = read_json(path, dict[str, Any])
+        rows = content["evaluations"]
         return Curve(
             seconds=tuple(float(row["seconds"]) for row in rows),
             steps=tuple(int(row["step"]) for row in rows),
             psnr=tuple(_number(row["psnr"]) for row in rows),
             ssim=tuple(_number(row["ssim"]) for row in rows),
-            frames=tuple(stored["frames"]),
-            compile_seconds=float(stored["compile_seconds"]),
-            machine=dict(stored["machine"]),
+            frames=tuple(content["frames"]),
+            compile_seconds=float(content["compile_seconds"]),
+            machine=dict(content["machine"]),
         )
     except FileError:  # it names the path already
         raise

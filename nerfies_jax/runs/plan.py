@@ -53,6 +53,6 @@ def rounded(steps: float | int) -> int:
     Returns:
       The rounded number, at least 1.
     """
-    whole = max(int(steps), 1)
-    unit = 10 ** max(math.floor(math.log10(whole)) - 1, 0)
-    return whole // unit * unit
+    count = max(int(steps), 1)
+    unit = 10 ** max(math.floor(math.log10(count)) - 1, 0)
+    return count // unit * unit

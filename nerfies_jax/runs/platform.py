@@ -68,12 +68,12 @@ def start_jax(
     from nerfies_jax.capture import cache_files
     from nerfies_jax.runtime import data_parallel
 
-    wanted = min(shares, cores()) if devices is None else devices
+    count = min(shares, cores()) if devices is None else devices
     forced = "--xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if wanted > 1 and not forced and "JAX_NUM_CPU_DEVICES" not in os.environ:
+    if count > 1 and not forced and "JAX_NUM_CPU_DEVICES" not in os.environ:
         # The number of devices cannot change if JAX has already been initialized.
         with contextlib.suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", wanted)
+            jax.config.update("jax_num_cpu_devices", count)
     if device != "auto":
         name = {"gpu": "cuda"}.get(device, device)
         os.environ["JAX_PLATFORMS"] = name  # for child processes

@@ -122,14 +122,14 @@ def prepare(
         capture = dataclasses.replace(
             capture, name=out.resolve().name, path=None, frames_per_second=rate
         )
-        written = scratch / "capture"
+        target = scratch / "capture"
         with events.stage("writing the capture"):
-            nerfies_format.write(capture, written)
-        shutil.copytree(solved.poses.folder / "sparse", written / "colmap" / "sparse")
+            nerfies_format.write(capture, target)
+        shutil.copytree(solved.poses.folder / "sparse", target / "colmap" / "sparse")
         if solved.masked and how.masks is None:
-            (scratch / "detected").rename(written / "masks_found")
-        write_json(written / RECORD, _record(source, how, solved))
-        os.replace(written, out.resolve())
+            (scratch / "detected").rename(target / "masks_found")
+        write_json(target / RECORD, _record(source, how, solved))
+        os.replace(target, out.resolve())
     for line in describe(capture):
         tell(line)
     return capture

@@ -78,7 +78,7 @@ def make(
     """
     state, renderer = trained.result.state, trained.renderer
     run = with_found_cameras(run, state)
-    rows, skipped_frames = frames_to_score(run, trained)
+    rows, skipped_frames = _frames_to_score(run, trained)
     scored = evaluation.score(trained.draw, state, run.observed, rows)
     if not np.isfinite(scored.color).all():
         raise FloatingPointError(
@@ -97,7 +97,7 @@ def make(
         with step_profile.profiling(run, state) as profile:
             figures = [*player]
             comparison = attempt(
-                None, save_comparison, target / "comparison.png", run.observed, scored
+                None, _save_comparison, target / "comparison.png", run.observed, scored
             )
             if comparison is not None:
                 figures.append(report.Figure(comparison, COMPARISON_CAPTION))
@@ -116,14 +116,14 @@ def make(
                 is_fitted=bool(fitted),
             )
             curve = attempt(
-                None, with_extra, curve_figure.save, path, run, trained, final
+                None, _with_extra, curve_figure.save, path, run, trained, final
             )
             if curve is not None:
                 caption = curve_figure.caption(run, trained, final)
                 figures.append(report.Figure(curve, caption))
             path = target / "scene.mp4"
             video = attempt(
-                None, with_extra, save_video, path, run, renderer, state, seconds
+                None, _with_extra, save_video, path, run, renderer, state, seconds
             )
             attempt(None, save_depth, target / "depth", run.capture, scored)
             save = run.representation.products.save
@@ -136,7 +136,7 @@ def make(
             metrics = heldout.metrics(numbers)
             metrics += measured(run, trained, scored, ms_per_frame, start_time)
             metrics += [*fitted, *model_size(saved)]
-            attempt(None, save_metrics, target / METRICS, metrics)
+            attempt(None, _save_metrics, target / METRICS, metrics)
             main = {each.key: each.value for each in metrics}
             warnings = baselines_text.warnings(main, quality.tracked_share(run, main))
             notes = [*warnings, trained.result.message, *skipped_frames]
@@ -176,17 +176,8 @@ def _staged(folder):
     return contextlib.nullcontext(folder)
 
 
-def with_extra(save: Callable[..., Any], path: pathlib.Path, *arguments):
-    """Save a product that may need an extra.
-
-    Args:
-      save: Function that saves the product.
-      path: Its first argument.
-      *arguments: Further arguments.
-
-    Returns:
-      Its result. None if the extra is not installed, which is printed.
-    """
+def _with_extra(save: Callable[..., Any], path: pathlib.Path, *arguments):
+    """Save a product that may need an extra."""
     try:
         return save(path, *arguments)
     except MissingExtra as error:
@@ -194,13 +185,8 @@ def with_extra(save: Callable[..., Any], path: pathlib.Path, *arguments):
         return None
 
 
-def save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
-    """Write metrics as JSON values by key, null for values that are not finite.
-
-    Args:
-      path: The file.
-      metrics: The metrics.
-    """
+def _save_metrics(path: pathlib.Path, metrics: list[Metric]) -> None:
+    """Write metrics as JSON values by key, null for values that are not finite."""
     write_json(
         path, {m.key: m.value if math.isfinite(m.value) else None for m in metrics}
     )
@@ -213,16 +199,8 @@ def _capture_notes(run, folder):
     return dict.fromkeys([*run.capture.notes, *preprocessing, *run.observed.notes])
 
 
-def frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Select the held-out frames to evaluate.
-
-    Args:
-      run: The run.
-      trained: Its training.
-
-    Returns:
-      Rows of the frames, and a note if time does not allow all of them.
-    """
+def _frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Select the held-out frames to evaluate."""
     heldout = run.capture.heldout
     seconds = trained.renderer.ms_per_frame(1) / 1e3
     count = budget.scored_frames(seconds, len(heldout))
@@ -340,19 +318,10 @@ def score_halves(
 
 
 @events.stage("drawing the comparison")
-def save_comparison(
+def _save_comparison(
     path: pathlib.Path, capture: Capture, scored: Scored
 ) -> pathlib.Path:
-    """Save an image of ground truth, render, error and depth of a few held-out frames.
-
-    Args:
-      path: The file.
-      capture: The capture.
-      scored: Evaluated frames.
-
-    Returns:
-      The path.
-    """
+    """Save truth, render, error and depth of a few held-out frames."""
     places = evaluation.spread(np.arange(len(scored.rows)), COMPARISON_FRAMES)
     captions = [
         f"frame {capture.ids[scored.rows[i]]}   {scored.psnr[i]:.2f} dB   "

@@ -255,20 +255,22 @@ def _sets_steps(config):
 def _new_run(config, effects, seconds):
     if config.preset is not None and effects != "auto":
         return new_run(config)
-    stored = stored_capture(config.source, config.seed)
-    chosen, lines = config, []
+    capture = stored_capture(config.source, config.seed)
+    new_config, lines = config, []
     if config.preset is None:
         planned = None if _sets_steps(config) else seconds
         try_out = None if effects == "preset" else effect_choice.compare_configs
-        chosen, lines = adviser.by_tracks(config, stored, planned, try_out)
+        new_config, lines = adviser.by_tracks(config, capture, planned, try_out)
         if effects != "preset":
-            chosen, more = effect_choice.choose(chosen, stored, config.overrides)
+            new_config, more = effect_choice.choose(
+                new_config, capture, config.overrides
+            )
             lines += more
     else:
-        findings = inspection.inspect(stored, CACHE / "evidence").findings
-        chosen, lines = adviser.follow(chosen, config.overrides, findings)
+        findings = inspection.inspect(capture, CACHE / "evidence").findings
+        new_config, lines = adviser.follow(new_config, config.overrides, findings)
     console.say("\n".join(lines))
-    return new_run(chosen, stored)
+    return new_run(new_config, capture)
 
 
 def _describe(run):
@@ -286,16 +288,16 @@ def _check_expected(folder, expected):
     Raises ValueError with the saved and the expected value of each difference.
     """
     config = read_config(folder)
-    stored = {**vars(config), **vars(config.source)}
-    capture, source = stored["capture"], expected.get("capture")
+    values = {**vars(config), **vars(config.source)}
+    capture, source = values["capture"], expected.get("capture")
     if capture is not None and source is not None and run_folder.is_of(capture, source):
         expected = {**expected, "capture": capture}  # also if `source` is its video
-    new_paths = {k: x for k, x in expected.items() if _has_moved(stored[k], x)}
-    stored = stored | new_paths
+    new_paths = {k: x for k, x in expected.items() if _has_moved(values[k], x)}
+    values = values | new_paths
     differences = [
-        f"{name.replace('_', '-')}: saved {stored[name]}, now {value}"
+        f"{name.replace('_', '-')}: saved {values[name]}, now {value}"
         for name, value in expected.items()
-        if value != stored[name]
+        if value != values[name]
     ]
     if differences:
         raise ValueError(

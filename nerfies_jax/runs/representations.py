@@ -73,8 +73,8 @@ def named(name: str) -> "Representation":
       ValueError: If there is none with that name.
     """
     if name not in installed():
-        known = known_names(name, installed())
-        raise ValueError(f"no representation {name!r}; {known}")
+        names = known_names(name, installed())
+        raise ValueError(f"no representation {name!r}; {names}")
     return installed()[name]
 
 
@@ -105,8 +105,8 @@ def of_preset(preset: str) -> "Representation":
     for representation in installed().values():
         if preset in representation.presets:
             return representation
-    known = sorted(p for each in installed().values() for p in each.presets)
-    raise ValueError(f"no preset {preset!r}; {known_names(preset, known)}")
+    presets = sorted(p for each in installed().values() for p in each.presets)
+    raise ValueError(f"no preset {preset!r}; {known_names(preset, presets)}")
 
 
 def of_run(folder: pathlib.Path) -> "Representation | None":
@@ -120,8 +120,8 @@ def of_run(folder: pathlib.Path) -> "Representation | None":
       reason.
     """
     try:
-        stored = json.loads((folder / CONFIG).read_text())
-        return named(stored["representation"])
+        content = json.loads((folder / CONFIG).read_text())
+        return named(content["representation"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -143,10 +143,10 @@ def stored_spec(
     Raises:
       ValueError, TypeError: If it is not a spec of that representation.
     """
-    known = representation.spec_type
+    spec_type = representation.spec_type
     names = extensions.names_in(stored, specs.TYPE) if load else ()
-    others = [name for name in names if name not in specs.allowed_names(known)]
-    return specs.from_json(stored, known, *map(extensions.load_class, others))
+    others = [name for name in names if name not in specs.allowed_names(spec_type)]
+    return specs.from_json(stored, spec_type, *map(extensions.load_class, others))
 
 
 class Cores(NamedTuple):
@@ -190,8 +190,8 @@ def cores_of_run(folder: pathlib.Path) -> Cores:
     if representation is None:
         return Cores("all", 1)
     try:
-        stored = json.loads((folder / CONFIG).read_text())["spec"]
-        shares = representation.resources.shares(stored_spec(representation, stored))
+        spec = json.loads((folder / CONFIG).read_text())["spec"]
+        shares = representation.resources.shares(stored_spec(representation, spec))
     except (OSError, ValueError, KeyError, TypeError):
         shares = 1
     return Cores(representation.resources.threads, shares)

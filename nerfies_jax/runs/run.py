@@ -54,8 +54,8 @@ class Run(NamedTuple):
     @property
     def code(self) -> tuple[str, ...]:
         """Names of the code from other packages that the run needs."""
-        stored = {"config": vars(self.config), "spec": specs.as_json(self.spec)}
-        return trust.outside_names(stored, type(self.spec))
+        settings = {"config": vars(self.config), "spec": specs.as_json(self.spec)}
+        return trust.outside_names(settings, type(self.spec))
 
 
 def new_run(config: RunConfig, stored: Capture | None = None) -> Run:
@@ -311,15 +311,15 @@ def save_config(folder: pathlib.Path, run: Run, notes: Sequence[str] = ()) -> No
       run: The run.
       notes: Notes on steps of preprocessing that were skipped.
     """
-    stored = {
+    content = {
         "config": specs.as_json(run.config),
         "representation": run.representation.name,
         "spec": specs.as_json(run.spec),
         "made by": provenance(),
     }
     if notes:
-        stored[PREPROCESSING_NOTES] = [*notes]
-    write_json(folder / CONFIG, stored)
+        content[PREPROCESSING_NOTES] = [*notes]
+    write_json(folder / CONFIG, content)
 
 
 def saved_run(
@@ -368,8 +368,8 @@ def saved_run(
     run = open_run(dataclasses.replace(config, source=source), kind, spec)
     same_capture.check(folder, run.capture)
     if moved:
-        stored = json.loads((folder / CONFIG).read_text())
-        write_json(folder / CONFIG, stored | {"config": specs.as_json(run.config)})
+        content = json.loads((folder / CONFIG).read_text())
+        write_json(folder / CONFIG, content | {"config": specs.as_json(run.config)})
     return run
 
 
@@ -388,13 +388,13 @@ def read_settings(folder: pathlib.Path, trusted: Collection[str] = ()) -> Settin
         ValueError, and nothing has been imported.
       FileError: If the settings cannot be read.
     """
-    stored = _stored(folder)
+    content = _stored(folder)
     with _readable(folder):
-        kind = representations.named(stored["representation"])
-        config = specs.from_json(stored["config"], RunConfig)
-    trust.check(folder, stored, kind.spec_type, trusted)
+        kind = representations.named(content["representation"])
+        config = specs.from_json(content["config"], RunConfig)
+    trust.check(folder, content, kind.spec_type, trusted)
     with _readable(folder):
-        spec = representations.stored_spec(kind, stored["spec"], load=True)
+        spec = representations.stored_spec(kind, content["spec"], load=True)
         _check_type(config, RunConfig)
         _check_type(spec, kind.spec_type)
     return Settings(config, kind, spec)
@@ -417,9 +417,9 @@ def read_config(folder: pathlib.Path) -> RunConfig:
     Raises:
       ValueError: If it cannot be read.
     """
-    stored = _stored(folder)
+    content = _stored(folder)
     with _readable(folder):
-        config = specs.from_json(stored["config"], RunConfig)
+        config = specs.from_json(content["config"], RunConfig)
         _check_type(config, RunConfig)
     return config
 
@@ -473,7 +473,7 @@ def initial_state(run: Run) -> TrainState:
     if resources.estimate_memory_bytes is not None:
         needed = resources.estimate_memory_bytes(run.spec, run.capture)
         needed -= frame_memory.capture_bytes(run.capture)  # already allocated
-        free = free_memory()
+        free = _free_memory()
         if needed > free:
             raise ValueError(
                 f"the initial training state needs about {needed / 2**30:.1f} GiB of "
@@ -483,12 +483,8 @@ def initial_state(run: Run) -> TrainState:
     return run.model.init(run.capture, jax.random.key(run.config.seed))
 
 
-def free_memory() -> int:
-    """Return the available memory.
-
-    Returns:
-      Bytes that programs may still allocate.
-    """
+def _free_memory() -> int:
+    """Return the available memory in bytes."""
     return psutil.virtual_memory().available
 
 

@@ -49,7 +49,7 @@ def scalars(event: Event) -> dict[str, float]:
       Numbers by name, such as `train/loss` or `held_out/psnr`.
     """
     if event["kind"] == "train":
-        named = {
+        values = {
             "psnr": event["psnr"],
             "steps_per_second": event["steps_per_second"],
             "memory_bytes": event["memory_bytes"],
@@ -58,10 +58,10 @@ def scalars(event: Event) -> dict[str, float]:
         }
         prefix = "train"
     elif event["kind"] == "evaluation":
-        named, prefix = event["metrics"], event["hook"].replace(" ", "_")
+        values, prefix = event["metrics"], event["hook"].replace(" ", "_")
     else:
         return {}
-    return {f"{prefix}/{k}": float(x) for k, x in named.items() if x is not None}
+    return {f"{prefix}/{k}": float(x) for k, x in values.items() if x is not None}
 
 
 class TensorBoard:

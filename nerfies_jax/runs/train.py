@@ -110,18 +110,18 @@ def train(
         del step, metrics
         capture = evaluation.as_found(run.model, state, run.observed)
         scored = evaluation.score(renderer, state, capture, rows)
-        whole = {
+        numbers = {
             "psnr": evaluation.known_mean(scored.psnr),
             "ssim": evaluation.known_mean(scored.ssim),
         }
         if scorer is None:
-            return whole
+            return numbers
         observed = evaluation.as_found(run.model, state, run.capture)
         halves = scorer(state, observed, rows)
         return {
             "psnr": evaluation.known_mean(halves.psnr),
             "ssim": evaluation.known_mean(halves.ssim),
-            **{f"unfitted_{name}": value for name, value in whole.items()},
+            **{f"unfitted_{name}": value for name, value in numbers.items()},
         }
 
     if len(rows):
@@ -182,10 +182,10 @@ def _with_best(run, result, checkpoints):
     if outcome.step not in {*checkpoint.steps(checkpoints.folder)} - {result.steps}:
         return result
     example = (run.model.example or run.model.init)(run.capture, jax.random.key(0))
-    kept = checkpoint.restore(
+    restored = checkpoint.restore(
         checkpoints.folder, example, run.model.spec, step=outcome.step
     )
-    return result._replace(state=kept.state)
+    return result._replace(state=restored.state)
 
 
 def _compile(run, state, frames, renderer, view) -> float:

@@ -66,11 +66,11 @@ def outside_names(stored: Any, spec_type: type) -> tuple[str, ...]:
         isinstance(each, str) for each in overrides
     ):
         raise ValueError(f"overrides must be strings, got {overrides!r}")
-    known = specs.allowed_names(spec_type)
+    allowed = specs.allowed_names(spec_type)
     in_spec = [
         name
         for name in extensions.names_in(stored.get("spec"), specs.TYPE)
-        if name not in known
+        if name not in allowed
     ]
     in_overrides = extensions.names_in_assignments(overrides)
     return tuple(dict.fromkeys((*in_overrides, *in_spec)))

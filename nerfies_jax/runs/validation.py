@@ -78,8 +78,8 @@ def training_frames(run: Run) -> Frames:
     capture, left_out = run.capture, rows(run)
     if len(left_out):
         train = capture.train
-        kept = train[~np.isin(train, left_out)]
-        capture = dataclasses.replace(capture, train=kept)
+        remaining = train[~np.isin(train, left_out)]
+        capture = dataclasses.replace(capture, train=remaining)
     return evaluation.frames_of(capture, run.model.required_data)
 
 
@@ -104,8 +104,8 @@ def hooks(run: Run, renderer: Renderer) -> tuple[Hook, ...]:
         return {"psnr": evaluation.known_mean(scored.psnr)}
 
     unit = EVALUATIONS * chunk.LENGTH
-    every = max(run.spec.steps // unit, 1) * chunk.LENGTH
-    return (Hook(VALIDATION, evaluate, every_steps=every),)
+    interval = max(run.spec.steps // unit, 1) * chunk.LENGTH
+    return (Hook(VALIDATION, evaluate, every_steps=interval),)
 
 
 def outcome(run: Run, result: FitResult) -> Outcome | None:
