@@ -83,8 +83,8 @@ def read(
     is_train = rows < len(split.train)
     full = image_files.read_header(files[0]).size
     _, shrink_by = frames.choose_source({1: root}, full, factor, max_side, where)
-    stored = frames.read_frames(files, shrink_by, background)
-    images, alpha = stored.images, stored.alpha
+    loaded = frames.read_frames(files, shrink_by, background)
+    images, alpha = loaded.images, loaded.alpha
     if alpha is not None and not alpha.any():
         raise CaptureError(
             f"{where}: all pixels of all images are transparent (alpha 0); save them "
@@ -118,7 +118,7 @@ def read(
         warp_ids=frames.dense(times),
         appearance_ids=np.zeros(len(rows), np.int32),
         camera_ids=camera_ids,
-        valid=frames.both(valid, stored.observed),
+        valid=frames.both(valid, loaded.observed),
         points=_in_scene_units(points, placement),
         background=background if alpha is not None else split.transforms.background,
         scale=placement.scale,
@@ -135,7 +135,7 @@ def read(
             *more,
             *time_notes,
             *masked,
-            *stored.notes,
+            *loaded.notes,
             *_unread_depths(entries),
         ),
     )

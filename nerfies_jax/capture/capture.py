@@ -418,8 +418,8 @@ def shrink_depth(depth: np.ndarray, factor: int) -> np.ndarray:
       float32 depths [height // factor, width // factor], 0 where all are unknown.
     """
     parts = blocks(depth, factor)
-    known = (parts > 0).sum((-3, -1))
-    mean = parts.sum((-3, -1), dtype=np.float64) / np.maximum(known, 1)
+    count = (parts > 0).sum((-3, -1))
+    mean = parts.sum((-3, -1), dtype=np.float64) / np.maximum(count, 1)
     return mean.astype(np.float32)
 
 

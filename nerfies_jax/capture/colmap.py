@@ -77,11 +77,11 @@ def read(
         path, model, factor, max_side, missing
     )
     # COLMAP reads pixels as stored and ignores the EXIF orientation.
-    stored = frames.read_frames(files, shrink_by, orientation="stored")
+    loaded = frames.read_frames(files, shrink_by, orientation="stored")
     images, valid, moving, lenses, more = _as_pinholes(
-        path, model, files, stored, shrink_by
+        path, model, files, loaded, shrink_by
     )
-    notes += (*stored.notes, *more)
+    notes += (*loaded.notes, *more)
     placement = place_by_points(model.points, model.positions, model.depths)
     center, scale = np.array(placement.center), placement.scale
     cameras = _cameras(lenses, model.rotations, (model.positions - center) * scale)

@@ -116,8 +116,8 @@ def _observations(capture):
     # which number * kept / count reaches the next integer.
     number = np.cumsum(visible, axis=0) - visible
     count = np.maximum(visible.sum(axis=0), 1)
-    kept = np.minimum(count, MOST_SEEN)
-    is_kept = (number * kept) // count != ((number - 1) * kept) // count
+    limit = np.minimum(count, MOST_SEEN)
+    is_kept = (number * limit) // count != ((number - 1) * limit) // count
     return visible & is_kept, pixels
 
 

@@ -200,12 +200,12 @@ def _next_answer(child, seconds):
             if min(shape, default=0) < 0 or total > MAX_ANSWER:
                 raise ValueError(f"an array of shape {shape}")
             arrays[name] = array = np.empty(shape, dtype)
-            left = memoryview(array.reshape(-1).view(np.uint8))
-            while left:
-                part = child.stdout.readinto(left)
+            remaining = memoryview(array.reshape(-1).view(np.uint8))
+            while remaining:
+                part = child.stdout.readinto(remaining)
                 if not part:
                     raise EOFError
-                left = left[part:]
+                remaining = remaining[part:]
         return Answer(head["about"], arrays)
     finally:
         timer.cancel()

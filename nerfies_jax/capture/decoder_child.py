@@ -59,11 +59,11 @@ def _image(path):
 def _mask(path):
     from nerfies_jax.capture import masks
 
-    stored = masks.decode(path)
-    arrays = {"value": stored.value}
-    if stored.alpha is not None:
-        arrays["alpha"] = stored.alpha
-    yield {"full": stored.full, "colorful": stored.colorful}, arrays
+    pixels = masks.decode(path)
+    arrays = {"value": pixels.value}
+    if pixels.alpha is not None:
+        arrays["alpha"] = pixels.alpha
+    yield {"full": pixels.full, "colorful": pixels.colorful}, arrays
 
 
 def _photograph(path, header_only):

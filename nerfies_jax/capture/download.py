@@ -123,17 +123,17 @@ def _captures_in(folder: pathlib.Path) -> list[pathlib.Path]:
     """List the folders that hold a capture of a format that is read."""
     from nerfies_jax.capture import formats
 
-    found: list[pathlib.Path] = []
+    folders: list[pathlib.Path] = []
     level = [folder]
     for _ in range(4):
         below = []
         for each in level:
             if any(form.recognize(each) for form in formats.FORMATS):
-                found.append(each)
+                folders.append(each)
             else:
                 below += sorted(path for path in each.iterdir() if path.is_dir())
         level = below
-    return found
+    return folders
 
 
 def _already(folder, address, sha256):
@@ -208,7 +208,7 @@ def _unpack(address, archive, folder):
                     f"{address}: its {len(members)} files would take more than "
                     f"{MOST_RATIO:g} times the archive's size, so it is not unpacked"
                 )
-            left = int(most)
+            remaining = int(most)
             for member in members:
                 stopping.check()
                 target = (root / member.filename).resolve()
@@ -222,8 +222,8 @@ def _unpack(address, archive, folder):
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with opened.open(member) as source, target.open("xb") as file:
                     while chunk := source.read(CHUNK_BYTES):
-                        left -= len(chunk)
-                        if left < 0:
+                        remaining -= len(chunk)
+                        if remaining < 0:
                             raise CaptureError(
                                 f"{address}: it holds more than it says, so it is not "
                                 "unpacked"

@@ -100,8 +100,8 @@ def check_observed(capture: Capture) -> None:
                     "the masks (white is observed) and the alpha channel of the images "
                     "(255 is observed)"
                 )
-    given = None if capture.given is None else capture.given.moving
-    for moving in (capture.moving, given):
+    external = None if capture.given is None else capture.given.moving
+    for moving in (capture.moving, external):
         if moving is None:
             continue
         static = ~moving[capture.train]

@@ -63,17 +63,17 @@ def _depths(capture):
     """Compare stored depths with those of the points, or with near and far."""
     if capture.depths is None:
         return []
-    known = capture.depths.ravel()[:: max(1, capture.depths.size // SAMPLES)]
-    known = known[known > 0]
+    sample = capture.depths.ravel()[:: max(1, capture.depths.size // SAMPLES)]
+    sample = sample[sample > 0]
     subject = "depths"
     if not capture.depths.any():
         problem = "depth is stored, but no pixel has one above 0"
         return [Finding(subject, "none", problem)]
-    if not known.size:
+    if not sample.size:
         return []
     near, far = capture.near, capture.far
-    median = float(np.median(known))
-    beyond = float(((known < near) | (known > far)).mean())
+    median = float(np.median(sample))
+    beyond = float(((sample < near) | (sample > far)).mean())
     expected = units.usual_depth(capture)
     ratio = median / expected
     has_points = units.point_depths(capture).size

@@ -66,8 +66,8 @@ def _observed(capture):
 
 
 def _moving(capture):
-    given = None if capture.given is None else capture.given.moving
-    moving = capture.moving if given is None else given
+    external = None if capture.given is None else capture.given.moving
+    moving = capture.moving if external is None else external
     if moving is None:
         return []
     share = moving.mean((1, 2))

@@ -45,10 +45,10 @@ def undistorted(
     parts: dict[str, Any] = {}
     if given.track_pixel is not None and given.track_seen is not None:
         pixel, seen = np.zeros_like(given.track_pixel), given.track_seen.copy()
-        for frame, here in enumerate(seen):
+        for frame, visible in enumerate(seen):
             place, exists = straight(frame, given.track_pixel[frame])
-            here &= exists & ((place > 0) & (place < size)).all(-1)
-            pixel[frame] = np.where(here[:, None], place, 0)
+            visible &= exists & ((place > 0) & (place < size)).all(-1)
+            pixel[frame] = np.where(visible[:, None], place, 0)
         parts |= {"track_pixel": pixel, "track_seen": seen}
     unknown = {"moving": False, "depth": np.nan}
     for name, outside in unknown.items():
@@ -82,6 +82,6 @@ def _flow(flow, sources, other, straight):
     end, exists = straight(other, end.astype(np.float32))
     height, width = inside.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    moved = end.reshape(height, width, 2) - np.stack([x, y], -1)
-    known = inside & exists.reshape(height, width)
-    return np.where(known[..., None], moved, NOWHERE).astype(np.float32)
+    shift = end.reshape(height, width, 2) - np.stack([x, y], -1)
+    valid = inside & exists.reshape(height, width)
+    return np.where(valid[..., None], shift, NOWHERE).astype(np.float32)

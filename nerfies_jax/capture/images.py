@@ -264,24 +264,26 @@ def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
     Raises:
       CaptureError: If it cannot be read, has no color, or is partly transparent.
     """
-    stored = exr.read_exr(path)
-    if stored.color is None:
+    picture = exr.read_exr(path)
+    if picture.color is None:
         raise CaptureError(f"{path}: no color channels; save it with R, G and B")
-    transparent = stored.alpha is not None and stored.color_finite & (stored.alpha < 1)
+    transparent = picture.alpha is not None and picture.color_finite & (
+        picture.alpha < 1
+    )
     if np.any(transparent):
         raise CaptureError(
             f"{path}: it has transparent pixels, and its colors may be premultiplied "
             "by alpha or not; composite it over its background first, or save it as a "
             "PNG"
         )
-    stored = exr.in_display_window(path, stored)
-    assert stored.color is not None
-    color = np.round(srgb_from_linear(stored.color) * 255).astype(np.uint8)
-    known = stored.color_finite
-    if known.all():
+    picture = exr.in_display_window(path, picture)
+    assert picture.color is not None
+    color = np.round(srgb_from_linear(picture.color) * 255).astype(np.uint8)
+    finite = picture.color_finite
+    if finite.all():
         return color, None
-    color[~known] = 0
-    return color, known
+    color[~finite] = 0
+    return color, finite
 
 
 def read_image(

@@ -334,10 +334,8 @@ def replaced_folder(
         new = scratch / "new"
         new.mkdir()
         yield new
-        written = _files(new)
-        _refuse_others(
-            path, alike(path, written) if replaceable is None else replaceable
-        )
+        files = _files(new)
+        _refuse_others(path, alike(path, files) if replaceable is None else replaceable)
         _swap_folders(new, path)
 
 

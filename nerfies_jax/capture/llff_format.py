@@ -72,10 +72,10 @@ def read(
     )
     # In lexicographic order, as in LLFF's script.
     files = frames.pictures_in(available[source])
-    stored = frames.read_frames(files, shrink_by, orientation="stored")
-    images = stored.images
-    valid, notes = without_black_borders(images, stored.valid())
-    notes += stored.notes
+    loaded = frames.read_frames(files, shrink_by, orientation="stored")
+    images = loaded.images
+    valid, notes = without_black_borders(images, loaded.valid())
+    notes += loaded.notes
     placement = placed(poses)
     cameras = cameras_of(poses, placement, (images.shape[2], images.shape[1]))
     names = tuple(file.stem for file in files)

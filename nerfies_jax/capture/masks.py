@@ -69,10 +69,10 @@ def read_mask(
     """
     path = pathlib.Path(path)
     encoding = encoding or find_encoding([path], orientation)
-    stored = _read(path, orientation)
+    pixels = _read(path, orientation)
     if encoding.alpha:
-        return stored.alpha
-    return stored.value >= encoding.threshold
+        return pixels.alpha
+    return pixels.value >= encoding.threshold
 
 
 def find_encoding(paths: Sequence[AnyPath], orientation: str = "refuse") -> Encoding:
@@ -205,17 +205,17 @@ def _value_encoding(surveys):
 
 
 def _survey(path, orientation):
-    stored = _read(path, orientation)
-    counts = np.bincount(stored.value.ravel(), minlength=stored.full + 1)
-    alpha = stored.alpha
+    pixels = _read(path, orientation)
+    counts = np.bincount(pixels.value.ravel(), minlength=pixels.full + 1)
+    alpha = pixels.alpha
     return _Survey(
         path=path,
         counts=counts,
-        full=stored.full,
-        colorful=stored.colorful,
+        full=pixels.full,
+        colorful=pixels.colorful,
         has_alpha=alpha is not None,
         opaque=alpha is None or bool(alpha.all()),
-        cut_out=alpha is not None and _is_cut_out(stored.value, alpha),
+        cut_out=alpha is not None and _is_cut_out(pixels.value, alpha),
     )
 
 

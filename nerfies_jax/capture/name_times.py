@@ -111,7 +111,7 @@ def _time_fields(names):
         columns = [column for column in columns if len(texts[column]) > 1] or [-1]
     else:
         columns = [-1]
-    chosen = next(
+    field = next(
         (
             column
             for column in columns
@@ -121,8 +121,8 @@ def _time_fields(names):
     )
     fields = []
     for name, row in zip(names, numbers, strict=True):
-        start, end = row[chosen].span()
-        fields.append((f"{name[:start]}#{name[end:]}", row[chosen].group()))
+        start, end = row[field].span()
+        fields.append((f"{name[:start]}#{name[end:]}", row[field].group()))
     return fields
 
 

@@ -59,8 +59,8 @@ def read(
     paths = [frames.find_picture(folder, name) for name in views.ids]
     rows, skip_notes = frames.keep_found(paths, views.ids, missing, str(folder))
     views = only(views, rows)
-    stored = frames.read_frames([paths[row] for row in rows], shrink_by)
-    images, alpha = stored.images, stored.alpha
+    loaded = frames.read_frames([paths[row] for row in rows], shrink_by)
+    images, alpha = loaded.images, loaded.alpha
     total = source * shrink_by
     _check_image_size(paths[rows[0]], views.size, source)
     cameras = camera.resize(views.cameras, (total, total), (1, 1))
@@ -73,8 +73,8 @@ def read(
         notes.append("images have alpha: pixels below 255 count as not observed")
     elif valid is not None:
         valid = valid == 1
-    valid = frames.both(valid, stored.observed)
-    notes += stored.notes
+    valid = frames.both(valid, loaded.observed)
+    notes += loaded.notes
     moving = None if static is None else static < 1
     points, more = _points(path, images, cameras, views, moving)
     depths, unread = _depths(path, views, size, total)
@@ -275,9 +275,9 @@ def _depths(path, views, size, total):
     if folder is None:
         return None, ()
     if not any(folder.glob("*.npy")):
-        stored = next(iter(folder.iterdir()), None)
+        first_file = next(iter(folder.iterdir()), None)
         note = f"depth/{folder.name} holds no .npy file: its depth is not read"
-        return None, () if stored is None else (note,)
+        return None, () if first_file is None else (note,)
     width, height = size
     count, depths = 0, np.zeros((len(views.ids), height, width), np.float32)
     for row, name in enumerate(views.ids):
@@ -294,8 +294,8 @@ def _depths(path, views, size, total):
                 f"{file}: depth of shape {depth.shape} for images of "
                 f"{width * shrink_by}x{height * shrink_by}; the sizes must agree"
             )
-        known = np.isfinite(depth) & (depth > 0)
-        depth = np.where(known, depth * views.scene.scale, 0).astype(np.float32)
+        positive = np.isfinite(depth) & (depth > 0)
+        depth = np.where(positive, depth * views.scene.scale, 0).astype(np.float32)
         depths[row] = shrink_depth(depth, shrink_by)
         count += 1
     if not count:

@@ -133,8 +133,8 @@ def read_cameras(
     extra_file = path / "extra.json"
     extra = read_json(extra_file, ExtraFile) if extra_file.exists() else ExtraFile()
     train, scored, notes = _splits(path, heldout)
-    chosen = sorted(set(train) | set(scored), key=frames.natural)
-    ids, skip_notes = _with_camera_files(path, chosen, missing)
+    names = sorted(set(train) | set(scored), key=frames.natural)
+    ids, skip_notes = _with_camera_files(path, names, missing)
     files = [_camera_file(path, name) for name in ids]
     size = _common_size(path, ids, files)
     cameras = cameras_of(files, scene.scale, scene.center)
@@ -210,10 +210,10 @@ def _splits(path, heldout):
         step = frames.HELD_OUT if heldout is None else heldout
         pool = all_names if isinstance(heldout, int) or not train else train
         pool = sorted(pool, key=frames.natural)
-        kept, scored = frames.hold_out_every(len(pool), step, str(path))
+        training, scored = frames.hold_out_every(len(pool), step, str(path))
         if heldout is None:
             notes += (f"no validation ids: {frames.held_out_note(scored, step)}",)
-        return [pool[row] for row in kept], [pool[row] for row in scored], notes
+        return [pool[row] for row in training], [pool[row] for row in scored], notes
     left_out = len(all_names) - len({*train, *val})
     if train and left_out:
         notes += (f"{left_out} frames in neither split are not read",)
@@ -224,8 +224,8 @@ def _named_split(path, heldout):
     folder = path / "splits"
     file = inside(folder, f"{heldout}.json", folder)
     if not file.is_file():
-        known = sorted(f.stem for f in folder.glob("*.json"))
-        raise CaptureError(f"{file}: no such split; {known_names(heldout, known)}")
+        names = sorted(f.stem for f in folder.glob("*.json"))
+        raise CaptureError(f"{file}: no such split; {known_names(heldout, names)}")
     # DyCheck pairs its splits: val_intl belongs to train_intl.
     partner = folder / f"{heldout.replace('val', 'train', 1)}.json"
     if partner == file or not partner.is_file():

@@ -83,10 +83,10 @@ def read_npz(path):
         raise CaptureError(
             f"{path}: not a readable .npz ({error}); save it again with numpy.savez"
         ) from None
-    missing = {"images", "poses", "focal"} - set(arrays)
-    if missing:
+    absent = {"images", "poses", "focal"} - set(arrays)
+    if absent:
         raise CaptureError(
-            f"{path}: no array {min(missing)!r}; there are {sorted(arrays)}"
+            f"{path}: no array {min(absent)!r}; there are {sorted(arrays)}"
         )
     for name in {"images", "poses", "focal", "times"} & set(arrays):
         if arrays[name].dtype.kind not in "fiu":

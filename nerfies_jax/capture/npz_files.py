@@ -106,8 +106,8 @@ def archive(path: AnyPath, most: int = MAX_BYTES) -> Iterator[Archive]:
     try:
         with safe_files.open_file(path) as file:
             size = os.fstat(file.fileno()).st_size
-            with zipfile.ZipFile(file) as opened:
-                yield Archive(opened, size, most)
+            with zipfile.ZipFile(file) as zip_file:
+                yield Archive(zip_file, size, most)
     except safe_files.CaptureError:
         raise
     except (*DAMAGED, OSError, NotImplementedError) as error:
@@ -130,8 +130,8 @@ def read_arrays(path: AnyPath, most: int = MAX_BYTES) -> dict[str, np.ndarray]:
         path.
       CaptureError: If it cannot be opened.
     """
-    with archive(path, most) as opened:
-        return {name: opened.read(name) for name in opened.names}
+    with archive(path, most) as zip_file:
+        return {name: zip_file.read(name) for name in zip_file.names}
 
 
 def read_npy(path: AnyPath, most: int = MAX_BYTES) -> np.ndarray:
@@ -169,12 +169,12 @@ def _read_array(stream: io.BufferedIOBase, size: int) -> np.ndarray:
             f"{size - header_bytes} bytes"
         )
     array = np.empty(count, dtype)
-    left = array.view(np.uint8).data if array.nbytes else memoryview(b"")
-    while left:
-        part = stream.readinto(left[:_CHUNK])
+    remaining = array.view(np.uint8).data if array.nbytes else memoryview(b"")
+    while remaining:
+        part = stream.readinto(remaining[:_CHUNK])
         if not part:
-            raise ValueError(f"truncated: {len(left)} of {size} bytes are missing")
-        left = left[part:]
+            raise ValueError(f"truncated: {len(remaining)} of {size} bytes are missing")
+        remaining = remaining[part:]
     return array.reshape(shape, order="F" if column_major else "C")
 
 

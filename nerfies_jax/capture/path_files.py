@@ -112,12 +112,12 @@ def _camera_path(path, cameras, size, times):
 
 
 def _times(path, times):
-    missing = sum(time is None for time in times)
-    if missing == len(times):
+    absent = sum(time is None for time in times)
+    if absent == len(times):
         return None
-    if missing:
+    if absent:
         raise CaptureError(
-            f"{path}: {missing} of {len(times)} cameras have no time; add it to all "
+            f"{path}: {absent} of {len(times)} cameras have no time; add it to all "
             "or to none"
         )
     times = np.array(times, np.float32)

@@ -54,11 +54,13 @@ def as_pinholes(capture: Capture) -> Capture:
         arrays = _undistorted(capture, wide)
         if arrays["images"].nbytes <= MOST_KEPT_BYTES:
             _last.keep(capture, arrays)
-    filmed = arrays["valid"]
-    note = f"images undistorted; {1 - filmed.mean():.1%} of their pixels are unobserved"
+    observed = arrays["valid"]
+    note = (
+        f"images undistorted; {1 - observed.mean():.1%} of their pixels are unobserved"
+    )
     return dataclasses.replace(
         capture,
-        **arrays | {"valid": None if filmed.all() else filmed},
+        **arrays | {"valid": None if observed.all() else observed},
         cameras=cameras.crop(pinhole(capture.cameras), -wide.left, -wide.top),
         flow=None,
         given=None if capture.given is None else _last.given(capture, wide),
@@ -113,7 +115,7 @@ def _undistorted(capture, wide):
     """Images, masks and depths by name, with booleans of the observed pixels."""
     shape = (len(capture.images), *wide.size[::-1])
     images = np.empty((*shape, 3), capture.images.dtype)
-    filmed = np.empty(shape, bool)
+    observed = np.empty(shape, bool)
     masks: dict[str, Any] = {
         name: None if array is None else np.empty(shape, array.dtype)
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
@@ -128,15 +130,15 @@ def _undistorted(capture, wide):
             place, inside = maps.of(cameras.take(capture.cameras, row))
             images[row] = resampling.lanczos(capture.images[row], place)
             images[row][~inside] = 0
-            filmed[row] = inside
+            observed[row] = inside
             if capture.valid is not None:
-                filmed[row] &= resampling.nearest(capture.valid[row], place)
+                observed[row] &= resampling.nearest(capture.valid[row], place)
             for name, array in masks.items():
                 if array is not None:
                     source = getattr(capture, name)[row]
                     array[row] = np.where(inside, resampling.nearest(source, place), 0)
             stage.advance()
-    return {"images": images, "valid": filmed, **masks}
+    return {"images": images, "valid": observed, **masks}
 
 
 def _undistorted_given(capture, given, wide):
@@ -230,14 +232,14 @@ def scorable(filmed: Capture) -> Capture:
     if not has_lens(filmed.cameras):
         return filmed
     maps = Maps(_straight_pixels, filmed.size)
-    drawn = np.stack(
+    scorable_pixels = np.stack(
         [
             maps.of(cameras.take(filmed.cameras, row))[1]
             for row in range(len(filmed.ids))
         ]
     )
     depths = filmed.depths
-    valid = drawn if filmed.valid is None else filmed.valid & drawn
+    valid = scorable_pixels if filmed.valid is None else filmed.valid & scorable_pixels
     before = 1.0 if filmed.valid is None else filmed.valid.mean()
     if valid.mean() == before:
         return filmed
@@ -246,7 +248,9 @@ def scorable(filmed: Capture) -> Capture:
         filmed,
         valid=valid,
         notes=(*filmed.notes, note),
-        depths=None if depths is None else np.where(drawn, depths, np.float32(0)),
+        depths=None
+        if depths is None
+        else np.where(scorable_pixels, depths, np.float32(0)),
     )
 
 

@@ -69,9 +69,9 @@ def read(
     recorded = reader(path, cameras, shrink_by)
     names = [each.stem for each in cameras]
     train, heldout_rows, note = _split(recorded, names, heldout, path)
-    placed = llff_format.placed(poses)
+    placement = llff_format.placed(poses)
     size = recorded.images.shape[2:0:-1]
-    fixed = llff_format.cameras_of(poses, placed, size)
+    fixed = llff_format.cameras_of(poses, placement, size)
     times = frames.spread(recorded.numbers)
     return Capture(
         name=path.resolve().name,
@@ -82,14 +82,14 @@ def read(
         times=times,
         train=train,
         heldout=heldout_rows,
-        near=placed.near,
-        far=placed.far,
+        near=placement.near,
+        far=placement.far,
         warp_ids=frames.dense(recorded.numbers),
         appearance_ids=recorded.camera_ids,
         camera_ids=recorded.camera_ids,
         valid=recorded.valid,
-        scale=placed.scale,
-        center=placed.center,
+        scale=placement.scale,
+        center=placement.center,
         up=frames.up_direction(fixed),
         frames_per_second=recorded.rate,
         path=path,
@@ -158,15 +158,15 @@ def _read_folders(path, folders, shrink_by):
             "the names of the images give no times that cameras share: the n-th images "
             "of all cameras are assumed to have the same time",
         )
-    stored = frames.read_frames(all_files, shrink_by, orientation="stored")
+    loaded = frames.read_frames(all_files, shrink_by, orientation="stored")
     return _Recorded(
-        images=stored.images,
-        valid=stored.valid(),
+        images=loaded.images,
+        valid=loaded.valid(),
         camera_ids=camera_ids.astype(np.int32),
         numbers=numbers,
         names=tuple(name.replace("/", "_") for name in names),
         rate=None,
-        notes=(*notes, *stored.notes, *_lengths(folders, camera_ids)),
+        notes=(*notes, *loaded.notes, *_lengths(folders, camera_ids)),
     )
 
 

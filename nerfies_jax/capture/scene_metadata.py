@@ -118,7 +118,7 @@ def _subject(capture):
         return None
     position = capture.points.position
     width, height = capture.size
-    shown = np.zeros(len(position), int)
+    views = np.zeros(len(position), int)
     for row in capture.train:
         camera = cameras.take(capture.cameras, row)
         x, y, z = camera.camera_from_world @ (position - camera.position).T
@@ -126,8 +126,8 @@ def _subject(capture):
         with np.errstate(divide="ignore", invalid="ignore"):
             u = focal[0] * x / z + camera.principal_point_px[0]
             v = focal[1] * y / z + camera.principal_point_px[1]
-        shown += (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    often = shown >= SHOWN_BY * np.quantile(shown, 1 - OUTLIERS)
+        views += (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    often = views >= SHOWN_BY * np.quantile(views, 1 - OUTLIERS)
     low, high = np.quantile(position[often], (OUTLIERS, 1 - OUTLIERS), axis=0)
     half_side = SUBJECT_MARGIN * float(np.max(high - low)) / 2
     return ((low + high) / 2, half_side) if half_side > 0 else None

@@ -34,10 +34,10 @@ def join(models: list[Any], database, images, folder, options) -> tuple[Any, lis
     pycolmap = library()
     base, others = models[0], models[1:]
     while True:
-        apart = [other for other in others if not _append(base, other)]
-        if len(apart) == len(others):
+        separate = [other for other in others if not _append(base, other)]
+        if len(separate) == len(others):
             return base, [each.num_reg_images() for each in (base, *others)]
-        others = apart
+        others = separate
         target = folder / "joined"
         target.mkdir(exist_ok=True)
         base = pycolmap.triangulate_points(
@@ -82,10 +82,10 @@ def _append(base, other):
     options = pycolmap.RANSACOptions()
     options.random_seed = SEED
     options.max_error = PAIR_ERROR * float(spread)
-    found = pycolmap.estimate_sim3d_robust(source, target, options)
-    if found is None or found["num_inliers"] < LEAST_AGREEING * len(pairs):
+    estimate = pycolmap.estimate_sim3d_robust(source, target, options)
+    if estimate is None or estimate["num_inliers"] < LEAST_AGREEING * len(pairs):
         return False
-    other.transform(found["tgt_from_src"])
+    other.transform(estimate["tgt_from_src"])
     for number in new:
         image = other.image(number)
         if not base.exists_camera(image.camera_id):

@@ -80,14 +80,14 @@ def faults(result: Summary) -> list[str]:
     Returns:
       One short text for each, empty if there are none.
     """
-    found = [*implausible_lens(result)]
+    reasons = [*implausible_lens(result)]
     if result.placed < LEAST_PLACED * result.images:
-        found.append(f"{result.placed} of {result.images} images registered")
+        reasons.append(f"{result.placed} of {result.images} images registered")
     if result.error_px > MOST_ERROR_PX:
-        found.append(f"reprojection error of {result.error_px:.2f} px")
+        reasons.append(f"reprojection error of {result.error_px:.2f} px")
     if result.angle_deg < LEAST_ANGLE_DEG:
-        found.append(f"triangulation angle of {result.angle_deg:.1f} degrees")
-    return found
+        reasons.append(f"triangulation angle of {result.angle_deg:.1f} degrees")
+    return reasons
 
 
 def implausible_lens(result: Summary) -> list[str]:
@@ -99,22 +99,22 @@ def implausible_lens(result: Summary) -> list[str]:
     Returns:
       One short text for each, empty if all are plausible.
     """
-    found = []
+    reasons = []
     low, high = result.focal
     # Also true for NaN.
     if not (low >= LEAST_FOCAL and high <= MOST_FOCAL):
-        found.append(
+        reasons.append(
             f"focal length of {low:.2f} to {high:.2f} image sides"
             if high > 1.001 * low
             else f"focal length of {low:.2f} image sides"
         )
     if not result.aspect <= MOST_ASPECT:
-        found.append(
+        reasons.append(
             f"focal lengths of both axes differ by a factor {result.aspect:.2f}"
         )
     if result.folds:
-        found.append("distortion that folds back inside the image")
-    return found
+        reasons.append("distortion that folds back inside the image")
+    return reasons
 
 
 def next_rung(results: Sequence[Summary], cameras: str = "auto") -> Rung | None:

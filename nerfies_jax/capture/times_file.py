@@ -41,7 +41,7 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
       CaptureError: The file cannot be read, or a frame has no time in it.
     """
     path = pathlib.Path(path)
-    named, listed = _read(path)
+    by_name, listed = _read(path)
     names = sorted(capture.ids, key=frames.natural)
     notes: tuple[str, ...] = ()
     if listed is not None:
@@ -53,7 +53,7 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
         table = dict(zip(names, listed, strict=True))
         values = [table[name] for name in capture.ids]
     else:
-        values, notes = _by_name(capture, named, path)
+        values, notes = _by_name(capture, by_name, path)
     clock = np.array(values, np.float64)
     if not np.isfinite(clock).all():
         row = int(np.argmin(np.isfinite(clock)))
@@ -117,12 +117,12 @@ def _read(path):
     if width == 1:
         return None, [_value(row[0], path) for row in rows]
     pairs = [tuple(reversed(row)) if time_first else tuple(row) for row in rows]
-    named: dict[str, float] = {}
+    by_name: dict[str, float] = {}
     for name, number in pairs:
         time = _value(number, path)
-        if named.setdefault(name, time) != time:
+        if by_name.setdefault(name, time) != time:
             raise CaptureError(f"{path}: frame {name!r} has two times; keep one")
-    return named, None
+    return by_name, None
 
 
 def _number(word):
@@ -155,11 +155,11 @@ def _by_name(capture, named, path):
         raise CaptureError(f"{path}: several names of one frame; keep one of each")
     find = _finder(table)
     keys = [find(name) for name in capture.ids]
-    lost = [name for name, key in zip(capture.ids, keys, strict=True) if key is None]
-    if lost:
-        listed = ", ".join(lost[:5]) + (", ..." if len(lost) > 5 else "")
+    absent = [name for name, key in zip(capture.ids, keys, strict=True) if key is None]
+    if absent:
+        listed = ", ".join(absent[:5]) + (", ..." if len(absent) > 5 else "")
         raise CaptureError(
-            f"{path}: no time for {len(lost)} of {len(keys)} frames ({listed}); add "
+            f"{path}: no time for {len(absent)} of {len(keys)} frames ({listed}); add "
             "them under these names, or under those of their images"
         )
     unused = len(table) - len({*keys})

@@ -162,13 +162,13 @@ def _fill_times(file, entries):
 
 def _fill_folder(file, entries):
     untimed = [entry for entry in entries if entry.time is None]
-    known = [entry for entry in entries if entry.time is not None]
+    timed = [entry for entry in entries if entry.time is not None]
     if not untimed:
         return
     clock = name_times.clock(stems(entries)).times
     name_time = dict(zip(map(id, entries), clock, strict=True))
-    knots, rows = np.unique([float(name_time[id(entry)]) for entry in known], True)
-    times = np.array([known[row].time for row in rows.tolist()], float)
+    knots, rows = np.unique([float(name_time[id(entry)]) for entry in timed], True)
+    times = np.array([timed[row].time for row in rows.tolist()], float)
     for entry in untimed:
         knot = name_time[id(entry)]
         time = -1.0
@@ -179,7 +179,7 @@ def _fill_folder(file, entries):
         if not -ROUNDING <= time <= 1 + ROUNDING:
             raise CaptureError(
                 f"{file}: frame {entry.file_path!r} has no time, and none can be "
-                f"derived from the {len(known)} other frames of its folder; add it"
+                f"derived from the {len(timed)} other frames of its folder; add it"
             )
         entry.time = min(max(time, 0.0), 1.0)
 
@@ -215,9 +215,9 @@ def stems(entries: list[Frame]) -> list[str]:
 
 def _unread(file):
     """Notes of unknown keys, which may affect the scene."""
-    known = HARMLESS.union(Transforms.__struct_fields__)
+    fields = HARMLESS.union(Transforms.__struct_fields__)
     known_of_frames = HARMLESS.union(Frame.__struct_fields__)
-    return unread_keys.notes(file, known, {"frames": known_of_frames})
+    return unread_keys.notes(file, fields, {"frames": known_of_frames})
 
 
 def _split(file, transforms, heldout, missing):

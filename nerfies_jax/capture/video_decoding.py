@@ -189,14 +189,14 @@ def _shortfall(container, stream, count, last):
             slack = max(slack, 1.0)
     else:
         return ()
-    read = last - start + interval
-    if read >= length - slack:
+    duration = last - start + interval
+    if duration >= length - slack:
         return ()
     frames = stream.frames or (round(length / interval) if interval else 0)
     of = f"{count} of {frames}" if frames > count else f"{count}"
     return (
-        f"the file is cut short or broken: {of} frames could be read, {read:.1f} of "
-        f"{length:.1f} s",
+        f"the file is cut short or broken: {of} frames could be read, {duration:.1f} "
+        f"of {length:.1f} s",
     )
 
 

@@ -59,9 +59,9 @@ def write_frame(
     """
     extra = {}
     if flow is not None:
-        known = np.isfinite(flow).all(axis=-1)
-        right, down = np.moveaxis(np.where(known[..., None], flow, 0), -1, 0)
-        extra = {"flow.x": right, "flow.y": down, "flow.A": known.astype(np.float32)}
+        finite = np.isfinite(flow).all(axis=-1)
+        right, down = np.moveaxis(np.where(finite[..., None], flow, 0), -1, 0)
+        extra = {"flow.x": right, "flow.y": down, "flow.A": finite.astype(np.float32)}
     height, width = rendering.alpha.shape
     exr.write_exr(
         path,

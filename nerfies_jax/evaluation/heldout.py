@@ -258,8 +258,8 @@ def _depths(scored, capture):
         masks["moving_"] = jnp.asarray(capture.moving[scored.rows])
     numbers = {}
     for name, mask in masks.items():
-        known = np.asarray(geometry_quality.known_depth(depth, truth, mask))
-        error = np.abs(np.asarray(depth - truth))[known]
+        valid = np.asarray(geometry_quality.known_depth(depth, truth, mask))
+        error = np.abs(np.asarray(depth - truth))[valid]
         errors = _depth_errors(depth, truth, mask)
         numbers[f"heldout.{name}depth_median"] = known_mean(error, np.median)
         numbers[f"heldout.{name}depth_rmse"] = errors.rmse

@@ -116,9 +116,9 @@ def _bounds(observed):
     points = []
     for one in observed:
         down, right = np.nonzero(np.isfinite(one.depth))
-        chosen = np.linspace(0, max(0, len(down) - 1), min(len(down), 2000)).astype(int)
-        pixels = np.stack([right[chosen], down[chosen]], axis=-1) + 0.5
-        depth = one.depth[down, right][chosen]
+        sample = np.linspace(0, max(0, len(down) - 1), min(len(down), 2000)).astype(int)
+        pixels = np.stack([right[sample], down[sample]], axis=-1) + 0.5
+        depth = one.depth[down, right][sample]
         points.append(model_flow.surface(one.camera, pixels, depth))
     points = np.concatenate(points)
     if not len(points):

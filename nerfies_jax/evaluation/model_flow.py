@@ -58,13 +58,13 @@ def _pixel_flow(
     The point at the depth of each pixel is moved and projected to the other view. The
     flow is NaN without depth, without the moved point, and behind the other camera.
     """
-    known = np.isfinite(depth) & (depth > 0)
+    valid = np.isfinite(depth) & (depth > 0)
     pixels = np.asarray(in_default_precision(pixels))
-    points = surface(here.camera, pixels, np.where(known, depth, 1))
-    moved = move(state, points, here, there)
-    target, in_front = _project(there.camera, in_default_precision(moved.points))
-    known = known & moved.found & np.asarray(in_front)
-    return np.where(known[:, None], np.asarray(target) - pixels, np.nan)
+    points = surface(here.camera, pixels, np.where(valid, depth, 1))
+    end = move(state, points, here, there)
+    target, in_front = _project(there.camera, in_default_precision(end.points))
+    valid = valid & end.found & np.asarray(in_front)
+    return np.where(valid[:, None], np.asarray(target) - pixels, np.nan)
 
 
 def picture_flow(
@@ -107,11 +107,11 @@ def picture_distance(
     """
     depth = np.asarray(rendering.depth).ravel()
     solid = np.asarray(rendering.alpha).ravel() > 0.5
-    known = solid & np.isfinite(depth) & (depth > 0)
-    points = surface(here.camera, _pixels(rendering), np.where(known, depth, 1))
-    moved = move(state, points, here, there)
-    distance = np.linalg.norm(moved.points - points, axis=1)
-    distance = np.where(known & moved.found, distance, np.nan)
+    valid = solid & np.isfinite(depth) & (depth > 0)
+    points = surface(here.camera, _pixels(rendering), np.where(valid, depth, 1))
+    end = move(state, points, here, there)
+    distance = np.linalg.norm(end.points - points, axis=1)
+    distance = np.where(valid & end.found, distance, np.nan)
     return distance.reshape(rendering.alpha.shape)
 
 

@@ -62,8 +62,8 @@ def follow(
     rows = spread(rows, frames or len(rows))
     times = capture.times[rows]
     start = rows[np.argmin(np.abs(times - time))]
-    here = view_of(capture, start)
-    rendering = draw(state, here)
+    first_view = view_of(capture, start)
+    rendering = draw(state, first_view)
     surface_depth = np.asarray(rendering.depth)
     surface = np.argwhere((rendering.alpha > MIN_ALPHA) & (surface_depth > 0))
     if not len(surface):
@@ -73,21 +73,21 @@ def follow(
         )
     line, column = spread(surface, count).T
     pixels = np.stack([column, line], axis=1) + 0.5
-    points = model_flow.surface(here.camera, pixels, surface_depth[line, column])
+    points = model_flow.surface(first_view.camera, pixels, surface_depth[line, column])
     positions, visible, projected = [], [], []
     for row in rows.tolist():
-        there = view_of(capture, row)
-        moved = move(state, points, here, there)
-        rendering = draw(state, there)
+        other_view = view_of(capture, row)
+        end = move(state, points, first_view, other_view)
+        rendering = draw(state, other_view)
         pixel, depth, inside = pixels_of(
-            capture.cameras, row, moved.points.astype(np.float32), capture.size
+            capture.cameras, row, end.points.astype(np.float32), capture.size
         )
         column, line = np.where(inside[:, None], pixel, 0).astype(int).T
         surface_depth = np.asarray(rendering.depth)
         in_front = depth <= surface_depth[line, column] * (1 + DEPTH_TOLERANCE)
         solid = rendering.alpha[line, column] > MIN_ALPHA
-        positions.append(moved.points)
-        visible.append(moved.found & inside & solid & in_front)
+        positions.append(end.points)
+        visible.append(end.found & inside & solid & in_front)
         projected.append(pixel)
     return SurfaceTracks(
         positions=np.stack(positions, axis=1).astype(np.float32),

@@ -184,12 +184,12 @@ def _undistorted_jvp(primals, tangents):
     radial, tangential, bent = primals
     radial_dot, tangential_dot, bent_dot = tangents
     slopes = _undistorted(radial, tangential, bent)
-    _, moved = jax.jvp(
+    _, tangent = jax.jvp(
         lambda k, p: distort(k, p, slopes),
         (radial, tangential),
         (radial_dot, tangential_dot),
     )
-    step = _solve(_jacobian(radial, tangential, slopes), bent_dot - moved)
+    step = _solve(_jacobian(radial, tangential, slopes), bent_dot - tangent)
     return slopes, jnp.where(_solves(radial, tangential, bent, slopes), step, 0)
 
 
@@ -225,8 +225,8 @@ def _radial_root(radial, bent):
         trusted = unfolded & (newton >= low) & (newton <= high)
         trusted &= jnp.abs(newton - radius) < last / 2
         middle = jnp.minimum((low + high) / 2, 2 * low + target)
-        chosen = jnp.where(trusted, newton, middle)
-        return low, high, chosen, jnp.abs(chosen - radius)
+        step = jnp.where(trusted, newton, middle)
+        return low, high, step, jnp.abs(step - radius)
 
     low = jnp.zeros_like(target)
     high = jnp.full_like(target, MAX_RADIUS)
@@ -258,9 +258,9 @@ def _unfolded(radial, radius_sq):
     half = -(b + jnp.where(b < 0, -root, root)) / 2  # the sum that does not cancel
     ends = [radius_sq]
     for numerator, denominator in ((half, a), (c, half)):
-        known = (denominator != 0) & (discriminant > 0)
-        at = numerator / jnp.where(known, denominator, 1)
-        ends.append(jnp.where(known & (at > 0) & (at < radius_sq), at, 0))
+        real = (denominator != 0) & (discriminant > 0)
+        at = numerator / jnp.where(real, denominator, 1)
+        ends.append(jnp.where(real & (at > 0) & (at < radius_sq), at, 0))
     return jnp.min(_radial_slope(radial, jnp.stack(ends))) > 0
 
 

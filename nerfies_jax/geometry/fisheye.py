@@ -189,10 +189,10 @@ def _undistorted_jvp(primals, tangents):
     coefficients, bent = primals
     coefficients_dot, bent_dot = tangents
     slopes = _undistorted(coefficients, bent)
-    _, moved = jax.jvp(
+    _, tangent = jax.jvp(
         lambda k: distort(k, slopes), (coefficients,), (coefficients_dot,)
     )
-    right = bent_dot - moved
+    right = bent_dot - tangent
     squared = jnp.sum(slopes * slopes)
     solved = _solves(coefficients, bent, slopes)
     ratio, _, along = stretch(coefficients, squared)

@@ -81,18 +81,18 @@ def depth_errors(
       Eigen et al. 2014, arXiv:1406.2283.
     """
     depth, truth = widened(depth), widened(truth)
-    known = known_depth(depth, truth, mask)
-    depth, truth = jnp.where(known, depth, 1.0), jnp.where(known, truth, 1.0)
+    valid = known_depth(depth, truth, mask)
+    depth, truth = jnp.where(valid, depth, 1.0), jnp.where(valid, truth, 1.0)
     error = depth - truth
     right = (depth < DELTA * truth) & (truth < DELTA * depth)
-    error_sq = _mean(error**2, known)
+    error_sq = _mean(error**2, valid)
     nonzero = error_sq > 0  # the root has no gradient at 0
     root = jnp.sqrt(jnp.where(nonzero, error_sq, 1.0))
     return DepthErrors(
-        abs_rel=_mean(jnp.abs(error) / truth, known),
+        abs_rel=_mean(jnp.abs(error) / truth, valid),
         rmse=jnp.where(nonzero, root, error_sq),  # NaN stays NaN
-        within_delta=_mean(right.astype(depth.dtype), known),
-        pixels=jnp.sum(known).astype(depth.dtype),
+        within_delta=_mean(right.astype(depth.dtype), valid),
+        pixels=jnp.sum(valid).astype(depth.dtype),
     )
 
 
@@ -119,12 +119,12 @@ def align_depth(
       Ranftl et al. 2020 (MiDaS), arXiv:1907.01341, equation 4.
     """
     depth, truth = widened(depth), widened(truth)
-    known = known_depth(depth, truth, mask)
-    depth, truth = jnp.where(known, depth, 0.0), jnp.where(known, truth, 0.0)
-    mean_depth, mean_truth = _mean(depth, known), _mean(truth, known)
-    from_mean = jnp.where(known, depth - mean_depth, 0.0)
-    variance = _mean(from_mean**2, known)
-    covariance = _mean(from_mean * (truth - mean_truth), known)
+    valid = known_depth(depth, truth, mask)
+    depth, truth = jnp.where(valid, depth, 0.0), jnp.where(valid, truth, 0.0)
+    mean_depth, mean_truth = _mean(depth, valid), _mean(truth, valid)
+    from_mean = jnp.where(valid, depth - mean_depth, 0.0)
+    variance = _mean(from_mean**2, valid)
+    covariance = _mean(from_mean * (truth - mean_truth), valid)
     # The mean has an error of a few ulps, which is the variance of a constant depth.
     rounding = 4 * jnp.finfo(depth.dtype).eps * mean_depth
     determined = variance > rounding**2
@@ -159,15 +159,15 @@ def flow_errors(
       The errors.
     """
     flow, truth = widened(flow), widened(truth)
-    known = jnp.all(jnp.isfinite(truth), axis=-1)
-    known = known if mask is None else known & mask
-    distance = _distance(flow, truth, known)
-    length = jnp.linalg.norm(jnp.where(known[..., None], truth, 0.0), axis=-1)
+    valid = jnp.all(jnp.isfinite(truth), axis=-1)
+    valid = valid if mask is None else valid & mask
+    distance = _distance(flow, truth, valid)
+    length = jnp.linalg.norm(jnp.where(valid[..., None], truth, 0.0), axis=-1)
     wrong = (distance > OUTLIER_PX) & (distance > OUTLIER_SHARE * length)
     return FlowErrors(
-        endpoint=_mean(distance, known),
-        outliers=_mean(wrong.astype(flow.dtype), known),
-        pixels=jnp.sum(known).astype(flow.dtype),
+        endpoint=_mean(distance, valid),
+        outliers=_mean(wrong.astype(flow.dtype), valid),
+        pixels=jnp.sum(valid).astype(flow.dtype),
     )
 
 
@@ -226,8 +226,8 @@ def _distance(a, b, where):
     )
     finite = jnp.all(jnp.isfinite(difference), axis=-1)
     squares = jnp.sum(jnp.where(finite[..., None], difference, 0.0) ** 2, axis=-1)
-    apart = squares > 0  # the root has no gradient at 0
-    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, squares, 1.0)), 0.0)
+    distinct = squares > 0  # the root has no gradient at 0
+    distance = jnp.where(distinct, jnp.sqrt(jnp.where(distinct, squares, 1.0)), 0.0)
     return jnp.where(finite, distance, jnp.inf)
 
 
@@ -335,8 +335,8 @@ def path_errors(
       Sturm et al. 2012.
     """
     alignment = align_points(positions, truth, scaled)
-    moved = alignment.scale * np.asarray(positions, float) @ alignment.rotation.T
-    distance = np.linalg.norm(moved + alignment.translation - truth, axis=1)
+    aligned = alignment.scale * np.asarray(positions, float) @ alignment.rotation.T
+    distance = np.linalg.norm(aligned + alignment.translation - truth, axis=1)
     return PathErrors(
         rmse=float(np.sqrt(np.mean(distance**2))),
         median=float(np.median(distance)),

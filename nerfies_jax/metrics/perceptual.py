@@ -303,8 +303,8 @@ def _missing(network, part, files):
         "heads": f"v0.1/{network.name}.pth of the lpips package as an argument, or "
         "install that package",
     }[part]
-    read = ", ".join(map(str, files)) or "no files were passed"
-    return f"no LPIPS {network.name} {part} weights ({read}); provide {source}"
+    names = ", ".join(map(str, files)) or "no files were passed"
+    return f"no LPIPS {network.name} {part} weights ({names}); provide {source}"
 
 
 def _hub_folder():

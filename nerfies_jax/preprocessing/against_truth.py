@@ -108,11 +108,14 @@ def _track_error(followed: Tracks, points):
     rows = rows[points.seen[rows, later[rows]]]
     if not len(rows):
         return np.nan, np.nan
-    kept = rows[followed.seen[rows, later[rows]]]
-    off = followed.pixel[kept, later[kept]] - points.pixel[kept, later[kept]]
+    compared = rows[followed.seen[rows, later[rows]]]
+    off = (
+        followed.pixel[compared, later[compared]]
+        - points.pixel[compared, later[compared]]
+    )
     error = np.linalg.norm(off, axis=-1)
     median = float(np.median(error)) if len(error) else np.nan
-    return median, 1 - len(kept) / len(rows)
+    return median, 1 - len(compared) / len(rows)
 
 
 def _path_error(capture, views, evidence, followed, points):
@@ -120,13 +123,13 @@ def _path_error(capture, views, evidence, followed, points):
     followed = followed.take(long)
     if not long.any():
         return np.nan
-    still = evidence.score < paths.AT_REST
+    static = evidence.score < paths.AT_REST
     around = paths.depth_around(
-        followed, evidence.tracks.take(still), evidence.rest.take(still), capture.near
+        followed, evidence.tracks.take(static), evidence.rest.take(static), capture.near
     )
     fitted = paths.least_acceleration(views, followed, capture.near, around)
     error = np.linalg.norm(fitted.position - points.position[long], axis=-1)
-    known = fitted.known & points.seen[long]
-    if not known.any():
+    valid = fitted.known & points.seen[long]
+    if not valid.any():
         return np.nan
-    return float(np.median(error[known]) / scene_unit(evidence))
+    return float(np.median(error[valid]) / scene_unit(evidence))

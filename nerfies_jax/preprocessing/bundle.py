@@ -133,14 +133,14 @@ def _descended(views, seen, body, step):
     for _ in range(ROUNDS):
         system = _system(views, seen, body, bend)
         for _ in range(TRIES):
-            moved = step(body, system, damping)
-            new = _cost(views, seen, moved, bend)
+            candidate = step(body, system, damping)
+            new = _cost(views, seen, candidate, bend)
             if new < cost:
                 break
             damping *= 10
         else:
             break
-        gained, cost, body = cost - new, new, moved
+        gained, cost, body = cost - new, new, candidate
         damping = max(damping / 10, LEAST_DAMPING)
         if gained < CONVERGED * cost:
             break

@@ -48,8 +48,8 @@ def followed(views: Views, evidence: Evidence) -> np.ndarray:
 
 def _draw_tracks(picture, evidence, frame, times):
     tracks, moves = evidence.tracks, evidence.score > MOVES
-    here = np.flatnonzero(tracks.seen[:, frame])
-    chosen = [_spread(here[moves[here] == kind], TRACKS // 2) for kind in (False, True)]
+    rows = np.flatnonzero(tracks.seen[:, frame])
+    chosen = [_spread(rows[moves[rows] == kind], TRACKS // 2) for kind in (False, True)]
     for row in np.concatenate(chosen):
         color = BY_ITSELF if moves[row] else AT_REST
         tail = np.arange(max(0, frame - TAIL), frame + 1)

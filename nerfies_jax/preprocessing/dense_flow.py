@@ -297,9 +297,9 @@ def _go_on(flow, frame, pictures, search):
         (frame + 1, flow.backward, flow.backward_seen, back, there),
     ):
         old, pair = shift[here], small if here == frame else small[::-1]
-        apart = np.linalg.norm(new - old, axis=-1) > JUMP_SHARE * width
+        disagrees = np.linalg.norm(new - old, axis=-1) > JUMP_SHARE * width
         alike = wide_steps.unlike(pair, new) < AS_ALIKE * wide_steps.unlike(pair, old)
-        better = closed(new, other) & (~seen[here] | (apart & alike))
+        better = closed(new, other) & (~seen[here] | (disagrees & alike))
         shift[here][better], seen[here][better] = new[better], True
 
 

@@ -42,18 +42,18 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
     light = _sightings(view_set.smaller(views, view_set.times_smaller(views)), points)
     groups = np.array_split(np.argsort(_along_widest(points)), GROUPS)
     each = np.stack([_gains(light[:, group]) for group in groups])
-    known = np.isfinite(each).all(-1).sum(0) >= GROUPS // 2
-    if known.sum() < max(3, 0.5 * len(views.row)):
+    valid = np.isfinite(each).all(-1).sum(0) >= GROUPS // 2
+    if valid.sum() < max(3, 0.5 * len(views.row)):
         return cannot_tell(
-            EFFECT, f"only {known.sum()} frames show enough static points", threshold
+            EFFECT, f"only {valid.sum()} frames show enough static points", threshold
         )
-    each = each[:, known]
+    each = each[:, valid]
     drift, error = common_drift(each)
     common = np.nanmedian(each, axis=0)
     common = common - common.mean(0)
     brightness = float(np.sqrt(np.mean(common.mean(-1) ** 2)))
     tint = float(np.sqrt(np.mean((common - common.mean(-1, keepdims=True)) ** 2)))
-    wanted, confidence = judge(drift, DRIFT_STOPS, error)
+    drifts, confidence = judge(drift, DRIFT_STOPS, error)
     evidence = (
         f"colors of static points differ by {drift:.3f} stops between frames "
         f"(brightness {brightness:.3f}, color {tint:.3f}), with an error of "
@@ -66,7 +66,7 @@ def exposure(views: Views, points: np.ndarray) -> Finding:
         "noise_stops": error,
         "points": float(len(points)),
     }
-    return Finding(EFFECT, evidence, threshold, wanted, confidence, numbers)
+    return Finding(EFFECT, evidence, threshold, drifts, confidence, numbers)
 
 
 def common_drift(gain: np.ndarray) -> tuple[float, float]:
@@ -116,8 +116,8 @@ def _sightings(views: Views, points: np.ndarray) -> np.ndarray:
         # OpenCV takes one map of pairs, which its stubs do not know.
         value = cv2.remap(picture, at, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
         value = value[:, 0]
-        shown = views.valid[index][tuple(place[:, ::-1].astype(int).T)]
-        usable = ((value > DARK) & (value < BRIGHT)).all(-1) & shown
+        visible = views.valid[index][tuple(place[:, ::-1].astype(int).T)]
+        usable = ((value > DARK) & (value < BRIGHT)).all(-1) & visible
         light[index, inside] = np.where(usable[:, None], np.log2(value), np.nan)
     return light
 
@@ -125,11 +125,11 @@ def _sightings(views: Views, points: np.ndarray) -> np.ndarray:
 def _gains(light: np.ndarray) -> np.ndarray:
     """Estimate the gain of each frame by median polish."""
     gain = np.zeros((len(light), 3))
-    seen = np.isfinite(light).all(-1)
-    enough = seen.sum(1) >= MIN_POINTS
-    kept = (seen & enough[:, None]).sum(0) >= 2
-    light = np.where(enough[:, None, None], light, np.nan)[:, kept]
-    if not enough.any() or not kept.any():
+    observed = np.isfinite(light).all(-1)
+    enough = observed.sum(1) >= MIN_POINTS
+    usable = (observed & enough[:, None]).sum(0) >= 2
+    light = np.where(enough[:, None, None], light, np.nan)[:, usable]
+    if not enough.any() or not usable.any():
         return np.full_like(gain, np.nan)
     rows = light[enough]
     for _ in range(POLISHES):

@@ -112,8 +112,8 @@ def table(
         for one in findings
     ]
     narrow = [max(len(row[i]) for row in (heads, *rows)) for i in range(4)]
-    rest = max(width - sum(narrow) - 10, 40)
-    columns = [*narrow, rest * 3 // 5, rest * 2 // 5]
+    remaining = max(width - sum(narrow) - 10, 40)
+    columns = [*narrow, remaining * 3 // 5, remaining * 2 // 5]
     lines = []
     for row in (heads, tuple("-" * column for column in columns), *rows):
         cells = [_folded(cell, size) for cell, size in zip(row, columns, strict=True)]

@@ -25,8 +25,8 @@ def with_flow(capture: Capture) -> Capture:
     width, height = capture.size
     count = len(capture.images)
     shape = (count, height, width)
-    own = np.arange(count, dtype=np.int32)
-    one_way = np.zeros((*shape, 2), np.float32), np.zeros(shape, bool), own
+    rows = np.arange(count, dtype=np.int32)
+    one_way = np.zeros((*shape, 2), np.float32), np.zeros(shape, bool), rows
     flow = FrameFlow._make(leaf.copy() for leaf in one_way * 2)
     for camera in np.unique(capture.camera_ids[capture.train]):
         mine = capture.train[capture.camera_ids[capture.train] == camera]
@@ -45,6 +45,6 @@ def with_flow(capture: Capture) -> Capture:
         flow.backward_seen[views.row] = neighbors.backward_seen & views.valid
         flow.previous_row[views.row[1:]] = views.row[:-1]
     note = "optical flow between neighboring frames was computed from the images"
-    if (flow.next_row == own).all():
+    if (flow.next_row == rows).all():
         note = "no optical flow: no camera has two training frames"
     return dataclasses.replace(capture, flow=flow, notes=(*capture.notes, note))

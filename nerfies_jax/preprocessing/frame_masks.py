@@ -50,9 +50,9 @@ def of_frames(evidence: Any, capture: Capture) -> np.ndarray:
     moving = np.zeros(capture.images.shape[:3], bool)
     canvas = pinholes.canvas(capture)
     for row, mask in zip(evidence.row, evidence.moving, strict=True):
-        whole = enlarged(mask, evidence.factor, canvas.size)
+        full = enlarged(mask, evidence.factor, canvas.size)
         camera = cameras.take(capture.cameras, row)
-        moving[row] = pinholes.as_filmed(whole, camera, canvas, capture.size)
+        moving[row] = pinholes.as_filmed(full, camera, canvas, capture.size)
     return moving
 
 

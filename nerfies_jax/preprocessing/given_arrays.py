@@ -28,12 +28,12 @@ def frames_of(
       CaptureError: If the number is that of neither.
     """
     learned = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-    every = np.argsort(capture.times, kind="stable")
-    for rows in (learned, every):
+    in_time = np.argsort(capture.times, kind="stable")
+    for rows in (learned, in_time):
         if count == len(rows):
             return rows
     raise CaptureError(
-        f"{path}: {what} of {count} frames, but the capture has {len(every)} frames "
+        f"{path}: {what} of {count} frames, but the capture has {len(in_time)} frames "
         f"({len(learned)} training frames); provide one for each, in temporal order"
     )
 

@@ -70,21 +70,21 @@ def scaled(
     count = len(measured)
     factor, spread = np.ones(count), np.full(count, prior)
     for group in np.unique(body):
-        own = np.flatnonzero(body == group)
-        both = tracks.seen[own] & (measured[own] > 0) & alone.known[own]
+        rows = np.flatnonzero(body == group)
+        both = tracks.seen[rows] & (measured[rows] > 0) & alone.known[rows]
         log, weight = 0.0, 1 / prior**2
         if both.sum() >= FEWEST:
-            ratio = np.log(alone.depth[own][both] / measured[own][both])
-            video = np.hypot(np.median(alone.depth_deviation[own]), VIDEO_DEVIATION)
+            ratio = np.log(alone.depth[rows][both] / measured[rows][both])
+            video = np.hypot(np.median(alone.depth_deviation[rows]), VIDEO_DEVIATION)
             # Errors of paths beyond a common factor make their median less certain.
             scatter = np.median(np.abs(ratio - np.median(ratio)))
-            known = 1 / (video**2 + scatter**2)
-            log = known * np.median(ratio) / (known + weight)
-            weight += known
-        hidden = bound[own][np.isfinite(bound[own])]
+            precision = 1 / (video**2 + scatter**2)
+            log = precision * np.median(ratio) / (precision + weight)
+            weight += precision
+        hidden = bound[rows][np.isfinite(bound[rows])]
         if len(hidden) >= FEWEST:
             log = min(log, np.log(np.quantile(hidden, HIDDEN_SHARE)))
-        factor[own], spread[own] = np.exp(log), weight**-0.5
+        factor[rows], spread[rows] = np.exp(log), weight**-0.5
     return BodyDepth(measured * factor[:, None], body, factor, spread)
 
 
@@ -107,12 +107,12 @@ def _bounds(views, tracks, measured, static, rest):
       Ratios of depths [tracks, frames], NaN where no static point is hidden.
     """
     bound = np.full(measured.shape, np.nan)
-    every = -(-len(rest.position) // MOST_POINTS) or 1
-    points, seen = rest.position[::every], static.seen[::every]
+    stride = -(-len(rest.position) // MOST_POINTS) or 1
+    points, visible = rest.position[::stride], static.seen[::stride]
     for frame in range(measured.shape[1]):
         here = np.flatnonzero(tracks.seen[:, frame] & (measured[:, frame] > 0))
         pixel, depth = project(views, frame, points)
-        hidden = in_picture(views, pixel, depth) & ~seen[:, frame]
+        hidden = in_picture(views, pixel, depth) & ~visible[:, frame]
         if not len(here) or not hidden.any():
             continue
         gap, near = cKDTree(pixel[hidden]).query(tracks.pixel[here, frame])

@@ -79,40 +79,40 @@ def aligned(
 
 
 def _aligned(depth, tracks, rest, inverse):
-    placed = np.full(depth.shape, np.nan, np.float32)
+    result = np.full(depth.shape, np.nan, np.float32)
     misses = np.full(len(depth), np.nan)
-    every = []
+    fits = []
     tilt = _tilt(depth.shape[1:])
-    for frame, given in enumerate(depth):
-        here = tracks.seen[:, frame] & (rest.depth[:, frame] > 0)
-        place = pixel_of(tracks.pixel[here, frame], given.shape)
-        own, true = given[place].astype(np.float64), rest.depth[here, frame]
-        known = np.isfinite(own)
-        if known.sum() < FEWEST:
+    for frame, external in enumerate(depth):
+        usable = tracks.seen[:, frame] & (rest.depth[:, frame] > 0)
+        place = pixel_of(tracks.pixel[usable, frame], external.shape)
+        own, true = external[place].astype(np.float64), rest.depth[usable, frame]
+        finite = np.isfinite(own)
+        if finite.sum() < FEWEST:
             continue
-        own, true = own[known], true[known]
-        place = tuple(axis[known] for axis in place)
-        wanted = 1 / true if inverse else true
+        own, true = own[finite], true[finite]
+        place = tuple(axis[finite] for axis in place)
+        target = 1 / true if inverse else true
         # Errors of inverse depth in units of depth, because tracks measure parallax.
         precision = np.ones_like(true) if inverse else (np.median(true) / true) ** 2
-        fit = _fit(own, tilt[:, *place], wanted, precision)
-        if fit[0] * np.median(own) < LEAST_TOLD * np.median(wanted):
+        fit = _fit(own, tilt[:, *place], target, precision)
+        if fit[0] * np.median(own) < LEAST_TOLD * np.median(target):
             # Points of one plane, or no relation at all, which the error then shows.
-            fit = np.median(wanted / own), 0.0, np.zeros(2)
+            fit = np.median(target / own), 0.0, np.zeros(2)
             if not (np.isfinite(fit[0]) and fit[0] > 0):
                 continue
         scale, offset, slope = fit
-        mapped = scale * given + offset + np.tensordot(slope, tilt, 1)
+        mapped = scale * external + offset + np.tensordot(slope, tilt, 1)
         mapped = np.where(mapped > 0, mapped, np.nan)
-        placed[frame] = 1 / mapped if inverse else mapped
-        error = abs(placed[frame][place] / true - 1)
+        result[frame] = 1 / mapped if inverse else mapped
+        error = abs(result[frame][place] / true - 1)
         error = np.where(np.isnan(error), 1.0, error)
-        every.append(error)
+        fits.append(error)
         misses[frame] = np.median(error)
         if misses[frame] > USABLE:
-            placed[frame] = np.nan
-    total = float(np.median(np.concatenate(every))) if every else np.inf
-    return AlignedDepth(placed, misses, total)
+            result[frame] = np.nan
+    total = float(np.median(np.concatenate(fits))) if fits else np.inf
+    return AlignedDepth(result, misses, total)
 
 
 def _tilt(shape):

@@ -61,8 +61,8 @@ def attached(
     if files.flow is not None:
         parts |= _flow(files.flow, capture)
     if files.depth_model is not None:
-        found = networks.depths(capture, files.depth_model, folder=folder)
-        parts |= found._asdict()
+        depths = networks.depths(capture, files.depth_model, folder=folder)
+        parts |= depths._asdict()
     if files.segmentation_model is not None:
         moving = networks.segments(capture, files.segmentation_model, folder=folder)
         share = moving[capture.train].mean()
@@ -85,9 +85,9 @@ def _files(folder, suffixes, capture, what):
     paths = [one for one in folder.iterdir() if one.suffix.lower() in suffixes]
     paths.sort(key=lambda one: frames.natural(one.name))
     by_name = {one.name.partition(".")[0]: one for one in paths}
-    named = [row for row, name in enumerate(capture.ids) if name in by_name]
-    if set(capture.train) <= set(named):
-        return [by_name[capture.ids[row]] for row in named], np.array(named)
+    by_id = [row for row, name in enumerate(capture.ids) if name in by_name]
+    if set(capture.train) <= set(by_id):
+        return [by_name[capture.ids[row]] for row in by_id], np.array(by_id)
     if not paths:
         raise CaptureError(
             f"{folder}: contains no {what} ({' or '.join(suffixes)} files)"
@@ -140,13 +140,13 @@ def _depths(path, capture):
         paths = paths * len(rows)
     depths = np.full(capture.images.shape[:3], np.nan, np.float32)
     for where, picture, row in zip(paths, pictures, rows, strict=True):
-        known = np.isfinite(picture) & (picture > 0)
-        if not known.any():
+        positive = np.isfinite(picture) & (picture > 0)
+        if not positive.any():
             raise CaptureError(
                 f"{where}: no positive depth for frame {capture.ids[row]!r}; use the "
                 "depth map as the tool wrote it"
             )
-        depth = np.where(known, picture, np.nan)
+        depth = np.where(positive, picture, np.nan)
         depths[row] = _fitted(depth, capture, where, "depth")
     return depths
 
@@ -190,10 +190,10 @@ def _flow(path, capture):
         sides = {side: _flo_stack(path / side) for side in ("forward", "backward")}
     else:
         arrays = given_arrays.read(path)
-        missing = {"forward", "backward"} - set(arrays)
-        if missing:
+        absent = {"forward", "backward"} - set(arrays)
+        if absent:
             raise CaptureError(
-                f"{path}: no {sorted(missing)[0]!r} flow; both directions are needed "
+                f"{path}: no {sorted(absent)[0]!r} flow; both directions are needed "
                 "for the consistency check"
             )
         sides = {side: arrays[side] for side in ("forward", "backward")}

@@ -54,22 +54,22 @@ def read(path: pathlib.Path, capture: Capture) -> dict[str, np.ndarray]:
     Raises:
       CaptureError: If the file does not fit.
     """
-    stored = _pairs(path) if path.is_dir() else None
-    if stored is None:
-        stored = _named(_arrays(path), path)
+    pairs = _pairs(path) if path.is_dir() else None
+    if pairs is None:
+        pairs = _named(_arrays(path), path)
     counts = {len(capture.train), len(capture.ids)}
-    pixel, seen = stored.pixel, stored.visible
+    pixel, seen = pairs.pixel, pairs.visible
     fits = [axis for axis in (0, 1) if pixel.shape[axis] in counts]
     if len(fits) != 1:
-        fits = [stored.frames_axis]
+        fits = [pairs.frames_axis]
     pixel, seen = np.moveaxis(pixel, fits[0], 0), np.moveaxis(seen, fits[0], 0)
     rows = given_arrays.frames_of(len(pixel), capture, path, "tracks")
-    every = -(-pixel[..., 0].size // MOST_PLACES) or 1
-    pixel, seen = pixel[:, ::every], seen[:, ::every]
-    pixel = pixel.astype(np.float32) + np.float32(0.5 - stored.center)
+    stride = -(-pixel[..., 0].size // MOST_PLACES) or 1
+    pixel, seen = pixel[:, ::stride], seen[:, ::stride]
+    pixel = pixel.astype(np.float32) + np.float32(0.5 - pairs.center)
     seen = seen & np.isfinite(pixel).all(-1)
-    if stored.size is not None:
-        pixel = pixel * (np.asarray(capture.size) / stored.size).astype(np.float32)
+    if pairs.size is not None:
+        pixel = pixel * (np.asarray(capture.size) / pairs.size).astype(np.float32)
     seen &= _inside(pixel, seen, capture.size, path)
     pixels = np.zeros((len(capture.ids), pixel.shape[1], 2), np.float32)
     there = np.zeros(pixels.shape[:2], bool)
@@ -104,7 +104,7 @@ def _inside(pixel, seen, size, path):
 def _arrays(path):
     """Arrays of an npz, or of a folder of npy files by their names."""
     if path.is_dir():
-        found = {}
+        arrays = {}
         names = (*POSITIONS, *VISIBLE, *OCCLUDED, UNCERTAIN, "size")
         # The longest first: clip_pred_tracks.npy is not tracks.
         names = sorted(names, key=len, reverse=True)
@@ -112,8 +112,10 @@ def _arrays(path):
             stem = file.stem
             name = next((n for n in names if stem == n or stem.endswith(f"_{n}")), None)
             if name is not None:
-                found[name] = frames.load_array(file, given_arrays.MOST_NUMBERS, "fiub")
-        return found
+                arrays[name] = frames.load_array(
+                    file, given_arrays.MOST_NUMBERS, "fiub"
+                )
+        return arrays
     if path.suffix.lower() not in (".npz", ""):
         raise CaptureError(
             f"{path}: tracks are read from npz files, not from {path.suffix} files; "
@@ -190,11 +192,11 @@ def _pairs(folder):
     queries = sorted({query for query, _ in found}, key=frames.natural)
     if not set(queries) <= set(targets):
         return None
-    missing = [(q, t) for q in queries for t in targets if (q, t) not in found]
-    if missing:
-        name = "_".join(missing[0])
+    absent = [(q, t) for q in queries for t in targets if (q, t) not in found]
+    if absent:
+        name = "_".join(absent[0])
         raise CaptureError(
-            f"{folder}: no {name}.npy ({len(missing)} of "
+            f"{folder}: no {name}.npy ({len(absent)} of "
             f"{len(queries) * len(targets)} pairs of frames are missing); run the "
             "tracker again until it completes"
         )
@@ -210,8 +212,8 @@ def _pairs(folder):
                     f"{file}: {len(table)} points, but {files[0].name} has "
                     f"{len(tables[0])}; all files of a query frame must have the same"
                 )
-        every = len(tables[0]) * len(targets) * len(queries) // MOST_PLACES + 1
-        parts.append(np.stack([table[::every] for table in tables]))
+        stride = len(tables[0]) * len(targets) * len(queries) // MOST_PLACES + 1
+        parts.append(np.stack([table[::stride] for table in tables]))
     table = np.concatenate(parts, axis=1)
     visible = _visible(table[..., 2], table[..., 3])
     return TrackFile(table[..., :2], visible, 0, 0.5, None)

@@ -41,8 +41,8 @@ def _moving_masks(images: np.ndarray) -> np.ndarray:
     flow = dense_flow.between_neighbors(views, pictures)
     tracks = tracking.from_flow(views, flow, pictures)
     off = _off_the_camera_motion(tracks, WITHIN_SHARE * views.size[0])
-    known = np.isfinite(off).any(1)
-    tracks, off = tracks.take(known), off[known]
+    valid = np.isfinite(off).any(1)
+    tracks, off = tracks.take(valid), off[valid]
     unplaced = np.zeros((len(off), 3)), off, np.zeros_like(off)
     score = moving.track_scores(tracks, RestPoints(*unplaced))
     share = moving.votes(views, tracks, score)
@@ -75,14 +75,14 @@ def moving_in(pictures: pathlib.Path) -> dict[str, np.ndarray]:
             f"{pictures}: {len(names)} images are too few to detect moving objects; "
             f"use more than {min(LATER)}"
         )
-    read = [pictures_of.read_image(pictures / name)[0] for name in names]
-    sizes = {one.shape for one in read}
+    images = [pictures_of.read_image(pictures / name)[0] for name in names]
+    sizes = {one.shape for one in images}
     if len(sizes) > 1:
         raise ValueError(
             f"{pictures}: images of {len(sizes)} sizes; frames of a video must have "
             "one size: resize them"
         )
-    return dict(zip(names, _moving_masks(np.stack(read)), strict=True))
+    return dict(zip(names, _moving_masks(np.stack(images)), strict=True))
 
 
 def _off_the_camera_motion(tracks, within):
@@ -124,9 +124,9 @@ def _pair_misses(here, there, within):
 
 
 def _homography_misses(plane, here, there):
-    moved = np.c_[here, np.ones(len(here))] @ plane.T
+    mapped = np.c_[here, np.ones(len(here))] @ plane.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        miss = np.linalg.norm(moved[:, :2] / moved[:, 2:] - there, axis=-1)
+        miss = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - there, axis=-1)
     return np.nan_to_num(miss, nan=np.inf)
 
 

@@ -65,10 +65,10 @@ def _by_tracks(views, evidence):
     shares, share = frame_shares(evidence), moving_share(evidence)
     masked, noise = float(evidence.moving.mean()), rest_noise(evidence)
     error = FALSE_SHARE * max(1.0, noise / CALM_PX) ** 2
-    wanted, confidence = judge(share, MOVING_SHARE, error)
-    lost = _why_not_no(views, evidence, noise) if wanted is False else None
+    moves, confidence = judge(share, MOVING_SHARE, error)
+    lost = _why_not_no(views, evidence, noise) if moves is False else None
     if lost is not None:
-        wanted, confidence = None, CANNOT_TELL
+        moves, confidence = None, CANNOT_TELL
     numbers = {
         "moving_share": share,
         "moving_share_most": float(shares.max()),
@@ -82,7 +82,7 @@ def _by_tracks(views, evidence):
     )
     if lost is not None:
         measurement += f"; {lost}"
-    speed = speeds(views, evidence) if wanted else {}
+    speed = speeds(views, evidence) if moves else {}
     if speed:
         numbers |= speed
         measurement += (
@@ -90,7 +90,7 @@ def _by_tracks(views, evidence):
             f"scene units) per frame, {speed['speed_px_fast']:.2g} px for the fastest "
             "tenth"
         )
-    return Finding(EFFECT, measurement, _threshold(), wanted, confidence, numbers)
+    return Finding(EFFECT, measurement, _threshold(), moves, confidence, numbers)
 
 
 def frame_shares(evidence: Evidence) -> np.ndarray:
@@ -102,9 +102,9 @@ def frame_shares(evidence: Evidence) -> np.ndarray:
     Returns:
       Shares, [frames].
     """
-    seen = evidence.tracks.seen
-    moves = seen[evidence.score > MOVES].sum(0)
-    return moves / np.maximum(seen.sum(0), 1)
+    visible = evidence.tracks.seen
+    moves = visible[evidence.score > MOVES].sum(0)
+    return moves / np.maximum(visible.sum(0), 1)
 
 
 def moving_share(evidence: Evidence) -> float:
@@ -129,10 +129,10 @@ def rest_noise(evidence: Evidence) -> float:
     Returns:
       The error in pixels, inf without static tracks.
     """
-    still = evidence.score < MOVES
-    if not still.any():
+    static = evidence.score < MOVES
+    if not static.any():
         return np.inf
-    return float(np.median(rest_points.miss(evidence.rest.take(still))))
+    return float(np.median(rest_points.miss(evidence.rest.take(static))))
 
 
 def _why_not_no(views, evidence, noise):
@@ -142,9 +142,9 @@ def _why_not_no(views, evidence, noise):
     frames = len(views.row)
     if frames < MIN_FOR_NO:
         return f"fast motion cannot be tracked in {frames} frames"
-    kept = record.carried(views, evidence.flow)
-    if kept < CARRIED_FOR_NO:
-        return f"fast objects may be in the {1 - kept:.0%} of pixels without flow"
+    matched = record.carried(views, evidence.flow)
+    if matched < CARRIED_FOR_NO:
+        return f"fast objects may be in the {1 - matched:.0%} of pixels without flow"
     if evidence.moving.mean() > MASKED_FOR_NO:
         return "pixels that differ from the static scene may be too fast for tracking"
     return None

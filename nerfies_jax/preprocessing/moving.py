@@ -47,13 +47,13 @@ def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
     half = max(HALF_CERTAIN_PX, OVER_NOISE * np.quantile(far, STILLEST))
     with np.errstate(divide="ignore"):
         odds = STEEPNESS * np.log(np.maximum(far, 1e-3) / half)
-    own = 1 / (1 + np.exp(-np.minimum(odds, 50)))
+    probability = 1 / (1 + np.exp(-np.minimum(odds, 50)))
     alike = _neighborhood(tracks)
     total = np.asarray(alike.sum(1)).ravel() + 1e-9
-    score = own
+    score = probability
     for _ in range(ROUNDS):
         around = alike @ score / total
-        score = (own + NEIGHBOR_WEIGHT * around) / (1 + NEIGHBOR_WEIGHT)
+        score = (probability + NEIGHBOR_WEIGHT * around) / (1 + NEIGHBOR_WEIGHT)
     return score
 
 
@@ -97,11 +97,11 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
     at = np.stack([x, y], axis=-1).reshape(-1, 2)
     shares = np.full((frames, height, width), FAR_FROM_TRACKS, np.float32)
     for frame in range(frames):
-        here = np.flatnonzero(tracks.seen[:, frame])
-        if len(here) < VOTES:
+        rows = np.flatnonzero(tracks.seen[:, frame])
+        if len(rows) < VOTES:
             continue
         color = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
-        place = tracks.pixel[here, frame]
+        place = tracks.pixel[rows, frame]
         theirs = color[pixel_of(place, (height, width))]
         distance, near = cKDTree(place).query(at + 0.5 * VOTE_STEP, VOTES)
         distance = (distance / picture_scale(width)).astype(np.float32)
@@ -109,7 +109,7 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
         unlike = np.einsum("pvc,pvc->pv", unlike, unlike) / VOTE_COLOR**2
         weight = np.exp(-0.5 * ((distance / VOTE_PX) ** 2 + unlike))
         weight += 1e-9 * np.exp(-distance / VOTE_PX)
-        share = (weight * score[here][near]).sum(1) / weight.sum(1)
+        share = (weight * score[rows][near]).sum(1) / weight.sum(1)
         share[distance[:, 0] > REACH_PX] = FAR_FROM_TRACKS
         share = share.reshape(x.shape)
         share = share.repeat(VOTE_STEP, 0).repeat(VOTE_STEP, 1)

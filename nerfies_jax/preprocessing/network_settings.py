@@ -72,27 +72,29 @@ def read(path: pathlib.Path, metadata: Mapping[str, str]) -> NetworkSettings:
     Raises:
       CaptureError: If one is unknown, or has a wrong type or value.
     """
-    own = path.with_suffix(".json")
+    settings_file = path.with_suffix(".json")
     fields: dict[str, Any] = {}
-    for source, stored in _sources(path, metadata):
-        unknown = set(stored) - {f.name for f in dataclasses.fields(NetworkSettings)}
-        if source == own and unknown:
+    for source, content in _sources(path, metadata):
+        unknown = set(content) - {f.name for f in dataclasses.fields(NetworkSettings)}
+        if source == settings_file and unknown:
             names = ", ".join(f.name for f in dataclasses.fields(NetworkSettings))
             raise CaptureError(
-                f"{own}: {min(unknown)!r} is no setting; there are {names}"
+                f"{settings_file}: {min(unknown)!r} is no setting; there are {names}"
             )
-        fields = {n: v for n, v in stored.items() if n not in unknown} | fields
+        fields = {n: v for n, v in content.items() if n not in unknown} | fields
     try:
         return msgspec.convert(fields, NetworkSettings)
     except ValueError as error:
-        raise CaptureError(f"{own if own.exists() else path}: {error}") from None
+        raise CaptureError(
+            f"{settings_file if settings_file.exists() else path}: {error}"
+        ) from None
 
 
 def _sources(path, metadata) -> Iterator[tuple[pathlib.Path, dict[str, Any]]]:
     """Settings by source, from the one that counts most."""
-    own = path.with_suffix(".json")
-    if own.exists():
-        yield own, _object(own)
+    settings_file = path.with_suffix(".json")
+    if settings_file.exists():
+        yield settings_file, _object(settings_file)
     for folder in (path.parent, path.parent.parent):
         file = folder / "preprocessor_config.json"
         if file.is_file():
@@ -102,10 +104,10 @@ def _sources(path, metadata) -> Iterator[tuple[pathlib.Path, dict[str, Any]]]:
 
 
 def _object(file):
-    stored = json_files.read_json(file, dict[str, Any])
-    if not isinstance(stored, dict):
+    content = json_files.read_json(file, dict[str, Any])
+    if not isinstance(content, dict):
         raise CaptureError(f"{file}: expected a JSON object of settings")
-    return stored
+    return content
 
 
 def _of_preprocessor(stored):

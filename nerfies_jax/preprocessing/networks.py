@@ -190,9 +190,9 @@ def _described(
         settings = network_settings.read(path, about["metadata"])
     inputs, outputs = about["inputs"], about["outputs"]
     if len(inputs) != 1 or len(inputs[0][2]) != 4:
-        shown = ", ".join(f"{name} {shape}" for name, _, shape in inputs)
+        listed = ", ".join(f"{name} {shape}" for name, _, shape in inputs)
         raise CaptureError(
-            f"{path}: its inputs are {shown or 'none'}; expected one image, [1, 3, "
+            f"{path}: its inputs are {listed or 'none'}; expected one image, [1, 3, "
             "height, width] or [1, height, width, 3]"
         )
     name, kind, shape = inputs[0]
@@ -241,16 +241,16 @@ def _cached(capture, network, result_of, folder):
     """Yield training frames and their results, from a cache if they are there."""
     identity = f"network {VERSION} {_digest(capture, network)}"
     path = folder / f"{identity.rpartition(' ')[2]}.npz"
-    stored = cache_files.read(
+    arrays = cache_files.read(
         path, lambda file: cache_files.read_arrays(file, identity)
     )
-    if stored is None:
-        stored = {"result": np.stack([*_results(capture, network, result_of)])}
+    if arrays is None:
+        arrays = {"result": np.stack([*_results(capture, network, result_of)])}
         with contextlib.suppress(
             OSError, CaptureError
         ):  # else computed again next time
-            cache_files.write_arrays(path, stored, identity)
-    yield from zip(capture.train, stored["result"], strict=True)
+            cache_files.write_arrays(path, arrays, identity)
+    yield from zip(capture.train, arrays["result"], strict=True)
 
 
 def _results(capture, network, result_of):

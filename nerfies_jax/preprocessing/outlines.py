@@ -60,8 +60,8 @@ def motion(views: Views, shapes: np.ndarray) -> Finding:
         return cannot_tell(EFFECT, "the outlines have no common volume", "")
     value = float(bare.mean())
     error = float(bare.std() / np.sqrt(len(bare)))
-    wanted, confidence = judge(value, BARE_SHARE, error)
-    if wanted is False:
+    moves, confidence = judge(value, BARE_SHARE, error)
+    if moves is False:
         confidence = LIKELY  # motion inside the silhouettes is not visible
     evidence = (
         f"{value:.1%} of the outlines in front of the plain background (up to "
@@ -69,7 +69,7 @@ def motion(views: Views, shapes: np.ndarray) -> Finding:
         "views"
     )
     numbers = {"bare_share": value, "bare_share_most": float(bare.max())}
-    return Finding(EFFECT, evidence, threshold, wanted, confidence, numbers)
+    return Finding(EFFECT, evidence, threshold, moves, confidence, numbers)
 
 
 def _uncovered(

@@ -142,10 +142,10 @@ def _measured(depths, tracks):
     """Return z-depths of tracks, NaN if unknown or at a depth discontinuity."""
     measured = np.full(tracks.seen.shape, np.nan)
     for frame, picture in enumerate(depths):
-        here = np.flatnonzero(tracks.seen[:, frame])
+        rows = np.flatnonzero(tracks.seen[:, frame])
         depth = _steady_depth(picture)
-        at = tracking.pixel_of(tracks.pixel[here, frame], depth.shape)
-        measured[here, frame] = depth[at]
+        at = tracking.pixel_of(tracks.pixel[rows, frame], depth.shape)
+        measured[rows, frame] = depth[at]
     return measured
 
 

@@ -82,9 +82,9 @@ def least_acceleration(
         (measured, measured_deviation),
     ):
         if depth is not None:
-            there = tracks.seen & np.isfinite(depth)
-            pull = np.where(there, (noise / deviation) ** 2, pull)
-            target = np.where(there, depth, target)
+            usable = tracks.seen & np.isfinite(depth)
+            pull = np.where(usable, (noise / deviation) ** 2, pull)
+            target = np.where(usable, depth, target)
     wanted = _Wanted(ray, tracks.seen, pull, target)
     some = slice(None, None, -(-len(ray) // TRIED) or 1)
     penalty = _penalty(views, _Wanted(*(part[some] for part in wanted)), noise)
@@ -105,8 +105,8 @@ def certain(views: Views, tracks: Tracks, position: np.ndarray, near: float) -> 
       The paths.
     """
     depth = views.depth_of(position)
-    there = tracks.seen & (np.nan_to_num(depth, nan=-1.0) > near)
-    return Paths(position, there, depth, np.zeros(len(position)))
+    usable = tracks.seen & (np.nan_to_num(depth, nan=-1.0) > near)
+    return Paths(position, usable, depth, np.zeros(len(position)))
 
 
 class _Wanted(NamedTuple):
@@ -139,24 +139,24 @@ def _fitted(views, wanted, penalty, noise):
     unit = wanted.ray / length[..., None]
     position = np.full((*wanted.seen.shape, 3), np.nan)
     flatness = np.full(len(wanted.seen), np.inf)
-    for row, seen in enumerate(wanted.seen):
-        first, last = np.flatnonzero(seen)[[0, -1]]
+    for row, visible in enumerate(wanted.seen):
+        first, last = np.flatnonzero(visible)[[0, -1]]
         span = slice(first, last + 1)
         stencils = np.sqrt(penalty) * _second_differences(views.time[span])
         along = unit[row, span]
-        weight, pulled = seen[span].astype(float), wanted.pull[row, span]
+        weight, pulled = visible[span].astype(float), wanted.pull[row, span]
         across = across_ray(along)
         onto = np.eye(3) - across
         blocks = weight[:, None, None] * across + pulled[:, None, None] * onto
         camera = views.position[span]
-        there = camera + wanted.ray[row, span] * wanted.depth[row, span, None]
+        place = camera + wanted.ray[row, span] * wanted.depth[row, span, None]
         right = weight[:, None] * np.einsum("fij,fj->fi", across, camera)
-        right += pulled[:, None] * np.einsum("fij,fj->fi", onto, there)
+        right += pulled[:, None] * np.einsum("fij,fj->fi", onto, place)
         path = _solved(blocks, _bands(stencils, len(along)), right)
         position[row, span] = path
         # Offsets from the cameras replace rays, which invisible frames do not have.
         offset = path - camera
-        far = np.median(np.linalg.norm(offset, axis=-1)[seen[span]])
+        far = np.median(np.linalg.norm(offset, axis=-1)[visible[span]])
         flatness[row] = _deviation(stencils, path, offset, noise * far)
     return position, flatness
 

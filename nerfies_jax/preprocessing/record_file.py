@@ -74,10 +74,10 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
     if capture.points is not None:
         parts.append(capture.points.position)
     depths = capture.depths if use_depths else None
-    given = () if capture.given is None else capture.given
-    for name, part in zip(Given._fields, given, strict=False):
+    external = () if capture.given is None else capture.given
+    for name, part in zip(Given._fields, external, strict=False):
         checksum.update(f"{name} {part is None}".encode())
-    parts += [part for part in (capture.valid, depths, *given) if part is not None]
+    parts += [part for part in (capture.valid, depths, *external) if part is not None]
     for part in parts:
         part = np.ascontiguousarray(part)
         checksum.update(f"{part.dtype}{part.shape}".encode())

@@ -77,10 +77,10 @@ def _fit(views, tracks):
     across = across_ray(unit)
     weight = tracks.seen.astype(np.float64)
     # For parallel rays, any depth in front of the cameras fits.
-    apart = np.linalg.norm(np.ptp(views.position, axis=0))
-    ahead = views.position + (FAR_AWAY * apart if apart > 0 else 1.0) * unit
-    seen = np.maximum(tracks.seen.sum(1), 1)[:, None]
-    ahead = (ahead * tracks.seen[..., None]).sum(1) / seen
+    baseline = np.linalg.norm(np.ptp(views.position, axis=0))
+    ahead = views.position + (FAR_AWAY * baseline if baseline > 0 else 1.0) * unit
+    count = np.maximum(tracks.seen.sum(1), 1)[:, None]
+    ahead = (ahead * tracks.seen[..., None]).sum(1) / count
     for _ in range(ROUNDS):
         matrix = np.einsum("nf,nfij->nij", weight, across)
         ridge = 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] + 1e-30

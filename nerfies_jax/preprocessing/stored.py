@@ -65,8 +65,8 @@ def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
         f"compared with parallax, after scaling by {1 / scale:.3g}"
     )
     numbers = {"share": share, "error_share": error, "scale": 1 / scale}
-    wanted = None if wrong is None else not wrong
-    return Finding(DEPTH, measurement, threshold, wanted, confidence, numbers)
+    agrees = None if wrong is None else not wrong
+    return Finding(DEPTH, measurement, threshold, agrees, confidence, numbers)
 
 
 def _over_parallax(pictures, views, evidence):
@@ -114,10 +114,10 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
     # Whole regions are in or out: one region a frame.
     error = np.sqrt(part * (1 - part) / frames)
     wrong, confidence = judge(part, MISSED_SHARE, float(error))
-    wanted = None if wrong is None else not wrong
+    agrees = None if wrong is None else not wrong
     measurement += f"; {part:.1%} of the moving tracks are outside"
     return Finding(
-        MASKS, measurement, threshold, wanted, confidence, numbers | {"missed": part}
+        MASKS, measurement, threshold, agrees, confidence, numbers | {"missed": part}
     )
 
 
@@ -147,10 +147,10 @@ def lens(capture: Capture) -> Finding:
         slope = ((pixel - cameras.principal_point_px[row]) / focal).astype(np.float32)
         one = jax.tree.map(jnp.float32, camera_records.take(cameras, row))
         bent = jax.vmap(lenses.distort, (None, 0))(one, jnp.asarray(slope))
-        moved = np.linalg.norm((np.asarray(bent) - slope) * focal, axis=-1)
-        worst = max(worst, float(moved.max()))
-    wanted, confidence = judge(worst, LENS_PX, 0.0)
+        shift = np.linalg.norm((np.asarray(bent) - slope) * focal, axis=-1)
+        worst = max(worst, float(shift.max()))
+    bends, confidence = judge(worst, LENS_PX, 0.0)
     measurement = f"lens distortion displaces pixels by up to {worst:.2g} px"
-    if wanted:
+    if bends:
         measurement += "; training and evaluation model it"
-    return Finding(LENS, measurement, threshold, wanted, confidence, {"most_px": worst})
+    return Finding(LENS, measurement, threshold, bends, confidence, {"most_px": worst})

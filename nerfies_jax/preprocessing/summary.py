@@ -50,16 +50,16 @@ def of(views: Views, evidence: Evidence) -> Summary:
       The numbers.
     """
     tracks, paths = evidence.tracks, evidence.paths
-    still = np.flatnonzero(evidence.score < MOVES)
+    static = np.flatnonzero(evidence.score < MOVES)
     parallax = still_points.depth_deviation(
-        views, tracks.take(still), evidence.rest.take(still)
+        views, tracks.take(static), evidence.rest.take(static)
     )
     distance = scene_unit(evidence)
     groups, miss = 0, np.nan
-    kept = paths.known.any(1)
-    if kept.any():
-        place, known = paths.position[kept], paths.known[kept]
-        groups, miss = rigid_groups.fewest(place, known, EXPLAINED * distance)
+    usable = paths.known.any(1)
+    if usable.any():
+        place, valid = paths.position[usable], paths.known[usable]
+        groups, miss = rigid_groups.fewest(place, valid, EXPLAINED * distance)
     return Summary(
         frames=len(evidence.row),
         size=views.size,

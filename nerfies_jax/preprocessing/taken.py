@@ -48,8 +48,8 @@ def tracks(given: Given, views: Views) -> Tracks | None:
 def _followed(given, views):
     scale = np.divide(views.size, given.size, dtype=np.float32)
     pixel = np.moveaxis(given.track_pixel[views.row], 0, 1) * scale
-    seen = np.moveaxis(given.track_seen[views.row], 0, 1)
-    return Tracks(seen.argmax(1), np.where(seen[..., None], pixel, 0), seen)
+    visible = np.moveaxis(given.track_seen[views.row], 0, 1)
+    return Tracks(visible.argmax(1), np.where(visible[..., None], pixel, 0), visible)
 
 
 def moving(given: Given, views: Views) -> np.ndarray | None:

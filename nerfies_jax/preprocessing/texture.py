@@ -43,12 +43,12 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
       The finding.
     """
     threshold = f"{SMALL} bands, as in the small presets of radiance fields"
-    seen = [one for one in _shown(views) if views.valid[one].mean() > 0.5]
-    if not seen:
+    frames = [one for one in _shown(views) if views.valid[one].mean() > 0.5]
+    if not frames:
         return cannot_tell(
             EFFECT, "plain background fills most of the views", threshold
         )
-    cycles = float(np.median([_finest(views.gray[one]) for one in seen]))
+    cycles = float(np.median([_finest(views.gray[one]) for one in frames]))
     near, far = view_set.depth_span(capture, views)
     depth = math.sqrt(near * far)
     scale = scene_metadata.metadata_of(capture, 1.0).scale

@@ -84,9 +84,9 @@ def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
             np.arange(x, width - 1, step), np.arange(y, height - 1, step)
         )
         pixel = np.stack([x.ravel(), y.ravel()], axis=-1)
-        shown = views.valid[frame][pixel[:, 1].astype(int), pixel[:, 0].astype(int)]
-        at = np.full((shown.sum(), 1), frame)
-        starts.append(np.concatenate([at, pixel[shown]], axis=-1))
+        visible = views.valid[frame][pixel[:, 1].astype(int), pixel[:, 0].astype(int)]
+        at = np.full((visible.sum(), 1), frame)
+        starts.append(np.concatenate([at, pixel[visible]], axis=-1))
     return np.concatenate(starts)
 
 
@@ -207,8 +207,8 @@ def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tr
                 flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
                 minEigThreshold=LEAST_EIGENVALUE,
             )
-            moved = np.linalg.norm(place - guess, axis=-1) / times
-            fits = (status.ravel() == 1) & (moved < FARTHEST_PX)
+            shift = np.linalg.norm(place - guess, axis=-1) / times
+            fits = (status.ravel() == 1) & (shift < FARTHEST_PX)
             pixel[which, frame] = (place + 0.5) / times
             seen[which[~fits], frame] = False
     return Tracks(tracks.start, np.where(seen[..., None], pixel, 0), seen)

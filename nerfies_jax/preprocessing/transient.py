@@ -107,8 +107,8 @@ def _always_there(evidence):
 def _jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
     """Compute the share of pixels that only one of two neighboring frames shows."""
     part = view_set.times_smaller(views)
-    shown = views.textured[:-1] & flow.forward_seen[:-1]
-    carried = shown.sum((1, 2)) / np.maximum(views.textured[:-1].sum((1, 2)), 1)
+    textured = views.textured[:-1] & flow.forward_seen[:-1]
+    carried = textured.sum((1, 2)) / np.maximum(views.textured[:-1].sum((1, 2)), 1)
     views = view_set.smaller(views, part)
     pictures = [_leveled(gray) for gray in views.gray]
     shares = []

@@ -96,14 +96,14 @@ def coverage(evidence: Evidence) -> float:
     Returns:
       The share, 0 if nothing moves.
     """
-    kept = _is_known(evidence)
-    pixel = evidence.tracks.pixel[evidence.moved[kept]]
-    known = evidence.paths.known[kept]
+    usable = _is_known(evidence)
+    pixel = evidence.tracks.pixel[evidence.moved[usable]]
+    valid = evidence.paths.known[usable]
     shape = evidence.moving.shape[1:]
     reach, near = NEAR_PX * picture_scale(shape[1]), 0
-    for frame in np.flatnonzero(known.any(0)):
+    for frame in np.flatnonzero(valid.any(0)):
         away = np.ones(shape, np.uint8)
-        away[tracking.pixel_of(pixel[known[:, frame], frame], shape)] = 0
+        away[tracking.pixel_of(pixel[valid[:, frame], frame], shape)] = 0
         distance = cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         near += int((evidence.moving[frame] & (distance <= reach)).sum())
     return near / max(int(evidence.moving.sum()), 1)
@@ -146,10 +146,10 @@ def known_paths(evidence: Evidence) -> KnownPaths:
     Returns:
       The paths.
     """
-    kept = _is_known(evidence)
+    usable = _is_known(evidence)
     paths = evidence.paths
     return KnownPaths(
-        paths.position[kept], paths.known[kept], paths.depth_deviation[kept]
+        paths.position[usable], paths.known[usable], paths.depth_deviation[usable]
     )
 
 

@@ -201,12 +201,12 @@ def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
         return np.zeros(images.shape[:3], bool)
     behind = near(images.astype(np.float32))
     # Only regions connected to the border, not black spots of an object.
-    kept = np.zeros_like(behind)
+    result = np.zeros_like(behind)
     for row, one in enumerate(behind):
         seeds = np.zeros_like(one)
         seeds[[0, -1]], seeds[:, [0, -1]] = True, True
-        kept[row] = nd.binary_propagation(seeds & one, mask=one)
-    return kept
+        result[row] = nd.binary_propagation(seeds & one, mask=one)
+    return result
 
 
 def rays(views: Views, index: int) -> np.ndarray:

@@ -72,8 +72,10 @@ def improved(
       Flow in pixels, [height, width, 2].
     """
     near, far = (_plane_flow(views, pair, depth) for depth in span)
-    apart = float(np.median(np.linalg.norm(near - far, axis=-1)))
-    count = int(np.clip(np.ceil(apart / (STEP_SHARE * flow.shape[1])), 1, MOST_PLANES))
+    distance = float(np.median(np.linalg.norm(near - far, axis=-1)))
+    count = int(
+        np.clip(np.ceil(distance / (STEP_SHARE * flow.shape[1])), 1, MOST_PLANES)
+    )
     share = (np.arange(count) + 0.5) / count
     inverse = share / span[0] + (1 - share) / span[1]
     best, lowest = flow.copy(), OWN * unlike(pictures, flow)
@@ -92,10 +94,10 @@ def _plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     point = views.position[one] + depth * view_set.rays(views, one)
     pixel, ahead = view_set.project(views, other, point.reshape(-1, 3))
-    moved = pixel.reshape(height, width, 2) - np.stack([x, y], -1)
+    shift = pixel.reshape(height, width, 2) - np.stack([x, y], -1)
     behind = (ahead <= 0).reshape(height, width)
     # The initial flow of points behind the camera is arbitrary.
-    return np.where(behind[..., None], 0, np.clip(moved, -width, width)).astype(
+    return np.where(behind[..., None], 0, np.clip(shift, -width, width)).astype(
         np.float32
     )
 
@@ -115,5 +117,5 @@ def unlike(pictures, flow):
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     at = x + flow[..., 0], y.astype(np.float32) + flow[..., 1]
     # Positions outside of the image have a large difference.
-    there = cv2.remap(np.float32(other), *at, cv2.INTER_LINEAR, borderValue=-255)
-    return cv2.GaussianBlur(np.abs(one - there), (0, 0), WINDOW_SHARE * width)
+    warped = cv2.remap(np.float32(other), *at, cv2.INTER_LINEAR, borderValue=-255)
+    return cv2.GaussianBlur(np.abs(one - warped), (0, 0), WINDOW_SHARE * width)

@@ -290,8 +290,8 @@ def _check_shape(title, check, shape, sizes, batches):
 
 
 def _shape_message(title, check, shape, sizes, batches):
-    named = batches is None and check.variadic
-    middle = [f"*{check.variadic}" if named else "..."]
+    needs_name = batches is None and check.variadic
+    middle = [f"*{check.variadic}" if needs_name else "..."]
     if batches is not None:
         axes = [*middle, *check.core]
     elif check.variadic is None:

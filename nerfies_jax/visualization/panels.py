@@ -93,9 +93,9 @@ def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> C
     if not largest > 0:
         raise ValueError(f"largest={largest} must be positive")
     error = np.mean(np.abs(_as_unit(image) - _as_unit(truth)), axis=-1)
-    known = np.isfinite(error)
-    unit = np.where(known, error, 0) / largest
-    return Colored(_apply_map(unit, known, ERROR_MAP), 0, largest)
+    valid = np.isfinite(error)
+    unit = np.where(valid, error, 0) / largest
+    return Colored(_apply_map(unit, valid, ERROR_MAP), 0, largest)
 
 
 def color_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Colored:
@@ -108,10 +108,10 @@ def color_distance(distance: np.ndarray, at_least: float | int = 0.0) -> Colored
     Returns:
       The image and the range.
     """
-    known = np.isfinite(distance)
-    largest = max(float(at_least), _limits(distance[known])[1] if known.any() else 0.0)
-    unit = np.where(known, distance, 0) / _span(0.0, largest)
-    return Colored(_apply_map(unit, known, ERROR_MAP), 0.0, largest)
+    valid = np.isfinite(distance)
+    largest = max(float(at_least), _limits(distance[valid])[1] if valid.any() else 0.0)
+    unit = np.where(valid, distance, 0) / _span(0.0, largest)
+    return Colored(_apply_map(unit, valid, ERROR_MAP), 0.0, largest)
 
 
 def color_flow(flow: np.ndarray, largest: float | int | None = None) -> Colored:
@@ -128,17 +128,17 @@ def color_flow(flow: np.ndarray, largest: float | int | None = None) -> Colored:
       The image and the range.
     """
     flow = np.asarray(flow, np.float32)
-    known = np.all(np.isfinite(flow), axis=-1)
-    flow = np.where(known[..., None], flow, 0)
+    valid = np.all(np.isfinite(flow), axis=-1)
+    flow = np.where(valid[..., None], flow, 0)
     length = np.linalg.norm(flow, axis=-1)
     if largest is None:
-        largest = _limits(length[known])[1]
+        largest = _limits(length[valid])[1]
     hue = np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi) % 1
     saturation = np.clip(length / (largest or 1), 0, 1)
     color = skimage.color.hsv2rgb(
         np.stack([hue, saturation, np.ones_like(hue)], axis=-1)
     )
-    image = np.where(known[..., None], as_bytes(color), np.array(UNKNOWN, np.uint8))
+    image = np.where(valid[..., None], as_bytes(color), np.array(UNKNOWN, np.uint8))
     return Colored(image, 0.0, float(largest))
 
 

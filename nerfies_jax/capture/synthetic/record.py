@@ -48,7 +48,7 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
     )
     scene_truth = _truth(spec, plan, hits, ids, programs, seed)
     in_collection = spec.collection is not None
-    known = depths[(depths > 0) & (hits.thing != spec.transient_id)]
+    visible = depths[(depths > 0) & (hits.thing != spec.transient_id)]
     capture = Capture(
         name=f"synthetic {spec.name}",
         source="synthetic",
@@ -58,7 +58,7 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         times=plan.time,
         train=np.flatnonzero(plan.learn),
         heldout=np.flatnonzero(~plan.learn),
-        near=float(0.9 * known.min()),
+        near=float(0.9 * visible.min()),
         far=float(1.1 * depths.max()),
         warp_ids=plan.instant,
         appearance_ids=plan.instant,

@@ -103,11 +103,11 @@ def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flo
         point = trace.place(spec, thing, material, time)
         return trace.visible(spec, camera, thing, point, time, transient_shown)
 
-    pixel, seen = jax.lax.map(lambda row: jax.vmap(one)(*row), (thing, material))
-    known = thing != trace.NOTHING
+    pixel, visible = jax.lax.map(lambda row: jax.vmap(one)(*row), (thing, material))
+    hit = thing != trace.NOTHING
     centers = rays.pixel_centers(spec.size, pixel.dtype)
-    shift = jnp.where(known[..., None], pixel - centers, 0)
-    return Flow(shift, seen & known)
+    shift = jnp.where(hit[..., None], pixel - centers, 0)
+    return Flow(shift, visible & hit)
 
 
 class Programs(NamedTuple):
@@ -181,14 +181,14 @@ def flows(
         plan.transient_shown[target],
     )
     shift = np.zeros((2 * count, height, width, 2), np.float32)
-    seen = np.zeros((2 * count, height, width), bool)
+    visible = np.zeros((2 * count, height, width), bool)
     if programs.flow is not None:
         program = programs.flow.result()
         results = data_parallel.rows_on_devices(flow, spec, pairs, program)
         for index, result in zip(np.flatnonzero(exists), results, strict=True):
-            shift[index], seen[index] = result
-    forward = Flow._make((shift[:count], seen[:count]))
-    return forward, Flow._make((shift[count:], seen[count:]))
+            shift[index], visible[index] = result
+    forward = Flow._make((shift[:count], visible[:count]))
+    return forward, Flow._make((shift[count:], visible[count:]))
 
 
 def tracks(
@@ -232,9 +232,11 @@ def tracks(
     padded = np.minimum(np.arange(spec.tracks), len(sample) - 1)
     world = np.asarray(programs.follow.result()(thing[padded], material[padded], times))
     positions = world[:, plan.instant]
-    pixel, seen = programs.watch.result()(thing[padded], positions, plan)
-    world, pixel, seen = (np.asarray(x)[: len(sample)] for x in (world, pixel, seen))
-    return thing, world[:, 0], world, pixel, seen
+    pixel, visible = programs.watch.result()(thing[padded], positions, plan)
+    world, pixel, visible = (
+        np.asarray(x)[: len(sample)] for x in (world, pixel, visible)
+    )
+    return thing, world[:, 0], world, pixel, visible
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -286,19 +288,19 @@ def load(path: pathlib.Path) -> SceneTruth:
       ValueError: If it is not such a file.
     """
     try:
-        stored = npz_files.read_arrays(path)
+        arrays = npz_files.read_arrays(path)
     except (OSError, ValueError) as error:
         raise ValueError(
             f"{path}: not a readable ground truth ({error}); delete it and create the "
             "scene again"
         ) from error
-    missing = set(SceneTruth._fields) - set(stored)
-    if missing:
+    absent = set(SceneTruth._fields) - set(arrays)
+    if absent:
         raise ValueError(
-            f"{path} holds no {sorted(missing)[0]!r}, so it is not a ground truth of "
+            f"{path} holds no {sorted(absent)[0]!r}, so it is not a ground truth of "
             "this version; delete it and create the scene again"
         )
-    fields: dict[str, Any] = {name: stored[name] for name in SceneTruth._fields}
+    fields: dict[str, Any] = {name: arrays[name] for name in SceneTruth._fields}
     for name in ("ids", "thing_names"):
         fields[name] = tuple(str(word) for word in fields[name])
     return SceneTruth(**fields)
