@@ -17,7 +17,6 @@ SLOW = [
     "opaque_64_clamp0999",
     "opaque_64_clamp099",
     "wide_offaxis_near02_80x60",
-    "n50_48_sh1",
     "n100_64_rgb_depth",
     "n2000_131x97_sh3",
     "n2000_256_rgb_fixedradius",
