@@ -473,7 +473,7 @@ def initial_state(run: Run) -> TrainState:
     if resources.estimate_memory_bytes is not None:
         needed = resources.estimate_memory_bytes(run.spec, run.capture)
         needed -= frame_memory.capture_bytes(run.capture)  # already allocated
-        free = _free_memory()
+        free = free_memory()
         if needed > free:
             raise ValueError(
                 f"the initial training state needs about {needed / 2**30:.1f} GiB of "
@@ -483,8 +483,12 @@ def initial_state(run: Run) -> TrainState:
     return run.model.init(run.capture, jax.random.key(run.config.seed))
 
 
-def _free_memory() -> int:
-    """Return the available memory in bytes."""
+def free_memory() -> int:
+    """Return the available memory.
+
+    Returns:
+      Bytes that programs may still allocate.
+    """
     return psutil.virtual_memory().available
 
 
