@@ -168,7 +168,7 @@ def _window(
     u = (clamped - times[left]) / (times[left + 1] - times[left])
     if interpolation == "linear":
         return left, [1 - u, u]
-    w0, w1, w2, w3 = _catmull_rom(u)
+    w0, w1, w2, w3 = catmull_rom(u)
     # In the first and the last interval the missing knot is extrapolated by the
     # parabola through three knots, 3a - 3b + c: its weight is added to those three.
     is_first, is_last = left == 0, left == count - 2
@@ -184,10 +184,20 @@ def _window(
     return start, weights
 
 
-def _catmull_rom(
+def catmull_rom(
     u: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Compute the Catmull-Rom weights of four evenly spaced knots."""
+    """Compute the Catmull-Rom weights of four evenly spaced knots.
+
+    Args:
+      u: Position between the middle two knots, in [0, 1].
+
+    Returns:
+      Four weights that sum to one, exactly those of one knot at 0 and 1.
+
+    References:
+      Catmull and Rom 1974, with tension 1/2.
+    """
     return (
         u * (u * (2 - u) - 1) / 2,
         (u * u * (3 * u - 5) + 2) / 2,
@@ -216,7 +226,7 @@ def spline_weights(knots: int, time: Float[Array, ""]) -> Float[Array, " knots"]
     left = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, last - 1)
     offset = position - left.astype(position.dtype)
     rows = jnp.clip(left + jnp.arange(-1, 3, dtype=jnp.int32), 0, last)
-    weights = jnp.stack(_catmull_rom(offset))
+    weights = jnp.stack(catmull_rom(offset))
     return jnp.zeros(knots, position.dtype).at[rows].add(weights)
 
 

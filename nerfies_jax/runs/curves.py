@@ -67,8 +67,15 @@ class Course(NamedTuple):
         return text
 
 
-def _course(events: Iterable[Event]) -> Course:
-    """Summarize the events of a run."""
+def course(events: Iterable[Event]) -> Course:
+    """Summarize the events of a run.
+
+    Args:
+      events: Events, from `event_log.read_events`.
+
+    Returns:
+      Rows of training and of evaluations, and the progress of the run.
+    """
     training: list[dict[str, Any]] = []
     evaluations: list[dict[str, Any]] = []
     numbers: dict[str, Any] = {}
@@ -105,7 +112,7 @@ def course_of(folder: pathlib.Path) -> Course | None:
       The summary, or None if there are no events.
     """
     try:
-        return _course(event_log.read_events(folder))
+        return course(event_log.read_events(folder))
     except ValueError:
         return None
 
