@@ -106,8 +106,11 @@ def _splatv(args: Any, run: Any) -> str:
     learned = sampled.gathered(at, rows, visible, sampled.MOST_INSTANTS)
     curves = splatv.write(args.place, learned, capture)
     model = run.model
-    if spec.exposure is not None:  # of which the file has none
-        neutral = ("exposure",)
+    # The file has no exposures and no appearances.
+    neutral = tuple(
+        name for name in ("exposure", "appearance") if getattr(spec, name) is not None
+    )
+    if neutral:
         model = run.representation.products.variant(spec, run.metadata, neutral, False)
     draw = evaluation.Renderer(model, capture.size)
     fit = splatv.measured(curves, learned, draw, state, raster, capture)

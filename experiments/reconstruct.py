@@ -40,13 +40,14 @@ class Reconstruct:
 
     source: cli.Source = cli.NamedSource()
     preset: cli.Preset = None
-    """Gaussian splats: splats-static, splats-mcmc, splats-tracked, splats-deformable,
-    sonata, moba, dynmf, spacetime, spline, 4dgs, e-d3dgs, sc-gs, edgs, d-miso, adc-gs,
-    motion-gs. Radiance fields: nerf, nerf-w, d-nerf, t-nerf, nerfies, hypernerf, nsff,
-    tineuvox, nerf-ds. Each has a version for a CPU with the suffix -small. nerf-grid,
-    nerf-w-grid, d-nerf-grid, nerfies-grid, hypernerf-grid and nsff-grid, on feature
-    grids, exist with -small only (default: splats-tracked-small, splats-static-small if
-    nothing moves, or spacetime-small without tracks if tracking fails)."""
+    """Gaussian splats: splats-static, splats-collection, splats-mcmc, splats-tracked,
+    splats-deformable, sonata, moba, dynmf, spacetime, spline, 4dgs, e-d3dgs, sc-gs,
+    edgs, d-miso, adc-gs, motion-gs. Radiance fields: nerf, nerf-w, d-nerf, t-nerf,
+    nerfies, hypernerf, nsff, tineuvox, nerf-ds. Each has a version for a CPU with the
+    suffix -small. nerf-grid, nerf-w-grid, d-nerf-grid, nerfies-grid, hypernerf-grid and
+    nsff-grid, on feature grids, exist with -small only (default: splats-tracked-small,
+    splats-static-small if nothing moves, splats-collection-small for photographs in
+    changing light, or spacetime-small without tracks if tracking fails)."""
     effects: Literal["preset", "auto"] | None = None
     """auto: inspect the capture first. Without --preset, compensation of exposures and
     a depth loss are enabled where they are certainly needed, and tried in a short run

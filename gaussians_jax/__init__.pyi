@@ -4,6 +4,7 @@ from . import strategy as strategy
 from .core.metadata import SceneMetadata as SceneMetadata
 from .core.protocols import Appearance as Appearance
 from .core.protocols import CameraOptimizer as CameraOptimizer
+from .core.protocols import GaussianAppearance as GaussianAppearance
 from .core.splats import Gaussians as Gaussians
 from .core.splats import Params as Params
 from .core.splats import Splats as Splats

@@ -35,8 +35,21 @@ from nerfies_jax.evaluation.representation import (
     Saved,
     Scoring,
 )
-from nerfies_jax.preprocessing import record, rigid_groups, usable_paths
-from nerfies_jax.preprocessing.findings import DEPTH, LIGHT, MOTION, START, TRANSIENT
+from nerfies_jax.preprocessing import (
+    findings,
+    inspection,
+    record,
+    rigid_groups,
+    usable_paths,
+)
+from nerfies_jax.preprocessing.findings import (
+    COLLECTION,
+    DEPTH,
+    LIGHT,
+    MOTION,
+    START,
+    TRANSIENT,
+)
 from nerfies_jax.training import specs
 from nerfies_jax.training.model import Model, TrainState
 from nerfies_jax.training.track_start import FROM_REST
@@ -71,6 +84,8 @@ ADVISED = ("splats-static", "splats-tracked", "splats-deformable")
 # tracks: D-NeRF's lego 21.8 dB, 20.7 and 21.3; bookshelf 36.8, 34.5 and 36.4; built-in
 # scene 25.1, 24.6 and 25.9.
 UNTRACKED = "spacetime"
+# Preset for photographs of a static scene in changing light.
+OF_PHOTOGRAPHS = "splats-collection"
 # Share of moving pixels near tracks from which motion needs no comparison with a static
 # scene, and the median relative deviation of the depths of tracks up to which it does
 # not. Built-in scenes have deviations of 0.02 to 0.08, a bag that is handled 0.15.
@@ -160,6 +175,8 @@ def advise(
     overrides, notes = [], []
     moves = wanted.get(MOTION)
     preset = "splats-deformable" if full else UNTRACKED
+    if wanted.get(COLLECTION) and family in (None, *ADVISED):
+        moves, family = False, OF_PHOTOGRAPHS
     if moves is not None:
         preset = "splats-tracked" if moves else "splats-static"
     if family is not None and family not in ADVISED:
@@ -177,8 +194,12 @@ def advise(
         overrides += [f"{name}=none" for name in present]
         if _starts_from_tracks(spec):
             overrides.append(FROM_REST)
-    if wanted.get(TRANSIENT) and (moves is False or spec.motion is None):
-        notes.append(f"{TRANSIENT}: splats cannot model transient objects; use a field")
+    static = moves is False or spec.motion is None
+    if wanted.get(TRANSIENT) and static and spec.transients is None:
+        notes.append(
+            f"{TRANSIENT}: splats cannot model transient objects, and can leave them "
+            "out of the loss (transients.start=500); use a field, or set this"
+        )
     overrides += effect_overrides(wanted, specs.override(spec, tuple(overrides)))
     return Choice(preset, tuple(overrides), tuple(notes))
 
@@ -194,10 +215,12 @@ def effect_overrides(wanted: dict[str, bool | None], spec: Any) -> tuple[str, ..
       Overrides such as "depth.weight=0.1".
     """
     overrides = []
-    if wanted.get(LIGHT) and spec.exposure is None:
+    if wanted.get(LIGHT) and spec.exposure is spec.appearance is None:
         overrides.append("exposure.learning_rate=0.01")
     if wanted.get(LIGHT) is False and spec.exposure is not None:
         overrides.append("exposure=none")
+    if wanted.get(LIGHT) is False and spec.appearance is not None:
+        overrides.append("appearance=none")
     if wanted.get(START) is False:
         overrides.append("init.source=random")
     if wanted.get(DEPTH) and spec.depth is None and not _starts_from_tracks(spec):
@@ -218,6 +241,12 @@ def _starts_from_tracks(spec: Any) -> bool:
     return spec.motion is not None and spec.start.motion == "tracks"
 
 
+def _validates(spec: Any) -> bool:
+    """Test if no parameters belong to single frames, and no loss to pairs of them."""
+    parts = (spec.exposure, spec.appearance, spec.poses, spec.flow)
+    return all(part is None for part in parts)
+
+
 def _spec_of(family, full):
     return presets.PRESETS[family if full else f"{family}-small"]
 
@@ -226,14 +255,18 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
     """Choose a small preset by the tracks of a capture, from the cache or computed.
 
     SE(3) bases are used if there are usable tracks, no motion if the scene is static,
-    and a polynomial per Gaussian otherwise. The number of Gaussians follows from the
-    image size, the length of the tracks and the planned seconds of training.
+    an appearance model for photographs in changing light, and a polynomial per Gaussian
+    otherwise. The number of Gaussians follows from the image size, the length of the
+    tracks and the planned seconds of training.
     """
     preprocessed = record.cached(capture, CACHE / "evidence")
     reason = usable_paths.unusable(preprocessed)
     without_tracks: tuple[str, ...] = ()
     name, notes = "splats-tracked-small", []
-    if reason and usable_paths.stands_still(preprocessed, capture.times):
+    if preprocessed.unusable and _is_collection(capture):
+        name = f"{OF_PHOTOGRAPHS}-small"
+        notes = ["photographs of one scene in changing light"]
+    elif reason and usable_paths.stands_still(preprocessed, capture.times):
         name, notes = "splats-static-small", [reason]
     elif reason:
         name, without_tracks = f"{UNTRACKED}-small", (FROM_REST,)
@@ -261,6 +294,13 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
             notes.append(f"for {frames} frames")
     other = None if reason else _alternative(preprocessed, capture.size, seconds)
     return Choice(name, overrides, tuple(notes), other)
+
+
+def _is_collection(capture):
+    """Test if frames are photographs in changing light, by the cached inspection."""
+    effects = (MOTION, TRANSIENT, LIGHT)
+    found = inspection.find(capture, effects, CACHE / "evidence")
+    return findings.is_collection(found)
 
 
 def _alternative(preprocessed, size, seconds):
@@ -343,8 +383,7 @@ GAUSSIANS = Representation(
         half_scorer=held_out_exposure.scorer,
         follow=gaussian_tracks.follow,
         mover=gaussian_tracks.mover,
-        # The flow loss reads pairs of consecutive frames.
-        validates=lambda spec: spec.exposure is spec.poses is spec.flow is None,
+        validates=_validates,
     ),
     products=Products(
         save=save,

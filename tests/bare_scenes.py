@@ -24,6 +24,8 @@ from gaussians_jax.motion.se3_bases import SE3BasesSpec
 from gaussians_jax.motion.time_basis import TimeBasisSpec
 from gaussians_jax.optim import densification, optimizer
 from gaussians_jax.optim import learning_rates as splat_rates
+from gaussians_jax.per_frame.appearance import ColorNetworkSpec
+from gaussians_jax.per_frame.sky import SkySpec
 from gaussians_jax.scene import presets as splat_presets
 from gaussians_jax.splatting import harmonics, projection, raster
 from nerfies_jax.fields import compositing, sampling, template
@@ -177,6 +179,12 @@ def tiny_splats(name):
         motion=motion,
         acceleration=shrunk(spec.acceleration, samples=16),
         neighbors=shrunk(spec.neighbors, count=3),
+        appearance=shrunk(
+            spec.appearance,
+            code=4,
+            network=ColorNetworkSpec(1, 1, 8),
+            sky=SkySpec(1, 8),
+        ),
     )
 
 

@@ -25,7 +25,8 @@ from gaussians_jax.motion import nodes as node_motion
 from gaussians_jax.motion import planes as plane_motion
 from gaussians_jax.motion import polynomial as polynomial_motion
 from gaussians_jax.motion import splines as spline_motion
-from gaussians_jax.per_frame import exposure
+from gaussians_jax.per_frame import appearance as gaussian_appearance
+from gaussians_jax.per_frame import exposure, sky
 from gaussians_jax.per_frame import poses as pose_refinement
 from nerfies_jax.fields.effects import (
     ambient,
@@ -67,6 +68,7 @@ SPLAT_MODULES = {
     "spectral": spectral,
     "depth": depth,
     "exposure": exposure,
+    "appearance": gaussian_appearance,
     "flow": motion_flow,
     "poses": pose_refinement,
 }
@@ -170,6 +172,9 @@ def of_splats(spec, metadata):
     if spec.exposure is not None:
         own = exposure.Bound(spec.exposure, spec.steps, metadata.exposures)
         effects.append(protocols.compile_appearance(own))
+    if spec.appearance is not None:
+        own = gaussian_appearance.Bound(spec.appearance, spec.steps, metadata.exposures)
+        effects.append(protocols.compile_gaussian_appearance(own))
     if spec.flow is not None:
         own = motion_flow.Bound(spec.flow, spec.raster)
         effects.append(protocols.compile_regularizer(own))
@@ -199,6 +204,8 @@ def absent_modules(spec):
         gone.remove(carried)
     if getattr(motion, "fading", None) is not None:
         gone.remove(temporal_opacity)
+    if getattr(spec.appearance, "sky", None) is None:
+        gone.append(sky)
     return gone
 
 

@@ -28,6 +28,7 @@ from gaussians_jax.motion.polynomial import PolynomialMotionSpec
 from gaussians_jax.motion.se3_bases import SE3BasesSpec
 from gaussians_jax.motion.splines import SplineMotionSpec
 from gaussians_jax.motion.time_basis import TimeBasisSpec
+from gaussians_jax.per_frame import appearance as gaussian_appearance
 from gaussians_jax.scene import presets as splat_presets
 from gaussians_jax.scene import scene as splat_scene
 from nerfies_jax.capture.scene_metadata import SceneMetadata
@@ -206,6 +207,10 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
             nets["spectral"] = spectral.init(spec.spectral)
         if spec.neighbors is not None:
             states.add("neighbors")
+        if spec.appearance is not None:
+            rows.add("appearance")
+            own = gaussian_appearance.Bound(spec.appearance, 1, metadata.exposures)
+            nets["appearance"] = own.init(key, state.params.rows["splats"]).shared
         assert set(state.params.rows) == rows
         assert shapes(state.params.nets) == shapes(nets)
         assert set(state.aux_state.effects) == states

@@ -46,7 +46,7 @@ def test_each_part_of_the_page_is_short():
         for node in ast.parse(block).body
         if isinstance(node, ast.ClassDef)
     ]
-    assert len(parts) == 9
+    assert len(parts) == 10
     assert all(node.end_lineno - node.lineno + 2 < 30 for node in parts)
 
 
@@ -61,6 +61,8 @@ def test_the_parts_of_the_page_train():
     assert 5e-3 < np.abs(names["velocity"]).max() < 3e-2
     assert 0.02 < np.abs(state.params.nets["gain"]).max() < 0.3
     assert 5e-4 < np.abs(state.params.nets["camera_shift"]).max() < 3e-3
+    gains = names["balanced"].state.params.nets["white_balance"]
+    assert 0.02 < np.abs(gains).max() < 0.3
     assert row["slow_motion/loss"] > 0
     assert len(state.aux_state.stats) == len(state.params.rows["splats"].mean)
     assert 3e-4 < np.abs(names["params"]["warp"]).max() < 3e-3

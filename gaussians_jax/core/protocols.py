@@ -19,6 +19,7 @@ from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Gaussians, Params, Splats
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training.effects import FrameCondition, stream
+from nerfies_jax.training.model import Frames
 from nerfies_jax.training.protocols import (
     LearningRate,
     Regularizer,
@@ -123,6 +124,62 @@ class Appearance(Protocol):
 
 
 @runtime_checkable
+class GaussianAppearance(Protocol):
+    """Appearance model: maps the colors of all Gaussians to those in one photograph.
+
+    The code of a photograph that is not a training frame is fitted to a part of it.
+
+    Optional member: `background(params, direction, code)` returns the sRGB colors
+    behind the Gaussians in unit directions of the world, as those of a sky.
+
+    Attributes:
+      learning_rate: A float, a schedule of the traced step, or `MotionParams` with one
+        of these for each leaf, or for several leaves at once.
+    """
+
+    @property
+    def learning_rate(self) -> LearningRate:
+        """Learning rate of the parameters."""
+        ...
+
+    def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
+        """Initialize the parameters, on the host.
+
+        Args:
+          key: PRNG key of this component.
+          gaussians: The Gaussians.
+
+        Returns:
+          Parameters with one row for each of `gaussians`, and shared parameters.
+        """
+        ...
+
+    def code(
+        self, params: MotionParams, appearance: Int[Array, ""]
+    ) -> Float[Array, " code"]:
+        """Return the code of an appearance id."""
+        ...
+
+    def apply(
+        self,
+        params: MotionParams,
+        colors: Float[Array, "gaussians 3"],
+        code: Float[Array, " code"],
+    ) -> Float[Array, "gaussians 3"]:
+        """Return the sRGB colors of the Gaussians for a code.
+
+        Args:
+          params: Parameters of this component.
+          colors: Colors of the Gaussians toward the camera.
+          code: Code of the photograph.
+
+        Returns:
+          The changed colors, which need not lie in [0, 1].
+        """
+        ...
+
+
+@runtime_checkable
 class CameraOptimizer(Protocol):
     """Refinement of the training cameras together with the scene.
 
@@ -179,6 +236,7 @@ class Population(NamedTuple):
       step: Number of completed steps.
       extent: Spread of the cameras in scene units.
       optimizer: The optimizer that `moments` belongs to.
+      frames: Training frames, with their cameras.
     """
 
     params: Params
@@ -188,6 +246,7 @@ class Population(NamedTuple):
     step: int
     extent: float
     optimizer: optax.GradientTransformation
+    frames: Frames | None = None
 
 
 class StrategyEvent(NamedTuple):
@@ -300,6 +359,31 @@ def compile_motion(motion: Motion) -> SplatRecord:
 def compile_appearance(appearance: Appearance) -> SplatRecord:
     """Compile an appearance model to the internal record."""
     return SplatRecord(**_hooks(appearance), expose=appearance.apply)
+
+
+def compile_gaussian_appearance(appearance: GaussianAppearance) -> SplatRecord:
+    """Compile an appearance model of Gaussians to the internal record."""
+    name = name_of(appearance)
+
+    def own_params(scene):
+        return MotionParams(scene.rows.get(name), scene.nets.get(name))
+
+    backdrop = None
+    if getattr(appearance, "background", None) is not None:
+
+        def backdrop(scene, direction, code):
+            return appearance.background(own_params(scene), direction, code)
+
+    return SplatRecord(
+        name,
+        init=appearance.init,
+        learning_rate=functools.partial(rate_at, appearance.learning_rate),
+        code=lambda scene, id_: appearance.code(own_params(scene), id_),
+        recolor=lambda scene, colors, code: appearance.apply(
+            own_params(scene), colors, code
+        ),
+        backdrop=backdrop,
+    )
 
 
 def compile_camera_optimizer(optimizer: CameraOptimizer) -> SplatRecord:

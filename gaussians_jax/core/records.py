@@ -45,6 +45,14 @@ class SplatRecord(Record):
     # (params, render [height, width, 3] sRGB, appearance id) -> the render with the
     # exposure of the observed frame, in training and afterwards
     expose: Callable[[PyTree, Any, Int[Array, ""]], Any] | None = None
+    # Appearance of one photograph in the colors of the Gaussians. At most one component
+    # of a scene has these.
+    # (scene, appearance id) -> code [code]
+    code: Callable[[Any, Int[Array, ""]], Any] | None = None
+    # (scene, colors [gaussians, 3], code) -> colors
+    recolor: Callable[[Any, Any, Any], Any] | None = None
+    # (scene, unit world directions [..., 3], code) -> colors behind the Gaussians
+    backdrop: Callable[[Any, Any, Any], Any] | None = None
     # (params, cameras of the training frames) -> refined cameras. All readers of a
     # training step's frames get these.
     pose: Callable[[PyTree, Camera], Camera] | None = None

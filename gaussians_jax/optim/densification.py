@@ -20,7 +20,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from gaussians_jax.core import splats
 from gaussians_jax.core.protocols import Population, StepInfo, StrategyEvent
 from gaussians_jax.core.splats import Params, Splats
+from gaussians_jax.optim import floaters
 from gaussians_jax.optim import optimizer as row_optimizer
+from gaussians_jax.optim.floaters import FloaterSpec
 from nerfies_jax.geometry import quaternion
 from nerfies_jax.training.step_counts import steps
 
@@ -47,6 +49,7 @@ class DefaultStrategySpec:
     reset_opacity: float = 0.01
     cap_max: int = 1_000_000  # Gaussians
     revised_opacity: bool = False  # two halves have the opacity of the parent together
+    floaters: FloaterSpec | None = None  # which are pruned in scenes without motion
 
     def __post_init__(self):
         if not 0 < self.prune_opa < self.reset_opacity < 1:
@@ -92,11 +95,17 @@ class DefaultStrategySpec:
         )
 
     def _densify(self, population: Population) -> Population:
+        stats, frames = population.state, population.frames
+        if self.floaters is not None and frames is not None:
+            size = frames.images.shape[2], frames.images.shape[1]
+            rows = population.params.rows["splats"]
+            floating = floaters.find(self.floaters, rows, frames.cameras, size)
+            stats = stats._replace(active=np.asarray(stats.active) & ~floating)
         changed = densify(
             population.optimizer,
             population.params,
             population.moments,
-            population.state,
+            stats,
             population.key,
             self,
             step=population.step,

@@ -8,20 +8,17 @@ would be ambiguous otherwise.
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.per_frame import id_tables
+from gaussians_jax.per_frame.id_tables import Places
 from nerfies_jax.geometry.precision import exact_product
-from nerfies_jax.nn import codes
 from nerfies_jax.training import schedules
 
 NAME = "exposure"
-# For each appearance id, two row indices and the interpolation weight of the second, as
-# in `nerfies_jax.capture.scene_metadata.exposures`.
-Places = tuple[tuple[int, int, float], ...]
 HELD = 1e-6  # ridge per pixel in a fit, in squared color
 
 
@@ -53,11 +50,7 @@ def init(key: Key[Array, ""], exposures: int) -> Float[Array, "exposures 3 4"]:
 def of_id(
     table: Float[Array, "exposures 3 4"], places: Places, appearance: Int[Array, ""]
 ) -> Float[Array, "3 4"]:
-    """Look up the exposure of an appearance id. Untrained ones are interpolated.
-
-    The mean of all exposures is the identity and treated as constant, because a
-    gradient through it would reach all other frames, and Adam normalizes even the
-    smallest gradients. An unknown id uses the nearest one.
+    """Look up the exposure of an appearance id, relative to the mean exposure.
 
     Args:
       table: Affine color transforms.
@@ -67,13 +60,8 @@ def of_id(
     Returns:
       The transform.
     """
-    left, right, progress = (np.asarray(column) for column in zip(*places, strict=True))
-    index = jnp.clip(appearance, 0, len(places) - 1)
-    weight = jnp.asarray(progress, table.dtype)[index]
-    deviation = table - jax.lax.stop_gradient(jnp.mean(table, axis=0))
-    flat = deviation.reshape(len(table), 12)
-    before, after = (jnp.asarray(side, jnp.int32)[index] for side in (left, right))
-    return codes.blend(flat, before, after, weight).reshape(3, 4)
+    flat = table.reshape(len(table), 12)
+    return id_tables.deviation(flat, places, appearance).reshape(3, 4)
 
 
 def apply_exposure(
@@ -109,8 +97,7 @@ class Bound:
 
     def init(self, key: Key[Array, ""]) -> Float[Array, "exposures 3 4"]:
         """Initialize exposures that do not change colors."""
-        count = 1 + max(max(left, right) for left, right, _ in self.places)
-        return init(key, count)
+        return init(key, id_tables.rows_of(self.places))
 
     def apply(
         self,

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from gaussians_jax.core import splats
 from gaussians_jax.motion import deformation
-from gaussians_jax.scene import scene, variants
+from gaussians_jax.scene import drawing, scene, variants
 from gaussians_jax.splatting import harmonics
 from nerfies_jax.evaluation.representation import SplatCloud, Splatting
 from nerfies_jax.geometry import quaternion as quaternions
@@ -52,9 +52,19 @@ def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
         coefficients = splats.active_harmonics(rows, degree)
         color = harmonics.color_toward(coefficients, gaussians.mean, position)
+        backdrop = background.astype(color.dtype)
+        painter = drawing.appearance_of(effects)
+        if painter is not None:
+            code = painter.code(params, appearance)
+            color = painter.recolor(params, color, code)
+            if painter.backdrop is not None:
+                # A viewer has one background color, so that of the middle is used.
+                toward = harmonics.unit_direction(
+                    jnp.mean(gaussians.mean, axis=0) - position
+                )
+                backdrop = painter.backdrop(params, toward, code)
         # Compositing weights and transmittance sum to one, so an affine change of the
         # image is the same change of all colors and of the background.
-        backdrop = background.astype(color.dtype)
         color = _exposed(effects, params, color, appearance)
         backdrop = _exposed(effects, params, backdrop[None], appearance)[0]
         leaves: dict[str, Any] = dict(

@@ -67,7 +67,6 @@ def events(
 
 def _event(event, strategy, metadata, effects, optimizer):
     def apply(state, frames):
-        del frames
         stats, states = state.aux_state
         population = Population(
             state.params,
@@ -77,6 +76,7 @@ def _event(event, strategy, metadata, effects, optimizer):
             int(state.step),
             metadata.extent,
             optimizer,
+            frames,
         )
         changed = event.apply(population)
         stats = changed.state

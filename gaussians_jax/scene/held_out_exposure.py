@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gaussians_jax.per_frame import exposure
-from gaussians_jax.scene import scene
+from gaussians_jax.scene import held_out_appearance, scene
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import HalfScorer
@@ -28,8 +28,10 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
 
     Returns:
       A function of a trained state, a capture and the indices of its frames, which
-      returns the metrics. None if the scene has no exposure model.
+      returns the metrics. None if the scene models no light of single images.
     """
+    if spec.appearance is not None:
+        return held_out_appearance.scorer(spec, metadata, size)
     if spec.exposure is None:
         return None
     neutral = dataclasses.replace(spec, exposure=None)

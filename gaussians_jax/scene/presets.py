@@ -12,6 +12,7 @@ from gaussians_jax.losses.depth import DepthSpec
 from gaussians_jax.losses.flow import FlowSpec
 from gaussians_jax.losses.neighbors import NeighborSpec
 from gaussians_jax.losses.spectral import SpectralSpec
+from gaussians_jax.losses.transients import TransientMaskSpec
 from gaussians_jax.motion.anchors import AnchorMotionSpec, RateSpec
 from gaussians_jax.motion.basis import BasisMotionSpec
 from gaussians_jax.motion.carried import CarriedSpec
@@ -27,11 +28,15 @@ from gaussians_jax.motion.splines import SplineMotionSpec
 from gaussians_jax.motion.temporal_opacity import TemporalOpacitySpec
 from gaussians_jax.motion.time_basis import TimeBasisSpec
 from gaussians_jax.optim.densification import DefaultStrategySpec
+from gaussians_jax.optim.floaters import FloaterSpec
 from gaussians_jax.optim.learning_rates import LearningRateSpec
 from gaussians_jax.optim.mcmc import MCMCStrategySpec
 from gaussians_jax.optim.phases import AlternationSpec, AnnealingSpec
+from gaussians_jax.per_frame.appearance import AppearanceSpec
+from gaussians_jax.per_frame.sky import SkySpec
 from gaussians_jax.scene.small_presets import (
     SMALL_ADC_GS,
+    SMALL_COLLECTION,
     SMALL_D_MISO,
     SMALL_DEFORMABLE,
     SMALL_DYNMF,
@@ -63,6 +68,26 @@ MCMC = SplatScene(
     steps=30_000,
     init=InitSpec(opacity=0.5, scale=0.1),
     strategy=MCMCStrategySpec(),
+)
+
+# WildGaussians (Kulhanek et al. 2024, arXiv:2407.08447), its code's numbers for
+# photographs of monuments: codes of 32, features of four octaves, two layers of 128.
+# Differences: a sky of spherical harmonics as in Splatfacto-W in place of Gaussians on
+# a sphere, residuals in place of DINO features for transient objects, no network for
+# the exposure of an image, and floaters in front of cameras are pruned. Codes learn ten
+# times as fast.
+COLLECTION = SplatScene(
+    steps=200_000,
+    learning_rates=LearningRateSpec(mean=1.6e-5, mean_end=1.6e-7, log_scale=5e-4),
+    strategy=DefaultStrategySpec(
+        refine_every=400,
+        refine_start_iter=4000,
+        refine_stop_iter=100_000,
+        reset_every=15_000,
+        floaters=FloaterSpec(),
+    ),
+    appearance=AppearanceSpec(learning_rate=5e-4, sky=SkySpec(degree=3, width=128)),
+    transients=TransientMaskSpec(start=35_000),
 )
 
 # Yang et al. 2023, arXiv:2309.13101, for real captures: the network, the warm-up and
@@ -261,6 +286,7 @@ ADC_GS = SplatScene(
 PRESETS = {
     "splats-static": STATIC,
     "splats-mcmc": MCMC,
+    "splats-collection": COLLECTION,
     "splats-tracked": TRACKED,
     "splats-deformable": DEFORMABLE,
     "sonata": SONATA,
@@ -278,6 +304,7 @@ PRESETS = {
     "splats-static-small": SMALL_STATIC,
     "splats-tracked-small": SMALL_TRACKED,
     "splats-mcmc-small": SMALL_MCMC,
+    "splats-collection-small": SMALL_COLLECTION,
     "splats-deformable-small": SMALL_DEFORMABLE,
     "sonata-small": SMALL_SONATA,
     "moba-small": SMALL_MOBA,

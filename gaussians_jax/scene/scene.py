@@ -4,30 +4,27 @@ import dataclasses
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.records import SplatRecord
-from gaussians_jax.core.splats import Params, Splats
+from gaussians_jax.core.splats import Params
 from gaussians_jax.init import points as initialization
 from gaussians_jax.init.points import StartSpec
 from gaussians_jax.losses import transients
 from gaussians_jax.motion import deformation
 from gaussians_jax.optim import phases
-from gaussians_jax.scene import growth, update
+from gaussians_jax.scene import drawing, growth, update
 from gaussians_jax.scene.first_state import count_rows, first_state
 from gaussians_jax.scene.spec import (
     SceneMetadata,
     SplatScene,
     effects_of,
     optimizer_of,
-    raster_of,
     strategy_of,
 )
 from gaussians_jax.scene.update import ViewStatistics
-from gaussians_jax.splatting import rendering
 from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.scene_metadata import exposures
@@ -101,7 +98,7 @@ def all_effects(
 
     Raises:
       ValueError: If a component has parameters but no learning rate, a name is taken,
-        or more than one component has child Gaussians.
+        or more than one component has child Gaussians or changes colors.
     """
     built_in = effects_of(spec, metadata)
     effects = joined(built_in, more, reserved=("splats",))
@@ -113,6 +110,7 @@ def all_effects(
                 "of the step"
             )
     deformation.check_derived(effects)
+    drawing.check_one_appearance(effects)
     return effects
 
 
@@ -194,43 +192,12 @@ def _stages(spec, metadata, effects):
 
     def draw(params, deformed, view, size, step):
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        rendered = _draw(spec, metadata, rows(params), deformed, view, size, degree)
-        return _exposed(effects, params, rendered.rendering, view)
+        rendered = drawing.draw(
+            spec, metadata, effects, params, rows(params), deformed, view, size, degree
+        )
+        return drawing.exposed(effects, params, rendered.rendering, view)
 
     return Stages(prepare, deform, draw, rows)
-
-
-def _draw(
-    spec,
-    metadata,
-    rows: Splats,
-    gaussians,
-    view,
-    size,
-    degree,
-    probe=None,
-    depth=True,
-):
-    return rendering.render_harmonics(
-        gaussians,
-        splats.active_harmonics(rows, degree),
-        view.camera,
-        size,
-        raster_of(spec, metadata),
-        jnp.asarray(metadata.background, gaussians.mean.dtype),
-        mean2d_offset=probe,
-        depth=depth,
-    )
-
-
-def _exposed(effects, params, rendered, view):
-    """Apply the exposure model of the view to a render."""
-    for effect in effects:
-        if effect.expose is not None:
-            own_params = params.nets.get(effect.name)
-            color = effect.expose(own_params, rendered.color, view.appearance)
-            rendered = rendered._replace(color=color)
-    return rendered
 
 
 def _posed(effects, params, frames):
@@ -306,8 +273,20 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
         rows, rendered = deformation.rendered(effects, params, moved, condition)
         posed = _posed(effects, params, frames)
         view = _view(posed, row)
-        frame = _draw(spec, metadata, rows, rendered, view, size, degree, probe, depth)
-        exposed = _exposed(effects, params, frame.rendering, view)
+        frame = drawing.draw(
+            spec,
+            metadata,
+            effects,
+            params,
+            rows,
+            rendered,
+            view,
+            size,
+            degree,
+            mean2d_offset=probe,
+            depth=depth,
+        )
+        exposed = drawing.exposed(effects, params, frame.rendering, view)
         observation = observe(posed, row, exposed)
         states = state.aux_state.effects
         value, metrics = loss_of(spec, effects, params, observation, condition, states)

@@ -9,6 +9,7 @@ from gaussians_jax.losses.flow import FlowSpec
 from gaussians_jax.losses.neighbors import NeighborSpec
 from gaussians_jax.losses.opacity_scale import OpacityScaleSpec
 from gaussians_jax.losses.spectral import SpectralSpec
+from gaussians_jax.losses.transients import TransientMaskSpec
 from gaussians_jax.motion.anchors import AnchorMotionSpec, RateSpec
 from gaussians_jax.motion.basis import SMALL_BASIS_MOTION
 from gaussians_jax.motion.carried import CarriedSpec, TurnSpec
@@ -24,9 +25,12 @@ from gaussians_jax.motion.splines import SplineMotionSpec
 from gaussians_jax.motion.temporal_opacity import TemporalOpacitySpec
 from gaussians_jax.motion.time_basis import SMALL_TIME_BASIS
 from gaussians_jax.optim.densification import DefaultStrategySpec
+from gaussians_jax.optim.floaters import FloaterSpec
 from gaussians_jax.optim.learning_rates import LearningRateSpec
 from gaussians_jax.optim.mcmc import MCMCStrategySpec
 from gaussians_jax.optim.phases import AlternationSpec, AnnealingSpec
+from gaussians_jax.per_frame.appearance import AppearanceSpec, ColorNetworkSpec
+from gaussians_jax.per_frame.sky import SkySpec
 from gaussians_jax.scene.spec import SplatScene
 from gaussians_jax.splatting.raster_spec import RasterSpec
 from nerfies_jax.nn.encoding import EncodingSpec
@@ -77,6 +81,18 @@ SMALL_MCMC = dataclasses.replace(
     strategy=MCMCStrategySpec(
         refine_every=50, refine_start_iter=300, refine_stop_iter=2500, cap_max=10_000
     ),
+)
+SMALL_COLLECTION = dataclasses.replace(
+    SMALL_STATIC,
+    init=dataclasses.replace(SMALL_STATIC.init, extra_random=0),
+    strategy=dataclasses.replace(SMALL_STRATEGY, floaters=FloaterSpec()),
+    appearance=AppearanceSpec(
+        code=20,
+        network=ColorNetworkSpec(bands=2, depth=1, width=32),
+        sky=SkySpec(),
+        learning_rate=5e-3,
+    ),
+    transients=TransientMaskSpec(),
 )
 STRATEGY_FROM_TRACKS = dataclasses.replace(
     SMALL_STRATEGY,

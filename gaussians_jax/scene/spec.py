@@ -4,7 +4,13 @@ import dataclasses
 
 from gaussians_jax.core import protocols
 from gaussians_jax.core.metadata import SceneMetadata
-from gaussians_jax.core.protocols import Appearance, CameraOptimizer, Motion, Strategy
+from gaussians_jax.core.protocols import (
+    Appearance,
+    CameraOptimizer,
+    GaussianAppearance,
+    Motion,
+    Strategy,
+)
 from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.init.points import InitSpec, StartSpec
 from gaussians_jax.losses import flow as motion_flow
@@ -42,6 +48,7 @@ from gaussians_jax.optim.learning_rates import LearningRateSpec
 from gaussians_jax.optim.mcmc import MCMCStrategySpec
 from gaussians_jax.optim.optimizer import scale_by_row_adam, scale_by_row_radam
 from gaussians_jax.optim.phases import AlternationSpec, AnnealingSpec
+from gaussians_jax.per_frame.appearance import AppearanceSpec
 from gaussians_jax.per_frame.exposure import ExposureSpec
 from gaussians_jax.per_frame.poses import PoseRefinementSpec
 from gaussians_jax.splatting.raster_spec import RasterSpec
@@ -86,6 +93,7 @@ PROTOCOLS = {
     "motion": Motion,
     "strategy": Strategy,
     "exposure": Appearance,
+    "appearance": GaussianAppearance,
     "poses": CameraOptimizer,
 }
 WITHOUT_NETWORKS = PolynomialMotionSpec, SplineMotionSpec  # only per-Gaussian params
@@ -119,6 +127,8 @@ class SplatScene:
     spectral: SpectralSpec | None = None
     depth: DepthSpec | None = None
     exposure: ExposureSpec | Appearance | Settings | None = None
+    # The light of each photograph, in place of an exposure.
+    appearance: AppearanceSpec | GaussianAppearance | Settings | None = None
     flow: FlowSpec | None = None
     opacity_scale: OpacityScaleSpec | None = None
     smooth_depth: SmoothDepthSpec | None = None
@@ -224,6 +234,17 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "motion to fit to tracks; leave one of them out"
         )
     _refuse_beside_children(spec)
+    if motion is not None and getattr(spec.strategy, "floaters", None) is not None:
+        raise ValueError(
+            "strategy.floaters tests the positions of Gaussians that do not move, and "
+            "this scene has a motion; leave it out as well (strategy.floaters=none)"
+        )
+    if spec.exposure is not None and spec.appearance is not None:
+        raise ValueError(
+            "exposure and appearance both model the light of a photograph, and a code "
+            "can be fitted for one of them only; leave one out (exposure=none or "
+            "appearance=none)"
+        )
     warm_up = 0 if spec.start.motion == "tracks" else getattr(motion, "warm_up", 0)
     if warm_up and _fading(motion) is not None:
         raise ValueError(
@@ -252,6 +273,11 @@ def _refuse_beside_children(spec):
         raise ValueError(
             "the flow loss needs rendered Gaussians, and parents of child Gaussians "
             f"are not rendered; leave it out (flow=none), or {ALONE}"
+        )
+    if has_children and spec.appearance is not None:
+        raise ValueError(
+            "appearance has a feature for each Gaussian, and parents of child "
+            f"Gaussians are not rendered; leave it out (appearance=none), or {ALONE}"
         )
     settings = {
         "temporal_opacity": spec.temporal_opacity,
@@ -364,6 +390,8 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[SplatRecord, 
     effects += [protocols.compile_regularizer(one) for one in early]
     if spec.exposure is not None:
         effects.append(protocols.compile_appearance(bound(spec.exposure)))
+    if spec.appearance is not None:
+        effects.append(protocols.compile_gaussian_appearance(bound(spec.appearance)))
     effects += [protocols.compile_regularizer(one) for one in late]
     if spec.poses is not None:
         effects.append(protocols.compile_camera_optimizer(bound(spec.poses)))

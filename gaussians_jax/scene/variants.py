@@ -13,7 +13,8 @@ from gaussians_jax.scene import scene
 from nerfies_jax.evaluation.representation import Parts, check_there
 from nerfies_jax.training.model import Model, Stages, TrainState
 
-REMOVABLE = ("motion", "carried", "exposure")  # components that affect a render
+# Components that affect a render
+REMOVABLE = ("motion", "carried", "exposure", "appearance")
 INSTANTS = 33  # frame times at which moving Gaussians are detected
 
 
@@ -21,7 +22,8 @@ def parts(spec, metadata) -> Parts:
     """Return the components that can be left out: those that affect a render."""
     del metadata
     present = tuple(name for name in REMOVABLE if getattr(spec, name) is not None)
-    return Parts(present, appearance=spec.exposure is not None)
+    per_image = spec.exposure is not None or spec.appearance is not None
+    return Parts(present, appearance=per_image)
 
 
 def without_effects(spec, metadata, without: tuple[str, ...], blended: bool) -> Model:

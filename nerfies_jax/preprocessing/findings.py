@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 CERTAIN, LIKELY, CANNOT_TELL = "certain", "likely", "cannot tell"
 # Names of the effects in all findings.
@@ -10,6 +10,11 @@ MOTION, LIGHT, TRANSIENT = "motion", "appearance codes", "transient objects"
 START, BACKGROUND = "start from points", "background points"
 DEPTH, MASKS, LENS = "depth", "masks of what moves", "lens distortion"
 TEXTURE = "more texture bands"
+# Not an effect, but a kind of capture, which several findings together tell
+# (`is_collection`).
+COLLECTION = "photo collection"
+# Photographs differ in light by this much (root mean square), or more.
+COLLECTION_STOPS = 0.5
 # Factors by which a value must differ from its threshold. The gain of an effect is
 # known to a factor of two at best, so values within a quarter are undecided.
 CERTAIN_FACTOR, LIKELY_FACTOR = 2.0, 1.25
@@ -69,6 +74,31 @@ def judge(
     if factor < LIKELY_FACTOR:
         return None, CANNOT_TELL
     return above, CERTAIN if factor >= CERTAIN_FACTOR else LIKELY
+
+
+def is_collection(findings: Iterable[Finding]) -> bool:
+    """Test if frames are photographs of one scene in changing light, not a video.
+
+    Nothing can be followed from one frame to the next, so transient objects are
+    undecided and no track moves, and the light certainly differs.
+
+    Args:
+      findings: Findings about motion, transient objects and light.
+
+    Returns:
+      True for a photo collection.
+    """
+    by_effect = {one.effect: one for one in findings}
+    if not {MOTION, TRANSIENT, LIGHT} <= by_effect.keys():
+        return False
+    motion, light = by_effect[MOTION], by_effect[LIGHT]
+    # Outlines, which people and cars in front change as well, say nothing.
+    if motion.wanted and "moving_share" in motion.numbers:
+        return False
+    if by_effect[TRANSIENT].wanted is not None:
+        return False
+    changes = light.wanted and light.confidence == CERTAIN
+    return bool(changes) and light.numbers.get("drift_stops", 0) >= COLLECTION_STOPS
 
 
 def cannot_tell(effect: str, reason: str, threshold: str = "") -> Finding:

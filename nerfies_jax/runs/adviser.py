@@ -5,7 +5,12 @@ from collections.abc import Callable
 
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import Representation
-from nerfies_jax.preprocessing.findings import Finding, table
+from nerfies_jax.preprocessing.findings import (
+    COLLECTION,
+    Finding,
+    is_collection,
+    table,
+)
 from nerfies_jax.runs import prices, representations
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.effect_choice import Trial
@@ -67,6 +72,7 @@ def advise(
         raise ValueError(
             f"the {representation.name} representation recommends no presets"
         )
+    wanted[COLLECTION] = is_collection(findings)
     choice = representation.recommendation.advise(wanted, full, family)
     return Advice(
         representation.name,

@@ -22,6 +22,7 @@ GROUP = "nerfies_jax.representations"
 USUAL = "splats-tracked-small"
 # Presets of both packages, because command lines are parsed without importing JAX.
 PRESETS = (
+    *("splats-collection", "splats-collection-small"),
     *("splats-static", "splats-mcmc", "splats-tracked", "splats-deformable"),
     *("sonata", "moba", "dynmf", "spacetime", "spline", "4dgs", "sc-gs", "edgs"),
     *("e-d3dgs", "e-d3dgs-small"),

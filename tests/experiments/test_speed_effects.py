@@ -62,6 +62,8 @@ def test_every_default_preset_has_effects_and_every_paper_is_there():
         assert priced, name
     left_out = {"nerf-small", "d-nerf-small", "t-nerf-small"}
     left_out |= {"splats-mcmc-small"}
+    # Two effects, which both read the photographs of a collection.
+    left_out |= {"splats-collection-small"}
     small = {n for n in presets if n.endswith("-small")}
     left_out |= {n for n in small if "-grid-" in n}  # the same effects once more
     assert small - set(effects.PRESETS) == left_out  # nothing, or the warp alone

@@ -8,6 +8,14 @@ import pytest
 from gaussians_jax import representation
 from gaussians_jax.scene.presets import PRESETS
 from nerfies_jax.preprocessing import record, rigid_groups, usable_paths
+from nerfies_jax.preprocessing.findings import (
+    CERTAIN,
+    LIGHT,
+    MOTION,
+    TRANSIENT,
+    Finding,
+    cannot_tell,
+)
 from nerfies_jax.training import specs
 from tests.preprocessing import films
 from tests.preprocessing.test_tracks import MOVES
@@ -52,6 +60,23 @@ def test_what_moves_and_cannot_be_followed_is_no_still_scene(monkeypatch):
     choice = representation.default_preset(films.film(**MOVES, frames=24))
     assert choice.preset == UNTRACKED
     assert "of the moving pixels are near a track" in "".join(choice.notes)
+
+
+@pytest.mark.parametrize("stops", [1.0, 0.2])
+def test_photographs_in_changing_light_get_an_appearance_of_each(stops, monkeypatch):
+    film = films.film(frames=24)
+    evidence = record.cached(film, representation.CACHE / "evidence")
+    apart = evidence._replace(unusable="the camera motion is discontinuous")
+    found = (
+        cannot_tell(MOTION, ""),
+        cannot_tell(TRANSIENT, ""),
+        Finding(LIGHT, "", "", True, CERTAIN, {"drift_stops": stops}),
+    )
+    monkeypatch.setattr(representation.record, "cached", lambda *_: apart)
+    monkeypatch.setattr(representation.inspection, "find", lambda *_: found)
+    choice = representation.default_preset(film)
+    preset = "splats-collection-small" if stops == 1 else UNTRACKED
+    assert choice.preset == preset
 
 
 def test_coverage_is_the_share_of_moving_pixels_near_known_paths():

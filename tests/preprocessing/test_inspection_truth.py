@@ -6,7 +6,7 @@ import pytest
 
 from nerfies_jax.capture import synthetic
 from nerfies_jax.preprocessing import inspection
-from nerfies_jax.preprocessing.findings import CERTAIN
+from nerfies_jax.preprocessing.findings import CERTAIN, is_collection
 
 # A scene without any effect, and one with two that only one built-in scene has each.
 # The others differ in how things move, not in what is to be decided.
@@ -46,4 +46,12 @@ def test_no_decision_on_a_built_in_scene_is_wrong(name):
     if not effects and answers["transient objects"] is None:
         answers["transient objects"] = False
     assert answers == truth
+    assert not is_collection(inspected.findings)
     assert inspected.finding("motion").confidence == CERTAIN
+
+
+@pytest.mark.slow
+def test_photographs_in_changing_light_are_a_collection():
+    small = dataclasses.replace(synthetic.PRESETS["collection"], frames=40)
+    capture, _ = synthetic.make(small, seed=5)
+    assert is_collection(inspection.find(capture, inspection.EFFECTS))

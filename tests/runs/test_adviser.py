@@ -161,6 +161,30 @@ def test_codes_and_media_come_in_where_the_preset_has_none():
     assert lit.exposure == ExposureSpec()
 
 
+def photographs(**numbers):
+    """Findings about photographs among which nothing can be followed."""
+    light = Finding("appearance codes", "", "", True, CERTAIN, numbers)
+    return (*findings(motion=None, transient_objects=None), light)
+
+
+def test_photographs_in_changing_light_get_an_appearance_of_each():
+    found = photographs(drift_stops=1.0)
+    for preset in ("splats-static-small", "splats-tracked-small"):
+        advice = adviser.advise_for(found, preset)
+        assert advice.preset == "splats-collection-small"
+        assert advice.overrides == ()
+    assert adviser.advise_for(found, "moba-small").preset == "moba-small"
+    moving = Finding("motion", "", "", True, CERTAIN, {"moving_share": 0.1})
+    still = findings(transient_objects=False)
+    for other in (
+        photographs(drift_stops=0.3),  # as automatic exposure
+        (*found, moving),
+        (*found, *still),
+        found[1:],
+    ):
+        assert adviser.advise_for(other, "splats-static-small").preset != advice.preset
+
+
 def test_no_medium_is_brought_in_beside_a_warp():
     spec, advice = spec_of("radiance", motion=True, transient_objects=True)
     assert spec.transient is None
