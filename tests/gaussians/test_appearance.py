@@ -233,12 +233,12 @@ def test_a_known_photograph_is_fitted_from_its_half(built):
     observed = dataclasses.replace(CAPTURE, images=images)
     score = held_out_exposure.scorer(SPEC, metadata, CAPTURE.size)
     halves = score(state, observed, observed.heldout)
-    # Rounding to 8 bits leaves 56 dB in the observed image.
-    assert halves.psnr.min() > 45
     neutral = variants.without_effects(SPEC, metadata, ("appearance",), False)
     plain = evaluation.Renderer(neutral, CAPTURE.size)
     base = plain(state, evaluation.view_of(CAPTURE, row)).color
-    assert np.abs(base - color).max() > 0.1
+    # Saturated pixels and the unknown right half of the sky leave 33 dB.
+    mean = evaluation.score_right_halves(observed, observed.heldout, [base])
+    assert halves.psnr.min() > 30 > mean.psnr.max() + 10
     assert variants.parts(SPEC, metadata).appearance
 
 
