@@ -204,6 +204,8 @@ def absent_modules(spec):
         gone.remove(carried)
     if getattr(motion, "fading", None) is not None:
         gone.remove(temporal_opacity)
+    if spec.appearance is not None:
+        gone.remove(exposure)  # its affine change of colors
     if getattr(spec.appearance, "sky", None) is None:
         gone.append(sky)
     return gone
