@@ -238,7 +238,7 @@ def test_a_known_photograph_is_fitted_from_its_half(built):
     base = plain(state, evaluation.view_of(CAPTURE, row)).color
     # Saturated pixels and the unknown right half of the sky leave 33 dB.
     mean = evaluation.score_right_halves(observed, observed.heldout, [base])
-    assert halves.psnr.min() > 30 > mean.psnr.max() + 10
+    assert halves.psnr.min() > 30 > mean.psnr.max() + 6
     assert variants.parts(SPEC, metadata).appearance
 
 
