@@ -28,7 +28,7 @@ def encode(rows: Splats) -> bytes:
     Returns:
       The file.
     """
-    order = _curve_order(np.asarray(rows.mean, np.float64))
+    order = curve_order(np.asarray(rows.mean, np.float64))
     leaves: Any = (np.asarray(leaf, np.float64)[order] for leaf in rows)
     rows = Splats(*leaves)
     color = 0.5 + SH_DC * rows.sh_dc[:, 0]
@@ -70,7 +70,7 @@ def encode(rows: Splats) -> bytes:
     return ("\n".join([*header, "end_header\n"])).encode() + b"".join(parts)
 
 
-def _curve_order(mean: np.ndarray) -> np.ndarray:
+def curve_order(mean: np.ndarray) -> np.ndarray:
     """Sort points along a Morton curve, so that chunks are small."""
     low, high = mean.min(axis=0), mean.max(axis=0)
     cells = (mean - low) / np.where(high > low, high - low, 1) * 1023
