@@ -1,0 +1,1 @@
+"""Plugins for other frameworks, which find them by entry points (docs/plugins.md)."""
