@@ -104,6 +104,9 @@ class RadianceScene:
     learning_rate_end: float = 5e-5
     template_rate: float = 1.0  # factor for the template
     table_rate: float = 1.0  # additional factor for the tables of the template
+    # Factor for latent codes. If codes learn more slowly than the template, density
+    # explains the exposures of photographs before codes do, and stays.
+    code_rate: float = 1.0
     optimizer: str | Optimizer = "adam"
     density_noise: float = 0.0  # standard deviation during training
     appearance: AppearanceSpec | None = None
@@ -150,7 +153,7 @@ class RadianceScene:
             raise ValueError(
                 f"density_noise={self.density_noise} must be finite and not negative"
             )
-        for name in ("template_rate", "table_rate"):
+        for name in ("template_rate", "table_rate", "code_rate"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(
                     f"{name}={getattr(self, name)} must be positive and finite"

@@ -360,6 +360,36 @@ STILL_NERF_GRID = dataclasses.replace(
     coarse=dataclasses.replace(COARSE_GRID_TEMPLATE, density_bias=EMPTIER),
 )
 
+# For photo collections. Codes need a much larger rate than in a video: the grid learns
+# within 100 steps, and what codes do not explain by then it explains by fog in front of
+# each camera, which stays. Built-in scene `collection`, one seed, PSNR with codes
+# fitted to the left half of a held-out photograph and evaluated on the right half, and
+# median error of the depth:
+#   codes at the common rate, transients from the start   600 steps    20.8 dB    56 %
+#   rate of codes x 10, no transients                    1600          26.5        9
+#   x 30                                                 1600          27.3        8
+#   x 30                                                 3200          26.8        8
+#   x 10, transients late, thin and priced               1600          26.7        7
+#   x 30, transients late, thin and priced               3200          27.8        5
+# All but the first have the box and the samples around the subject.
+SMALL_NERF_W_GRID = _on_grid(
+    dataclasses.replace(
+        SMALL_NERF_W,
+        volume="subject",
+        sampling=SamplingSpec(16, 16, spacing="center"),
+        code_rate=30.0,
+        transient=TransientSpec(
+            code_width=8,
+            depth=2,
+            width=48,
+            beta_power=1.0,
+            density_weight=0.1,
+            density_bias=-3.0,
+            hold_steps=750,
+        ),
+    )
+)
+
 PRESETS = {
     "nerf": NERF,
     "nerf-w": NERF_W,
@@ -380,7 +410,7 @@ PRESETS = {
     "tineuvox-small": SMALL_TINEUVOX,
     "nerf-ds-small": SMALL_NERF_DS,
     "nerf-grid-small": STILL_NERF_GRID,
-    "nerf-w-grid-small": _on_grid(SMALL_NERF_W),
+    "nerf-w-grid-small": SMALL_NERF_W_GRID,
     "d-nerf-grid-small": _on_grid(SMALL_D_NERF),
     "nerfies-grid-small": _on_grid(SMALL_NERFIES),
     "hypernerf-grid-small": _on_grid(SMALL_HYPERNERF),

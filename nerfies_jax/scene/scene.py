@@ -286,6 +286,8 @@ def learning_rates(
     )(step)
     rates: dict[str, PyTree]
     rates = {name: own[name](step) if name in own else common for name in params}
+    if "codes" in rates:
+        rates["codes"] = spec.code_rate * common
     held: Array | float = 1.0
     if spec.start.motion == "tracks":
         held = schedules.log_linear(spec.start.first_rate, 1.0, spec.steps)(step)

@@ -89,6 +89,7 @@ def sample_pdf(edges, weights, count):
         (lambda: RadianceScene(1, learning_rate=np.inf), "learning_rate=inf.*finite"),
         (lambda: RadianceScene(1, template_rate=np.inf), "template_rate=inf.*finite"),
         (lambda: RadianceScene(1, table_rate=np.inf), "table_rate=inf.*finite"),
+        (lambda: RadianceScene(1, code_rate=0.0), "code_rate=0.0.*positive"),
         (lambda: RadianceScene(1, ON_MOMENTS), "position.moments=none"),
         (lambda: RadianceScene(1, coarse=ON_MOMENTS), "position.moments=none"),
         (

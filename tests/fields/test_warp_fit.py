@@ -205,6 +205,15 @@ def test_a_medium_on_tables_learns_at_the_rate_of_the_template(motion):
     assert own.network == rates["template"] == spec.template_rate * own.blend
 
 
+def test_codes_learn_at_a_rate_of_their_own():
+    preset = presets.PRESETS["nerf-w-grid-small"]
+    field = scene.field(preset, field_of("nsff-small").metadata)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    rates = scene.learning_rates(preset, field.effects, params, jnp.int32(0))
+    assert set(params["codes"]) == {"appearance", "transient"}
+    assert rates["codes"] == preset.code_rate * preset.learning_rate
+
+
 @pytest.mark.full
 def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
     """Against the body's own velocity; also where frames are two moments apart.
