@@ -86,9 +86,8 @@ def centered(
 ) -> Float[Array, " count"]:
     """Sample distances in [near, far] that are dense around a middle.
 
-    The density is 1 / (width² + (t - middle)²). Samples are at equal angles as seen
-    from a point at the distance `width` from the middle of the ray. They have no
-    gradient.
+    The density of samples is proportional to 1 / (width + |t - middle|)², so that half
+    of those of a long ray are within `width` of the middle. They have no gradient.
 
     Args:
       key: PRNG key, or None.
@@ -96,20 +95,27 @@ def centered(
       far: Distance of the last sample.
       count: Number of samples, at least 2.
       middle: Distance of the largest density.
-      width: Half width of the density at half of its maximum, positive.
+      width: Distance from the middle at which the density is a quarter of its maximum,
+        positive.
 
     Returns:
       Sorted distances, [count].
     """
     near, far, middle, width = jax.lax.stop_gradient((near, far, middle, width))
     width = jnp.where(width > 0, width, 1)  # finite also for a width of zero
-    # Farther away, angles round to a right one.
+    # Distances in widths are contracted to (-1, 1). Equal angles have nearly the same
+    # density, but `jnp.arctan` is wrong with wide vectors (`runs.platform.start_jax`),
+    # and all samples were drawn next to the far plane.
     start, end = (
-        jnp.arctan(jnp.clip((side - middle) / width, -WIDTHS, WIDTHS))
+        _contracted(jnp.clip((side - middle) / width, -WIDTHS, WIDTHS))
         for side in (near, far)
     )
-    angle = stratified(key, start, end, count)
-    return jnp.clip(middle + width * jnp.tan(angle), near, far)
+    place = stratified(key, start, end, count)
+    return jnp.clip(middle + width * place / (1 - jnp.abs(place)), near, far)
+
+
+def _contracted(x):
+    return x / (1 + jnp.abs(x))
 
 
 def among(

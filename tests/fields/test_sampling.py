@@ -307,7 +307,7 @@ def test_a_weight_that_is_not_a_number_shows(dtype):
 
 
 @pytest.mark.parametrize("near", [0.0, 2.5])
-def test_centered_samples_are_at_equal_angles_around_the_middle(near, dtype):
+def test_centered_samples_have_the_density_of_the_documentation(near, dtype):
     ends = (jnp.asarray(value, dtype) for value in (near, 40.0, 3.0, 0.5))
     start, far, middle, width = ends
 
@@ -315,10 +315,11 @@ def test_centered_samples_are_at_equal_angles_around_the_middle(near, dtype):
         return sampling.centered(key, start, far, 33, middle, width)
 
     even = np.asarray(at(None), float)
-    angles = np.arctan((even - 3) / 0.5)
-    np.testing.assert_allclose(np.diff(angles), np.diff(angles).mean(), rtol=2e-3)
+    # Equal integrals of the density between neighbors.
+    away = np.abs(even - 3)
+    integral = np.sign(even - 3) * (1 / 0.5 - 1 / (0.5 + away))
+    np.testing.assert_allclose(np.diff(integral), np.diff(integral).mean(), rtol=2e-3)
     np.testing.assert_allclose(even[[0, -1]], [near, 40], rtol=1e-4, atol=1e-5)
-    # Half of the angles are within the width of the middle.
     assert np.mean(np.abs(even - 3) <= 0.5) > 0.45
     jittered = at(jax.random.key(0))
     assert jittered.dtype == dtype

@@ -211,7 +211,8 @@ def test_codes_learn_at_a_rate_of_their_own():
     params = jax.eval_shape(field.init, jax.random.key(0))
     rates = scene.learning_rates(preset, field.effects, params, jnp.int32(0))
     assert set(params["codes"]) == {"appearance", "transient"}
-    assert rates["codes"] == preset.code_rate * preset.learning_rate
+    expected = preset.code_rate * preset.learning_rate
+    np.testing.assert_allclose(rates["codes"], expected, rtol=1e-6)
 
 
 @pytest.mark.full
