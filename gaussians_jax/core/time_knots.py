@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from gaussians_jax.core import splats, static_rows
@@ -50,7 +51,7 @@ def bake(
     deform: Callable[[Float[Array, ""]], Gaussians],
     knots: int,
     static_threshold: float = 0.0,
-    dtype=jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> Knots:
     """Evaluate a motion at all knots, on the host.
 

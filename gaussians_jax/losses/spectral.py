@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax.core.metadata import SceneMetadata
@@ -288,7 +289,7 @@ def _times_in_whole_spectrum(width, dtype):
     return jnp.where(once, 1, 2).astype(dtype)
 
 
-def init(spec: SpectralSpec, dtype=jnp.float32) -> Gates:
+def init(spec: SpectralSpec, dtype: DTypeLike = jnp.float32) -> Gates:
     """Initialize the logits at the opening: g = 0 for one half, as in the paper."""
     opening = _start_of_sigmoid(spec)
     logit = jnp.asarray(math.log(opening) - math.log1p(-opening), dtype)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Key
 
 from gaussians_jax.core.metadata import SceneMetadata
@@ -176,7 +177,10 @@ def _context_spec(spec: AnchorMotionSpec) -> MLPSpec:
 
 
 def init_features(
-    key: Key[Array, ""], spec: AnchorMotionSpec, count: int, dtype=jnp.float32
+    key: Key[Array, ""],
+    spec: AnchorMotionSpec,
+    count: int,
+    dtype: DTypeLike = jnp.float32,
 ) -> Features:
     """Initialize random features of anchors.
 
@@ -199,7 +203,10 @@ def init_features(
 
 
 def init(
-    key: Key[Array, ""], spec: AnchorMotionSpec, frames: int, dtype=jnp.float32
+    key: Key[Array, ""],
+    spec: AnchorMotionSpec,
+    frames: int,
+    dtype: DTypeLike = jnp.float32,
 ) -> Anchors:
     """Initialize networks without motion.
 

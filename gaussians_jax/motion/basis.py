@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax.core import splats
@@ -184,7 +185,9 @@ SMALL_BASIS_MOTION = BasisMotionSpec(
 )
 
 
-def init(key: Key[Array, ""], spec: BasisMotionSpec, dtype=jnp.float32) -> BasisMotion:
+def init(
+    key: Key[Array, ""], spec: BasisMotionSpec, dtype: DTypeLike = jnp.float32
+) -> BasisMotion:
     """Initialize networks that hardly move anything."""
     base_key, basis_key, weights_key = jax.random.split(key, 3)
     basis = None

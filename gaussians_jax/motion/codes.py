@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core import splats
@@ -115,7 +116,7 @@ def _random_waves(key, spec, positions, width):
 
 
 def init_times(
-    key: Key[Array, ""], spec: Codes, frames: int, dtype=jnp.float32
+    key: Key[Array, ""], spec: Codes, frames: int, dtype: DTypeLike = jnp.float32
 ) -> Float[Array, "moments code"]:
     """Initialize the table of time codes like the embeddings.
 

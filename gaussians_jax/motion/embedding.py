@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax.core.metadata import SceneMetadata
@@ -102,7 +103,10 @@ class EmbeddingMotion(NamedTuple):
 
 
 def init(
-    key: Key[Array, ""], spec: EmbeddingMotionSpec, frames: int, dtype=jnp.float32
+    key: Key[Array, ""],
+    spec: EmbeddingMotionSpec,
+    frames: int,
+    dtype: DTypeLike = jnp.float32,
 ) -> EmbeddingMotion:
     """Initialize networks without motion.
 

@@ -20,6 +20,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax.core import splats
@@ -241,7 +242,10 @@ SMALL_KAN_MOTION = KanMotionSpec(time_code=16, hidden=(32, 32), kernels=5, base=
 
 
 def init(
-    key: Key[Array, ""], spec: KanMotionSpec, frames: int, dtype=jnp.float32
+    key: Key[Array, ""],
+    spec: KanMotionSpec,
+    frames: int,
+    dtype: DTypeLike = jnp.float32,
 ) -> KanMotion:
     """Initialize a motion model without motion.
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax.core import splats
@@ -146,7 +147,9 @@ def _time_width(spec):
     return spec.time.width(1) if spec.time_code is None else spec.time_code
 
 
-def init(key: Key[Array, ""], spec: MotionSpec, dtype=jnp.float32) -> Motion:
+def init(
+    key: Key[Array, ""], spec: MotionSpec, dtype: DTypeLike = jnp.float32
+) -> Motion:
     """Initialize a network that hardly moves anything."""
     trunk_key, time_key = jax.random.split(key)
     trunk = mlp.init(trunk_spec(spec), trunk_key, dtype)

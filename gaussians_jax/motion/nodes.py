@@ -43,6 +43,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax.core import splats
@@ -190,7 +191,9 @@ SMALL_NODE_MOTION = NodeMotionSpec(
 )
 
 
-def init(key: Key[Array, ""], spec: NodeMotionSpec, dtype=jnp.float32) -> Nodes:
+def init(
+    key: Key[Array, ""], spec: NodeMotionSpec, dtype: DTypeLike = jnp.float32
+) -> Nodes:
     """Initialize nodes at the origin that hardly move anything (`_place_nodes`)."""
     return Nodes(
         position=jnp.zeros((spec.nodes, 3), dtype),

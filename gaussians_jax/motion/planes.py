@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core.metadata import SceneMetadata
@@ -112,7 +113,9 @@ SMALL_PLANE_MOTION = PlaneMotionSpec(
 )
 
 
-def init(key: Key[Array, ""], spec: PlaneMotionSpec, dtype=jnp.float32) -> Motion:
+def init(
+    key: Key[Array, ""], spec: PlaneMotionSpec, dtype: DTypeLike = jnp.float32
+) -> Motion:
     """Initialize planes and a network that hardly move anything."""
     planes_key, network_key = jax.random.split(key)
     return Motion(

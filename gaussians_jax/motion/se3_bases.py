@@ -21,6 +21,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core import splats, time_knots
@@ -121,7 +122,9 @@ class Motion(NamedTuple):
     offset: Float[Array, "bases 3"]
 
 
-def init(key: Key[Array, ""], spec: SE3BasesSpec, dtype=jnp.float32) -> Bases:
+def init(
+    key: Key[Array, ""], spec: SE3BasesSpec, dtype: DTypeLike = jnp.float32
+) -> Bases:
     """Initialize bases with small motions. Equal bases would get equal gradients."""
     shape = (spec.bases, spec.knots, 3)
     shift = 1e-3 * jax.random.normal(key, shape, dtype)
@@ -130,7 +133,7 @@ def init(key: Key[Array, ""], spec: SE3BasesSpec, dtype=jnp.float32) -> Bases:
     return Bases(fine, Poses(zero, zero), jnp.zeros((spec.bases, 3), dtype))
 
 
-def init_logits(spec: SE3BasesSpec, gaussians: int, dtype=jnp.float32):
+def init_logits(spec: SE3BasesSpec, gaussians: int, dtype: DTypeLike = jnp.float32):
     """Initialize logits [gaussians, 1 + bases] of static Gaussians."""
     logits = jnp.zeros((gaussians, 1 + spec.bases), dtype)
     return logits.at[:, 0].set(spec.still_logit)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core import splats, time_knots
@@ -62,7 +63,9 @@ class Splines(NamedTuple):
     turn: Float[Array, "gaussians knots 3"]  # rotation vectors, rad, in world axes
 
 
-def init(spec: SplineMotionSpec, gaussians: int, dtype=jnp.float32) -> Splines:
+def init(
+    spec: SplineMotionSpec, gaussians: int, dtype: DTypeLike = jnp.float32
+) -> Splines:
     """Initialize control points without motion.
 
     Args:

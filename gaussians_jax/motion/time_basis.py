@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax.core import splats
@@ -116,12 +117,16 @@ def network_spec(spec: TimeBasisSpec) -> MLPSpec:
 SMALL_TIME_BASIS = TimeBasisSpec(time=EncodingSpec(4, times_pi=True), depth=2, width=64)
 
 
-def init(key: Key[Array, ""], spec: TimeBasisSpec, dtype=jnp.float32) -> MLP:
+def init(
+    key: Key[Array, ""], spec: TimeBasisSpec, dtype: DTypeLike = jnp.float32
+) -> MLP:
     """Initialize a network whose trajectories are all different."""
     return mlp.init(network_spec(spec), key, dtype)
 
 
-def _init_coefficients(spec: TimeBasisSpec, gaussians: int, dtype=jnp.float32):
+def _init_coefficients(
+    spec: TimeBasisSpec, gaussians: int, dtype: DTypeLike = jnp.float32
+):
     """Initialize static coefficients [gaussians, count]."""
     return jnp.zeros((gaussians, spec.count), dtype)
 

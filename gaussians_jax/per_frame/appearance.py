@@ -21,6 +21,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core.metadata import SceneMetadata
@@ -147,7 +148,10 @@ def _hidden(spec: ColorNetworkSpec, code: int) -> MLPSpec:
 
 
 def init_network(
-    key: Key[Array, ""], spec: ColorNetworkSpec, code: int, dtype=jnp.float32
+    key: Key[Array, ""],
+    spec: ColorNetworkSpec,
+    code: int,
+    dtype: DTypeLike = jnp.float32,
 ) -> ColorNetwork:
     """Initialize the network.
 

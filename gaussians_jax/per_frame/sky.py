@@ -9,6 +9,7 @@ import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Key
 
 from gaussians_jax.splatting import harmonics
@@ -51,7 +52,9 @@ def _network(spec, code):
     return MLPSpec(code, 1, spec.width, (("out", head),), (), "relu", "he")
 
 
-def init(key: Key[Array, ""], spec: SkySpec, code: int, dtype=jnp.float32) -> Sky:
+def init(
+    key: Key[Array, ""], spec: SkySpec, code: int, dtype: DTypeLike = jnp.float32
+) -> Sky:
     """Initialize a gray sky in all photographs.
 
     Args:

@@ -67,8 +67,7 @@ def sample_along_rays(
 
     Raises:
       ValueError: If a shape or type, `num_samples` or `spacing` is invalid, or if
-      `near`
-        or `far` is invalid, unless they are traced.
+        `near` or `far` is invalid, unless they are traced.
 
     References:
       Stratified sampling, Mildenhall et al. 2020, arXiv:2003.08934, section 4.

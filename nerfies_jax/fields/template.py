@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.nn import dense, encoding, grids, mlp, planes, voxels
@@ -151,7 +152,7 @@ def init(
     key: Key[Array, ""],
     inputs: int,
     condition: int,
-    dtype=jnp.float32,
+    dtype: DTypeLike = jnp.float32,
 ) -> Template:
     """Initialize the parameters with Glorot weights.
 

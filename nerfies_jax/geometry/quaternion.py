@@ -6,6 +6,7 @@ exactly one.
 """
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from nerfies_jax.geometry.fusion import components, stacked
@@ -50,7 +51,7 @@ def normalize(quaternion: Quaternion) -> Quaternion:
     return stacked([part / length for part in parts])
 
 
-def identity(dtype=jnp.float32) -> Quaternion:
+def identity(dtype: DTypeLike = jnp.float32) -> Quaternion:
     """Make the identity rotation.
 
     Args:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from nerfies_jax.geometry import camera as cameras
@@ -62,7 +63,9 @@ def pixel_rays(camera: Camera, size: tuple[int, int]) -> Rays:
     )
 
 
-def pixel_centers(size: tuple[int, int], dtype=jnp.float32) -> Float[Array, "h w 2"]:
+def pixel_centers(
+    size: tuple[int, int], dtype: DTypeLike = jnp.float32
+) -> Float[Array, "h w 2"]:
     """Return the positions (column + 0.5, row + 0.5) of all pixels of an image.
 
     Args:

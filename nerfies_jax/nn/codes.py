@@ -5,13 +5,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 Table = Float[Array, "ids code"]
 
 
 def init(
-    key: Key[Array, ""], ids: int, width: int, scale: float = 0.05, dtype=jnp.float32
+    key: Key[Array, ""],
+    ids: int,
+    width: int,
+    scale: float = 0.05,
+    dtype: DTypeLike = jnp.float32,
 ) -> Table:
     """Initialize codes uniformly in [-scale, scale].
 

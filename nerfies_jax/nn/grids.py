@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.geometry.precision import exact_product
@@ -92,7 +93,9 @@ class HashGridSpec:
         )
 
 
-def init(spec: HashGridSpec, key: Key[Array, ""], dtype=jnp.float32) -> Tables:
+def init(
+    spec: HashGridSpec, key: Key[Array, ""], dtype: DTypeLike = jnp.float32
+) -> Tables:
     """Initialize tables uniformly in [-1e-4, 1e-4].
 
     Args:

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Key
 
 from nerfies_jax.geometry.precision import at_least_float32, power_of_two
@@ -202,7 +203,9 @@ def spacing(spec: KANSpec, layer: int) -> float:
     return (high - low) / gaps
 
 
-def centers(spec: KANSpec, layer: int, dtype=jnp.float32) -> Float[Array, " kernels"]:
+def centers(
+    spec: KANSpec, layer: int, dtype: DTypeLike = jnp.float32
+) -> Float[Array, " kernels"]:
     """Return the fixed centers of a layer, or the initial ones if they are trained.
 
     The centers of B-splines begin and end one interval outside the grid, so that the
@@ -238,7 +241,7 @@ def width(spec: KANSpec, layer: int) -> float:
 
 
 @checked
-def init(key: Key[Array, ""], spec: KANSpec, dtype=jnp.float32) -> KAN:
+def init(key: Key[Array, ""], spec: KANSpec, dtype: DTypeLike = jnp.float32) -> KAN:
     """Initialize the parameters of a network.
 
     Hidden layers and `out_features` are initialized as "glorot": inputs that cover the

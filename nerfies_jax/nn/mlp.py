@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Key
 
 from nerfies_jax.nn import dense
@@ -100,7 +101,7 @@ class MLPSpec:
         return self.width if self.depth else self.inputs
 
 
-def init(spec: MLPSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
+def init(spec: MLPSpec, key: Key[Array, ""], dtype: DTypeLike = jnp.float32) -> MLP:
     """Initialize the parameters, with zero biases.
 
     All types start from the same numbers.
@@ -126,7 +127,11 @@ def init(spec: MLPSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
 
 
 def init_layer(
-    key: Key[Array, ""], inputs: int, outputs: int, init: str, dtype=jnp.float32
+    key: Key[Array, ""],
+    inputs: int,
+    outputs: int,
+    init: str,
+    dtype: DTypeLike = jnp.float32,
 ) -> Layer:
     """Initialize one affine map, with zero bias.
 

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 COMBINATIONS = ("product", "sum")
@@ -109,7 +110,9 @@ class Level(NamedTuple):
 Lines = tuple[tuple[Float[Array, "_ features"], ...], ...]
 
 
-def init(spec: PlanesSpec, key: Key[Array, ""], dtype=jnp.float32) -> tuple[Level, ...]:
+def init(
+    spec: PlanesSpec, key: Key[Array, ""], dtype: DTypeLike = jnp.float32
+) -> tuple[Level, ...]:
     """Initialize planes of space uniformly and planes of time to the neutral element.
 
     Args:

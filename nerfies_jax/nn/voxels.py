@@ -13,6 +13,7 @@ import dataclasses
 import math
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from nerfies_jax.nn import encoding, grids
@@ -81,7 +82,7 @@ class VoxelGridSpec:
         return EncodingSpec(self.bands).width(self.levels * self.features)
 
 
-def init(spec: VoxelGridSpec, key=None, dtype=jnp.float32) -> Tables:
+def init(spec: VoxelGridSpec, key=None, dtype: DTypeLike = jnp.float32) -> Tables:
     """Initialize the grid with zeros, as published.
 
     Args:

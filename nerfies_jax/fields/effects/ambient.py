@@ -12,6 +12,7 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.fields.effects.effect import Vector, guides_of
@@ -145,7 +146,7 @@ class BentBound(Bound):
         return init(self.spec, key)
 
 
-def init(spec: AmbientSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
+def init(spec: AmbientSpec, key: Key[Array, ""], dtype: DTypeLike = jnp.float32) -> MLP:
     """Initialize a bent surface near the plane through zero, for all codes.
 
     Args:

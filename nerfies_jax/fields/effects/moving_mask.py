@@ -14,6 +14,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Key
 
 from nerfies_jax.fields.effects.effect import RayOutput, Scalar, Vector
@@ -107,7 +108,9 @@ def network(spec: MovingMaskSpec) -> MLPSpec:
     )
 
 
-def init(spec: MovingMaskSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
+def init(
+    spec: MovingMaskSpec, key: Key[Array, ""], dtype: DTypeLike = jnp.float32
+) -> MLP:
     """Initialize the network with probabilities of one half.
 
     Args:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.fields import compositing, template
@@ -175,7 +176,10 @@ class Bound:
 
 
 def init(
-    spec: SceneFlowSpec, key: Key[Array, ""], features: int, dtype=jnp.float32
+    spec: SceneFlowSpec,
+    key: Key[Array, ""],
+    features: int,
+    dtype: DTypeLike = jnp.float32,
 ) -> SceneFlow:
     """Initialize the parameters: small flow, logits of disocclusion and blend near 0.
 

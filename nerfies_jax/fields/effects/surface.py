@@ -15,6 +15,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from nerfies_jax.fields.effects.effect import (
@@ -86,7 +87,7 @@ def effect(spec: SurfaceSpec, widths: dict[str, int]) -> FieldRecord:
 
 
 def init(
-    widths: dict[str, int], key: Key[Array, ""], dtype=jnp.float32
+    widths: dict[str, int], key: Key[Array, ""], dtype: DTypeLike = jnp.float32
 ) -> dict[str, Layer]:
     """Initialize a head for each level.
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Key
 
 from nerfies_jax.fields.effects.effect import Scalar, Vector
@@ -87,7 +88,9 @@ def _shift_network(spec: TimeWarpSpec) -> MLPSpec:
     return MLPSpec(inputs, spec.depth, spec.width, heads)
 
 
-def init(spec: TimeWarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> TimeWarp:
+def init(
+    spec: TimeWarpSpec, key: Key[Array, ""], dtype: DTypeLike = jnp.float32
+) -> TimeWarp:
     """Initialize near the identity. In a box of side two, shifts are at most 1e-4.
 
     Args:

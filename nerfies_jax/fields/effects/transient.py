@@ -13,6 +13,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Key
 
 from nerfies_jax.fields.effects.effect import Medium, Sample
@@ -126,7 +127,10 @@ def network(spec: TransientSpec, features: int) -> MLPSpec:
 
 
 def init(
-    spec: TransientSpec, key: Key[Array, ""], features: int, dtype=jnp.float32
+    spec: TransientSpec,
+    key: Key[Array, ""],
+    features: int,
+    dtype: DTypeLike = jnp.float32,
 ) -> MLP:
     """Initialize with Glorot weights.
 

@@ -10,6 +10,7 @@ import dataclasses
 import math
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.fields.effects.effect import Vector, guides_of
@@ -111,7 +112,7 @@ def network(spec: WarpSpec) -> MLPSpec:
     )
 
 
-def init(spec: WarpSpec, key: Key[Array, ""], dtype=jnp.float32) -> MLP:
+def init(spec: WarpSpec, key: Key[Array, ""], dtype: DTypeLike = jnp.float32) -> MLP:
     """Initialize near the identity. In a box of side two, shifts are at most 2e-4.
 
     Weights of an annealed band start at zero. They have no gradient until the band
