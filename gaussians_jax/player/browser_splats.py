@@ -55,6 +55,8 @@ def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
         backdrop = background.astype(color.dtype)
         painter = drawing.appearance_of(effects)
         if painter is not None:
+            assert painter.code is not None
+            assert painter.recolor is not None
             code = painter.code(params, appearance)
             color = painter.recolor(params, color, code)
             if painter.backdrop is not None:

@@ -65,10 +65,16 @@ def draw(
     background = jnp.asarray(metadata.background, gaussians.mean.dtype)
     coefficients = splats.active_harmonics(rows, degree)
     appearance = appearance_of(effects)
-    extras = dict(mean2d_offset=mean2d_offset, depth=depth)
     if appearance is None:
         return rendering.render_harmonics(
-            gaussians, coefficients, view.camera, size, raster, background, **extras
+            gaussians,
+            coefficients,
+            view.camera,
+            size,
+            raster,
+            background,
+            mean2d_offset=mean2d_offset,
+            depth=depth,
         )
     assert appearance.code is not None
     assert appearance.recolor is not None
@@ -80,7 +86,14 @@ def draw(
         direction = directions(camera, size, distorted=raster.distorted)
         background = appearance.backdrop(params, direction, code)
     return rendering.render(
-        gaussians, colors, camera, size, raster, background, **extras
+        gaussians,
+        colors,
+        camera,
+        size,
+        raster,
+        background,
+        mean2d_offset=mean2d_offset,
+        depth=depth,
     )
 
 
