@@ -10,6 +10,7 @@ import scipy.spatial
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.splats import Splats
+from gaussians_jax.init import visual_hull
 from nerfies_jax.capture.capture import Capture, point_depths
 from nerfies_jax.training.track_start import TrackStartSpec
 
@@ -21,8 +22,9 @@ class InitSpec:
     """Settings of the initial Gaussians.
 
     `source="auto"` uses the capture's points if there are at least `min_points`, and
-    random ones otherwise. "points" and "random" require one of them. MoBa-GS, which
-    claims to need no points from structure from motion, supports both.
+    random ones otherwise, in the visual hull if there is one. "points" and "random"
+    require the capture's points, and random ones in all views. MoBa-GS, which claims to
+    need no points from structure from motion, supports both.
 
     `extra_random` points are sampled in the views in addition to the capture's points.
     None means half as many as `points`, or none if tracks initialize the motion
@@ -152,7 +154,9 @@ def initial_count(spec: InitSpec, capture: Capture) -> int:
 def initial_points(spec: InitSpec, capture: Capture, seed: int):
     """Sample positions and colors of the initial Gaussians, on the host.
 
-    Random points lie between the near and far planes of the capture.
+    Random points lie between the near and far planes of the capture, and inside the
+    silhouettes of a static object in front of a known background
+    (`visual_hull.hull_points`).
 
     Args:
       spec: Settings.
@@ -165,7 +169,12 @@ def initial_points(spec: InitSpec, capture: Capture, seed: int):
     spec = of_start(spec, False)
     rng = np.random.default_rng(seed)
     if not uses_capture_points(spec, capture):
-        return _random_points(rng, capture, spec.random, (capture.near, capture.far))
+        span = capture.near, capture.far
+        if spec.source != "random":
+            inside = visual_hull.hull_points(rng, capture, spec.random, span)
+            if inside is not None:
+                return inside
+        return _random_points(rng, capture, spec.random, span)
     cloud = capture.points
     assert cloud is not None
     position, color = cloud.position, cloud.color / 255

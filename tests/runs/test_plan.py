@@ -50,12 +50,12 @@ def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
 
     monkeypatch.setattr(rate, "step_time", step_time)
     planned, line = plan.with_seconds(run, state, 10)
-    assert measured == [(run.model, 3000)]
+    assert measured == [(run.model, 2000)]
     # 200 static points may become 400.
     steps = 1000 / 2**0.5 if growing else 1000
     assert planned.spec.steps == planned.config.steps == plan.rounded(steps)
     assert planned.spec == runs.scene_spec(planned.config)
-    assert planned.spec.sh_every == 10 * round(planned.spec.steps / 30)
+    assert planned.spec.sh_every == 10 * round(70 * planned.spec.steps / 2000)
     longer = planned.model.init(planned.capture, jax.random.key(0))
     jax.tree.map(np.testing.assert_array_equal, longer.params, state.params)
     assert planned.capture is run.capture
@@ -66,7 +66,8 @@ def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
     assert ("grow 1.4 times" in line) == growing
     if growing:
         stop = planned.spec.strategy.refine_stop_iter
-        assert stop == 10 * round(200 * planned.spec.steps / 3000)
+        assert stop % 10 == 0
+        assert abs(stop - 0.65 * planned.spec.steps) <= 5
 
 
 def test_growth_is_expected_within_bounds():
