@@ -22,7 +22,7 @@ def _gaussians(args: Any, run: Any) -> str:
     visible = None
     if args.kept == "seen":
         visible = sampled.visible(_seen(run, state))
-        left_out = int(splats.active_mask(run.model.stages.rows(state.params)).sum())
+        left_out = splats.active_count(run.model.stages.rows(state.params))
         left_out -= int(visible.sum())
 
     def at(time):

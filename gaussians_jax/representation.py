@@ -3,6 +3,7 @@
 import pathlib
 from typing import Any
 
+import jax
 import numpy as np
 
 from gaussians_jax.core import splats
@@ -104,7 +105,7 @@ def growth(spec: Any, state: TrainState) -> float:
     """
     if spec.strategy is None:
         return 1.0
-    first = int(splats.active_mask(state.params.rows["splats"]).sum())
+    first = splats.active_count(state.params.rows["splats"])
     return min(max(spec.strategy.cap_max / first, 1.0) ** 0.5, 2.0)
 
 
@@ -115,7 +116,7 @@ def save(
     state: TrainState,
 ) -> Saved:
     """Write `model.npz`, the whole scene, and `gaussians.ply` for other viewers."""
-    if not bool(splats.active_mask(state.params.rows["splats"]).any()):
+    if not splats.active_count(state.params.rows["splats"]):
         return Saved(notes=(f"No Gaussian is left, so there is no {MODEL}.",))
     about = {"spec": spec, "metadata": metadata, "step": int(state.step)}
     size = model_file.save(folder / MODEL, state.params, about)
@@ -160,8 +161,9 @@ def player(
     poster: np.ndarray,
 ) -> Player:
     """Write `player.html`, with a poster uint8 [height, width, 3]."""
-    degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
+    degree = min(int(state.step) // spec.sh_every, spec.sh_degree)
     raster = raster_of(spec, model.spec[1])
+    degree = jax.device_put(np.int32(degree))
     return page.write(path, title, model, raster, degree, state, capture, poster)
 
 

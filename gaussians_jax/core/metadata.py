@@ -2,6 +2,13 @@
 
 import dataclasses
 import math
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from nerfies_jax.capture.scene_metadata import Number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,13 +30,15 @@ class SceneMetadata:
       distorted: True if the cameras have lens distortion.
     """
 
-    extent: float
-    background: tuple[float, float, float]
+    extent: Number
+    background: tuple[Number, Number, Number]
     frames: int
-    exposures: tuple[tuple[int, int, float], ...] = ((0, 0, 0.0),)
-    box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    exposures: tuple[tuple[int, int, float], ...] | Float[Array, "appearances 3"] = (
+        (0, 0, 0.0),
+    )
+    box: tuple[tuple[Number, ...], tuple[Number, ...]] | None = None
     near: float = math.inf
-    depth: float = 1.0
+    depth: Number = 1.0
     times: int | None = None
     distorted: bool = False
 
@@ -37,3 +46,34 @@ class SceneMetadata:
     def moments(self) -> int:
         """Number of distinct training times, which several cameras may share."""
         return self.frames if self.times is None else self.times
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """Fields that programs take as arguments (`training.programs`).
+
+        The others determine shapes, or which operations there are. `near` is rounded
+        instead (`scene.spec.raster_of`), because the settings of the rasterizer must be
+        hashable.
+        """
+        return {
+            "extent": self.extent,
+            "background": self.background,
+            "exposures": np.asarray(self.exposures, float),
+            "box": self.box,
+            "depth": self.depth,
+        }
+
+
+def is_traced(value: Any) -> bool:
+    """Test if a value belongs to a program that is being traced.
+
+    Such numbers of a capture cannot be validated. The same ones are validated when the
+    model is built from the capture.
+
+    Args:
+      value: A pytree.
+
+    Returns:
+      True if any leaf is traced.
+    """
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))

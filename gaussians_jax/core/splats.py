@@ -128,7 +128,23 @@ def active_mask(splats: Splats) -> Bool[Array, " gaussians"]:
     Returns:
       True for active Gaussians.
     """
-    return ~(splats.opacity_logit <= INACTIVE_LOGIT / 2)
+    return _is_active(splats.opacity_logit)
+
+
+def _is_active(logit):
+    return ~(logit <= INACTIVE_LOGIT / 2)
+
+
+def active_count(splats: Splats) -> int:
+    """Count the Gaussians, on the host.
+
+    Args:
+      splats: Raw parameters.
+
+    Returns:
+      The number of active Gaussians.
+    """
+    return int(_is_active(np.asarray(splats.opacity_logit)).sum())
 
 
 def in_use(gaussians: Gaussians) -> Bool[Array, " gaussians"]:
@@ -256,10 +272,16 @@ def deactivate(splats: Splats, inactive: Bool[Array, " gaussians"]) -> Splats:
     Returns:
       Raw parameters with their opacity logits replaced.
     """
-    mark = jnp.asarray(INACTIVE_LOGIT, splats.opacity_logit.dtype)
-    return splats._replace(
-        opacity_logit=jnp.where(inactive, mark, splats.opacity_logit),
-    )
+    return _deactivated(splats, inactive)
+
+
+def _deactivated(splats, inactive):
+    logit = splats.opacity_logit
+    mark = np.asarray(INACTIVE_LOGIT, logit.dtype)
+    # Arrays of the host stay there: their length is that of a capture, and JAX would
+    # compile a program for each.
+    where = np.where if isinstance(logit, np.ndarray) else jnp.where
+    return splats._replace(opacity_logit=where(inactive, mark, logit))
 
 
 def pad_rows(params: Params, capacity: int) -> Params:
@@ -285,11 +307,10 @@ def pad_rows(params: Params, capacity: int) -> Params:
             "least one Gaussian and a capacity that is not smaller than their number"
         )
     rows = np.concatenate([np.arange(count), np.zeros(capacity - count, int)])
-    padded = take_rows(params, jnp.asarray(rows, jnp.int32))
-    inactive = jnp.arange(capacity) >= count
-    return padded._replace(
-        rows=padded.rows | {"splats": deactivate(padded.rows["splats"], inactive)}
-    )
+    padded = jax.tree.map(lambda leaf: leaf[rows], params.rows)
+    inactive = np.arange(capacity) >= count
+    padded["splats"] = _deactivated(padded["splats"], inactive)
+    return params._replace(rows=padded)
 
 
 def from_points(
@@ -348,13 +369,18 @@ def from_points(
     distance = neighbor_distance(points, lone_scale)
     log_scale = np.clip(np.log(scale * distance), *LOG_SCALE_RANGE)
     count, rest = len(points), (degree + 1) ** 2 - 1
+    rows = dict(
+        mean=points,
+        log_scale=np.repeat(log_scale[:, None], 3, axis=1),
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        opacity_logit=np.full(count, math.log(opacity / (1 - opacity))),
+        sh_dc=(colors[:, None, :] - 0.5) / SH_DC,
+        sh_rest=np.zeros((count, rest, 3)),
+    )
+    # Converted on the host: JAX would compile a program for each shape, and the number
+    # of points depends on the capture.
     return Splats(
-        mean=jnp.asarray(points, dtype),
-        log_scale=jnp.asarray(np.repeat(log_scale[:, None], 3, axis=1), dtype),
-        quaternion=jnp.asarray(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)), dtype),
-        opacity_logit=jnp.full(count, math.log(opacity / (1 - opacity)), dtype),
-        sh_dc=jnp.asarray((colors[:, None, :] - 0.5) / SH_DC, dtype),
-        sh_rest=jnp.zeros((count, rest, 3), dtype),
+        **{name: jnp.asarray(x.astype(dtype), dtype) for name, x in rows.items()}
     )
 
 

@@ -15,9 +15,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from gaussians_jax.core import splats
+from gaussians_jax.core.metadata import Number
 from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Params, Splats
 from nerfies_jax.preprocessing import rigid_groups
+from nerfies_jax.training import programs
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.updates import descended
 
@@ -146,12 +148,12 @@ def resting(paths: Paths) -> Float[Array, "still 3"] | None:
     if paths.still is None or not len(paths.still):
         return None
     chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
-    return jnp.asarray(paths.still[chosen], jnp.float32)
+    return captured(paths.still[chosen])
 
 
 def rest_loss(
     motion: Callable[[Float[Array, ""]], tuple[Array, Array]],
-    unit: float,
+    unit: Number,
     times: Float[Array, " times"],
 ) -> Float[Array, ""]:
     """Compute a penalty on the motion of static points, the mean over the times.
@@ -213,7 +215,7 @@ def _guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
     """
     if effect.fit_to_paths is not None:
         return effect.fit_to_paths(paths, key)
-    canonical = jnp.asarray(positions_at_middle(paths), jnp.float32)
+    canonical = captured(positions_at_middle(paths))
     params = _initialized(effect, canonical, key)
     static, static_rows = None, None
     if params.shared is not None:
@@ -234,8 +236,22 @@ def _guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
     return Guess(
         points._replace(resting=Resting(static, static_rows)),
         rates._replace(resting=Resting._make((0.0, row_rate))),
-        _unrest_of(effect, paths.unit),
+        _unrest_of(effect, captured(paths.unit)),
     )
+
+
+def captured(values: Any) -> Array:
+    """Move numbers of a capture to the device, for functions that capture them.
+
+    Fits take captured arrays as arguments (`programs.with_captured`).
+
+    Args:
+      values: Numbers or an array on the host.
+
+    Returns:
+      The array, in float32 like the points of a fit.
+    """
+    return jax.device_put(np.asarray(values, np.float32))
 
 
 def _initialized(effect, positions, key):
@@ -336,21 +352,20 @@ def fit(
     Raises:
       ValueError: If no position is known.
     """
-    times, position, known, unit, _, depth = paths
+    times, position, known, _, _, depth = paths
     if not known.any():
         raise ValueError("no path has a known position; a motion cannot be fitted")
     start, rates, penalty, rigid = _guess(effect, paths, key)
     rates = jax.tree.map(lambda relative: rate * relative, rates)
-    target = jnp.asarray(np.moveaxis(np.where(known[..., None], position, 0), 1, 0))
-    target = target.astype(start.canonical.dtype)
-    weight = jnp.asarray(known.T, target.dtype)
+    target = captured(np.moveaxis(np.where(known[..., None], position, 0), 1, 0))
+    weight = captured(known.T)
     # Component along the rays to remove from the distances.
-    ray_part = jnp.zeros_like(target)
+    along_ray = np.zeros(target.shape)
     if rigid and depth is not None:
         along_ray = np.sqrt(1 - along(depth.deviation))[:, None, None] * depth.ray
         along_ray = np.moveaxis(np.where(known[..., None], along_ray, 0), 1, 0)
-        ray_part = jnp.asarray(along_ray, target.dtype)
-    frame_times = jnp.asarray(times, target.dtype)
+    ray_part, frame_times = captured(along_ray), captured(times)
+    unit = captured(paths.unit)
     count = min(FRAMES_AT_ONCE, len(times))
 
     def distance(points, frames):
@@ -373,7 +388,9 @@ def fit(
             value if penalty is None else value + penalty(points, frame_times[frames])
         )
 
-    all_frames = jnp.arange(len(times))
-    mean_distance = jax.jit(lambda points: distance(points, all_frames))
+    all_frames = np.arange(len(times))
+    separate, arrays = programs.with_captured(lambda p: distance(p, all_frames), start)
+    mean_distance = jax.jit(separate)
     fitted = descended(loss, start, rates, key, steps)
-    return PathFit(fitted, float(mean_distance(start)), float(mean_distance(fitted)))
+    first, last = (float(mean_distance(arrays, p)) for p in (start, fitted))
+    return PathFit(fitted, first, last)

@@ -4,7 +4,6 @@ import dataclasses
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
 
@@ -230,7 +229,7 @@ def clamp_scales(rows: Splats, capture: Capture, max_scale: float) -> Splats:
     cameras = scipy.spatial.cKDTree(capture.cameras.position[capture.train])
     distance, _ = cameras.query(np.asarray(rows.mean))
     bound = np.log(np.maximum(max_scale * distance, 1e-8)).astype(np.float32)
-    return rows._replace(log_scale=jnp.minimum(rows.log_scale, bound[:, None]))
+    return rows._replace(log_scale=np.minimum(rows.log_scale, bound[:, None]))
 
 
 def observed_depths(capture):

@@ -9,11 +9,11 @@ positions.
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
+from gaussians_jax.core import splats
 from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Params
 from gaussians_jax.init import motion_fit
@@ -108,8 +108,9 @@ def _seeds(effect, points, followed, evidence, views, times, unit, spec):
     rows = (
         [] if point_rows is None else [jax.tree.map(lambda leaf: leaf[:0], point_rows)]
     )
-    # Padded to the frame with the most pixels, so that all frames share one program.
+    # Padded, so that all frames share one program, and most captures as well.
     most = int(np.bincount(frame).max()) if len(frame) else 0
+    most = splats.capacity_for(most)
     for current in np.unique(frame):
         pixels = np.flatnonzero(frame == current)
         pixel = np.stack([column[pixels], row[pixels]], -1)
@@ -224,9 +225,7 @@ def rows_at_rest(resting: Resting, positions: Float[Array, "places 3"]) -> PyTre
     """
     static, static_rows = jax.tree.map(np.asarray, resting)
     _, neighbors, weights = _carriers(static, np.asarray(positions))
-    return jax.tree.map(
-        lambda leaf: jnp.asarray(_mixed(leaf, neighbors, weights)), static_rows
-    )
+    return jax.tree.map(lambda leaf: _mixed(leaf, neighbors, weights), static_rows)
 
 
 def put_in(
@@ -247,11 +246,15 @@ def put_in(
     rows, nets = dict(params.rows), dict(params.nets)
 
     def set_last(leaf, values):
-        return leaf.at[len(leaf) - len(values) :].set(jnp.asarray(values, leaf.dtype))
+        if not len(values):  # no moving pixel has a depth
+            return leaf
+        changed = np.array(leaf)
+        changed[len(leaf) - len(values) :] = np.asarray(values)
+        return changed
 
     motion, *others = effects
     if tracked.nets is not None:
-        nets[motion.name] = jax.tree.map(jnp.asarray, tracked.nets)
+        nets[motion.name] = tracked.nets
     if tracked.resting is not None and tracked.resting.rows is not None:
         rows[motion.name] = rows_at_rest(tracked.resting, rows["splats"].mean)
     if tracked.rows is not None:

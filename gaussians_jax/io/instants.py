@@ -21,6 +21,7 @@ from nerfies_jax.capture import units
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.json_files import alike, replaced_folder
 from nerfies_jax.runtime import events
+from nerfies_jax.training import programs
 from nerfies_jax.training.model import Model, TrainState
 
 # Function from a time in [0, 1] to Gaussians.
@@ -55,14 +56,12 @@ def gaussians_at(model: Model, state: TrainState) -> At:
             "Gaussian files need a run of Gaussians; a radiance field has none, so "
             "export its cameras, images or tracks"
         )
-    params = state.params
-    prepared = jax.jit(model.stages.prepare)(params)
-    deform = jax.jit(model.stages.deform)
-    dtype = params.rows["splats"].mean.dtype
+    deform = programs.deformer(model)(state.params)
+    dtype = state.params.rows["splats"].mean.dtype
 
     def at(time: float) -> Gaussians:
         _check_time(time)
-        return deform(params, prepared, jnp.asarray(time, dtype))
+        return deform(np.asarray(time, dtype))
 
     return at
 

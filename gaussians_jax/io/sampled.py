@@ -79,7 +79,7 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
         ),
         opacity=opacity,
         color=seen.color[chosen],
-        left_out=int(splats.active_mask(rows).sum()) - int(chosen.sum()),
+        left_out=splats.active_count(rows) - int(chosen.sum()),
     )
 
 
@@ -142,7 +142,7 @@ def seen_in_training(
     """
     factor = math.ceil(max(capture.size) / MOST_SIDE_PX)
     size = (max(1, capture.size[0] // factor), max(1, capture.size[1] // factor))
-    coefficients = splats.active_harmonics(rows, degree)
+    coefficients = jax.jit(splats.active_harmonics)(rows, degree)
     color_toward = jax.jit(harmonics.color_toward)
     moves = _moves(at, capture)
     most: np.ndarray | float = 0.0
@@ -152,8 +152,10 @@ def seen_in_training(
         deformed = at(float(view.time))
         variants = [(deformed, view.camera)]
         if moves.any():
-            opacity = jnp.where(moves, 0, deformed.opacity)
-            variants.append((deformed._replace(opacity=opacity), view.camera))
+            opacity = np.array(deformed.opacity)
+            opacity[moves] = 0
+            still = deformed._replace(opacity=jax.device_put(opacity))
+            variants.append((still, view.camera))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *variants)
         weights = list(data_parallel.rows_on_devices(_shown, (size, raster), stacked))
         most = np.maximum(most, np.max(weights, axis=0) * factor**2)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax.core import splats
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata, is_traced
 from gaussians_jax.core.splats import Params
 from nerfies_jax.training.effects import PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
@@ -86,7 +86,7 @@ def acceleration_loss(
     before: Float[Array, "gaussians 3"],
     now: Float[Array, "gaussians 3"],
     after: Float[Array, "gaussians 3"],
-    decay: float,
+    decay: Number,
     drift: float,
 ) -> Float[Array, ""]:
     """Compute the weighted mean of squared accelerations and velocities.
@@ -150,12 +150,14 @@ class Bound:
     """
 
     spec: AccelerationSpec
-    extent: float  # of the scene, in scene units
+    extent: Number  # of the scene, in scene units
     frames: int
 
     name = NAME
 
     def __post_init__(self):
+        if is_traced(self.extent):
+            return
         if self.frames < 2 or not 0 < self.extent < math.inf:
             raise ValueError(
                 "an acceleration penalty needs at least two frames and a finite, "

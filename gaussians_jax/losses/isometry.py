@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gaussians_jax.core import splats
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata
 from gaussians_jax.core.splats import Params
 from gaussians_jax.losses import neighbors
 from gaussians_jax.losses.acceleration import draw_active
@@ -61,7 +61,7 @@ class Bound:
     """The `Regularizer` of an `IsometrySpec`."""
 
     spec: IsometrySpec
-    extent: float  # of the scene, in scene units
+    extent: Number  # of the scene, in scene units
 
     name = "isometry"
 

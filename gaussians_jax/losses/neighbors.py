@@ -17,6 +17,7 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from gaussians_jax.core import splats
+from gaussians_jax.core.metadata import Number
 from gaussians_jax.core.splats import Params
 from nerfies_jax.training.effects import PenaltyContext, Term
 from nerfies_jax.training.step_counts import steps
@@ -78,7 +79,7 @@ class Neighbors(NamedTuple):
     weight: Float[Array, "gaussians neighbors"]  # in [0, 1]
 
 
-def find(spec: NeighborSpec, params: Params, extent: float) -> Neighbors:
+def find(spec: NeighborSpec, params: Params, extent: Number) -> Neighbors:
     """Find the nearest active neighbors of every active Gaussian, on the host.
 
     On one core it takes 31 ms for 10k Gaussians and 450 ms for 100k.
@@ -174,7 +175,7 @@ class Bound:
     """The `Regularizer` of a `NeighborSpec` on `params.rows[of]`."""
 
     spec: NeighborSpec
-    extent: float  # of the scene, in scene units
+    extent: Number  # of the scene, in scene units
     of: str
 
     name = NAME

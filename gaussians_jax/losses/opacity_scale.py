@@ -8,7 +8,7 @@ fit the difference between two images, shrink.
 import dataclasses
 import math
 
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata
 from gaussians_jax.core.splats import Params
 from gaussians_jax.optim.mcmc import mean_opacity_and_scale
 from nerfies_jax.training.effects import PenaltyContext, Term
@@ -44,7 +44,7 @@ class Bound:
     """The `Regularizer` of an `OpacityScaleSpec`."""
 
     spec: OpacityScaleSpec
-    extent: float  # of the scene, in scene units
+    extent: Number  # of the scene, in scene units
 
     name = NAME
 

@@ -11,7 +11,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata
 from gaussians_jax.core.splats import Params
 from nerfies_jax.training.effects import PenaltyContext, Term
 
@@ -67,7 +67,7 @@ class Bound:
     """The `Regularizer` of a `SmoothDepthSpec`."""
 
     spec: SmoothDepthSpec
-    depth: float  # typical depth, in scene units
+    depth: Number  # typical depth, in scene units
 
     name = NAME
     reads_depth = True

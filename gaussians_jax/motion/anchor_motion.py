@@ -170,7 +170,8 @@ def _fit_to_paths(
     static.
     """
     rows_key, nets_key, rest_key = jax.random.split(key, 3)
-    points = jnp.asarray(motion_fit.positions_at_middle(paths), jnp.float32)
+    points = motion_fit.captured(motion_fit.positions_at_middle(paths))
+    unit = motion_fit.captured(paths.unit)
     static_features = init_features(rest_key, spec, RESTING)
 
     def penalty(points, times):
@@ -183,7 +184,7 @@ def _fit_to_paths(
             )
             return residuals.turn, residuals.position
 
-        return motion_fit.rest_loss(motion, paths.unit, times)
+        return motion_fit.rest_loss(motion, unit, times)
 
     rows = init_features(rows_key, spec, len(points))
     start = Points(points, rows, init(nets_key, spec, frames))

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from gaussians_jax.core.metadata import Number, is_traced
 from gaussians_jax.core.protocols import StepInfo, StrategyEvent
 from gaussians_jax.core.splats import Gaussians, Splats
 from gaussians_jax.optim.densification import DefaultStrategySpec
@@ -179,13 +180,13 @@ def growth_factor(
 
 
 def grow_score(
-    spec: MotionGrowthSpec, extent: float, state: Travel, step: int
+    spec: MotionGrowthSpec, extent: Number, state: Travel, step: int
 ) -> Float[np.ndarray, " gaussians"]:
     """Compute the factor of each Gaussian's gradient at a step, on the host."""
     rows, dtype = state.low.shape[0], state.low.dtype
     if step < spec.start:
         return np.ones(rows, dtype)
-    return growth_factor(spec, motion(state), spec.motion * extent).astype(dtype)
+    return growth_factor(spec, motion(state), spec.motion * float(extent)).astype(dtype)
 
 
 class Guided(NamedTuple):
@@ -201,9 +202,11 @@ class MotionGuided:
 
     base: DefaultStrategySpec
     spec: MotionGrowthSpec
-    extent: float  # of the scene, in scene units
+    extent: Number  # of the scene, in scene units
 
     def __post_init__(self):
+        if is_traced(self.extent):
+            return
         if not 0 < self.extent < math.inf:
             raise ValueError(
                 f"extent={self.extent} of the scene must be positive and finite; see "

@@ -47,7 +47,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax.core import splats
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
 from gaussians_jax.init import motion_fit
@@ -236,7 +236,7 @@ def _place_nodes(nodes: Nodes, position: Float[np.ndarray, "places 3"]) -> Nodes
 
 
 def moves(
-    nodes: Nodes, spec: NodeMotionSpec, extent: float, time: Float[Array, ""]
+    nodes: Nodes, spec: NodeMotionSpec, extent: Number, time: Float[Array, ""]
 ) -> Moves:
     """Evaluate the motion of the nodes at a time.
 
@@ -274,7 +274,7 @@ def moves(
 def _find(
     nodes: Nodes,
     spec: NodeMotionSpec,
-    extent: float,
+    extent: Number,
     mean: Float[Array, "gaussians 3"],
     linked: bool = True,
 ) -> Neighborhoods:
@@ -325,7 +325,7 @@ def displace(
 def _arap_loss(
     nodes: Nodes,
     spec: NodeMotionSpec,
-    extent: float,
+    extent: Number,
     linked: Links,
     times: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> Float[Array, ""]:
@@ -338,7 +338,7 @@ def _arap_loss(
 
 
 def fit_to_paths(
-    spec: NodeMotionSpec, extent: float, paths: Paths, key: Key[Array, ""]
+    spec: NodeMotionSpec, extent: Number, paths: Paths, key: Key[Array, ""]
 ) -> Guess:
     """Distribute nodes over moving and static points, on the host.
 
@@ -354,7 +354,8 @@ def fit_to_paths(
     Returns:
       Initial guess of a fit.
     """
-    unit, canonical = paths.unit, motion_fit.positions_at_middle(paths)
+    canonical = motion_fit.positions_at_middle(paths)
+    unit, unit_extent = map(motion_fit.captured, (paths.unit, extent))
     static_points = np.zeros((0, 3))
     if paths.still is not None:
         static_points = np.asarray(paths.still, np.float64)
@@ -378,15 +379,15 @@ def fit_to_paths(
             static = static._replace(mask=all_nodes.mask[static_rows])
 
         def motion(time):
-            now = moves(static, spec, extent, time)
+            now = moves(static, spec, unit_extent, time)
             return now.turn[:, 1:], now.shift
 
         return motion_fit.rest_loss(motion, unit, times)
 
-    start = Points(jnp.asarray(canonical, jnp.float32), None, nodes)
+    start = Points(motion_fit.captured(canonical), None, nodes)
     mask = None if spec.mask is None else 1.0
     node_rates = Nodes._make((0.0, 1.0, 0.4, mask))
-    rates = Points._make((unit, None, node_rates, None))
+    rates = Points._make((paths.unit, None, node_rates, None))
     return Guess(start, rates, penalty if len(static_nodes) else None)
 
 
@@ -395,7 +396,7 @@ class Bound(BoundMotion):
     """The `Motion` of a `NodeMotionSpec` in a run of `steps`."""
 
     spec: NodeMotionSpec
-    extent: float  # of the scene, the unit of translations, in scene units
+    extent: Number  # of the scene, the unit of translations, in scene units
 
     name = NAME
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata, is_traced
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
 from gaussians_jax.motion.basis import Offsets, apply
@@ -43,7 +43,7 @@ from nerfies_jax.training.effects import (
 from nerfies_jax.training.step_counts import steps
 
 NAME = "plane_motion"
-Corner = tuple[float, ...]  # of three coordinates
+Corner = tuple[Number, ...]  # of three coordinates
 Features = Float[Array, "gaussians levels features"]
 
 
@@ -204,12 +204,14 @@ class Bound(BoundMotion):
     """
 
     spec: PlaneMotionSpec
-    extent: float  # of the scene, the unit of shifts, in scene units
+    extent: Number  # of the scene, the unit of shifts, in scene units
     box: tuple[Corner, Corner] | None
 
     name = NAME
 
     def __post_init__(self):
+        if is_traced(self.box):
+            return
         if self.box is None or not all(
             low < high for low, high in zip(*self.box, strict=True)
         ):

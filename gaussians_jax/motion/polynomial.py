@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core import splats
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
 from gaussians_jax.init import motion_fit
@@ -171,7 +171,7 @@ class Bound(BoundMotion):
     """The `Motion` of a `PolynomialMotionSpec` in a run of `steps`."""
 
     spec: PolynomialMotionSpec
-    extent: float  # of the scene, the unit of shifts, in scene units
+    extent: Number  # of the scene, the unit of shifts, in scene units
 
     name = NAME
 

@@ -16,6 +16,7 @@ front of books: 37.12 dB, 33.12 in moving regions, instead of 37.56 and 34.18.
 """
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -25,10 +26,10 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core import splats, time_knots
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
-from gaussians_jax.init.motion_fit import Guess, Paths, Points
+from gaussians_jax.init.motion_fit import Guess, Paths, Points, captured
 from gaussians_jax.motion.bound import BoundMotion
 from nerfies_jax.geometry import lie
 from nerfies_jax.geometry.fusion import components, stacked
@@ -122,6 +123,7 @@ class Motion(NamedTuple):
     offset: Float[Array, "bases 3"]
 
 
+@functools.partial(jax.jit, static_argnums=(1, 2))
 def init(
     key: Key[Array, ""], spec: SE3BasesSpec, dtype: DTypeLike = jnp.float32
 ) -> Bases:
@@ -135,8 +137,10 @@ def init(
 
 def init_logits(spec: SE3BasesSpec, gaussians: int, dtype: DTypeLike = jnp.float32):
     """Initialize logits [gaussians, 1 + bases] of static Gaussians."""
-    logits = jnp.zeros((gaussians, 1 + spec.bases), dtype)
-    return logits.at[:, 0].set(spec.still_logit)
+    # On the host, because the number of Gaussians depends on the capture.
+    logits = np.zeros((gaussians, 1 + spec.bases), dtype)
+    logits[:, 0] = spec.still_logit
+    return jax.device_put(logits)
 
 
 def at_time(bases: Bases, time: Float[Array, ""]) -> Motion:
@@ -224,12 +228,13 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     zero = np.zeros((spec.bases, spec.coarse_knots, 3))
     fine, coarse = Poses._make((turn, shift)), Poses._make((zero, zero))
     bases = Bases._make((fine, coarse, middle))
-    bases = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), bases)
+    bases = jax.tree.map(captured, bases)
     logits = np.zeros((len(position), 1 + spec.bases), np.float32)
     logits[:, 0] = STILL_LOGIT
     logits[np.arange(len(position)), 1 + label] = MEMBER_LOGIT
-    guess = Points(jnp.asarray(canonical, jnp.float32), jnp.asarray(logits), bases)
-    unknown = jnp.asarray(~_supported(times, known, label, spec), jnp.float32)
+    guess = Points(captured(canonical), captured(logits), bases)
+    unknown = captured(~_supported(times, known, label, spec))
+    scale = captured(unit)
 
     def penalty(points, _times):
         def bend(table):
@@ -238,14 +243,14 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
             return jnp.mean(jnp.abs(table[:, 2:] - 2 * table[:, 1:-1] + table[:, :-2]))
 
         fine = points.nets.fine
-        shift, turn = bend(fine.shift) / unit, bend(fine.turn)
+        shift, turn = bend(fine.shift) / scale, bend(fine.turn)
         return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn + held(fine)
 
     def held(fine):
         def steps(table):
             return jnp.mean(unknown[..., None] * jnp.abs(jnp.diff(table, axis=1)))
 
-        return HOLD * steps(fine.shift) / unit + TURN_HOLD * steps(fine.turn)
+        return HOLD * steps(fine.shift) / scale + TURN_HOLD * steps(fine.turn)
 
     fine_rates, coarse_rates = Poses._make((3.0, unit)), Poses._make((0.0, 0.0))
     base_rates = Bases._make((fine_rates, coarse_rates, 0.0))
@@ -286,7 +291,7 @@ class Bound(BoundMotion):
     """The `Motion` of a `SE3BasesSpec` in a run of `steps`."""
 
     spec: SE3BasesSpec
-    extent: float  # of the scene, the unit of translations, in scene units
+    extent: Number  # of the scene, the unit of translations, in scene units
 
     name = NAME
 

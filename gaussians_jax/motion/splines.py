@@ -18,7 +18,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
 from gaussians_jax.core import splats, time_knots
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
 from gaussians_jax.init import motion_fit
@@ -125,7 +125,7 @@ class Bound(BoundMotion):
     """The `Motion` of a `SplineMotionSpec` in a run of `steps`."""
 
     spec: SplineMotionSpec
-    extent: float  # of the scene, the unit of shifts, in scene units
+    extent: Number  # of the scene, the unit of shifts, in scene units
 
     name = NAME
 

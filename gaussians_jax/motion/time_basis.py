@@ -22,7 +22,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from gaussians_jax.core import splats
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Gaussians, Splats
 from gaussians_jax.motion.bound import BoundMotion
@@ -132,7 +132,7 @@ def _init_coefficients(
 
 
 def _at_time(
-    params: MLP, spec: TimeBasisSpec, extent: float, time: Float[Array, ""]
+    params: MLP, spec: TimeBasisSpec, extent: Number, time: Float[Array, ""]
 ) -> Trajectories:
     """Evaluate the trajectories at a time."""
     encoded = encoding.encode(spec.time, time[None], None)
@@ -193,7 +193,7 @@ class Bound(BoundMotion):
     """The `Motion` of a `TimeBasisSpec` in a run of `steps`."""
 
     spec: TimeBasisSpec
-    extent: float  # of the scene, the unit of translations, in scene units
+    extent: Number  # of the scene, the unit of translations, in scene units
 
     name = NAME
 

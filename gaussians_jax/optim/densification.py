@@ -151,6 +151,7 @@ class Changed(NamedTuple):
     report: Report
 
 
+@jax.jit
 def empty_stats(rows: Splats) -> RowStats:
     """Return the statistics before any view."""
     like = rows.opacity_logit

@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from gaussians_jax.core.metadata import Number
 from gaussians_jax.core.splats import Splats
 from gaussians_jax.optim import phases
 from gaussians_jax.optim.phases import AnnealingSpec
@@ -45,7 +46,7 @@ class LearningRateSpec:
 
 def at_step(
     spec: LearningRateSpec,
-    extent: float,
+    extent: Number,
     steps: int,
     step: Int[Array, ""],
     annealing: AnnealingSpec | None = None,

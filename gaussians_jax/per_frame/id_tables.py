@@ -2,14 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nerfies_jax.nn import codes
 
 # For each appearance id, two row indices and the interpolation weight of the second, as
 # in `nerfies_jax.capture.scene_metadata.exposures`.
-Places = tuple[tuple[int, int, float], ...]
+Places = tuple[tuple[int, int, float], ...] | Float[Array, "appearances 3"]
 
 
 def rows_of(places: Places) -> int:
@@ -34,9 +33,6 @@ def deviation(
     Returns:
       The deviation.
     """
-    left, right, progress = (np.asarray(column) for column in zip(*places, strict=True))
-    index = jnp.clip(appearance, 0, len(places) - 1)
-    weight = jnp.asarray(progress, table.dtype)[index]
     deviations = table - jax.lax.stop_gradient(jnp.mean(table, axis=0))
-    before, after = (jnp.asarray(side, jnp.int32)[index] for side in (left, right))
-    return codes.blend(deviations, before, after, weight)
+    place = codes.place_of(places, appearance, table.dtype)
+    return codes.blend(deviations, *place)

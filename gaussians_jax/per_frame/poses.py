@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from gaussians_jax.core.metadata import SceneMetadata
+from gaussians_jax.core.metadata import Number, SceneMetadata
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry.camera import Camera, move
 from nerfies_jax.training import schedules
@@ -51,7 +51,7 @@ class PoseRefinementSpec:
         return Bound(self, run_steps, metadata.frames, metadata.depth)
 
 
-def refine(screws: Screws, cameras: Camera, depth: float) -> Camera:
+def refine(screws: Screws, cameras: Camera, depth: Number) -> Camera:
     """Move cameras by the deviation of their screws from the mean.
 
     Equal screws do not change any camera. The mean is treated as constant, so the
@@ -116,7 +116,7 @@ class Bound:
     spec: PoseRefinementSpec
     steps: int
     frames: int  # number of training frames
-    depth: float  # z-depth in the middle of the scene, scene units
+    depth: Number  # z-depth in the middle of the scene, scene units
 
     name = NAME
 
@@ -135,4 +135,4 @@ class Bound:
 
     def apply_to_capture(self, params: Screws, capture: Capture) -> Capture:
         """Return the capture with the refined cameras of all frames, on the host."""
-        return refine_capture(params, capture, self.depth)
+        return refine_capture(params, capture, float(self.depth))

@@ -4,7 +4,6 @@ import dataclasses
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Key
@@ -100,21 +99,25 @@ def first_state(
         opacity=spec.init.opacity,
         scale=spec.init.scale,
     )
-    opaque = rows.opacity_logit.at[hidden_rows].set(HIDDEN_LOGIT)
-    rows = rows._replace(opacity_logit=opaque)
+    # In NumPy up to the padded rows. JAX would compile a program for each operation and
+    # number of points, which differs between captures.
+    opaque = np.array(rows.opacity_logit)
+    opaque[hidden_rows] = HIDDEN_LOGIT
+    rows = rows._replace(opacity_logit=jax.device_put(opaque))
+    rows = jax.tree.map(np.asarray, rows)
     rows = initialization.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
-    params = Params({"splats": rows}, {})
+    params = Params({"splats": jax.device_put(rows)}, {})
     params = protocols.initialized(effects, start_key, params)
     if tracked is not None:
         params = track_start.put_in(params, effects, tracked)
+    params = params._replace(rows=jax.tree.map(np.asarray, params.rows))
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
     stats = () if strategy is None else strategy.init(params.rows["splats"])
     aux_state = AuxState(stats, states_of(effects, params))
-    return TrainState(
-        params, optimizer.init(params), aux_state, jnp.zeros((), jnp.int32), run_key
-    )
+    moments, step = jax.jit(optimizer.init)(params), jax.device_put(np.int32(0))
+    return TrainState(params, moments, aux_state, step, run_key)
 
 
 def _from_tracks(spec, effects, capture, key):
@@ -155,7 +158,7 @@ def count_rows(effects: tuple[SplatRecord, ...], state: TrainState) -> dict[str,
       scalars. With child Gaussians also "rows", the number of parents.
     """
     params = state.params
-    active = int(splats.active_mask(params.rows["splats"]).sum())
+    active = splats.active_count(params.rows["splats"])
     each = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves(params.rows))
     nets = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(params.nets))
     counts = {

@@ -1,6 +1,5 @@
 """Tracks of surface points, predicted by the motion of the Gaussians around them."""
 
-import jax
 import numpy as np
 import scipy.spatial
 
@@ -8,6 +7,7 @@ from gaussians_jax.scene import scene
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.model_flow import Move, Moved
 from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTracks
+from nerfies_jax.training import programs
 from nerfies_jax.training.model import in_default_precision
 
 NEIGHBORS = 8  # Gaussians that move a point
@@ -45,16 +45,11 @@ def follow(
     effects = scene.all_effects(spec, metadata)
     if all(effect.deform is None for effect in effects) or not len(known.path):
         return None
-    stages = scene.build(spec, metadata).stages
-    assert stages is not None
-    prepared = jax.jit(stages.prepare)(state.params)
-    deform = jax.jit(lambda params, ready, time: stages.deform(params, ready, time))
-    times = in_default_precision(capture.times[known.moments])
+    deform = programs.deformer(scene.build(spec, metadata))(state.params)
+    times = np.asarray(in_default_precision(capture.times[known.moments]))
     # [times, gaussians, 3]
-    means = np.stack(
-        [np.asarray(deform(state.params, prepared, time).mean) for time in times]
-    )
-    first = deform(state.params, prepared, times[known.start])
+    means = np.stack([np.asarray(deform(time).mean) for time in times])
+    first = deform(times[known.start])
     opacity = np.asarray(first.opacity)
     path = _move_with_gaussians(known.start_points, means, opacity, known.start)
     drift = float("nan")
@@ -79,15 +74,11 @@ def mover(spec, metadata) -> Move | None:
     effects = scene.all_effects(spec, metadata)
     if all(effect.deform is None for effect in effects):
         return None
-    stages = scene.build(spec, metadata).stages
-    assert stages is not None
-
-    @jax.jit
-    def deform(params, time):
-        return stages.deform(params, stages.prepare(params), time)
+    deformer = programs.deformer(scene.build(spec, metadata))
 
     def move(state, points, source, target):
-        first, last = (deform(state.params, view.time) for view in (source, target))
+        deform = deformer(state.params)
+        first, last = (deform(view.time) for view in (source, target))
         means = np.stack([np.asarray(first.mean), np.asarray(last.mean)])
         path = _move_with_gaussians(points, means, np.asarray(first.opacity), 0)
         return Moved(path[:, 1].astype(points.dtype), np.ones(len(points), bool))

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 import optax
 from jaxtyping import Array, Key
 
@@ -37,7 +38,12 @@ def states_of(effects: tuple[SplatRecord, ...], params: Params) -> dict[str, PyT
 
 def stream_key(state: TrainState, stream: int) -> Key[Array, ""]:
     """Return a PRNG key of this step that is independent of `loop.step_key`."""
-    return jax.random.fold_in(jax.random.fold_in(state.key, stream), state.step)
+    return _fold_in_both(state.key, np.uint32(stream), state.step)
+
+
+@jax.jit
+def _fold_in_both(key, stream, step):
+    return jax.random.fold_in(jax.random.fold_in(key, stream), step)
 
 
 def events(

@@ -29,7 +29,7 @@ from nerfies_jax.capture import pinholes
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.scene_metadata import exposures
 from nerfies_jax.runtime import compiler, data_parallel
-from nerfies_jax.training import loop, losses
+from nerfies_jax.training import loop, losses, programs
 from nerfies_jax.training.effects import (
     FrameCondition,
     Observation,
@@ -130,6 +130,16 @@ def build(
     Raises:
       ValueError: If settings contradict each other or the capture.
     """
+
+    def build_with(numbers):
+        return _model(spec, dataclasses.replace(metadata, **numbers), effects)
+
+    model = _model(spec, metadata, effects)
+    return programs.taking(model, metadata.numbers, build_with)
+
+
+def _model(spec, metadata, effects):
+    """Return the model with the numbers of the capture compiled in."""
     names = tuple(effect.name for effect in effects)
     effects = all_effects(spec, metadata, effects)
     # Its update counts per Gaussian do not change the updates of shared parameters.

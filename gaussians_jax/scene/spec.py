@@ -1,6 +1,7 @@
 """Settings of a scene of Gaussians, and the components that they enable."""
 
 import dataclasses
+import math
 
 from gaussians_jax.core import protocols
 from gaussians_jax.core.metadata import SceneMetadata
@@ -174,7 +175,8 @@ def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
     if the cameras have any.
 
     Scenes with a distant background are small in the units of a box around all points.
-    The default near plane of 0.01 would then be meters in front of the camera.
+    The default near plane of 0.01 would then be meters in front of the camera. A nearer
+    plane is rounded down to a power of two, so that captures share compiled programs.
 
     Args:
       spec: Settings.
@@ -183,7 +185,9 @@ def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
     Returns:
       Settings of the rasterizer.
     """
-    near = min(spec.raster.near, metadata.near)
+    near = spec.raster.near
+    if metadata.near < near:
+        near = 2.0 ** math.floor(math.log2(metadata.near))
     distorted = spec.raster.distorted or metadata.distorted
     return dataclasses.replace(spec.raster, near=near, distorted=distorted)
 

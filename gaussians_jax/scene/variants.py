@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,6 +10,7 @@ from gaussians_jax.core import splats, static_rows, time_knots
 from gaussians_jax.motion.anchors import AnchorMotionSpec
 from gaussians_jax.scene import scene
 from nerfies_jax.evaluation.representation import Parts, check_there
+from nerfies_jax.training import programs
 from nerfies_jax.training.model import Model, Stages, TrainState
 
 # Components that affect a render
@@ -83,10 +83,8 @@ def from_knots(
     stages = _stages(model, "a table of knots")
     time_knots.check(knots, interpolation)
     params = state.params
-    prepared = jax.jit(stages.prepare)(params)
-    deform = jax.jit(stages.deform)
     table = time_knots.bake(
-        lambda time: deform(params, prepared, time),
+        programs.deformer(model)(params),
         knots,
         static_threshold,
         stages.rows(params).mean.dtype,
@@ -182,7 +180,7 @@ def without_moving(
     )
     moves = static_rows.of_rows(state.params, np.asarray(parts.row_index.moves))
     rows = state.params.rows
-    active = int(splats.active_mask(rows["splats"]).sum())
+    active = splats.active_count(rows["splats"])
     if int(moves.sum()) == active:
         raise ValueError(
             f"all {active} Gaussians move farther than {farther_than:g} scene units, "

@@ -2,11 +2,16 @@
 
 import dataclasses
 import itertools
+from typing import Any
 
 import numpy as np
+from jaxtyping import Array, Float
 
 from nerfies_jax.capture.capture import Capture, point_depths
 from nerfies_jax.geometry import camera as cameras
+
+# A number of a capture, traced in a program that takes it as an argument.
+Number = float | Float[Array, ""]
 
 MIN_POINTS = 100  # fewer points do not determine the bounds of the scene
 # Share of points at either end taken for outliers of structure from motion.
@@ -19,17 +24,65 @@ SUBJECT_MARGIN = 1.2
 class SceneMetadata:
     """Bounds, scale, times and exposures of a scene. Static and hashable."""
 
-    near: float  # z-depth, scene units
-    far: float
-    center: tuple[float, float, float]  # of the captured volume, scene units
-    scale: float  # field = (scene - center) * scale
-    background: tuple[float, float, float] | None  # sRGB in [0, 1], if known
-    times: tuple[float, ...]  # distinct times of the training frames, ascending
+    near: Number  # z-depth, scene units
+    far: Number
+    center: tuple[Number, Number, Number]  # of the captured volume, scene units
+    scale: Number  # field = (scene - center) * scale
+    background: tuple[Number, Number, Number] | None  # sRGB in [0, 1], if known
+    # Distinct times of the training frames, ascending.
+    times: tuple[float, ...] | Float[Array, " times"]
     # For each appearance id, two rows of the table of codes and the weight between them
     # (left, right, weight). The code of an appearance that no training frame has is
     # interpolated between those before and after it in time.
-    exposures: tuple[tuple[int, int, float], ...]
+    exposures: tuple[tuple[int, int, float], ...] | Float[Array, "appearances 3"]
     available_data: frozenset[str] = frozenset()  # of "depths", "points", "flow"
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """Fields that programs take as arguments (`training.programs`).
+
+        The lengths of the arrays still determine shapes.
+        """
+        return {
+            "near": self.near,
+            "far": self.far,
+            "center": self.center,
+            "scale": self.scale,
+            "background": self.background,
+            "times": np.asarray(self.times, float),
+            "exposures": np.asarray(self.exposures, float),
+        }
+
+    @property
+    def concrete(self) -> "SceneMetadata":
+        """The metadata of the capture, which decide which operations there are."""
+        return self
+
+    def with_numbers(self, numbers: dict[str, Any]) -> "SceneMetadata":
+        """Replace the numbers, by those of a program that is being traced.
+
+        Args:
+          numbers: Values of all fields of `numbers`.
+
+        Returns:
+          The metadata, whose `concrete` is that of this object.
+        """
+        return _Traced(**vars(self) | numbers, untraced=self.concrete)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Traced(SceneMetadata):
+    """Metadata with traced numbers."""
+
+    untraced: SceneMetadata | None = None
+
+    @property
+    def concrete(self) -> SceneMetadata:
+        assert self.untraced is not None
+        return self.untraced
+
+    def with_numbers(self, numbers):
+        return self.concrete.with_numbers(numbers)
 
 
 def metadata_of(

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
@@ -245,22 +244,25 @@ def _lpips(params, network, color, truth, valid):
 
 
 # One program each, because their operations take longer to compile separately.
-_depth_errors = jax.jit(geometry_quality.depth_errors)
+@jax.jit
+def _depth_errors(depth, truth, mask):
+    known = geometry_quality.known_depth(depth, truth, mask)
+    return known, geometry_quality.depth_errors(depth, truth, mask)
+
+
 _flow_errors = jax.jit(geometry_quality.flow_errors)
 
 
 def _depths(scored, capture):
     """Compute depth errors over the known pixels of all frames together."""
-    truth = jnp.asarray(capture.depths[scored.rows])
-    depth = jnp.asarray(scored.depth)
+    truth, depth = capture.depths[scored.rows], scored.depth
     masks = {"": None}
     if capture.moving is not None:
-        masks["moving_"] = jnp.asarray(capture.moving[scored.rows])
+        masks["moving_"] = capture.moving[scored.rows]
     numbers = {}
     for name, mask in masks.items():
-        valid = np.asarray(geometry_quality.known_depth(depth, truth, mask))
-        error = np.abs(np.asarray(depth - truth))[valid]
-        errors = _depth_errors(depth, truth, mask)
+        known, errors = _depth_errors(depth, truth, mask)
+        error = np.abs(depth - truth)[np.asarray(known)]
         numbers[f"heldout.{name}depth_median"] = known_mean(error, np.median)
         numbers[f"heldout.{name}depth_rmse"] = errors.rmse
         if mask is None:
@@ -275,7 +277,7 @@ def _flow(flow):
     flows = in_default_precision((flow.predicted, flow.truth))
 
     def errors(mask=None):
-        return _flow_errors(*flows, None if mask is None else jnp.asarray(mask))
+        return _flow_errors(*flows, mask)
 
     numbers = {
         "flow.epe": errors(predicted).endpoint,

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax import evaluation
@@ -141,9 +140,7 @@ def _scored(known):
 
 
 def _endpoints(path, known):
-    return _track_errors(
-        jnp.asarray(path), jnp.asarray(known.path), jnp.asarray(_scored(known))
-    )
+    return _track_errors(path, known.path, _scored(known))
 
 
 @jax.jit  # because its operations take longer to compile separately

@@ -1,5 +1,6 @@
 """Compiled whole-frame renderer of a model, which caches intermediate results."""
 
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.runtime import events
+from nerfies_jax.training import programs
 from nerfies_jax.training.model import (
     Model,
     Rendering,
@@ -168,35 +170,44 @@ def _compile(model, size, inputs):
 def _compile_surveyed(model, size, inputs):
     params, view, step = inputs
 
-    def draw(params, known, view, step):
+    def survey(model, params, step):
+        return model.surveyed.survey(params, step)
+
+    def draw(model, params, known, view, step):
         return _float32(model.surveyed.draw(params, known, view, size, step))
 
-    survey = jax.jit(model.surveyed.survey).lower(params, step)
-    lowered_draw = jax.jit(draw).lower(params, survey.out_info, view, step)
-    return Surveyed(*_compile_all(model, survey, lowered_draw))
+    surveyed = programs.Program(survey, model).lower(params, step)
+    drawn = programs.Program(draw, model).lower(params, surveyed.out_info, view, step)
+    return Surveyed(*_compile_all(model, surveyed, drawn))
 
 
 def _compile_render(model, size, inputs):
-    def render(params, view, step):
+    def render(model, params, view, step):
         return _float32(model.render(params, view, size, step))
 
-    return jax.jit(render).lower(*inputs).compile(model.compiler_options)
+    (program,) = _compile_all(model, programs.Program(render, model).lower(*inputs))
+    return program
 
 
 def _compile_stages(model, size, inputs):
-    stages, (params, view, step) = model.stages, inputs
+    params, view, step = inputs
 
-    def draw(params, deformed, view, step):
-        return _float32(stages.draw(params, deformed, view, size, step))
+    def draw(model, params, deformed, view, step):
+        return _float32(model.stages.draw(params, deformed, view, size, step))
 
-    prepare = jax.jit(stages.prepare).lower(params)
-    deform = jax.jit(stages.deform).lower(params, prepare.out_info, view.time)
-    lowered_draw = jax.jit(draw).lower(params, deform.out_info, view, step)
-    return _Programs(*_compile_all(model, prepare, deform, lowered_draw))
+    prepared = programs.Program(programs.prepare, model).lower(params)
+    deformed = programs.Program(programs.deform, model).lower(
+        params, prepared.out_info, view.time
+    )
+    drawn = programs.Program(draw, model).lower(params, deformed.out_info, view, step)
+    return _Programs(*_compile_all(model, prepared, deformed, drawn))
 
 
 def _compile_all(model, *lowered):
-    return [program.compile(model.compiler_options) for program in lowered]
+    return [
+        functools.partial(program.compile(model.compiler_options), model.numbers)
+        for program in lowered
+    ]
 
 
 def as_picture(color: np.ndarray) -> np.ndarray:

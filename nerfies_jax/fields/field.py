@@ -58,6 +58,13 @@ class Field(NamedTuple):
     survey: Callable[..., Occupancy] | None
     # (params, occupancy, ...) -> the same frame as `render`, not differentiable
     render_occupied: Callable[..., Rendering]
+    # (field, numbers) -> the field with these numbers, which may be traced
+    with_numbers: Callable[["Field", PyTree], "Field"]
+
+    @property
+    def numbers(self) -> PyTree:
+        """Numbers of the capture (`training.programs`)."""
+        return self.metadata.numbers
 
 
 def field(
@@ -136,6 +143,9 @@ def field(
         render,
         survey if skipping.usable(spec, active) else None,
         render_occupied,
+        lambda own, numbers: field(
+            spec, own.metadata.with_numbers(numbers), without, effects
+        ),
     )
 
 
@@ -256,7 +266,7 @@ def _look_up(
         place = (
             _place_in_time(metadata, time)
             if table.by == MOMENT
-            else _place_of_exposure(metadata, appearance, rows.dtype)
+            else codes.place_of(metadata.exposures, appearance, rows.dtype)
         )
         frame_codes[table.name] = codes.blend(rows, *place)
     return frame_codes
@@ -271,13 +281,3 @@ def _place_in_time(metadata, time):
     gap = times[right] - times[left]
     progress = (time - times[left]) / jnp.where(gap > 0, gap, 1)
     return left, right, jnp.clip(progress, 0, 1)
-
-
-def _place_of_exposure(metadata, appearance, dtype):
-    left, right, progress = zip(*metadata.exposures, strict=True)
-    row = jnp.clip(appearance, 0, len(left) - 1)
-    return (
-        jnp.asarray(left, jnp.int32)[row],
-        jnp.asarray(right, jnp.int32)[row],
-        jnp.asarray(progress, dtype)[row],
-    )

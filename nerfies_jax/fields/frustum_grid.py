@@ -49,7 +49,7 @@ def resolves(bound: Bound) -> bool:
     Returns:
       True if the grid can replace evaluation at every sample.
     """
-    metadata = bound.metadata
+    metadata = bound.metadata.concrete
     cell = (metadata.far - metadata.near) * metadata.scale / DEEP
     if any(effect.trunk_features or effect.point_codes for effect in bound.effects):
         return False
@@ -57,7 +57,7 @@ def resolves(bound: Bound) -> bool:
     known = [wave for wave in waves if wave is not None]
     if not waves or len(known) < len(waves):
         return False
-    return CELLS_A_WAVE * cell <= min(known)
+    return bool(CELLS_A_WAVE * cell <= min(known))
 
 
 def displacements(

@@ -9,11 +9,10 @@ of a step are those of the selected rays, which are larger than the mean over al
 """
 
 import functools
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Bool, Int
 
 from nerfies_jax.fields import skipping
 from nerfies_jax.fields.effects.effect import Batch
@@ -21,6 +20,7 @@ from nerfies_jax.fields.field import Field
 from nerfies_jax.fields.field_ray import Ray, field_ray, filled_along
 from nerfies_jax.fields.occupancy import Cells
 from nerfies_jax.fields.render_ray import is_moved
+from nerfies_jax.training import programs
 from nerfies_jax.training.model import Event, Frames, TrainState
 
 
@@ -36,7 +36,8 @@ def first(field: Field) -> Cells | tuple[()]:
     if field.spec.sampling.occupancy is None:
         return ()
     params = jax.eval_shape(field.init, jax.random.key(0))
-    found = jax.eval_shape(_survey(field), params, jnp.zeros((), jnp.int32))
+    survey = functools.partial(_occupied, field)
+    found = jax.eval_shape(survey, params, jnp.zeros((), jnp.int32))
     return jnp.ones(found.shape, bool)
 
 
@@ -63,7 +64,7 @@ def events(field: Field) -> tuple[Event, ...]:
             "surveyed once for all: it moves, has a transient medium, normals, or no "
             "extent; leave it out (sampling.occupancy=none)"
         )
-    survey = jax.jit(_survey(field))
+    survey = programs.Program(_occupied, field)
 
     def apply(state: TrainState, frames: Frames) -> TrainState:
         del frames
@@ -77,11 +78,9 @@ def events(field: Field) -> tuple[Event, ...]:
     return (Event("survey", when, apply),)
 
 
-def _survey(field: Field) -> Callable[[PyTree, Int[Array, ""]], Cells]:
-    """Return a function that finds the cells that are occupied in any level."""
-    survey = field.survey
-    assert survey is not None
-    return lambda params, step: survey(params, step)[skipping.GUIDE]
+def _occupied(field, params, step):
+    """Find the cells that are occupied in any level."""
+    return field.survey(params, step)[skipping.GUIDE]
 
 
 def meets(occupied: Cells, ray: Ray, half_side: float) -> Bool[Array, ""]:

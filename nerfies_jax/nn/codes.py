@@ -107,6 +107,25 @@ def blend(
     return (1 - progress) * start + progress * end
 
 
+def place_of(
+    places: Any, index: Int[Array, ""], dtype: Any
+) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
+    """Look up the place of an id in a table whose ids are interpolated.
+
+    Args:
+      places: For each id, two ids of the table and the progress between them: tuples,
+        or an array [ids, 3].
+      index: The id. One that is out of range uses the nearest one.
+      dtype: Floating-point type of the progress.
+
+    Returns:
+      Left id, right id and progress, as for `blend`.
+    """
+    row = jnp.clip(index, 0, len(places) - 1)
+    left, right, progress = jnp.asarray(places)[row]
+    return left.astype(jnp.int32), right.astype(jnp.int32), progress.astype(dtype)
+
+
 def at_time(table: Table, time: Float[Array, ""]) -> Float[Array, " code"]:
     """Interpolate linearly in time between the codes of a table.
 

@@ -187,6 +187,9 @@ class MoreMetrics:
     fit_heldout_cameras: int = 0
     """Optimize the cameras of this many held-out frames with the trained scene fixed,
     and evaluate these frames again."""
+    step_profile: bool = False
+    """Measure the time of each part of a training step for the report. The parts are
+    compiled separately, which takes longer than the measurement."""
 
     def __post_init__(self):
         if self.lpips_network not in ("alex", "vgg"):

@@ -19,6 +19,9 @@ Device = Literal["auto", "cpu", "gpu", "tpu"]
 # Number of cores that XLA:CPU sees. Each representation chooses it.
 Threads = Literal["one", "all"]
 _AFFINITY = hasattr(psutil.Process, "cpu_affinity")  # not on macOS
+# Programs that compile faster are not kept. A run has 40 between this and the 1 s of
+# JAX, and reads each in milliseconds.
+CACHED_SECONDS = 0.05
 VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # 256 bits by default
 
 
@@ -93,6 +96,9 @@ def start_jax(
         with contextlib.suppress(OSError):  # JAX also works without a cache
             folder.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(folder))
+            if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+                seconds = CACHED_SECONDS
+                jax.config.update("jax_persistent_cache_min_compile_time_secs", seconds)
             # Not `jax_compilation_cache_max_size`: a process that is killed between the
             # two files of an entry would make all later writes fail (JAX 0.10).
             cache_files.evict(folder, cache.limit_bytes())

@@ -94,7 +94,7 @@ def make(
         player, player_notes = attempt(no_player, save_player, target, run, trained)
         # The parts of a step are compiled in the background while other products are
         # written. The player comes first, because its compilation uses all cores.
-        with step_profile.profiling(run, state) as profile:
+        with step_profile.profiling(run, state, extra.step_profile) as profile:
             figures = [*player]
             comparison = attempt(
                 None, _save_comparison, target / "comparison.png", run.observed, scored
@@ -142,8 +142,7 @@ def make(
             notes = [*warnings, trained.result.message, *skipped_frames]
             notes += _capture_notes(run, folder)
             notes += [*quality_notes, *fit_notes, *saved.notes, *player_notes]
-            with events.stage("timing the parts of a step"):
-                step_ms, profile_notes = profile()
+            step_ms, profile_notes = profile()
         notes += profile_notes
     page = attempt(
         None,

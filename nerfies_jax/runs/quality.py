@@ -37,9 +37,10 @@ class Extra(NamedTuple):
 
     lpips: Lpips | None
     camera_fits: int  # frames to score also with optimized cameras
+    step_profile: bool  # True to measure the parts of a training step
 
 
-NOTHING = Extra(None, 0)
+NOTHING = Extra(None, 0, False)
 
 
 def prepared(more: MoreMetrics) -> Extra:
@@ -58,7 +59,7 @@ def prepared(more: MoreMetrics) -> Extra:
     if more.lpips_weights:
         network = NETWORKS[more.lpips_network]
         lpips = Lpips(network, perceptual.load(network, more.lpips_weights))
-    return Extra(lpips, more.fit_heldout_cameras)
+    return Extra(lpips, more.fit_heldout_cameras, more.step_profile)
 
 
 def check(extra: Extra, size: tuple[int, int]) -> None:

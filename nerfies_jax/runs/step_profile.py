@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from nerfies_jax.runs import validation
 from nerfies_jax.runs.run import Run
+from nerfies_jax.runtime import events
 from nerfies_jax.training.model import TrainState
 
 
@@ -17,7 +18,9 @@ class Profile(NamedTuple):
 
 
 @contextlib.contextmanager
-def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
+def profiling(
+    run: Run, state: TrainState, requested: bool = True
+) -> Iterator[Callable[[], Profile]]:
     """Compile the parts of a step in the background, to time them later.
 
     A failure becomes a note and does not affect other products of the run. If the block
@@ -26,6 +29,7 @@ def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
     Args:
       run: The run.
       state: Trained state.
+      requested: False to measure nothing.
 
     Yields:
       A function that measures the times.
@@ -38,12 +42,13 @@ def profiling(run: Run, state: TrainState) -> Iterator[Callable[[], Profile]]:
 
     def measure():
         try:
-            return Profile(parts.ms(), [])
+            with events.stage("timing the parts of a step"):
+                return Profile(parts.ms(), [])
         except Exception as error:
             return failure(error)
 
     step_parts = run.representation.resources.step_parts
-    if step_parts is None:
+    if step_parts is None or not requested:
         yield lambda: Profile({}, [])
         return
     frames = validation.training_frames(run)

@@ -14,7 +14,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import HalfScorer
 from nerfies_jax.fields import field_ray, skipping
 from nerfies_jax.scene import scene
-from nerfies_jax.training import fit, losses
+from nerfies_jax.training import fit, losses, programs
 from nerfies_jax.training.effects import APPEARANCE, FrameCondition
 from nerfies_jax.training.model import (
     Rendering,
@@ -55,11 +55,14 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
     if not tables:
         return None
     guided = spec.sampling.occupancy is not None
-    draw = jax.jit(field.render, static_argnums=4)
-    codes_of = jax.jit(field.codes_at)
 
-    @jax.jit
-    def solve(params, view, pixels, colors, step):
+    def render_codes(field, params, camera, time, codes, step):
+        return field.render(params, camera, time, codes, size, step)
+
+    def look_up(field, params, view):
+        return field.codes_at(params, view)
+
+    def fit_codes(field, params, view, pixels, colors, step):
         # With the same samples as the rendered image.
         guide = field.survey(params, step)[skipping.GUIDE] if guided else None
         codes = field.codes_at(params, view)
@@ -70,7 +73,9 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
                 lambda pixel: (
                     field.render_ray(
                         params,
-                        field_ray.field_ray_through(metadata, view.camera, pixel)[0],
+                        field_ray.field_ray_through(field.metadata, view.camera, pixel)[
+                            0
+                        ],
                         condition,
                         guide=guide,
                     )[-1].color
@@ -81,6 +86,10 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
         start = {name: codes[name] for name in tables}
         solution = fit.fit_code(loss, start, max_steps=MOST_STEPS, tolerance=TOLERANCE)
         return codes | solution.value
+
+    draw, codes_of, solve = (
+        programs.Program(each, field) for each in (render_codes, look_up, fit_codes)
+    )
 
     def score(
         state: TrainState, capture: Capture, rows: np.ndarray
@@ -100,7 +109,7 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
             return solve(params, view, pixels, colors, step)
 
         def render(view: View, codes: Any) -> Rendering:
-            return draw(params, view.camera, view.time, codes, size, step)
+            return draw(params, view.camera, view.time, codes, step)
 
         return evaluation.score_halves(fit_code, render, capture, rows)
 

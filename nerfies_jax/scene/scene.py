@@ -31,7 +31,7 @@ from nerfies_jax.nn.planes import PlanesSpec
 from nerfies_jax.preprocessing import usable_paths
 from nerfies_jax.runtime import data_parallel
 from nerfies_jax.scene import warp_fit
-from nerfies_jax.training import loop, losses, schedules
+from nerfies_jax.training import loop, losses, programs, schedules
 from nerfies_jax.training.effects import (
     FrameCondition,
     PenaltyContext,
@@ -97,6 +97,19 @@ def build(
     if template is not None:
         spec = dataclasses.replace(spec, template=template, coarse=None)
     radiance = field(spec, metadata, effects=effects)
+
+    def build_with(numbers):
+        return _model(programs.with_numbers(radiance, numbers), effects)
+
+    return programs.taking(_model(radiance, effects), metadata.numbers, build_with)
+
+
+def _model(radiance, more):
+    """Return the model of a field, `more` of whose effects are not of its spec.
+
+    The numbers of the capture are compiled in.
+    """
+    spec, metadata = radiance.spec, radiance.metadata
     _check_guides(spec, radiance.effects)
     codes_at = radiance.codes_at
     if spec.background is not None and "points" not in metadata.available_data:
@@ -135,7 +148,7 @@ def build(
     read = frozenset().union(*(effect.required_data for effect in radiance.effects))
     return Model(
         # Further effects are stored by name. A run with others is a different run.
-        spec=(spec, metadata, *(effect.name for effect in effects)),
+        spec=(spec, metadata, *(effect.name for effect in more)),
         init=init,
         step=_stepper(spec, radiance, devices),
         events=occupied_rays.events(radiance),

@@ -19,6 +19,7 @@ from nerfies_jax.fields.effects import scene_flow, timestamps
 from nerfies_jax.fields.field import Field
 from nerfies_jax.preprocessing import usable_paths
 from nerfies_jax.preprocessing.record import Evidence
+from nerfies_jax.training import programs
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
 from nerfies_jax.training.track_start import TrackStartSpec
@@ -127,8 +128,7 @@ def fit(
         key, direction_key = jax.random.split(key)
         return sum(distances(*free, *_drawn(paths, frames, key), direction_key))
 
-    @jax.jit
-    def mean_distance(free):
+    def mean_distance(free, key):
         nothing = jnp.zeros((0, 3), paths.position.dtype)
         every = jnp.arange(frames), jnp.arange(points)
         return distances(*free, *every, nothing, key)[0]
@@ -140,7 +140,9 @@ def fit(
         jnp.asarray(_first_places(paths)),
     )
     fitted = descended(loss, free, start.fit_rate, key, start.fit_steps)
-    first, last = float(mean_distance(free)), float(mean_distance(fitted))
+    separate, captured = programs.with_captured(mean_distance, free, key)
+    distance_of = jax.jit(separate)
+    first, last = (float(distance_of(captured, x, key)) for x in (free, fitted))
     return WarpFit(params | fitted[0], fitted[1], first, last)
 
 
@@ -181,6 +183,7 @@ def fit_flow(
     moments = moments / timestamps.interval(len(field.metadata.times))
     shift = np.diff(paths.position, axis=1) / moments[:, None]
     unit = max(float(np.linalg.norm(shift, axis=-1)[both].mean()), 1e-12)
+    unit = jax.device_put(np.asarray(unit, shift.dtype))  # captured, not a constant
     away = _flow_distances(field, paths, shift, both)
     frames, points = len(moments), len(paths.known)
 
@@ -188,14 +191,15 @@ def fit_flow(
         drawn = _drawn(paths, frames, key)
         return sum(away(own, *drawn, SOFT_FLOW * unit)) / unit
 
-    @jax.jit
     def mean_distance(own):
         nothing = jnp.zeros((0, 3), paths.position.dtype)
         return away(own, jnp.arange(frames), jnp.arange(points), nothing, 0.0)[0]
 
     own = params[scene_flow.NAME]
     fitted = descended(loss, own, start.fit_rate, key, start.fit_steps)
-    first, last = float(mean_distance(own)), float(mean_distance(fitted))
+    separate, captured = programs.with_captured(mean_distance, own)
+    distance_of = jax.jit(separate)
+    first, last = (float(distance_of(captured, x)) for x in (own, fitted))
     return FlowFit(params | {scene_flow.NAME: fitted}, first, last)
 
 

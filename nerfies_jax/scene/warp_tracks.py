@@ -11,7 +11,7 @@ from nerfies_jax.evaluation.protocol import STATIC_POINTS, GroundTruth, PointTra
 from nerfies_jax.fields.effects import scene_flow, timestamps
 from nerfies_jax.fields.render_ray import Bound, mean_flow
 from nerfies_jax.scene import scene
-from nerfies_jax.training import tracks
+from nerfies_jax.training import programs, tracks
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import in_default_precision
 
@@ -47,7 +47,7 @@ def follow(
     if all(effect.displace is None for effect in field.effects):
         return _follow_flow(field, state, capture, known)
     views = [evaluation.view_of(capture, int(row)) for row in known.moments]
-    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
+    views = jax.tree.map(lambda *leaves: np.stack(leaves), *views)
     center = np.asarray(metadata.center, np.float32)
 
     def to_field(points):
@@ -55,8 +55,7 @@ def follow(
 
     static = _static_points(capture)
 
-    @jax.jit
-    def solve(params, step, start, true, static):
+    def solve(field, params, step, views, start, true, static):
         def condition_of(view):
             return FrameCondition(view.time, field.codes_at(params, view), step)
 
@@ -72,9 +71,10 @@ def follow(
         return followed, apart, grads
 
     followed, apart, grads = jax.device_get(
-        solve(
+        programs.Program(solve, field)(
             state.params,
             state.step,
+            views,
             to_field(known.start_points),
             to_field(known.path),
             to_field(static),
@@ -142,12 +142,13 @@ def _flow_mover(field) -> Move | None:
     center = np.asarray(metadata.center, np.float32)
     gap = timestamps.interval(len(metadata.times))
 
-    @jax.jit
-    def hop(params, step, points, view, side, length):
+    def hop(field, params, step, points, view, side, length):
         condition = FrameCondition(view.time, field.codes_at(params, view), step)
-        bound = Bound(field.spec, metadata, field.effects, params)
+        bound = Bound(field.spec, field.metadata, field.effects, params)
         flow = jax.vmap(lambda point: mean_flow(bound, point, condition))(points)
         return points + length * flow[:, side]
+
+    hopped = programs.Program(hop, field)
 
     def move(state, points, here, there):
         begin, end = float(here.time), float(there.time)
@@ -157,7 +158,7 @@ def _flow_mover(field) -> Move | None:
         place = in_default_precision((points - center) * np.float32(metadata.scale))
         for time in np.linspace(begin, end, hops, endpoint=False):
             view = here._replace(time=jnp.asarray(time, here.time.dtype))
-            place = hop(state.params, state.step, place, view, side, length)
+            place = hopped(state.params, state.step, place, view, side, length)
         reached = np.asarray(place) / np.float32(metadata.scale) + center
         known = np.isfinite(reached).all(axis=1)
         return Moved(np.where(known[:, None], reached, points), known)
@@ -180,8 +181,7 @@ def mover(spec, metadata) -> Move | None:
         return _flow_mover(field)
     center = np.asarray(metadata.center, np.float32)
 
-    @jax.jit
-    def solve(params, step, points, here, there):
+    def solve(field, params, step, points, here, there):
         def condition_of(view):
             return FrameCondition(view.time, field.codes_at(params, view), step)
 
@@ -190,10 +190,12 @@ def mover(spec, metadata) -> Move | None:
         tracked = tracks.point_tracks(field.displace, params, points, conditions, 0)
         return tracked.points[:, 1], tracked.converged[:, 1]
 
+    solved = programs.Program(solve, field)
+
     def move(state, points, here, there):
         inside = in_default_precision((points - center) * np.float32(metadata.scale))
         reached, known = jax.device_get(
-            solve(state.params, state.step, inside, here, there)
+            solved(state.params, state.step, inside, here, there)
         )
         moved = reached / np.float32(metadata.scale) + center
         return Moved(np.where(known[:, None], moved, points), known)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.capture.flow import FrameFlow
@@ -82,9 +83,12 @@ def in_default_precision(tree: PyTree) -> PyTree:
     default = jnp.result_type(float)
 
     def convert(leaf):
-        leaf = jnp.asarray(leaf)
-        is_float = jnp.issubdtype(leaf.dtype, jnp.floating)
-        return leaf.astype(default) if is_float else leaf
+        on_host = not isinstance(leaf, jax.Array)
+        leaf = np.asarray(leaf) if on_host else leaf
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            leaf = leaf.astype(default)
+        # `jnp.asarray` would compile a program for each shape.
+        return jax.device_put(leaf) if on_host else leaf
 
     return jax.tree.map(convert, tree)
 
@@ -148,3 +152,8 @@ class Model(NamedTuple):
     found: Callable[[PyTree, Any], Any] | None = None
     # Compiler options of steps and renders (`nerfies_jax.runtime.compiler`).
     compiler_options: Mapping[str, str] | None = None
+    # Numbers of the capture that the functions above read, a pytree of floats and
+    # arrays, and a function (model, numbers) -> the model for other numbers, which may
+    # be traced (`training.programs`). None: they are compiled into the programs.
+    numbers: PyTree = None
+    with_numbers: Callable[["Model", PyTree], "Model"] | None = None

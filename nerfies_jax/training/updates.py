@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Key
 
+from nerfies_jax.training import programs
+
 PyTree = Any
 LAST_RATE = 0.02  # last over first learning rate in `descended`
 
@@ -56,21 +58,24 @@ def descended(
     """
     adam = optax.scale_by_adam()
 
-    def step(state, key_and_count):
-        params, moments = state
-        key, count = key_and_count
-        grads = jax.grad(loss)(params, key)
-        updates, moments = adam.update(grads, moments)
-        decay = LAST_RATE ** (count.astype(jnp.result_type(float)) / steps)
-        step_rates = jax.tree.map(lambda rate: rate * decay, rates)
-        return (apply_updates(params, updates, step_rates), moments), None
-
+    # Numbers and arrays of the capture are arguments, so that other captures reuse the
+    # compiled program.
     @jax.jit
-    def run(params):
+    def run(params, rates, key, captured):
+        def step(state, key_and_count):
+            params, moments = state
+            key, count = key_and_count
+            grads = jax.grad(lambda params: separate(captured, params, key))(params)
+            updates, moments = adam.update(grads, moments)
+            decay = LAST_RATE ** (count.astype(jnp.result_type(float)) / steps)
+            step_rates = jax.tree.map(lambda rate: rate * decay, rates)
+            return (apply_updates(params, updates, step_rates), moments), None
+
         keys = jax.random.split(key, steps), jnp.arange(steps)
         (params, _), _ = jax.lax.scan(step, (params, adam.init(params)), keys)
         return params
 
     # optax raises floats to an integer number of steps.
     with jax.numpy_dtype_promotion("standard"):
-        return run(start)
+        separate, captured = programs.with_captured(loss, start, key)
+        return run(start, rates, key, captured)

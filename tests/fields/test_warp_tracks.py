@@ -45,6 +45,8 @@ def test_points_are_followed_through_a_warp_in_closed_form(
         effects=(FieldRecord("warp", displace=displace),),
         codes_at=lambda params, view: {},
         displace=displace,
+        numbers=None,
+        with_numbers=None,
     )
     monkeypatch.setattr(scene, "field", lambda *_, **__: stub)
     state = types.SimpleNamespace(params=velocity, step=jnp.int32(5))

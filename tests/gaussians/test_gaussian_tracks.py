@@ -14,7 +14,7 @@ from gaussians_jax.scene import gaussian_tracks
 from gaussians_jax.scene import scene as splat_scene
 from nerfies_jax.capture import synthetic
 from nerfies_jax.evaluation import protocol
-from nerfies_jax.training.model import Stages
+from nerfies_jax.training.model import Model, Stages
 from tests import scenes
 from tests.gaussians.shared import put, rows_of
 
@@ -43,9 +43,8 @@ def follow_moved(monkeypatch, filmed, rows, moved):
         return Gaussians(mean, splats.quaternion, jnp.exp(splats.log_scale), opacity)
 
     stages = Stages(lambda params: jnp.zeros(()), deform, None)
-    monkeypatch.setattr(
-        splat_scene, "build", lambda *_: types.SimpleNamespace(stages=stages)
-    )
+    model = Model(None, None, None, None, (), None, stages=stages)
+    monkeypatch.setattr(splat_scene, "build", lambda *_: model)
     effects = (types.SimpleNamespace(deform=deform),)
     monkeypatch.setattr(splat_scene, "all_effects", lambda *_: effects)
     state = types.SimpleNamespace(params=Params({"splats": rows}, {}))

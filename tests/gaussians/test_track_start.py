@@ -20,6 +20,7 @@ from gaussians_jax.scene import presets, scene, spec
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import hidden_points, record, usable_paths
+from tests import compilations
 from tests.gradients import directional_error
 from tests.preprocessing import films
 from tests.preprocessing.test_tracks import MOVES, gathered
@@ -84,6 +85,21 @@ def test_every_motion_can_be_fitted_to_paths(name):
     off = np.linalg.norm(middle - position[:, FRAMES // 2], axis=-1)
     # Also where a path was not known: it moves as its neighbors do.
     assert np.median(off) < 0.03
+
+
+@pytest.mark.full
+def test_a_fit_to_other_paths_compiles_nothing(tmp_path):
+    position, time = turning_body()
+    known = np.ones(position.shape[:2], bool)
+    effect, counts = effect_of(MOTIONS["bases"]), []
+    with compilations.counted(tmp_path) as since:
+        for scale in (1.0, 1.1):
+            path = (scale * position).astype(np.float32)
+            depth = Depth(np.ones_like(path) / 3**0.5, np.full(len(path), 0.02))
+            paths = Paths(time, path, known, scale, depth=depth)
+            motion_fit.fit(effect, paths, jax.random.key(int(9 * scale)), steps=10)
+            counts.append(since())
+    assert counts[0] > counts[1] == 0
 
 
 @pytest.mark.full

@@ -187,7 +187,8 @@ def _points(spec, plan, images, hits, moving, seed):
     candidates = np.flatnonzero(static & plan.learn[:, None, None])
     sample = rng.choice(candidates, min(spec.points, len(candidates)), replace=False)
     row = sample // static[0].size
-    direction = jax.vmap(functools.partial(rendering.view_direction, spec))
+    # One program, because its operations take longer to compile separately.
+    direction = jax.jit(jax.vmap(functools.partial(rendering.view_direction, spec)))
     directions = direction(
         cameras.take(plan.cameras, row), _pixel_centers(sample, spec.size)
     )

@@ -146,7 +146,7 @@ class Bound:
     """
 
     spec: SceneFlowSpec
-    times: tuple[float, ...]
+    times: tuple[float, ...] | Float[Array, " times"]
 
     name = NAME
 
@@ -287,7 +287,7 @@ def medium(
 
 def neighbor(
     spec: SceneFlowSpec,
-    times: tuple[float, ...],
+    times: tuple[float, ...] | Float[Array, " times"],
     params: SceneFlow,
     context: PenaltyContext,
     side: int,
@@ -338,7 +338,7 @@ def neighbor(
 
 def penalty(
     spec: SceneFlowSpec,
-    times: tuple[float, ...],
+    times: tuple[float, ...] | Float[Array, " times"],
     params: SceneFlow,
     context: PenaltyContext,
 ) -> dict[str, Term]:

@@ -1,7 +1,6 @@
 """Spacing and neighbors of the training timestamps."""
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 
@@ -23,7 +22,9 @@ def interval(moments: int) -> float:
 
 
 def neighbor(
-    times: tuple[float, ...], time: Float[Array, " rays"], sign: int
+    times: tuple[float, ...] | Float[Array, " times"],
+    time: Float[Array, " rays"],
+    sign: int,
 ) -> tuple[Float[Array, " rays"], Bool[Array, " rays"]]:
     """Find the training timestamp after or before the one nearest to a time.
 
@@ -36,10 +37,10 @@ def neighbor(
       Timestamps [rays], one interval away if there is none, and booleans [rays] that
       are True if there is one.
     """
-    timestamps = np.asarray(times)
-    midpoints = jnp.asarray((timestamps[1:] + timestamps[:-1]) / 2, time.dtype)
+    timestamps = jnp.asarray(times, time.dtype)
+    midpoints = (timestamps[1:] + timestamps[:-1]) / 2
     index = jnp.searchsorted(midpoints, time) + sign
     present = (index >= 0) & (index < len(times))
-    nearest = jnp.asarray(timestamps, time.dtype)[jnp.clip(index, 0, len(times) - 1)]
+    nearest = timestamps[jnp.clip(index, 0, len(times) - 1)]
     extrapolated = time + sign * interval(len(times))
     return jnp.where(present, nearest, extrapolated), present

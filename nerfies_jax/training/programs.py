@@ -1,0 +1,140 @@
+"""Programs of a model that take the numbers of its capture as arguments.
+
+A number that is compiled into a program, such as the scale of the scene, is part of its
+key in the compilation cache. As an argument it is not, so a second capture of the same
+shapes reuses the programs of the first.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from nerfies_jax.training.model import Model, PyTree
+
+
+def taking(model: Model, numbers: PyTree, build: Callable[[PyTree], Model]) -> Model:
+    """Let the programs of a model take the numbers of its capture as arguments.
+
+    Args:
+      model: The model, with the numbers compiled in.
+      numbers: The numbers, a pytree of floats and arrays.
+      build: Function of numbers, which may be traced, that returns the model for them.
+
+    Returns:
+      The model with `numbers` and `with_numbers`. Functions of it that the caller
+      replaces later stay as they are.
+    """
+
+    def renewed(current, numbers):
+        try:
+            rebuilt = build(numbers)
+        except TypeError:
+            # A part from another package converts a number to a Python one, which is
+            # not possible for a traced number.
+            return current
+        fields = zip(current, model, rebuilt, strict=True)
+        return Model(*(new if mine is old else mine for mine, old, new in fields))
+
+    return model._replace(numbers=numbers, with_numbers=renewed)
+
+
+def with_numbers(owner: Any, numbers: PyTree) -> Any:
+    """Return a model or field with other numbers of the capture, which may be traced.
+
+    Args:
+      owner: A `Model` or a field, with attributes `numbers` and `with_numbers`.
+      numbers: Numbers of the structure of its own.
+
+    Returns:
+      The model or field, unchanged if its functions take no numbers of the capture.
+    """
+    return owner if owner.with_numbers is None else owner.with_numbers(owner, numbers)
+
+
+class Program:
+    """A function of a model and of arrays, compiled with `jax.jit`.
+
+    The numbers of the capture are the first argument of the compiled function.
+
+    Args:
+      function: Pure function of a model, or field, and arrays. Its name is that of the
+        program.
+      owner: The model or field.
+    """
+
+    def __init__(self, function: Callable[..., Any], owner: Any):
+        def program(numbers, *args):
+            return function(with_numbers(owner, numbers), *args)
+
+        program.__name__ = function.__name__
+        options = getattr(owner, "compiler_options", None)
+        self._program = jax.jit(program, compiler_options=options)
+        self._numbers = owner.numbers
+
+    def __call__(self, *args: Any) -> Any:
+        """Call the program for the capture of the model."""
+        return self._program(self._numbers, *args)
+
+    def lower(self, *args: Any) -> jax.stages.Lowered:
+        """Lower the program. Once compiled, it takes the numbers before `args`."""
+        return self._program.lower(self._numbers, *args)
+
+
+def with_captured(
+    function: Callable[..., Any], *args: Any
+) -> tuple[Callable[..., Any], list[Any]]:
+    """Separate a function from the arrays that it has captured.
+
+    JAX compiles captured arrays into a program, which makes them part of its key in the
+    compilation cache.
+
+    Args:
+      function: Pure function, whose inner calls of `jax.jit` capture no arrays.
+      *args: Example arguments. Only their structure, shapes and dtypes are used.
+
+    Returns:
+      A function of the list of captured arrays and of arguments like `args`, and that
+      list.
+    """
+    closed, result = jax.make_jaxpr(function, return_shape=True)(*args)
+    structure = jax.tree.structure(result)
+
+    def separate(captured, *args):
+        program = core.jaxpr_as_fun(core.ClosedJaxpr(closed.jaxpr, captured))
+        return jax.tree.unflatten(structure, program(*jax.tree.leaves(args)))
+
+    captured = [x if isinstance(x, jax.Array) else np.asarray(x) for x in closed.consts]
+    return separate, captured
+
+
+def deformer(model: Model) -> Callable[[PyTree], Callable[[Any], PyTree]]:
+    """Compile the first two stages of rendering. The renderer has the same programs.
+
+    Args:
+      model: A model with stages.
+
+    Returns:
+      A function of parameters that returns the second stage as a function of time.
+    """
+    prepared_of, deformed_of = Program(prepare, model), Program(deform, model)
+
+    def deformer_of(params):
+        prepared = prepared_of(params)
+        return lambda time: deformed_of(params, prepared, time)
+
+    return deformer_of
+
+
+def prepare(model: Model, params: PyTree) -> PyTree:
+    """Call the first stage of rendering."""
+    assert model.stages is not None
+    return model.stages.prepare(params)
+
+
+def deform(model: Model, params: PyTree, prepared: PyTree, time: Any) -> PyTree:
+    """Call the second stage of rendering."""
+    assert model.stages is not None
+    return model.stages.deform(params, prepared, time)
