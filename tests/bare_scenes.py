@@ -218,7 +218,13 @@ def field_loss(spec, metadata, params, batch, key):
         span = metadata.scale / cosine
         near, far = metadata.near * span, metadata.far * span
         first, second, _ = jax.random.split(key, 3)
-        distance = sampling.stratified(first, near, far, plan.coarse, plan.spacing)
+        if plan.spacing == "center":
+            middle = -jnp.sum(origin * direction)
+            miss_sq = jnp.sum(jnp.square(origin + middle * direction))
+            width = jnp.sqrt(spec.extent**2 + miss_sq)
+            distance = sampling.centered(first, near, far, plan.coarse, middle, width)
+        else:
+            distance = sampling.stratified(first, near, far, plan.coarse, plan.spacing)
         if plan.fine == 0:
             return (level("fine", origin, direction, far, distance)[1],)
         name = "fine" if plan.shared else "coarse"

@@ -111,8 +111,8 @@ def same_program(ours, by_hand, *args):
 
 
 # Every kind of static field: two networks for two levels, one for both, one level, a
-# coarse network of its own that does not see the direction, and a fine level that sees
-# its own samples alone.
+# coarse network of its own that does not see the direction, a fine level that sees its
+# own samples alone, and samples around the captured volume.
 @pytest.mark.full
 @pytest.mark.parametrize(
     "name",
@@ -120,6 +120,7 @@ def same_program(ours, by_hand, *args):
         "nerf-small",
         *(pytest.param(n, marks=pytest.mark.slow) for n in ("nerf", "d-nerf", "nsff")),
         pytest.param("nerf-grid-small", marks=pytest.mark.slow),
+        pytest.param("nerf-w-grid-small", marks=pytest.mark.slow),
     ],
 )
 def test_a_field_without_effects_is_the_static_one_bit_for_bit(name):
@@ -138,7 +139,7 @@ def test_there_is_no_other_kind_of_static_field():
         ways = plan.shared, union, plan.spacing, plan.jitter, spec.density_noise
         return two, blind, *ways
 
-    few = "nerf-small", "nerf", "d-nerf", "nsff", "nerf-grid-small"
+    few = "nerf-small", "nerf", "d-nerf", "nsff", "nerf-grid-small", "nerf-w-grid-small"
     held = {kind(name) for name in few}
     # SMALL_D_NERF has two networks, and NSFF's levels are one
     assert {kind(name) for name in field_presets.PRESETS} == held
