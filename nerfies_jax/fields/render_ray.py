@@ -374,16 +374,20 @@ def _media(bound, effects, ray, condition, samples, radiance) -> dict[str, Mediu
 def _composite(bound, ray, samples, radiance, media):
     distance = samples.distance
     background = bound.metadata.background
-    last_interval = compositing.AT_INFINITY
-    if background is not None:
-        last_interval = jnp.maximum(ray.far - distance[-1], 0)
+    captured = compositing.intervals(distance, jnp.maximum(ray.far - distance[-1], 0))
+    spacing = captured
+    if background is None:
+        spacing = compositing.intervals(distance, compositing.AT_INFINITY)
+    else:
         background = jnp.asarray(background, distance.dtype)
-    spacing = compositing.intervals(distance, last_interval)
     static, of_media = radiance.density * spacing, []
     for medium in media.values():
-        depth = medium.density * spacing
-        if medium.share is not None:
-            depth = compositing.thinned(depth, medium.share)
+        if medium.share is None:
+            # It ends at the far plane. Over the interval behind it any density would be
+            # opaque, at almost no price: transient objects would explain the sky.
+            depth = medium.density * captured
+        else:
+            depth = compositing.thinned(medium.density * spacing, medium.share)
             static = compositing.thinned(static, -medium.share)
         of_media.append(depth)
     if media:

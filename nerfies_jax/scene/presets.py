@@ -49,7 +49,8 @@ NERF = RadianceScene(
 # Martin-Brualla et al. 2021, arXiv:2008.02268, with the sizes of its public
 # reimplementation. beta_min is that of the paper, and is added outside the rendered
 # sum. The trunk is that of NeRF. Its skip connection is one layer earlier in the
-# reimplementation.
+# reimplementation. The transient medium ends at the far plane. In the reimplementation
+# its last sample represents everything behind it.
 NERF_W = dataclasses.replace(
     NERF,
     appearance=AppearanceSpec(width=48),

@@ -141,6 +141,22 @@ def test_a_static_level_is_the_plain_nerf(union, behind, asked, dtype):
     assert np.all(np.diff(fine.distances) >= 0)
 
 
+def test_a_transient_medium_ends_at_the_far_plane(dtype):
+    """A density of 1e-5 would be opaque over the interval behind it."""
+    thin = TransientSpec(code_width=2, depth=1, width=8, density_bias=-12.0)
+    spec = dataclasses.replace(STATIC, transient=thin)
+    field = scene.field(spec, dataclasses.replace(METADATA, background=None))
+    params = drawn.params(field.init, dtype)
+    ray, condition = ray_of(dtype), condition_of(dtype, transient=np.zeros(2))
+    output = jax.jit(field.render_ray)(params, ray, condition)[-1]
+    share = np.asarray(output.media_weight["transient"], float)
+    ends = np.append(output.distances[1:], ray.far)
+    depth = output.media["transient"].density * (ends - output.distances)
+    assert 0 < share.sum() <= 1.01 * depth.sum() < 1e-2
+    # The static field is still opaque there.
+    np.testing.assert_allclose(np.sum(output.static_weight), 1, atol=1e-2)
+
+
 def plain_nerf(net, ray, distances, behind):
     """One ray of the two-layer field in NumPy, in float64; `behind` it a color."""
     origin, direction, _, far = networks.exact(tuple(ray))

@@ -43,6 +43,9 @@ class TransientSpec:
     out of the transient medium. `beta_power` is that of `photometric`. Zero is the loss
     of the paper. With one, short runs also learn regions of high uncertainty.
 
+    The medium ends at the far plane, as people and cars do. The static field is opaque
+    behind it.
+
     The medium is absent for `hold_steps`, so that the static scene explains what it
     can before. `density_bias` is added to the density before its activation. Negative
     values start with less density, and the static scene is visible through it.
