@@ -386,7 +386,9 @@ def test_a_picture_without_effects_asks_none(start, spec):
     every = {
         True: hand_made_effects.FIELD_MODULES
         | {"time_warp": hand_made_effects.time_warp},
-        False: hand_made_effects.SPLAT_MODULES | hand_made_effects.MOTION_MODULES,
+        False: hand_made_effects.SPLAT_MODULES
+        | hand_made_effects.MOTION_MODULES
+        | {"sky": hand_made_effects.sky},
     }
     assert modules == [*every[start is started_field].values()]
 

@@ -215,7 +215,8 @@ for name in [*names.split(), "distributed"]:
     sys.modules[name] = None
 for package in ("nerfies_jax", "gaussians_jax", "experiments"):
     for path in sorted(pathlib.Path(package).rglob("*.py")):
-        if path.stem != "worker":  # does its work when it is loaded
+        # One does its work when it is loaded, and nerfbaselines loads the other.
+        if path.stem not in ("worker", "nerfbaselines_spec"):
             importlib.import_module(".".join(path.with_suffix("").parts))
 """
 

@@ -47,7 +47,7 @@ def filmed(tmp_path_factory):
 def run(filmed):
     """A short run of a field with appearance codes and a warp."""
     out = filmed.parent / "run"
-    common = ("--preset", "nerfies", "--steps", "12", "--out", out)
+    common = ("--preset", "nerfies", "--steps", "12", "--step-profile", "--out", out)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(budget, "MAX_VIDEO_FRAMES", budget.MIN_VIDEO_FRAMES)
         assert main(reconstruct, filmed, *common, "--set", *TINY) == 0
