@@ -218,6 +218,7 @@ OTHERS = {
     "nj.FrameCondition nj.Term nj.Renderer gj.RasterSpec "
     "gj.RasterizationInfo gj.TrackFit gj.Scene gj.SceneMetadata gj.Gaussians "
     "gj.Params gj.Splats gj.Appearance gj.CameraOptimizer "
+    "gj.GaussianAppearance "
     "nj.kan.KANSpec nj.kan.KAN nj.kan.KANLayer nj.kan.Kernels",
     "settings": "nj.PRESETS nj.with_steps gj.PRESETS gj.with_steps nj.checked "
     "nj.losses.check_geman_mcclure nj.kan.spacing nj.kan.centers nj.kan.width "
