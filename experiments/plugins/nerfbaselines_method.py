@@ -34,7 +34,7 @@ SETTINGS, CAMERAS, STATES = "settings.json", "cameras.npz", "states"
 class NerfiesJax:
     """A model that nerfbaselines trains, renders, saves and loads.
 
-    It fulfils `nerfbaselines.Method`, a protocol, so that package is not imported.
+    It fulfills `nerfbaselines.Method`, a protocol, so that package is not imported.
 
     Args:
       checkpoint: Folder that `save` wrote, or None for a new model.

@@ -20,6 +20,10 @@ MARGIN_PX = 1  # by which silhouettes are widened, because their edges are mixed
 MIN_FOREGROUND, MAX_FOREGROUND = 0.005, 0.9
 
 
+# One function for all batches of candidates, which is compiled once.
+_in_view = jax.jit(jax.vmap(project, (None, 0)))
+
+
 def hull_points(
     rng: np.random.Generator,
     capture: Capture,
@@ -79,15 +83,14 @@ def _inside(points, cameras, images, masks):
     A view does not constrain points outside of its image.
     """
     height, width = masks.shape[1:]
-    in_view = jax.jit(jax.vmap(project, (None, 0)))
     color, views = np.zeros((len(points), 3)), np.zeros((len(points), 1))
-    # All arrays have the first number of points, so that `in_view` compiles once.
+    # All arrays have the first number of points, so that `_in_view` compiles once.
     kept = np.arange(len(points))
     for row, (image, mask) in enumerate(zip(images, masks, strict=True)):
         camera = jax.tree.map(lambda leaf, row=row: leaf[row], cameras)
         padded = np.zeros(points.shape, np.float32)
         padded[: len(kept)] = points[kept]
-        pixel, depth = (np.asarray(x)[: len(kept)] for x in in_view(camera, padded))
+        pixel, depth = (np.asarray(x)[: len(kept)] for x in _in_view(camera, padded))
         shown = (depth > 0) & np.all((pixel >= 0) & (pixel < (width, height)), axis=1)
         column, line = np.where(shown[:, None], pixel, 0).astype(int).T
         color[kept] += np.where(shown[:, None], image[line, column] / 255, 0)

@@ -28,15 +28,13 @@ def encode(rows: Splats) -> bytes:
     Returns:
       The file.
     """
-    order = curve_order(np.asarray(rows.mean, np.float64))
-    leaves: Any = (np.asarray(leaf, np.float64)[order] for leaf in rows)
-    rows = Splats(*leaves)
+    rows = along_curve(rows)
     color = 0.5 + SH_DC * rows.sh_dc[:, 0]
     log_scale = np.clip(rows.log_scale, *SCALE_RANGE)
     position, position_bounds = _in_chunks(rows.mean)
     scale, scale_bounds = _in_chunks(log_scale)
     shade, color_bounds = _in_chunks(color)
-    opacity = 1 / (1 + np.exp(-np.clip(rows.opacity_logit, -700, 700)))
+    opacity = opacity_of(rows)
     words = np.stack(
         [
             _packed(position, _BITS),
@@ -70,7 +68,55 @@ def encode(rows: Splats) -> bytes:
     return ("\n".join([*header, "end_header\n"])).encode() + b"".join(parts)
 
 
-def curve_order(mean: np.ndarray) -> np.ndarray:
+def along_curve(rows: Splats) -> Splats:
+    """Sort Gaussians along a Morton curve.
+
+    Args:
+      rows: Raw parameters in NumPy.
+
+    Returns:
+      The parameters in float64, in the order of `_curve_order`.
+    """
+    order = _curve_order(np.asarray(rows.mean, np.float64))
+    leaves: Any = (np.asarray(leaf, np.float64)[order] for leaf in rows)
+    return Splats(*leaves)
+
+
+def opacity_of(rows: Splats) -> np.ndarray:
+    """Compute opacities, without overflow for logits of any size.
+
+    Args:
+      rows: Raw parameters in NumPy.
+
+    Returns:
+      Opacities in [0, 1], [gaussians].
+    """
+    return 1 / (1 + np.exp(-np.clip(rows.opacity_logit, -700, 700)))
+
+
+def smallest_three(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split rotations into the index of the largest component and the three others.
+
+    Args:
+      quaternion: Quaternions of any length, [gaussians, 4]. Zero is the identity.
+
+    Returns:
+      Indices [gaussians], and the other components [gaussians, 3] of the unit
+      quaternion whose largest one is positive, mapped from [-1/sqrt(2), 1/sqrt(2)] to
+      [0, 1].
+    """
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    unit = np.where(
+        length > 0, quaternion / np.where(length > 0, length, 1), [1, 0, 0, 0]
+    )
+    largest = np.argmax(np.abs(unit), axis=1)
+    row = np.arange(len(unit))
+    unit = unit * np.where(unit[row, largest] < 0, -1, 1)[:, None]
+    others = np.argsort(np.arange(4) == largest[:, None], axis=1, kind="stable")[:, :3]
+    return largest, np.take_along_axis(unit, others, axis=1) / 2**0.5 + 0.5
+
+
+def _curve_order(mean: np.ndarray) -> np.ndarray:
     """Sort points along a Morton curve, so that chunks are small."""
     low, high = mean.min(axis=0), mean.max(axis=0)
     cells = (mean - low) / np.where(high > low, high - low, 1) * 1023
@@ -104,14 +150,5 @@ def _packed(values, bits):
 
 def _packed_rotations(quaternion):
     """Join the number of the largest component and the three others."""
-    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    unit = np.where(
-        length > 0, quaternion / np.where(length > 0, length, 1), [1, 0, 0, 0]
-    )
-    largest = np.argmax(np.abs(unit), axis=1)
-    row = np.arange(len(unit))
-    unit = unit * np.where(unit[row, largest] < 0, -1, 1)[:, None]
-    others = np.argsort(np.arange(4) == largest[:, None], axis=1, kind="stable")[:, :3]
-    # The three smaller ones are at most 1/sqrt(2).
-    level = np.take_along_axis(unit, others, axis=1) / 2**0.5 + 0.5
+    largest, level = smallest_three(quaternion)
     return (largest.astype(np.uint32) << np.uint32(30)) | _packed(level, (10, 10, 10))

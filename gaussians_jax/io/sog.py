@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from gaussians_jax.core.splats import Splats
-from gaussians_jax.io.packed_ply import SCALE_RANGE, curve_order
+from gaussians_jax.io import packed_ply
 
 SUFFIX = ".sog"
 CODEBOOK = 256
@@ -36,13 +36,13 @@ def encode(rows: Splats) -> bytes:
     Returns:
       The file.
     """
-    order = curve_order(np.asarray(rows.mean, np.float64))
-    leaves: Any = (np.asarray(leaf, np.float64)[order] for leaf in rows)
-    rows = Splats(*leaves)
+    rows = packed_ply.along_curve(rows)
     low, high, bounds = _positions(rows.mean)
-    scale_codes, scale_book = _in_codebook(np.clip(rows.log_scale, *SCALE_RANGE))
+    scale_codes, scale_book = _in_codebook(
+        np.clip(rows.log_scale, *packed_ply.SCALE_RANGE)
+    )
     color_codes, color_book = _in_codebook(rows.sh_dc[:, 0])
-    opacity = 1 / (1 + np.exp(-np.clip(rows.opacity_logit, -700, 700)))
+    opacity = packed_ply.opacity_of(rows)
     files = {
         "means_l": _image(low),
         "means_u": _image(high),
@@ -85,16 +85,7 @@ def _positions(mean):
 
 def _rotations(quaternion):
     """Bytes of the three smaller components, and the tag of the largest one."""
-    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    unit = np.where(
-        length > 0, quaternion / np.where(length > 0, length, 1), [1, 0, 0, 0]
-    )
-    largest = np.argmax(np.abs(unit), axis=1)
-    row = np.arange(len(unit))
-    unit = unit * np.where(unit[row, largest] < 0, -1, 1)[:, None]
-    others = np.argsort(np.arange(4) == largest[:, None], axis=1, kind="stable")[:, :3]
-    # The three smaller ones are at most 1/sqrt(2).
-    share = np.take_along_axis(unit, others, axis=1) / math.sqrt(2) + 0.5
+    largest, share = packed_ply.smallest_three(quaternion)
     level = np.clip(np.rint(255 * share), 0, 255)
     return np.column_stack([level, _FIRST_TAG + largest])
 
