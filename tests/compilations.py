@@ -25,6 +25,7 @@ def counted(folder):
     before = jax.config.jax_compilation_cache_dir
     jax.monitoring.register_event_listener(listen)
     _use(folder)
+    jax.clear_caches()  # else the count depends on the tests before
     try:
         yield since
     finally:
