@@ -325,11 +325,12 @@ def _on_grid(preset: RadianceScene) -> RadianceScene:
 
 # The dynamic medium on planes of space and time as in HexPlane. It is evaluated three
 # times per sample. Built-in scene `default` after 90 seconds on one core (steps,
-# held-out PSNR, PSNR of moving regions, and gain of the motion there):   waves, 4 of 96
-# wide, 1024 rays           54    18.8  15.1   and 256 rays
-# 220    21.29 16.60   0.0 dB   waves, 3 of 64 wide                     410    21.97
-# 16.82   0.0   a hash grid of space and the time       820    22.16 16.96   0.1
-# planes, exponential, template's rate    690    23.57 18.26   1.2
+# held-out PSNR, PSNR of moving regions, and gain of the motion there):
+#   waves, 4 of 96 wide, 1024 rays           54    18.8  15.1
+#   and 256 rays                            220    21.29 16.60   0.0 dB
+#   waves, 3 of 64 wide                     410    21.97 16.82   0.0
+#   a hash grid of space and the time       820    22.16 16.96   0.1
+#   planes, exponential, template's rate    690    23.57 18.26   1.2
 PLANES_MEDIUM = dataclasses.replace(
     GRID_TEMPLATE,
     position=PlanesSpec(vertices=64, multiples=(1, 2), moments=30, features=8),
@@ -340,13 +341,16 @@ PLANES_MEDIUM = dataclasses.replace(
 # warp the bias has no benefit within a minute.) The number of samples in occupied space
 # matters most: the first samples are in occupied cells, and the fine level also
 # evaluates them. PSNR of 25 held-out frames of Blender lego and 15 of the built-in
-# scene `static`, with seconds on a busy core:   24 + 24 of 1024 rays, all along them
-# 24.33 dB in 56 s    29.51 dB in 60 s   and the finer ones see both              (32 +
-# 24) 25.67 in 103   in filled cells, each level its own      24.61       59   in filled
-# cells, the finer ones see both 26.29       97   and 512 rays, twice the steps
-# 26.52       89      30.56       76   48 in filled cells, no coarse level      26.62
-# 99      (512) 29.34 61 Networks of width 64 gain nothing (24.33 in 90 s). A finer grid
-# of 512 cells gains 0.3 dB on lego and loses 2 on the other.
+# scene `static`, with seconds on a busy core:
+#   24 + 24 of 1024 rays, along the whole ray    24.33 dB in 56 s    29.51 dB in 60 s
+#   and fine level with both (32 + 24)           25.67       103
+#   in occupied cells, each level its own        24.61        59
+#   in occupied cells, fine level with both      26.29        97
+#   and 512 rays, twice the steps                26.52        89     30.56       76
+#   48 in occupied cells, no coarse level        26.62        99     29.34       61
+# The last number of the other scene has 512 rays. Networks of width 64 gain nothing
+# (24.33 in 90 s). A finer grid of 512 cells gains 0.3 dB on lego and loses 2 on the
+# other.
 EMPTIER = -3.0  # added to the density
 STILL_NERF_GRID = dataclasses.replace(
     SMALL_NERF_GRID,
