@@ -5,8 +5,9 @@
     nerfies study results benchmark --measured runs/benchmark/benchmark.json
 
 Nothing is measured here. A page consists of the docstring of its command and of tables
-of the stored file, which `--measured FILE` replaces first. A test compares every page
-with its file.
+of the stored file, which `--measured FILE` replaces first. The runs of a benchmark are
+added to those in the stored file, and replace earlier ones of the same options. A test
+compares every page with its file.
 """
 
 import dataclasses
@@ -219,6 +220,8 @@ def kept() -> list[str]:
 def keep(name: str, measured: pathlib.Path) -> None:
     """Store a result as the numbers of a page.
 
+    Benchmarks are added to the stored ones and replace those of the same options.
+
     Args:
       name: Name of the page.
       measured: File of the result.
@@ -237,7 +240,22 @@ def keep(name: str, measured: pathlib.Path) -> None:
         raise ValueError(
             f"--measured {measured}: not what {STUDIES[name].line} writes ({error!r})"
         ) from error
-    _copy(measured, path_of(name))
+    path = path_of(name)
+    if "benchmarks" in record and path.exists():
+        _add(record, path)
+    else:
+        _copy(measured, path)
+
+
+def _add(record, path):
+    """Add the benchmarks of a result to a stored file."""
+    from nerfies_jax.capture.json_files import write_json
+    from nerfies_jax.metrics import clock
+
+    stored = json.loads(path.read_text())
+    record["benchmarks"] = stored["benchmarks"] | record["benchmarks"]
+    record["machine"] = clock.beside(record["machine"], stored["machine"])
+    write_json(path, record)
 
 
 def _check_of(name, stored, measured):

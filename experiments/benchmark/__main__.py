@@ -198,6 +198,7 @@ def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
       results: Results of finished runs.
     """
     from experiments.benchmark import page, verdicts  # load JAX
+    from nerfies_jax.training.provenance import revision
 
     path = args.out / STORED
     record = records.rows(path, benchmarks=dict) or {"benchmarks": {}}
@@ -213,6 +214,7 @@ def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
     claims = () if args.suite is None else suites.SUITES[args.suite].claims
     benchmark = {
         "suite": args.suite,
+        "revision": revision(),
         "methods": methods,
         "claims": [one._asdict() for one in verdicts.judge(numbers, claims)],
     }

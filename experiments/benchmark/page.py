@@ -49,7 +49,9 @@ Numbers are means over the seeds, ± their standard deviation. Scores are of the
 original, distorted held-out images. The *fitted PSNR* is NeRF-W's protocol: codes of
 each image are fitted to its left half, and its right half is evaluated. A run must
 exceed both baselines (*neighbors*, *time average*). Seconds are wall clock, on a
-machine that may have been busy."""
+machine that may have been busy. The *revision* is that of this repository when the runs
+ended. A + marks changes that were not committed, or that only the revision before the
+numbers were committed is known."""
 
 
 def page(stored: Mapping[str, Any]) -> str:
@@ -65,7 +67,7 @@ def page(stored: Mapping[str, Any]) -> str:
     for label, benchmark in stored["benchmarks"].items():
         if benchmark["suite"] is None:
             (method,) = benchmark["methods"].values()
-            single[label] = method
+            single[label] = method | {"revision": benchmark["revision"]}
         else:
             parts += _suite(label, benchmark)
     if single:
@@ -79,7 +81,8 @@ def page(stored: Mapping[str, Any]) -> str:
 
 
 def _suite(label, benchmark):
-    parts = [f"## `{label}`", *_tables("method", benchmark["methods"])]
+    parts = [f"## `{label}`", f"Revision {_short(benchmark['revision'])}."]
+    parts += _tables("method", benchmark["methods"])
     if benchmark["claims"]:
         parts += ["### Claims", _claims(benchmark["claims"])]
     context = suites.SUITES[benchmark["suite"]].context
@@ -88,11 +91,17 @@ def _suite(label, benchmark):
 
 def _tables(kind, methods):
     """Format the settings of each row, and one table for each group of columns."""
+    heads: tuple[str, ...] = (kind, "preset and changes", "seeds")
     rows = [
         [f"`{name}`", one["settings"], str(one["seeds"])]
         for name, one in methods.items()
     ]
-    tables = [markdown.table((kind, "preset and changes", "seeds"), rows, words=2)]
+    revisions = [one.get("revision") for one in methods.values()]
+    if any(revisions):  # a row of a suite has that of the suite
+        heads += ("revision",)
+        for row, revision in zip(rows, revisions, strict=True):
+            row.append(_short(revision))
+    tables = [markdown.table(heads, rows, words=2)]
     for group in GROUPS:
         columns = _known(group, methods.values())
         heads = (kind, *(column[1] for column in columns))
@@ -103,6 +112,12 @@ def _tables(kind, methods):
         if columns:
             tables.append(markdown.table(heads, rows))
     return tables
+
+
+def _short(revision):
+    """Format a revision by its first eight digits, and a mark for changed files."""
+    commit, _, changes = revision.partition("+")
+    return commit[:8] + ("+" if changes else "")
 
 
 def _known(group: Iterable[Column], methods) -> list[Column]:

@@ -170,7 +170,12 @@ def test_a_claim_is_judged_by_the_spread_over_seeds(warp, static, verdict):
         interval = scipy.stats.ttest_1samp(gains, 0).confidence_interval(0.95)
         width = (interval.high - interval.low) / 2
         assert first.half_width == pytest.approx(width, rel=1e-9)
-    benchmark = {"suite": "fields", "claims": [first._asdict()], "methods": {}}
+    benchmark = {
+        "suite": "fields",
+        "revision": "a",
+        "claims": [first._asdict()],
+        "methods": {},
+    }
     assert f"| {verdict} |" in page.page({"benchmarks": {"--scene fast": benchmark}})
 
 

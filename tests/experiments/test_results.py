@@ -42,12 +42,14 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
     method = {"settings": "nerf", "seeds": 1, "spread": {}}
     method["mean"] = {"heldout.psnr": 21.5}
     default = {"suite": None, "claims": [], "methods": {"nerf": method}}
+    default["revision"] = 40 * "a" + "+changes"
     benchmarks = {"--scene default": default}
     machine = {"cpu": "a core", "backend": "cpu", "jax": "0"}
     new.write_text(json.dumps({"machine": machine, "benchmarks": benchmarks}))
     results.main(["benchmark", "--measured", str(new)])
     written = (tmp_path / "benchmark.md").read_text()
     assert "| `--scene default` | 21.50 |" in written
+    assert "| nerf | 1 | aaaaaaaa+ |" in written
     assert "[benchmark.md]" in (tmp_path / "README.md").read_text()
     broken = {"machine": machine, "benchmarks": {"--scene default": {"suite": None}}}
     new.write_text(json.dumps(broken))
@@ -57,6 +59,15 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
     assert "not what nerfies study benchmark" in capsys.readouterr().err
     stored = json.loads((tmp_path / "kept.json").read_text())
     assert stored["benchmarks"] == benchmarks
+    # Others are added, and those of the same options replaced.
+    later = {"--scene fast": default, "--scene default": default | {"revision": "b"}}
+    other = {"machine": {**machine, "cpu": "b core"}, "benchmarks": later}
+    new.write_text(json.dumps(other))
+    results.main(["benchmark", "--measured", str(new)])
+    stored = json.loads((tmp_path / "kept.json").read_text())
+    assert list(stored["benchmarks"]) == ["--scene default", "--scene fast"]
+    assert stored["benchmarks"]["--scene default"]["revision"] == "b"
+    assert stored["machine"]["cpu"] == "a core; b core"
 
 
 def test_a_seed_of_0_is_no_lack_of_results(tmp_path, monkeypatch):
