@@ -54,6 +54,8 @@ Scene = Literal[
     "rig",
     "collection",
     "collection-masked",
+    "static-20",
+    "static-50",
     "pan",
     "zoom",
 ]

@@ -8,7 +8,13 @@ import pytest
 import scipy.ndimage
 
 from nerfies_jax.capture import nerfies_format, synthetic
-from nerfies_jax.capture.synthetic import presets, record, rendering, truth
+from nerfies_jax.capture.synthetic import (
+    photographed,
+    presets,
+    record,
+    rendering,
+    truth,
+)
 from nerfies_jax.capture.synthetic.collection import BASE_GAIN
 from nerfies_jax.capture.synthetic.spec import Exposure, Specular, Transient
 from nerfies_jax.geometry import camera as cameras
@@ -458,7 +464,7 @@ def test_a_collection_has_an_appearance_for_each_photograph_and_views_to_score()
     collection = synthetic.Collection(masked=True)
     spec = dataclasses.replace(
         synthetic.PRESETS["collection"],
-        things=presets.MONUMENT[:4],
+        things=photographed.MONUMENT[:4],
         size=(32, 24),
         frames=9,
         heldout_every=4,

@@ -47,7 +47,6 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         for instant, camera in zip(plan.instant, plan.camera_id, strict=True)
     )
     scene_truth = _truth(spec, plan, hits, ids, programs, seed)
-    in_collection = spec.collection is not None
     visible = depths[(depths > 0) & (hits.thing != spec.transient_id)]
     capture = Capture(
         name=f"synthetic {spec.name}",
@@ -64,11 +63,11 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         appearance_ids=plan.instant,
         camera_ids=plan.camera_id,
         valid=collection.observed(spec, hits.thing),
-        moving=None if in_collection else moving,
+        moving=None if spec.photographed else moving,
         depths=depths,
-        flow=None if in_collection else _flow(plan, scene_truth),
+        flow=None if spec.photographed else _flow(plan, scene_truth),
         points=_points(spec, plan, images, hits, moving, seed),
-        background=None if in_collection else spec.background,
+        background=None if spec.photographed else spec.background,
         up=(0.0, 1.0, 0.0),
     )
     return capture, scene_truth
@@ -150,7 +149,8 @@ def digest(spec: SceneSpec, seed: int = 0) -> str:
       Twelve hex digits of a hash of the spec, the seed and the version of the renderer.
     """
     text = f"{VERSION} {seed} {spec!r}"
-    for effect in (spec.pose_error, spec.lens, spec.rig, spec.collection):
+    effects = (spec.pose_error, spec.lens, spec.rig, spec.collection, spec.snapshots)
+    for effect in effects:
         if effect is not None:
             text += f" {effect!r}"
     if spec.cameras.pan_rad:

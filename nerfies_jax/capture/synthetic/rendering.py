@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.capture.synthetic import collection, texture, trace
+from nerfies_jax.capture.synthetic import collection, snapshots, texture, trace
 from nerfies_jax.capture.synthetic.collection import Photo
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
@@ -54,6 +54,8 @@ def schedule(spec: SceneSpec, seed: int) -> Schedule:
     """
     if spec.collection is not None:
         return _collection_schedule(spec, seed)
+    if spec.snapshots is not None:
+        return _snapshot_schedule(spec, seed)
     instants = np.arange(spec.frames)
     second_instants = instants[spec.heldout_every // 2 :: spec.heldout_every]
     instant = np.concatenate([instants, second_instants])
@@ -97,6 +99,21 @@ def _collection_schedule(spec, seed):
         light_gain=taken.light_gain,
         transient_shown=np.asarray(taken.photo.board_shown),
         photo=taken.photo,
+    )
+
+
+def _snapshot_schedule(spec, seed):
+    """Photographs with one camera, of which every n-th is held out."""
+    instants = np.arange(spec.frames, dtype=np.int32)
+    times = instants / (spec.frames - 1)
+    return Schedule(
+        instant=instants,
+        camera_id=np.zeros(spec.frames, np.int32),
+        time=times.astype(np.float32),
+        learn=instants % spec.heldout_every != 0,
+        cameras=_through_lens(spec, snapshots.views(spec, seed)),
+        light_gain=_light_gain(spec, times, seed),
+        transient_shown=np.zeros(spec.frames, bool),
     )
 
 

@@ -1,6 +1,7 @@
 """Settings of a synthetic scene: objects, cameras and effects. Frozen and hashable."""
 
 import dataclasses
+import math
 from typing import Literal
 
 from nerfies_jax.capture.synthetic.motion import Motion, Vector, unit_axis
@@ -228,6 +229,40 @@ class Collection:
 
 
 @dataclasses.dataclass(frozen=True)
+class Snapshots:
+    """Photographs of a static scene with one camera, in no order of place or time.
+
+    They replace the hand-held camera and the second one. There is one viewpoint in each
+    cell of a grid over azimuth and elevation, at a random place in it and at a random
+    distance. `SceneSpec.frames` is their number, and every `heldout_every`-th one, from
+    the first on, is held out, as in LLFF.
+    """
+
+    columns: int = 10  # of the grid, over the azimuth
+    rows: int = 5  # of the grid, over the elevation
+    target: Vector = (0.0, -0.03, 0.0)
+    arc_rad: float = math.pi  # to either side
+    elevation_rad: tuple[float, float] = (0.05, 0.75)
+    distance: tuple[float, float] = (0.5, 1.1)  # from the target, scene units
+    field_of_view_rad: float = 0.85  # horizontal
+    aim: float = 0.03  # largest deviation of the aim along each axis, scene units
+
+    def __post_init__(self):
+        if self.columns < 1 or self.rows < 1:
+            raise ValueError(
+                f"columns={self.columns} and rows={self.rows} must be at least 1"
+            )
+        if not 0 < self.distance[0] <= self.distance[1]:
+            raise ValueError(
+                f"distance={self.distance} must be positive and must not decrease"
+            )
+        if not 0 < self.field_of_view_rad < 3:
+            raise ValueError(
+                f"field_of_view_rad={self.field_of_view_rad} must lie between 0 and 3"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
 class SceneSpec:
     """An analytic dynamic scene and its cameras. An effect of None is absent."""
 
@@ -255,6 +290,7 @@ class SceneSpec:
     # The first camera's frames are then those of the rig.
     rig: Rig | None = dataclasses.field(default=None, repr=False)
     collection: Collection | None = dataclasses.field(default=None, repr=False)
+    snapshots: Snapshots | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self):
         unit_axis(self.light)
@@ -268,17 +304,30 @@ class SceneSpec:
                 f"specular thing {self.specular.thing!r} is not in the scene; "
                 f"choose one of {', '.join(names)}"
             )
-        if self.collection is not None:
-            self._check_collection()
+        if self.photographed:
+            self._check_photographs()
 
-    def _check_collection(self):
-        others = ("exposure", "transient", "pose_error", "lens", "rig")
+    @property
+    def photographed(self) -> bool:
+        """Whether the images are photographs without order instead of a video."""
+        return self.collection is not None or self.snapshots is not None
+
+    def _check_photographs(self):
+        others = ["exposure", "transient", "pose_error", "lens", "rig"]
+        if self.snapshots is not None:
+            others = ["transient", "rig", "collection"]
         present = [name for name in others if getattr(self, name) is not None]
         moving = [thing.name for thing in self.things if thing.moves()]
         if present or moving:
             raise ValueError(
-                "a collection shows static objects and has its own cameras and "
+                "photographs show static objects and have their own cameras and "
                 f"appearances; remove {', '.join(present + moving)}"
+            )
+        grid = self.snapshots
+        if grid is not None and self.frames != grid.columns * grid.rows:
+            raise ValueError(
+                f"frames={self.frames} must be {grid.columns} columns times "
+                f"{grid.rows} rows of snapshots, {grid.columns * grid.rows}"
             )
 
     def _check_counts(self):

@@ -140,7 +140,7 @@ def programs(spec: SceneSpec, plan: Schedule) -> Programs:
         plan.time,
         plan.transient_shown,
     )
-    if spec.collection is not None:  # no two photographs share a camera
+    if spec.photographed:  # consecutive photographs are not neighbors
         return Programs(None)
     lowered = [data_parallel.lower_rows(flow, spec, seen)]
     if points and any(thing.moves() for thing in spec.things):
