@@ -34,6 +34,7 @@ from nerfies_jax.fields.effects import (
     background,
     elastic,
     moving_mask,
+    ray_distortion,
     records,
     scene_flow,
     smoothness,
@@ -56,6 +57,7 @@ FIELD_MODULES = {
     "background": background,
     "scene_flow": scene_flow,
     "smoothness": smoothness,
+    "distortion": ray_distortion,
     "mask": moving_mask,
     "surface": surface,
 }
@@ -133,6 +135,8 @@ def of_field(spec, metadata):
         medium(scene_flow.Bound(spec.scene_flow, metadata.times))
     if spec.smoothness is not None:
         regularizer(smoothness.Bound(spec.smoothness, templates_of(spec)))
+    if spec.distortion is not None:
+        regularizer(spec.distortion)
     if spec.mask is not None:
         conditioning(spec.mask)
     if spec.surface is not None:

@@ -15,6 +15,7 @@ from nerfies_jax.fields.effects.background import BackgroundSpec
 from nerfies_jax.fields.effects.elastic import ElasticSpec
 from nerfies_jax.fields.effects.moving_mask import MovingMaskSpec
 from nerfies_jax.fields.effects.protocols import Conditioning, Medium, Template, Warp
+from nerfies_jax.fields.effects.ray_distortion import DistortionSpec
 from nerfies_jax.fields.effects.records import FieldRecord
 from nerfies_jax.fields.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.fields.effects.smoothness import SmoothnessSpec
@@ -118,6 +119,7 @@ class RadianceScene:
     background: BackgroundSpec | None = None
     scene_flow: SceneFlowSpec | None = None
     smoothness: SmoothnessSpec | None = None
+    distortion: DistortionSpec | None = None
     mask: MovingMaskSpec | None = None
     surface: SurfaceSpec | None = None
     # Further conditionings.
@@ -261,6 +263,7 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecor
         (spec.background, regularizer),
         (spec.scene_flow, medium),
         (smooth, regularizer),
+        (spec.distortion, regularizer),
         (spec.mask, conditioning),
         (spec.surface, surfaces),
         *((one, conditioning) for one in spec.conditioning),

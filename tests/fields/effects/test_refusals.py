@@ -10,6 +10,7 @@ from nerfies_jax.fields.effects.appearance import AppearanceSpec
 from nerfies_jax.fields.effects.background import BackgroundSpec
 from nerfies_jax.fields.effects.elastic import ElasticSpec
 from nerfies_jax.fields.effects.moving_mask import MovingMaskSpec
+from nerfies_jax.fields.effects.ray_distortion import DistortionSpec
 from nerfies_jax.fields.effects.scene_flow import FlowWeights, SceneFlowSpec
 from nerfies_jax.fields.effects.smoothness import SmoothnessSpec
 from nerfies_jax.fields.effects.surface import SurfaceSpec
@@ -58,6 +59,7 @@ REFUSED = [
     (FlowWeights, {"depth": math.inf}, "depth=inf"),
     (timestamps.interval, {"moments": 0}, "moments=0"),
     (SmoothnessSpec, {"weight": -1.0}, "weight=-1.0"),
+    (DistortionSpec, {"weight": math.inf}, "weight=inf"),
     (SmoothnessSpec, {"until": 0}, "until=0.*none"),
     (TimeWarpSpec, {"embedding": 0}, "embedding=0"),
     (TimeWarpSpec, {"depth": -1}, "depth=-1"),
