@@ -14,6 +14,14 @@ from jax.extend import core
 
 from nerfies_jax.training.model import Model, PyTree
 
+# A component from another package converts a number of the capture to a Python or NumPy
+# one, or branches on it, which is not possible for a traced number.
+_CONCRETE_NUMBERS_NEEDED = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
 
 def taking(model: Model, numbers: PyTree, build: Callable[[PyTree], Model]) -> Model:
     """Let the programs of a model take the numbers of its capture as arguments.
@@ -25,15 +33,14 @@ def taking(model: Model, numbers: PyTree, build: Callable[[PyTree], Model]) -> M
 
     Returns:
       The model with `numbers` and `with_numbers`. Functions of it that the caller
-      replaces later stay as they are.
+      replaces later stay as they are. If `build` needs concrete numbers, they stay
+      compiled into the programs; its other errors are raised.
     """
 
     def renewed(current, numbers):
         try:
             rebuilt = build(numbers)
-        except TypeError:
-            # A part from another package converts a number to a Python one, which is
-            # not possible for a traced number.
+        except _CONCRETE_NUMBERS_NEEDED:
             return current
         fields = zip(current, model, rebuilt, strict=True)
         return Model(*(new if mine is old else mine for mine, old, new in fields))
