@@ -268,9 +268,9 @@ def _npy(folder):
 
 
 def _read_npy(folder):
-    from nerfies_jax.capture import frames
+    from nerfies_jax.capture import npz_files
 
-    frames.load_array(folder / "a.npy", 10**6)
+    npz_files.load_array(folder / "a.npy", 10**6)
 
 
 def _npz(folder):
@@ -289,7 +289,7 @@ def _npz(folder):
 def _read_npz(folder):
     from nerfies_jax.capture import npz_archive
 
-    npz_archive.read_npz(folder / "a.npz")
+    npz_archive.read_archive(folder / "a.npz")
 
 
 def _points(folder):

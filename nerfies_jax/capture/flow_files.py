@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerfies_jax.capture import flow as flows
-from nerfies_jax.capture import frames, images
+from nerfies_jax.capture import images, npz_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.capture.json_files import read_json, write_json
@@ -80,7 +80,7 @@ def read(
 
 
 def _read_frame(file, shrink_by, size):
-    array = frames.load_array(file, 3 * images.MAX_PIXELS)
+    array = npz_files.load_array(file, 3 * images.MAX_PIXELS)
     width, height = size
     fits = array.ndim == 3 and array.shape[2] == 3
     if not fits or (

@@ -16,7 +16,6 @@ from nerfies_jax.capture import (
     decoder,
     frame_memory,
     masks,
-    npz_files,
     safe_files,
     text_files,
 )
@@ -613,32 +612,3 @@ def colored_points(
     if visible.any():
         color[visible] = np.round(np.nanmedian(samples[:, visible], axis=0))
     return PointCloud(position, color)
-
-
-def load_array(path: pathlib.Path, most: int, kinds: str = "fiu") -> np.ndarray:
-    """Read a .npy file of numbers.
-
-    Args:
-      path: The file.
-      most: Largest number of values.
-      kinds: NumPy's codes of the accepted types: f, i, u, and b for booleans.
-
-    Returns:
-      The array.
-
-    Raises:
-      CaptureError: If it is damaged, larger, or not an array of numbers.
-    """
-    try:
-        array = npz_files.read_npy(path, 8 * most + npz_files.MAX_HEADER)
-    except CaptureError:
-        raise
-    except ValueError as error:
-        raise CaptureError(
-            f"{path}: not a readable array ({error}); save it again with numpy.save"
-        ) from None
-    if array.dtype.kind not in kinds:
-        raise CaptureError(f"{path}: not an array of numbers; save it with numpy.save")
-    if array.size > most:
-        raise CaptureError(f"{path}: {array.size} numbers; at most {most} are read")
-    return array

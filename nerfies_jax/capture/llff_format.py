@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerfies_jax.capture import frames, name_times
+from nerfies_jax.capture import frames, name_times, npz_files
 from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError
@@ -178,7 +178,7 @@ def read_poses(path: pathlib.Path) -> Poses:
     Raises:
       CaptureError: If the file does not have this layout.
     """
-    table = frames.load_array(path, MOST_NUMBERS)
+    table = npz_files.load_array(path, MOST_NUMBERS)
     if table.ndim != 2 or table.shape[1] != 17 or len(table) < 2:
         raise CaptureError(
             f"{path}: shape {table.shape}; expected [images, 17] with at least two "

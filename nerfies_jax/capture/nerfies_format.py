@@ -8,7 +8,13 @@ import pathlib
 
 import numpy as np
 
-from nerfies_jax.capture import flow_files, frames, nerfies_colmap, text_files
+from nerfies_jax.capture import (
+    flow_files,
+    frames,
+    nerfies_colmap,
+    npz_files,
+    text_files,
+)
 from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import (
     Capture,
@@ -284,7 +290,7 @@ def _depths(path, views, size, total):
         file = text_files.find(folder, name, (".npy",))
         if file is None:
             continue  # DyCheck has depth for the moving camera only
-        depth = frames.load_array(file, image_files.MAX_PIXELS)
+        depth = npz_files.load_array(file, image_files.MAX_PIXELS)
         depth = depth[..., 0] if depth.ndim == 3 else depth
         if depth.ndim != 2 or (
             depth.shape[0] // shrink_by != height
@@ -316,7 +322,7 @@ def _points(path, images, cameras, views, moving):
     file = path / "points.npy"
     if not file.exists():
         return nerfies_colmap.points_beside(path, views)
-    world = frames.load_array(file, 3 * MAX_POINTS)
+    world = npz_files.load_array(file, 3 * MAX_POINTS)
     if world.ndim != 2 or world.shape[1] != 3:
         raise CaptureError(f"{file}: shape {world.shape}; expected [points, 3]")
     finite = np.isfinite(world).all(1)
@@ -330,7 +336,7 @@ def _points(path, images, cameras, views, moving):
     # An extension of this library, which earlier versions spelled differently.
     colors = next(iter(sorted(path.glob("points_colo*r.npy"))), None)
     if colors is not None:
-        color = frames.load_array(colors, 3 * MAX_POINTS)
+        color = npz_files.load_array(colors, 3 * MAX_POINTS)
         if color.shape != world.shape or color.dtype != np.uint8:
             raise CaptureError(
                 f"{colors}: {color.dtype} of shape {color.shape}; expected uint8 of "

@@ -38,7 +38,7 @@ def convert(
       CaptureError: If the archive cannot be read.
       ValueError: If the rows are not valid.
     """
-    images, poses, times, focal = read_npz(pathlib.Path(file))
+    images, poses, times, focal = read_archive(pathlib.Path(file))
     train, heldout, note = _rows_of(poses, heldout, train, str(file))
     common = {"camera_angle_x": 2 * math.atan(images.shape[2] / 2 / focal)}
     background = _background_of(images)
@@ -63,7 +63,7 @@ def convert(
     return [*describe(formats.load(out)), note]
 
 
-def read_npz(path):
+def read_archive(path):
     """Read the arrays of an archive.
 
     Args:
@@ -75,24 +75,13 @@ def read_npz(path):
     Raises:
       CaptureError: If it cannot be read or an array is missing or has a wrong shape.
     """
-    try:
-        arrays = npz_files.read_arrays(path)
-    except CaptureError:
-        raise
-    except ValueError as error:
-        raise CaptureError(
-            f"{path}: not a readable .npz ({error}); save it again with numpy.savez"
-        ) from None
+    arrays = npz_files.load_arrays(path, ("images", "poses", "focal", "times"))
     absent = {"images", "poses", "focal"} - set(arrays)
     if absent:
         raise CaptureError(
-            f"{path}: no array {min(absent)!r}; there are {sorted(arrays)}"
+            f"{path}: no array {min(absent)!r}; expected images, poses, focal and, for "
+            "a dynamic scene, times"
         )
-    for name in {"images", "poses", "focal", "times"} & set(arrays):
-        if arrays[name].dtype.kind not in "fiu":
-            raise CaptureError(
-                f"{path}: {name} is {arrays[name].dtype}; expected an array of numbers"
-            )
     images, poses, times = arrays["images"], arrays["poses"], arrays.get("times")
     count = len(images) if images.ndim else 0
     if (

@@ -8,9 +8,10 @@ import contextlib
 import io
 import math
 import os
+import pathlib
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
@@ -132,6 +133,74 @@ def read_arrays(path: AnyPath, most: int = MAX_BYTES) -> dict[str, np.ndarray]:
     """
     with archive(path, most) as zip_file:
         return {name: zip_file.read(name) for name in zip_file.names}
+
+
+def load_arrays(
+    path: pathlib.Path, names: Collection[str] | None = None
+) -> dict[str, np.ndarray]:
+    """Read arrays of numbers or booleans from a .npz file that a user provides.
+
+    Args:
+      path: The file.
+      names: Names of the arrays to read, as far as they exist. None reads all.
+
+    Returns:
+      Arrays by name.
+
+    Raises:
+      CaptureError: If it is damaged or too large, or if one of these arrays does not
+        hold numbers.
+    """
+    try:
+        with archive(path) as zip_file:
+            selected = [n for n in zip_file.names if names is None or n in names]
+            arrays = {name: zip_file.read(name) for name in selected}
+    except safe_files.CaptureError:
+        raise
+    except ValueError as error:
+        raise safe_files.CaptureError(
+            f"{path}: not a readable .npz ({error}); save it again with numpy.savez"
+        ) from None
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiub":
+            raise safe_files.CaptureError(
+                f"{path}: {name} is {array.dtype} of shape {array.shape}; expected an "
+                "array of numbers"
+            )
+    return arrays
+
+
+def load_array(path: pathlib.Path, most: int, kinds: str = "fiu") -> np.ndarray:
+    """Read a .npy file of numbers that a user provides.
+
+    Args:
+      path: The file.
+      most: Largest number of values.
+      kinds: NumPy's codes of the accepted types: f, i, u, and b for booleans.
+
+    Returns:
+      The array.
+
+    Raises:
+      CaptureError: If it is damaged, larger, or not an array of numbers.
+    """
+    try:
+        array = read_npy(path, 8 * most + MAX_HEADER)
+    except safe_files.CaptureError:
+        raise
+    except ValueError as error:
+        raise safe_files.CaptureError(
+            f"{path}: not a readable array ({error}); save it again with numpy.save"
+        ) from None
+    if array.dtype.kind not in kinds:
+        raise safe_files.CaptureError(
+            f"{path}: not an array of numbers; save it with numpy.save"
+        )
+    if array.size > most:
+        raise safe_files.CaptureError(
+            f"{path}: {array.size} numbers; at most {most} are read"
+        )
+    return array
 
 
 def read_npy(path: AnyPath, most: int = MAX_BYTES) -> np.ndarray:

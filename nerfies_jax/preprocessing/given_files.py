@@ -17,6 +17,7 @@ from nerfies_jax.capture import (
     frames,
     images,
     masks,
+    npz_files,
     safe_files,
 )
 from nerfies_jax.capture.capture import Capture, CaptureError
@@ -153,7 +154,7 @@ def _depths(path, capture):
 
 def _depth_picture(path):
     if path.suffix.lower() == ".npy":
-        picture = frames.load_array(path, images.MAX_PIXELS).squeeze()
+        picture = npz_files.load_array(path, images.MAX_PIXELS).squeeze()
     elif path.suffix.lower() == ".exr":
         stored = exr.in_display_window(path, exr.read_exr(path))
         picture = stored.depth
@@ -169,9 +170,9 @@ def _depth_picture(path):
 def _stack(path):
     if path.suffix == ".npy":
         return _checked_stack(
-            frames.load_array(path, given_arrays.MOST_NUMBERS), path, "it"
+            npz_files.load_array(path, given_arrays.MOST_NUMBERS), path, "it"
         )
-    arrays = given_arrays.read(path)
+    arrays = npz_files.load_arrays(path)
     name = "depths" if "depths" in arrays else next(iter(arrays), "depths")
     return _checked_stack(arrays.get(name, np.zeros(0)), path, name)
 
@@ -189,7 +190,7 @@ def _flow(path, capture):
     if path.is_dir():
         sides = {side: _flo_stack(path / side) for side in ("forward", "backward")}
     else:
-        arrays = given_arrays.read(path)
+        arrays = npz_files.load_arrays(path)
         absent = {"forward", "backward"} - set(arrays)
         if absent:
             raise CaptureError(

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
-from nerfies_jax.capture import frames
+from nerfies_jax.capture import frames, npz_files
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.preprocessing import given_arrays
 
@@ -112,7 +112,7 @@ def _arrays(path):
             stem = file.stem
             name = next((n for n in names if stem == n or stem.endswith(f"_{n}")), None)
             if name is not None:
-                arrays[name] = frames.load_array(
+                arrays[name] = npz_files.load_array(
                     file, given_arrays.MOST_NUMBERS, "fiub"
                 )
         return arrays
@@ -121,7 +121,7 @@ def _arrays(path):
             f"{path}: tracks are read from npz files, not from {path.suffix} files; "
             f"save them with {EXAMPLE}"
         )
-    return given_arrays.read(path)
+    return npz_files.load_arrays(path)
 
 
 def _named(arrays, path):
@@ -220,7 +220,7 @@ def _pairs(folder):
 
 
 def _pair(file):
-    table = frames.load_array(file, given_arrays.MOST_NUMBERS)
+    table = npz_files.load_array(file, given_arrays.MOST_NUMBERS)
     if table.ndim != 2 or table.shape[1] != PAIR_COLUMNS:
         raise CaptureError(
             f"{file}: an array of shape {table.shape}; expected [points, "

@@ -13,7 +13,6 @@ from nerfies_jax.capture import (
     blender_format,
     colmap,
     formats,
-    frames,
     json_files,
     llff_format,
     nerfies_format,
@@ -151,7 +150,7 @@ def test_the_header_of_an_array_is_believed_as_far_as_its_bytes_go(tmp_path, lie
     content = header(LIES[lie]) + bytes(16)
     (tmp_path / "a.npy").write_bytes(content)
     with pytest.raises(CaptureError, match=r"a\.npy: not a readable array"):
-        frames.load_array(tmp_path / "a.npy", 10**6)
+        npz_files.load_array(tmp_path / "a.npy", 10**6)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("a.npy", content)
     with pytest.raises(ValueError, match=r"header|array|holds"):

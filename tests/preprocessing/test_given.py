@@ -256,7 +256,7 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
     np.save(pairs / "001_000.npy", np.zeros((2, 4)))
     refused(r"001_001\.npy: 3 points, but 001_000\.npy has 2", tracks=pairs)
     path.write_bytes(b"cut short")
-    refused(r"not a readable npz", tracks=path)
+    refused(r"not a readable .npz", tracks=path)
     refused(r"no such folder of masks", masks=tmp_path / "nowhere")
     refused(r"contains no masks \(\.png", masks=tmp_path)
     images.write_png(tmp_path / "0.png", np.zeros((72, 96), bool))
