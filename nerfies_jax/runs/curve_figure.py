@@ -5,6 +5,7 @@ import pathlib
 from typing import NamedTuple
 
 from nerfies_jax.metrics.metric_table import PROTOCOL
+from nerfies_jax.runs import curves
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.runtime import events
@@ -35,12 +36,11 @@ def save(path: pathlib.Path, run: Run, trained: Trained, result: Result):
     Returns:
       The path, or None if the run ended before its first evaluation.
     """
-    history = trained.result.history
-    if not history.evaluations:
+    rows = curves.of_held_out(trained.result.history.evaluations)
+    if not rows:
         return None
     points = panels.History(
-        [row["seconds"] for row in history.evaluations],
-        [row["psnr"] for row in history.evaluations],
+        [row["seconds"] for row in rows], [row["psnr"] for row in rows]
     )
     final = None
     if _is_partial(trained, result):
@@ -72,7 +72,7 @@ def caption(run: Run, trained: Trained, result: Result) -> str:
         names = ", ".join(run.capture.ids[row] for row in trained.watched)
         count = len(trained.watched)
         frames = f"{count} of the {result.frames} scored held-out frames ({names})"
-    last = trained.result.history.evaluations[-1]["psnr"]
+    last = curves.of_held_out(trained.result.history.evaluations)[-1]["psnr"]
     protocol = f" ({PROTOCOL})" if result.is_fitted else ""
     text = f"PSNR during training{protocol}. The line is the mean over {frames}"
     if math.isfinite(last):

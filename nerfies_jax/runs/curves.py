@@ -5,7 +5,7 @@ They are in `events.jsonl` during the run. `curve.json` holds a summary after it
 
 import math
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from nerfies_jax.capture.errors import FileError
@@ -16,6 +16,7 @@ from nerfies_jax.runtime.events import Event
 from nerfies_jax.training.loop import History
 
 CURVE = "curve.json"
+HELD_OUT = "held out"  # name of the hook that evaluates held-out frames
 
 
 class Curve(NamedTuple):
@@ -61,10 +62,23 @@ class Course(NamedTuple):
         text = f"step {self.step:,}"
         if self.steps is not None:
             text += f" of {self.steps:,}"
-        scores = [row["psnr"] for row in self.evaluations if row.get("psnr")]
+        rows = of_held_out(self.evaluations)
+        scores = [row["psnr"] for row in rows if row.get("psnr")]
         if scores:
             text += f", {scores[-1]:.2f} dB over {len(self.frames)} held-out frames"
         return text
+
+
+def of_held_out(evaluations: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the evaluations of held-out frames, without those of other hooks.
+
+    Args:
+      evaluations: Evaluations of a run.
+
+    Returns:
+      The rows, in the same order.
+    """
+    return [row for row in evaluations if row.get("hook", HELD_OUT) == HELD_OUT]
 
 
 def course(events: Iterable[Event]) -> Course:
@@ -194,7 +208,7 @@ def read(folder: pathlib.Path) -> Curve:
 
 
 def _curve_of(logged):
-    rows = [row for row in logged.evaluations if "psnr" in row]
+    rows = [row for row in of_held_out(logged.evaluations) if "psnr" in row]
     return Curve(
         seconds=tuple(row["seconds"] for row in rows),
         steps=tuple(row["step"] for row in rows),
@@ -209,7 +223,7 @@ def _curve_of(logged):
 def _stored(path):
     try:
         content = read_json(path, dict[str, Any])
-        rows = content["evaluations"]
+        rows = of_held_out(content["evaluations"])
         return Curve(
             seconds=tuple(float(row["seconds"]) for row in rows),
             steps=tuple(int(row["step"]) for row in rows),

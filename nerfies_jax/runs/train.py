@@ -11,7 +11,7 @@ from nerfies_jax import evaluation
 from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.representation import HalfScorer
 from nerfies_jax.evaluation.scores import Draw
-from nerfies_jax.runs import budget, run_folder, validation
+from nerfies_jax.runs import budget, curves, run_folder, validation
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runtime import console, events
 from nerfies_jax.training import checkpoint, chunk, loop, losses
@@ -127,7 +127,7 @@ def train(
     if len(rows):
         names = [run.capture.ids[row] for row in rows]
         events.emit("evaluation_frames", frames=names)
-        hooks = (Hook("held out", held_out, every_seconds=evaluate_every), *hooks)
+        hooks = (Hook(curves.HELD_OUT, held_out, every_seconds=evaluate_every), *hooks)
     hooks = (*hooks, *validation.hooks(run, renderer))
     result = loop.fit(
         run.model,

@@ -40,7 +40,10 @@ def test_a_curve_comes_back_as_it_was_written(tmp_path):
         {"hook": "held out", "step": step, "seconds": at, "psnr": dB, "ssim": 0.5}
         for step, at, dB in ((0, 1.0, 12.5), (1, 3.0, np.nan))
     )
-    history = History(({"step": 1, "seconds": 1.0, "loss": 0.1},), rows, 3.0, 2.0)
+    # Training frames that were left out are other frames, and have no SSIM.
+    other = {"hook": "validation", "step": 1, "seconds": 2.0, "psnr": 40.0}
+    training = ({"step": 1, "seconds": 1.0, "loss": 0.1},)
+    history = History(training, (*rows, other), 3.0, 2.0)
     curves.write(tmp_path, history, ["frame 3"])
     stored = curves.read(tmp_path)
     assert stored.seconds == (1.0, 3.0)
