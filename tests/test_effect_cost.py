@@ -321,8 +321,9 @@ def at(path, places):
 
 
 def test_small_presets_have_parts_that_papers_have():
-    # A penalty of our own, whose values and gradients test_regularizers.py checks.
-    ours = {"opacity_scale"}
+    # Penalties from elsewhere. Their values and gradients are checked in
+    # test_regularizers.py and test_ray_distortion.py.
+    ours = {"opacity_scale", "distortion"}
     for presets in (field_presets.PRESETS, splat_presets.PRESETS):
         for name, spec in presets.items():
             paper = presets[name.removesuffix("-small").removesuffix("-grid")]
