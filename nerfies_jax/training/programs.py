@@ -5,6 +5,7 @@ key in the compilation cache. As an argument it is not, so a second capture of t
 shapes reuses the programs of the first.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -79,7 +80,13 @@ class Program:
         program.__name__ = function.__name__
         options = getattr(owner, "compiler_options", None)
         self._program = jax.jit(program, compiler_options=options)
-        self._numbers = owner.numbers
+        self._owner = owner
+
+    @functools.cached_property
+    def _numbers(self):
+        # Not computed before a call, because a model that is built while a program is
+        # traced has traced numbers.
+        return self._owner.numbers
 
     def __call__(self, *args: Any) -> Any:
         """Call the program for the capture of the model."""

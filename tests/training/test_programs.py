@@ -50,3 +50,19 @@ def test_errors_of_a_component_are_raised():
 
     with pytest.raises(TypeError, match="a fault of the component"):
         scale_for(model(scale_of), 5)
+
+
+def test_building_a_model_may_compile_another_program_of_its_numbers():
+    # An event has a program of its own, which is made whenever the model is built.
+    def scale_of(scale):
+        class Field:
+            with_numbers = None
+
+            @property
+            def numbers(self):
+                return {"scale": np.asarray(scale)}
+
+        programs.Program(lambda field: field.numbers, Field())
+        return 2 * scale
+
+    assert scale_for(model(scale_of), 5) == 10
