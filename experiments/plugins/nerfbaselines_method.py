@@ -21,7 +21,7 @@ from nerfies_jax.runs import run
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.representations import of_preset
 from nerfies_jax.training import checkpoint as checkpoints
-from nerfies_jax.training import specs
+from nerfies_jax.training import programs, specs
 from nerfies_jax.training.model import View, in_default_precision
 
 PRESET = "splats-static"
@@ -88,10 +88,7 @@ class NerfiesJax:
         self._frames = None
         if train_dataset is not None:
             self._frames = frames_of(self._capture, model.required_data)
-        options = model.compiler_options
-        self._advance = jax.jit(
-            model.step, compiler_options=None if options is None else dict(options)
-        )
+        self._advance = programs.Program(_step, model)
         self._events = collections.defaultdict(list)
         for event in model.events:
             for step in event.steps:
@@ -269,6 +266,10 @@ class NerfiesJax:
             "quaternions": rows.quaternion,
             "spherical_harmonics": harmonics.transpose(0, 2, 1),
         }
+
+
+def _step(model, state, frames):
+    return model.step(state, frames)
 
 
 def _config(settings):
