@@ -14,7 +14,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import Renderer
 from nerfies_jax.preprocessing import inspection
 from nerfies_jax.preprocessing.findings import CERTAIN, DEPTH, LIGHT, Finding
-from nerfies_jax.runs import representations
+from nerfies_jax.runs import representations, validation
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.run import Run, initial_state, new_run, scene_spec, with_steps
 from nerfies_jax.runtime import events, stopping
@@ -23,12 +23,10 @@ from nerfies_jax.training import loop
 # Motion is chosen with the preset. The other effects of an inspection change no preset
 # of Gaussian splats.
 CHOSEN = (LIGHT, DEPTH)
-STEPS = (
-    300  # of a trial, for images of up to `PIXELS` pixels, and fewer for larger ones
-)
+STEPS = 300  # of a trial, for images of up to `PIXELS`. Larger ones have fewer.
 MIN_STEPS = 100
 PIXELS = 176 * 132
-LEFT_OUT = 6  # of a trial: every 6th training frame, and at most `MAX_LEFT_OUT`
+LEFT_OUT = 6  # A trial leaves out one in six training frames, at most `MAX_LEFT_OUT`.
 MAX_LEFT_OUT = 8
 MIN_GAIN = 0.1  # dB. Differences between seeds are about as large.
 
@@ -155,25 +153,13 @@ def compare_configs(
     """
     with events.stage(f"trying {name}"):
         short = [_short_run(each, capture) for each in (config, changed)]
-        rows = left_out(short[0].capture.train)
+        train, times = short[0].capture.train, short[0].capture.times
+        count = min(max(len(train) // LEFT_OUT, 1), MAX_LEFT_OUT)
+        rows = validation.spread_over_time(train, times, count)
         without, with_effect = (
             _score(run, short[1], _trained(run, rows), rows) for run in short
         )
     return Trial(short[0].spec.steps, len(rows), without, with_effect)
-
-
-def left_out(train: np.ndarray) -> np.ndarray:
-    """Choose training frames to leave out of a trial, evenly spaced.
-
-    Args:
-      train: Indices of the training frames.
-
-    Returns:
-      Some of them.
-    """
-    count = min(max(len(train) // LEFT_OUT, 1), MAX_LEFT_OUT)
-    places = (np.arange(count) + 0.5) * len(train) / count
-    return train[places.astype(int)]
 
 
 def _short_run(config: RunConfig, capture: Capture) -> Run:

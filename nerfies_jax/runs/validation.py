@@ -60,10 +60,26 @@ def rows(run: Run) -> np.ndarray:
     Returns:
       Rows of the capture, without the first and the last frame.
     """
-    train = run.capture.train
-    in_time = train[np.argsort(run.capture.times[train], kind="stable")]
-    count = min(run.config.validation, max(len(train) - 2, 0))
-    return np.sort(evaluation.spread(in_time, count + 2)[1:-1])
+    count = min(run.config.validation, max(len(run.capture.train) - 2, 0))
+    return spread_over_time(run.capture.train, run.capture.times, count)
+
+
+def spread_over_time(train: np.ndarray, times: np.ndarray, count: int) -> np.ndarray:
+    """Choose training frames to leave out of training, evenly spaced in their order.
+
+    Args:
+      train: Rows of the training frames, [training frames].
+      times: Times of all frames of the capture, [frames].
+      count: Number of frames to choose.
+
+    Returns:
+      Rows of the capture, without the first and the last training frame in time if
+      there are more than two.
+    """
+    in_time = train[np.argsort(times[train], kind="stable")]
+    candidates = in_time[1:-1] if len(in_time) > 2 else in_time
+    places = (np.arange(count) + 0.5) * len(candidates) / max(count, 1)
+    return np.sort(candidates[places.astype(int)])
 
 
 def training_frames(run: Run) -> Frames:

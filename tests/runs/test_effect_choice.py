@@ -75,14 +75,6 @@ def test_splats_whose_motion_starts_from_tracks_get_no_depth_loss():
         assert overrides == expected
 
 
-@pytest.mark.parametrize("frames", [2, 5, 6, 60, 1000])
-def test_frames_left_out_of_a_trial_are_spread(frames):
-    train = np.arange(frames) * 3 + 1
-    rows = effect_choice.left_out(train)
-    assert 1 <= len(set(rows)) == len(rows) <= min(8, frames - 1)
-    assert set(rows) <= set(train)
-
-
 @pytest.mark.full
 def test_a_trial_finds_that_exposures_pay_where_brightness_alternates():
     capture = scenes.tiny_capture()

@@ -36,6 +36,22 @@ def test_long_runs_on_many_frames_leave_some_out(config, monkeypatch):
     assert validation.frames_to_leave_out(runs.new_run(spec), 1200) == 0
 
 
+@pytest.mark.parametrize(("frames", "count"), [(2, 1), (3, 1), (6, 4), (60, 8), (9, 0)])
+def test_frames_left_out_are_spread_over_time(frames, count, rng):
+    # The rows of the training frames are not in temporal order.
+    train = 3 * np.arange(frames) + 1
+    times = np.full(3 * frames + 1, np.nan)
+    times[train] = rng.permutation(frames)
+    rows = validation.spread_over_time(train, times, count)
+    assert len(set(rows)) == len(rows) == count
+    assert set(rows) <= set(train)
+    if frames > 2 and count:
+        left_out_times = np.sort(times[rows])
+        assert 0 < left_out_times[0] <= left_out_times[-1] < frames - 1
+        gaps = np.diff([-1, *left_out_times, frames])
+        assert gaps.max() <= 2 * max(frames / (count + 1), 1)
+
+
 def test_frames_left_out_are_not_trained_on(config):
     run = runs.new_run(dataclasses.replace(config, validation=1))
     (row,) = validation.rows(run)
