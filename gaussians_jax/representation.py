@@ -44,6 +44,7 @@ from nerfies_jax.preprocessing import (
     usable_paths,
 )
 from nerfies_jax.preprocessing.findings import (
+    CERTAIN,
     COLLECTION,
     DEPTH,
     LIGHT,
@@ -265,11 +266,17 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
     reason = usable_paths.unusable(preprocessed)
     without_tracks: tuple[str, ...] = ()
     name, notes = "splats-tracked-small", []
-    if preprocessed.unusable and _is_collection(capture):
+    static = bool(reason) and usable_paths.stands_still(preprocessed, capture.times)
+    inspected = preprocessed.unusable or (reason and not static)
+    found = _findings(capture, preprocessed) if inspected else ()
+    motion = next((one for one in found if one.effect == MOTION), None)
+    if findings.is_collection(found):
         name = f"{OF_PHOTOGRAPHS}-small"
         notes = ["photographs of one scene in changing light"]
-    elif reason and usable_paths.stands_still(preprocessed, capture.times):
+    elif static:
         name, notes = "splats-static-small", [reason]
+    elif motion and motion.wanted is False and motion.confidence == CERTAIN:
+        name, notes = "splats-static-small", [f"nothing moves: {motion.evidence}"]
     elif reason:
         name, without_tracks = f"{UNTRACKED}-small", (FROM_REST,)
         notes = [f"tracks are not usable: {reason}"]
@@ -298,11 +305,10 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
     return Choice(name, overrides, tuple(notes), other)
 
 
-def _is_collection(capture):
-    """Test if frames are photographs in changing light, by the cached inspection."""
-    effects = (MOTION, TRANSIENT, LIGHT)
-    found = inspection.find(capture, effects, CACHE / "evidence")
-    return findings.is_collection(found)
+def _findings(capture, preprocessed):
+    """Inspect the motion, and the light where nothing can be tracked."""
+    effects = (MOTION, TRANSIENT, LIGHT) if preprocessed.unusable else (MOTION,)
+    return inspection.find(capture, effects, CACHE / "evidence")
 
 
 def _alternative(preprocessed, size, seconds):

@@ -79,6 +79,20 @@ def test_photographs_in_changing_light_get_an_appearance_of_each(stops, monkeypa
     assert choice.preset == preset
 
 
+@pytest.mark.parametrize("wanted", [False, True])
+def test_photographs_are_static_if_the_inspection_is_certain(wanted, monkeypatch):
+    film = films.film(frames=24)
+    evidence = record.cached(film, representation.CACHE / "evidence")
+    apart = evidence._replace(unusable="the camera motion is discontinuous")
+    found = (Finding(MOTION, "none of 400 points moves", "", wanted, CERTAIN),)
+    monkeypatch.setattr(representation.record, "cached", lambda *_: apart)
+    monkeypatch.setattr(representation.inspection, "find", lambda *_: found)
+    choice = representation.default_preset(film)
+    assert choice.preset == (UNTRACKED if wanted else "splats-static-small")
+    said = "nothing moves: none of 400 points moves" in choice.notes
+    assert said is not wanted
+
+
 def test_coverage_is_the_share_of_moving_pixels_near_known_paths():
     folder = representation.CACHE / "evidence"
     evidence = record.cached(films.film(**MOVES, frames=24), folder)
