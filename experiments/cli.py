@@ -64,6 +64,7 @@ SCENES: tuple[str, ...] = typing.get_args(Scene)
 ARGUMENTS = (
     *(
         "checkpoint_every",
+        "coordinator",
         "device",
         "devices",
         "evaluate_every",

@@ -35,6 +35,7 @@ class Reconstruct:
             *("steps", "seconds", "quality", "seed"),
             *("evaluate_every", "checkpoint_every"),
         ),
+        "hosts": ("coordinator", "processes", "process"),
         "following": ("view", "log"),
     }
 
@@ -73,6 +74,14 @@ class Reconstruct:
     """Number of devices that share a training step: the views of splats (batch_size) or
     the rays of a field (micro_batches). The result is that of one device up to rounding
     (default: all; of a CPU, as many as it has cores and the step has parts)."""
+    coordinator: str | None = None
+    """Train on several hosts, on each of which this command is started: HOST:PORT at
+    which the first process listens, with --processes and --process, or auto if Slurm
+    or Open MPI started them. See docs/hosts.md."""
+    processes: int | None = None
+    """Number of processes, which share each training step."""
+    process: int | None = None
+    """Number of this process, from 0."""
     seed: int | None = None
     """Seed of all random numbers (default: 0)."""
     set: cli.Overrides = ()
@@ -111,6 +120,8 @@ def main(args):
     except KeyboardInterrupt as stop:
         console.note(str(stop) or "interrupted while no step was running")
         raise SystemExit(130) from None
+    if outcome is None:  # process 0 writes the results
+        return None
     for line in outcome.errors:
         console.error(line)
     stopped_by = outcome.result.stopped_by
@@ -143,9 +154,19 @@ def _outcome(args):
             _check_resumed(args)
         wide = not (args.trust or names)
         cores = _cores(args)
-        platform.start_jax(args.device, *cores, devices=args.devices, wide=wide)
+        cluster = _cluster(args)
+        platform.start_jax(
+            args.device, *cores, devices=args.devices, cluster=cluster, wide=wide
+        )
         watched = _watched(args)
     from nerfies_jax import runs
+    from nerfies_jax.runs import multiple_hosts
+    from nerfies_jax.runtime import hosts
+
+    if hosts.joined() and not hosts.leads():
+        with cli.user_errors():
+            multiple_hosts.follow((*args.trust, *names))
+        return None
 
     common = {
         name: getattr(args, name)
@@ -153,7 +174,7 @@ def _outcome(args):
     }
     if args.resume:
         steps = () if args.steps is None else (f"steps={args.steps}",)
-        with cli.user_errors((runs.Refused,)):
+        with cli.user_errors((runs.Refused, hosts.Lost)):
             return runs.resume(
                 args.out,
                 expected=_expected(args),
@@ -169,7 +190,7 @@ def _outcome(args):
         overrides=args.set,
         seed=args.seed or 0,
     )
-    with cli.user_errors((runs.Refused,)):
+    with cli.user_errors((runs.Refused, hosts.Lost)):
         return runs.reconstruct(
             config,
             args.out,
@@ -229,6 +250,27 @@ def _check_resumed(args):
             "--effects auto chooses what a new run begins with; leave it out with "
             "--resume"
         )
+
+
+def _cluster(args):
+    """Return the processes to train with, or None; ValueError if they are unclear."""
+    numbers = {"processes": args.processes, "process": args.process}
+    if args.coordinator is None:
+        for name, number in numbers.items():
+            if number is not None:
+                raise ValueError(
+                    f"--{name} {number}: name the coordinator too, with --coordinator "
+                    "HOST:PORT, or leave it out"
+                )
+        return None
+    if args.coordinator == "auto":
+        return platform.Cluster(None, **numbers)
+    if None in numbers.values():
+        raise ValueError(
+            f"--coordinator {args.coordinator}: give --processes and --process too, or "
+            "--coordinator auto under Slurm or Open MPI"
+        )
+    return platform.Cluster(args.coordinator, **numbers)
 
 
 def _cores(args):

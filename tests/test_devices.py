@@ -12,9 +12,9 @@ from nerfies_jax.scene import scene as field_scene
 from tests import scenes
 
 
-def model_of(spec):
+def model_of(spec, capture=None):
     """Return a model of the tiny capture, with its first state and frames."""
-    capture = scenes.tiny_capture()
+    capture = capture or scenes.tiny_capture()
     if isinstance(spec, field_scene.RadianceScene):
         model = field_scene.build(spec, field_scene.metadata_of(capture, spec))
     else:

@@ -6,7 +6,7 @@ XLA:CPU sees must be set before the first array is created.
 
 import contextlib
 import os
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import psutil
 
@@ -25,6 +25,14 @@ CACHED_SECONDS = 0.05
 VECTOR_WIDTH = "--xla_cpu_prefer_vector_width"  # 256 bits by default
 
 
+class Cluster(NamedTuple):
+    """The processes that train one run together (`nerfies_jax.runtime.hosts`)."""
+
+    coordinator: str | None  # None to take all from the variables of the launcher
+    processes: int | None = None
+    process: int | None = None  # number of this process
+
+
 @events.stage("starting JAX")
 def start_jax(
     device: Device = "auto",
@@ -32,6 +40,7 @@ def start_jax(
     shares: int = 1,
     *,
     devices: int | None = None,
+    cluster: Cluster | None = None,
     wide: bool = True,
 ) -> None:
     """Choose the platform, the number of cores that XLA:CPU sees, and the cache.
@@ -49,12 +58,15 @@ def start_jax(
         of its own if there are enough cores (`data_parallel`).
       devices: Number of devices to compute on. None for all, and on a CPU for as many
         as there are shares and cores.
+      cluster: Other processes to train with. None for this process alone. Each uses
+        as many devices as `devices` says.
       wide: False for processes that compile code of other packages. With vectors of 512
         bits, `jnp.arctan(x)` and `jnp.arctan2(x, 1)` are wrong for long arrays (JAX
         0.10.2, errors of 1 rad). The functions of this package do not use them.
 
     Raises:
-      ValueError: If the devices are not available, or the limit of the cache is wrong.
+      ValueError: If the devices are not available, the processes cannot be connected,
+        or the limit of the cache is wrong.
     """
     if threads == "one" and os.environ.setdefault("PJRT_NPROC", "1") == "1":
         # XLA has a thread for each device and would divide the loops of every device
@@ -69,7 +81,7 @@ def start_jax(
 
     # These load JAX.
     from nerfies_jax.capture import cache_files
-    from nerfies_jax.runtime import data_parallel
+    from nerfies_jax.runtime import data_parallel, hosts
 
     count = min(shares, cores()) if devices is None else devices
     forced = "--xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
@@ -81,6 +93,8 @@ def start_jax(
         name = {"gpu": "cuda"}.get(device, device)
         os.environ["JAX_PLATFORMS"] = name  # for child processes
         jax.config.update("jax_platforms", name)
+    if cluster is not None:
+        hosts.join(*cluster)
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:

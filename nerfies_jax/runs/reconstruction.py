@@ -15,6 +15,7 @@ from nerfies_jax.runs import (
     adviser,
     commands,
     effect_choice,
+    multiple_hosts,
     plan,
     preparation,
     products,
@@ -39,7 +40,7 @@ from nerfies_jax.runs.run import (
     stored_capture,
 )
 from nerfies_jax.runs.train import Pace
-from nerfies_jax.runtime import console, data_parallel, stopping
+from nerfies_jax.runtime import console, data_parallel, hosts, stopping
 from nerfies_jax.training import checkpoint
 from nerfies_jax.training.loop import FitResult, Hook
 
@@ -103,6 +104,7 @@ def reconstruct(
     """
     start_time = time.perf_counter()
     with contextlib.ExitStack() as stack:
+        stack.enter_context(hosts.dismissing())
         with _refusing():
             pace = Pace(seconds, evaluate_every, checkpoint_every)
             follow = stack.enter_context(following(log))
@@ -114,6 +116,7 @@ def reconstruct(
             config = _with_cameras(config, out, prepare)
             run = _new_run(config, effects, seconds)
             _describe(run)
+            multiple_hosts.check(run)
             quality.check(extra, run.capture.size)
             state = initial_state(run)
             if seconds is not None and not run.config.validation:
@@ -180,6 +183,7 @@ def resume(
     start_time = time.perf_counter()
     folder = pathlib.Path(folder)
     with contextlib.ExitStack() as stack:
+        stack.enter_context(hosts.dismissing())
         with _refusing():
             pace = Pace(seconds, evaluate_every, checkpoint_every)
             follow = stack.enter_context(following(log))
@@ -188,6 +192,7 @@ def resume(
             extra = quality.prepared(more)
             run = saved_run(folder, overrides, new_paths, trusted)
             _describe(run)
+            multiple_hosts.check(run)
             quality.check(extra, run.capture.size)
             state, history, after = _restore(folder, run)
             follow.begin(folder, run, after or 0)
@@ -347,7 +352,8 @@ def _hooks(stack, watched, run, folder):
 
 def _train(folder, run, start, pace, hooks, start_time, extra):
     """Train a run to its end and write its products."""
-    trained = train.train(run, *start, pace, hooks)
+    with multiple_hosts.sharing(folder, run) as shared:
+        trained = train.train(shared, *start, pace, hooks)
     result = trained.result
     errors = [result.unsaved] if result.unsaved else []
     if result.stopped_by in ("steps", "seconds", "non-finite"):

@@ -141,6 +141,19 @@ def with_steps(run: Run, steps: int) -> Run:
     return _build(config, run.representation, spec, run.capture, run.observed)
 
 
+def rebuilt(run: Run) -> Run:
+    """Build the model of a run again, for the devices that are available now.
+
+    Args:
+      run: The run.
+
+    Returns:
+      The run with another model for the same scene.
+    """
+    config, representation, spec = run.config, run.representation, run.spec
+    return _build(config, representation, spec, run.capture, run.observed)
+
+
 @events.stage("building the model")
 def _build(config, representation, spec, capture, observed):
     metadata = representation.metadata_of(capture, spec)

@@ -1,5 +1,6 @@
 """Data parallelism: equal shares of a step, in sequence or one on each device."""
 
+import contextlib
 import functools
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any
@@ -15,6 +16,7 @@ PyTree = Any
 AXIS = "shares"
 
 _limit: int | None = None  # of `limit_devices`
+_spanning = False  # in `spanning_hosts`
 
 
 def limit_devices(count: int | None) -> None:
@@ -42,6 +44,52 @@ def available() -> int:
     return jax.local_device_count() if _limit is None else _limit
 
 
+@contextlib.contextmanager
+def spanning_hosts() -> Iterator[None]:
+    """Let models that are built and trained in the block use the devices of all hosts.
+
+    All processes must run the same steps in the same order (`runtime.hosts`). Other
+    programs, such as those of `rows_on_devices`, stay on the devices of this process.
+
+    Yields:
+      None.
+    """
+    global _spanning
+    before, _spanning = _spanning, True
+    try:
+        yield
+    finally:
+        _spanning = before
+
+
+def spans_hosts() -> bool:
+    """Test if models use the devices of all hosts.
+
+    Returns:
+      True within `spanning_hosts`.
+    """
+    return _spanning
+
+
+def check_hosts(shares: int, setting: str) -> None:
+    """Check that all processes get equal numbers of the shares of a step.
+
+    Args:
+      shares: Number of shares.
+      setting: Name of the setting of this number, empty if there is none.
+
+    Raises:
+      ValueError: If they do not.
+    """
+    processes = jax.process_count()
+    if shares % processes:
+        remedy = f"set {setting} to a multiple of {processes}, or " if setting else ""
+        raise ValueError(
+            f"a step has {shares} equal part(s), which {processes} processes cannot "
+            f"share evenly; {remedy}start fewer processes"
+        )
+
+
 def idle_note(used: int, shares: int, setting: str) -> list[str]:
     """Describe the devices that a training step does not use, with a way to use them.
 
@@ -66,17 +114,29 @@ def idle_note(used: int, shares: int, setting: str) -> list[str]:
 
 
 def device_count(shares: int) -> int:
-    """Return the number of local devices that equal shares of a step can use.
+    """Return the number of devices that equal shares of a step can use.
 
     A CPU is one device unless `jax_num_cpu_devices` is larger. `limit_devices` may
-    exclude some.
+    exclude some. They are local devices, or within `spanning_hosts` equal numbers of
+    each process.
 
     Args:
       shares: Number of shares.
 
     Returns:
       The largest divisor of `shares` that is at most the number of devices.
+
+    Raises:
+      ValueError: If the processes of `spanning_hosts` cannot have equal numbers.
     """
+    if _spanning:
+        check_hosts(shares, "")
+        processes = jax.process_count()
+        return processes * _largest_divisor(shares // processes)
+    return _largest_divisor(shares)
+
+
+def _largest_divisor(shares):
     most = min(shares, available())
     return next(count for count in range(most, 0, -1) if shares % count == 0)
 
@@ -99,17 +159,22 @@ def on_devices(
     Returns:
       Results stacked along a new first axis.
     """
+    mesh = None if devices == 1 else _mesh(devices)
+    return _on_mesh(work, shares, mesh, *inputs)
+
+
+def _on_mesh(work, shares, mesh, *inputs):
     indices = jnp.arange(shares, dtype=jnp.int32)  # the dtype of steps, even with x64
-    if devices == 1:
+    if mesh is None:
         return lax.map(lambda share: work(share, *inputs), indices)
-    per_device = shares // devices
+    per_device = shares // mesh.size
 
     def on_device(first, *inputs):
         return lax.map(lambda i: work(first[0] + i, *inputs), indices[:per_device])
 
     sharded = jax.shard_map(
         on_device,
-        mesh=_mesh(devices),
+        mesh=mesh,
         in_specs=(PartitionSpec(AXIS), *(PartitionSpec() for _ in inputs)),
         out_specs=PartitionSpec(AXIS),
         check_vma=False,  # not supported for results of a `while_loop`
@@ -177,7 +242,8 @@ def _one_each(work, fixed, devices, rows):
     def one(share, rows):
         return work(fixed, *jax.tree.map(lambda leaf: leaf[share], rows))
 
-    return on_devices(one, devices, devices, rows)
+    mesh = None if devices == 1 else _local_mesh(devices)
+    return _on_mesh(one, devices, mesh, rows)
 
 
 def shared(tree: PyTree, devices: int) -> PyTree:
@@ -196,7 +262,7 @@ def shared(tree: PyTree, devices: int) -> PyTree:
     sharding = NamedSharding(mesh, PartitionSpec())
 
     def whole(leaf):
-        copies = [jax.device_put(leaf, device) for device in mesh.devices]
+        copies = [jax.device_put(leaf, device) for device in mesh.local_devices]
         return jax.make_array_from_single_device_arrays(leaf.shape, sharding, copies)
 
     return jax.tree.map(whole, tree)
@@ -214,6 +280,8 @@ def replicate(tree: PyTree, devices: int) -> PyTree:
     """
     if devices == 1:
         return tree
+    if _spanning:  # `device_put` would compare the arrays of all processes
+        return shared(tree, devices)
     return jax.device_put(tree, NamedSharding(_mesh(devices), PartitionSpec()))
 
 
@@ -236,4 +304,13 @@ def first_copy(tree: PyTree, devices: int) -> PyTree:
 
 
 def _mesh(devices):
+    """Return the mesh of a step: local devices, or equal numbers of each process."""
+    if not _spanning:
+        return _local_mesh(devices)
+    each = devices // jax.process_count()
+    of_process = [jax.local_devices(i)[:each] for i in range(jax.process_count())]
+    return Mesh(np.array(of_process).ravel(), (AXIS,))
+
+
+def _local_mesh(devices):
     return Mesh(np.array(jax.local_devices()[:devices]), (AXIS,))

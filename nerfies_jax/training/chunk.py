@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from nerfies_jax.runtime import compiler, data_parallel, events
+from nerfies_jax.runtime import compiler, data_parallel, events, hosts
 from nerfies_jax.training import matrix_flops, programs
 from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
@@ -133,7 +134,8 @@ class Program:
 
     Called with (state, frames, count) it returns the state and the `Outcome`. The state
     passed in is overwritten. If a step uses several devices, state and outcome are on
-    the first of them and `frames` on all (`data_parallel.replicate`).
+    the first of them and `frames` on all (`data_parallel.replicate`). If it uses the
+    devices of several processes, process 0 sends each call to the others.
     """
 
     def __init__(self, model: Model, state: TrainState, frames: Frames, steps: int):
@@ -141,6 +143,10 @@ class Program:
         self._step = jax.jit(functools.partial(_step, model), inline=True)
         self._devices, self._options = model.devices, model.compiler_options
         self._numbers = model.numbers
+        self._spans, self._steps = data_parallel.spans_hosts(), steps
+        if self._spans:
+            # Arrays of one device cannot be inputs beside those of several processes.
+            self._numbers = jax.tree.map(_on_host, self._numbers)
         shapes = jax.tree.map(_abstract, (self._replicate(state), frames))
         self._inputs = (*shapes, self._numbers)
         self._lowered: dict[int, jax.stages.Lowered] = {}  # by the number of steps
@@ -185,10 +191,20 @@ class Program:
         if not missing:
             return 0.0
         began = time.perf_counter()
+        state, frames, _ = self._inputs
+        leads = self._tell(hosts.COMPILE, state, frames, count)
         with events.stage("compiling the training step"):
             for length in missing:
                 self._programs[length] = self._lower(length).compile(self._options)
+        if leads:
+            hosts.meet()
         return time.perf_counter() - began
+
+    def _tell(self, kind, state, frames, count):
+        leads = self._spans and hosts.leads()
+        if leads:
+            hosts.send_steps(kind, state, frames, self._steps, count)
+        return leads
 
     def _lengths(self, count):
         scans, singles = divmod(count, self.length)
@@ -197,7 +213,10 @@ class Program:
     def __call__(self, state: TrainState, frames: Frames, count: int):
         """Run `count` steps, or fewer if one is not finite."""
         self.prepare(count)
+        self._tell(hosts.STEPS, state, frames, count)
         state = self._replicate(state)
+        if self._spans:
+            hosts.meet()
         total: dict[str, float] = {}
         done, outcome = 0, None
         for length in self._lengths(count):
@@ -210,11 +229,17 @@ class Program:
                 break
         assert outcome is not None, count
         state = data_parallel.first_copy(state, self._devices)
+        if self._spans:
+            hosts.remember(state)
         return state, outcome._replace(done=done, metrics=total)
 
 
 def _step(model, state, frames, numbers):
     return programs.with_numbers(model, numbers).step(state, frames)
+
+
+def _on_host(leaf):
+    return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
 
 
 def _abstract(leaf):

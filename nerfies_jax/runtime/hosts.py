@@ -1,0 +1,281 @@
+"""Several processes, one for each host, that train together by `jax.distributed`.
+
+Process 0 leads. It does all that a single process does, and sends every chunk of
+training steps to the others, which compute their shares of it (`training.follower`).
+Only process 0 reads the clock, applies events and writes files, so the processes
+cannot disagree. Messages go through the coordination service of JAX, and arrays through
+its collectives. If a process dies, the service ends the others.
+"""
+
+import contextlib
+import json
+import weakref
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nerfies_jax.runtime import stopping
+
+PyTree = Any
+
+HEARTBEAT_SECONDS = 30  # without a sign of life, after which a process is dead
+SHUTDOWN_SECONDS = 15  # that processes which have ended wait for each other
+POLL_SECONDS = 1
+BARRIER_SECONDS = 3600  # one process may still be compiling
+END, RUN, COMPILE, STEPS = "end", "run", "compile", "steps"  # kinds of messages
+
+_messages = 0  # sent or received by this process
+_barriers = 0
+# Leaves of the state that the last chunk returned, which all processes have.
+_known: list[weakref.ref] = []
+
+
+class Lost(ValueError):
+    """A program that several processes run together failed."""
+
+
+def join(
+    coordinator: str | None, processes: int | None = None, process: int | None = None
+) -> None:
+    """Connect this process to the others, before the first array is created.
+
+    Args:
+      coordinator: ADDRESS:PORT at which process 0 listens. None to take all three from
+        the variables of Slurm, Open MPI or another launcher that JAX recognizes.
+      processes: Number of processes.
+      process: Number of this process, from 0.
+
+    Raises:
+      ValueError: If the launcher is not recognized, or the others cannot be reached.
+    """
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    try:
+        with stopping.keeps_handlers():
+            jax.distributed.initialize(
+                coordinator,
+                processes,
+                process,
+                heartbeat_timeout_seconds=HEARTBEAT_SECONDS,
+                shutdown_timeout_seconds=SHUTDOWN_SECONDS,
+            )
+    except (RuntimeError, ValueError, TypeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(
+            f"coordinator={coordinator or 'auto'}: the processes cannot be connected "
+            f"({reason}); start them by Slurm or Open MPI, or give the coordinator as "
+            "HOST:PORT of process 0, the number of processes and that of each"
+        ) from error
+    counts = [0] * jax.process_count()
+    for device in jax.devices():
+        counts[device.process_index] += 1
+    if len(set(counts)) > 1:
+        raise ValueError(
+            f"the processes have {counts} devices, but each needs the same number; "
+            "limit them with the variables of the platform, such as "
+            "CUDA_VISIBLE_DEVICES or JAX_NUM_CPU_DEVICES"
+        )
+
+
+def joined() -> bool:
+    """Test if this process was connected to others.
+
+    Returns:
+      True after `join`, if there is more than one process.
+    """
+    return jax.distributed.is_initialized() and jax.process_count() > 1
+
+
+def leads() -> bool:
+    """Test if this process leads others.
+
+    Returns:
+      True for process 0 of several.
+    """
+    return joined() and jax.process_index() == 0
+
+
+@contextlib.contextmanager
+def dismissing() -> Iterator[None]:
+    """Tell the other processes to end when the block ends, if this process leads.
+
+    Yields:
+      None.
+    """
+    error = ""
+    try:
+        yield
+    except BaseException as cause:
+        error = (str(cause).splitlines() or [type(cause).__name__])[0]
+        raise
+    finally:
+        if leads():
+            send(END, error=error)
+
+
+def send(kind: str, **content: Any) -> None:
+    """Send a message to all other processes.
+
+    Args:
+      kind: END, RUN, COMPILE or STEPS.
+      **content: JSON values.
+    """
+    global _messages
+    _client().key_value_set(_key(_messages), json.dumps({"kind": kind, **content}))
+    _messages += 1
+
+
+def receive() -> dict[str, Any]:
+    """Wait for the next message of process 0.
+
+    Returns:
+      Its content.
+    """
+    global _messages
+    while True:
+        stopping.check()
+        try:
+            text = _client().blocking_key_value_get(
+                _key(_messages), 1000 * POLL_SECONDS
+            )
+        except jax.errors.JaxRuntimeError as error:
+            if "DEADLINE_EXCEEDED" not in str(error):
+                raise
+            continue
+        _messages += 1
+        return json.loads(text)
+
+
+def meet() -> None:
+    """Wait until all processes have called this function as often.
+
+    Collectives fail after a time, which compilation on one host may exceed.
+    """
+    global _barriers
+    _client().wait_at_barrier(f"nerfies-{_barriers}", 1000 * BARRIER_SECONDS)
+    _barriers += 1
+
+
+def send_steps(
+    kind: str, state: PyTree, frames: PyTree, steps: int, count: int
+) -> None:
+    """Send a chunk of steps to the other processes.
+
+    Args:
+      kind: COMPILE or STEPS.
+      state: Training state, or its shapes to COMPILE. The arrays are sent unless they
+        are those that the last chunk returned.
+      frames: Training frames, or their shapes.
+      steps: Number of steps of the whole run.
+      count: Number of steps of the chunk.
+    """
+    leaves = jax.tree.leaves(state)
+    known = len(leaves) == len(_known) and all(
+        last() is leaf for last, leaf in zip(_known, leaves, strict=True)
+    )
+    arrays = kind == STEPS and not known
+    send(
+        kind,
+        steps=steps,
+        count=count,
+        state=[_note(leaf) for leaf in leaves],
+        frames=[_note(leaf) for leaf in jax.tree.leaves(frames)],
+        arrays=arrays,
+    )
+    if arrays:
+        _broadcast(b"".join(_to_host(leaf).tobytes() for leaf in leaves))
+
+
+def remember(state: PyTree) -> None:
+    """Note the state that a chunk returned, the same in all processes.
+
+    Args:
+      state: Training state.
+    """
+    _known[:] = [weakref.ref(leaf) for leaf in jax.tree.leaves(state)]
+
+
+def received_state(message: dict[str, Any], example: PyTree) -> PyTree:
+    """Return the state of a message of `send_steps`.
+
+    Args:
+      message: The message.
+      example: A state of the same structure.
+
+    Returns:
+      The state on the first local device, zeros if the message has no arrays.
+    """
+    notes = message["state"]
+    sizes = [jnp.dtype(n["dtype"]).itemsize * int(np.prod(n["shape"])) for n in notes]
+    data = bytes(sum(sizes))
+    if message["arrays"]:
+        data = _broadcast(data)
+    examples, structure = jax.tree.flatten(example)
+    leaves, start = [], 0
+    for note, size, same in zip(notes, sizes, examples, strict=True):
+        array = np.frombuffer(data[start : start + size], jnp.dtype(note["dtype"]))
+        leaf = jnp.array(array.reshape(note["shape"]))
+        if _is_key(same):
+            leaf = jax.random.wrap_key_data(leaf, impl=jax.random.key_impl(same))
+        leaves.append(leaf)
+        start += size
+    return jax.tree.unflatten(structure, leaves)
+
+
+def check_frames(message: dict[str, Any], frames: PyTree) -> None:
+    """Check that the frames of this process have the shapes of those of process 0.
+
+    Args:
+      message: A message of `send_steps`.
+      frames: Training frames.
+
+    Raises:
+      ValueError: If an array has another shape or type.
+    """
+    own = [_note(leaf) for leaf in jax.tree.leaves(frames)]
+    if own != message["frames"]:
+        raise ValueError(
+            f"process {jax.process_index()} read training frames of "
+            f"{[n['shape'] for n in own]}, and process 0 of "
+            f"{[n['shape'] for n in message['frames']]}; give all processes the same "
+            "capture and the same cache (XDG_CACHE_HOME)"
+        )
+
+
+def _note(leaf):
+    """Describe an array, or the data of PRNG keys, as JSON values."""
+    if _is_key(leaf):
+        shape = jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
+        leaf = jax.eval_shape(jax.random.key_data, shape)
+    return {"dtype": str(leaf.dtype), "shape": list(leaf.shape)}
+
+
+def _to_host(leaf):
+    return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+
+
+def _is_key(leaf):
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _broadcast(data: bytes) -> bytes:
+    """Return the bytes that process 0 passes, of which others pass the number."""
+    from jax.experimental import multihost_utils
+
+    meet()
+    array = np.frombuffer(data, np.uint8)
+    return np.asarray(multihost_utils.broadcast_one_to_all(array)).tobytes()
+
+
+def _key(number):
+    return f"nerfies/{number}"
+
+
+def _client():
+    # JAX has no public access to the service, without which a process could wait for
+    # another only inside of a collective, which fails after 30 s. Orbax does the same.
+    from jax._src import distributed
+
+    return distributed.global_state.client

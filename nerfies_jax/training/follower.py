@@ -1,0 +1,49 @@
+"""The part of other processes in a training that process 0 leads (`runtime.hosts`)."""
+
+import jax
+import jax.numpy as jnp
+
+from nerfies_jax.runtime import data_parallel, hosts
+from nerfies_jax.runtime.stopping import StopRequests
+from nerfies_jax.training import chunk
+from nerfies_jax.training.model import Frames, Model, TrainState
+
+
+def follow(model: Model, example: TrainState, frames: Frames) -> str:
+    """Compute the share of this process of each chunk, until process 0 ends.
+
+    A signal does not end it, because the launcher sends it to process 0 as well, which
+    saves first. A second signal does.
+
+    Args:
+      model: The model, built within `data_parallel.spanning_hosts`.
+      example: A state of the structure of its states.
+      frames: The training frames.
+
+    Returns:
+      The error that ended process 0, empty if there was none.
+
+    Raises:
+      ValueError: If the frames have other shapes than those of process 0.
+    """
+    frames = jax.tree.map(jnp.asarray, frames)
+    frames = data_parallel.shared(frames, model.devices)
+    state = example  # until the first is received
+    with StopRequests() as requests:
+        requests.protect()
+        while True:
+            message = hosts.receive()
+            if message["kind"] == hosts.END:
+                return message["error"]
+            hosts.check_frames(message, frames)
+            compiles = message["kind"] == hosts.COMPILE
+            if compiles or message["arrays"]:
+                given = hosts.received_state(message, example)
+            else:
+                given = state
+            program, _ = chunk.program(model, given, frames, message["steps"])
+            if compiles:
+                program.prepare(message["count"])
+                hosts.meet()
+            else:
+                state, _ = program(given, frames, message["count"])

@@ -1,0 +1,109 @@
+"""Training on several processes, which are connected by `jax.distributed`."""
+
+import dataclasses
+import os
+import pathlib
+import pickle
+import socket
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nerfies_jax.runtime import data_parallel, hosts
+from nerfies_jax.training import follower
+from nerfies_jax.training.model import Event
+from tests import scenes
+from tests.test_devices import model_of
+from tests.training import toy
+
+STEPS = 4
+SPECS = (
+    dataclasses.replace(scenes.TINY_SPLATS, batch_size=2),
+    dataclasses.replace(scenes.TINY_FIELD, micro_batches=2),
+)
+
+
+def shrunk(state, _frames):
+    """The state as an event changes it, which only process 0 does."""
+    return state._replace(params=jax.tree.map(lambda leaf: 0.9 * leaf, state.params))
+
+
+EVENT = Event("shrink", (2,), shrunk)
+
+
+def started(code, *more, processes=2):
+    """Start processes that run `code` with the arguments of `hosts.join`."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    env = dict(os.environ, JAX_PLATFORMS="cpu", JAX_NUM_CPU_DEVICES="1")
+    env["XLA_FLAGS"] = "--xla_backend_optimization_level=0"  # compiles sooner
+    return [
+        subprocess.Popen(
+            [sys.executable, "-c", code, f"localhost:{port}", str(processes), str(i)]
+            + [str(argument) for argument in more],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=env,
+        )
+        for i in range(processes)
+    ]
+
+
+def ended(process):
+    """Return the exit code of a process and the end of its output."""
+    output = process.communicate(timeout=300)[0]
+    return process.returncode, output[-3000:]
+
+
+def connected():
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    address, count, number = sys.argv[1:4]
+    hosts.join(address, int(count), int(number))
+
+
+def train_each():
+    """Train each scene on all processes, in process 0 also alone."""
+    connected()
+    capture = pickle.loads(pathlib.Path(sys.argv[4]).read_bytes())
+    assert hosts.joined()
+    with hosts.dismissing() if hosts.leads() else data_parallel.spanning_hosts():
+        for spec in SPECS:
+            if hosts.leads():
+                compare(spec, capture)
+            else:
+                model, state, frames = model_of(spec, capture)
+
+                assert follower.follow(model, state, frames) == ""
+
+
+def compare(spec, capture):
+    model, state, frames = model_of(spec, capture)
+    one = toy.fit(frames, state, model, steps=STEPS, events=(EVENT,))
+    with data_parallel.spanning_hosts():
+        model, state, frames = model_of(spec, capture)
+        assert model.devices == 2
+        several = toy.fit(frames, state, model, steps=STEPS, events=(EVENT,))
+    hosts.send(hosts.END, error="")
+    assert several.stopped_by == "steps"
+    ours, plain = jax.tree.leaves(several.state), jax.tree.leaves(one.state)
+    for new, old in zip(ours, plain, strict=True):
+        if not jnp.issubdtype(old.dtype, jax.dtypes.prng_key):
+            # Adam amplifies the rounding of gradients close to zero.
+            new, old = np.asarray(new, float), np.asarray(old, float)
+            assert np.linalg.norm(new - old) <= 1e-4 * np.linalg.norm(old)
+
+
+@pytest.mark.full
+def test_two_processes_train_what_one_does(tmp_path):
+    """Splats and a field, with an event that process 0 alone applies."""
+    file = tmp_path / "capture"
+    file.write_bytes(pickle.dumps(scenes.tiny_capture()))
+    processes = started("from tests import test_hosts as t; t.train_each()", file)
+    for code, output in [ended(process) for process in processes]:
+        assert code == 0, output
