@@ -274,7 +274,7 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
         name = f"{OF_PHOTOGRAPHS}-small"
         notes = ["photographs of one scene in changing light"]
     elif static:
-        name, notes = "splats-static-small", [reason]
+        name, notes = "splats-static-small", [f"nothing moves: {reason}"]
     elif motion and motion.wanted is False and motion.confidence == CERTAIN:
         name, notes = "splats-static-small", [f"nothing moves: {motion.evidence}"]
     elif reason:

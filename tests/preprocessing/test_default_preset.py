@@ -42,7 +42,7 @@ def noisy():
     ("make", "preset", "words"),
     [
         (lambda: films.film(**MOVES, frames=24), "splats-tracked-small", ""),
-        (lambda: films.film(frames=24), "splats-static-small", "show moving objects"),
+        (lambda: films.film(frames=24), "splats-static-small", "nothing moves: "),
         (noisy, UNTRACKED, "only 0% of the moving pixels are near a track"),
     ],
 )
