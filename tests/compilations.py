@@ -6,6 +6,10 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 MISS = "/jax/compilation_cache/cache_misses"
+SETTINGS = (
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+)
 
 
 @contextlib.contextmanager
@@ -22,9 +26,10 @@ def counted(folder):
         count, misses = misses, 0
         return count
 
-    before = jax.config.jax_compilation_cache_dir
+    before = {name: getattr(jax.config, name) for name in SETTINGS}
     jax.monitoring.register_event_listener(listen)
-    _use(folder)
+    # JAX counts programs that it stores, and by default not those that compile fast.
+    _use(dict(zip(SETTINGS, (str(folder), 0.0), strict=True)))
     jax.clear_caches()  # else the count depends on the tests before
     try:
         yield since
@@ -33,6 +38,7 @@ def counted(folder):
         _use(before)
 
 
-def _use(folder):
-    jax.config.update("jax_compilation_cache_dir", str(folder))
+def _use(settings):
+    for name, value in settings.items():
+        jax.config.update(name, value)
     compilation_cache.reset_cache()  # it is opened once otherwise

@@ -107,6 +107,8 @@ def _tested(views, rows, features, here, others):
     each = [_matches(features[here], features[other]) for other in others]
     place, strong = (np.stack(parts, axis=1) for parts in zip(*each, strict=True))
     tested = strong.sum(1) >= LEAST_MATCHES
+    if not tested.any():
+        return np.zeros(0), np.zeros(0, bool)
     pixel, place, strong = pixel[tested], place[tested], strong[tested]
     start, along = _lines(views, rows[here], rows[others], pixel)
     most = _most_explained(start, along, place, strong)

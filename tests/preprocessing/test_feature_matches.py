@@ -1,5 +1,6 @@
 """Motion told by features of photographs that have no order."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -59,3 +60,11 @@ def test_few_features_do_not_tell_that_nothing_moves(sharp):
     np.testing.assert_allclose(few.most_moving, -np.log(0.05) / 100)
     assert few.most_moving > motion.FEATURES_FOR_NO
     assert feature_matches.Census(0.0, 0.0).most_moving == 1
+
+
+def test_an_image_that_matches_no_other_has_no_part_in_the_count(sharp):
+    capture = sharp()
+    images = np.array(capture.images)
+    images[3] = np.random.default_rng(0).integers(0, 256, images[3].shape)
+    finding = _finding(dataclasses.replace(capture, images=images))
+    assert (finding.wanted, finding.confidence) == (False, CERTAIN)
