@@ -66,8 +66,7 @@ def page(stored: Mapping[str, Any]) -> str:
     single, parts = {}, [READING]
     for label, benchmark in stored["benchmarks"].items():
         if benchmark["suite"] is None:
-            (method,) = benchmark["methods"].values()
-            single[label] = method | {"revision": benchmark["revision"]}
+            (single[label],) = _methods(benchmark).values()
         else:
             parts += _suite(label, benchmark)
     if single:
@@ -80,9 +79,14 @@ def page(stored: Mapping[str, Any]) -> str:
     return "\n\n".join([*parts, markdown.bullets(_legend(methods))])
 
 
+def _methods(benchmark):
+    """Return the methods of a benchmark by name, each with its revision."""
+    common = {"revision": benchmark["revision"]}
+    return {name: one | common for name, one in benchmark["methods"].items()}
+
+
 def _suite(label, benchmark):
-    parts = [f"## `{label}`", f"Revision {_short(benchmark['revision'])}."]
-    parts += _tables("method", benchmark["methods"])
+    parts = [f"## `{label}`", *_tables("method", _methods(benchmark))]
     if benchmark["claims"]:
         parts += ["### Claims", _claims(benchmark["claims"])]
     context = suites.SUITES[benchmark["suite"]].context
@@ -91,16 +95,11 @@ def _suite(label, benchmark):
 
 def _tables(kind, methods):
     """Format the settings of each row, and one table for each group of columns."""
-    heads: tuple[str, ...] = (kind, "preset and changes", "seeds")
     rows = [
-        [f"`{name}`", one["settings"], str(one["seeds"])]
+        [f"`{name}`", one["settings"], str(one["seeds"]), _short(one["revision"])]
         for name, one in methods.items()
     ]
-    revisions = [one.get("revision") for one in methods.values()]
-    if any(revisions):  # a row of a suite has that of the suite
-        heads += ("revision",)
-        for row, revision in zip(rows, revisions, strict=True):
-            row.append(_short(revision))
+    heads: tuple[str, ...] = (kind, "preset and changes", "seeds", "revision")
     tables = [markdown.table(heads, rows, words=2)]
     for group in GROUPS:
         columns = _known(group, methods.values())

@@ -309,7 +309,7 @@ class SceneSpec:
 
     @property
     def photographed(self) -> bool:
-        """Whether the images are photographs without order instead of a video."""
+        """True if the images are photographs without order, and not a video."""
         return self.collection is not None or self.snapshots is not None
 
     def _check_photographs(self):
