@@ -43,6 +43,25 @@ def test_one_of_several_kinds_is_chosen_by_the_name_of_its_class():
     assert spec.strategy == MCMCStrategySpec(cap_max=123)
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_assignments_are_validated_together_in_any_order(order):
+    rates = ("motion.learning_rate=5e-8", "motion.learning_rate_end=5e-10")[::order]
+    motion = specs.override(presets.SMALL_DEFORMABLE, rates).motion
+    assert (motion.learning_rate, motion.learning_rate_end) == (5e-8, 5e-10)
+    # The last rate alone is valid, and would exceed the first.
+    rates = ("motion.learning_rate=5e-8", "motion.learning_rate_end=5e-7")[::order]
+    with pytest.raises(specs.OverrideError) as refusal:
+        specs.override(presets.SMALL_DEFORMABLE, ("sh_degree=0", *rates))
+    assert str(refusal.value).startswith(f"{' '.join(rates)}: the rate falls from")
+
+
+def test_a_later_assignment_replaces_earlier_ones_below_it():
+    lines = ("strategy.cap_max=7", "strategy=MCMCStrategySpec", "motion=none")
+    spec = specs.override(presets.SMALL_DEFORMABLE, lines)
+    assert spec.strategy == MCMCStrategySpec()
+    assert spec.motion is None
+
+
 def test_a_tuple_is_read_by_its_items():
     spec = specs.override(presets.SMALL_DEFORMABLE, ("motion.skips=1,2",))
     assert spec.motion.skips == (1, 2)

@@ -23,7 +23,7 @@ from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation.representation import HalfScorer
 from nerfies_jax.geometry.precision import exact_product
-from nerfies_jax.training.model import TrainState, in_default_precision
+from nerfies_jax.training.model import TrainState, View, in_default_precision
 
 # Rendered images with Jacobians in a fit, at most, and the relative decrease of the
 # error at which it ends, or the damping from which none is expected.
@@ -164,18 +164,16 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer:
     def score(
         state: TrainState, capture: Capture, rows: np.ndarray
     ) -> evaluation.Halves:
-        colors = []
-        for row in rows:
-            valid = np.ones(capture.images.shape[1:3], bool)
-            if capture.valid is not None:
-                valid = capture.valid[row].copy()
-            valid[:, size[0] // 2 :] = False
-            truth = capture.images[row].astype(np.float32) / 255
-            inputs = in_default_precision((truth, valid))
-            view = evaluation.view_of(capture, row)
-            color = solve(state.params, view, *inputs, state.step)
-            colors.append(jax.device_get(color))
-        return evaluation.score_right_halves(capture, rows, colors)
+        def fit_image(view: View, left: np.ndarray, valid: np.ndarray | None):
+            # The renderer's images are whole, so the right half is not to be fitted.
+            right = ((0, 0), (0, size[0] - left.shape[1]))
+            observed = np.ones(left.shape[:2], bool) if valid is None else valid
+            truth = np.pad(left.astype(np.float32) / 255, (*right, (0, 0)))
+            inputs = in_default_precision((truth, np.pad(observed, right)))
+            return solve(state.params, view, *inputs, state.step)
+
+        # The fitted image is rendered already.
+        return evaluation.score_halves(fit_image, lambda _, x: x, capture, rows)
 
     return score
 

@@ -47,11 +47,11 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
             change = exposure.fit(color, left.astype(np.float32) / 255, valid)
             return rendering, change
 
-        def render(view: View, fitted: tuple[Rendering, np.ndarray]) -> Rendering:
-            rendering, change = fitted
+        def render(_, fit: tuple[Rendering, np.ndarray]) -> np.ndarray:
+            rendering, change = fit
             image = jnp.asarray(rendering.color)
             color = exposure.apply_exposure(image, jnp.asarray(change, image.dtype))
-            return rendering._replace(color=jax.device_get(color))
+            return jax.device_get(color)
 
         return evaluation.score_halves(fit_code, render, capture, rows)
 

@@ -76,7 +76,7 @@ def score(
 
 def score_halves(
     fit_code: Callable[[View, np.ndarray, np.ndarray | None], Any],
-    render: Callable[[View, Any], Rendering],
+    render: Callable[[View, Any], np.ndarray],
     capture: Capture,
     rows: np.ndarray,
 ) -> Halves:
@@ -88,7 +88,7 @@ def score_halves(
     Args:
       fit_code: Function of a view, the left half of its image (uint8 [height, width //
         2, 3]) and its observed pixels (or None), which returns codes.
-      render: Function of a view and codes, which renders the whole frame.
+      render: Function of a view and codes, which returns the whole image.
       capture: The capture.
       rows: Indices of the frames.
 
@@ -104,7 +104,7 @@ def score_halves(
         half = image.shape[1] // 2
         valid = None if capture.valid is None else capture.valid[row, :, :half]
         codes = fit_code(view, image[:, :half], valid)
-        colors.append(np.asarray(render(view, codes).color))
+        colors.append(np.asarray(render(view, codes)))
     return score_right_halves(capture, rows, colors)
 
 

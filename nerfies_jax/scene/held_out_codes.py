@@ -16,12 +16,7 @@ from nerfies_jax.fields import field_ray, skipping
 from nerfies_jax.scene import scene
 from nerfies_jax.training import fit, losses, programs
 from nerfies_jax.training.effects import APPEARANCE, FrameCondition
-from nerfies_jax.training.model import (
-    Rendering,
-    TrainState,
-    View,
-    in_default_precision,
-)
+from nerfies_jax.training.model import TrainState, View, in_default_precision
 
 RAYS = 512  # of the left half, to which a code is fitted
 # L-BFGS has nearly converged after some twenty steps of about two evaluations each.
@@ -69,19 +64,12 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
 
         def loss(fitted):
             condition = FrameCondition(view.time, codes | fitted, step)
-            seen = jax.vmap(
-                lambda pixel: (
-                    field.render_ray(
-                        params,
-                        field_ray.field_ray_through(field.metadata, view.camera, pixel)[
-                            0
-                        ],
-                        condition,
-                        guide=guide,
-                    )[-1].color
-                )
-            )
-            return losses.mse(seen(pixels), colors)
+
+            def color_of(pixel):
+                ray, _ = field_ray.field_ray_through(field.metadata, view.camera, pixel)
+                return field.render_ray(params, ray, condition, guide=guide)[-1].color
+
+            return losses.mse(jax.vmap(color_of)(pixels), colors)
 
         start = {name: codes[name] for name in tables}
         solution = fit.fit_code(loss, start, max_steps=MOST_STEPS, tolerance=TOLERANCE)
@@ -108,8 +96,8 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
             colors = in_default_precision(left[line, column].astype(np.float32) / 255)
             return solve(params, view, pixels, colors, step)
 
-        def render(view: View, codes: Any) -> Rendering:
-            return draw(params, view.camera, view.time, codes, step)
+        def render(view: View, codes: Any) -> np.ndarray:
+            return draw(params, view.camera, view.time, codes, step).color
 
         return evaluation.score_halves(fit_code, render, capture, rows)
 

@@ -262,6 +262,7 @@ def override(spec: Any, assignments: Iterable[str]) -> Any:
     Fields of a nested spec are set by a dotted path, which creates the nested spec with
     its defaults if it is None. The value `none` removes it, if its type allows that. A
     class name, as in `config.json`, selects one of several types of nested specs.
+    Settings are validated once, with all assignments, in whatever order they come.
 
     Args:
       spec: A frozen dataclass.
@@ -272,36 +273,63 @@ def override(spec: Any, assignments: Iterable[str]) -> Any:
       The changed spec.
 
     Raises:
-      OverrideError: If a field is unknown or a value cannot be parsed.
-      ValueError: If a value is out of range.
+      OverrideError: If a field is unknown, a value cannot be parsed, or the settings
+        with all assignments are invalid.
     """
+    draft = _Draft(spec)
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
         if not equals:
             raise OverrideError(f"{assignment}: expected path.to.field=value")
-        spec = _assign(spec, path.split("."), text, path, spec)
-    return spec
+        draft.assign(path.split("."), text, path, spec)
+    return draft.build()
 
 
-def _assign(spec, names, text, path, outermost):
-    fields = {field.name for field in dataclasses.fields(spec)}
-    name, inner_names = names[0], names[1:]
-    if name not in fields:
-        raise OverrideError(
-            f"{path}: {type(spec).__name__} has no field {name!r}; "
-            + _suggestion(names[-1], sorted(fields), outermost)
-        )
-    if inner_names:
-        inner = getattr(spec, name)
+class _Draft:
+    """A spec with assignments to its fields, which are validated together at the end.
+
+    Two settings can be valid together although one of them with the former value of the
+    other is not.
+    """
+
+    def __init__(self, spec: Any) -> None:
+        self.spec = spec
+        self.changes: dict[str, Any] = {}  # values, and drafts of nested specs
+        self.assignments: list[str] = []
+
+    def assign(self, names: list[str], text: str, path: str, outermost: Any) -> None:
+        """Set the field `names` of this spec, or of a spec in it, to a parsed text."""
+        spec, (name, *inner_names) = self.spec, names
+        fields = {field.name for field in dataclasses.fields(spec)}
+        if name not in fields:
+            raise OverrideError(
+                f"{path}: {type(spec).__name__} has no field {name!r}; "
+                + _suggestion(names[-1], sorted(fields), outermost)
+            )
+        self.assignments.append(f"{path}={text}")
+        if not inner_names:
+            kind = typing.get_type_hints(type(spec))[name]
+            self.changes[name] = _read(kind, text, path)
+            return
+        inner = self.changes.get(name, getattr(spec, name))
         if inner is None:
             inner = _default_of_absent(spec, name)
-        if not dataclasses.is_dataclass(inner):
-            raise OverrideError(f"{path}: {name!r} is {inner!r} and has no fields")
-        return dataclasses.replace(
-            spec, **{name: _assign(inner, inner_names, text, path, outermost)}
-        )
-    kind = typing.get_type_hints(type(spec))[name]
-    return dataclasses.replace(spec, **{name: _read(kind, text, path)})
+        if not isinstance(inner, _Draft):
+            if not dataclasses.is_dataclass(inner):
+                raise OverrideError(f"{path}: {name!r} is {inner!r} and has no fields")
+            inner = self.changes[name] = _Draft(inner)
+        inner.assign(inner_names, text, path, outermost)
+
+    def build(self) -> Any:
+        """Return the spec, or raise an error that names the assignments to it."""
+        changes = {
+            name: value.build() if isinstance(value, _Draft) else value
+            for name, value in self.changes.items()
+        }
+        try:
+            return dataclasses.replace(self.spec, **changes)
+        except ValueError as error:
+            raise OverrideError(f"{' '.join(self.assignments)}: {error}") from error
 
 
 def _suggestion(name, fields, outermost):

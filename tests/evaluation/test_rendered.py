@@ -284,7 +284,7 @@ def test_the_code_sees_the_left_half_and_the_score_the_right(masked):
     def render(view, code):
         picture = np.full((30, 40, 3), code, np.float32)
         picture[:, :20] = 5.0  # what is wrong on the left costs nothing
-        return Rendering(picture, None, None)
+        return picture
 
     scored = evaluation.score_halves(fit_code, render, capture, capture.heldout)
     np.testing.assert_array_equal(scored.rows, capture.heldout)
