@@ -82,9 +82,9 @@ def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
     if len(rows):
         points = TruePoints(*(part[rows] for part in points))
         views = view_set.in_time_order(small)
-        followed = _followed(views, evidence, points)
-        track_px, lost = _track_error(followed, points)
-        path_error = _path_error(capture, views, evidence, followed, points)
+        tracks = _tracks_of(views, evidence, points)
+        track_px, lost = _track_error(tracks, points)
+        path_error = _path_error(capture, views, evidence, tracks, points)
     return Errors(
         mask_iou=float(iou),
         false_share=float((evidence.moving & ~true).mean()),
@@ -94,7 +94,7 @@ def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
     )
 
 
-def _followed(views, evidence, points):
+def _tracks_of(views, evidence, points):
     start = points.seen.argmax(1)
     place = points.pixel[np.arange(len(start)), start]
     starts = np.concatenate([start[:, None], place], axis=1)
@@ -102,15 +102,15 @@ def _followed(views, evidence, points):
     return tracking.realigned(chained, dense_flow.leveled(views), views.size)
 
 
-def _track_error(followed: Tracks, points):
-    later = followed.start + LATER
+def _track_error(tracks: Tracks, points):
+    later = tracks.start + LATER
     rows = np.flatnonzero(later < points.seen.shape[1])
     rows = rows[points.seen[rows, later[rows]]]
     if not len(rows):
         return np.nan, np.nan
-    compared = rows[followed.seen[rows, later[rows]]]
+    compared = rows[tracks.seen[rows, later[rows]]]
     off = (
-        followed.pixel[compared, later[compared]]
+        tracks.pixel[compared, later[compared]]
         - points.pixel[compared, later[compared]]
     )
     error = np.linalg.norm(off, axis=-1)
@@ -118,18 +118,18 @@ def _track_error(followed: Tracks, points):
     return median, 1 - len(compared) / len(rows)
 
 
-def _path_error(capture, views, evidence, followed, points):
-    long = followed.seen.sum(1) >= min(record.SHORTEST_PATH, len(views.row))
-    followed = followed.take(long)
+def _path_error(capture, views, evidence, tracks, points):
+    long = tracks.seen.sum(1) >= min(record.SHORTEST_PATH, len(views.row))
+    tracks = tracks.take(long)
     if not long.any():
         return np.nan
     static = evidence.score < paths.AT_REST
     around = paths.depth_around(
-        followed, evidence.tracks.take(static), evidence.rest.take(static), capture.near
+        tracks, evidence.tracks.take(static), evidence.rest.take(static), capture.near
     )
-    fitted = paths.least_acceleration(views, followed, capture.near, around)
-    error = np.linalg.norm(fitted.position - points.position[long], axis=-1)
-    valid = fitted.known & points.seen[long]
+    solution = paths.least_acceleration(views, tracks, capture.near, around)
+    error = np.linalg.norm(solution.position - points.position[long], axis=-1)
+    valid = solution.known & points.seen[long]
     if not valid.any():
         return np.nan
     return float(np.median(error[valid]) / scene_unit(evidence))

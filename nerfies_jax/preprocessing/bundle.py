@@ -52,89 +52,91 @@ class Sight(NamedTuple):
     to_px: np.ndarray  # [entries, 2, 3] camera axes to pixels times depth
 
 
-def sight(views: Views, tracks: Tracks, known: np.ndarray) -> Sight:
+def sight(views: Views, tracks: Tracks, valid: np.ndarray) -> Sight:
     """Collect the observations of tracks.
 
     Args:
       views: The frames.
       tracks: The tracks.
-      known: True for observations to use, [tracks, frames].
+      valid: True for observations to use, [tracks, frames].
 
     Returns:
       The observations.
     """
-    track, frame = np.nonzero(known)
+    track, frame = np.nonzero(valid)
     center = views.intrinsics[frame, :2, 2]
     to_px = views.intrinsics[frame, :2].copy()
     to_px[:, :, 2] = 0
     return Sight(track, frame, tracks.pixel[track, frame] - center, to_px)
 
 
-def misses(views: Views, seen: Sight, body: Body) -> np.ndarray:
+def misses(views: Views, sight: Sight, body: Body) -> np.ndarray:
     """Compute reprojection errors.
 
     Args:
       views: The frames.
-      seen: Observations.
+      sight: Observations.
       body: The object.
 
     Returns:
       Errors in pixels, [entries].
     """
-    return np.linalg.norm(_projected(views, seen, body)[0], axis=-1)
+    return np.linalg.norm(_projected(views, sight, body)[0], axis=-1)
 
 
-def _projected(views, seen, body):
-    """Errors [entries, 2] in px, and their gradients [entries, 2, 3] by the
-    position.
+def _projected(views, sight, body):
+    """Compute errors [entries, 2] in px, and their gradients [entries, 2, 3].
+
+    The gradients are by the position of the point. The third value is the position
+    relative to the center of the body, in world axes.
     """
-    turned = np.einsum("oij,oj->oi", body.rotation[seen.frame], body.point[seen.track])
-    away = turned + (body.shift - views.position)[seen.frame]
-    local = np.einsum("oij,oj->oi", views.rotation[seen.frame], away)
+    arm = np.einsum("oij,oj->oi", body.rotation[sight.frame], body.point[sight.track])
+    offset = arm + (body.shift - views.position)[sight.frame]
+    local = np.einsum("oij,oj->oi", views.rotation[sight.frame], offset)
     depth = np.maximum(local[:, 2], NEAR * np.median(np.abs(local[:, 2])))
-    pixel = np.einsum("oij,oj->oi", seen.to_px, local) / depth[:, None]
-    slope = seen.to_px.copy()
-    slope[:, :, 2] = -pixel
-    slope = slope / depth[:, None, None] @ views.rotation[seen.frame]
-    return pixel - seen.place, slope, turned
+    pixel = np.einsum("oij,oj->oi", sight.to_px, local) / depth[:, None]
+    gradient = sight.to_px.copy()
+    gradient[:, :, 2] = -pixel
+    gradient = gradient / depth[:, None, None] @ views.rotation[sight.frame]
+    return pixel - sight.place, gradient, arm
 
 
-def adjusted(views: Views, seen: Sight, body: Body) -> Body:
+def adjusted(views: Views, sight: Sight, body: Body) -> Body:
     """Adjust points and poses to the observations.
 
     Args:
       views: The frames.
-      seen: Observations.
+      sight: Observations.
       body: Initial object.
 
     Returns:
       The adjusted object.
     """
-    return _descended(views, seen, body, _moved)
+    return _minimize(views, sight, body, _step_of_all)
 
 
-def posed(views: Views, seen: Sight, body: Body) -> Body:
+def posed(views: Views, sight: Sight, body: Body) -> Body:
     """Adjust the poses alone.
 
     Args:
       views: The frames.
-      seen: Observations.
+      sight: Observations.
       body: Object whose points are correct.
 
     Returns:
       The object with adjusted poses.
     """
-    return _descended(views, seen, body, _turned)
+    return _minimize(views, sight, body, _step_of_poses)
 
 
-def _descended(views, seen, body, step):
-    bend = _bend(views, body)
-    cost, damping = _cost(views, seen, body, bend), DAMPING
+def _minimize(views, sight, body, step):
+    smoothness = _smoothness(views, body)
+    cost, damping = _cost(views, sight, body, smoothness), DAMPING
     for _ in range(ROUNDS):
-        system = _system(views, seen, body, bend)
+        system = _system(views, sight, body, smoothness)
         for _ in range(TRIES):
             candidate = step(body, system, damping)
-            new = _cost(views, seen, candidate, bend)
+            new = _cost(views, sight, candidate, smoothness)
             if new < cost:
                 break
             damping *= 10
@@ -147,96 +149,101 @@ def _descended(views, seen, body, step):
     return body
 
 
-def _bend(views, body):
-    """[frames, frames] weight of second differences of shifts and turns."""
+def _smoothness(views, body):
+    """Return the penalty [frames, frames] on second differences of shifts."""
     frames = len(body.shift)
     second = np.diff(np.eye(frames), 2, axis=0)
     distance = np.median(np.linalg.norm(body.shift - views.position, axis=-1))
     return (BEND_PX / max(distance, 1e-30)) ** 2 * second.T @ second
 
 
-def _cost(views, seen, body, bend):
-    miss_sq = (_projected(views, seen, body)[0] ** 2).sum(-1)
+def _cost(views, sight, body, smoothness):
+    miss_sq = (_projected(views, sight, body)[0] ** 2).sum(-1)
     robust = SOFT_PX**2 * np.log1p(miss_sq / SOFT_PX**2).sum()
-    return robust + np.einsum("fi,fg,gi->", body.shift, bend, body.shift)
+    return robust + np.einsum("fi,fg,gi->", body.shift, smoothness, body.shift)
 
 
 class _System(NamedTuple):
+    """Normal equations of a round, by blocks of poses and points."""
+
     poses: np.ndarray  # [6 frames, 6 frames]
     points: np.ndarray  # [points, 3, 3]
-    both: np.ndarray  # [points, 6 frames, 3]
-    pose_slope: np.ndarray  # [6 frames]
-    point_slope: np.ndarray  # [points, 3]
+    mixed: np.ndarray  # [points, 6 frames, 3]
+    pose_gradient: np.ndarray  # [6 frames]
+    point_gradient: np.ndarray  # [points, 3]
 
 
-def _system(views, seen, body, bend):
-    """The normal equations of one round, weights as the misses are."""
-    miss, slope, turned = _projected(views, seen, body)
+def _system(views, sight, body, smoothness):
+    """Build the normal equations of one round, weighted by the Cauchy loss."""
+    miss, gradient, arm = _projected(views, sight, body)
     weight = _weights(miss)
-    by_turn = np.cross(turned[:, None], slope)
-    by_pose = np.concatenate([slope, by_turn], axis=-1)
-    by_point = slope @ body.rotation[seen.frame]
+    by_turn = np.cross(arm[:, None], gradient)
+    by_pose = np.concatenate([gradient, by_turn], axis=-1)
+    by_point = gradient @ body.rotation[sight.frame]
     frames, points = len(body.shift), len(body.point)
-    own = _summed(_products(weight, by_pose, by_pose), seen.frame, frames)
+    pose_blocks = _summed(_products(weight, by_pose, by_pose), sight.frame, frames)
     poses = np.zeros((frames, 6, frames, 6))
-    poses[np.arange(frames), :, np.arange(frames)] = own
+    poses[np.arange(frames), :, np.arange(frames)] = pose_blocks
     for part in range(6):
-        poses[:, part, :, part] += bend
-    both = np.zeros((points, frames, 6, 3))
-    both[seen.track, seen.frame] = _products(weight, by_pose, by_point)
+        poses[:, part, :, part] += smoothness
+    mixed = np.zeros((points, frames, 6, 3))
+    mixed[sight.track, sight.frame] = _products(weight, by_pose, by_point)
     off = miss[..., None]
-    pose_slope = _summed(_products(weight, by_pose, off), seen.frame, frames)[..., 0]
-    pose_slope[:, :3] += bend @ body.shift
+    pose_gradient = _summed(_products(weight, by_pose, off), sight.frame, frames)
+    pose_gradient = pose_gradient[..., 0]
+    pose_gradient[:, :3] += smoothness @ body.shift
     return _System(
         poses.reshape(6 * frames, 6 * frames),
-        _summed(_products(weight, by_point, by_point), seen.track, points),
-        both.reshape(points, 6 * frames, 3),
-        pose_slope.ravel(),
-        _summed(_products(weight, by_point, off), seen.track, points)[..., 0],
+        _summed(_products(weight, by_point, by_point), sight.track, points),
+        mixed.reshape(points, 6 * frames, 3),
+        pose_gradient.ravel(),
+        _summed(_products(weight, by_point, off), sight.track, points)[..., 0],
     )
 
 
 def _weights(miss):
-    """Weights of observations [entries], from errors [entries, 2] in px."""
+    """Return weights of observations [entries] from errors [entries, 2] in px."""
     return 1 / (1 + (miss**2).sum(-1) / SOFT_PX**2)
 
 
-def _products(weight, left, right):
+def _products(weight, first, second):
     # The three in one einsum take two and a half times as long.
-    return np.einsum("oki,okj->oij", weight[:, None, None] * left, right)
+    return np.einsum("oki,okj->oij", weight[:, None, None] * first, second)
 
 
-def _summed(product, where, rows):
-    """[rows, ...] sums of the entries of each row."""
-    entries = len(where)
+def _summed(blocks, row, rows):
+    """Sum the blocks of each row, [rows, ...]."""
+    entries = len(row)
     # Seven times as fast as numpy.add.at on 60,000 matrices of 6 by 6.
-    which = scipy.sparse.csr_array(
-        (np.ones(entries), where, np.arange(entries + 1)), shape=(entries, rows)
+    selection = scipy.sparse.csr_array(
+        (np.ones(entries), row, np.arange(entries + 1)), shape=(entries, rows)
     )
-    total = which.T @ product.reshape(entries, math.prod(product.shape[1:]))
-    return total.reshape(rows, *product.shape[1:])
+    total = selection.T @ blocks.reshape(entries, math.prod(blocks.shape[1:]))
+    return total.reshape(rows, *blocks.shape[1:])
 
 
-def _moved(body, system, damping):
+def _step_of_all(body, system, damping):
     size = np.einsum("nii->n", system.points) / 3
     ridge = damping * size + POINT_PRIOR * max(np.median(size), 1e-30)
     inverse = np.linalg.inv(system.points + ridge[:, None, None] * np.eye(3))
     matrix = _damped(system.poses, damping)
-    onto = system.both @ inverse
+    projection = system.mixed @ inverse
     flat = (len(matrix), -1)
-    matrix -= onto.transpose(1, 0, 2).reshape(flat) @ (
-        system.both.transpose(1, 0, 2).reshape(flat).T
+    matrix -= projection.transpose(1, 0, 2).reshape(flat) @ (
+        system.mixed.transpose(1, 0, 2).reshape(flat).T
     )
-    right = np.einsum("nij,nj->i", onto, system.point_slope) - system.pose_slope
-    pose = np.linalg.solve(matrix, right)
-    back = system.point_slope + np.einsum("nij,i->nj", system.both, pose)
-    point = body.point - np.einsum("nij,nj->ni", inverse, back)
-    return _by(body._replace(point=point), pose)
+    target = (
+        np.einsum("nij,nj->i", projection, system.point_gradient) - system.pose_gradient
+    )
+    pose = np.linalg.solve(matrix, target)
+    residual = system.point_gradient + np.einsum("nij,i->nj", system.mixed, pose)
+    point = body.point - np.einsum("nij,nj->ni", inverse, residual)
+    return _posed_by(body._replace(point=point), pose)
 
 
-def _turned(body, system, damping):
-    return _by(
-        body, np.linalg.solve(_damped(system.poses, damping), -system.pose_slope)
+def _step_of_poses(body, system, damping):
+    return _posed_by(
+        body, np.linalg.solve(_damped(system.poses, damping), -system.pose_gradient)
     )
 
 
@@ -246,19 +253,19 @@ def _damped(matrix, damping):
     return matrix + np.diag(ridge)
 
 
-def _by(body, pose):
-    """The body moved and turned by `pose` [6 frames]."""
+def _posed_by(body, pose):
+    """Add `pose` [6 frames], shifts and turns of each frame, to a body."""
     pose = pose.reshape(-1, 6)
     turn = Rotation.from_rotvec(pose[:, 3:]).as_matrix()
     return body._replace(rotation=turn @ body.rotation, shift=body.shift + pose[:, :3])
 
 
-def placed(views: Views, seen: Sight, body: Body) -> Body:
+def placed(views: Views, sight: Sight, body: Body) -> Body:
     """Adjust the points alone.
 
     Args:
       views: The frames.
-      seen: Observations.
+      sight: Observations.
       body: Object whose poses are correct.
 
     Returns:
@@ -266,17 +273,17 @@ def placed(views: Views, seen: Sight, body: Body) -> Body:
     """
     point = body.point.copy()
     for _ in range(ROUNDS // 4):
-        miss, slope, _ = _projected(views, seen, body._replace(point=point))
+        miss, gradient, _ = _projected(views, sight, body._replace(point=point))
         weight = _weights(miss)
-        by_point = slope @ body.rotation[seen.frame]
-        matrix, right = (
-            _summed(_products(weight, by_point, other), seen.track, len(point))
-            for other in (by_point, miss[..., None])
+        by_point = gradient @ body.rotation[sight.frame]
+        matrix, target = (
+            _summed(_products(weight, by_point, factor), sight.track, len(point))
+            for factor in (by_point, miss[..., None])
         )
         size = np.einsum("nii->n", matrix) / 3
         ridge = POINT_PRIOR * (size + max(np.median(size), 1e-30))
         matrix += ridge[:, None, None] * np.eye(3)
-        point = point - np.linalg.solve(matrix, right)[..., 0]
+        point = point - np.linalg.solve(matrix, target)[..., 0]
     return body._replace(point=point)
 
 
@@ -295,11 +302,11 @@ def scaled(views: Views, body: Body, factor: float) -> Body:
     return Body(factor * body.point, body.rotation, shift)
 
 
-def typical_misses(seen: Sight, miss: np.ndarray, tracks: int) -> np.ndarray:
+def typical_misses(sight: Sight, miss: np.ndarray, tracks: int) -> np.ndarray:
     """Compute the median reprojection error of each track.
 
     Args:
-      seen: Observations.
+      sight: Observations.
       miss: Their errors in pixels, [entries].
       tracks: Number of tracks.
 
@@ -308,8 +315,8 @@ def typical_misses(seen: Sight, miss: np.ndarray, tracks: int) -> np.ndarray:
     """
     if not len(miss):
         return np.full(tracks, np.inf)
-    ordered = np.lexsort((miss, seen.track))
-    count = np.bincount(seen.track, minlength=tracks)
+    ordered = np.lexsort((miss, sight.track))
+    count = np.bincount(sight.track, minlength=tracks)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     at = np.minimum(first + count // 2, len(miss) - 1)
     return np.where(count > 0, miss[ordered][at], np.inf)

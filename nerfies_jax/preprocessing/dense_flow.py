@@ -79,39 +79,39 @@ def leveled(views: Views, times: int | None = None) -> np.ndarray:
     mean, spread = gray.mean((1, 2)), np.maximum(gray.std((1, 2)), 1e-3)
     scaled = (gray - mean[:, None, None]) / spread[:, None, None]
     alike = np.clip(scaled * np.median(spread) + np.median(mean), 0, 255)
-    pictures = [np.rint(one).astype(np.uint8) for one in alike]
+    images = [np.rint(image).astype(np.uint8) for image in alike]
     times = enlarged(views) if times is None else times
-    return np.stack([larger(one, times) for one in pictures])
+    return np.stack([larger(image, times) for image in images])
 
 
-def searched_pixels(views: Views, pictures: np.ndarray) -> int:
+def searched_pixels(views: Views, images: np.ndarray) -> int:
     """Return the number of pixels on the finest level of one search.
 
     Args:
       views: The frames.
-      pictures: Their images from `leveled`.
+      images: Their images from `leveled`.
 
     Returns:
       The number of pixels.
     """
-    pixels = pictures[0].size
+    pixels = images[0].size
     return pixels if enlarged(views) > 1 else pixels // 4
 
 
-def larger(picture: np.ndarray, times: int) -> np.ndarray:
+def larger(image: np.ndarray, times: int) -> np.ndarray:
     """Enlarge an image.
 
     Args:
-      picture: uint8 image, [height, width].
+      image: uint8 image, [height, width].
       times: Integer factor.
 
     Returns:
       uint8 image, [times height, times width].
     """
     if times == 1:
-        return picture
-    size = times * picture.shape[1], times * picture.shape[0]
-    return cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+        return image
+    size = times * image.shape[1], times * image.shape[0]
+    return cv2.resize(image, size, interpolation=cv2.INTER_CUBIC)
 
 
 def reduced(shift: np.ndarray, times: int) -> np.ndarray:
@@ -136,9 +136,9 @@ def _enlarged_flow(shift: np.ndarray, times: int) -> np.ndarray:
     return times * cv2.resize(np.ascontiguousarray(shift), size)
 
 
-def _smaller(picture, times):
-    size = picture.shape[1] // times, picture.shape[0] // times
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+def _smaller(image, times):
+    size = image.shape[1] // times, image.shape[0] // times
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def dis(times: int) -> Callable[..., np.ndarray]:
@@ -166,7 +166,7 @@ def dis(times: int) -> Callable[..., np.ndarray]:
 
 def between_neighbors(
     views: Views,
-    pictures: np.ndarray,
+    images: np.ndarray,
     span: tuple[float, float] | None = None,
     room_for: Callable[[int], int] = lambda count: count,
 ) -> NeighborFlow:
@@ -174,7 +174,7 @@ def between_neighbors(
 
     Args:
       views: The frames.
-      pictures: Their images from `leveled`.
+      images: Their images from `leveled`.
       span: Nearest and farthest z-depth of the scene in scene units. If given, large
         displacements are searched for again, starting from the flow of a static scene.
       room_for: Function of the number of such searches, which returns the number of
@@ -184,13 +184,13 @@ def between_neighbors(
       The flow.
     """
     (width, height), frames = views.size, len(views.row)
-    times = pictures.shape[2] // width
+    times = images.shape[2] // width
     searches = threading.local()  # one for each thread, because they have a state
 
     def search(*pair_and_guess):
-        if not hasattr(searches, "own"):
-            searches.own = dis(times)
-        return searches.own(*pair_and_guess)
+        if not hasattr(searches, "flow"):
+            searches.flow = dis(times)
+        return searches.flow(*pair_and_guess)
 
     forward, backward = np.zeros((2, frames, height, width, 2), np.float32)
 
@@ -200,13 +200,13 @@ def between_neighbors(
 
     def first_look(step):
         one, other = step
-        return reduced(search(pictures[one], pictures[other]), times)
+        return reduced(search(images[one], images[other]), times)
 
     def second_look(step):
-        pair = tuple(pictures[frame] for frame in step)
+        pair = tuple(images[frame] for frame in step)
         return wide_steps.improved(
             views,
-            tuple(_smaller(picture, times) for picture in pair),
+            tuple(_smaller(image, times) for image in pair),
             step,
             place(step),
             lambda guess: reduced(search(*pair, _enlarged_flow(guess, times)), times),
@@ -237,7 +237,7 @@ def between_neighbors(
     checked_flow = checked(forward, backward)
     for frame in range(1, frames - 1):
         if _lost(checked_flow, frame) or _jumps(checked_flow, frame):
-            _go_on(checked_flow, frame, pictures, search)
+            _continue_motion(checked_flow, frame, images, search)
     return checked_flow
 
 
@@ -253,9 +253,9 @@ def checked(forward: np.ndarray, backward: np.ndarray) -> NeighborFlow:
     """
     forward_seen, backward_seen = np.zeros((2, *forward.shape[:3]), bool)
     for frame in range(len(forward) - 1):
-        there, back = forward[frame], backward[frame + 1]
-        forward_seen[frame] = closed(there, back)
-        backward_seen[frame + 1] = closed(back, there)
+        ahead, behind = forward[frame], backward[frame + 1]
+        forward_seen[frame] = closed(ahead, behind)
+        backward_seen[frame + 1] = closed(behind, ahead)
     return NeighborFlow(forward, forward_seen, backward, backward_seen)
 
 
@@ -266,9 +266,9 @@ def _lost(flow, frame):
 
 def _jumps(flow, frame):
     """Test if a coherent area changes its motion abruptly at a frame."""
-    turned = np.linalg.norm(flow.forward[frame] + flow.backward[frame], axis=-1)
-    both = flow.backward_seen[frame] & flow.forward_seen[frame]
-    return _covers_patch(both & (turned > JUMP_SHARE * turned.shape[1]))
+    change = np.linalg.norm(flow.forward[frame] + flow.backward[frame], axis=-1)
+    valid = flow.backward_seen[frame] & flow.forward_seen[frame]
+    return _covers_patch(valid & (change > JUMP_SHARE * change.shape[1]))
 
 
 def _covers_patch(area):
@@ -278,48 +278,48 @@ def _covers_patch(area):
     return cv2.erode(np.uint8(area), np.ones((side, side)), **outside).any()
 
 
-def _go_on(flow, frame, pictures, search):
+def _continue_motion(flow, frame, images, search):
     """Search again, starting from constant motion, and keep flow that is consistent."""
     height, width = flow.forward.shape[1:3]
-    times = pictures.shape[2] // width
+    times = images.shape[2] // width
 
-    def again(one, other, guess):
+    def search_from(one, other, guess):
         guess = _enlarged_flow(guess, times)
-        return reduced(search(pictures[one], pictures[other], guess), times)
+        return reduced(search(images[one], images[other], guess), times)
 
-    there = again(frame, frame + 1, -flow.backward[frame])
+    ahead = search_from(frame, frame + 1, -flow.backward[frame])
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
-    at = x - there[..., 0], y.astype(np.float32) - there[..., 1]
-    back = again(frame + 1, frame, -cv2.remap(there, *at, cv2.INTER_LINEAR))
-    small = [_smaller(pictures[index], times) for index in (frame, frame + 1)]
-    for here, shift, seen, new, other in (
-        (frame, flow.forward, flow.forward_seen, there, back),
-        (frame + 1, flow.backward, flow.backward_seen, back, there),
+    at = x - ahead[..., 0], y.astype(np.float32) - ahead[..., 1]
+    behind = search_from(frame + 1, frame, -cv2.remap(ahead, *at, cv2.INTER_LINEAR))
+    small = [_smaller(images[index], times) for index in (frame, frame + 1)]
+    for start, shift, valid, new, other in (
+        (frame, flow.forward, flow.forward_seen, ahead, behind),
+        (frame + 1, flow.backward, flow.backward_seen, behind, ahead),
     ):
-        old, pair = shift[here], small if here == frame else small[::-1]
+        old, pair = shift[start], small if start == frame else small[::-1]
         disagrees = np.linalg.norm(new - old, axis=-1) > JUMP_SHARE * width
         alike = wide_steps.unlike(pair, new) < AS_ALIKE * wide_steps.unlike(pair, old)
-        better = closed(new, other) & (~seen[here] | (disagrees & alike))
-        shift[here][better], seen[here][better] = new[better], True
+        better = closed(new, other) & (~valid[start] | (disagrees & alike))
+        shift[start][better], valid[start][better] = new[better], True
 
 
-def closed(there: np.ndarray, back: np.ndarray) -> np.ndarray:
+def closed(flow: np.ndarray, reverse: np.ndarray) -> np.ndarray:
     """Find the pixels where forward and backward flow are consistent.
 
     Args:
-      there: Flow in pixels, [height, width, 2].
-      back: Flow in the opposite direction, [height, width, 2].
+      flow: Flow in pixels, [height, width, 2].
+      reverse: Flow in the opposite direction, [height, width, 2].
 
     Returns:
-      Booleans [height, width], True if `back` leads from the end of `there` to its
+      Booleans [height, width], True if `reverse` leads from the end of `flow` to its
       start.
     """
-    height, width = there.shape[:2]
+    height, width = flow.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
-    to = (x + there[..., 0], y.astype(np.float32) + there[..., 1])
+    to = (x + flow[..., 0], y.astype(np.float32) + flow[..., 1])
     # Positions outside of the image are never consistent.
-    back_there = cv2.remap(
-        back, *to, cv2.INTER_LINEAR, borderValue=(1e3, 1e3, 1e3, 1e3)
+    reverse_at_end = cv2.remap(
+        reverse, *to, cv2.INTER_LINEAR, borderValue=(1e3, 1e3, 1e3, 1e3)
     )
-    gap = np.linalg.norm(there + back_there, axis=-1)
-    return gap < CLOSED_PX + CLOSED_SHARE * np.linalg.norm(there, axis=-1)
+    gap = np.linalg.norm(flow + reverse_at_end, axis=-1)
+    return gap < CLOSED_PX + CLOSED_SHARE * np.linalg.norm(flow, axis=-1)

@@ -58,51 +58,51 @@ def read(path: pathlib.Path, capture: Capture) -> dict[str, np.ndarray]:
     if pairs is None:
         pairs = _named(_arrays(path), path)
     counts = {len(capture.train), len(capture.ids)}
-    pixel, seen = pairs.pixel, pairs.visible
+    pixel, visible = pairs.pixel, pairs.visible
     fits = [axis for axis in (0, 1) if pixel.shape[axis] in counts]
     if len(fits) != 1:
         fits = [pairs.frames_axis]
-    pixel, seen = np.moveaxis(pixel, fits[0], 0), np.moveaxis(seen, fits[0], 0)
+    pixel, visible = np.moveaxis(pixel, fits[0], 0), np.moveaxis(visible, fits[0], 0)
     rows = given_arrays.frames_of(len(pixel), capture, path, "tracks")
     stride = -(-pixel[..., 0].size // MOST_PLACES) or 1
-    pixel, seen = pixel[:, ::stride], seen[:, ::stride]
+    pixel, visible = pixel[:, ::stride], visible[:, ::stride]
     pixel = pixel.astype(np.float32) + np.float32(0.5 - pairs.center)
-    seen = seen & np.isfinite(pixel).all(-1)
+    visible = visible & np.isfinite(pixel).all(-1)
     if pairs.size is not None:
         pixel = pixel * (np.asarray(capture.size) / pairs.size).astype(np.float32)
-    seen &= _inside(pixel, seen, capture.size, path)
+    visible &= _inside(pixel, visible, capture.size, path)
     pixels = np.zeros((len(capture.ids), pixel.shape[1], 2), np.float32)
-    there = np.zeros(pixels.shape[:2], bool)
-    pixels[rows], there[rows] = np.where(seen[..., None], pixel, 0), seen
-    return {"track_pixel": pixels, "track_seen": there}
+    track_seen = np.zeros(pixels.shape[:2], bool)
+    pixels[rows], track_seen[rows] = np.where(visible[..., None], pixel, 0), visible
+    return {"track_pixel": pixels, "track_seen": track_seen}
 
 
-def _inside(pixel, seen, size, path):
+def _inside(pixel, visible, size, path):
     """Find the positions inside the images, which most visible ones must be."""
 
-    def count(place):
+    def count(position):
         with np.errstate(invalid="ignore"):
-            inside = ((place > 0) & (place < np.asarray(size))).all(-1)
-        return inside, (inside & seen).sum()
+            inside = ((position > 0) & (position < np.asarray(size))).all(-1)
+        return inside, (inside & visible).sum()
 
     inside, number = count(pixel)
-    if seen.any() and number >= LEAST_INSIDE * seen.sum():
+    if visible.any() and number >= LEAST_INSIDE * visible.sum():
         return inside
     advice = (
         "if images of another size were tracked, add their width and height as an "
         "array size"
     )
-    if seen.any() and count(pixel[..., ::-1])[1] >= LEAST_INSIDE * seen.sum():
+    if visible.any() and count(pixel[..., ::-1])[1] >= LEAST_INSIDE * visible.sum():
         advice = "their axes seem to be exchanged: store x (right) before y (down)"
     width, height = size
     raise CaptureError(
-        f"{path}: {number} of {seen.sum()} visible positions are inside the images of "
-        f"{width}x{height}, at least half must be; {advice}"
+        f"{path}: {number} of {visible.sum()} visible positions are inside the images "
+        f"of {width}x{height}, at least half must be; {advice}"
     )
 
 
 def _arrays(path):
-    """Arrays of an npz, or of a folder of npy files by their names."""
+    """Load the arrays of an npz, or of a folder of npy files, by their names."""
     if path.is_dir():
         arrays = {}
         names = (*POSITIONS, *VISIBLE, *OCCLUDED, UNCERTAIN, "size")
@@ -126,16 +126,16 @@ def _arrays(path):
 
 def _named(arrays, path):
     name = next((name for name in POSITIONS if name in arrays), None)
-    shown = next((n for n in (*VISIBLE, *OCCLUDED) if n in arrays), None)
-    if name is None or shown is None:
+    visibility = next((n for n in (*VISIBLE, *OCCLUDED) if n in arrays), None)
+    if name is None or visibility is None:
         raise CaptureError(
             f"{path}: contains {', '.join(arrays) or 'nothing'}; expected "
             f"{' or '.join(POSITIONS)}, and {VISIBLE[0]}, pred_visibility or "
             f"occlusion; save them with {EXAMPLE}"
         )
-    pixel, flag = arrays[name], arrays[shown]
-    parts = {shown: flag}
-    if UNCERTAIN in arrays and shown in OCCLUDED:
+    pixel, flag = arrays[name], arrays[visibility]
+    parts = {visibility: flag}
+    if UNCERTAIN in arrays and visibility in OCCLUDED:
         parts[UNCERTAIN] = arrays[UNCERTAIN]
     if pixel.ndim == 4 and len(pixel) == 1:  # a batch of one
         pixel = pixel[0]
@@ -151,9 +151,9 @@ def _named(arrays, path):
                 f"{path}: {name} of shape {pixel.shape} and {key} of {part.shape}; "
                 "expected [tracks, frames, 2] and [tracks, frames], or frames first"
             )
-    visible = parts[shown] > SEEN
-    if shown in OCCLUDED:
-        visible = _visible(parts[shown], parts.get(UNCERTAIN))
+    visible = parts[visibility] > SEEN
+    if visibility in OCCLUDED:
+        visible = _visible(parts[visibility], parts.get(UNCERTAIN))
     axis, center = POSITIONS[name]
     return TrackFile(pixel, visible, axis, center, _size(arrays.get("size"), path))
 
@@ -170,7 +170,7 @@ def _size(size, path):
 
 
 def _visible(occlusion, uncertain=None):
-    """Visibility as in TAPIR: neither occluded nor uncertain, from two logits."""
+    """Compute visibility as TAPIR does from the logits of occlusion and uncertainty."""
     occlusion = np.asarray(occlusion, np.float32)
     is_logit = bool(((occlusion < 0) | (occlusion > 1)).any())
     if not is_logit:
@@ -182,17 +182,17 @@ def _visible(occlusion, uncertain=None):
 
 
 def _pairs(folder):
-    """Tracks of files QUERY_TARGET.npy, each with the points of one query frame."""
-    found = {}
+    """Read files QUERY_TARGET.npy, each with the points of one query frame."""
+    files = {}
     for file in folder.glob("*.npy"):
         middle = len(file.stem) // 2  # both names have the same length
         if file.stem[middle : middle + 1] == "_" and len(file.stem) % 2:
-            found[file.stem[:middle], file.stem[middle + 1 :]] = file
-    targets = sorted({target for _, target in found}, key=frames.natural)
-    queries = sorted({query for query, _ in found}, key=frames.natural)
+            files[file.stem[:middle], file.stem[middle + 1 :]] = file
+    targets = sorted({target for _, target in files}, key=frames.natural)
+    queries = sorted({query for query, _ in files}, key=frames.natural)
     if not set(queries) <= set(targets):
         return None
-    absent = [(q, t) for q in queries for t in targets if (q, t) not in found]
+    absent = [(q, t) for q in queries for t in targets if (q, t) not in files]
     if absent:
         name = "_".join(absent[0])
         raise CaptureError(
@@ -200,16 +200,16 @@ def _pairs(folder):
             f"{len(queries) * len(targets)} pairs of frames are missing); run the "
             "tracker again until it completes"
         )
-    if not found:
+    if not files:
         return None
     parts = []
     for query in queries:
-        files = [found[query, target] for target in targets]
-        tables = [_pair(file) for file in files]
-        for file, table in zip(files, tables, strict=True):
+        of_query = [files[query, target] for target in targets]
+        tables = [_pair(file) for file in of_query]
+        for file, table in zip(of_query, tables, strict=True):
             if table.shape != tables[0].shape:
                 raise CaptureError(
-                    f"{file}: {len(table)} points, but {files[0].name} has "
+                    f"{file}: {len(table)} points, but {of_query[0].name} has "
                     f"{len(tables[0])}; all files of a query frame must have the same"
                 )
         stride = len(tables[0]) * len(targets) * len(queries) // MOST_PLACES + 1

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from nerfies_jax.capture import frames
-from nerfies_jax.capture import images as pictures_of
+from nerfies_jax.capture import images as image_files
 from nerfies_jax.preprocessing import dense_flow, moving, view_set
 from nerfies_jax.preprocessing import tracks as tracking
 from nerfies_jax.preprocessing.rest_points import RestPoints
@@ -37,9 +37,9 @@ def _moving_masks(images: np.ndarray) -> np.ndarray:
     """
     whole = view_set.without_cameras(images)
     views = view_set.smaller(whole, view_set.times_smaller(whole))
-    pictures = dense_flow.leveled(views)
-    flow = dense_flow.between_neighbors(views, pictures)
-    tracks = tracking.from_flow(views, flow, pictures)
+    leveled = dense_flow.leveled(views)
+    flow = dense_flow.between_neighbors(views, leveled)
+    tracks = tracking.from_flow(views, flow, leveled)
     off = _off_the_camera_motion(tracks, WITHIN_SHARE * views.size[0])
     valid = np.isfinite(off).any(1)
     tracks, off = tracks.take(valid), off[valid]
@@ -57,11 +57,11 @@ def _moving_masks(images: np.ndarray) -> np.ndarray:
 
 
 @events.stage("detecting moving objects")
-def moving_in(pictures: pathlib.Path) -> dict[str, np.ndarray]:
+def moving_in(folder: pathlib.Path) -> dict[str, np.ndarray]:
     """Segment moving pixels of the images in a folder.
 
     Args:
-      pictures: Folder of images whose names are in order of time.
+      folder: Folder of images whose names are in order of time.
 
     Returns:
       Booleans [height, width] by the name of each image.
@@ -69,17 +69,17 @@ def moving_in(pictures: pathlib.Path) -> dict[str, np.ndarray]:
     Raises:
       ValueError: If there are too few images, or they differ in size.
     """
-    names = [file.name for file in frames.pictures_in(pictures)]
+    names = [file.name for file in frames.pictures_in(folder)]
     if len(names) <= min(LATER):
         raise ValueError(
-            f"{pictures}: {len(names)} images are too few to detect moving objects; "
+            f"{folder}: {len(names)} images are too few to detect moving objects; "
             f"use more than {min(LATER)}"
         )
-    images = [pictures_of.read_image(pictures / name)[0] for name in names]
+    images = [image_files.read_image(folder / name)[0] for name in names]
     sizes = {one.shape for one in images}
     if len(sizes) > 1:
         raise ValueError(
-            f"{pictures}: images of {len(sizes)} sizes; frames of a video must have "
+            f"{folder}: images of {len(sizes)} sizes; frames of a video must have "
             "one size: resize them"
         )
     return dict(zip(names, _moving_masks(np.stack(images)), strict=True))
@@ -95,44 +95,42 @@ def _off_the_camera_motion(tracks, within):
     count = np.zeros(tracks.seen.shape, int)
     for later in LATER:
         for frame in range(frames - later):
-            both = np.flatnonzero(tracks.seen[:, frame] & tracks.seen[:, frame + later])
-            if len(both) < FEWEST:
+            rows = np.flatnonzero(tracks.seen[:, frame] & tracks.seen[:, frame + later])
+            if len(rows) < FEWEST:
                 continue
-            here, there = (tracks.pixel[both, at] for at in (frame, frame + later))
-            miss = _pair_misses(here, there, within)
+            start, end = (tracks.pixel[rows, at] for at in (frame, frame + later))
+            miss = _pair_misses(start, end, within)
             for at in (frame, frame + later):
-                off[both, at] = np.maximum(off[both, at], miss)
-                count[both, at] += 1
+                off[rows, at] = np.maximum(off[rows, at], miss)
+                count[rows, at] += 1
     return np.where(count > 0, off, np.nan)
 
 
-def _pair_misses(here, there, within):
+def _pair_misses(start, end, within):
     """Return distances in px of tracks in a pair of frames from the camera motion."""
     settings = {"ransacReprojThreshold": within, "confidence": 0.999}
-    plane, _ = cv2.findHomography(
-        here, there, cv2.USAC_MAGSAC, within, confidence=0.999
-    )
-    lines, _ = cv2.findFundamentalMat(here, there, cv2.USAC_MAGSAC, **settings)
-    by_plane = np.full(len(here), np.inf)
+    plane, _ = cv2.findHomography(start, end, cv2.USAC_MAGSAC, within, confidence=0.999)
+    lines, _ = cv2.findFundamentalMat(start, end, cv2.USAC_MAGSAC, **settings)
+    by_plane = np.full(len(start), np.inf)
     if plane is not None:
-        by_plane = _homography_misses(plane, here, there)
+        by_plane = _homography_misses(plane, start, end)
     if lines is None or lines.shape != (3, 3):
         return by_plane
-    by_lines = _sampson(lines, here, there)
+    by_lines = _sampson(lines, start, end)
     explained = [(miss < within).sum() for miss in (by_plane, by_lines)]
     return by_plane if explained[0] > AS_GOOD * explained[1] else by_lines
 
 
-def _homography_misses(plane, here, there):
-    mapped = np.c_[here, np.ones(len(here))] @ plane.T
+def _homography_misses(plane, start, end):
+    mapped = np.c_[start, np.ones(len(start))] @ plane.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        miss = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - there, axis=-1)
+        miss = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - end, axis=-1)
     return np.nan_to_num(miss, nan=np.inf)
 
 
-def _sampson(lines, here, there):
+def _sampson(lines, start, end):
     """Return Sampson distances in px (Hartley and Zisserman, 11.4.3)."""
-    one, other = (np.c_[points, np.ones(len(points))] for points in (here, there))
+    one, other = (np.c_[points, np.ones(len(points))] for points in (start, end))
     second, first = one @ lines.T, other @ lines
     slope_sq = (second[:, :2] ** 2).sum(1) + (first[:, :2] ** 2).sum(1)
     return np.abs((other * second).sum(1)) / np.sqrt(np.maximum(slope_sq, 1e-30))

@@ -103,7 +103,7 @@ def test_flow_that_a_thing_lost_is_found_from_how_it_came():
     assert dense_flow._lost(flow, 2)
     assert not dense_flow._lost(true, 2)
     search = dense_flow.dis(pictures.shape[2] // views.size[0])
-    dense_flow._go_on(flow, 2, pictures, search)
+    dense_flow._continue_motion(flow, 2, pictures, search)
     for frame, flow_of_frame, exact in (
         (2, flow[:2], true[:2]),
         (3, flow[2:], true[2:]),
