@@ -110,7 +110,14 @@ class Appearance(Protocol):
         ...
 
     def init(self, key: Key[Array, ""]) -> PyTree:
-        """Initialize the parameters."""
+        """Initialize the parameters.
+
+        Args:
+          key: PRNG key of this component.
+
+        Returns:
+          Parameters, shared by all Gaussians.
+        """
         ...
 
     def apply(
@@ -119,7 +126,16 @@ class Appearance(Protocol):
         image: Float[Array, "*pixels 3"],
         appearance: Int[Array, ""],
     ) -> Float[Array, "*pixels 3"]:
-        """Return the sRGB image as observed under an appearance id."""
+        """Return the sRGB image as observed under an appearance id.
+
+        Args:
+          params: Parameters of this component.
+          image: Rendered image, sRGB, not clipped.
+          appearance: Appearance id of the frame, a row of per-frame parameters.
+
+        Returns:
+          The image, which need not lie in [0, 1].
+        """
         ...
 
 
@@ -157,7 +173,15 @@ class GaussianAppearance(Protocol):
     def code(
         self, params: MotionParams, appearance: Int[Array, ""]
     ) -> Float[Array, " code"]:
-        """Return the code of an appearance id."""
+        """Return the code of an appearance id.
+
+        Args:
+          params: Parameters of this component.
+          appearance: Appearance id of the frame.
+
+        Returns:
+          The code, which `apply` receives.
+        """
         ...
 
     def apply(
@@ -193,11 +217,26 @@ class CameraOptimizer(Protocol):
         ...
 
     def init(self, key: Key[Array, ""]) -> PyTree:
-        """Initialize the parameters."""
+        """Initialize the parameters.
+
+        Args:
+          key: PRNG key of this component.
+
+        Returns:
+          Parameters, shared by all Gaussians.
+        """
         ...
 
     def apply(self, params: PyTree, cameras: Camera) -> Camera:
-        """Return the refined cameras of the training frames, in their order."""
+        """Return the refined cameras of the training frames, in their order.
+
+        Args:
+          params: Parameters of this component.
+          cameras: Captured cameras, batched over the training frames.
+
+        Returns:
+          Cameras of the same batch shape.
+        """
         ...
 
 
@@ -284,15 +323,38 @@ class Strategy(Protocol):
         ...
 
     def init(self, gaussians: Splats) -> PyTree:
-        """Return the initial state: a pytree of arrays, or () without any."""
+        """Return the initial state: a pytree of arrays, or () without any.
+
+        Args:
+          gaussians: The Gaussians, at the start or after an event that changed their
+            rows.
+
+        Returns:
+          The state.
+        """
         ...
 
     def update(self, state: PyTree, info: StepInfo) -> PyTree:
-        """Return the state after one more view. This function is traced."""
+        """Return the state after one more view. This function is traced.
+
+        Args:
+          state: State of the strategy.
+          info: Statistics of the view.
+
+        Returns:
+          State of the same structure, shapes and types.
+        """
         ...
 
     def events(self, steps: int) -> tuple[StrategyEvent, ...]:
-        """Return the events of a run of this many steps."""
+        """Return the events of a run of this many steps.
+
+        Args:
+          steps: Number of training steps of the run.
+
+        Returns:
+          Events in the order in which they happen after the same step.
+        """
         ...
 
 
@@ -303,12 +365,27 @@ def bound(part: Any, steps: int, metadata: SceneMetadata) -> Any:
       part: An object that implements a protocol, or settings with `bind`.
       steps: Number of training steps.
       metadata: Metadata of the capture.
+
+    Args:
+      part: An object that implements a protocol, or settings with `bind`.
+      steps: Number of training steps.
+      metadata: Metadata of the capture.
+
+    Returns:
+      The object.
     """
     return part.bind(steps, metadata) if hasattr(part, "bind") else part
 
 
 def moving_at_once(motion: Any) -> Any:
-    """Return a motion, or its settings, without warm-up."""
+    """Return a motion, or its settings, without warm-up.
+
+    Args:
+      motion: The motion, or its settings.
+
+    Returns:
+      The same with `warm_up=0`.
+    """
     if not getattr(motion, "warm_up", 0):
         return motion
     return dataclasses.replace(motion, warm_up=0)
@@ -319,7 +396,14 @@ _HOOKS = ("derive_rows", "derive", "significance", "lifted_rows")
 
 
 def compile_motion(motion: Motion) -> SplatRecord:
-    """Compile a motion to the internal record that a scene is built from."""
+    """Compile a motion to the internal record that a scene is built from.
+
+    Args:
+      motion: The motion, bound to a run.
+
+    Returns:
+      The record.
+    """
     name = name_of(motion)
 
     def own_params(scene):
@@ -357,12 +441,26 @@ def compile_motion(motion: Motion) -> SplatRecord:
 
 
 def compile_appearance(appearance: Appearance) -> SplatRecord:
-    """Compile an appearance model to the internal record."""
+    """Compile an appearance model to the internal record.
+
+    Args:
+      appearance: The appearance model, bound to a run.
+
+    Returns:
+      The record.
+    """
     return SplatRecord(**_hooks(appearance), expose=appearance.apply)
 
 
 def compile_gaussian_appearance(appearance: GaussianAppearance) -> SplatRecord:
-    """Compile an appearance model of Gaussians to the internal record."""
+    """Compile an appearance model of Gaussians to the internal record.
+
+    Args:
+      appearance: The appearance model, bound to a run.
+
+    Returns:
+      The record.
+    """
     name = name_of(appearance)
 
     def own_params(scene):
@@ -387,7 +485,14 @@ def compile_gaussian_appearance(appearance: GaussianAppearance) -> SplatRecord:
 
 
 def compile_camera_optimizer(optimizer: CameraOptimizer) -> SplatRecord:
-    """Compile a camera optimizer to the internal record."""
+    """Compile a camera optimizer to the internal record.
+
+    Args:
+      optimizer: The camera optimizer, bound to a run.
+
+    Returns:
+      The record.
+    """
     apply_to_capture = getattr(optimizer, "apply_to_capture", None)
     return SplatRecord(
         **_hooks(optimizer), pose=optimizer.apply, found=apply_to_capture
@@ -399,6 +504,12 @@ def compile_regularizer(regularizer: Regularizer) -> SplatRecord:
 
     A regularizer may have parameters, from its `init(key)` and `learning_rate`. Its
     loss finds them in `params.nets`.
+
+    Args:
+      regularizer: The regularizer, bound to a run.
+
+    Returns:
+      The record.
     """
     hooks = regularizer_hooks(regularizer)
     if hasattr(regularizer, "init"):
@@ -427,6 +538,14 @@ def initialized(
     """Add the initial parameters of all components to a scene, on the host.
 
     The PRNG key of a component depends on its name only, not on the other components.
+
+    Args:
+      parts: Records of the components.
+      key: PRNG key of the scene.
+      scene: Parameters, with the Gaussians in `rows["splats"]`.
+
+    Returns:
+      The parameters with those of the components, under their names.
     """
     rows, nets = dict(scene.rows), dict(scene.nets)
     for part in parts:

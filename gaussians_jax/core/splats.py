@@ -67,6 +67,12 @@ def refuse_half(dtype: Any) -> None:
 
     In bfloat16, a mean at 256 px is accurate to one pixel only, and at usual learning
     rates the steps of Adam are below half an ulp, so no parameter would change.
+
+    Args:
+      dtype: Type of the arrays.
+
+    Raises:
+      ValueError: If it has fewer than 32 bits.
     """
     if jnp.finfo(dtype).bits < 32:
         raise ValueError(

@@ -144,7 +144,14 @@ def along(deviation: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points
 
 
 def resting(paths: Paths) -> Float[Array, "still 3"] | None:
-    """Sample static points in scene units. None if none are known."""
+    """Sample static points in scene units. None if none are known.
+
+    Args:
+      paths: Paths of tracks, with static points.
+
+    Returns:
+      At most `RESTING` points, in units of the capture.
+    """
     if paths.still is None or not len(paths.still):
         return None
     chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]

@@ -122,7 +122,18 @@ class Bound:
 def flow_error(
     spec: FlowSpec, raster_spec: RasterSpec, params: Any, context: PenaltyContext
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Compute the flow error of a step's frame, and the share of compared pixels."""
+    """Compute the flow error of a step's frame, and the share of compared pixels.
+
+    Args:
+      spec: Settings of the loss.
+      raster_spec: Settings of the rasterizer.
+      params: Parameters of the scene.
+      context: The rendered frame, with the flow of the capture and the motion at other
+        times.
+
+    Returns:
+      The error, and the share in [0, 1].
+    """
     observation, at_time = context.observation, context.at_time
     assert observation is not None
     assert at_time is not None
@@ -200,7 +211,16 @@ def render_flow(
 def linear_flow(
     first: Footprints, start: Footprints, end: Footprints
 ) -> tuple[Float[Array, "gaussians 2 2"], Float[Array, "gaussians 2"]]:
-    """Return A and b of the flow A x + b of each Gaussian (see `render_flow`)."""
+    """Return A and b of the flow A x + b of each Gaussian (see `render_flow`).
+
+    Args:
+      first: Footprints in the first camera, at the first time.
+      start: Footprints in the second camera, at the first time.
+      end: Footprints in the second camera, at the second time.
+
+    Returns:
+      A, and b in pixels.
+    """
     p, k, r = first.whitening.T
     zero = jnp.zeros_like(p)
     whiten = _matrix(p, zero, -r * k, r)

@@ -70,7 +70,15 @@ class Codes(Protocol):
 
 
 def moments(spec: Codes, frames: int) -> int:
-    """Return the number of time codes for a number of training frames."""
+    """Return the number of time codes for a number of training frames.
+
+    Args:
+      spec: Settings of the codes.
+      frames: Number of training frames.
+
+    Returns:
+      Number of codes.
+    """
     return -(-frames // spec.frames_per_code)
 
 
@@ -171,13 +179,30 @@ def fine_rows(spec: Codes, count: int, step: int) -> int:
 
 
 def growth_steps(spec: Codes, count: int) -> tuple[int, ...]:
-    """Return the steps after which the number of codes of the fine network changes."""
+    """Return the steps after which the number of codes of the fine network changes.
+
+    Args:
+      spec: Settings of the codes.
+      count: Number of codes at the end.
+
+    Returns:
+      Numbers of completed steps, sorted.
+    """
     counts = [fine_rows(spec, count, step) for step in range(spec.grow_until + 1)]
     return tuple(k for k in range(1, len(counts)) if counts[k] != counts[k - 1])
 
 
 def revised(spec: Codes, shared: Any, step: int) -> Any:
-    """Return shared parameters with the number of codes of the fine network."""
+    """Return shared parameters with the number of codes of the fine network.
+
+    Args:
+      spec: Settings of the codes.
+      shared: Shared parameters of the motion.
+      step: Number of completed steps.
+
+    Returns:
+      The parameters.
+    """
     count = fine_rows(spec, len(shared.times), step)
     return shared._replace(rows=jnp.full_like(shared.rows, count))
 

@@ -88,7 +88,14 @@ def deform_rows(
 
 
 def child_component(effects: Effects) -> SplatRecord | None:
-    """Return the component that defines child Gaussians, or None."""
+    """Return the component that defines child Gaussians, or None.
+
+    Args:
+      effects: Records of the components.
+
+    Returns:
+      The record, or None without child Gaussians.
+    """
     return next((effect for effect in effects if effect.derive is not None), None)
 
 
@@ -99,7 +106,14 @@ def _derivation(effects):
 
 
 def check_derived(effects: Effects) -> None:
-    """Raise ValueError unless one component at most defines children, completely."""
+    """Raise ValueError unless one component at most defines children, completely.
+
+    Args:
+      effects: Records of the components.
+
+    Raises:
+      ValueError: If several define children, or one lacks a hook.
+    """
     names = [e.name for e in effects if e.derive is not None]
     if len(names) > 1:
         raise ValueError(
@@ -114,7 +128,15 @@ def check_derived(effects: Effects) -> None:
 
 
 def rendered_rows(effects: Effects, params: Params) -> Splats:
-    """Return the raw parameters of the rendered Gaussians in their canonical state."""
+    """Return the raw parameters of the rendered Gaussians in their canonical state.
+
+    Args:
+      effects: Records of the components.
+      params: Parameters of the scene.
+
+    Returns:
+      Parameters of the children, or of the Gaussians if they have none.
+    """
     derivation = _derivation(effects)
     if derivation is None:
         return params.rows["splats"]
@@ -147,7 +169,15 @@ def rendered(
 def significance(
     effects: Effects, gaussians: Gaussians
 ) -> Float[Array, " gaussians"] | None:
-    """Return the weights of children in their parents' statistics, None if equal."""
+    """Return the weights of children in their parents' statistics, None if equal.
+
+    Args:
+      effects: Records of the components.
+      gaussians: The rendered Gaussians.
+
+    Returns:
+      Weights, not negative.
+    """
     component = child_component(effects)
     if component is None or component.significance is None:
         return None
@@ -155,7 +185,15 @@ def significance(
 
 
 def children_per_gaussian(effects: Effects, params: Params) -> int:
-    """Return the number of children per Gaussian."""
+    """Return the number of children per Gaussian.
+
+    Args:
+      effects: Records of the components.
+      params: Parameters of the scene.
+
+    Returns:
+      The number, 1 if Gaussians are rendered themselves.
+    """
     if child_component(effects) is None:
         return 1
     rendered = jax.eval_shape(lambda params: rendered_rows(effects, params), params)
@@ -229,7 +267,15 @@ def deform_in_training(
 def deformer(
     effects: Effects, condition: FrameCondition
 ) -> Callable[[Params, Float[Array, ""]], Gaussians]:
-    """Return a function of parameters and a time near `condition` for losses."""
+    """Return a function of parameters and a time near `condition` for losses.
+
+    Args:
+      effects: Records of the components.
+      condition: Frame, step and key of the training step.
+
+    Returns:
+      A function that returns the Gaussians at a time in [0, 1].
+    """
 
     def at_time(params, time):
         gaussians = splats.activate(params.rows["splats"])

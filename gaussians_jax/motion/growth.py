@@ -72,7 +72,14 @@ class Travel(NamedTuple):
 
 
 def no_travel(gaussians: Splats | Gaussians) -> Travel:
-    """Return the state before any observation."""
+    """Return the state before any observation.
+
+    Args:
+      gaussians: The Gaussians.
+
+    Returns:
+      The state, with one row for each.
+    """
     mean = gaussians.mean
     # The largest float, not infinity, because the loop stops if a state is not finite.
     most = jnp.finfo(mean.dtype).max
@@ -182,7 +189,17 @@ def growth_factor(
 def grow_score(
     spec: MotionGrowthSpec, extent: Number, state: Travel, step: int
 ) -> Float[np.ndarray, " gaussians"]:
-    """Compute the factor of each Gaussian's gradient at a step, on the host."""
+    """Compute the factor of each Gaussian's gradient at a step, on the host.
+
+    Args:
+      spec: Settings.
+      extent: Spread of the cameras in scene units.
+      state: Observed travel of the Gaussians.
+      step: Number of completed steps.
+
+    Returns:
+      Factors in [0, 1].
+    """
     rows, dtype = state.low.shape[0], state.low.dtype
     if step < spec.start:
         return np.ones(rows, dtype)

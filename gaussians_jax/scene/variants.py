@@ -19,7 +19,15 @@ INSTANTS = 33  # frame times at which moving Gaussians are detected
 
 
 def parts(spec, metadata) -> Parts:
-    """Return the components that can be left out: those that affect a render."""
+    """Return the components that can be left out: those that affect a render.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata, which is not used.
+
+    Returns:
+      Names of the fields, and whether the appearance depends on the frame.
+    """
     del metadata
     present = tuple(name for name in REMOVABLE if getattr(spec, name) is not None)
     per_image = spec.exposure is not None or spec.appearance is not None
@@ -27,7 +35,20 @@ def parts(spec, metadata) -> Parts:
 
 
 def without_effects(spec, metadata, without: tuple[str, ...], blended: bool) -> Model:
-    """Build the model without some of its components."""
+    """Build the model without some of its components.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      without: Names of the components to leave out.
+      blended: Blend the appearance of frames, which splats cannot.
+
+    Returns:
+      The model.
+
+    Raises:
+      ValueError: If `blended`, or if a component cannot be left out.
+    """
     if blended:
         raise ValueError(
             "splats have no appearance codes to blend; reconstruct with a preset that "
@@ -38,6 +59,14 @@ def without_effects(spec, metadata, without: tuple[str, ...], blended: bool) -> 
 
 def reduced(spec, metadata, without: tuple[str, ...]):
     """Remove components from the settings of a scene.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      without: Names of the components to leave out.
+
+    Returns:
+      The settings without them.
 
     Raises:
       ValueError: If the scene cannot be rendered without one of them.

@@ -21,7 +21,17 @@ MAX_DEGREE = 3
 
 
 def degree_of(coefficients: int) -> int:
-    """Return the degree that has this many coefficients: 1, 4, 9 or 16."""
+    """Return the degree that has this many coefficients: 1, 4, 9 or 16.
+
+    Args:
+      coefficients: Number of coefficients per color channel.
+
+    Returns:
+      The degree, 0 to 3.
+
+    Raises:
+      ValueError: If no degree has this number.
+    """
     degree = math.isqrt(coefficients) - 1
     if not 0 <= degree <= MAX_DEGREE or (degree + 1) ** 2 != coefficients:
         raise ValueError(

@@ -100,7 +100,11 @@ def making(path: pathlib.Path) -> Iterator[None]:
 
 
 def mark_used(path: pathlib.Path) -> None:
-    """Set the time of last use of a file, by which `evict` orders files."""
+    """Set the time of last use of a file, by which `evict` orders files.
+
+    Args:
+      path: The file, which may be absent.
+    """
     with contextlib.suppress(OSError):
         os.utime(path)
 

@@ -39,7 +39,14 @@ def aligned_empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def is_shared(capture: Capture) -> bool:
-    """Test if training on this device indexes all images of a capture in place."""
+    """Test if training on this device indexes all images of a capture in place.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      True if no copy of the images is needed.
+    """
     images = capture.images
     return (
         images.nbytes >= LEAST_SHARED_BYTES
@@ -70,6 +77,13 @@ def frame_bytes(capture: Capture, devices: int = 1) -> int:
 
 
 def capture_bytes(capture: Capture) -> int:
-    """Return the memory of the images, masks and depths of a capture on the host."""
+    """Return the memory of the images, masks and depths of a capture on the host.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Bytes.
+    """
     arrays = (capture.images, capture.valid, capture.moving, capture.depths)
     return sum(array.nbytes for array in arrays if array is not None)

@@ -462,7 +462,15 @@ def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.n
 
 
 def held_out_note(heldout: np.ndarray | list[Any], every: int) -> str:
-    """Describe the frames that `hold_out_every` held out."""
+    """Describe the frames that `hold_out_every` held out.
+
+    Args:
+      heldout: Rows of the held-out frames.
+      every: Distance between them in frames.
+
+    Returns:
+      A clause without a final period.
+    """
     if not len(heldout):
         return "no frames are held out: there are too few"
     if len(heldout) == 1:

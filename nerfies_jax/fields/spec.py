@@ -221,7 +221,15 @@ def _refuse_beside_other_template(spec):
 
 
 def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecord, ...]:
-    """The effects that the spec asks for, in the order in which they act."""
+    """The effects that the spec asks for, in the order in which they act.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+
+    Returns:
+      Records of the components.
+    """
 
     def bound(part):
         return part.bind(spec.steps, metadata) if hasattr(part, "bind") else part
@@ -273,7 +281,14 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecor
 
 
 def optimizer_of(spec: RadianceScene) -> Optimizer:
-    """Return the optimizer of a field, whose updates are scaled by learning rates."""
+    """Return the optimizer of a field, whose updates are scaled by learning rates.
+
+    Args:
+      spec: The scene.
+
+    Returns:
+      The optimizer.
+    """
     own = spec.optimizer
     return OPTIMIZERS[own]() if isinstance(own, str) else own
 
@@ -296,7 +311,17 @@ def guided(one: GuidedT) -> GuidedT:
 
 
 def tables_of(effects: tuple[FieldRecord, ...]) -> tuple[Table, ...]:
-    """The latent tables of all effects, each once."""
+    """The latent tables of all effects, each once.
+
+    Args:
+      effects: Records of the components.
+
+    Returns:
+      The tables, in the order of their first use.
+
+    Raises:
+      ValueError: If two components have different tables of one name.
+    """
     tables: dict[str, Table] = {}
     for effect in effects:
         for table in effect.tables:
@@ -309,12 +334,27 @@ def tables_of(effects: tuple[FieldRecord, ...]) -> tuple[Table, ...]:
 
 
 def templates_of(spec: RadianceScene) -> dict[str, TemplateSpec | Template]:
-    """The networks of all levels that have one, by name."""
+    """The networks of all levels that have one, by name.
+
+    Args:
+      spec: The scene.
+
+    Returns:
+      Templates by level, "coarse" and "fine".
+    """
     single = spec.sampling.fine == 0 or spec.sampling.shared
     names = ("fine",) if single else ("coarse", "fine")
     return {name: template_of(spec, name) for name in names}
 
 
 def template_of(spec: RadianceScene, level: str) -> TemplateSpec | Template:
-    """The network of one level, "coarse" or "fine"."""
+    """The network of one level, "coarse" or "fine".
+
+    Args:
+      spec: The scene.
+      level: "coarse" or "fine".
+
+    Returns:
+      The template, or its settings.
+    """
     return spec.coarse if level == "coarse" and spec.coarse else spec.template

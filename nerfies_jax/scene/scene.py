@@ -264,7 +264,17 @@ def descend(
     state: TrainState,
     grads: PyTree,
 ) -> tuple[PyTree, optax.OptState]:
-    """Return the parameters and the optimizer state after one update."""
+    """Return the parameters and the optimizer state after one update.
+
+    Args:
+      spec: The scene.
+      effects: Records of its components.
+      state: State before the update.
+      grads: Gradients of the loss, with the structure of the parameters.
+
+    Returns:
+      The parameters, and the state of the optimizer.
+    """
     # optax counts in int32 and multiplies float32 by it.
     with jax.numpy_dtype_promotion("standard"):
         updates, moments = optimizer_of(spec).update(

@@ -203,7 +203,17 @@ def penalty_terms(
     context: PenaltyContext,
     states: Mapping[str, PyTree],
 ) -> dict[str, Term]:
-    """Compute the terms of all effects by `effect/term`, with a key for each effect."""
+    """Compute the terms of all effects by `effect/term`, with a key for each effect.
+
+    Args:
+      effects: Records of the components.
+      own_params: Parameters of the components by name.
+      context: Rendered frame or rays, key and step.
+      states: States of the components by name.
+
+    Returns:
+      Terms by `component/term`.
+    """
     terms: dict[str, Term] = {}
     for effect in effects:
         if effect.penalty is None:
@@ -224,6 +234,14 @@ def from_step(
 
     Before the warm-up of a motion ends, only the regularizers produce gradients, and
     Adam would drive the motion to zero.
+
+    Args:
+      first: First step with weights.
+      step: Number of completed steps.
+      terms: Terms by name.
+
+    Returns:
+      The terms.
     """
     if first == 0:
         return dict(terms)

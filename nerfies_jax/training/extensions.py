@@ -23,6 +23,9 @@ class Settings(Protocol):
         Args:
           steps: Length of the run.
           metadata: `SceneMetadata` of the representation.
+
+        Returns:
+          The object.
         """
         ...
 
@@ -130,13 +133,27 @@ def names_in(stored: Any, key: str) -> tuple[str, ...]:
 
 
 def names_in_assignments(assignments: Iterable[str]) -> tuple[str, ...]:
-    """Return the values MODULE:NAME of `path.to.field=value` assignments."""
+    """Return the values MODULE:NAME of `path.to.field=value` assignments.
+
+    Args:
+      assignments: Texts of the form `path.to.field=value`.
+
+    Returns:
+      The names, in order.
+    """
     values = (text.partition("=")[2].split(",") for text in assignments)
     return tuple(name for value in values for name in value if SEPARATOR in name)
 
 
 def members(protocol: type) -> list[str]:
-    """Return the names of the members that a protocol requires."""
+    """Return the names of the members that a protocol requires.
+
+    Args:
+      protocol: The protocol.
+
+    Returns:
+      Names of its methods and properties, sorted.
+    """
     return sorted(
         name
         for name, value in vars(protocol).items()

@@ -143,12 +143,30 @@ def deformer(model: Model) -> Callable[[PyTree], Callable[[Any], PyTree]]:
 
 
 def prepare(model: Model, params: PyTree) -> PyTree:
-    """Call the first stage of rendering."""
+    """Call the first stage of rendering.
+
+    Args:
+      model: A model with stages.
+      params: Its parameters.
+
+    Returns:
+      The cache of the frames, which does not depend on the time.
+    """
     assert model.stages is not None
     return model.stages.prepare(params)
 
 
 def deform(model: Model, params: PyTree, prepared: PyTree, time: Any) -> PyTree:
-    """Call the second stage of rendering."""
+    """Call the second stage of rendering.
+
+    Args:
+      model: A model with stages.
+      params: Its parameters.
+      prepared: Result of `prepare`.
+      time: Time in [0, 1] over the capture.
+
+    Returns:
+      The scene at this time.
+    """
     assert model.stages is not None
     return model.stages.deform(params, prepared, time)

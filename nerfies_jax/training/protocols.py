@@ -51,18 +51,41 @@ class Optimizer(Protocol):
     """
 
     def init(self, params: PyTree) -> PyTree:
-        """Return the initial state for parameters."""
+        """Return the initial state for parameters.
+
+        Args:
+          params: Parameters of the scene.
+
+        Returns:
+          The state, a pytree of arrays.
+        """
         ...
 
     def update(
         self, updates: PyTree, state: PyTree, params: PyTree | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Return the updates for gradients, and the new state."""
+        """Return the updates for gradients, and the new state.
+
+        Args:
+          updates: Gradients, with the structure of the parameters.
+          state: State of the optimizer.
+          params: Parameters before the update.
+
+        Returns:
+          Updates that are to be subtracted after scaling, and the new state.
+        """
         ...
 
 
 def regularizer_hooks(regularizer: Regularizer) -> dict[str, Any]:
-    """Return the hooks of a regularizer for the records of both representations."""
+    """Return the hooks of a regularizer for the records of both representations.
+
+    Args:
+      regularizer: The regularizer.
+
+    Returns:
+      Its name, penalty and required data, as fields of a record.
+    """
     weight = getattr(regularizer, "weight", 1.0)
     return {
         "name": name_of(regularizer),
@@ -74,7 +97,14 @@ def regularizer_hooks(regularizer: Regularizer) -> dict[str, Any]:
 
 
 def name_of(part: Any) -> str:
-    """Return the name of a component: its `name`, or its class name in snake case."""
+    """Return the name of a component: its `name`, or its class name in snake case.
+
+    Args:
+      part: The component.
+
+    Returns:
+      The key of its parameters and metrics.
+    """
     name = getattr(part, "name", None)
     if name is not None:
         return name
@@ -82,7 +112,15 @@ def name_of(part: Any) -> str:
 
 
 def as_terms(loss: Scalar | Mapping[str, Term], weight: float = 1.0) -> dict[str, Term]:
-    """Return the terms of a loss. A scalar becomes the term "loss" with the weight."""
+    """Return the terms of a loss. A scalar becomes the term "loss" with the weight.
+
+    Args:
+      loss: A scalar, or terms by name.
+      weight: Weight of a scalar loss. Terms have their own weights.
+
+    Returns:
+      Terms by name.
+    """
     if isinstance(loss, Mapping):
         return dict(loss)
     return {"loss": Term(loss, weight)}

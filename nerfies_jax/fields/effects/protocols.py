@@ -62,11 +62,22 @@ class Template(Protocol):
           key: PRNG key.
           features: Number of `TemplateInputs.features`.
           condition: Number of `TemplateInputs.condition`.
+
+        Returns:
+          Parameters of the template.
         """
         ...
 
     def apply(self, params: PyTree, inputs: TemplateInputs) -> tuple[Scalar, Vector]:
-        """Compute density (not negative, per unit of the field) and color (sRGB)."""
+        """Compute density (not negative, per unit of the field) and color (sRGB).
+
+        Args:
+          params: Parameters of the template.
+          inputs: Inputs of one sample.
+
+        Returns:
+          Density and color.
+        """
         ...
 
 
@@ -82,11 +93,28 @@ class NetworkTemplate:
     network: Network
 
     def init(self, key: Key[Array, ""], features: int, condition: int) -> PyTree:
-        """Initialize the parameters of the network."""
+        """Initialize the parameters of the network.
+
+        Args:
+          key: PRNG key.
+          features: Number of features, which the network knows.
+          condition: Number of condition features, which the network knows.
+
+        Returns:
+          Parameters of the network.
+        """
         return self.network.init(key)
 
     def apply(self, params: PyTree, inputs: TemplateInputs) -> tuple[Scalar, Vector]:
-        """Evaluate the network at one sample."""
+        """Evaluate the network at one sample.
+
+        Args:
+          params: Parameters of the network.
+          inputs: Inputs of one sample.
+
+        Returns:
+          Density and color, as the network returns them.
+        """
         place = jnp.concatenate([inputs.point, inputs.features])
         ray = jnp.concatenate([inputs.direction, inputs.condition])
         return self.network.apply(params, place, ray)
@@ -102,7 +130,14 @@ class Warp(Protocol):
     """
 
     def init(self, key: Key[Array, ""]) -> PyTree:
-        """Initialize the parameters, with a displacement near zero."""
+        """Initialize the parameters, with a displacement near zero.
+
+        Args:
+          key: PRNG key of this component.
+
+        Returns:
+          Parameters of the warp.
+        """
         ...
 
     def apply(self, params: PyTree, point: Vector, frame: FrameCondition) -> Vector:
@@ -149,6 +184,9 @@ class Conditioning(Protocol):
           params: Parameters of the conditioning, None without `init`.
           point: The observed point, None if the target is color.
           frame: Time, codes and training step of the frame.
+
+        Returns:
+          The features.
         """
         ...
 
@@ -162,11 +200,28 @@ class Medium(Protocol):
     """
 
     def init(self, key: Key[Array, ""], features: int) -> PyTree:
-        """Initialize the parameters, for a trunk of `features` features."""
+        """Initialize the parameters, for a trunk of `features` features.
+
+        Args:
+          key: PRNG key of this component.
+          features: Number of features of the trunk, `sample.features`.
+
+        Returns:
+          Parameters of the medium.
+        """
         ...
 
     def apply(
         self, params: PyTree, sample: Sample, frame: FrameCondition
     ) -> MediumSample:
-        """Compute density and color of the medium at one sample of a ray."""
+        """Compute density and color of the medium at one sample of a ray.
+
+        Args:
+          params: Parameters of the medium.
+          sample: The sample, with the features of the trunk.
+          frame: Time, codes and training step of the frame.
+
+        Returns:
+          Density, color and, optionally, the uncertainty of the medium.
+        """
         ...

@@ -60,7 +60,14 @@ class FieldRecord(Record):
 
 
 def compile_warp(warp: Warp) -> FieldRecord:
-    """Convert a warp to the internal record."""
+    """Convert a warp to the internal record.
+
+    Args:
+      warp: The warp, bound to a run.
+
+    Returns:
+      The record.
+    """
     hooks = _hooks(warp, "warp")
     if hasattr(warp, "trunk_features"):
         hooks["trunk_features"] = warp.trunk_features
@@ -70,7 +77,17 @@ def compile_warp(warp: Warp) -> FieldRecord:
 
 
 def compile_conditioning(conditioning: Conditioning) -> FieldRecord:
-    """Convert a conditioning to the internal record."""
+    """Convert a conditioning to the internal record.
+
+    Args:
+      conditioning: The conditioning, bound to a run.
+
+    Returns:
+      The record.
+
+    Raises:
+      ValueError: If the target is unknown.
+    """
     hooks, target = _hooks(conditioning), conditioning.target
     name, apply, width = hooks["name"], conditioning.apply, conditioning.features
     if target == "color":
@@ -89,7 +106,15 @@ def compile_conditioning(conditioning: Conditioning) -> FieldRecord:
 
 
 def compile_medium(medium: Medium, features: int) -> FieldRecord:
-    """Convert a medium to the internal record, for a trunk of `features` features."""
+    """Convert a medium to the internal record, for a trunk of `features` features.
+
+    Args:
+      medium: The medium, bound to a run.
+      features: Number of features of the trunk.
+
+    Returns:
+      The record.
+    """
     hooks = _hooks(medium) | {"init": functools.partial(medium.init, features=features)}
     return FieldRecord(
         **hooks,
@@ -100,7 +125,14 @@ def compile_medium(medium: Medium, features: int) -> FieldRecord:
 
 
 def compile_regularizer(regularizer: Regularizer) -> FieldRecord:
-    """Convert a regularizer to the internal record."""
+    """Convert a regularizer to the internal record.
+
+    Args:
+      regularizer: The regularizer, bound to a run.
+
+    Returns:
+      The record.
+    """
     return FieldRecord(**regularizer_hooks(regularizer))
 
 

@@ -76,7 +76,15 @@ class SurfaceSpec:
 
 
 def effect(spec: SurfaceSpec, widths: dict[str, int]) -> FieldRecord:
-    """Return the hooks of `spec`, for levels with trunks of these widths."""
+    """Return the hooks of `spec`, for levels with trunks of these widths.
+
+    Args:
+      spec: Settings of the surfaces.
+      widths: Width of the trunk of each level, by name.
+
+    Returns:
+      The record.
+    """
     return FieldRecord(
         NAME,
         init=lambda key: init(widths, key),
