@@ -69,10 +69,10 @@ def _main(arguments):
     _run(words, by_name, "command", [*for_users, STUDY])
 
 
-def _run(words, known, kind, shown):
+def _run(words, names, kind, listed):
     name, *arguments = words
-    if name not in known:
-        console.error(f"no {kind} {name!r}; {known_names(name, shown)}")
+    if name not in names:
+        console.error(f"no {kind} {name!r}; {known_names(name, listed)}")
         raise SystemExit(2)
     main_of(name)(arguments)
 

@@ -249,11 +249,11 @@ def remarks(compared) -> list[str]:
     from nerfies_jax.metrics.metric_table import PROTOCOL
 
     sentences = [run.remark for run in compared if run.remark]
-    fitted = [run.name for run in compared if _is_fitted(run)]
-    if fitted:
+    fitted_runs = [run.name for run in compared if _is_fitted(run)]
+    if fitted_runs:
         sentences.append(
-            f"PSNR, SSIM and curve of {', '.join(fitted)} follow {PROTOCOL}. Those of "
-            "runs without codes of single images are of whole frames."
+            f"PSNR, SSIM and curve of {', '.join(fitted_runs)} follow {PROTOCOL}. "
+            "Those of runs without codes of single images are of whole frames."
         )
     first = compared[0]
     for run in compared:

@@ -128,10 +128,12 @@ class Export:
                 f"name a format ({', '.join(OPTIONS)}), or with --for a program "
                 f"({', '.join(PROGRAMS)})"
             )
-        names = {name for known in OPTIONS.values() for name in known}
+        names = {name for options in OPTIONS.values() for name in options}
         for name in sorted(names - set(OPTIONS[self.kind])):
             if getattr(self, name) is not None:
-                fits = ", ".join(key for key, known in OPTIONS.items() if name in known)
+                fits = ", ".join(
+                    key for key, options in OPTIONS.items() if name in options
+                )
                 raise ValueError(
                     f"--{name.replace('_', '-')} is not for {self.kind}, but for {fits}"
                 )

@@ -21,7 +21,7 @@ def _gaussians(args: Any, run: Any) -> str:
     rotation = None if args.axis is None else axes.rotation_to(run.capture, args.axis)
     visible = None
     if args.kept == "seen":
-        visible = sampled.visible(_seen(run, state))
+        visible = sampled.visible(_visible_statistics(run, state))
         left_out = splats.active_count(run.model.stages.rows(state.params))
         left_out -= int(visible.sum())
 
@@ -50,7 +50,7 @@ def _gaussians(args: Any, run: Any) -> str:
     return summary
 
 
-def _seen(run: Any, state: Any) -> Any:
+def _visible_statistics(run: Any, state: Any) -> Any:
     """Return what the training cameras saw of each Gaussian."""
     from gaussians_jax.core import splats
     from gaussians_jax.io import instants, sampled
@@ -102,7 +102,7 @@ def _splatv(args: Any, run: Any) -> str:
     at = instants.gaussians_at(run.model, state)
     rows = run.model.stages.rows(state.params)
     raster = raster_of(spec, run.metadata)
-    visible = _seen(run, state)
+    visible = _visible_statistics(run, state)
     learned = sampled.gathered(at, rows, visible, sampled.MOST_INSTANTS)
     curves = splatv.write(args.place, learned, capture)
     model = run.model

@@ -76,7 +76,7 @@ def several(kinds: list[Any]) -> type:
     """Return a type whose subcommands are these types."""
     marks = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     union: Any = Annotated[(functools.reduce(operator.or_, kinds), *marks)]
-    return _made("Several", [("kind", union, dataclasses.field())], "")
+    return _settings_class("Several", [("kind", union, dataclasses.field())], "")
 
 
 def _kinds(settings):
@@ -115,17 +115,17 @@ def shown(settings: type, offering: bool = False, top: bool = True) -> type:
         parts.append((JSON.strip("-"), flag, dataclasses.field(default=False)))
     groups = list(itertools.starmap(_group, under.items()))
     doc = inspect.cleandoc(settings.__doc__ or "")
-    return _made(settings.__name__, [*groups, *parts], doc)
+    return _settings_class(settings.__name__, [*groups, *parts], doc)
 
 
 def _group(heading, entries):
-    inner = _made(heading, entries, "")
+    inner = _settings_class(heading, entries, "")
     marks = (tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=""))
     entry = dataclasses.field(default_factory=inner)
     return heading, Annotated[(inner, *marks)], entry
 
 
-def _made(name, parts, doc):
+def _settings_class(name, parts, doc):
     record = dataclasses.make_dataclass(name, parts, frozen=True, kw_only=True)
     record.__doc__ = doc
     return record

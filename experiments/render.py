@@ -137,27 +137,27 @@ def main(args):
         move = _mover(args, run)
         restored = runs.restore(args.run, run)
         state = restored.state
-        made = _made(args, restored)
+        settings = _settings_of(args, restored)
         run = runs.with_found_cameras(run, state)
-        trained = _shown(args, run.model, state)
+        trained = _view_of(args, run.model, state)
         model, state = _faster(args, _model(args, run), trained)
         names, views, own_size = _views(args, run)
         size = cli.sized(own_size, args.max_side)
         views = [evaluation.resized(view, own_size, size) for view in views]
         views = _blended(args, run, views)
         files = _files(args, names)
-        may_go = render_folder.replaceable(out, args, made, files)
+        may_go = render_folder.replaceable(out, args, settings, files)
     picture_of = _Pictures(args.show, move, trained, views)
     renderer = evaluation.Renderer(model, size)
     replaced = json_files.replaced_folder(out, True, may_go)
     with cli.user_errors((CaptureError, OSError)), replaced as partial:
         _write(args, partial, renderer, state, names, views, picture_of)
-        record = render_folder.record(made, args, files)
+        record = render_folder.record(settings, args, files)
         json_files.write_json(partial / render_folder.RECORD, record)
     return _report(out, renderer, len(names), files)
 
 
-def _made(args, restored):
+def _settings_of(args, restored):
     """Collect the settings that determine the images."""
     from nerfies_jax.training import provenance
 
@@ -195,7 +195,7 @@ def _mover(args, run):
     return move
 
 
-def _shown(args, model, state):
+def _view_of(args, model, state):
     """Return the state without what is hidden in all images."""
     if args.hide_moving is None:
         return state
@@ -278,23 +278,23 @@ def _write(args, out, renderer, state, names, views, picture_of):
     from nerfies_jax.capture import images, video
     from nerfies_jax.evaluation import exr_series
 
-    def pictures(stage):
+    def rendered_images(stage):
         for place, (name, view) in enumerate(zip(names, views, strict=True)):
             rendering = renderer(state, view)
-            picture = picture_of(rendering, place)
+            image = picture_of(rendering, place)
             if "png" in args.formats:
-                images.write_png(out / f"{name}.png", picture)
+                images.write_png(out / f"{name}.png", image)
             if "exr" in args.formats:
-                seen = getattr(view, "view", view)  # of a `variants.Between`
-                exr_series.write_frame(out / f"{name}.exr", rendering, seen)
+                captured_view = getattr(view, "view", view)  # of a `variants.Between`
+                exr_series.write_frame(out / f"{name}.exr", rendering, captured_view)
             stage.advance()
-            yield picture
+            yield image
 
     with events.stage("rendering images", len(views)) as stage:
         if "mp4" in args.formats:
-            video.write_video(out / "film.mp4", pictures(stage), cli.RATE)
+            video.write_video(out / "film.mp4", rendered_images(stage), cli.RATE)
         else:
-            for _ in pictures(stage):
+            for _ in rendered_images(stage):
                 pass
 
 

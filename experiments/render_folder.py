@@ -168,18 +168,18 @@ def _earlier(out):
     """Read the record of a folder, None if there is no readable one."""
     try:
         earlier = json.loads((out / RECORD).read_text())
-        known = isinstance(earlier["request"], dict) and isinstance(
+        valid = isinstance(earlier["request"], dict) and isinstance(
             earlier["run"], dict
         )
         named = all(isinstance(name, str) for name in earlier["files"])
-        return earlier if known and named and "revision" in earlier else None
+        return earlier if valid and named and "revision" in earlier else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def _refuse_other(out, made, earlier):
+def _refuse_other(out, metadata, earlier):
     """Raise where an earlier render is not the one that would replace it."""
-    reason = _differs(made, earlier) or _edited(out, earlier)
+    reason = _differs(metadata, earlier) or _edited(out, earlier)
     if reason:
         raise ValueError(
             f"{out}: holds another render ({reason}); name another folder with "
@@ -187,15 +187,17 @@ def _refuse_other(out, made, earlier):
         )
 
 
-def _differs(made, earlier):
+def _differs(metadata, earlier):
     """Describe the first difference from an earlier render, or return ''."""
-    for place, now in (("request", made.request), ("run", made.run)):
+    for place, now in (("request", metadata.request), ("run", metadata.run)):
         for key in dict.fromkeys((*now, *earlier[place])):
             before, after = earlier[place].get(key), now.get(key)
             if before != after:
                 return f"{key} is {_words(before)} there and {_words(after)} here"
-    if earlier["revision"] != made.revision:
-        return f"made by revision {earlier['revision']}, and this is {made.revision}"
+    if earlier["revision"] != metadata.revision:
+        return (
+            f"made by revision {earlier['revision']}, and this is {metadata.revision}"
+        )
     return ""
 
 

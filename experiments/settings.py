@@ -76,10 +76,10 @@ def lines(described: dict[str, Any]) -> list[str]:
 
 def _entry(assignment, field):
     """Format an assignment with the kind and meaning of its field next to it."""
-    said = [field["kind"]]
+    facts = [field["kind"]]
     if field["default"] not in ("", field["value"]):
-        said.append(f"default {field['default']}")
-    words = ", ".join(said) + (f"; {field['about']}" if field["about"] else "")
+        facts.append(f"default {field['default']}")
+    words = ", ".join(facts) + (f"; {field['about']}" if field["about"] else "")
     notes = textwrap.wrap(words, WIDTH - COLUMN)
     if len(assignment) + 4 > COLUMN:
         notes.insert(0, "")

@@ -268,9 +268,9 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
     name, notes = "splats-tracked-small", []
     static = bool(reason) and usable_paths.stands_still(preprocessed, capture.times)
     inspected = preprocessed.unusable or (reason and not static)
-    found = _findings(capture, preprocessed) if inspected else ()
-    motion = next((one for one in found if one.effect == MOTION), None)
-    if findings.is_collection(found):
+    inspection_result = _findings(capture, preprocessed) if inspected else ()
+    motion = next((one for one in inspection_result if one.effect == MOTION), None)
+    if findings.is_collection(inspection_result):
         name = f"{OF_PHOTOGRAPHS}-small"
         notes = ["photographs of one scene in changing light"]
     elif static:
@@ -282,14 +282,12 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
         notes = [f"tracks are not usable: {reason}"]
     spec = specs.override(presets.PRESETS[name], without_tracks)
     paths = usable_paths.known_paths(preprocessed)
-    followed = 1.0 if reason else float(paths.known.mean())
-    overrides = without_tracks + capacity(spec, capture.size, followed, seconds)
+    share = 1.0 if reason else float(paths.known.mean())
+    overrides = without_tracks + capacity(spec, capture.size, share, seconds)
     if overrides != without_tracks:
         size = "x".join(map(str, capture.size))
         size += "" if seconds is None else f" in {seconds:g} s"
-        coverage = (
-            f" and tracks of {followed:.0%} of the video" if followed < LONG else ""
-        )
+        coverage = f" and tracks of {share:.0%} of the video" if share < LONG else ""
         notes.append(f"for images of {size}{coverage}")
     if not reason:
         bases = rigid_groups.enough(paths.position, paths.known, BASES, EXPLAINED)

@@ -181,8 +181,8 @@ def _engine(args) -> engines.Engine:
             args.out.absolute() / "slurm",
             (w.partition("=") for w in args.slurm),
         )
-        chosen = {key: value for key, _, value in words}
-        return lambda each: engines.slurm(each, folder, args.jobs, chosen)
+        options = {key: value for key, _, value in words}
+        return lambda each: engines.slurm(each, folder, args.jobs, options)
     return lambda each: engines.local(each, args.jobs)
 
 

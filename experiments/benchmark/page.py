@@ -102,7 +102,7 @@ def _tables(kind, methods):
     heads: tuple[str, ...] = (kind, "preset and changes", "seeds", "revision")
     tables = [markdown.table(heads, rows, words=2)]
     for group in GROUPS:
-        columns = _known(group, methods.values())
+        columns = _measured_columns(group, methods.values())
         heads = (kind, *(column[1] for column in columns))
         rows = [
             [f"`{name}`", *(_cell(one, column) for column in columns)]
@@ -119,7 +119,7 @@ def _short(revision):
     return commit[:8] + ("+" if changes else "")
 
 
-def _known(group: Iterable[Column], methods) -> list[Column]:
+def _measured_columns(group: Iterable[Column], methods) -> list[Column]:
     return [column for column in group if any(column[0] in m["mean"] for m in methods)]
 
 
@@ -147,7 +147,7 @@ def _claims(verdicts):
 
 def _legend(methods):
     for group in GROUPS:
-        for key, heading, *_ in _known(group, methods):
+        for key, heading, *_ in _measured_columns(group, methods):
             entry = METRICS[key]
             unit = "" if heading.endswith(("MB", " s", " ms")) else entry.unit
             yield f"{heading}{f' ({unit})' if unit else ''}: {entry.explanation}"

@@ -214,7 +214,7 @@ def _read_times(folder):
         times_file.with_times(_capture(), path)
 
 
-def _pictures(folder):
+def _image_files(folder):
     rng = np.random.default_rng(4)
     gray = rng.integers(0, 256, SIDE[::-1], np.uint8)
     color = rng.integers(0, 256, (*SIDE[::-1], 3), np.uint8)
@@ -523,7 +523,7 @@ TARGETS = {
     "rig of cameras": Target(_rig, lambda f: _load(f / "capture"), 10),
     "frame times": Target(_times, _read_times, 200),
     "photographs": Target(_photographs, _read_photographs, 100),
-    "images": Target(_pictures, _read_pictures, 200),
+    "images": Target(_image_files, _read_pictures, 200),
     "masks": Target(_masks, _read_masks, 100),
     "EXR": Target(_exr, _read_exr, 50),
     "npy": Target(_npy, _read_npy, 500),

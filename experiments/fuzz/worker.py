@@ -64,14 +64,14 @@ def run(
                 damaged = mutate.mutate(originals[path], path.name, draw)
                 path.write_bytes(damaged)
                 failure, spent = _read(target, work, counts)
-                grown = max(_peak(resource) - before, 0)
-                before += grown
+                growth = max(_peak(resource) - before, 0)
+                before += growth
                 counts["seconds"] = max(counts["seconds"], spent)
-                counts["bytes"] = max(counts["bytes"], grown)
+                counts["bytes"] = max(counts["bytes"], growth)
                 if spent > MOST_SECONDS:
                     failure = f"took {spent:.1f} s"
-                elif grown > MOST_BYTES:
-                    failure = f"grew by {grown / 2**20:.0f} MB"
+                elif growth > MOST_BYTES:
+                    failure = f"grew by {growth / 2**20:.0f} MB"
                 if failure:
                     _keep(folder, name, number, path, damaged, failure, counts)
                 path.write_bytes(originals[path])
@@ -82,7 +82,7 @@ def _peak(resource):
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def _read(target, work, seen):
+def _read(target, work, counts):
     """Read an input, and return the failure or None, and the processor time."""
     from nerfies_jax.capture.errors import FileError
 
@@ -90,9 +90,9 @@ def _read(target, work, seen):
     failure = None
     try:
         target.read(work)
-        seen["read"] += 1
+        counts["read"] += 1
     except FileError as error:
-        seen["refused"] += 1
+        counts["refused"] += 1
         if str(work) not in str(error):
             failure = f"no path in {_place(error)}"
         elif "\n" in str(error):
@@ -115,14 +115,14 @@ def _place(error):
     return f"{pathlib.Path(ours[-1].filename).name}:{ours[-1].name}"
 
 
-def _keep(folder, name, number, path, damaged, failure, seen):
-    same = [one for one in seen["failures"] if one["failure"] == failure]
+def _keep(folder, name, number, path, damaged, failure, counts):
+    same = [one for one in counts["failures"] if one["failure"] == failure]
     if len(same) < KEPT:
         failures = folder / "failures"
         failures.mkdir(exist_ok=True)
         label = "".join(c if c.isalnum() else "_" for c in f"{name}-{number}")
         (failures / f"{label}-{path.name}").write_bytes(damaged)
-    seen["failures"].append({"number": number, "file": path.name, "failure": failure})
+    counts["failures"].append({"number": number, "file": path.name, "failure": failure})
 
 
 def main() -> None:

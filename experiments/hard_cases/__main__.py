@@ -138,9 +138,9 @@ def select(topics, names) -> list[tuple[Case, str]]:
             if not names or any(name in case.name for name in names)
         ]
     if not selection:
-        known = [case.name for topic in topics for case in TOPICS[topic][0]]
+        existing = [case.name for topic in topics for case in TOPICS[topic][0]]
         raise ValueError(
-            f"--cases {' '.join(names)}: no such case; there are {', '.join(known)}"
+            f"--cases {' '.join(names)}: no such case; there are {', '.join(existing)}"
         )
     return selection
 
@@ -154,11 +154,11 @@ def measure(case: Case, test: str, numbers: int, repeats: int) -> CaseResult:
         errors = {}
         for form in Outcome._fields:
             with jax.enable_x64(dtype == "float64"):
-                got = hard_case.evaluate(
+                result = hard_case.evaluate(
                     getattr(case, form), case.inputs, dtype, len(bounds)
                 )
             errors[form] = tuple(
-                hard_case.errors(case, got[order], exact[order], order)
+                hard_case.errors(case, result[order], exact[order], order)
                 for order in range(len(bounds))
             )
         outcomes[dtype] = Outcome(**errors)

@@ -204,5 +204,5 @@ def evaluate(
 
 @functools.cache
 def _program(function, count, options):
-    every = jax.vmap(derivatives(function, count))
-    return jax.jit(every, compiler_options=dict(options))
+    batched = jax.vmap(derivatives(function, count))
+    return jax.jit(batched, compiler_options=dict(options))

@@ -19,7 +19,7 @@ DIRECTIONS = np.array(
 ALONG = np.array([1.0, -0.5, 0.25])
 
 
-def _moved(shares):
+def _positions(shares):
     """[3, 3] the sum of directions, each so far."""
     directions = constant(DIRECTIONS, shares.dtype)
     return jnp.sum(shares[:, None, None] * directions, axis=0)
@@ -71,14 +71,14 @@ def _by_squares(matrix):
 
 
 def _of_displacement(form):
-    return lambda shares: form(_moved(shares))[None]
+    return lambda shares: form(_positions(shares))[None]
 
 
 def _of_jacobian(form, size=1.0):
     """Evaluate at a perturbed multiple of the identity."""
 
     def energy(shares):
-        return form(size * jnp.eye(3, dtype=shares.dtype) + _moved(shares))[None]
+        return form(size * jnp.eye(3, dtype=shares.dtype) + _positions(shares))[None]
 
     return energy
 

@@ -93,10 +93,10 @@ def _one_part(x):
     """Reduced by quarter turns that are rounded once, and then to their product."""
     angles = 2 ** jnp.arange(BANDS, dtype=x.dtype)[:, None] * x
     turns = jnp.round(angles / (0.5 * jnp.pi))
-    rest = angles - turns * jnp.asarray(0.5 * jnp.pi, x.dtype)
+    remainder = angles - turns * jnp.asarray(0.5 * jnp.pi, x.dtype)
     swap, flip = turns % 2 == 1, turns % 4
-    sine = jnp.where(swap, jnp.cos(rest), jnp.sin(rest))
-    cosine = jnp.where(swap, jnp.sin(rest), jnp.cos(rest))
+    sine = jnp.where(swap, jnp.cos(remainder), jnp.sin(remainder))
+    cosine = jnp.where(swap, jnp.sin(remainder), jnp.cos(remainder))
     waves = (
         jnp.where(flip >= 2, -sine, sine),
         jnp.where((flip == 1) | (flip == 2), -cosine, cosine),

@@ -39,8 +39,8 @@ def _covariance(x):
         [2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)],
         [2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)],
     ]
-    turned = jnp.stack([jnp.stack(row) for row in rows])
-    spread = turned @ jnp.diag(x[4:7] ** 2) @ turned.T
+    rotation = jnp.stack([jnp.stack(row) for row in rows])
+    spread = rotation @ jnp.diag(x[4:7] ** 2) @ rotation.T
     return PX**2 * spread[:2, :2]
 
 

@@ -27,15 +27,15 @@ def _pinhole(rotation, position):
     )
 
 
-def _far_pixel(both):
+def _far_pixel(inputs):
     """Project a point seen by a camera at a position."""
-    return cameras.project(_pinhole(TURN, both[3:]), both[:3])[0]
+    return cameras.project(_pinhole(TURN, inputs[3:]), inputs[:3])[0]
 
 
-def _textbook_far_pixel(both):
+def _textbook_far_pixel(inputs):
     """K [R | t], with t = -R c."""
-    rotation = constant(TURN, both.dtype)
-    point = rotation @ both[:3] + -rotation @ both[3:]
+    rotation = constant(TURN, inputs.dtype)
+    point = rotation @ inputs[:3] + -rotation @ inputs[3:]
     return _on_plane(point[:2], point[2])
 
 
@@ -50,8 +50,8 @@ def _exact_pixel(x, y, divisor):
     ]
 
 
-def _exact_far_pixel(both):
-    offset = mpmath.matrix(both[:3]) - mpmath.matrix(both[3:])
+def _exact_far_pixel(inputs):
+    offset = mpmath.matrix(inputs[:3]) - mpmath.matrix(inputs[3:])
     return _exact_pixel(*(mpmath.matrix(TURN.tolist()) * offset))
 
 
@@ -104,27 +104,30 @@ NEAR_PLANE = Case(
 BARREL = -0.5  # k1; folds at a slope of √(2/3), distorted to 0.5443
 
 
-def _undistorted(bent):
-    lens = constant([BARREL, 0, 0], bent.dtype), constant(np.zeros(2), bent.dtype)
-    return distortion.undistort(*lens, bent)[0]
+def _undistorted(distorted):
+    lens = (
+        constant([BARREL, 0, 0], distorted.dtype),
+        constant(np.zeros(2), distorted.dtype),
+    )
+    return distortion.undistort(*lens, distorted)[0]
 
 
-def _fixed_point(bent):
+def _fixed_point(distorted):
     """Ten steps as in OpenCV."""
-    slopes = bent
+    slopes = distorted
     for _ in range(10):
-        slopes = bent / (1 + BARREL * jnp.sum(slopes**2))
+        slopes = distorted / (1 + BARREL * jnp.sum(slopes**2))
     return slopes
 
 
-def _exact_undistorted(bent):
+def _exact_undistorted(distorted):
     """The middle root of r³ - 2 r + 2 t = 0, by Viète's cosines."""
-    target = mpmath.sqrt(bent[0] ** 2 + bent[1] ** 2)
+    target = mpmath.sqrt(distorted[0] ** 2 + distorted[1] ** 2)
     if target == 0:
         return [mpmath.mpf(0)] * 2
     third = mpmath.acos(-target * mpmath.sqrt(mpmath.mpf(27) / 8)) / 3
     radius = mpmath.sqrt(mpmath.mpf(8) / 3) * mpmath.cos(third - 2 * mpmath.pi / 3)
-    return [radius / target * x for x in bent]
+    return [radius / target * x for x in distorted]
 
 
 _BENT = np.array([0, 1e-20, 1e-6, 0.1, 0.3, 0.5, 0.54, 0.544])

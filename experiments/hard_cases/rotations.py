@@ -24,10 +24,10 @@ def _rodrigues(w):
     sine = jnp.sin(angle) / angle
     versine = (1 - jnp.cos(angle)) / angle**2
     quotient = (angle - jnp.sin(angle)) / angle**3
-    turned = point + sine * jnp.cross(w, point)
-    turned = turned + versine * jnp.cross(w, jnp.cross(w, point))
+    rotated = point + sine * jnp.cross(w, point)
+    rotated = rotated + versine * jnp.cross(w, jnp.cross(w, point))
     result = linear + versine * jnp.cross(w, linear)
-    return turned + result + quotient * jnp.cross(w, jnp.cross(w, linear))
+    return rotated + result + quotient * jnp.cross(w, jnp.cross(w, linear))
 
 
 def _exact_screw(w):
@@ -39,8 +39,8 @@ def _exact_screw(w):
         return list(x + v)
     one = (1 - mpmath.cos(angle)) / angle**2
     two = (angle - mpmath.sin(angle)) / angle**3
-    turned = x + mpmath.sin(angle) / angle * (hat * x) + one * (hat * (hat * x))
-    return list(turned + v + one * (hat * v) + two * (hat * (hat * v)))
+    rotated = x + mpmath.sin(angle) / angle * (hat * x) + one * (hat * (hat * x))
+    return list(rotated + v + one * (hat * v) + two * (hat * (hat * v)))
 
 
 _EDGE = SERIES_BELOW**0.5
@@ -91,8 +91,8 @@ def _exact_displacement(w, v, x):
     w, v = mpmath.matrix(w), mpmath.matrix(v)
     hat, squared = _hat(w), _square(w)
     one, two, three = (_exact_stumpff(k, squared) for k in (1, 2, 3))
-    turned = one * (hat * x) + two * (hat * (hat * x))
-    return list(turned + v + two * (hat * v) + three * (hat * (hat * v)))
+    shift = one * (hat * x) + two * (hat * (hat * x))
+    return list(shift + v + two * (hat * v) + three * (hat * (hat * v)))
 
 
 def _textbook_displacement(w, v, x):

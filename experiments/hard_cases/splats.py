@@ -27,11 +27,11 @@ _VALUES = np.cos(np.arange(COUNT) * 0.7)
 
 def _pixel(x):
     """A pixel behind `COUNT` wide Gaussians, the first with alpha x0, all others x1."""
-    rest = constant(np.ones(COUNT - 1), x.dtype) * x[1]
+    others = constant(np.ones(COUNT - 1), x.dtype) * x[1]
     footprints = Footprints(
         mean_px=constant(np.full((COUNT, 2), 0.5), x.dtype),
         whitening=constant(np.tile([1e-3, 0, 1e-3], (COUNT, 1)), x.dtype),
-        opacity=jnp.concatenate([x[:1], rest]),
+        opacity=jnp.concatenate([x[:1], others]),
         depth=constant(np.arange(1, COUNT + 1), x.dtype),
         extent_px=constant(np.full((COUNT, 2), 2.0), x.dtype),
     )
@@ -43,8 +43,8 @@ def _pixel(x):
 @jax.custom_vjp
 def _composite_dividing(alpha, values):
     """Composite as INRIA's kernel, whose backward pass divides the transmittance."""
-    passed = jnp.cumprod(1 - alpha)
-    before = jnp.concatenate([jnp.ones_like(passed[:1]), passed[:-1]])
+    transmittance = jnp.cumprod(1 - alpha)
+    before = jnp.concatenate([jnp.ones_like(transmittance[:1]), transmittance[:-1]])
     return jnp.sum(before * alpha * values)
 
 
@@ -80,16 +80,16 @@ def _pixel_textbook(x):
 
 
 def _exact_pixel(x):
-    def seen(alpha):
+    def opacity(alpha):
         if alpha < mpmath.mpf(OPEN.alpha_threshold):
             return mpmath.mpf(0)
         return min(alpha, mpmath.mpf(OPEN.alpha_max))
 
-    first, rest = seen(x[0]), seen(x[1])
-    total, passed = first * mpmath.mpf(float(_VALUES[0])), 1 - first
+    first, other = opacity(x[0]), opacity(x[1])
+    total, transmittance = first * mpmath.mpf(float(_VALUES[0])), 1 - first
     for value in _VALUES[1:].tolist():
-        total += passed * rest * mpmath.mpf(value)
-        passed *= 1 - rest
+        total += transmittance * other * mpmath.mpf(value)
+        transmittance *= 1 - other
     return [total]
 
 

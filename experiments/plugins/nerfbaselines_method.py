@@ -132,13 +132,13 @@ class NerfiesJax:
     def get_info(self) -> Any:
         """Return the number of steps and the settings of this model."""
         path = None if self._checkpoint is None else str(self._checkpoint)
-        own = {"preset": self._config.preset_name, "seed": self._config.seed}
+        settings = {"preset": self._config.preset_name, "seed": self._config.seed}
         return {
             **self.get_method_info(),
             "num_iterations": self._spec.steps,
             "loaded_step": self._loaded_step,
             "loaded_checkpoint": path,
-            "hparams": {**self._settings, **own, "steps": self._spec.steps},
+            "hparams": {**self._settings, **settings, "steps": self._spec.steps},
         }
 
     def get_train_embedding(self, index: int) -> np.ndarray | None:
@@ -209,8 +209,8 @@ class NerfiesJax:
             "depth": rendering.depth / self._capture.scale,
             "accumulation": rendering.alpha,
         }
-        wanted = (options or {}).get("outputs") or images
-        return {k: np.asarray(v, np.float32) for k, v in images.items() if k in wanted}
+        outputs = (options or {}).get("outputs") or images
+        return {k: np.asarray(v, np.float32) for k, v in images.items() if k in outputs}
 
     def _view(self, one):
         cameras = conversion.world_cameras(one)

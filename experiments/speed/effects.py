@@ -238,8 +238,8 @@ def variants(spec: Any, parts: Mapping[str, Any]) -> list[Variant]:
             + ", ".join(PRESETS)
         )
 
-    def only(*kept):
-        return without(spec, tuple(name for name in names if name not in kept))
+    def only(*present):
+        return without(spec, tuple(name for name in names if name not in present))
 
     scenes = [Variant("bare", only())]
     for name in names:
@@ -249,7 +249,7 @@ def variants(spec: Any, parts: Mapping[str, Any]) -> list[Variant]:
     if len(names) > 1:  # the only one is the whole scene
         scenes.append(Variant("all", spec))
         parts = {name: without(spec, (name,)) for name in names} | dict(parts)
-    return scenes + [Variant(f"without {name}", rest) for name, rest in parts.items()]
+    return scenes + [Variant(f"without {name}", scene) for name, scene in parts.items()]
 
 
 def measure(

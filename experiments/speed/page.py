@@ -38,7 +38,7 @@ def page(stored: Mapping[str, Any]) -> str:
     if "job" in stored:
         parts += ["## The default command", _job(stored["job"])]
         if "jobs" in stored:
-            parts.append(_beside(**stored["jobs"]))
+            parts.append(_comparison(**stored["jobs"]))
     if "raster" in stored:
         parts += ["## The rasterizer compared with a tuned C++ one", RASTER]
         parts.append(_raster(stored["raster"]["rows"]))
@@ -50,13 +50,13 @@ def _presets(presets):
     heads += ("compile s", "frame ms", "peak MB")
     rows = []
     for name, record in presets.items():
-        one, every = record["one"], record["all"]
+        one, all_presets = record["one"], record["all"]
         rows.append(
             [
                 f"`{name}`",
                 markdown.number(one["step_ms"], 1),
-                markdown.number(every["step_ms"], 1),
-                markdown.number(one["step_ms"] / every["step_ms"], 2),
+                markdown.number(all_presets["step_ms"], 1),
+                markdown.number(one["step_ms"] / all_presets["step_ms"], 2),
                 markdown.number(one["compile_seconds"], 1),
                 markdown.number(one["frame_ms"], 0),
                 markdown.number(one["peak_mb"], 0),
@@ -85,13 +85,13 @@ def _job(job):
     )
 
 
-def _beside(first, beside, again):
+def _comparison(first, second, again):
     """An earlier revision's job, between two of ours."""
     ours = (first["seconds"] + again["seconds"]) / 2
     heads = ("revision", "all s", "training s", "compiling it s", "PSNR", "moving PSNR")
     names = ("seconds", "train.seconds", "train.compile_seconds")
     rows = []
-    for job in (first, beside, again):
+    for job in (first, second, again):
         quality = (job["heldout.psnr"], job["heldout.moving_psnr"])
         rows.append(
             [
@@ -100,10 +100,10 @@ def _beside(first, beside, again):
                 *(markdown.number(value, 2) for value in quality),
             ]
         )
-    share = ours / beside["seconds"]
+    share = ours / second["seconds"]
     return (
         f"An earlier revision on {first['cpu']}, in one session: {ours:.0f} s, "
-        f"the mean of both, for {beside['seconds']:.0f} s, {share:.2f} of the time.\n\n"
+        f"the mean of both, for {second['seconds']:.0f} s, {share:.2f} of the time.\n\n"
         + markdown.table(heads, rows)
     )
 

@@ -218,9 +218,9 @@ def active_harmonics(
     Returns:
       The coefficients, degree 0 first.
     """
-    rest = splats.sh_rest.shape[1]
+    count = splats.sh_rest.shape[1]
     # Coefficient k belongs to the degree floor(sqrt(k)); k = 0 is `sh_dc`.
-    band = np.array([math.isqrt(k) for k in range(1, rest + 1)], np.int32)
+    band = np.array([math.isqrt(k) for k in range(1, count + 1)], np.int32)
     used = jnp.asarray(band) <= degree
     masked = jnp.where(used[:, None], splats.sh_rest, jnp.zeros_like(splats.sh_rest))
     return jnp.concatenate([splats.sh_dc, masked], axis=1)
@@ -460,11 +460,11 @@ def random_in_views(
     distorted = np.any(cameras.radial) or np.any(cameras.tangential)
     if distorted or cameras.fisheye is not None:
         axes = np.ndim(cameras.focal_px)
-        own = jax.tree.map(
+        cameras_of_view = jax.tree.map(
             lambda leaf: jnp.float32(per_view(leaf, *np.shape(leaf)[axes:])), cameras
         )
-        bent = jnp.float32(np.stack([x, y], axis=-1))
-        slopes, _ = jax.vmap(lens.undistort)(own, bent)
+        observed = jnp.float32(np.stack([x, y], axis=-1))
+        slopes, _ = jax.vmap(lens.undistort)(cameras_of_view, observed)
         x, y = np.asarray(slopes, np.float64).T
     in_camera = np.stack([x, y, np.ones_like(x)], axis=-1) * z[:, None]
     rotation = per_view(cameras.camera_from_world, 3, 3)

@@ -122,14 +122,14 @@ def at(
         return sum(rows[1:], rows[0])
 
     mean, log_scale, turn = (between(leaf) for leaf in knots.track)
-    moved = Gaussians(
+    gaussians_at = Gaussians(
         mean=mean,
         quaternion=jax.vmap(quaternion.normalize)(turn),
         scale=jnp.exp(log_scale),
         # Opacities are not interpolated. The table's are set after the merge.
         opacity=jnp.zeros_like(mean[:, 0]),
     )
-    merged = static_rows.merge(knots.static, moved, knots.row_index)
+    merged = static_rows.merge(knots.static, gaussians_at, knots.row_index)
     return merged._replace(opacity=knots.static.opacity)
 
 

@@ -154,8 +154,8 @@ def resting(paths: Paths) -> Float[Array, "still 3"] | None:
     """
     if paths.still is None or not len(paths.still):
         return None
-    chosen = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
-    return captured(paths.still[chosen])
+    sample = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
+    return captured(paths.still[sample])
 
 
 def rest_loss(
@@ -209,9 +209,9 @@ def combination(
     # Relative to the mean position, so that the ridge does not pull to the origin.
     offset = np.where(paths.known[..., None], paths.position - middle, 0)
     normal = np.einsum("tk,nt,tl->nkl", basis, weight, basis, optimize=True) + stiff
-    moment = np.einsum("tk,ntc->nkc", basis, offset)
+    projection = np.einsum("tk,ntc->nkc", basis, offset)
     constant = np.linalg.lstsq(basis, np.ones(len(basis)), rcond=None)[0]
-    return np.linalg.solve(normal, moment) + constant[:, None] * middle
+    return np.linalg.solve(normal, projection) + constant[:, None] * middle
 
 
 def _guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
@@ -398,6 +398,6 @@ def fit(
     all_frames = np.arange(len(times))
     separate, arrays = programs.with_captured(lambda p: distance(p, all_frames), start)
     mean_distance = jax.jit(separate)
-    fitted = descended(loss, start, rates, key, steps)
-    first, last = (float(mean_distance(arrays, p)) for p in (start, fitted))
-    return PathFit(fitted, first, last)
+    solution = descended(loss, start, rates, key, steps)
+    first, last = (float(mean_distance(arrays, p)) for p in (start, solution))
+    return PathFit(solution, first, last)

@@ -78,25 +78,27 @@ def start(
     ray = position - views.position
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     depth = Depth(ray, deviation)
-    fitted = motion_fit.fit(
+    fit_result = motion_fit.fit(
         effect,
         Paths(times, position.astype(np.float32), known, unit, static_points, depth),
         key,
         rate=spec.fit_rate,
         steps=spec.fit_steps,
     )
-    followed = known.mean(axis=1).astype(np.float32)
-    return _seeds(effect, fitted.points, followed, evidence, views, times, unit, spec)
+    visibility = known.mean(axis=1).astype(np.float32)
+    return _seeds(
+        effect, fit_result.points, visibility, evidence, views, times, unit, spec
+    )
 
 
-def _seeds(effect, points, followed, evidence, views, times, unit, spec):
+def _seeds(effect, points, visibility, evidence, views, times, unit, spec):
     """Unproject moving pixels of all frames to canonical positions."""
     rng = np.random.default_rng(0)
     depth = moving_depths(evidence)
     frame, row, column = np.nonzero(depth > 0)
     # Twice as many as needed, because some are dropped.
-    chosen = rng.permutation(len(frame))[: 2 * spec.moving_points]
-    frame, row, column = frame[chosen], row[chosen], column[chosen]
+    selection = rng.permutation(len(frame))[: 2 * spec.moving_points]
+    frame, row, column = frame[selection], row[selection], column[selection]
     canonical = np.asarray(points.canonical)
     point_rows = None if points.rows is None else jax.tree.map(np.asarray, points.rows)
     positions_at = jax.jit(
@@ -119,15 +121,15 @@ def _seeds(effect, points, followed, evidence, views, times, unit, spec):
             views.position[current]
             + ray * depth[current][row[pixels], column[pixels], None]
         )
-        moved = np.asarray(positions_at(points, times[current]))
-        distance, neighbors, weights = _carriers(moved, observed)
+        position_then = np.asarray(positions_at(points, times[current]))
+        distance, neighbors, weights = _carriers(position_then, observed)
 
         def mixed(leaf, neighbors=neighbors, weights=weights):
             return _mixed(leaf, neighbors, weights)
 
         pixel_rows = None if point_rows is None else jax.tree.map(mixed, point_rows)
         start = observed + np.einsum(
-            "nk,nkc->nc", weights, canonical[neighbors] - moved[neighbors]
+            "nk,nkc->nc", weights, canonical[neighbors] - position_then[neighbors]
         )
 
         def padded(leaf):
@@ -136,9 +138,9 @@ def _seeds(effect, points, followed, evidence, views, times, unit, spec):
         padded_rows = None if pixel_rows is None else jax.tree.map(padded, pixel_rows)
         canonical_position = start.astype(np.float32)
         for _ in range(ROUNDS):
-            shifted = Points(padded(canonical_position), padded_rows, points.nets)
+            padded_points = Points(padded(canonical_position), padded_rows, points.nets)
             canonical_position = canonical_position - (
-                np.asarray(positions_at(shifted, times[current]))[: len(pixels)]
+                np.asarray(positions_at(padded_points, times[current]))[: len(pixels)]
                 - observed
             )
             canonical_position = canonical_position.astype(np.float32)
@@ -146,7 +148,7 @@ def _seeds(effect, points, followed, evidence, views, times, unit, spec):
         is_valid = (distance[:, 0] < FAR * unit) & (displacement < GONE * unit)
         positions.append(canonical_position[is_valid])
         times_of = np.full(int(is_valid.sum()), times[current])
-        spans.append(np.stack([times_of, mixed(followed)[is_valid]]))
+        spans.append(np.stack([times_of, mixed(visibility)[is_valid]]))
         colors.append(
             views.image[current][pixel[is_valid, 1], pixel[is_valid, 0]] / 255
         )
@@ -155,13 +157,20 @@ def _seeds(effect, points, followed, evidence, views, times, unit, spec):
                 jax.tree.map(lambda leaf, valid=is_valid: leaf[valid], pixel_rows)
             )
     position, color = np.concatenate(positions), np.concatenate(colors)
-    chosen = np.sort(rng.permutation(len(position))[: spec.moving_points])
+    selection = np.sort(rng.permutation(len(position))[: spec.moving_points])
     all_rows = None
     if rows:
-        all_rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[chosen], *rows)
-    span = np.concatenate(spans, axis=1)[:, chosen]
+        all_rows = jax.tree.map(
+            lambda *leaves: np.concatenate(leaves)[selection], *rows
+        )
+    span = np.concatenate(spans, axis=1)[:, selection]
     return TrackStart(
-        position[chosen], color[chosen], all_rows, points.nets, *span, points.resting
+        position[selection],
+        color[selection],
+        all_rows,
+        points.nets,
+        *span,
+        points.resting,
     )
 
 
@@ -194,15 +203,15 @@ def moving_depths(evidence: Evidence) -> np.ndarray:
     depths = np.zeros(evidence.moving.shape, np.float32)
     tracks = evidence.tracks.take(evidence.moved)
     for frame, mask in enumerate(evidence.moving):
-        known = np.flatnonzero(evidence.paths.known[:, frame])
+        rows = np.flatnonzero(evidence.paths.known[:, frame])
         row, column = np.nonzero(mask)
-        if len(known) < DEPTH_TRACKS or not len(row):
+        if len(rows) < DEPTH_TRACKS or not len(row):
             continue
-        tree = cKDTree(tracks.pixel[known, frame])
+        tree = cKDTree(tracks.pixel[rows, frame])
         distance, neighbors = tree.query(
             np.stack([column, row], -1) + 0.5, DEPTH_TRACKS
         )
-        depth = np.median(evidence.paths.depth[known, frame][neighbors], axis=1)
+        depth = np.median(evidence.paths.depth[rows, frame][neighbors], axis=1)
         depth[distance[:, 0] > DEPTH_REACH_PX * picture_scale(mask.shape[1])] = 0
         depths[frame, row, column] = depth
     return depths

@@ -85,16 +85,18 @@ def _inside(points, cameras, images, masks):
     height, width = masks.shape[1:]
     color, views = np.zeros((len(points), 3)), np.zeros((len(points), 1))
     # All arrays have the first number of points, so that `_in_view` compiles once.
-    kept = np.arange(len(points))
+    rows = np.arange(len(points))
     for row, (image, mask) in enumerate(zip(images, masks, strict=True)):
         camera = jax.tree.map(lambda leaf, row=row: leaf[row], cameras)
         padded = np.zeros(points.shape, np.float32)
-        padded[: len(kept)] = points[kept]
-        pixel, depth = (np.asarray(x)[: len(kept)] for x in _in_view(camera, padded))
-        shown = (depth > 0) & np.all((pixel >= 0) & (pixel < (width, height)), axis=1)
-        column, line = np.where(shown[:, None], pixel, 0).astype(int).T
-        color[kept] += np.where(shown[:, None], image[line, column] / 255, 0)
-        views[kept] += shown[:, None]
-        kept = kept[~shown | mask[line, column]]
-    kept = kept[views[kept, 0] > 0]
-    return points[kept], color[kept] / views[kept]
+        padded[: len(rows)] = points[rows]
+        pixel, depth = (np.asarray(x)[: len(rows)] for x in _in_view(camera, padded))
+        in_image = (depth > 0) & np.all(
+            (pixel >= 0) & (pixel < (width, height)), axis=1
+        )
+        column, line = np.where(in_image[:, None], pixel, 0).astype(int).T
+        color[rows] += np.where(in_image[:, None], image[line, column] / 255, 0)
+        views[rows] += in_image[:, None]
+        rows = rows[~in_image | mask[line, column]]
+    rows = rows[views[rows, 0] > 0]
+    return points[rows], color[rows] / views[rows]

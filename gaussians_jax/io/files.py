@@ -197,8 +197,8 @@ def _read_ply(path):
         sh_dc=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
         sh_rest=np.ascontiguousarray(channels.transpose(0, 2, 1)),
     )
-    known = {*_REQUIRED, *rest, "nx", "ny", "nz"}
-    extra = [name for name in names if name not in known]
+    expected = {*_REQUIRED, *rest, "nx", "ny", "nz"}
+    extra = [name for name in names if name not in expected]
     extra += [f"element {part.name}" for part in ply.elements if part.name != "vertex"]
     notes = (f"ignored: {', '.join(extra)}",) if extra else ()
     trailing = path.stat().st_size - len(header) - vertex.nbytes
@@ -213,15 +213,15 @@ def _refuse_map_coordinates(vertex):
     if not axes or not len(vertex):
         return
     with np.errstate(over="ignore", invalid="ignore"):
-        moved = max(
+        rounding = max(
             float(np.nanmax(np.abs(vertex[axis] - vertex[axis].astype(np.float32))))
             for axis in axes
         )
         scales = [np.float64(vertex[f"scale_{number}"]) for number in range(3)]
         size = float(np.exp(np.median(scales)))
-    if np.isfinite(moved) and moved > MOST_ROUNDING * size:
+    if np.isfinite(rounding) and rounding > MOST_ROUNDING * size:
         raise ValueError(
-            f"float32 would round its float64 coordinates by up to {moved:.2g}, but "
+            f"float32 would round its float64 coordinates by up to {rounding:.2g}, but "
             f"the median scale of a Gaussian is {size:.2g}; subtract an origin from "
             "the coordinates and write the file again"
         )

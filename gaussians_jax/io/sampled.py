@@ -64,10 +64,10 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
     Raises:
       ValueError: If no Gaussian is visible from a training camera.
     """
-    chosen = visible(seen)
+    is_visible = visible(seen)
     poses = [jax.device_get(at(float(time))) for time in np.linspace(0, 1, count)]
     mean, quaternion, scale, opacity = (
-        np.stack([leaf[chosen] for leaf in leaves])
+        np.stack([leaf[is_visible] for leaf in leaves])
         for leaves in zip(*poses, strict=True)
     )
     return Instants(
@@ -78,8 +78,8 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
             *splats.LOG_SCALE_RANGE,
         ),
         opacity=opacity,
-        color=seen.color[chosen],
-        left_out=splats.active_count(rows) - int(chosen.sum()),
+        color=seen.color[is_visible],
+        left_out=splats.active_count(rows) - int(is_visible.sum()),
     )
 
 
@@ -95,13 +95,13 @@ def visible(seen: Seen) -> np.ndarray:
     Raises:
       ValueError: If no Gaussian is visible from a training camera.
     """
-    chosen = seen.most >= LEAST_SEEN_PX  # NaN compares false and is left out
-    if not chosen.any():
+    is_visible = seen.most >= LEAST_SEEN_PX  # NaN compares false and is left out
+    if not is_visible.any():
         raise ValueError(
             f"none of the {len(seen.most)} Gaussians is visible from a training "
             "camera; train for more steps"
         )
-    return chosen
+    return is_visible
 
 
 def count_for(capture: Capture) -> int:
@@ -154,10 +154,12 @@ def seen_in_training(
         if moves.any():
             opacity = np.array(deformed.opacity)
             opacity[moves] = 0
-            still = deformed._replace(opacity=jax.device_put(opacity))
-            variants.append((still, view.camera))
+            static = deformed._replace(opacity=jax.device_put(opacity))
+            variants.append((static, view.camera))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *variants)
-        weights = list(data_parallel.rows_on_devices(_shown, (size, raster), stacked))
+        weights = list(
+            data_parallel.rows_on_devices(_appearance, (size, raster), stacked)
+        )
         most = np.maximum(most, np.max(weights, axis=0) * factor**2)
         weight = np.sum(weights, axis=0)
         colors = color_toward(coefficients, deformed.mean, view.camera.position)
@@ -167,7 +169,7 @@ def seen_in_training(
     return Seen(np.asarray(most), color / total_weight[:, None])
 
 
-def _shown(how, gaussians: Gaussians, camera: Camera):
+def _appearance(how, gaussians: Gaussians, camera: Camera):
     """Sum the compositing weights of each Gaussian over the pixels.
 
     An image is a weighted sum of colors, so the summed weights of a Gaussian are the

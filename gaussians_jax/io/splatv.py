@@ -131,13 +131,13 @@ def _bells(times, opacity):
     # The error of the opacity is its logarithm's error times the opacity.
     weight = np.maximum(opacity, 1e-4) ** 2
     elapsed = times - 0.5
-    fitted = _polynomials(elapsed, weight, logarithm, 3)[..., 0]
-    opens_down = fitted[:, 2] < -((1 / ALWAYS) ** 2)
-    curvature = np.where(opens_down, -fitted[:, 2], 1.0)
-    offset = fitted[:, 1] / (2 * curvature)
+    parabola = _polynomials(elapsed, weight, logarithm, 3)[..., 0]
+    opens_down = parabola[:, 2] < -((1 / ALWAYS) ** 2)
+    curvature = np.where(opens_down, -parabola[:, 2], 1.0)
+    offset = parabola[:, 1] / (2 * curvature)
     opens_down &= np.abs(offset) < FARTHEST_CENTER
     offset = np.where(opens_down, offset, 0.0)
-    height = np.exp(np.minimum(fitted[:, 0] + curvature * offset**2, 0))
+    height = np.exp(np.minimum(parabola[:, 0] + curvature * offset**2, 0))
     bell = height * np.exp(-curvature * (elapsed[:, None] - offset) ** 2)
     is_better = ((bell - opacity) ** 2).sum(0) < ((constant - opacity) ** 2).sum(0)
     use_bell = opens_down & is_better

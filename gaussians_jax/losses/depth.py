@@ -145,17 +145,17 @@ def metric(
     return error / jnp.where(scale > 0, scale, 1)
 
 
-def _about_median(depth, known):
+def _about_median(depth, valid):
     """Normalize by median and deviation, with gradients through both."""
-    center = _median(depth, known)
-    offset = jnp.where(known, depth - center, 0)
-    return _divided(offset, losses.masked_mean(jnp.abs(offset)[:, None], known), center)
+    center = _median(depth, valid)
+    offset = jnp.where(valid, depth - center, 0)
+    return _divided(offset, losses.masked_mean(jnp.abs(offset)[:, None], valid), center)
 
 
-def _about_mean(depth, known):
-    center = losses.masked_mean(depth[:, None], known)
-    offset = jnp.where(known, depth - center, 0)
-    variance = losses.masked_mean(jnp.square(offset)[:, None], known)
+def _about_mean(depth, valid):
+    center = losses.masked_mean(depth[:, None], valid)
+    offset = jnp.where(valid, depth - center, 0)
+    variance = losses.masked_mean(jnp.square(offset)[:, None], valid)
     # Divided by at least 1e-3 of the mean, to bound the gradient of the square root.
     least = jnp.square(FLATTEST * jax.lax.stop_gradient(center))
     deviation = jnp.sqrt(jnp.where(variance > least, variance, 1))
@@ -167,13 +167,13 @@ def _divided(offset, deviation, center):
     return offset / jnp.maximum(deviation, jnp.where(least > 0, least, 1))
 
 
-def _median(depth, known):
+def _median(depth, valid):
     """Return the lower median of positive depths, 0 without any."""
-    count = jnp.sum(known)
-    fixed = jax.lax.stop_gradient(jnp.where(known, depth, 1))
-    middle = nth_smallest(fixed, known, jnp.maximum(count - 1, 0) // 2)
-    index = jnp.argmax(known & (fixed == middle))
-    return jnp.where(count > 0, jnp.where(known, depth, 0)[index], 0)
+    count = jnp.sum(valid)
+    fixed = jax.lax.stop_gradient(jnp.where(valid, depth, 1))
+    middle = nth_smallest(fixed, valid, jnp.maximum(count - 1, 0) // 2)
+    index = jnp.argmax(valid & (fixed == middle))
+    return jnp.where(count > 0, jnp.where(valid, depth, 0)[index], 0)
 
 
 def nth_smallest(
@@ -232,15 +232,15 @@ def terms(spec: DepthSpec, observation: Observation) -> dict[str, Term]:
     assert rendering.depth is not None  # rendered because of `required_data`
     # Depths are often stored in half precision, too little to count and center.
     truth, rendered = widened(truth), widened(rendering.depth)
-    known = (truth > 0) & jnp.isfinite(truth) & (rendered > 0) & jnp.isfinite(rendered)
-    known = known & (rendering.alpha >= spec.opaque)
+    valid = (truth > 0) & jnp.isfinite(truth) & (rendered > 0) & jnp.isfinite(rendered)
+    valid = valid & (rendering.alpha >= spec.opaque)
     if observation.valid is not None:
-        known = known & observation.valid
+        valid = valid & observation.valid
     # Selected before any computation, because unknown pixels may be NaN.
-    rendered, truth = (jnp.where(known, x, 1).reshape(-1) for x in (rendered, truth))
+    rendered, truth = (jnp.where(valid, x, 1).reshape(-1) for x in (rendered, truth))
     if spec.space == "disparity":
         rendered, truth = 1 / rendered, 1 / truth
-    known = known.reshape(-1)
-    error = FORMS[spec.kind](rendered, truth, known)
-    share = jnp.mean(known.astype(error.dtype))
+    valid = valid.reshape(-1)
+    error = FORMS[spec.kind](rendered, truth, valid)
+    share = jnp.mean(valid.astype(error.dtype))
     return {"error": Term(error, spec.weight), "known": Term(share, None)}

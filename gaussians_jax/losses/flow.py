@@ -112,11 +112,11 @@ class Bound:
             return zero, zero
 
         if spec.start == 0:
-            error, known = evaluate(params)
+            error, share = evaluate(params)
         else:
             early = context.step < spec.start
-            error, known = lax.cond(early, nothing, evaluate, params)
-        return {"error": Term(error, spec.weight), "known": Term(known, None)}
+            error, share = lax.cond(early, nothing, evaluate, params)
+        return {"error": Term(error, spec.weight), "known": Term(share, None)}
 
 
 def flow_error(
@@ -147,13 +147,13 @@ def flow_error(
     size = frames.images.shape[2], frames.images.shape[1]
     rendered = render_flow(start, end, pair, size, raster_spec)
     shift = frames.flow.forward[row].astype(rendered.flow.dtype)
-    seen = frames.flow.forward_seen[row] & (rendered.share >= spec.opaque)
+    valid = frames.flow.forward_seen[row] & (rendered.share >= spec.opaque)
     if observation.valid is not None:
-        seen = seen & observation.valid
+        valid = valid & observation.valid
     if spec.moving_only and frames.moving is not None:
-        seen = seen & frames.moving[row]
+        valid = valid & frames.moving[row]
     object_flow = shift - camera_flow(pair, rendered.depth, raster_spec.distorted)
-    return error(rendered.flow, object_flow, seen), jnp.mean(seen.astype(shift.dtype))
+    return error(rendered.flow, object_flow, valid), jnp.mean(valid.astype(shift.dtype))
 
 
 def render_flow(
@@ -267,7 +267,7 @@ def camera_flow(
     x = (offset[..., 0] - first.skew_px * y) / first.focal_px
     slopes = jnp.stack([x, y], axis=-1)
     if distorted:
-        straighten = jax.vmap(jax.vmap(lambda bent: lens.undistort(first, bent)[0]))
+        straighten = jax.vmap(jax.vmap(lambda point: lens.undistort(first, point)[0]))
         slopes = straighten(slopes)
     directions = jnp.concatenate([slopes, jnp.ones_like(x)[..., None]], axis=-1)
     point = first.position + depth[..., None] * exact_product(

@@ -85,9 +85,9 @@ class Bound:
         shape = (*indices.shape, 3)
         canonical = selected.rows["splats"].mean.reshape(shape) / self.extent
         assert context.at_time is not None
-        moved = context.at_time(selected, context.condition.time).mean
+        mean = context.at_time(selected, context.condition.time).mean
         return change_of_distances(
-            canonical, moved.reshape(shape) / self.extent, graph.weight[rows]
+            canonical, mean.reshape(shape) / self.extent, graph.weight[rows]
         )
 
 

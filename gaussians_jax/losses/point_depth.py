@@ -89,13 +89,13 @@ def relative_errors(
     share = pixel - first.astype(pixel.dtype)
     usable = (alpha >= OPAQUE) & (depth > 0)
     inverse = jnp.where(usable, 1 / jnp.where(usable, depth, 1), 0)
-    value, known = jnp.zeros_like(z), inside
+    value, valid = jnp.zeros_like(z), inside
     for right in (0, 1):
         for down in (0, 1):
             column, row = first[:, 0] + right, first[:, 1] + down
             across = share[:, 0] if right else 1 - share[:, 0]
             along = share[:, 1] if down else 1 - share[:, 1]
             value = value + across * along * inverse[row, column]
-            known = known & usable[row, column]
+            valid = valid & usable[row, column]
     error = jnp.minimum(jnp.abs(value * z - 1), reach)
-    return error, known
+    return error, valid

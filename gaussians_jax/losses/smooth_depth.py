@@ -50,15 +50,15 @@ def curvature(
       The mean over all pixels, in units of the inverse of `depth`. Differences that
       touch a pixel with an opacity below `OPAQUE` count as zero.
     """
-    known = (alpha >= OPAQUE) & (depth > 0)
-    inverse = jnp.where(known, 1 / jnp.where(known, depth, 1), 0)
+    valid = (alpha >= OPAQUE) & (depth > 0)
+    inverse = jnp.where(valid, 1 / jnp.where(valid, depth, 1), 0)
 
-    def along(values, known):
+    def along(values, valid):
         bend = values[2:] - 2 * values[1:-1] + values[:-2]
-        valid = known[2:] & known[1:-1] & known[:-2]
-        return jnp.sum(jnp.where(valid, jnp.abs(bend), 0))
+        all_valid = valid[2:] & valid[1:-1] & valid[:-2]
+        return jnp.sum(jnp.where(all_valid, jnp.abs(bend), 0))
 
-    total = along(inverse, known) + along(inverse.T, known.T)
+    total = along(inverse, valid) + along(inverse.T, valid.T)
     return total / depth.size
 
 

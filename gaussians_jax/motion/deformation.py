@@ -54,12 +54,12 @@ def deform(
     Returns:
       The Gaussians, or their children.
     """
-    moved = deform_rows(effects, params, prepared, time)
+    result = deform_rows(effects, params, prepared, time)
     derivation = _derivation(effects)
     if derivation is None:
-        return moved
+        return result
     derive_rows, derive = derivation
-    return derive(params, derive_rows(params, None), moved, FrameCondition(time))
+    return derive(params, derive_rows(params, None), result, FrameCondition(time))
 
 
 def deform_rows(

@@ -103,14 +103,14 @@ def traveled(state: Travel, canonical: Gaussians, moved: Gaussians) -> Travel:
       The bounding boxes with the added positions.
     """
     displacement = moved.mean - canonical.mean
-    known = jnp.all(jnp.isfinite(displacement), axis=1)
+    finite = jnp.all(jnp.isfinite(displacement), axis=1)
     # The opacity of an inactive Gaussian is exactly zero.
-    common = common_motion(displacement, known & (canonical.opacity > 0))
+    common = common_motion(displacement, finite & (canonical.opacity > 0))
     relative = displacement - common
-    known = known[:, None]
+    finite = finite[:, None]
     return Travel(
-        jnp.where(known, jnp.minimum(state.low, relative), state.low),
-        jnp.where(known, jnp.maximum(state.high, relative), state.high),
+        jnp.where(finite, jnp.minimum(state.low, relative), state.low),
+        jnp.where(finite, jnp.maximum(state.high, relative), state.high),
     )
 
 

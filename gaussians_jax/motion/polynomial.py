@@ -154,14 +154,14 @@ def fit_to_paths(spec: PolynomialMotionSpec, paths: Paths) -> Guess:
     """
     since = paths.times.astype(float) - 0.5
     powers = since[:, None] ** range(spec.degree + 1)
-    fitted = jnp.asarray(motion_fit.combination(powers, paths), jnp.float32)
-    count = len(fitted)
+    coefficients = jnp.asarray(motion_fit.combination(powers, paths), jnp.float32)
+    count = len(coefficients)
     fading = rate = None
     if spec.fading is not None:
         fading = temporal_opacity.always(count, jnp.float32)
         rate = 0.0
-    rows = Polynomials(fitted[:, 1:], jnp.zeros((count, 3), jnp.float32), fading)
-    points = motion_fit.Points(fitted[:, 0], rows, None)
+    rows = Polynomials(coefficients[:, 1:], jnp.zeros((count, 3), jnp.float32), fading)
+    points = motion_fit.Points(coefficients[:, 0], rows, None)
     rates = Polynomials._make((paths.unit, 0.0, rate))
     return Guess(points, motion_fit.Points._make((paths.unit, rates, None, None)))
 

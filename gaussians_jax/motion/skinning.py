@@ -266,13 +266,13 @@ def farthest_points(
     if not len(points) or count < 1:
         return np.zeros(0, int)
     offset = points - points.mean(axis=0)
-    chosen = [int(np.argmax(np.sum(offset * offset, axis=1)))]
+    selection = [int(np.argmax(np.sum(offset * offset, axis=1)))]
     distance_sq = np.full(len(points), np.inf)
-    while len(chosen) < count:
-        offset = points - points[chosen[-1]]
+    while len(selection) < count:
+        offset = points - points[selection[-1]]
         distance_sq = np.minimum(distance_sq, np.sum(offset * offset, axis=1))
         farthest = int(np.argmax(distance_sq))
         if distance_sq[farthest] == 0:
             break
-        chosen.append(farthest)
-    return np.array(chosen)
+        selection.append(farthest)
+    return np.array(selection)

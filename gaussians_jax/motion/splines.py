@@ -111,9 +111,9 @@ def fit_to_paths(spec: SplineMotionSpec, paths: Paths) -> Guess:
     weights = np.stack(
         [time_knots.spline_weights(spec.knots, jnp.asarray(t)) for t in paths.times]
     )
-    fitted = motion_fit.combination(weights, paths)
-    mean = fitted.mean(axis=1)
-    shift = jnp.asarray(fitted - mean[:, None], jnp.float32)
+    coefficients = motion_fit.combination(weights, paths)
+    mean = coefficients.mean(axis=1)
+    shift = jnp.asarray(coefficients - mean[:, None], jnp.float32)
     rows = Splines(shift, jnp.zeros_like(shift))
     points = Points(jnp.asarray(mean, jnp.float32), rows, None)
     rates = Points._make((paths.unit, Splines._make((paths.unit, 0.0)), None, None))

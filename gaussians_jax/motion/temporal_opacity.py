@@ -100,11 +100,11 @@ def always(gaussians: int, dtype) -> Fading:
 def _around(
     spec: TemporalOpacitySpec,
     time: Float[np.ndarray, " gaussians"],
-    followed: Float[np.ndarray, " gaussians"],
+    visibility: Float[np.ndarray, " gaussians"],
 ) -> Fading:
     """Initialize visibility around a time, as long as nearby tracks, on the host."""
     least = math.exp(LOG_WIDTH_RANGE[0])
-    width = np.log(np.maximum(spec.width * followed, least))
+    width = np.log(np.maximum(spec.width * visibility, least))
     return Fading._make((time, width))
 
 

@@ -280,28 +280,28 @@ def _plan(rows, stats, spec, step, extent):
     finite, opacity, scale = map(np.asarray, row_summary(rows))
     score = stats.grad2d / np.maximum(stats.views, 1)
 
-    kept = stats.active & finite & (opacity >= spec.prune_opa)
-    grows = kept & (score >= spec.grow_grad2d)
+    keeps = stats.active & finite & (opacity >= spec.prune_opa)
+    grows = keeps & (score >= spec.grow_grad2d)
     splits = grows & (scale > spec.grow_scale3d * extent)
-    large = np.zeros_like(kept)
+    large = np.zeros_like(keeps)
     if step > spec.reset_every:
         bound = spec.prune_scale3d * extent
         large = scale > bound
         if spec.prune_radius_px is not None:
             large |= stats.radius_px > spec.prune_radius_px
-        kept &= np.where(splits, scale / spec.shrink <= bound, ~large)
-    grows &= kept
-    free_slots = max(spec.cap_max - int(kept.sum()), 0)
+        keeps &= np.where(splits, scale / spec.shrink <= bound, ~large)
+    grows &= keeps
+    free_slots = max(spec.cap_max - int(keeps.sum()), 0)
     candidates = np.flatnonzero(grows)
     best = candidates[np.argsort(-score[candidates], kind="stable")][:free_slots]
-    chosen = np.zeros_like(grows)
-    chosen[best] = True
-    splits &= chosen
-    kept &= splits | ~large  # large ones that the cap prevents from splitting stay
+    selection = np.zeros_like(grows)
+    selection[best] = True
+    splits &= selection
+    keeps &= splits | ~large  # large ones that the cap prevents from splitting stay
 
-    clones = np.flatnonzero(chosen & ~splits)
+    clones = np.flatnonzero(selection & ~splits)
     parents = np.flatnonzero(splits)
-    unchanged = np.flatnonzero(kept & ~splits)
+    unchanged = np.flatnonzero(keeps & ~splits)
     source = np.concatenate([unchanged, clones, np.repeat(parents, 2)])
     kind = np.concatenate(
         [
@@ -314,7 +314,7 @@ def _plan(rows, stats, spec, step, extent):
     report = Report(
         cloned=len(clones),
         split=len(parents),
-        pruned=int((stats.active & ~kept).sum()) - broken,
+        pruned=int((stats.active & ~keeps).sum()) - broken,
         broken=broken,
         refused=len(candidates) - len(best),
     )

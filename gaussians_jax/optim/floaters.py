@@ -65,10 +65,10 @@ def find(
     floating = inside.sum(axis=0) < spec.views
     if spec.near is not None:
         opacity = np.asarray(splats.activate(rows).opacity)
-        for own_depth, own in zip(depth, inside, strict=True):
-            if own.any():
-                subject = _weighted_median(own_depth[own], opacity[own])
-                floating |= own & (own_depth < spec.near * subject)
+        for own_depth, in_view in zip(depth, inside, strict=True):
+            if in_view.any():
+                subject = _weighted_median(own_depth[in_view], opacity[in_view])
+                floating |= in_view & (own_depth < spec.near * subject)
     return floating & active
 
 

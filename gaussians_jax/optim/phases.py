@@ -155,11 +155,13 @@ def stop_frozen_gradients(
       A function with the same values, whose gradients are zero for frozen networks.
     """
 
-    def frozen(params, *rest):
-        return function(params._replace(nets=jax.lax.stop_gradient(params.nets)), *rest)
+    def frozen(params, *others):
+        return function(
+            params._replace(nets=jax.lax.stop_gradient(params.nets)), *others
+        )
 
-    def either(params, *rest):
-        return jax.lax.cond(mask.nets, function, frozen, params, *rest)
+    def either(params, *others):
+        return jax.lax.cond(mask.nets, function, frozen, params, *others)
 
     return either
 

@@ -194,8 +194,8 @@ def network_change(
     hidden = _hidden(spec, code.shape[0])
     layers = mlp.with_known(hidden, mlp.MLP(params.hidden, {}), code)
     inputs = jnp.concatenate([features, colors], axis=1)
-    known = dataclasses.replace(hidden, inputs=inputs.shape[1])
-    activations = mlp.hidden_features(known, layers, inputs)
+    reduced_spec = dataclasses.replace(hidden, inputs=inputs.shape[1])
+    activations = mlp.hidden_features(reduced_spec, layers, inputs)
     weight = dense.product(code, params.gate)[:, None] * params.out
     return dense.product(activations, weight)
 

@@ -86,7 +86,7 @@ def usable(spec, effects) -> bool:
 def survey(
     bound: Bound,
     condition: FrameCondition,
-    shown: occupancy.Cells | None = None,
+    visible: occupancy.Cells | None = None,
 ) -> Occupancy:
     """Find the occupied cells of each level at the time of one frame.
 
@@ -97,25 +97,24 @@ def survey(
     Args:
       bound: The field with its parameters.
       condition: Conditioning of the frame.
-      shown: Visible cells. Cells that are neither visible nor adjacent to a visible
-      cell
-        are not evaluated and count as occupied. None for all cells.
+      visible: Visible cells. Cells that are neither visible nor adjacent to a visible
+        cell are not evaluated and count as occupied. None for all cells.
 
     Returns:
       Occupied cells by level.
     """
     spec, metadata = bound.spec, bound.metadata
     cells = _cells_across(bound)
-    asked = jnp.ones(cells**3, bool)
-    if shown is not None:
-        asked = occupancy.dilated(shown).ravel()
+    to_evaluate = jnp.ones(cells**3, bool)
+    if visible is not None:
+        to_evaluate = occupancy.dilated(visible).ravel()
     span = (metadata.far - metadata.near) * metadata.scale
     names = tuple(bound.params["template"])
     dtype = jax.tree.leaves(bound.params["template"])[0].dtype
     direction = jnp.zeros(3, dtype).at[2].set(1)  # density does not depend on it
     offset = {n: color_offset(bound, n, direction, condition) for n in names}
 
-    def look(found, number):
+    def add_look(occupied, number):
         key = jax.random.fold_in(jax.random.key(0), number)
 
         def densities(point):
@@ -127,21 +126,21 @@ def survey(
 
         index = jnp.arange(cells**3, dtype=jnp.int32)
         point = occupancy.random_points(key, index, cells, spec.extent, dtype)
-        seen = _compacted(lambda cell: jax.vmap(densities)(point[cell]), asked)
-        filled = {name: new * span > SKIPPED_DEPTH for name, new in seen.items()}
+        density = _compacted(lambda cell: jax.vmap(densities)(point[cell]), to_evaluate)
+        above = {name: new * span > SKIPPED_DEPTH for name, new in density.items()}
         if guided:
-            most = functools.reduce(jnp.maximum, seen.values())
-            filled[GUIDE] = most * span > GUIDE_DEPTH
-        return jax.tree.map(jnp.logical_or, found, filled), None
+            most = functools.reduce(jnp.maximum, density.values())
+            above[GUIDE] = most * span > GUIDE_DEPTH
+        return jax.tree.map(jnp.logical_or, occupied, above), None
 
     guided = spec.sampling.occupancy is not None
     kinds = (*names, GUIDE) if guided else names
     start = {name: jnp.zeros(cells**3, bool) for name in kinds}
-    found, _ = jax.lax.scan(look, start, jnp.arange(LOOKS, dtype=jnp.int32))
+    occupancy_of, _ = jax.lax.scan(add_look, start, jnp.arange(LOOKS, dtype=jnp.int32))
     whole = (cells,) * 3
     return {
-        name: occupancy.dilated(occupied.reshape(whole)) | ~asked.reshape(whole)
-        for name, occupied in found.items()
+        name: occupancy.dilated(occupied.reshape(whole)) | ~to_evaluate.reshape(whole)
+        for name, occupied in occupancy_of.items()
     }
 
 
@@ -167,23 +166,23 @@ def shown_cells(bound: Bound, camera: Camera, size: tuple[int, int]) -> occupanc
     metadata, dtype = bound.metadata, camera.position.dtype
     assert bound.spec.extent is not None  # of the cells
 
-    def seen(direction):
+    def in_camera(direction):
         return exact_einsum("ij,...j->...i", camera.camera_from_world, direction)
 
     centers = rays.pixel_centers(size, dtype)
     border = jnp.concatenate([centers[0], centers[-1], centers[:, 0], centers[:, -1]])
-    ray = seen(jax.vmap(lambda at: rays.pixel_ray(camera, at).direction)(border))
-    slope = ray[:, :2] / ray[:, 2:]
+    ray = in_camera(jax.vmap(lambda at: rays.pixel_ray(camera, at).direction)(border))
+    ratio = ray[:, :2] / ray[:, 2:]
     corner = occupancy.corners(_cells_across(bound), bound.spec.extent, dtype)
     world = corner / metadata.scale + jnp.asarray(metadata.center, dtype)
-    place = seen(world - camera.position)
+    place = in_camera(world - camera.position)
     lateral, depth = place[..., :2], place[..., 2:]
     beyond = jnp.concatenate(
         [
             depth < metadata.near,
             depth > metadata.far,
-            lateral < slope.min(0) * depth,
-            lateral > slope.max(0) * depth,
+            lateral < ratio.min(0) * depth,
+            lateral > ratio.max(0) * depth,
         ],
         axis=-1,
     )
@@ -223,18 +222,18 @@ def draw(
     if frustum_grid.resolves(bound):
         grid = frustum_grid.displacements(bound, camera, condition, size)
 
-    def part(position):
+    def render_block(position):
         columns = None
         if grid is not None:
             columns = jax.vmap(lambda at: frustum_grid.column(grid, at, size))(position)
         return _block(bound, occupied, camera, condition, position, columns)
 
-    drawn = jax.lax.map(part, centers.reshape(blocks, block, 2))
+    renderings = jax.lax.map(render_block, centers.reshape(blocks, block, 2))
     return jax.tree.map(
         lambda x: x.reshape(-1, *x.shape[2:])[:pixels].reshape(
             height, width, *x.shape[2:]
         ),
-        drawn,
+        renderings,
     )
 
 
@@ -253,67 +252,78 @@ def _block(bound, occupied, camera, condition, position, columns):
             end = jnp.maximum(far - distance[-1], 0)
         return compositing.intervals(distance, end)
 
-    def ask(name, distance, values, before=None):
+    def evaluate(name, distance, values, before=None):
         spacing = jax.vmap(spacing_of)(distance, ray.far)
-        moved = None
+        displacement = None
         if columns is not None:
-            moved = jax.vmap(frustum_grid.along)(columns, ray, distance)
-        seen = name, occupied[name], ray, condition
-        answer, asked = _ask(bound, *seen, distance, spacing, values, before, moved)
-        return answer[..., 0] * spacing, answer[..., 1:], asked
+            displacement = jax.vmap(frustum_grid.along)(columns, ray, distance)
+        inputs = name, occupied[name], ray, condition
+        answer, evaluated = _evaluate(
+            bound, *inputs, distance, spacing, values, before, displacement
+        )
+        return answer[..., 0] * spacing, answer[..., 1:], evaluated
 
     before = None
     if plan.fine:
-        depth, _, asked = ask("fine" if plan.shared else "coarse", distance, 1)
+        depth, _, evaluated = evaluate("fine" if plan.shared else "coarse", distance, 1)
 
-        def refined(distance, depth, asked):
+        def refined(distance, depth, evaluated):
             weights = compositing.weights(depth)
-            drawn = sampling.refine(None, distance, weights, plan.fine)
-            every = fine_distances(bound.spec, bound.metadata, distance, drawn)
-            if asked is None or not plan.union:
-                return every, None
-            place = sampling.merged_places(distance, drawn)[: plan.coarse]
+            fine = sampling.refine(None, distance, weights, plan.fine)
+            merged = fine_distances(bound.spec, bound.metadata, distance, fine)
+            if evaluated is None or not plan.union:
+                return merged, None
+            place = sampling.merged_places(distance, fine)[: plan.coarse]
 
-            def among(x):
-                return jnp.zeros((len(every), *x.shape[1:]), x.dtype).at[place].set(x)
+            def scatter(x):
+                return jnp.zeros((len(merged), *x.shape[1:]), x.dtype).at[place].set(x)
 
-            return every, jax.tree.map(among, asked)
+            return merged, jax.tree.map(scatter, evaluated)
 
-        distance, before = jax.vmap(refined)(distance, depth, asked)
-    depth, color, _ = ask("fine", distance, 4, before)
+        distance, before = jax.vmap(refined)(distance, depth, evaluated)
+    depth, color, _ = evaluate("fine", distance, 4, before)
     background = None if behind is None else jnp.asarray(behind, distance.dtype)
-    whole = jax.vmap(
+    composite = jax.vmap(
         lambda depth, color, distance: compositing.composite(
             compositing.weights(depth), color, distance, background
         )
     )(depth, color, distance)
-    z_depth = whole.distance * cosine / bound.metadata.scale
-    return Rendering(whole.color, whole.alpha, z_depth)
+    z_depth = composite.distance * cosine / bound.metadata.scale
+    return Rendering(composite.color, composite.alpha, z_depth)
 
 
-class _Asked(NamedTuple):
+class _Evaluated(NamedTuple):
     """Coordinates at which the template was evaluated, zero for skipped samples."""
 
     known: Bool[Array, "rays samples"]
     place: tuple[Float[Array, "rays samples 3"], tuple[Array, ...]]
 
 
-def _ask(
-    bound, name, occupied, ray, condition, distance, spacing, values, before, moved
+def _evaluate(
+    bound,
+    name,
+    occupied,
+    ray,
+    condition,
+    distance,
+    spacing,
+    values,
+    before,
+    displacement,
 ):
     """Evaluate density, or density and color, [rays, samples, values], zero if skipped.
 
-    `moved` are the displacements of all samples, if they are on a grid. Otherwise the
-    template coordinates of the samples `before` are reused. Without `before` the
-    coordinates computed here are returned as well.
+    `displacement` has the displacements of all samples, if they are on a grid.
+    Otherwise the template coordinates of the samples `before` are reused. Without
+    `before` the coordinates computed here are returned as well.
     """
     count, samples = distance.shape
     point = ray.origin[:, None] + distance[..., None] * ray.direction[:, None]
-    if moved is not None:
-        point = point + moved
-    wanted = occupancy.at(occupied, point, bound.spec.extent)
+    if displacement is not None:
+        point = point + displacement
+    mask = occupancy.at(occupied, point, bound.spec.extent)
     if bound.metadata.background is None:
-        wanted = wanted.at[:, -1].set(True)  # it represents everything behind it
+        mask = mask.at[:, -1].set(True)  # it represents everything behind it
     offset = jax.vmap(lambda d: color_offset(bound, name, d, condition))(ray.direction)
     width = -(-samples // STAGES)  # samples of a stage
 
@@ -326,75 +336,78 @@ def _ask(
         x = jnp.moveaxis(x.reshape(STAGES, count, width, *x.shape[2:]), 0, 1)
         return x.reshape(count, STAGES * width, *x.shape[3:])[:, :samples]
 
-    def said(index, place):
+    def values_at(index, place):
         radiance = radiance_at(bound, name, place, offset[index // width], condition)
-        every = jnp.concatenate([radiance.density[None], radiance.color])
-        return every[:values]
+        outputs = jnp.concatenate([radiance.density[None], radiance.color])
+        return outputs[:values]
 
-    def stage(passed, given):
-        spacing, wanted, distance, before, moved = given
-        wanted = wanted & (passed < OPAQUE_DEPTH)[:, None]
-        wanted, distance, before, moved = jax.tree.map(
-            lambda x: x.reshape(-1, *x.shape[2:]), (wanted, distance, before, moved)
+    def stage(passed_depth, inputs):
+        spacing, mask, distance, before, displacement = inputs
+        mask = mask & (passed_depth < OPAQUE_DEPTH)[:, None]
+        mask, distance, before, displacement = jax.tree.map(
+            lambda x: x.reshape(-1, *x.shape[2:]),
+            (mask, distance, before, displacement),
         )
 
         def place_of(index):
             row = index // width
             at = rays.point_at(ray.origin[row], ray.direction[row], distance[index])
-            if moved is None:
+            if displacement is None:
                 return template_coordinates(bound, at, condition)
-            return at + moved[index], ()
+            return at + displacement[index], ()
 
         if before is None:
-            kept = moved is None and is_moved(bound.effects)
+            is_kept = displacement is None and is_moved(bound.effects)
 
-            def anew(index):
+            def evaluate_new(index):
                 place = place_of(index)
-                return said(index, place), place if kept else None
+                return values_at(index, place), place if is_kept else None
 
-            answer, place = _compacted(jax.vmap(anew), wanted)
-            asked = _Asked(wanted, place) if kept else None
+            answer, place = _compacted(jax.vmap(evaluate_new), mask)
+            evaluated = _Evaluated(mask, place) if is_kept else None
         else:
-            more = _compacted(jax.vmap(place_of), wanted & ~before.known)
-            place = jax.tree.map(jnp.add, before.place, more)  # one of both is zero
+            more = _compacted(jax.vmap(place_of), mask & ~before.known)
+            place = jax.tree.map(jnp.add, before.place, more)  # one of them is zero
 
-            def again(index):
-                return said(index, jax.tree.map(lambda x: x[index], place))
+            def evaluate_known(index):
+                return values_at(index, jax.tree.map(lambda x: x[index], place))
 
-            answer, asked = _compacted(jax.vmap(again), wanted), None
+            answer, evaluated = _compacted(jax.vmap(evaluate_known), mask), None
         depth = answer[:, 0].reshape(spacing.shape) * spacing
-        return passed + jnp.sum(depth, axis=1), (answer, asked)
+        return passed_depth + jnp.sum(depth, axis=1), (answer, evaluated)
 
-    given = jax.tree.map(staged, (spacing, wanted, distance, before, moved))
-    _, found = jax.lax.scan(stage, jnp.zeros(count, distance.dtype), given)
-    return jax.tree.map(whole, found)
+    inputs = jax.tree.map(staged, (spacing, mask, distance, before, displacement))
+    _, results = jax.lax.scan(stage, jnp.zeros(count, distance.dtype), inputs)
+    return jax.tree.map(whole, results)
 
 
 def _compacted(
-    ask: Callable[[Int[Array, " batch"]], PyTree], wanted: Bool[Array, " places"]
+    function: Callable[[Int[Array, " batch"]], PyTree], mask: Bool[Array, " places"]
 ) -> PyTree:
     """Evaluate a function at a subset of indices, batch by batch."""
-    places = wanted.shape[0]
-    order = jnp.cumsum(wanted, dtype=jnp.int32)
+    places = mask.shape[0]
+    order = jnp.cumsum(mask, dtype=jnp.int32)
     rows = math.ceil(places / BATCH) * BATCH
-    slot = jnp.where(wanted, order - 1, rows)
+    slot = jnp.where(mask, order - 1, rows)
     listed = jnp.zeros(rows, jnp.int32)
     listed = listed.at[slot].set(jnp.arange(places, dtype=jnp.int32), mode="drop")
 
-    def more(state):
+    def unfinished(state):
         return state[0] * BATCH < order[-1]
 
     def batch(state):
         number, answers = state
         start = number * BATCH
         place = jax.lax.dynamic_slice(listed, (start,), (BATCH,))
-        given = start + jnp.arange(BATCH, dtype=jnp.int32) < order[-1]
-        row = jnp.where(given, place, places)
+        valid = start + jnp.arange(BATCH, dtype=jnp.int32) < order[-1]
+        row = jnp.where(valid, place, places)
         answers = jax.tree.map(
-            lambda all_, some: all_.at[row].set(some, mode="drop"), answers, ask(place)
+            lambda all_, some: all_.at[row].set(some, mode="drop"),
+            answers,
+            function(place),
         )
         return number + 1, answers
 
-    one = jax.eval_shape(ask, jnp.zeros(BATCH, jnp.int32))
-    start = jax.tree.map(lambda x: jnp.zeros((places, *x.shape[1:]), x.dtype), one)
-    return jax.lax.while_loop(more, batch, (jnp.zeros((), jnp.int32), start))[1]
+    shapes = jax.eval_shape(function, jnp.zeros(BATCH, jnp.int32))
+    start = jax.tree.map(lambda x: jnp.zeros((places, *x.shape[1:]), x.dtype), shapes)
+    return jax.lax.while_loop(unfinished, batch, (jnp.zeros((), jnp.int32), start))[1]

@@ -126,12 +126,12 @@ def fit(
 
     def loss(free, key):
         key, direction_key = jax.random.split(key)
-        return sum(distances(*free, *_drawn(paths, frames, key), direction_key))
+        return sum(distances(*free, *_sample(paths, frames, key), direction_key))
 
     def mean_distance(free, key):
         nothing = jnp.zeros((0, 3), paths.position.dtype)
-        every = jnp.arange(frames), jnp.arange(points)
-        return distances(*free, *every, nothing, key)[0]
+        all_indices = jnp.arange(frames), jnp.arange(points)
+        return distances(*free, *all_indices, nothing, key)[0]
 
     names = {effect.name for effect in field.effects if effect.displace is not None}
     names &= params.keys()  # effects from other packages may have no parameters
@@ -139,11 +139,11 @@ def fit(
         {name: params[name] for name in (*sorted(names), "codes")},
         jnp.asarray(_first_places(paths)),
     )
-    fitted = descended(loss, free, start.fit_rate, key, start.fit_steps)
+    solution = descended(loss, free, start.fit_rate, key, start.fit_steps)
     separate, captured = programs.with_captured(mean_distance, free, key)
     distance_of = jax.jit(separate)
-    first, last = (float(distance_of(captured, x, key)) for x in (free, fitted))
-    return WarpFit(params | fitted[0], fitted[1], first, last)
+    first, last = (float(distance_of(captured, x, key)) for x in (free, solution))
+    return WarpFit(params | solution[0], solution[1], first, last)
 
 
 def fit_flow(
@@ -173,37 +173,37 @@ def fit_flow(
       ValueError: If no point is known in two consecutive frames.
     """
     apart = np.diff(paths.time)
-    both = paths.known[:, 1:] & paths.known[:, :-1] & (apart > 0)
-    if not both.any():
+    valid = paths.known[:, 1:] & paths.known[:, :-1] & (apart > 0)
+    if not valid.any():
         raise ValueError(
             "no path is known in two frames that follow each other: nothing to fit a "
             "scene flow to"
         )
-    moments = np.where(apart > 0, apart, 1)
-    moments = moments / timestamps.interval(len(field.metadata.times))
-    shift = np.diff(paths.position, axis=1) / moments[:, None]
-    unit = max(float(np.linalg.norm(shift, axis=-1)[both].mean()), 1e-12)
+    intervals = np.where(apart > 0, apart, 1)
+    intervals = intervals / timestamps.interval(len(field.metadata.times))
+    shift = np.diff(paths.position, axis=1) / intervals[:, None]
+    unit = max(float(np.linalg.norm(shift, axis=-1)[valid].mean()), 1e-12)
     unit = jax.device_put(np.asarray(unit, shift.dtype))  # captured, not a constant
-    away = _flow_distances(field, paths, shift, both)
-    frames, points = len(moments), len(paths.known)
+    errors = _flow_distances(field, paths, shift, valid)
+    frames, points = len(intervals), len(paths.known)
 
-    def loss(own, key):
-        drawn = _drawn(paths, frames, key)
-        return sum(away(own, *drawn, SOFT_FLOW * unit)) / unit
+    def loss(medium, key):
+        sample = _sample(paths, frames, key)
+        return sum(errors(medium, *sample, SOFT_FLOW * unit)) / unit
 
-    def mean_distance(own):
+    def mean_distance(medium):
         nothing = jnp.zeros((0, 3), paths.position.dtype)
-        return away(own, jnp.arange(frames), jnp.arange(points), nothing, 0.0)[0]
+        return errors(medium, jnp.arange(frames), jnp.arange(points), nothing, 0.0)[0]
 
-    own = params[scene_flow.NAME]
-    fitted = descended(loss, own, start.fit_rate, key, start.fit_steps)
-    separate, captured = programs.with_captured(mean_distance, own)
+    medium = params[scene_flow.NAME]
+    solution = descended(loss, medium, start.fit_rate, key, start.fit_steps)
+    separate, captured = programs.with_captured(mean_distance, medium)
     distance_of = jax.jit(separate)
-    first, last = (float(distance_of(captured, x)) for x in (own, fitted))
-    return FlowFit(params | {scene_flow.NAME: fitted}, first, last)
+    first, last = (float(distance_of(captured, x)) for x in (medium, solution))
+    return FlowFit(params | {scene_flow.NAME: solution}, first, last)
 
 
-def _flow_distances(field, paths, shift, both):
+def _flow_distances(field, paths, shift, valid):
     """Return a function of (medium, frames, rows, static points, soft).
 
     It computes the mean error of the flow of the rows, to the next timestamp and back,
@@ -212,27 +212,29 @@ def _flow_distances(field, paths, shift, both):
     """
     spec, time = field.spec.scene_flow, jnp.asarray(paths.time)
     position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
-    target = jnp.asarray(np.moveaxis(np.where(both[..., None], shift, 0), 1, 0))
-    weight = jnp.asarray(both.T, position.dtype)
+    target = jnp.asarray(np.moveaxis(np.where(valid[..., None], shift, 0), 1, 0))
+    weight = jnp.asarray(valid.T, position.dtype)
 
-    def away(own, frames, rows, still, soft):
+    def errors(medium, frames, rows, static, soft):
         @functools.partial(jax.vmap, in_axes=(0, None))
         def flow(point, time):
             return scene_flow.dynamic(
-                spec, own, point, jnp.zeros_like(point), time
+                spec, medium, point, jnp.zeros_like(point), time
             ).flow
 
-        def one(frame):
-            there = frame + 1
+        def frame_errors(frame):
+            following = frame + 1
             ahead = flow(position[frame][rows], time[frame])[:, scene_flow.FORWARD]
-            back = flow(position[there][rows], time[there])[:, scene_flow.BACKWARD]
+            back = flow(position[following][rows], time[following])[
+                :, scene_flow.BACKWARD
+            ]
             goal = target[frame][rows]
             moving = (_length(ahead - goal, soft) + _length(back + goal, soft)) / 2
-            return moving, _length(flow(still, time[frame]), soft)
+            return moving, _length(flow(static, time[frame]), soft)
 
-        return _means(*jax.vmap(one)(frames), weight[frames][:, rows])
+        return _means(*jax.vmap(frame_errors)(frames), weight[frames][:, rows])
 
-    return away
+    return errors
 
 
 def _distances(field, params, paths):
@@ -247,26 +249,26 @@ def _distances(field, params, paths):
     time, appearance = jnp.asarray(paths.time), jnp.asarray(paths.appearance)
     trained = jnp.asarray(field.spec.steps)  # all bands of the warp are open
 
-    def distances(own, canonical, frames, rows, still, key):
-        def one(frame, key):
+    def distances(changed, canonical, frames, rows, static, key):
+        def frame_distances(frame, key):
             view = View(None, time[frame], appearance[frame])
-            codes = field.codes_at(params | own, view)
+            codes = field.codes_at(params | changed, view)
             condition = FrameCondition(view.time, codes, trained)
 
             def warped(point):
-                return point + field.displace(params | own, point, condition)
+                return point + field.displace(params | changed, point, condition)
 
             def along(point, direction):
                 return jax.jvp(warped, (point,), (direction,))
 
-            here = position[frame][rows]
-            place, stretched = jax.vmap(along)(here, _directions(key, here))
+            observed = position[frame][rows]
+            place, stretched = jax.vmap(along)(observed, _directions(key, observed))
             # Computed from the square, since a norm has no gradient at zero.
             stretch = jnp.log(jnp.sum(stretched**2, axis=-1) + LEAST_STRETCH) / 2
-            gap, rest = place - canonical[rows], jax.vmap(warped)(still) - still
-            return _length(gap), _length(rest), stretch**2
+            gap, static_gap = place - canonical[rows], jax.vmap(warped)(static) - static
+            return _length(gap), _length(static_gap), stretch**2
 
-        moving, resting, stretch = jax.vmap(one)(
+        moving, resting, stretch = jax.vmap(frame_distances)(
             frames, jax.random.split(key, len(frames))
         )
         counted = weight[frames][:, rows]
@@ -278,24 +280,24 @@ def _distances(field, params, paths):
 
 def _directions(key, like):
     """Sample a uniformly distributed unit vector for each point."""
-    drawn = jax.random.normal(key, like.shape, like.dtype)
-    return drawn / jnp.linalg.norm(drawn, axis=-1, keepdims=True)
+    normal = jax.random.normal(key, like.shape, like.dtype)
+    return normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
 
 
 def _length(gap, soft=SOFT):
     return jnp.sqrt(jnp.sum(gap**2, axis=-1) + soft**2)
 
 
-def _drawn(paths, frames, key):
+def _sample(paths, frames, key):
     """Sample frames, rows of points and static points for a step."""
     frame_key, row_key, still_key = jax.random.split(key, 3)
     together = min(FRAMES_AT_ONCE, frames)
-    chosen = jax.random.choice(frame_key, frames, (together,), replace=False)
+    frame = jax.random.choice(frame_key, frames, (together,), replace=False)
     rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, len(paths.known))
-    still = jnp.asarray(paths.still)
-    if len(still):
-        still = still[jax.random.randint(still_key, (STILL_AT_ONCE,), 0, len(still))]
-    return chosen, rows, still
+    static = jnp.asarray(paths.still)
+    if len(static):
+        static = static[jax.random.randint(still_key, (STILL_AT_ONCE,), 0, len(static))]
+    return frame, rows, static
 
 
 def _means(moving, resting, counted):
@@ -311,6 +313,6 @@ def _first_places(paths):
     """Return the position of each point in the middle of its known times."""
     places = np.zeros((len(paths.known), 3), np.float32)
     for row, known in enumerate(paths.known):
-        seen = np.flatnonzero(known)
-        places[row] = paths.position[row, seen[len(seen) // 2]]
+        frames = np.flatnonzero(known)
+        places[row] = paths.position[row, frames[len(frames) // 2]]
     return places

@@ -60,17 +60,17 @@ def follow(
             return FrameCondition(view.time, field.codes_at(params, view), step)
 
         conditions = jax.vmap(condition_of)(views)
-        followed = tracks.point_tracks(
+        result = tracks.point_tracks(
             field.displace, params, start, conditions, known.start
         )
         each = jax.vmap(field.displace, (None, 0, None))  # point
-        moved = jax.vmap(each, (None, None, 0))(params, static, conditions)
+        shift = jax.vmap(each, (None, None, 0))(params, static, conditions)
         grad = jax.vmap(jax.jacfwd(field.displace, 1), (None, 0, None))
         grads = jax.vmap(grad, (None, 1, 0))(params, true, conditions)
-        apart = jnp.linalg.norm(moved - jnp.mean(moved, axis=0), axis=-1)
-        return followed, apart, grads
+        apart = jnp.linalg.norm(shift - jnp.mean(shift, axis=0), axis=-1)
+        return result, apart, grads
 
-    followed, apart, grads = jax.device_get(
+    result, apart, grads = jax.device_get(
         programs.Program(solve, field)(
             state.params,
             state.step,
@@ -80,14 +80,14 @@ def follow(
             to_field(static),
         )
     )
-    path = followed.points / np.float32(metadata.scale) + center
+    path = result.points / np.float32(metadata.scale) + center
     still_path = known.start_points[:, None]
-    path = np.where(followed.converged[..., None], path, still_path)
+    path = np.where(result.converged[..., None], path, still_path)
     stretch = np.linalg.svd(np.eye(3) + grads.astype(float), compute_uv=False)
     strain = np.log(np.maximum(stretch, LEAST_STRETCH))
     return PointTracks(
         path=path.astype(np.float32),
-        found=followed.converged,
+        found=result.converged,
         drift=float(apart.mean() / metadata.scale) if apart.size else float("nan"),
         strain=float(np.sqrt(np.mean(np.sum(strain**2, axis=-1)))),
     )
@@ -110,17 +110,21 @@ def _follow_flow(field, state, capture, known):
     places = {known.start: Moved(begin, np.ones(len(begin), bool))}
     last = len(views) - 1
     for step, stop in ((1, last), (-1, 0)):
-        for here in range(known.start, stop, step):
-            before, there = places[here], here + step
-            moved = move(state, before.points, views[here], views[there])
-            places[there] = Moved(moved.points, before.found & moved.found)
+        for frame in range(known.start, stop, step):
+            before, following = places[frame], frame + step
+            step_result = move(state, before.points, views[frame], views[following])
+            places[following] = Moved(
+                step_result.points, before.found & step_result.found
+            )
     count = len(known.path)
     path, found = (
         np.stack(each, axis=1)
         for each in zip(*(places[k] for k in range(len(views))), strict=True)
     )
-    still = path[count:]
-    apart = np.linalg.norm(still - still.mean(axis=1, keepdims=True), axis=-1)
+    static_path = path[count:]
+    apart = np.linalg.norm(
+        static_path - static_path.mean(axis=1, keepdims=True), axis=-1
+    )
     lost = ~found[:count, :, None]
     return PointTracks(
         path=np.where(lost, known.start_points[:, None], path[:count]).astype("f4"),
@@ -160,8 +164,8 @@ def _flow_mover(field) -> Move | None:
             view = here._replace(time=jnp.asarray(time, here.time.dtype))
             place = hopped(state.params, state.step, place, view, side, length)
         reached = np.asarray(place) / np.float32(metadata.scale) + center
-        known = np.isfinite(reached).all(axis=1)
-        return Moved(np.where(known[:, None], reached, points), known)
+        finite = np.isfinite(reached).all(axis=1)
+        return Moved(np.where(finite[:, None], reached, points), finite)
 
     return move
 
@@ -194,10 +198,10 @@ def mover(spec, metadata) -> Move | None:
 
     def move(state, points, here, there):
         inside = in_default_precision((points - center) * np.float32(metadata.scale))
-        reached, known = jax.device_get(
+        reached, finite = jax.device_get(
             solved(state.params, state.step, inside, here, there)
         )
         moved = reached / np.float32(metadata.scale) + center
-        return Moved(np.where(known[:, None], moved, points), known)
+        return Moved(np.where(finite[:, None], moved, points), finite)
 
     return move
