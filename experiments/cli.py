@@ -67,6 +67,7 @@ ARGUMENTS = (
         "coordinator",
         "device",
         "devices",
+        "evaluate_at",
         "evaluate_every",
         "factor",
         "heldout",

@@ -33,7 +33,7 @@ class Reconstruct:
         "model": ("preset", "effects", "set", "trust"),
         "training": (
             *("steps", "seconds", "quality", "seed"),
-            *("evaluate_every", "checkpoint_every"),
+            *("evaluate_every", "evaluate_at", "checkpoint_every"),
         ),
         "hosts": ("coordinator", "processes", "process"),
         "following": ("view", "log"),
@@ -92,6 +92,9 @@ class Reconstruct:
     MODULE:NAME. It is loaded only if it is named here again."""
     evaluate_every: float = 20.0
     """Seconds of training between two points of the PSNR curve."""
+    evaluate_at: tuple[int, ...] = ()
+    """Steps of the points of the PSNR curve, each over as many held-out frames as the
+    final metrics (default: points of a few frames in intervals of time)."""
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints, which is the most that a killed run loses."""
     view: bool = False
@@ -170,7 +173,10 @@ def _outcome(args):
 
     common = {
         name: getattr(args, name)
-        for name in ("more", "seconds", "evaluate_every", "checkpoint_every", "log")
+        for name in (
+            *("more", "seconds", "log"),
+            *("evaluate_every", "evaluate_at", "checkpoint_every"),
+        )
     }
     if args.resume:
         steps = () if args.steps is None else (f"steps={args.steps}",)

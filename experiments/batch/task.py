@@ -38,6 +38,8 @@ class Result(NamedTuple):
     preset: str
     metrics: dict[str, float]
     machine: dict[str, Any]
+    curve: Any  # a `runs.curves.Curve`, whose module loads JAX
+    settings: dict[str, Any]  # contents of its config.json
 
 
 class Ending(NamedTuple):
@@ -192,6 +194,7 @@ def options(
     changes: Sequence[str],
     seed: int,
     steps: int | None,
+    evaluate_at: Sequence[int] = (),
 ) -> tuple[str, ...]:
     """Assemble the options of `nerfies reconstruct`, without the folder.
 
@@ -201,6 +204,7 @@ def options(
       changes: Changes of its fields.
       seed: The seed.
       steps: Number of steps, None for the preset's own.
+      evaluate_at: Steps of the points of its curve, empty for those of the default.
 
     Returns:
       The options.
@@ -208,6 +212,7 @@ def options(
     words = [*source, "--seed", str(seed)]
     words += [] if preset is None else ["--preset", preset]
     words += [] if steps is None else ["--steps", str(steps)]
+    words += ["--evaluate-at", *map(str, evaluate_at)] if evaluate_at else []
     return (*words, *(["--set", *changes] if changes else ()))
 
 
@@ -225,9 +230,11 @@ def result(task: Task) -> Result | None:
     metrics = records.one(task.folder / "metrics.json", COMPLETE)
     if metrics is None:
         return None
-    config = json.loads((task.folder / run_folder.CONFIG).read_text())["config"]
+    settings = json.loads((task.folder / run_folder.CONFIG).read_text())
     values = {key: value for key, value in metrics.items() if value is not None}
-    return Result(config["preset"], values, curves.read(task.folder).machine)
+    curve = curves.read(task.folder)
+    preset = settings["config"]["preset"]
+    return Result(preset, values, curve.machine, curve, settings)
 
 
 def summary(metrics: Mapping[str, float]) -> str:

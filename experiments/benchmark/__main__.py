@@ -5,14 +5,17 @@
     nerfies study benchmark --preset nerfies-small --set elastic=none
     nerfies study benchmark --suite sonata --steps 900 --jobs 2
     nerfies study benchmark --suite presets --seconds 90
+    nerfies study benchmark --suite curves --seeds 2 --jobs 2
 
 Every run is one of `nerfies reconstruct`, in its own process and folder. The
 methods of a suite train on the same frames with the same seeds, for the same number of
 steps (`--steps`) or the same time (`--seconds`), and the final state is evaluated. The
 seed determines the initial model and the order of the frames, and the camera path of a
-built-in scene. A claim of a suite is judged by the difference between two methods and
-its spread over the seeds. Two baselines are reported: the mean of the two neighboring
-training images, and the run's own renders averaged over time.
+built-in scene. The suite `curves` compares quality over processor time: each of its
+methods has its own number of steps, which take about the same time. A claim of a suite
+is judged by the difference between two methods and its spread over the seeds. Two
+baselines are reported: the mean of the two neighboring training images, and the run's
+own renders averaged over time.
 
 The same command continues interrupted runs, and other results in OUT/benchmark.json
 stay. `nerfies compare` draws curves and images of the run folders.
@@ -45,12 +48,13 @@ class Benchmark:
     }
 
     source: cli.Source = cli.NamedSource()
-    suite: Literal["fields", "tracked", "poses", "sonata", "moba", "presets"] | None = (
-        None
-    )
-    """Methods to compare: radiance fields, the parts of splats-tracked-small, pose
-    refinement, the ablations of Sonata or MoBa-GS, or every small preset (default:
-    one method, the preset)."""
+    suite: (
+        Literal["curves", "fields", "tracked", "poses", "sonata", "moba", "presets"]
+        | None
+    ) = None
+    """Methods to compare: one of each kind, over time; radiance fields; the parts of
+    splats-tracked-small; pose refinement; the ablations of Sonata or MoBa-GS; or every
+    small preset (default: one method, the preset)."""
     methods: tuple[str, ...] = ()
     """Methods of the suite (default: all)."""
     preset: cli.Preset = None
@@ -58,7 +62,8 @@ class Benchmark:
     set: cli.Overrides = ()
     """Fields changed in every method, as for nerfies reconstruct."""
     steps: int | None = None
-    """Steps of training of every method (default: the presets' own)."""
+    """Steps of training of every method (default: those of the suite or, if it has
+    none, the presets' own)."""
     seconds: float | None = None
     """Seconds of training of every method, without compilation, instead. Schedules
     stretch with the steps that fit."""
@@ -159,7 +164,10 @@ def planned(args: Benchmark) -> list[Run]:
     runs = []
     for seed in range(args.seeds):
         for method, settings in args.chosen.items():
-            words = tasks.options(source, *suites.parsed(settings), seed, args.steps)
+            preset, changes = suites.parsed(settings)
+            words = tasks.options(
+                source, preset, changes, seed, *_lengths(args, method)
+            )
             task = tasks.Task(
                 f"{method}, seed {seed}",
                 folder / f"{method}-{seed}",
@@ -169,6 +177,15 @@ def planned(args: Benchmark) -> list[Run]:
             )
             runs.append(Run(method, seed, task))
     return runs
+
+
+def _lengths(args, method):
+    """Return the number of steps of a method, and those of its evaluations."""
+    own = {} if args.suite is None else suites.SUITES[args.suite].steps
+    if args.seconds is not None or method not in own:
+        return args.steps, ()
+    steps = args.steps or own[method]
+    return steps, suites.evaluated_at(steps)
 
 
 def _execute(args, runs):
@@ -197,7 +214,7 @@ def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
       args: Options.
       results: Results of finished runs.
     """
-    from experiments.benchmark import page, verdicts  # load JAX
+    from experiments.benchmark import origin, page, verdicts  # load JAX
     from nerfies_jax.training.provenance import revision
 
     path = args.out / STORED
@@ -205,12 +222,19 @@ def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
     numbers = {(run.method, run.seed): one.metrics for run, one in results.items()}
     methods = {}
     for method, settings in args.chosen.items():
-        of_method = [run for run in results if run.method == method]
-        presets = dict.fromkeys(results[run].preset for run in of_method)
-        seeds = [results[run].metrics for run in of_method]
-        if seeds:
+        of_method = {run.seed: results[run] for run in results if run.method == method}
+        presets = dict.fromkeys(one.preset for one in of_method.values())
+        if of_method:
             settings = settings if suites.parsed(settings)[0] else " / ".join(presets)
-            methods[method] = {"settings": settings, **verdicts.summary(seeds)}
+            methods[method] = {
+                "settings": settings,
+                "made_with": origin.of_run(of_method[min(of_method)].settings),
+                **verdicts.summary([one.metrics for one in of_method.values()]),
+                "curves": {
+                    str(seed): verdicts.curve(one.curve)
+                    for seed, one in of_method.items()
+                },
+            }
     claims = () if args.suite is None else suites.SUITES[args.suite].claims
     benchmark = {
         "suite": args.suite,

@@ -35,6 +35,7 @@ GROUPS: tuple[tuple[Column, ...], ...] = (
     (
         ("train.steps", "steps", 0, 1),
         ("train.seconds", "training s", 0, 1),
+        ("train.cpu_seconds", "training CPU s", 0, 1),
         ("train.compile_seconds", "compilation s", 0, 1),
         ("total.seconds", "all s", 0, 1),
         ("render.ms_per_frame", "frame ms", 0, 1),

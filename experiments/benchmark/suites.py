@@ -4,6 +4,7 @@ The methods of a suite differ in one part.
 """
 
 import shlex
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from nerfies_jax.runs.representations import PRESETS
@@ -24,6 +25,9 @@ class Suite(NamedTuple):
     methods: dict[str, str]  # preset and changes, as for --preset and --set
     claims: tuple[Claim, ...] = ()
     context: str = ""  # published numbers
+    # Own number of steps of each method, at which it is also evaluated during training
+    # (`evaluated_at`). Empty for the presets' own.
+    steps: Mapping[str, int] = {}
 
 
 def parsed(settings: str) -> tuple[str | None, tuple[str, ...]]:
@@ -39,6 +43,20 @@ def parsed(settings: str) -> tuple[str | None, tuple[str, ...]]:
     if words and "=" not in words[0]:
         return words[0], tuple(words[1:])
     return None, tuple(words)
+
+
+def evaluated_at(steps: int) -> tuple[int, ...]:
+    """Return the steps at which to evaluate a method of a suite with own steps.
+
+    Each is half of the next one, for an axis of time that is logarithmic.
+
+    Args:
+      steps: Number of steps of the method.
+
+    Returns:
+      The steps.
+    """
+    return tuple(steps // 2**k for k in (4, 3, 2, 1, 0) if steps // 2**k)
 
 
 MOVING = ("heldout.psnr", "heldout.moving_psnr", "heldout.moving_ssim")
@@ -262,7 +280,38 @@ MOBA = Suite(
     f"K = 4 23.62/.847, K = 16 23.54/.845, K = 32 23.44/.841.\n{CONTEXT}",
 )
 
+# About as many steps as take 75 processor seconds on one core of an idle machine, or
+# half as much again if another run competes for its memory. They are multiples of 160,
+# so that evaluations are after whole scans of ten steps.
+CURVES = Suite(
+    {
+        "tracked": "splats-tracked-small",
+        "space-time": "spacetime-small",
+        "static": "splats-static-small",
+        "deformable": f"splats-deformable-small {TRACKS}",
+        "sonata": f"sonata-small {TRACKS}",
+        "moba": f"moba-small {TRACKS}",
+        "d-nerf-grid": "d-nerf-grid-small",
+        "nerf-grid": "nerf-grid-small",
+    },
+    context="All methods with a motion start from the same tracks. The processor "
+    "seconds include neither\ntracking nor compilation. Learning rates decay to the "
+    "end of each run, so an earlier point\nof a curve is below what a run of that "
+    "length would reach.",
+    steps={
+        "tracked": 1920,
+        "space-time": 2080,
+        "static": 3360,
+        "deformable": 1600,
+        "sonata": 1440,
+        "moba": 1280,
+        "d-nerf-grid": 640,
+        "nerf-grid": 2080,
+    },
+)
+
 SUITES = {
+    "curves": CURVES,
     "fields": FIELDS,
     "tracked": TRACKED_PARTS,
     "poses": POSES,

@@ -9,6 +9,7 @@ import scipy.stats
 
 from experiments.benchmark.suites import Claim
 from nerfies_jax.metrics.metric_table import METRICS
+from nerfies_jax.runs.curves import Curve
 
 CONFIDENCE = 0.95  # of the interval of a gain
 
@@ -46,6 +47,30 @@ def summary(seeds: Sequence[Mapping[str, float]]) -> dict[str, Any]:
             key: statistics.stdev(each) for key, each in values.items() if len(each) > 1
         },
     }
+
+
+def curve(measured: Curve) -> dict[str, Any]:
+    """Select what is stored of the curve of a run.
+
+    Args:
+      measured: The curve.
+
+    Returns:
+      Number of evaluated frames, and lists of steps, processor seconds and scores, as
+      JSON values.
+    """
+    lists = {
+        "steps": measured.steps,
+        "cpu_seconds": [_rounded(value, 2) for value in measured.cpu_seconds],
+        "psnr": [_rounded(value, 3) for value in measured.psnr],
+        "ssim": [_rounded(value, 4) for value in measured.ssim],
+    }
+    values = {name: list(each) for name, each in lists.items()}
+    return {"frames": len(measured.frames), **values}
+
+
+def _rounded(value, digits):
+    return round(value, digits) if math.isfinite(value) else None
 
 
 def judge(

@@ -200,6 +200,11 @@ METRICS: dict[str, Entry] = {
         *("Training", "Time", "s", "lower"),
         "Wall-clock time of all training steps, without compilation.",
     ),
+    "train.cpu_seconds": Entry(
+        *("Training, processor", "Time", "s", "lower"),
+        "Processor time of all training steps on all cores, without compilation. It "
+        "depends less than the wall-clock time on what else the machine does.",
+    ),
     "train.compile_seconds": Entry(
         *("Compilation", "Time", "s", "lower"),
         "Wall-clock time of compiling the training programs.",

@@ -29,13 +29,16 @@ class Curve(NamedTuple):
     frames: tuple[str, ...]  # names of those frames
     compile_seconds: float
     machine: dict[str, Any]
+    # Processor time of training on all cores, NaN in runs of earlier versions.
+    cpu_seconds: tuple[float, ...] = ()
 
 
 class Course(NamedTuple):
     """Training of a run so far, from its events.
 
-    Rows are dictionaries with `step`, `seconds` of training and the metrics, in the
-    order of steps. If a resumed run repeated steps, only the last repetition is kept.
+    Rows are dictionaries with `step`, `seconds` and `cpu_seconds` of training and the
+    metrics, in the order of steps. If a resumed run repeated steps, only the last
+    repetition is kept.
     """
 
     training: tuple[dict[str, Any], ...] = ()  # subsampled mean metrics of chunks
@@ -136,6 +139,8 @@ _NUMBERS = ("step", "steps", "seconds", "compile_seconds")
 
 def _row(event):
     at = {"step": int(event["step"]), "seconds": float(event["seconds"])}
+    if "cpu_seconds" in event:  # not in runs of earlier versions
+        at["cpu_seconds"] = _number(event["cpu_seconds"])
     return at | dict(event["metrics"])
 
 
@@ -217,6 +222,7 @@ def _curve_of(logged):
         frames=logged.frames,
         compile_seconds=logged.compile_seconds,
         machine=logged.machine,
+        cpu_seconds=tuple(_number(row.get("cpu_seconds")) for row in rows),
     )
 
 
@@ -232,6 +238,7 @@ def _stored(path):
             frames=tuple(content["frames"]),
             compile_seconds=float(content["compile_seconds"]),
             machine=dict(content["machine"]),
+            cpu_seconds=tuple(_number(row.get("cpu_seconds")) for row in rows),
         )
     except FileError:  # it names the path already
         raise

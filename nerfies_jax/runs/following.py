@@ -66,6 +66,7 @@ class Following:
             stopped_by=result.stopped_by,
             step=result.steps,
             seconds=result.seconds,
+            cpu_seconds=result.history.cpu_seconds,
             compile_seconds=result.compile_seconds,
             errors=list(errors),
         )

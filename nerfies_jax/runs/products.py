@@ -233,6 +233,7 @@ def measured(
     return [
         metric("heldout.frames", len(scored.rows)),
         metric("train.seconds", result.seconds, 0.2 * result.seconds),
+        *_processor_time(result.history),
         metric("train.compile_seconds", result.compile_seconds, 10.0),
         metric("train.steps", result.steps),
         metric("render.ms_per_frame", ms_per_frame, 0.2 * ms_per_frame),
@@ -251,6 +252,14 @@ def _device_memory():
     if peak is None:
         return []
     return [metric("memory.device_peak_bytes", peak, 2e8)]
+
+
+def _processor_time(history):
+    """Return the processor time of training, unless earlier sessions lack it."""
+    seconds = history.cpu_seconds
+    if math.isnan(seconds):
+        return []
+    return [metric("train.cpu_seconds", seconds, 0.2 * seconds)]
 
 
 def _transient_share(history):

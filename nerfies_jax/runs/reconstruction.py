@@ -68,6 +68,7 @@ def reconstruct(
     effects: Literal["preset", "auto"] | None = None,
     seconds: float | int | None = None,
     evaluate_every: float | int = 20.0,
+    evaluate_at: tuple[int, ...] = (),
     checkpoint_every: float | int = 60.0,
     more: MoreMetrics = MoreMetrics(),
     prepare: Preparation = Preparation(),
@@ -90,6 +91,8 @@ def reconstruct(
       seconds: Time budget in seconds of training. It determines the number of steps. If
         `config` sets that number, training ends early when the budget is spent.
       evaluate_every: Seconds of training between two evaluations.
+      evaluate_at: Steps after which to evaluate as many held-out frames as at the end,
+        instead of a few in intervals.
       checkpoint_every: Seconds of training between two checkpoints.
       more: Additional metrics, computed at the end.
       prepare: Settings of the conversion to a capture.
@@ -106,7 +109,7 @@ def reconstruct(
     with contextlib.ExitStack() as stack:
         stack.enter_context(hosts.dismissing())
         with _refusing():
-            pace = Pace(seconds, evaluate_every, checkpoint_every)
+            pace = Pace(seconds, evaluate_every, checkpoint_every, evaluate_at)
             follow = stack.enter_context(following(log))
             if out is not None:
                 out = pathlib.Path(out).absolute()
@@ -150,6 +153,7 @@ def resume(
     trusted: Collection[str] = (),
     seconds: float | int | None = None,
     evaluate_every: float | int = 20.0,
+    evaluate_at: tuple[int, ...] = (),
     checkpoint_every: float | int = 60.0,
     more: MoreMetrics = MoreMetrics(),
     watched: Watched | None = None,
@@ -168,6 +172,8 @@ def resume(
         run was started with it. The folder alone cannot cause code to run.
       seconds: Time budget of this call in seconds of training.
       evaluate_every: Seconds of training between two evaluations.
+      evaluate_at: Steps after which to evaluate as many held-out frames as at the end,
+        instead of a few in intervals.
       checkpoint_every: Seconds of training between two checkpoints.
       more: Additional metrics, computed at the end.
       watched: Context that watches the training, such as `viewer.live`.
@@ -185,7 +191,7 @@ def resume(
     with contextlib.ExitStack() as stack:
         stack.enter_context(hosts.dismissing())
         with _refusing():
-            pace = Pace(seconds, evaluate_every, checkpoint_every)
+            pace = Pace(seconds, evaluate_every, checkpoint_every, evaluate_at)
             follow = stack.enter_context(following(log))
             new_paths = _check_expected(folder, expected)
             stack.enter_context(run_folder.owned(folder))

@@ -1,6 +1,7 @@
 """Training of a run, with evaluations on held-out frames."""
 
 import dataclasses
+import math
 import pathlib
 from typing import Any, NamedTuple
 
@@ -23,13 +24,23 @@ EVALUATED = 4  # held-out frames during training. All of them are scored at the 
 
 @dataclasses.dataclass(frozen=True)
 class Pace:
-    """Duration of training and intervals of evaluations and checkpoints, in seconds."""
+    """Duration of training and intervals of evaluations and checkpoints, in seconds.
+
+    Evaluations during training are of a few frames and cost at most a tenth of the
+    time of training. Those at given steps are of the same frames as the final metrics.
+    """
 
     seconds: float | int | None = None  # None for no limit
     evaluate_every: float | int = 20.0
     checkpoint_every: float | int = 60.0
+    evaluate_at: tuple[int, ...] = ()  # steps, which replace `evaluate_every`
 
     def __post_init__(self):
+        if min(self.evaluate_at, default=1) < 1:
+            raise ValueError(
+                f"evaluate_at={self.evaluate_at}: steps must be at least 1; the state "
+                "before the first step has not been trained"
+            )
         for name in ("seconds", "evaluate_every", "checkpoint_every"):
             value = getattr(self, name)
             if value is not None and not value >= 0:
@@ -92,9 +103,9 @@ def train(
       The result with the renderer.
     """
     renderer = Renderer(run.model, run.capture.size)
-    rows, evaluate_every = run.capture.heldout, pace.evaluate_every
+    rows, every_seconds = run.capture.heldout, pace.evaluate_every
     frames = validation.training_frames(run)
-    history = History() if record is None else History(**record)
+    history = History() if record is None else _history(record)
     first = evaluation.view_of(run.capture, int(rows[0])) if len(rows) else None
     scorer = half_scorer(run)
     seconds = history.compile_seconds + _compile(run, state, frames, renderer, first)
@@ -102,9 +113,8 @@ def train(
     if first is not None:
         renderer(state, first)  # measures the time of a frame
         cost = renderer.seconds[-1] * (1 + _fit_cost(run, scorer))
-        plan = budget.evaluations(cost, evaluate_every, EVALUATED)
-        rows = evaluation.spread(run.capture.heldout, plan.frames)
-        evaluate_every = plan.every_seconds
+        count, every_seconds = _evaluations(pace, cost, len(rows))
+        rows = evaluation.spread(run.capture.heldout, count)
 
     def held_out(state, step, metrics):
         del step, metrics
@@ -127,7 +137,10 @@ def train(
     if len(rows):
         names = [run.capture.ids[row] for row in rows]
         events.emit("evaluation_frames", frames=names)
-        hooks = (Hook(curves.HELD_OUT, held_out, every_seconds=evaluate_every), *hooks)
+        hook = Hook(curves.HELD_OUT, held_out, every_seconds=every_seconds)
+        if pace.evaluate_at:
+            hook = Hook(curves.HELD_OUT, held_out, at_steps=pace.evaluate_at)
+        hooks = (hook, *hooks)
     hooks = (*hooks, *validation.hooks(run, renderer))
     result = loop.fit(
         run.model,
@@ -142,6 +155,18 @@ def train(
     )
     result = _with_best(run, result, checkpoints)
     return Trained(result, renderer, renderer, rows, scorer)
+
+
+def _history(record):
+    """Restore the history of a run, which earlier versions stored without a field."""
+    return History(**{"cpu_seconds": math.nan, **record})
+
+
+def _evaluations(pace, frame_seconds, heldout):
+    """Return the number of frames of an evaluation, and the seconds between two."""
+    if pace.evaluate_at:
+        return budget.scored_frames(frame_seconds, heldout), pace.evaluate_every
+    return budget.evaluations(frame_seconds, pace.evaluate_every, EVALUATED)
 
 
 def half_scorer(run: Run) -> HalfScorer | None:

@@ -39,6 +39,7 @@ class Hook(NamedTuple):
     call: Callable[[TrainState, int, dict[str, float]], dict[str, float] | None]
     every_steps: int | None = None
     every_seconds: float | int | None = None  # training time
+    at_steps: tuple[int, ...] = ()
 
 
 class History(NamedTuple):
@@ -48,6 +49,9 @@ class History(NamedTuple):
     evaluations: tuple[dict[str, Any], ...] = ()  # hook, step, seconds, numbers
     seconds: float = 0.0  # training time, of chunks and events
     compile_seconds: float = 0.0
+    # Processor time of training, of all threads. NaN after a session of an earlier
+    # version, which did not measure it.
+    cpu_seconds: float = 0.0
 
 
 class FitResult(NamedTuple):
@@ -64,15 +68,6 @@ class FitResult(NamedTuple):
     def seconds(self) -> float:
         """Seconds of training, of all sessions of the run."""
         return self.history.seconds
-
-    @property
-    def training_share(self) -> float:
-        """Training time as a fraction of training and compilation.
-
-        Processor time is only measured for the sum of the two.
-        """
-        total = self.seconds + self.compile_seconds
-        return self.seconds / total if total else 0.0
 
     @property
     def compile_seconds(self) -> float:
@@ -213,7 +208,7 @@ class _Run:
 
     def _chunk(self, program, count) -> bool:
         """Run one chunk and the events after it. Return False if not all is finite."""
-        began = time.perf_counter()
+        began, cpu_began = time.perf_counter(), time.process_time()
         self.state, outcome = program(self.state, self.device_frames, count)
         done = outcome.done
         if not outcome.finite:
@@ -238,9 +233,12 @@ class _Run:
         self.step += done
         self.stage.done = self.step
         self.step_seconds = elapsed / done
-        self._add_time(seconds=time.perf_counter() - began)
+        self._add_time(
+            seconds=time.perf_counter() - began,
+            cpu_seconds=time.process_time() - cpu_began,
+        )
         metrics = {name: float(x) for name, x in outcome.metrics.items()}
-        row = {"step": self.step, "seconds": self.history.seconds, **metrics}
+        row = {**self._position(), **metrics}
         self.history = self.history._replace(rows=(*self.history.rows, row))
         self.snapshot = self.snapshot.renewed(self.step, self.state, bool(due_events))
         return True
@@ -270,6 +268,7 @@ class _Run:
         for hook in self.hooks:
             if hook.every_steps is not None:
                 stops.append((self.step // hook.every_steps + 1) * hook.every_steps)
+            stops += [step for step in hook.at_steps if step > self.step]
         affordable = min(CHUNK_SECONDS, self._seconds_left()) / self.step_seconds
         distance = min(stops) - self.step
         if distance < length:
@@ -305,9 +304,8 @@ class _Run:
         remaining = min(remaining, self._seconds_left())
         event_stream.emit(
             "train",
-            step=self.step,
+            **self._position(),
             steps=self.steps,
-            seconds=self.history.seconds,
             compile_seconds=self.history.compile_seconds,
             steps_per_second=1 / self.step_seconds,
             eta_seconds=max(remaining, 0.0),
@@ -317,14 +315,25 @@ class _Run:
             memory_bytes=psutil.Process().memory_info().rss,
         )
 
+    def _position(self) -> dict[str, Any]:
+        """Return the steps and the times of training so far."""
+        history = self.history
+        return {
+            "step": self.step,
+            "seconds": history.seconds,
+            "cpu_seconds": history.cpu_seconds,
+        }
+
     def _metrics(self) -> dict[str, float]:
         """Mean metrics of the last chunk, empty before the first."""
         row = self.history.rows[-1] if self.history.rows else {}
-        return {k: v for k, v in row.items() if k not in ("step", "seconds")}
+        return {k: v for k, v in row.items() if k not in self._position()}
 
     def _is_due(self, hook: Hook) -> bool:
         last_step, last_seconds = self.last_calls[hook.name]
         if hook.every_steps is not None and self.step % hook.every_steps == 0:
+            return self.step != last_step
+        if self.step in hook.at_steps:
             return self.step != last_step
         if hook.every_seconds is None:
             return False
@@ -335,11 +344,7 @@ class _Run:
         numbers = hook.call(self.state, self.step, self._metrics())
         self.last_calls[hook.name] = [self.step, self.history.seconds]
         if numbers is not None:
-            row = {
-                "hook": hook.name,
-                "step": self.step,
-                "seconds": self.history.seconds,
-            }
+            row: dict[str, Any] = {"hook": hook.name, **self._position()}
             values = {name: float(value) for name, value in numbers.items()}
             event_stream.emit("evaluation", **row, metrics=values)
             row |= values

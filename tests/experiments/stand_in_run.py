@@ -45,7 +45,7 @@ def main(words):
     os.chdir(out)
     preset = words[words.index("--preset") + 1] if "--preset" in words else "nerf-small"
     config = {"preset": preset}
-    pathlib.Path("config.json").write_text(json.dumps({"config": config}))
+    pathlib.Path("config.json").write_text(json.dumps({"config": config, "spec": {}}))
     print("at work", flush=True)
     time.sleep(float(os.environ.get("WAIT", "0")))
     capture = pathlib.Path(words[0]).name
@@ -58,7 +58,10 @@ def main(words):
     seed = int(words[words.index("--seed") + 1])
     metrics = {"heldout.psnr": 20.0 + seed, "train.seconds": 1.0, "tracks.epe": None}
     pathlib.Path("metrics.json").write_text(json.dumps(metrics))
-    curve = {"evaluations": [], "frames": [], "compile_seconds": 1, "machine": MACHINE}
+    point = {"hook": "held out", "step": 9, "seconds": 1, "cpu_seconds": 2}
+    point |= {"psnr": 20.1234, "ssim": 0.5}
+    curve = {"evaluations": [point], "frames": ["a"]}
+    curve |= {"compile_seconds": 1, "machine": MACHINE}
     pathlib.Path("curve.json").write_text(json.dumps(curve))
 
 

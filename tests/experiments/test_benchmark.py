@@ -13,10 +13,12 @@ import scipy.stats
 from experiments import cli
 from experiments.batch import task
 from experiments.benchmark import __main__ as benchmark
-from experiments.benchmark import page, suites, verdicts
+from experiments.benchmark import origin, page, suites, verdicts
 from experiments.benchmark.suites import SUITES, Claim
 from nerfies_jax.metrics.metric_table import METRICS
 from nerfies_jax.runs import representations
+from nerfies_jax.runs.config import RunConfig
+from nerfies_jax.runs.run import scene_spec
 from nerfies_jax.training import specs
 from tests.experiments import stand_in_run
 
@@ -61,6 +63,32 @@ def test_a_run_is_one_of_reconstruct():
     assert first.seconds == 9
 
 
+def test_methods_over_time_are_evaluated_at_halves_of_their_own_steps():
+    words = ["--suite", "curves", "--methods", "static", "moba", "--seeds", "1"]
+    for more, steps in ([], suites.CURVES.steps), (["--steps", "20"], {"static": 20}):
+        args = cli.parse(benchmark.Benchmark, words + more)
+        told = " ".join(benchmark.planned(args)[0].task.words)
+        count = steps["static"]
+        points = [count // 16, count // 8, count // 4, count // 2, count]
+        shown = " ".join(map(str, points))
+        assert f"--steps {count} --evaluate-at {shown}" in told
+    timed = cli.parse(benchmark.Benchmark, [*words, "--seconds", "9"])
+    assert "--evaluate-at" not in benchmark.planned(timed)[0].task.words
+
+
+def test_a_method_says_if_its_preset_has_changed_since():
+    config = RunConfig("nerf-small", steps=30, overrides=("rays=16",))
+    spec = specs.as_json(scene_spec(config))
+    made_with = origin.of_run({"config": specs.as_json(config), "spec": spec})
+    stored = json.loads(json.dumps(made_with))
+    assert origin.age(stored) == "current"
+    before = origin.of_run({"config": specs.as_json(config), "spec": spec | {"x": 1}})
+    assert origin.age(before) == "old"
+    assert origin.age(stored | {"overrides": ["no_such_field=1"]}) == "old"
+    assert origin.age(stored | {"preset": "no-such-preset"}) == "old"
+    assert origin.age(None) == "unknown"
+
+
 def test_interrupted_runs_continue_and_finished_ones_are_not_repeated(
     tmp_path, stand_in, capsys
 ):
@@ -83,6 +111,9 @@ def test_interrupted_runs_continue_and_finished_ones_are_not_repeated(
     assert method["settings"] == "nerf-small"
     assert method["mean"] == {"heldout.psnr": 21.0, "train.seconds": 1.0}
     assert method["spread"]["heldout.psnr"] == 1.0
+    assert method["made_with"]["preset"] == "nerf-small"
+    (point,) = {tuple(one["psnr"]) for one in method["curves"].values()}
+    assert point == (20.123,)
     shown = "| 21.00 ± 1.00 |"
     assert shown in capsys.readouterr().out
     assert shown in page.page(stored)
@@ -197,6 +228,7 @@ def test_suites_are_consistent(name):
         assert set(claim.metrics) <= set(METRICS)
     judged = {method for claim in suite.claims for method in claim[1:3]}
     assert judged == (set(suite.methods) if suite.claims else set())
+    assert set(suite.steps) in (set(suite.methods), set())
 
 
 def test_every_column_has_an_explanation():

@@ -40,6 +40,7 @@ def test_a_curve_comes_back_as_it_was_written(tmp_path):
         {"hook": "held out", "step": step, "seconds": at, "psnr": dB, "ssim": 0.5}
         for step, at, dB in ((0, 1.0, 12.5), (1, 3.0, np.nan))
     )
+    rows[1]["cpu_seconds"] = 5.0  # an earlier version did not measure the first row's
     # Training frames that were left out are other frames, and have no SSIM.
     other = {"hook": "validation", "step": 1, "seconds": 2.0, "psnr": 40.0}
     training = ({"step": 1, "seconds": 1.0, "loss": 0.1},)
@@ -49,6 +50,7 @@ def test_a_curve_comes_back_as_it_was_written(tmp_path):
     assert stored.seconds == (1.0, 3.0)
     assert stored.psnr[0] == 12.5
     assert np.isnan(stored.psnr[1])
+    np.testing.assert_array_equal(stored.cpu_seconds, [np.nan, 5.0])
     assert stored.frames == ("frame 3",)
     assert stored.compile_seconds == 2.0
     assert "jax" in stored.machine

@@ -172,6 +172,15 @@ def test_hooks_run_at_their_steps_and_at_the_end(frames):
     assert result.history.evaluations[0]["hook"] == "score"
 
 
+def test_hooks_run_at_listed_steps(frames):
+    hook = loop.Hook("score", lambda _, step, metrics: {"psnr": step}, at_steps=(3, 8))
+    result = fit(frames, steps=10, hooks=[hook])
+    rows = result.history.evaluations
+    assert [row["step"] for row in rows] == [3, 8, 10]
+    assert 0 < rows[0]["cpu_seconds"] < rows[-1]["cpu_seconds"]
+    assert rows[-1]["cpu_seconds"] == result.history.cpu_seconds
+
+
 def test_time_in_hooks_is_not_training_time(frames, straight):
     hook = loop.Hook("nap", lambda *_: time.sleep(0.3), every_steps=5)
     result = fit(frames, steps=20, hooks=[hook])
