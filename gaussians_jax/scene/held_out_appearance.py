@@ -80,8 +80,8 @@ def fit_code(
             exact_product(rows.T, error) - price * code,
         )
 
-    def step(carried):
-        best, damping, passes, _ = carried
+    def step(loop_state):
+        best, damping, passes, _ = loop_state
         diagonal = damping * jnp.diag(jnp.diag(best.matrix))
         change = jnp.linalg.solve(best.matrix + diagonal, best.gradient)
         trial = normal(best.code + change)
@@ -93,8 +93,8 @@ def fit_code(
         done = (better & little) | (damping > STUCK) | ~jnp.isfinite(best.cost)
         return best, damping, passes + 1, done
 
-    def unfinished(carried):
-        _, _, passes, done = carried
+    def unfinished(loop_state):
+        _, _, passes, done = loop_state
         return (passes < PASSES) & ~done
 
     # One evaluation in the program: the first step, from an infinite cost, is to

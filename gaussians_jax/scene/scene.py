@@ -279,8 +279,8 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
 
     def loss(params, probe):
         canonical = splats.activate(params.rows["splats"])
-        moved = deform(params, canonical)
-        rows, rendered = deformation.rendered(effects, params, moved, condition)
+        gaussians = deform(params, canonical)
+        rows, rendered = deformation.rendered(effects, params, gaussians, condition)
         posed = _posed(effects, params, frames)
         view = _view(posed, row)
         frame = drawing.draw(
@@ -301,7 +301,7 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
         states = state.aux_state.effects
         value, metrics = loss_of(spec, effects, params, observation, condition, states)
         weight = deformation.significance(effects, rendered)
-        return value, (metrics, frame.footprints, canonical, moved, weight)
+        return value, (metrics, frame.footprints, canonical, gaussians, weight)
 
     probe = deformation.probe(effects, state.params)
     (value, (metrics, *statistics)), (grads, mean2d_grad) = jax.value_and_grad(

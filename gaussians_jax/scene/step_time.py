@@ -159,10 +159,10 @@ def _sum_of_effect(effect, effects, params, observation, condition, state):
     total = jnp.zeros(())
     if effect.deform is not None:
         gaussians = splats.activate(params.rows["splats"])
-        moved = deformation.deform_in_training(
+        at_frame = deformation.deform_in_training(
             (effect,), params, gaussians, condition, {effect.name: state}
         )
-        total += sum(jnp.sum(leaf) for leaf in moved)
+        total += sum(jnp.sum(leaf) for leaf in at_frame)
     if effect.derive is not None:
         canonical = splats.activate(params.rows["splats"])
         rows, rendered = deformation.rendered((effect,), params, canonical, condition)

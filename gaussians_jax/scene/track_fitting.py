@@ -117,20 +117,20 @@ def fit_tracks(
             "tracks must have shape [points, times, 3] with at least two times, got "
             f"{position.shape}"
         )
-    known = np.all(np.isfinite(position), axis=-1)
+    valid = np.all(np.isfinite(position), axis=-1)
     if visible is not None:
         visible = np.asarray(visible)
-        if visible.shape != known.shape or visible.dtype != bool:
+        if visible.shape != valid.shape or visible.dtype != bool:
             raise ValueError(
-                f"visible must be bool of shape {known.shape}, got {visible.dtype} of "
+                f"visible must be bool of shape {valid.shape}, got {visible.dtype} of "
                 f"shape {visible.shape}"
             )
-        known &= visible
-    invisible = np.flatnonzero(~known.any(axis=1))
-    if len(invisible) or not len(known):
+        valid &= visible
+    invisible = np.flatnonzero(~valid.any(axis=1))
+    if len(invisible) or not len(valid):
         raise ValueError(
             f"every track must be visible at some time, but {len(invisible)} of "
-            f"{len(known)} never are (rows {invisible[:5].tolist()}); remove them"
+            f"{len(valid)} never are (rows {invisible[:5].tolist()}); remove them"
         )
     count = position.shape[1]
     times = np.linspace(0, 1, count) if times is None else np.asarray(times, np.float64)
@@ -139,7 +139,7 @@ def fit_tracks(
             f"times must be {count} increasing numbers, one for each column of tracks, "
             f"got {times}"
         )
-    observed = position[known]
+    observed = position[valid]
     unit = float(np.sqrt(np.mean(np.sum((observed - observed.mean(0)) ** 2, axis=-1))))
     unit = max(unit, float(np.finfo(np.float32).tiny) ** 0.5)
     box = tuple(observed.min(0) - unit), tuple(observed.max(0) + unit)
@@ -147,12 +147,12 @@ def fit_tracks(
     component = protocols.bound(protocols.moving_at_once(motion), steps, metadata)
     effect = protocols.compile_motion(component)
     fraction = (times - times[0]) / (times[-1] - times[0])
-    fitted = motion_fit.fit(
+    solution = motion_fit.fit(
         effect,
         Paths(
             fraction.astype(np.float32),
-            np.where(known[..., None], position, np.nan).astype(np.float32),
-            known,
+            np.where(valid[..., None], position, np.nan).astype(np.float32),
+            valid,
             unit,
         ),
         jax.random.key(0) if key is None else key,
@@ -160,10 +160,10 @@ def fit_tracks(
         steps=steps,
     )
     return TrackFit(
-        motion_fit.scene_of(effect, fitted.points),
-        fitted.first,
-        fitted.last,
+        motion_fit.scene_of(effect, solution.points),
+        solution.first,
+        solution.last,
         effect,
-        fitted.points,
+        solution.points,
         (float(times[0]), float(times[-1])),
     )

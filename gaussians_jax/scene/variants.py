@@ -129,7 +129,7 @@ def from_knots(
             deform=lambda inputs, prepared, time: time_knots.at(
                 inputs[1], time, interpolation
             ),
-            draw=lambda inputs, *rest: stages.draw(inputs[0], *rest),
+            draw=lambda inputs, *others: stages.draw(inputs[0], *others),
             rows=lambda inputs: stages.rows(inputs[0]),
         ),
         summary,
@@ -171,7 +171,7 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
         Stages(
             prepare=lambda inputs: stages.prepare(inputs[1].dynamic),
             deform=deform,
-            draw=lambda inputs, *rest: stages.draw(inputs[0], *rest),
+            draw=lambda inputs, *others: stages.draw(inputs[0], *others),
             rows=lambda inputs: stages.rows(inputs[0]),
         ),
         f"the deformation of {_moving(parts.row_index, static_threshold)}",

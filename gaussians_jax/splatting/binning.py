@@ -233,14 +233,14 @@ def _span(cursor, count, capacity):
 
 def _expand(cursor, count, capacity):
     """Return each slot's rank and number within its rectangle, or -1 beyond the end."""
-    begin, filled, next_cursor = _span(cursor, count, capacity)
+    begin, length, next_cursor = _span(cursor, count, capacity)
     index = jnp.arange(count.shape[0], dtype=jnp.int32)
     starts = jnp.zeros(capacity + 1, jnp.int32).at[begin].max(index + 1)
     rank = _running_max(starts[:capacity]) - 1
     slot = jnp.arange(capacity, dtype=jnp.int32)
     tile_index = slot - begin[jnp.maximum(rank, 0)]
     tile_index += jnp.where(rank == cursor.rank, cursor.skip, 0)
-    return jnp.where(slot < filled, rank, -1), tile_index, next_cursor
+    return jnp.where(slot < length, rank, -1), tile_index, next_cursor
 
 
 def _running_max(values):

@@ -61,7 +61,7 @@ def bounds(camera: Camera, size: tuple[int, int], margin: float) -> Bounds:
     # Without the skew, as for a pinhole.
     x = offset[:, 0] / camera.focal_px
     # Where the lens shows no point of the border, the last that it shows.
-    tangents, _ = jax.vmap(lambda bent: lens.undistort(camera, bent))(
+    tangents, _ = jax.vmap(lambda point: lens.undistort(camera, point))(
         jnp.stack([x, y], axis=1)
     )
     return Bounds(jnp.min(tangents, axis=0), jnp.max(tangents, axis=0))
@@ -143,11 +143,11 @@ def _linearized(camera: Camera, x: Float[Array, ""], y: Float[Array, ""]) -> Lin
     p1, p2 = camera.tangential[0], camera.tangential[1]
     ratio = 1 + squared * (k1 + squared * (k2 + squared * k3))
     change = 2 * (k1 + squared * (2 * k2 + squared * 3 * k3))
-    bent = (
+    linearized = (
         x * ratio + 2 * p1 * x * y + p2 * (squared + 2 * x * x),
         y * ratio + 2 * p2 * x * y + p1 * (squared + 2 * y * y),
     )
     xx = ratio + change * x * x + 2 * p1 * y + 6 * p2 * x
     xy = change * x * y + 2 * p1 * x + 2 * p2 * y
     yy = ratio + change * y * y + 2 * p2 * x + 6 * p1 * y
-    return LinearLens(bent, xx, xy, yy, (xx * x + xy * y, xy * x + yy * y))
+    return LinearLens(linearized, xx, xy, yy, (xx * x + xy * y, xy * x + yy * y))

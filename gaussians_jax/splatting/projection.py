@@ -107,11 +107,11 @@ def project(
     *vectors, opacity = gaussians
     columns = [components(rows) for rows in vectors]
     by_column = Footprints._make((1, 1, 0, 0, 1))
-    drawn = jax.vmap(one, (0, 0), by_column)(columns, opacity)
-    return drawn._replace(
-        mean_px=drawn.mean_px.T,
-        whitening=drawn.whitening.T,
-        extent_px=drawn.extent_px.T,
+    footprints = jax.vmap(one, (0, 0), by_column)(columns, opacity)
+    return footprints._replace(
+        mean_px=footprints.mean_px.T,
+        whitening=footprints.whitening.T,
+        extent_px=footprints.extent_px.T,
     )
 
 
@@ -120,24 +120,24 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec, bounds):
     # R (x - c), not R x + t: exact far from origin
     offset = [x - camera.position[i] for i, x in enumerate(mean)]
     depth = dot(camera.camera_from_world[2], offset)
-    drawn = (
+    is_visible = (
         (depth >= spec.near) & (depth <= spec.far) & (opacity >= spec.alpha_threshold)
     )
     for part in (*offset, *quaternion, *scale, opacity):
-        drawn &= jnp.isfinite(part)
+        is_visible &= jnp.isfinite(part)
     largest = jnp.max(jnp.abs(jnp.stack(quaternion)))
-    drawn &= largest >= jnp.finfo(largest.dtype).tiny
+    is_visible &= largest >= jnp.finfo(largest.dtype).tiny
 
     if bounds is not None:
-        drawn &= lens_jacobian.visible(offset, drawn, camera)
+        is_visible &= lens_jacobian.visible(offset, is_visible, camera)
 
     # `where` differentiates both branches: what is not drawn becomes a unit sphere one
     # unit ahead before anything is divided.
     ahead = camera.camera_from_world[2]
-    offset = [jnp.where(drawn, x, ahead[i]) for i, x in enumerate(offset)]
-    quaternion = [jnp.where(drawn, x, 1) for x in quaternion]
-    scale = [jnp.where(drawn, x, 1) for x in scale]
-    opacity = jnp.where(drawn, opacity, 0.5)
+    offset = [jnp.where(is_visible, x, ahead[i]) for i, x in enumerate(offset)]
+    quaternion = [jnp.where(is_visible, x, 1) for x in quaternion]
+    scale = [jnp.where(is_visible, x, 1) for x in scale]
+    opacity = jnp.where(is_visible, opacity, 0.5)
 
     if bounds is None:
         mean_px, depth, rows = _project_frame(offset, camera, size, spec)
@@ -145,18 +145,18 @@ def _project_one(mean, quaternion, scale, opacity, camera, size, spec, bounds):
         mean_px, depth, rows = lens_jacobian.project(offset, camera, bounds)
     first, second = _footprint_rows(rows, quaternion, scale)
     widest = jnp.max(jnp.abs(jnp.stack(first + second)))
-    drawn &= (widest < MAX_EXTENT_PX) & jnp.all(jnp.isfinite(mean_px))
-    mean_px = jnp.where(drawn, mean_px, 0)
-    first = [jnp.where(drawn, x, 0) for x in first]
-    second = [jnp.where(drawn, x, 0) for x in second]
+    is_visible &= (widest < MAX_EXTENT_PX) & jnp.all(jnp.isfinite(mean_px))
+    mean_px = jnp.where(is_visible, mean_px, 0)
+    first = [jnp.where(is_visible, x, 0) for x in first]
+    second = [jnp.where(is_visible, x, 0) for x in second]
 
     whitening, compensation = _whiten(first, second, spec)
     if spec.antialiased:
         opacity = opacity * compensation
-        drawn &= opacity >= spec.alpha_threshold
-    extent = jnp.where(drawn, _extent(whitening, opacity, spec), 0)
+        is_visible &= opacity >= spec.alpha_threshold
+    extent = jnp.where(is_visible, _extent(whitening, opacity, spec), 0)
     fields = (
-        jnp.where(drawn, field, lax.stop_gradient(field))
+        jnp.where(is_visible, field, lax.stop_gradient(field))
         for field in (mean_px, whitening, opacity, depth)
     )
     return Footprints(*fields, lax.stop_gradient(extent))

@@ -277,8 +277,8 @@ def _checked(arrays: dict[str, Any], sh_degree, coefficients):
         raise ValueError("viewmats must hold at least one camera, got none")
     sizes = {"N": count, "C": cameras, "3": 3, "4": 4, "2": 2}
     lenses = arrays["distortion"]
-    known = lenses is not None and lenses.shape[-1:] in ((n,) for n in coefficients)
-    numbers = str(lenses.shape[-1] if known else coefficients[-1])
+    is_lens = lenses is not None and lenses.shape[-1:] in ((n,) for n in coefficients)
+    numbers = str(lenses.shape[-1] if is_lens else coefficients[-1])
     sizes[numbers] = int(numbers)
     colors = arrays["colors"]
     last = _color_axes(colors, sh_degree)
@@ -371,8 +371,8 @@ def _camera_image(settings, gaussians, colors, view):
     camera = _camera(view, settings.camera_model)
     footprints = projection.project(gaussians, camera, size, spec)
     if view.means2d_offset is not None:
-        shifted = footprints.mean_px + view.means2d_offset
-        footprints = footprints._replace(mean_px=shifted)
+        mean_px = footprints.mean_px + view.means2d_offset
+        footprints = footprints._replace(mean_px=mean_px)
     radii = _radii(footprints, size)
     if settings.radius_clip > 0:
         is_large = jnp.any(radii > int(settings.radius_clip), axis=1, keepdims=True)

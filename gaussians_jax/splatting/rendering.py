@@ -72,16 +72,16 @@ def render(
     if not (spec.distorted or isinstance(camera.radial, jax.core.Tracer)):
         _refuse_distortion(camera)
     footprints = projection.project(gaussians, camera, size, spec)
-    drawn = footprints
+    displaced = footprints
     if mean2d_offset is not None:
-        drawn = footprints._replace(mean_px=footprints.mean_px + mean2d_offset)
+        displaced = footprints._replace(mean_px=footprints.mean_px + mean2d_offset)
     values = [widened(colors)]
     if depth:
         values.append(footprints.depth[:, None])
     if features is not None:
         values.append(widened(features))
     image, transmittance = raster.rasterize(
-        drawn, jnp.concatenate(values, axis=1), size, spec
+        displaced, jnp.concatenate(values, axis=1), size, spec
     )
     color, alpha = image[..., :3], 1 - transmittance
     if background is not None:

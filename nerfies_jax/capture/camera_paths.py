@@ -145,20 +145,20 @@ def smoothed(captured: Camera, captured_times: np.ndarray, times: np.ndarray) ->
     poses = np.concatenate(
         [captured.position, captured.camera_from_world.reshape(count, 9)], axis=1
     ).astype(np.float64)
-    fitted = np.empty((len(times), 12))
+    solution = np.empty((len(times), 12))
     for row, time in enumerate(np.asarray(times, np.float64)):
         offset = captured_times - time
         # The square root of the Gaussian, since least squares squares the weights.
         weight = np.exp(-((offset / (2 * width)) ** 2))
         line = np.stack([np.ones(count), offset], axis=1) * weight[:, None]
-        fitted[row] = np.linalg.lstsq(line, poses * weight[:, None], rcond=1e-9)[0][0]
-    left, _, right = np.linalg.svd(fitted[:, 3:].reshape(-1, 3, 3))
+        solution[row] = np.linalg.lstsq(line, poses * weight[:, None], rcond=1e-9)[0][0]
+    left, _, right = np.linalg.svd(solution[:, 3:].reshape(-1, 3, 3))
     flip = np.ones((len(times), 3))
     flip[:, 2] = np.linalg.det(left @ right)  # excludes reflections
     lens = cameras.take(captured, np.full(len(times), count // 2))
     leaves: dict[str, Any] = dict(
         camera_from_world=((left * flip[:, None]) @ right).astype(np.float32),
-        position=fitted[:, :3].astype(np.float32),
+        position=solution[:, :3].astype(np.float32),
         skew_px=np.zeros_like(lens.skew_px),
         radial=np.zeros_like(lens.radial),
         tangential=np.zeros_like(lens.tangential),

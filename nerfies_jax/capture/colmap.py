@@ -393,12 +393,12 @@ def _cameras(lenses, rotations, positions):
     if _is_fisheye(lenses[0]):
         fisheye = np.array([lens.params[4:8] for lens in lenses], np.float32)
     for row, lens in enumerate(lenses if fisheye is None else ()):
-        bent = np.asarray(lens.params)[2 + len(lens.focal_length_idxs()) :]
-        radial[row, : min(2, len(bent))] = bent[:2]
-        if len(bent) >= 4:
-            tangential[row] = bent[2:4]
-        if len(bent) >= 5:
-            radial[row, 2] = bent[4]
+        coefficients = np.asarray(lens.params)[2 + len(lens.focal_length_idxs()) :]
+        radial[row, : min(2, len(coefficients))] = coefficients[:2]
+        if len(coefficients) >= 4:
+            tangential[row] = coefficients[2:4]
+        if len(coefficients) >= 5:
+            radial[row, 2] = coefficients[4]
     focal = np.array([[lens.focal_length_x, lens.focal_length_y] for lens in lenses])
     center = [[lens.principal_point_x, lens.principal_point_y] for lens in lenses]
     return Camera(

@@ -46,7 +46,7 @@ def read_exr(path: AnyPath) -> ExrPicture:
     with decoder.session() as child:
         about, _ = _decode(child, path, True)
         about, channels = _decode(child, path, False, about["numbers"])
-    return _picture(channels, tuple(about["origin"]), tuple(about["display_size"]))
+    return _cropped(channels, tuple(about["origin"]), tuple(about["display_size"]))
 
 
 def read_size(path: AnyPath) -> tuple[int, int]:
@@ -99,12 +99,12 @@ def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
     def fit(array):
         if array is None:
             return None
-        fitted = np.zeros((height, width, *array.shape[2:]), array.dtype)
-        fitted[rows, columns] = array[
+        window = np.zeros((height, width, *array.shape[2:]), array.dtype)
+        window[rows, columns] = array[
             rows.start - top : rows.stop - top,
             columns.start - left : columns.stop - left,
         ]
-        return fitted
+        return window
 
     return ExrPicture(
         color=fit(picture.color),
@@ -143,7 +143,7 @@ def _decode(child, path, header_only, numbers=0):
         ) from None
 
 
-def _picture(channels, origin, display_size):
+def _cropped(channels, origin, display_size):
     channels = {
         name: array if array.dtype == np.uint32 else array.astype(np.float32)
         for name, array in channels.items()

@@ -54,8 +54,11 @@ def validate(
     """
     count = len(ids)
     full_shape = (count, size[1], size[0])
-    for name, shift, seen, rows in sides(flow):
-        expected = ((shift, np.float32, (*full_shape, 2)), (seen, np.bool_, full_shape))
+    for name, shift, valid, rows in sides(flow):
+        expected = (
+            (shift, np.float32, (*full_shape, 2)),
+            (valid, np.bool_, full_shape),
+        )
         for array, dtype, shape in expected:
             if array.shape != shape or array.dtype != dtype:
                 raise ValueError(
@@ -87,7 +90,7 @@ def validate(
                 f"{name} flow of frame {ids[int(np.argmax(bad))]!r} has NaN or "
                 "infinite pixels; write 0 there and mark them as not seen"
             )
-        alone = (rows == np.arange(count)) & seen.any((1, 2))
+        alone = (rows == np.arange(count)) & valid.any((1, 2))
         if alone.any():
             raise ValueError(
                 f"{name} flow of frame {ids[int(np.argmax(alone))]!r} is seen, but it "
@@ -110,14 +113,14 @@ def take(flow: FrameFlow, rows: np.ndarray) -> FrameFlow:
     new_index = np.full(len(flow.next_row), -1)
     new_index[rows] = np.arange(len(rows))
     leaves = []
-    for _, shift, seen, neighbor in sides(flow):
+    for _, shift, valid, neighbor in sides(flow):
         new_neighbor = new_index[neighbor[rows]]
         is_alone = new_neighbor < 0
         # A frame without a neighbor refers to its own row.
         new_neighbor = np.where(is_alone, np.arange(len(rows)), new_neighbor)
-        shift, seen = shift[rows], seen[rows]  # copies, by indexing with an array
-        shift[is_alone], seen[is_alone] = 0, False
-        leaves += [shift, seen, new_neighbor.astype(np.int32)]
+        shift, valid = shift[rows], valid[rows]  # copies, by indexing with an array
+        shift[is_alone], valid[is_alone] = 0, False
+        leaves += [shift, valid, new_neighbor.astype(np.int32)]
     return FrameFlow(*leaves)
 
 
@@ -133,8 +136,8 @@ def shrink(flow: FrameFlow, factor: int) -> FrameFlow:
       block is. Incomplete blocks are cropped as those of images.
     """
     leaves = []
-    for _, shift, seen, neighbor in sides(flow):
-        pairs = [shrink_one(*pair, factor) for pair in zip(shift, seen, strict=True)]
+    for _, shift, valid, neighbor in sides(flow):
+        pairs = [shrink_one(*pair, factor) for pair in zip(shift, valid, strict=True)]
         leaves += [np.stack(array) for array in zip(*pairs, strict=True)] + [neighbor]
     return FrameFlow(*leaves)
 

@@ -27,13 +27,13 @@ def write(flow: FrameFlow, ids: Sequence[str], folder: pathlib.Path, factor: int
       factor: Integer reduction.
     """
     neighbors = {}
-    for name, shift, seen, rows in flows.sides(flows.shrink(flow, factor)):
+    for name, shift, valid, rows in flows.sides(flows.shrink(flow, factor)):
         target = folder / f"{factor}x" / name
         target.mkdir(parents=True, exist_ok=True)
         paired = np.flatnonzero(rows != np.arange(len(rows))).tolist()
         neighbors[name] = {ids[row]: ids[rows[row]] for row in paired}
         for row in paired:
-            array = np.concatenate([shift[row], seen[row, ..., None]], axis=-1)
+            array = np.concatenate([shift[row], valid[row, ..., None]], axis=-1)
             array = array.astype(np.float32)
             np.save(target / f"{ids[row]}.npy", array, allow_pickle=False)
     write_json(folder / NEIGHBORS, neighbors)
@@ -66,16 +66,16 @@ def read(
     leaves = []
     for side in flows.SIDES:
         shift = np.zeros((len(ids), height, width, 2), np.float32)
-        seen = np.zeros((len(ids), height, width), bool)
+        valid = np.zeros((len(ids), height, width), bool)
         rows = np.arange(len(ids), dtype=np.int32)
         for row, name in enumerate(ids):
             neighbor = row_of.get(neighbors.get(side, {}).get(name))
             file = folder / f"{source}x" / side / f"{name}.npy"
             if neighbor is None or not file.is_file():
                 continue
-            shift[row], seen[row] = _read_frame(file, shrink_by, size)
+            shift[row], valid[row] = _read_frame(file, shrink_by, size)
             rows[row] = neighbor
-        leaves += [shift, seen, rows]
+        leaves += [shift, valid, rows]
     return FrameFlow._make(leaves)
 
 
@@ -91,5 +91,5 @@ def _read_frame(file, shrink_by, size):
             f"for images of {width * shrink_by}x{height * shrink_by}, "
             f"[{height * shrink_by}, {width * shrink_by}, 3]"
         )
-    shift, seen = array[..., :2].astype(np.float32), array[..., 2] > 0.5
-    return flows.shrink_one(shift, seen, shrink_by)
+    shift, valid = array[..., :2].astype(np.float32), array[..., 2] > 0.5
+    return flows.shrink_one(shift, valid, shrink_by)

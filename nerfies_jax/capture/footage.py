@@ -149,7 +149,7 @@ def from_film(
     return Taken(tuple(names), tuple(notes), float(np.ptp(times[selected])))
 
 
-def _frame_count(film, times, count, per_second):
+def _frame_count(path, times, count, per_second):
     """Number of frames to select."""
     if per_second is not None:
         if count is not None:
@@ -160,7 +160,7 @@ def _frame_count(film, times, count, per_second):
     count = FRAMES if count is None else count
     if count < MIN_TRACK:
         raise ValueError(
-            f"{film}: {count} frames to select; a reconstruction needs at least "
+            f"{path}: {count} frames to select; a reconstruction needs at least "
             f"{MIN_TRACK}"
         )
     return count

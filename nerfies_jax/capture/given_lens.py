@@ -44,12 +44,12 @@ def undistorted(
     """
     parts: dict[str, Any] = {}
     if given.track_pixel is not None and given.track_seen is not None:
-        pixel, seen = np.zeros_like(given.track_pixel), given.track_seen.copy()
-        for frame, visible in enumerate(seen):
+        pixel, is_visible = np.zeros_like(given.track_pixel), given.track_seen.copy()
+        for frame, visible in enumerate(is_visible):
             place, exists = straight(frame, given.track_pixel[frame])
             visible &= exists & ((place > 0) & (place < size)).all(-1)
             pixel[frame] = np.where(visible[:, None], place, 0)
-        parts |= {"track_pixel": pixel, "track_seen": seen}
+        parts |= {"track_pixel": pixel, "track_seen": is_visible}
     unknown = {"moving": False, "depth": np.nan}
     for name, outside in unknown.items():
         array = getattr(given, name)

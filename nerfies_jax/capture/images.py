@@ -264,11 +264,11 @@ def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
     Raises:
       CaptureError: If it cannot be read, has no color, or is partly transparent.
     """
-    picture = exr.read_exr(path)
-    if picture.color is None:
+    content = exr.read_exr(path)
+    if content.color is None:
         raise CaptureError(f"{path}: no color channels; save it with R, G and B")
-    transparent = picture.alpha is not None and picture.color_finite & (
-        picture.alpha < 1
+    transparent = content.alpha is not None and content.color_finite & (
+        content.alpha < 1
     )
     if np.any(transparent):
         raise CaptureError(
@@ -276,10 +276,10 @@ def read_light(path: AnyPath) -> tuple[np.ndarray, np.ndarray | None]:
             "by alpha or not; composite it over its background first, or save it as a "
             "PNG"
         )
-    picture = exr.in_display_window(path, picture)
-    assert picture.color is not None
-    color = np.round(srgb_from_linear(picture.color) * 255).astype(np.uint8)
-    finite = picture.color_finite
+    content = exr.in_display_window(path, content)
+    assert content.color is not None
+    color = np.round(srgb_from_linear(content.color) * 255).astype(np.uint8)
+    finite = content.color_finite
     if finite.all():
         return color, None
     color[~finite] = 0

@@ -173,9 +173,9 @@ def _unread(path, ids):
     }
     notes = [
         note
-        for file, known in files.items()
+        for file, keys in files.items()
         if file.is_file()
-        for note in unread_keys.notes(file, known)
+        for note in unread_keys.notes(file, keys)
     ]
     file = path / "metadata.json"
     if file.is_file():

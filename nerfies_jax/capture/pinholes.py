@@ -141,7 +141,7 @@ def _undistorted(capture, wide):
     return {"images": images, "valid": observed, **masks}
 
 
-def _undistorted_given(capture, given, wide):
+def _undistorted_given(capture, external, wide):
     camera_of = [cameras.take(capture.cameras, row) for row in range(len(capture.ids))]
     maps = Maps(lambda camera, size: _source_pixels(camera, size, wide), capture.size)
     order = np.argsort(capture.times[capture.train], kind="stable")
@@ -150,7 +150,7 @@ def _undistorted_given(capture, given, wide):
         return _straight_points(camera_of[row], pixel, wide)
 
     return given_lens.undistorted(
-        given,
+        external,
         wide.size,
         capture.train[order],
         lambda row: maps.of(camera_of[row]),
@@ -314,9 +314,11 @@ def _source_pixels(camera, size, wide):
     Where the lens model folds back there is no pixel at all.
     """
     straight = cameras.crop(pinhole(camera), -wide.left, -wide.top)
-    bent, single = _bent(_float32(camera), _slopes(straight, wide.size))
-    bent = np.where(np.asarray(single)[:, None], np.asarray(bent), np.nan)
-    return resampling.array_places(_pixels(camera, bent, wide.size), size)
+    distorted, single = _distorted_slopes(
+        _float32(camera), _slopes(straight, wide.size)
+    )
+    distorted = np.where(np.asarray(single)[:, None], np.asarray(distorted), np.nan)
+    return resampling.array_places(_pixels(camera, distorted, wide.size), size)
 
 
 def _float32(camera):
@@ -324,16 +326,16 @@ def _float32(camera):
 
 
 @jax.jit
-def _straight(camera, bent):
+def _straight(camera, distorted):
     """Slopes of the rays that the lens bends to these, and whether there are any."""
-    return jax.vmap(lens.undistort, (None, 0))(camera, bent)
+    return jax.vmap(lens.undistort, (None, 0))(camera, distorted)
 
 
 @jax.jit
-def _bent(camera, slopes):
+def _distorted_slopes(camera, slopes):
     """Distorted image-plane positions, and booleans where the lens is one-to-one."""
-    bent = jax.vmap(lens.distort, (None, 0))(camera, slopes)
-    return bent, jax.vmap(lens.one_to_one, (None, 0))(camera, slopes)
+    distorted = jax.vmap(lens.distort, (None, 0))(camera, slopes)
+    return distorted, jax.vmap(lens.one_to_one, (None, 0))(camera, slopes)
 
 
 def _slopes(camera, size):

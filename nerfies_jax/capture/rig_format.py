@@ -266,12 +266,12 @@ def _split(recorded, names, heldout, path):
             recorded.numbers, recorded.camera_ids, heldout, str(path)
         )
         return train, heldout_rows, frames.held_out_note(heldout_rows, heldout)
-    chosen = names[0] if heldout is None else heldout
-    if chosen not in names:
+    test = names[0] if heldout is None else heldout
+    if test not in names:
         raise CaptureError(
-            f"{path}: no camera {chosen!r} to hold out; there are {', '.join(names)}, "
+            f"{path}: no camera {test!r} to hold out; there are {', '.join(names)}, "
             "or a number n holds out every n-th frame"
         )
-    is_heldout = recorded.camera_ids == names.index(chosen)
-    note = f"camera {chosen} is held out, {len(names) - 1} cameras are for training"
+    is_heldout = recorded.camera_ids == names.index(test)
+    note = f"camera {test} is held out, {len(names) - 1} cameras are for training"
     return np.flatnonzero(~is_heldout), np.flatnonzero(is_heldout), note

@@ -132,12 +132,12 @@ def next_rung(results: Sequence[Summary], cameras: str = "auto") -> Rung | None:
         rungs = [EACH, HELD]
     else:
         rungs = [FREE, RADIAL, HELD] + ([EACH] if cameras == "auto" else [])
-    tried = [result.rung for result in results]
+    earlier_rungs = [result.rung for result in results]
     sound = [result for result in results if not faults(result)]
     if sound:
         may_zoom = cameras == "auto" and sound[-1].spread > ZOOM_SPREAD
-        return EACH if may_zoom and EACH not in tried else None
-    return next((rung for rung in rungs if rung not in tried), None)
+        return EACH if may_zoom and EACH not in earlier_rungs else None
+    return next((rung for rung in rungs if rung not in earlier_rungs), None)
 
 
 def best(results: Sequence[Summary]) -> int:

@@ -199,7 +199,7 @@ def _focal_spread(model):
             continue
         camera = copy.deepcopy(model.camera(image.camera_id))
         before = camera.mean_focal_length()
-        fitted = pycolmap.refine_absolute_pose(
+        solution = pycolmap.refine_absolute_pose(
             image.cam_from_world(),
             np.array([point.xy for point in observed]),
             np.array([model.point3D(point.point3D_id).xyz for point in observed]),
@@ -207,7 +207,7 @@ def _focal_spread(model):
             camera,
             options,
         )
-        if fitted is not None:
+        if solution is not None:
             ratios.append(camera.mean_focal_length() / before)
     if len(ratios) < MIN_TRACK:
         return 0.0

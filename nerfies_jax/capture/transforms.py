@@ -136,8 +136,10 @@ def _with_poses(file, missing):
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = getattr(transforms, key)
         if names is not None:
-            kept = [n for n in names if text_files.forward_slashes(n) not in skipped]
-            setattr(transforms, key, kept)
+            used_names = [
+                n for n in names if text_files.forward_slashes(n) not in skipped
+            ]
+            setattr(transforms, key, used_names)
     transforms.frames = posed
     note = f"{len(unposed)} frames left out, they have no transform_matrix: {listed}"
     return transforms, (note,)

@@ -68,7 +68,7 @@ def neighbor_means(capture: Capture, rows: np.ndarray) -> Averages | None:
     """
     if len(capture.train) < NEIGHBORS or not np.ptp(capture.times[capture.train]):
         return None
-    colors, known = [], []
+    colors, validity = [], []
     for row in rows:
         neighbors = neighbor_rows(capture, row)
         images = capture.images[neighbors].astype(np.float32) / 255
@@ -78,11 +78,11 @@ def neighbor_means(capture: Capture, rows: np.ndarray) -> Averages | None:
         count = valid.sum(axis=0)
         total = np.where(valid[..., None], images, 0).sum(axis=0)
         colors.append(total / np.maximum(count, 1)[..., None])
-        known.append(count > 0)
+        validity.append(count > 0)
     return Averages(
         np.arange(len(rows)),
         np.stack(colors).astype(np.float32),
-        None if capture.valid is None else np.stack(known),
+        None if capture.valid is None else np.stack(validity),
     )
 
 

@@ -93,7 +93,7 @@ def _fit_camera(
     model: Model,
     state: TrainState,
     view: View,
-    picture: UInt8[Array, "height width 3"],
+    image: UInt8[Array, "height width 3"],
     valid: Bool[Array, "height width"] | None,
     depth: Float[Array, ""],
     spec: CameraFitSpec = CameraFitSpec(),
@@ -103,15 +103,15 @@ def _fit_camera(
     `residual` is the norm of the gradient in squared gray levels per pixel. An image
     that does not depend on the camera never converges.
     """
-    loss = photometric_loss(model, state, view, picture, valid, depth)
+    loss = photometric_loss(model, state, view, image, valid, depth)
     start = jnp.zeros(6, view.camera.position.dtype)
-    fitted = fit.fit_code(
+    solution = fit.fit_code(
         loss, start, max_steps=spec.max_steps, tolerance=spec.tolerance
     )
-    return fitted._replace(
-        value=_move_camera(view.camera, fitted.value, depth),
+    return solution._replace(
+        value=_move_camera(view.camera, solution.value, depth),
         # Rounding errors keep the gradient of a real image from being exactly zero.
-        converged=fitted.converged & (fitted.residual > 0),
+        converged=solution.converged & (solution.residual > 0),
     )
 
 
@@ -164,7 +164,7 @@ def fit_cameras(
         valid = None
         if capture.valid is not None:
             valid = jnp.asarray(blocks(capture.valid[row], factor).all((-3, -1)))
-        fitted = program(
+        solution = program(
             state.params,
             state.step,
             resized(view, cropped, size),
@@ -174,11 +174,11 @@ def fit_cameras(
         )
         cameras.append(
             view.camera._replace(
-                camera_from_world=fitted.value.camera_from_world,
-                position=fitted.value.position,
+                camera_from_world=solution.value.camera_from_world,
+                position=solution.value.position,
             )
         )
-        converged.append(bool(fitted.converged))
+        converged.append(bool(solution.converged))
     stacked = jax.tree.map(
         lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *cameras
     )

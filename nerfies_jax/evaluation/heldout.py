@@ -246,8 +246,8 @@ def _lpips(params, network, color, truth, valid):
 # One program each, because their operations take longer to compile separately.
 @jax.jit
 def _depth_errors(depth, truth, mask):
-    known = geometry_quality.known_depth(depth, truth, mask)
-    return known, geometry_quality.depth_errors(depth, truth, mask)
+    valid = geometry_quality.known_depth(depth, truth, mask)
+    return valid, geometry_quality.depth_errors(depth, truth, mask)
 
 
 _flow_errors = jax.jit(geometry_quality.flow_errors)
@@ -261,8 +261,8 @@ def _depths(scored, capture):
         masks["moving_"] = capture.moving[scored.rows]
     numbers = {}
     for name, mask in masks.items():
-        known, errors = _depth_errors(depth, truth, mask)
-        error = np.abs(depth - truth)[np.asarray(known)]
+        valid, errors = _depth_errors(depth, truth, mask)
+        error = np.abs(depth - truth)[np.asarray(valid)]
         numbers[f"heldout.{name}depth_median"] = known_mean(error, np.median)
         numbers[f"heldout.{name}depth_rmse"] = errors.rmse
         if mask is None:
@@ -289,23 +289,23 @@ def _flow(flow):
     return numbers
 
 
-def _cameras(fitted, capture, exact):
+def _cameras(estimate, capture, exact):
     """Compute the PSNR with fitted cameras, and their pose errors if `exact`.
 
     `exact` means that the cameras of the capture are ground truth. The alignment does
     not change the scale, which the trained scene determines.
     """
-    numbers = {"heldout.camera_fitted_psnr": known_mean(fitted.scored.psnr)}
-    true = cameras.take(capture.cameras, fitted.scored.rows)
-    if exact and len(fitted.scored.rows) > 1:
+    numbers = {"heldout.camera_fitted_psnr": known_mean(estimate.scored.psnr)}
+    true = cameras.take(capture.cameras, estimate.scored.rows)
+    if exact and len(estimate.scored.rows) > 1:
         path = geometry_quality.path_errors(
-            fitted.cameras.position, true.position, scaled=False
+            estimate.cameras.position, true.position, scaled=False
         )
         if path.alignment.determined:
             numbers["cameras.ate"] = path.rmse
         relative = geometry_quality.relative_errors(
-            fitted.cameras.camera_from_world,
-            fitted.cameras.position,
+            estimate.cameras.camera_from_world,
+            estimate.cameras.position,
             true.camera_from_world,
             true.position,
         )

@@ -131,8 +131,8 @@ def tile_camera(camera: Camera, pyramid: Pyramid, cell: tuple[int, int]) -> Came
       The camera with its principal point shifted.
     """
     corner = np.multiply(cell, pyramid.tile)
-    shifted: Any = np.asarray(camera.principal_point_px) - corner
-    return camera._replace(principal_point_px=shifted.astype(np.float32))
+    principal_point: Any = np.asarray(camera.principal_point_px) - corner
+    return camera._replace(principal_point_px=principal_point.astype(np.float32))
 
 
 def next_level(

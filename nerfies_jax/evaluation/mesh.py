@@ -83,14 +83,14 @@ def extract(
     color = (sums[:, 3:] / np.maximum(shade, 1e-9)).reshape(*sides, 3)
     # All neighbors are seen, since unseen space has no sign: a surface between it and
     # the inside would be no surface of the scene.
-    seen = (weight > 0).reshape(sides)
-    seen = scipy.ndimage.binary_erosion(seen, np.ones((3, 3, 3)))
-    if not ((distance < 0) & seen).any() or not ((distance > 0) & seen).any():
+    in_view = (weight > 0).reshape(sides)
+    in_view = scipy.ndimage.binary_erosion(in_view, np.ones((3, 3, 3)))
+    if not ((distance < 0) & in_view).any() or not ((distance > 0) & in_view).any():
         raise ValueError(
             "the depth of the training views shows no surface; train for more steps"
         )
     vertices, faces, _, _ = skimage.measure.marching_cubes(
-        distance, 0.0, mask=seen, gradient_direction="descent"
+        distance, 0.0, mask=in_view, gradient_direction="descent"
     )
     if not len(faces):
         raise ValueError(

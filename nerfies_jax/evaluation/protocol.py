@@ -132,20 +132,20 @@ def static_error(known: GroundTruth) -> float:
     return float(_endpoints(static, known)[0])
 
 
-def _scored(known):
+def _scored(truth):
     """Return a mask of the visible points, except at the start."""
-    scored = known.seen.copy()
-    scored[:, known.start] = False
+    scored = truth.seen.copy()
+    scored[:, truth.start] = False
     return scored
 
 
-def _endpoints(path, known):
-    return _track_errors(path, known.path, _scored(known))
+def _endpoints(path, truth):
+    return _track_errors(path, truth.path, _scored(truth))
 
 
 @jax.jit  # because its operations take longer to compile separately
-def _track_errors(path, truth, seen):
-    return geometry_quality.track_errors(path, truth, seen, CORRECT_WITHIN)
+def _track_errors(path, truth, visible):
+    return geometry_quality.track_errors(path, truth, visible, CORRECT_WITHIN)
 
 
 # (spec, metadata, state, capture, known, effects=()) -> None without a deformation

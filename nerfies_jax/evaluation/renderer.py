@@ -173,12 +173,12 @@ def _compile_surveyed(model, size, inputs):
     def survey(model, params, step):
         return model.surveyed.survey(params, step)
 
-    def draw(model, params, known, view, step):
-        return _float32(model.surveyed.draw(params, known, view, size, step))
+    def draw(model, params, result_of_survey, view, step):
+        return _float32(model.surveyed.draw(params, result_of_survey, view, size, step))
 
     surveyed = programs.Program(survey, model).lower(params, step)
-    drawn = programs.Program(draw, model).lower(params, surveyed.out_info, view, step)
-    return Surveyed(*_compile_all(model, surveyed, drawn))
+    program = programs.Program(draw, model).lower(params, surveyed.out_info, view, step)
+    return Surveyed(*_compile_all(model, surveyed, program))
 
 
 def _compile_render(model, size, inputs):
@@ -199,8 +199,8 @@ def _compile_stages(model, size, inputs):
     deformed = programs.Program(programs.deform, model).lower(
         params, prepared.out_info, view.time
     )
-    drawn = programs.Program(draw, model).lower(params, deformed.out_info, view, step)
-    return _Programs(*_compile_all(model, prepared, deformed, drawn))
+    program = programs.Program(draw, model).lower(params, deformed.out_info, view, step)
+    return _Programs(*_compile_all(model, prepared, deformed, program))
 
 
 def _compile_all(model, *lowered):

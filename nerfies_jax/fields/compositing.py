@@ -210,8 +210,10 @@ def median_index(weights: Float[Array, " samples"]) -> Int[Array, ""]:
     Returns:
       Index of the sample, or of the last one if less than half is absorbed.
     """
-    passed = _running_sum(weights) >= 0.5
-    return jnp.where(jnp.any(passed), jnp.argmax(passed), weights.shape[0] - 1)
+    is_past_half = _running_sum(weights) >= 0.5
+    return jnp.where(
+        jnp.any(is_past_half), jnp.argmax(is_past_half), weights.shape[0] - 1
+    )
 
 
 def _composite(color, weights, distances, background):

@@ -87,14 +87,14 @@ def field(
     Returns:
       The field.
     """
-    own = specs.effects_of(spec, metadata)
-    every = joined(own, effects, reserved=("template", "codes"))
-    tables = specs.tables_of(every)
-    active = _active(every, without)
+    built_in = specs.effects_of(spec, metadata)
+    all_effects = joined(built_in, effects, reserved=("template", "codes"))
+    tables = specs.tables_of(all_effects)
+    active = _active(all_effects, without)
     bind = functools.partial(Bound, spec, metadata, active)
 
     def init(key):
-        return _init(spec, metadata, every, key)
+        return _init(spec, metadata, all_effects, key)
 
     def codes_at(params, view):
         return _look_up(tables, metadata, params, view.time, view.appearance)
@@ -109,7 +109,9 @@ def field(
         return draw(bind(params), camera, FrameCondition(time, codes, step), size)
 
     moves = is_moved(active)
-    still = tuple(dataclasses.replace(effect, displace=None) for effect in active)
+    static_effects = tuple(
+        dataclasses.replace(effect, displace=None) for effect in active
+    )
 
     def surveyed_once():
         # With displacements on a grid, the template is surveyed, which is the same at
@@ -123,13 +125,13 @@ def field(
         time = jnp.asarray(metadata.times[0], kind)
         frame_codes = _look_up(tables, metadata, params, time, jnp.int32(0))
         condition = FrameCondition(time, frame_codes, step)
-        return skipping.survey(Bound(spec, metadata, still, params), condition)
+        return skipping.survey(Bound(spec, metadata, static_effects, params), condition)
 
     def render_occupied(params, occupied, camera, time, codes, size, step):
         bound, condition = bind(params), FrameCondition(time, codes, step)
         if not surveyed_once():
-            shown = skipping.shown_cells(bound, camera, size)
-            occupied = skipping.survey(bound, condition, shown)
+            visible_cells = skipping.shown_cells(bound, camera, size)
+            occupied = skipping.survey(bound, condition, visible_cells)
         return skipping.draw(bound, occupied, camera, condition, size)
 
     return Field(
@@ -143,8 +145,8 @@ def field(
         render,
         survey if skipping.usable(spec, active) else None,
         render_occupied,
-        lambda own, numbers: field(
-            spec, own.metadata.with_numbers(numbers), without, effects
+        lambda original, numbers: field(
+            spec, original.metadata.with_numbers(numbers), without, effects
         ),
     )
 
@@ -221,20 +223,20 @@ def _active(effects, without):
 
 
 def _init(spec, metadata, effects, key):
-    lifted = sum(effect.trunk_width for effect in effects)
+    ambient_width = sum(effect.trunk_width for effect in effects)
     condition = sum(e.condition_width + e.surface_width for e in effects)
     nets = {}
     keys = jax.random.split(key, 3)
     for number, (name, one) in enumerate(specs.templates_of(spec).items()):
         own = jax.random.fold_in(keys[0], number)
         if not isinstance(one, template.TemplateSpec):
-            nets[name] = one.init(own, lifted, condition)
+            nets[name] = one.init(own, ambient_width, condition)
             continue
         extras = 0 if one.direction is None else one.direction.width(3)
         nets[name] = template.init(
             one,
             own,
-            one.encoded_width + lifted,
+            one.encoded_width + ambient_width,
             condition + extras,
         )
     rows = {MOMENT: len(metadata.times)}

@@ -121,9 +121,9 @@ def first_distances(
     assert spec.extent is not None
     assert plan.occupancy is not None
     # Equal parts for any spacing, because cells are of equal size.
-    filled = filled_along(guide, ray, spec.extent)
+    is_occupied = filled_along(guide, ray, spec.extent)
     empty = plan.occupancy.empty
-    return sampling.among(key, ray.near, ray.far, filled, plan.coarse, empty)
+    return sampling.among(key, ray.near, ray.far, is_occupied, plan.coarse, empty)
 
 
 def fine_distances(

@@ -54,10 +54,10 @@ def resolves(bound: Bound) -> bool:
     if any(effect.trunk_features or effect.point_codes for effect in bound.effects):
         return False
     waves = [e.shortest_wave for e in bound.effects if e.displace is not None]
-    known = [wave for wave in waves if wave is not None]
-    if not waves or len(known) < len(waves):
+    wavelengths = [wave for wave in waves if wave is not None]
+    if not waves or len(wavelengths) < len(waves):
         return False
-    return bool(CELLS_A_WAVE * cell <= min(known))
+    return bool(CELLS_A_WAVE * cell <= min(wavelengths))
 
 
 def displacements(
@@ -82,7 +82,7 @@ def displacements(
     )
     share = jnp.linspace(0, 1, DEEP + 1, dtype=dtype)
 
-    def moved(position):
+    def displacement_at(position):
         ray, _ = field_ray_through(bound.metadata, camera, position)
 
         def corner(share):
@@ -93,7 +93,9 @@ def displacements(
         return jax.vmap(corner)(share)
 
     # Row by row, with some thousand points at a time.
-    return jax.lax.map(jax.vmap(moved), jnp.stack(jnp.meshgrid(columns, rows), axis=-1))
+    return jax.lax.map(
+        jax.vmap(displacement_at), jnp.stack(jnp.meshgrid(columns, rows), axis=-1)
+    )
 
 
 def column(

@@ -75,7 +75,7 @@ def random_points(
     """
     corner = jnp.stack(jnp.unravel_index(index, (cells,) * 3), axis=-1)
     jitter = jax.random.uniform(key, corner.shape, dtype)
-    return _placed((corner.astype(dtype) + jitter) / cells, half_side)
+    return _contract_back((corner.astype(dtype) + jitter) / cells, half_side)
 
 
 def corners(
@@ -92,16 +92,18 @@ def corners(
       Points in units of the field, [cells + 1, cells + 1, cells + 1, 3].
     """
     share = jnp.arange(cells + 1, dtype=dtype) / cells
-    return _placed(jnp.stack(jnp.meshgrid(*3 * [share], indexing="ij"), -1), half_side)
+    return _contract_back(
+        jnp.stack(jnp.meshgrid(*3 * [share], indexing="ij"), -1), half_side
+    )
 
 
-def _placed(share, half_side):
+def _contract_back(share, half_side):
     """Convert positions in [0, 1] over the grid to units of the field."""
     contracted = REACH * (2 * share - 1)
     size = jnp.max(jnp.abs(contracted), axis=-1, keepdims=True)
     # Inverse of (2 - 1 / |x|) x / |x|, which exists because REACH is below 2.
-    away = 1 / (jnp.maximum(size, 1) * (2 - jnp.maximum(size, 1)))
-    return half_side * contracted * away
+    distance = 1 / (jnp.maximum(size, 1) * (2 - jnp.maximum(size, 1)))
+    return half_side * contracted * distance
 
 
 def dilated(occupied: Cells) -> Cells:

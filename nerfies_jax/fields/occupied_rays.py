@@ -37,8 +37,8 @@ def first(field: Field) -> Cells | tuple[()]:
         return ()
     params = jax.eval_shape(field.init, jax.random.key(0))
     survey = functools.partial(_occupied, field)
-    found = jax.eval_shape(survey, params, jnp.zeros((), jnp.int32))
-    return jnp.ones(found.shape, bool)
+    shapes = jax.eval_shape(survey, params, jnp.zeros((), jnp.int32))
+    return jnp.ones(shapes.shape, bool)
 
 
 def events(field: Field) -> tuple[Event, ...]:

@@ -112,19 +112,19 @@ def sample_along_rays(
 
 
 def _check_bounds(near, far, spacing):
-    if spacing == "linear" and _known(far) and bool(jnp.any(jnp.isinf(far))):
+    if spacing == "linear" and _is_concrete(far) and bool(jnp.any(jnp.isinf(far))):
         raise ValueError(
             "sample_along_rays: bins of equal length cannot reach far=inf; use "
             "spacing='disparity' or a finite far"
         )
-    if spacing == "disparity" and _known(near) and not bool(jnp.all(near > 0)):
+    if spacing == "disparity" and _is_concrete(near) and not bool(jnp.all(near > 0)):
         raise ValueError(
             "sample_along_rays: spacing='disparity' needs near > 0, got "
             f"{float(jnp.min(near)):g}"
         )
 
 
-def _known(array):
+def _is_concrete(array):
     return not isinstance(array, jax.core.Tracer)
 
 

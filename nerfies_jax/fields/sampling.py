@@ -227,8 +227,8 @@ def union(
     Returns:
       Sorted distances, [coarse + fine].
     """
-    both = jnp.concatenate([coarse, fine])
-    return jnp.zeros_like(both).at[merged_places(coarse, fine)].set(both)
+    combined = jnp.concatenate([coarse, fine])
+    return jnp.zeros_like(combined).at[merged_places(coarse, fine)].set(combined)
 
 
 def merged_places(
@@ -249,8 +249,8 @@ def merged_places(
     # 40 ms compared with 168.
     before = jnp.sum(fine < coarse[:, None], axis=1, dtype=jnp.int32)
     behind = jnp.sum(coarse <= fine[:, None], axis=1, dtype=jnp.int32)
-    own = [jnp.arange(x.shape[0], dtype=jnp.int32) for x in (coarse, fine)]
-    return jnp.concatenate([own[0] + before, own[1] + behind])
+    ranks = [jnp.arange(x.shape[0], dtype=jnp.int32) for x in (coarse, fine)]
+    return jnp.concatenate([ranks[0] + before, ranks[1] + behind])
 
 
 def refine(

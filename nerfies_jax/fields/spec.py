@@ -253,19 +253,19 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecor
     smooth = None
     if spec.smoothness is not None:
         smooth = smoothness.Bound(spec.smoothness, templates_of(spec))
-    bent, slice_ = spec.warp, spec.ambient
-    if isinstance(bent, WarpSpec) and spec.start.motion == "tracks":
+    warp_spec, slice_ = spec.warp, spec.ambient
+    if isinstance(warp_spec, WarpSpec) and spec.start.motion == "tracks":
         # The warp is fitted with all bands open. Closing them would undo the fit.
-        bent = dataclasses.replace(bent, anneal_steps=None)
-    if spec.mask is not None and isinstance(bent, WarpSpec):
-        bent = guided(bent)
+        warp_spec = dataclasses.replace(warp_spec, anneal_steps=None)
+    if spec.mask is not None and isinstance(warp_spec, WarpSpec):
+        warp_spec = guided(warp_spec)
     if spec.mask is not None and slice_ is not None:
         slice_ = guided(slice_)
     built = (
         (spec.appearance, conditioning),
         (spec.transient, medium),
         (spec.time, conditioning),
-        (bent, warp),
+        (warp_spec, warp),
         (slice_, conditioning),
         (spec.elastic, regularizer),
         (spec.background, regularizer),
@@ -289,8 +289,8 @@ def optimizer_of(spec: RadianceScene) -> Optimizer:
     Returns:
       The optimizer.
     """
-    own = spec.optimizer
-    return OPTIMIZERS[own]() if isinstance(own, str) else own
+    optimizer = spec.optimizer
+    return OPTIMIZERS[optimizer]() if isinstance(optimizer, str) else optimizer
 
 
 GuidedT = TypeVar("GuidedT", WarpSpec, AmbientSpec)

@@ -215,10 +215,10 @@ def encode(
     place = (grids.contract(point) + 2) / 4
     if spec.reads_time and time is not None:
         place = jnp.concatenate([place, time[None]])
-    found = grid.encode(position, params.tables, place)
+    features = grid.encode(position, params.tables, place)
     if window is not None:
-        found = found * jnp.repeat(window, position.features)
-    return found
+        features = features * jnp.repeat(window, position.features)
+    return features
 
 
 def raw_density(
@@ -295,8 +295,10 @@ def color_offset(
       The contribution, [color_width].
     """
     bottleneck, first = params.trunk.heads["bottleneck"], params.color.hidden[0]
-    ours, rest = jnp.split(first.weight, [spec.width])
-    return condition @ rest[: len(condition)] + (bottleneck.bias @ ours + first.bias)
+    ours, other_weights = jnp.split(first.weight, [spec.width])
+    return condition @ other_weights[: len(condition)] + (
+        bottleneck.bias @ ours + first.bias
+    )
 
 
 def colored(

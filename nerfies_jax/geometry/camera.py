@@ -117,11 +117,11 @@ def project(
     # formed, so no 0 * inf reaches the gradient.
     reach = jnp.max(jnp.abs(lateral))
     divisor = jnp.maximum(depth, jnp.maximum(reach / MAX_SLOPE, MIN_DEPTH))
-    bent = lens.distort(camera, lateral / divisor)
+    distorted = lens.distort(camera, lateral / divisor)
     pixel = jnp.stack(
         [
-            camera.focal_px * bent[0] + camera.skew_px * bent[1],
-            camera.focal_px * camera.pixel_aspect * bent[1],
+            camera.focal_px * distorted[0] + camera.skew_px * distorted[1],
+            camera.focal_px * camera.pixel_aspect * distorted[1],
         ]
     )
     return pixel + camera.principal_point_px, depth
@@ -237,10 +237,10 @@ def move(
       The camera with rotation and position changed.
     """
     rotation, shift = lie.exp_se3(angular, linear)
-    turned = exact_product(rotation, camera.camera_from_world)
+    rotation_from_world = exact_product(rotation, camera.camera_from_world)
     # t' = R t + V v with t = -R c; the center moves by -R'ᵀ V v, and nothing cancels.
-    moved = camera.position - exact_product(shift, turned)
-    return camera._replace(camera_from_world=turned, position=moved)
+    position = camera.position - exact_product(shift, rotation_from_world)
+    return camera._replace(camera_from_world=rotation_from_world, position=position)
 
 
 def resize(
@@ -265,10 +265,10 @@ def resize(
                 f"{name}={size} must be at least 1x1 pixels (width, height)"
             )
     across, down = new_size[0] / old_size[0], new_size[1] / old_size[1]
-    both = np.asarray([across, down], dtype=camera.principal_point_px.dtype)
+    factors = np.asarray([across, down], dtype=camera.principal_point_px.dtype)
     return camera._replace(
         focal_px=camera.focal_px * across,
-        principal_point_px=camera.principal_point_px * both,
+        principal_point_px=camera.principal_point_px * factors,
         skew_px=camera.skew_px * across,
         pixel_aspect=camera.pixel_aspect * (down / across),
     )

@@ -165,48 +165,52 @@ def _bernstein(radial, tangential, slopes):
 
 
 @jax.custom_jvp
-def _undistorted(radial, tangential, bent):
-    start = _radial_root(radial, bent)
+def _undistorted(radial, tangential, distorted):
+    start = _radial_root(radial, distorted)
 
     def newton(_, slopes):
         jacobian = _jacobian(radial, tangential, slopes)
-        step = _solve(jacobian, distort(radial, tangential, slopes) - bent)
+        step = _solve(jacobian, distort(radial, tangential, slopes) - distorted)
         return slopes - step
 
     slopes = lax.fori_loop(0, PLANE_STEPS, newton, start)
     # Where there is no solution Newton wanders to other branches, or to infinity.
-    return jnp.where(_solves(radial, tangential, bent, slopes), slopes, start)
+    return jnp.where(_solves(radial, tangential, distorted, slopes), slopes, start)
 
 
 @_undistorted.defjvp
 def _undistorted_jvp(primals, tangents):
     """Implicit: J ds = d bent - ∂distort/∂(lens) d lens. Same rule at every order."""
-    radial, tangential, bent = primals
+    radial, tangential, distorted = primals
     radial_dot, tangential_dot, bent_dot = tangents
-    slopes = _undistorted(radial, tangential, bent)
+    slopes = _undistorted(radial, tangential, distorted)
     _, tangent = jax.jvp(
         lambda k, p: distort(k, p, slopes),
         (radial, tangential),
         (radial_dot, tangential_dot),
     )
     step = _solve(_jacobian(radial, tangential, slopes), bent_dot - tangent)
-    return slopes, jnp.where(_solves(radial, tangential, bent, slopes), step, 0)
+    return slopes, jnp.where(_solves(radial, tangential, distorted, slopes), step, 0)
 
 
-def _solves(radial, tangential, bent, slopes):
+def _solves(radial, tangential, distorted, slopes):
     """Test if `slopes` is the wanted root. False for NaN, as comparisons are."""
-    residual = jnp.max(jnp.abs(distort(radial, tangential, slopes) - bent))
-    bound = RESIDUAL_ULPS * jnp.finfo(bent.dtype).eps * (1 + jnp.max(jnp.abs(bent)))
+    residual = jnp.max(jnp.abs(distort(radial, tangential, slopes) - distorted))
+    bound = (
+        RESIDUAL_ULPS
+        * jnp.finfo(distorted.dtype).eps
+        * (1 + jnp.max(jnp.abs(distorted)))
+    )
     return (residual <= bound) & one_to_one(radial, tangential, slopes)
 
 
-def _radial_root(radial, bent):
+def _radial_root(radial, distorted):
     """The root without tangential terms: bisection that Newton shortens.
 
     `beyond` tells on which side of the root (or of the fold, where there is no root) a
     radius lies, so the bracket always holds the first of the two.
     """
-    target = jnp.sqrt(jnp.sum(bent**2))
+    target = jnp.sqrt(jnp.sum(distorted**2))
     k1, k2, k3 = radial[0], radial[1], radial[2]
 
     def narrow(_, state):
@@ -237,7 +241,7 @@ def _radial_root(radial, bent):
     radius = jnp.where(
         _unfolded(radial, (radius / INSIDE) ** 2), radius, INSIDE * radius
     )
-    return bent * (radius / jnp.where(target > 0, target, 1))
+    return distorted * (radius / jnp.where(target > 0, target, 1))
 
 
 def _radial_slope(radial, radius_sq):

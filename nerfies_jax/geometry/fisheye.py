@@ -149,8 +149,8 @@ def _unfolded(coefficients, angle_sq):
 
 
 @jax.custom_jvp
-def _undistorted(coefficients, bent):
-    target = jnp.sqrt(jnp.sum(bent**2))
+def _undistorted(coefficients, distorted):
+    target = jnp.sqrt(jnp.sum(distorted**2))
 
     def narrow(_, state):
         low, high, angle = state
@@ -166,13 +166,15 @@ def _undistorted(coefficients, bent):
         return low, high, jnp.where(trusted, inside, (low + high) / 2)
 
     # No angle beyond the first fold is searched.
-    angles = jnp.linspace(0, _WIDEST, SEARCHED, dtype=bent.dtype)
+    angles = jnp.linspace(0, _WIDEST, SEARCHED, dtype=distorted.dtype)
     _, slopes = _radius(coefficients, angles)
     high = jnp.min(jnp.where(slopes <= 0, angles, _WIDEST))
     state = jnp.zeros_like(target), high, jnp.minimum(target, high)
     _, _, angle = lax.fori_loop(0, STEPS, narrow, state)
     radius = jnp.tan(jnp.minimum(angle, high))
-    return bent * jnp.where(target > 0, radius / jnp.where(target > 0, target, 1), 1)
+    return distorted * jnp.where(
+        target > 0, radius / jnp.where(target > 0, target, 1), 1
+    )
 
 
 def _radius(coefficients, angle):
@@ -186,15 +188,15 @@ def _radius(coefficients, angle):
 @_undistorted.defjvp
 def _undistorted_jvp(primals, tangents):
     """Implicit: J ds = d bent - ∂distort/∂k dk, with J in its radial frame."""
-    coefficients, bent = primals
+    coefficients, distorted = primals
     coefficients_dot, bent_dot = tangents
-    slopes = _undistorted(coefficients, bent)
+    slopes = _undistorted(coefficients, distorted)
     _, tangent = jax.jvp(
         lambda k: distort(k, slopes), (coefficients,), (coefficients_dot,)
     )
     right = bent_dot - tangent
     squared = jnp.sum(slopes * slopes)
-    solved = _solves(coefficients, bent, slopes)
+    solved = _solves(coefficients, distorted, slopes)
     ratio, _, along = stretch(coefficients, squared)
     ratio, along = jnp.where(solved, ratio, 1), jnp.where(solved, along, 1)
     # 1/ratio across and 1/along along the slopes; both are 1 at the axis.
@@ -203,8 +205,12 @@ def _undistorted_jvp(primals, tangents):
     return slopes, jnp.where(solved, step, 0)
 
 
-def _solves(coefficients, bent, slopes):
+def _solves(coefficients, distorted, slopes):
     """Test if `slopes` is the wanted root. False for NaN, as comparisons are."""
-    residual = jnp.max(jnp.abs(distort(coefficients, slopes) - bent))
-    bound = RESIDUAL_ULPS * jnp.finfo(bent.dtype).eps * (1 + jnp.max(jnp.abs(bent)))
+    residual = jnp.max(jnp.abs(distort(coefficients, slopes) - distorted))
+    bound = (
+        RESIDUAL_ULPS
+        * jnp.finfo(distorted.dtype).eps
+        * (1 + jnp.max(jnp.abs(distorted)))
+    )
     return (residual <= bound) & one_to_one(coefficients, slopes)

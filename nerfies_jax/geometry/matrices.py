@@ -65,8 +65,10 @@ def camera_fields(
         **fisheye,
     }
     return {
-        name: np.broadcast_to(value, batch + value.shape[value.ndim - own :]).copy()
-        for name, (value, own) in fields.items()
+        name: np.broadcast_to(
+            value, batch + value.shape[value.ndim - base_rank :]
+        ).copy()
+        for name, (value, base_rank) in fields.items()
     }
 
 

@@ -55,8 +55,8 @@ def known_depth(
     Returns:
       Booleans [...], True if both are finite and the truth is positive.
     """
-    known = jnp.isfinite(depth) & jnp.isfinite(truth) & (truth > 0)
-    return known if mask is None else known & mask
+    valid = jnp.isfinite(depth) & jnp.isfinite(truth) & (truth > 0)
+    return valid if mask is None else valid & mask
 
 
 def depth_errors(

@@ -40,8 +40,8 @@ def main_key(key: str, values: Mapping[str, object]) -> str:
     Returns:
       The key of the metric with fitted codes, if the run has it. `key` otherwise.
     """
-    fitted = FITTED.get(key, key)
-    return fitted if values.get(fitted) is not None else key
+    fitted_key = FITTED.get(key, key)
+    return fitted_key if values.get(fitted_key) is not None else key
 
 
 METRICS: dict[str, Entry] = {

@@ -90,10 +90,10 @@ class PlanesSpec:
         Raises:
           ValueError: If the planes have another number of dimensions.
         """
-        wanted = 3 if self.moments is None else 4
-        if dimensions != wanted:
+        axes = 3 if self.moments is None else 4
+        if dimensions != axes:
             raise ValueError(
-                f"planes with moments={self.moments} have {wanted} dimensions, but the "
+                f"planes with moments={self.moments} have {axes} dimensions, but the "
                 f"points have {dimensions}"
             )
         return len(self.multiples) * self.features

@@ -62,18 +62,18 @@ def advise(
     Raises:
       ValueError: If the representation recommends no presets.
     """
-    wanted = {one.effect: one.wanted for one in findings}
+    needs = {one.effect: one.wanted for one in findings}
     notes = [
         f"{effect}: undecided, the setting of the preset is kept"
-        for effect, choice in wanted.items()
+        for effect, choice in needs.items()
         if choice is None
     ]
     if representation.recommendation is None:
         raise ValueError(
             f"the {representation.name} representation recommends no presets"
         )
-    wanted[COLLECTION] = is_collection(findings)
-    choice = representation.recommendation.advise(wanted, full, family)
+    needs[COLLECTION] = is_collection(findings)
+    choice = representation.recommendation.advise(needs, full, family)
     return Advice(
         representation.name,
         choice.preset if full else f"{choice.preset}-small",
@@ -145,10 +145,12 @@ def by_tracks(
         )
     _, choose = choosing[0]
     choice = choose(capture, seconds)
-    changed, lines = _chosen(config, choice), []
+    changed, lines = _config_of_choice(config, choice), []
     other = choice.alternative
     if other is not None and try_out is not None and _accepted(config, other):
-        trial = try_out(changed, _chosen(config, other), capture, other.preset)
+        trial = try_out(
+            changed, _config_of_choice(config, other), capture, other.preset
+        )
         lines = [
             f"motion: after {trial.steps} steps {trial.without:.2f} dB with "
             f"{choice.preset} and {trial.with_effect:.2f} dB with {other.preset} on "
@@ -156,13 +158,13 @@ def by_tracks(
         ]
         if trial.pays:
             lines[0] += "; motion is worth less than nothing, so the scene is static"
-            choice, changed = other, _chosen(config, other)
+            choice, changed = other, _config_of_choice(config, other)
     words = [choice.preset, *(["--set"] if choice.overrides else []), *choice.overrides]
     line = f"preset: {' '.join(words)}" + "".join(f" ({n})" for n in choice.notes)
     return changed, [*lines, line]
 
 
-def _chosen(config, choice):
+def _config_of_choice(config, choice):
     overrides = (*choice.overrides, *config.overrides)
     return dataclasses.replace(config, preset=choice.preset, overrides=overrides)
 
@@ -170,7 +172,7 @@ def _chosen(config, choice):
 def _accepted(config, choice):
     """Test if a preset has all components that the user's overrides set."""
     try:
-        scene_spec(_chosen(config, choice))
+        scene_spec(_config_of_choice(config, choice))
     except ValueError:
         return False
     return True

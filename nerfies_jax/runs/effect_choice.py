@@ -95,8 +95,8 @@ def _overrides(config: RunConfig, finding: Finding, user_overrides) -> tuple[str
     recommendation = representation.recommendation
     if recommendation is None:
         return ()
-    wanted = {finding.effect: finding.wanted}
-    overrides = recommendation.effect_overrides(wanted, scene_spec(config))
+    needs = {finding.effect: finding.wanted}
+    overrides = recommendation.effect_overrides(needs, scene_spec(config))
     user_set = {_component(text) for text in user_overrides}
     return tuple(text for text in overrides if _component(text) not in user_set)
 

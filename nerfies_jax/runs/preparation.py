@@ -107,16 +107,16 @@ def prepare(
     with scratch_folder(out) as scratch, _renaming_paths(scratch, source, out):
         if kind == "film":
             tell(f"selecting sharp frames of {source}")
-        taken = _taken(kind, source, scratch, how)
-        for line in taken.notes:
+        source_images = _source_images(kind, source, scratch, how)
+        for line in source_images.notes:
             tell(line)
-        solved = _solve(scratch, taken, how, tell)
+        solved = _solve(scratch, source_images, how, tell)
         for line in solved.lines:
             tell(line)
         capture = colmap.read(solved.poses.folder)
         rate = None
-        if taken.seconds:
-            rate = (len(taken.names) - 1) / taken.seconds
+        if source_images.seconds:
+            rate = (len(source_images.names) - 1) / source_images.seconds
         if how.masks is None:  # detected masks are not ground truth for metrics
             capture = dataclasses.replace(capture, moving=None)
         capture = dataclasses.replace(
@@ -154,7 +154,7 @@ def _renaming_paths(scratch, source, out):
         raise CaptureError(message) from error
 
 
-def _taken(kind, source, scratch, how) -> Taken:
+def _source_images(kind, source, scratch, how) -> Taken:
     if kind == "film":
         return footage.from_film(
             source, scratch, how.frames, how.fps, how.max_side, how.masks
@@ -162,7 +162,7 @@ def _taken(kind, source, scratch, how) -> Taken:
     return footage.from_pictures(source, scratch, how.max_side, how.masks)
 
 
-def _solve(scratch, taken, how, tell) -> Solved:
+def _solve(scratch, source_images, how, tell) -> Solved:
     """Estimate the cameras of the images in `scratch/images`, in one pass or two."""
     spec = MappingSpec(
         camera_model=how.camera_model,
@@ -170,9 +170,9 @@ def _solve(scratch, taken, how, tell) -> Solved:
         threads=how.threads,
         cameras=how.cameras,
     )
-    if taken.focal is not None:
-        spec = dataclasses.replace(spec, focal=taken.focal)
-    groups = _camera_groups(taken, how, spec)
+    if source_images.focal is not None:
+        spec = dataclasses.replace(spec, focal=source_images.focal)
+    groups = _camera_groups(source_images, how, spec)
     if len(groups) > 1:  # photographs of several cameras are in no order
         spec = dataclasses.replace(spec, in_order=False)
         if how.cameras == "auto":
@@ -204,7 +204,9 @@ def _solve(scratch, taken, how, tell) -> Solved:
     else:
         row_of = {f"{name}.png": row for row, name in enumerate(capture.ids)}
         empty = np.zeros(moving.shape[1:], bool)  # for images that were not registered
-        by_name = {n: moving[row_of[n]] if n in row_of else empty for n in taken.names}
+        by_name = {
+            n: moving[row_of[n]] if n in row_of else empty for n in source_images.names
+        }
         masks = _write_masks(scratch, by_name)
         tell(
             f"{moving.mean():.1%} of the pixels show moving objects; estimating the "
@@ -225,14 +227,14 @@ def _solve(scratch, taken, how, tell) -> Solved:
     return Solved(second, masks is not None, tuple(second.lines()))
 
 
-def _camera_groups(taken, how, spec):
+def _camera_groups(source_images, how, spec):
     """Images by camera."""
-    if how.cameras == "auto" and len(taken.groups) > 1:
+    if how.cameras == "auto" and len(source_images.groups) > 1:
         return [
             CameraGroup(names, spec.focal if focal is None else focal)
-            for names, focal in taken.groups
+            for names, focal in source_images.groups
         ]
-    return [CameraGroup(taken.names, spec.focal)]
+    return [CameraGroup(source_images.names, spec.focal)]
 
 
 def _accepted(spec, how):

@@ -107,13 +107,15 @@ def make(
             attempt(None, curves.write, target, history, watched, course)
             path = target / "psnr_over_time.png"
             seconds = ms_per_frame / 1e3
-            fitted, fit_notes = score_halves(
+            fitted_metrics, fit_notes = score_halves(
                 run, state, trained.scorer, scored, seconds
             )
             final = curve_figure.Result(
-                fitted[0].value if fitted else evaluation.known_mean(scored.psnr),
+                fitted_metrics[0].value
+                if fitted_metrics
+                else evaluation.known_mean(scored.psnr),
                 len(scored.rows),
-                is_fitted=bool(fitted),
+                is_fitted=bool(fitted_metrics),
             )
             curve = attempt(
                 None, _with_extra, curve_figure.save, path, run, trained, final
@@ -135,7 +137,7 @@ def make(
             )
             metrics = heldout.metrics(numbers)
             metrics += measured(run, trained, scored, ms_per_frame, start_time)
-            metrics += [*fitted, *model_size(saved)]
+            metrics += [*fitted_metrics, *model_size(saved)]
             attempt(None, _save_metrics, target / METRICS, metrics)
             main = {each.key: each.value for each in metrics}
             warnings = baselines_text.warnings(main, quality.tracked_share(run, main))

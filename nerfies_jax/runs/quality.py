@@ -101,24 +101,26 @@ def measure(
     Returns:
       Values by the keys of `heldout.TOLERANCES`, and notes.
     """
-    known = tracked = flow = fitted = None
+    ground_truth = tracked = flow = camera_fit = None
     capture, note = moving_masks.with_masks(run.observed, CACHE / "evidence")
     notes = [note] if note else []
     try:
         truth = protocol.stored_truth(capture)
         if truth is not None:
-            known = protocol.ground_truth(capture, truth, len(scored.rows), TRACKS)
+            ground_truth = protocol.ground_truth(
+                capture, truth, len(scored.rows), TRACKS
+            )
     except ValueError as error:
         notes.append(f"Tracks were not evaluated: {error}")
-    if known is not None:
+    if ground_truth is not None:
         kind, scene = run.representation, (run.spec, run.metadata)
-        tracked = kind.scoring.follow(*scene, state, capture, known)
+        tracked = kind.scoring.follow(*scene, state, capture, ground_truth)
         move = kind.scoring.mover(*scene)
         if move is not None:
             flow = model_flow.heldout_flow(move, state, capture, scored)
     if extra.camera_fits:
         places = evaluation.spread(np.arange(len(scored.rows)), extra.camera_fits)
-        fitted = fitted_cameras.fit_cameras(
+        camera_fit = fitted_cameras.fit_cameras(
             run.model,
             draw,
             state,
@@ -127,12 +129,12 @@ def measure(
             observed=run.observed,
         )
         before, after = map(
-            evaluation.known_mean, (scored.psnr[places], fitted.scored.psnr)
+            evaluation.known_mean, (scored.psnr[places], camera_fit.scored.psnr)
         )
         notes.append(
             f"PSNR of {len(places)} held-out frames: {before:.2f} dB with the cameras "
             f"of the capture, {after:.2f} dB with cameras optimized for these frames "
-            f"({fitted.converged.sum()} of {len(places)} converged)."
+            f"({camera_fit.converged.sum()} of {len(places)} converged)."
         )
     if extra.lpips is not None:
         notes.append(f"LPIPS uses {extra.lpips.network.name}, version 0.1.")
@@ -140,10 +142,10 @@ def measure(
         scored,
         capture,
         lpips=extra.lpips,
-        known=known,
+        known=ground_truth,
         followed=tracked,
         flow=flow,
-        fitted=fitted,
+        fitted=camera_fit,
         baselines=_baselines(run, state, draw, scored.rows, frame_seconds),
     )
     return numbers, notes

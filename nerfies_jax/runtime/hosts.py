@@ -30,7 +30,7 @@ END, RUN, COMPILE, STEPS = "end", "run", "compile", "steps"  # kinds of messages
 _messages = 0  # sent or received by this process
 _barriers = 0
 # Leaves of the state that the last chunk returned, which all processes have.
-_known: list[weakref.ref] = []
+_sent_leaves: list[weakref.ref] = []
 
 
 class Lost(ValueError):
@@ -172,10 +172,10 @@ def send_steps(
       count: Number of steps of the chunk.
     """
     leaves = jax.tree.leaves(state)
-    known = len(leaves) == len(_known) and all(
-        last() is leaf for last, leaf in zip(_known, leaves, strict=True)
+    is_same_tree = len(leaves) == len(_sent_leaves) and all(
+        last() is leaf for last, leaf in zip(_sent_leaves, leaves, strict=True)
     )
-    arrays = kind == STEPS and not known
+    arrays = kind == STEPS and not is_same_tree
     send(
         kind,
         steps=steps,
@@ -194,7 +194,7 @@ def remember(state: PyTree) -> None:
     Args:
       state: Training state.
     """
-    _known[:] = [weakref.ref(leaf) for leaf in jax.tree.leaves(state)]
+    _sent_leaves[:] = [weakref.ref(leaf) for leaf in jax.tree.leaves(state)]
 
 
 def received_state(message: dict[str, Any], example: PyTree) -> PyTree:
@@ -234,11 +234,11 @@ def check_frames(message: dict[str, Any], frames: PyTree) -> None:
     Raises:
       ValueError: If an array has another shape or type.
     """
-    own = [_note(leaf) for leaf in jax.tree.leaves(frames)]
-    if own != message["frames"]:
+    notes = [_note(leaf) for leaf in jax.tree.leaves(frames)]
+    if notes != message["frames"]:
         raise ValueError(
             f"process {jax.process_index()} read training frames of "
-            f"{[n['shape'] for n in own]}, and process 0 of "
+            f"{[n['shape'] for n in notes]}, and process 0 of "
             f"{[n['shape'] for n in message['frames']]}; give all processes the same "
             "capture and the same cache (XDG_CACHE_HOME)"
         )

@@ -41,12 +41,12 @@ class Display:
                 self._train(event)
 
     def _train(self, event):
-        for shown in reversed(self._open.values()):
-            if shown.name == event.get("phase"):
-                shown.done, shown.total = event["step"], event["steps"]
-                shown.text, shown.eta = _training_text(event), event["eta_seconds"]
-                shown.count_format = "step {:,} of {:,}"
-                self._view.update(shown)
+        for state in reversed(self._open.values()):
+            if state.name == event.get("phase"):
+                state.done, state.total = event["step"], event["steps"]
+                state.text, state.eta = _training_text(event), event["eta_seconds"]
+                state.count_format = "step {:,} of {:,}"
+                self._view.update(state)
                 return
 
     def _message(self, event):
@@ -65,16 +65,16 @@ class Display:
             if not self._open:
                 self._start()
             self._open[number] = _Shown(event["name"])
-        shown = self._open.get(number)
-        if shown is None:  # the stage began on another display
+        state = self._open.get(number)
+        if state is None:  # the stage began on another display
             return
-        shown.done, shown.total = event["done"], event["total"]
-        shown.text = event.get("text", shown.text)
+        state.done, state.total = event["done"], event["total"]
+        state.text = event.get("text", state.text)
         if event["status"] in ("begin", "progress"):
-            self._view.update(shown)
+            self._view.update(state)
             return
         del self._open[number]
-        self._view.remove(shown)
+        self._view.remove(state)
         if not self._open:
             self._idle.set()
             self._view.close()
@@ -144,14 +144,14 @@ class _Lines:
         else:
             _print(self._target, text)
 
-    def update(self, shown):
+    def update(self, state):
         # The speed of training is reported immediately.
-        if shown.first and shown.eta is not None:
-            self._show(shown)
+        if state.first and state.eta is not None:
+            self._show(state)
 
-    def _show(self, shown):
-        shown.first, self._last = False, time.monotonic()
-        self.write(shown.line())
+    def _show(self, state):
+        state.first, self._last = False, time.monotonic()
+        self.write(state.line())
 
     def tick(self, stages):
         innermost = stages[-1]
@@ -164,7 +164,7 @@ class _Lines:
         if due:
             self._show(innermost)
 
-    def remove(self, shown):
+    def remove(self, state):
         pass
 
     def close(self):
@@ -192,30 +192,30 @@ class _Bars:
     def write(self, text):
         _print(self._console, text)
 
-    def update(self, shown):
-        if shown.task is not None:
+    def update(self, state):
+        if state.task is not None:
             self._bars.update(
-                shown.task,
-                total=shown.total,
-                completed=shown.done,
-                text=_bar_text(shown),
+                state.task,
+                total=state.total,
+                completed=state.done,
+                text=_bar_text(state),
             )
 
     def tick(self, stages):
-        for shown in stages:
-            if shown.task is None and shown.seconds >= BAR_SECONDS:
-                shown.task = self._bars.add_task(shown.name, total=None, text="")
-            self.update(shown)  # shows the elapsed time
-        if not self._live and any(shown.task is not None for shown in stages):
+        for state in stages:
+            if state.task is None and state.seconds >= BAR_SECONDS:
+                state.task = self._bars.add_task(state.name, total=None, text="")
+            self.update(state)  # shows the elapsed time
+        if not self._live and any(state.task is not None for state in stages):
             self._live = True
             self._stack.enter_context(self._bars)
             self._stack.enter_context(console.display(self.write))
 
-    def remove(self, shown):
-        if shown.task is not None:
-            self._bars.remove_task(shown.task)
-        if shown.seconds >= FIRST_LINE_SECONDS:
-            self.write(f"{shown.name}: {duration(shown.seconds)}")
+    def remove(self, state):
+        if state.task is not None:
+            self._bars.remove_task(state.task)
+        if state.seconds >= FIRST_LINE_SECONDS:
+            self.write(f"{state.name}: {duration(state.seconds)}")
 
     def close(self):
         self._stack.close()
@@ -227,26 +227,26 @@ def _print(target, text):
         target.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
-def _bar_text(shown):
+def _bar_text(state):
     parts = []
-    if shown.total is not None:
-        parts.append(f"{shown.done:,}/{shown.total:,}")
-    if shown.text:
-        parts.append(shown.text)
-    if shown.eta is None:
-        remaining = _remaining_seconds(shown)
+    if state.total is not None:
+        parts.append(f"{state.done:,}/{state.total:,}")
+    if state.text:
+        parts.append(state.text)
+    if state.eta is None:
+        remaining = _remaining_seconds(state)
         if remaining is not None:
             parts.append(f"{duration(remaining)} left")
-        elif shown.seconds >= FIRST_LINE_SECONDS:
-            parts.append(duration(shown.seconds))
+        elif state.seconds >= FIRST_LINE_SECONDS:
+            parts.append(duration(state.seconds))
     return "  ".join(parts)
 
 
-def _remaining_seconds(shown):
+def _remaining_seconds(state):
     """Estimate the remaining time, or return None if too few items are finished."""
-    if not shown.total or not shown.done or shown.seconds < FIRST_LINE_SECONDS:
+    if not state.total or not state.done or state.seconds < FIRST_LINE_SECONDS:
         return None
-    return max(0.0, shown.seconds * (shown.total / shown.done - 1))
+    return max(0.0, state.seconds * (state.total / state.done - 1))
 
 
 def _training_text(event: dict[str, Any]) -> str:

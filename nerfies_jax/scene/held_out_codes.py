@@ -62,8 +62,8 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
         guide = field.survey(params, step)[skipping.GUIDE] if guided else None
         codes = field.codes_at(params, view)
 
-        def loss(fitted):
-            condition = FrameCondition(view.time, codes | fitted, step)
+        def loss(candidate):
+            condition = FrameCondition(view.time, codes | candidate, step)
 
             def color_of(pixel):
                 ray, _ = field_ray.field_ray_through(field.metadata, view.camera, pixel)
@@ -85,13 +85,13 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
         params, step = state.params, state.step
 
         def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> Any:
-            shown = np.ones(left.shape[:2], bool) if valid is None else valid
-            place = np.argwhere(shown)
+            observed = np.ones(left.shape[:2], bool) if valid is None else valid
+            place = np.argwhere(observed)
             if not len(place):  # no valid pixels
                 return codes_of(params, view)
             # With replacement, so that shapes do not depend on the number of pixels.
-            chosen = np.random.default_rng(0).integers(len(place), size=RAYS)
-            line, column = place[chosen].T
+            sample = np.random.default_rng(0).integers(len(place), size=RAYS)
+            line, column = place[sample].T
             pixels = in_default_precision(np.stack([column, line], axis=1) + 0.5)
             colors = in_default_precision(left[line, column].astype(np.float32) / 255)
             return solve(params, view, pixels, colors, step)

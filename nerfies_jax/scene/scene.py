@@ -162,13 +162,13 @@ def _model(radiance, more):
 
 def _check_guides(spec, effects):
     """Raise ValueError for guides that no effect provides, before tracing."""
-    there = tuple(effect.name for effect in effects if effect.point_codes is not None)
+    guides = tuple(effect.name for effect in effects if effect.point_codes is not None)
     for part in ("warp", "ambient"):
         for guide in getattr(getattr(spec, part), "guides", ()):
-            if guide not in there:
+            if guide not in guides:
                 raise ValueError(
                     f"{part}.guides names {guide!r}, and there is "
-                    f"{' and '.join(there) or 'none'}; leave it out, set mask for "
+                    f"{' and '.join(guides) or 'none'}; leave it out, set mask for "
                     f"{moving_mask.NAME!r}, or add a conditioning of that name whose "
                     'target is "warp"'
                 )
@@ -186,12 +186,12 @@ def drawing(radiance: Field, seen: Callable[..., tuple[View, Codes]]) -> dict[st
       The fields of `Model` by name.
     """
 
-    def render(params, given, size, step):
-        view, frame_codes = seen(params, given)
+    def render(params, inputs, size, step):
+        view, frame_codes = seen(params, inputs)
         return radiance.render(params, view.camera, view.time, frame_codes, size, step)
 
-    def draw(params, occupied, given, size, step):
-        view, frame_codes = seen(params, given)
+    def draw(params, occupied, inputs, size, step):
+        view, frame_codes = seen(params, inputs)
         return radiance.render_occupied(
             params, occupied, view.camera, view.time, frame_codes, size, step
         )
@@ -303,22 +303,27 @@ def learning_rates(
     Returns:
       Rates, a prefix of the parameters.
     """
-    own = {e.name: e.learning_rate for e in effects if e.learning_rate is not None}
+    effect_rates = {
+        e.name: e.learning_rate for e in effects if e.learning_rate is not None
+    }
     common = schedules.log_linear(
         spec.learning_rate, spec.learning_rate_end, spec.steps
     )(step)
     rates: dict[str, PyTree]
-    rates = {name: own[name](step) if name in own else common for name in params}
+    rates = {
+        name: effect_rates[name](step) if name in effect_rates else common
+        for name in params
+    }
     if "codes" in rates:
         rates["codes"] = spec.code_rate * common
-    held: Array | float = 1.0
+    factor: Array | float = 1.0
     if spec.start.motion == "tracks":
-        held = schedules.log_linear(spec.start.first_rate, 1.0, spec.steps)(step)
+        factor = schedules.log_linear(spec.start.first_rate, 1.0, spec.steps)(step)
         warps = [effect for effect in effects if effect.displace is not None]
         tables = {table.name for effect in warps for table in effect.tables}
-        rates |= {e.name: held * rates[e.name] for e in warps if e.name in params}
+        rates |= {e.name: factor * rates[e.name] for e in warps if e.name in params}
         rates["codes"] = {
-            name: held * rates["codes"] if name in tables else rates["codes"]
+            name: factor * rates["codes"] if name in tables else rates["codes"]
             for name in params["codes"]
         }
     flow = params.get(scene_flow.NAME)
@@ -326,7 +331,7 @@ def learning_rates(
         rate, apart = rates[scene_flow.NAME], flow.flow_trunk is not None
         on_tables = flow.network.tables is not None
         # With a warp, the flow is not initialized from tracks (`build`).
-        of_flow = held * rate if apart and spec.warp is None else rate
+        of_flow = factor * rate if apart and spec.warp is None else rate
         flow_rates: dict[str, PyTree] = dict(
             network=spec.template_rate * rate if on_tables else rate,
             flow=of_flow,

@@ -107,10 +107,10 @@ def appearance_id(capture: Capture, name: str) -> int:
     """
     if name in capture.ids:
         return int(capture.appearance_ids[capture.ids.index(name)])
-    known = np.unique(capture.appearance_ids)
-    if name.isdigit() and int(name) in known:
+    ids = np.unique(capture.appearance_ids)
+    if name.isdigit() and int(name) in ids:
         return int(name)
     raise ValueError(
         f"appearance {name!r} is neither a frame of {capture.name}, such as "
-        f"{capture.ids[0]!r}, nor one of its appearance ids, {known[0]} to {known[-1]}"
+        f"{capture.ids[0]!r}, nor one of its appearance ids, {ids[0]} to {ids[-1]}"
     )

@@ -83,12 +83,12 @@ def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
             np.float32
         )
 
-    position, known, _ = usable_paths.known_paths(evidence)
+    position, valid, _ = usable_paths.known_paths(evidence)
     return FilmPaths(
         capture.times[evidence.row].astype(np.float32),
         capture.appearance_ids[evidence.row],
-        inside(np.where(known[..., None], position, 0)),
-        known,
+        inside(np.where(valid[..., None], position, 0)),
+        valid,
         inside(evidence.still.position),
     )
 
@@ -312,7 +312,7 @@ def _mean(values, counted):
 def _first_places(paths):
     """Return the position of each point in the middle of its known times."""
     places = np.zeros((len(paths.known), 3), np.float32)
-    for row, known in enumerate(paths.known):
-        frames = np.flatnonzero(known)
+    for row, valid in enumerate(paths.known):
+        frames = np.flatnonzero(valid)
         places[row] = paths.position[row, frames[len(frames) // 2]]
     return places

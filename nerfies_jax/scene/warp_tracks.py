@@ -99,25 +99,25 @@ def _static_points(capture):
     return capture.points.position[:STATIC_POINTS]
 
 
-def _follow_flow(field, state, capture, known):
+def _follow_flow(field, state, capture, truth):
     """Track forward and backward by scene flow. Return None without a scene flow."""
     move = _flow_mover(field)
     if move is None:
         return None
-    views = [evaluation.view_of(capture, int(row)) for row in known.moments]
+    views = [evaluation.view_of(capture, int(row)) for row in truth.moments]
     static = _static_points(capture)
-    begin = np.concatenate([known.start_points, static])
-    places = {known.start: Moved(begin, np.ones(len(begin), bool))}
+    begin = np.concatenate([truth.start_points, static])
+    places = {truth.start: Moved(begin, np.ones(len(begin), bool))}
     last = len(views) - 1
     for step, stop in ((1, last), (-1, 0)):
-        for frame in range(known.start, stop, step):
+        for frame in range(truth.start, stop, step):
             before, following = places[frame], frame + step
             step_result = move(state, before.points, views[frame], views[following])
             places[following] = Moved(
                 step_result.points, before.found & step_result.found
             )
-    count = len(known.path)
-    path, found = (
+    count = len(truth.path)
+    path, valid = (
         np.stack(each, axis=1)
         for each in zip(*(places[k] for k in range(len(views))), strict=True)
     )
@@ -125,10 +125,10 @@ def _follow_flow(field, state, capture, known):
     apart = np.linalg.norm(
         static_path - static_path.mean(axis=1, keepdims=True), axis=-1
     )
-    lost = ~found[:count, :, None]
+    lost = ~valid[:count, :, None]
     return PointTracks(
-        path=np.where(lost, known.start_points[:, None], path[:count]).astype("f4"),
-        found=found[:count],
+        path=np.where(lost, truth.start_points[:, None], path[:count]).astype("f4"),
+        found=valid[:count],
         drift=float(apart.mean()) if apart.size else float("nan"),
         strain=float("nan"),
     )

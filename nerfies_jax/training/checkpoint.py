@@ -398,18 +398,21 @@ def _read(folder):
 def _decode(leaves, notes, example, source):
     """Arrange the leaves in the structure of `example`, on the device."""
     paths, structure = jax.tree_util.tree_flatten_with_path(example)
-    wanted = {
+    expected = {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
         for path, leaf in paths
     }
-    if wanted.keys() != notes.keys():
-        missing, unknown = wanted.keys() - notes.keys(), notes.keys() - wanted.keys()
+    if expected.keys() != notes.keys():
+        missing, unknown = (
+            expected.keys() - notes.keys(),
+            notes.keys() - expected.keys(),
+        )
         raise ValueError(
             f"checkpoint {source} was saved by another version: it lacks "
             f"{sorted(missing)} and has the unknown {sorted(unknown)}"
         )
     decoded = []
-    for name, template in wanted.items():
+    for name, template in expected.items():
         array = leaves[name]
         if "key" in notes[name]:
             decoded.append(jax.random.wrap_key_data(array, impl=notes[name]["key"]))

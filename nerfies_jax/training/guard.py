@@ -65,9 +65,11 @@ def _to_host(leaf):
 
 def _to_device(array, sharding, key_impl):
     # Must not alias the host copy, because donated buffers are overwritten.
-    placed = jax.device_put(array, sharding, may_alias=False)
+    on_device = jax.device_put(array, sharding, may_alias=False)
     return (
-        placed if key_impl is None else jax.random.wrap_key_data(placed, impl=key_impl)
+        on_device
+        if key_impl is None
+        else jax.random.wrap_key_data(on_device, impl=key_impl)
     )
 
 

@@ -337,8 +337,8 @@ class _Run:
             return self.step != last_step
         if hook.every_seconds is None:
             return False
-        passed = self.history.seconds - (last_seconds or 0.0)
-        return last_seconds is None or passed >= hook.every_seconds
+        elapsed = self.history.seconds - (last_seconds or 0.0)
+        return last_seconds is None or elapsed >= hook.every_seconds
 
     def _call_hook(self, hook: Hook) -> None:
         numbers = hook.call(self.state, self.step, self._metrics())

@@ -210,8 +210,8 @@ def staircase(steps: tuple[int, ...], start: int = 0) -> Schedule:
     edges = jnp.asarray(steps, jnp.int32)
 
     def schedule(step):
-        passed = jnp.asarray(step, jnp.int32)[..., None] >= edges
-        return start + jnp.sum(passed, axis=-1, dtype=jnp.int32)
+        is_past = jnp.asarray(step, jnp.int32)[..., None] >= edges
+        return start + jnp.sum(is_past, axis=-1, dtype=jnp.int32)
 
     return schedule
 
@@ -219,10 +219,10 @@ def staircase(steps: tuple[int, ...], start: int = 0) -> Schedule:
 def _share(step, steps, after=0):
     """Compute the fraction of the interval that has passed, from 0 to 1."""
     # Subtracted as integers, because float32 cannot count beyond 16.7 million steps.
-    passed = jnp.clip(jnp.asarray(step, jnp.int32) - after, 0, steps)
-    share = passed.astype(jnp.result_type(float)) / steps
+    elapsed = jnp.clip(jnp.asarray(step, jnp.int32) - after, 0, steps)
+    share = elapsed.astype(jnp.result_type(float)) / steps
     # XLA multiplies by the rounded 1 / steps, so the last value may differ from one.
-    return jnp.where(passed == steps, 1.0, share)
+    return jnp.where(elapsed == steps, 1.0, share)
 
 
 def _with_ends(share, between, start, end):

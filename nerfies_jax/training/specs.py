@@ -221,20 +221,20 @@ def record_named(name: Any) -> type:
 # Comparing --------------------------------------------------------------------------
 
 
-def differences(saved: Any, wanted: Any) -> list[str]:
+def differences(saved: Any, current: Any) -> list[str]:
     """Compare two specs.
 
     Args:
       saved: First spec, as JSON.
-      wanted: Second spec, as JSON.
+      current: Second spec, as JSON.
 
     Returns:
       One line for each field in which they differ.
     """
-    saved, wanted = dict(_leaves(saved, "spec")), dict(_leaves(wanted, "spec"))
+    saved, current = dict(_leaves(saved, "spec")), dict(_leaves(current, "spec"))
     lines = []
-    for path in {**saved, **wanted}:
-        before, now = saved.get(path, "absent"), wanted.get(path, "absent")
+    for path in {**saved, **current}:
+        before, now = saved.get(path, "absent"), current.get(path, "absent")
         if before != now:
             lines.append(f"{path}: saved {before}, now {now}")
     return lines

@@ -153,13 +153,15 @@ def point_tracks(
         if row is None:
             canonical = point
             fit = inverse_warp(displace_at, (params, reference), canonical, spec=spec)
-            middle, known = fit.value, fit.converged
+            middle, converged = fit.value, fit.converged
         else:
             canonical = point + displace(params, point, reference)
-            middle, known = point, jnp.all(jnp.isfinite(canonical))
+            middle, converged = point, jnp.all(jnp.isfinite(canonical))
 
-        def advance(position, moment):
-            fit = inverse_warp(displace_at, (params, moment), canonical, position, spec)
+        def advance(position, condition):
+            fit = inverse_warp(
+                displace_at, (params, condition), canonical, position, spec
+            )
             position = jnp.where(fit.converged, fit.value, position)
             return position, (position, fit.converged)
 
@@ -167,7 +169,7 @@ def point_tracks(
         _, (forward, forward_known) = lax.scan(advance, middle, after)
         return Tracks(
             jnp.concatenate([backward[::-1], middle[None], forward]),
-            jnp.concatenate([backward_known[::-1], known[None], forward_known]),
+            jnp.concatenate([backward_known[::-1], converged[None], forward_known]),
         )
 
     return jax.vmap(track)(points)

@@ -333,11 +333,11 @@ def as_bytes(picture: np.ndarray) -> np.ndarray:
     )
 
 
-def _as_unit(picture: np.ndarray) -> np.ndarray:
+def _as_unit(image: np.ndarray) -> np.ndarray:
     """Convert an image to floats."""
-    if picture.dtype == np.uint8:
-        return picture.astype(np.float32) / 255
-    return np.clip(picture, 0, 1).astype(np.float32)
+    if image.dtype == np.uint8:
+        return image.astype(np.float32) / 255
+    return np.clip(image, 0, 1).astype(np.float32)
 
 
 def _limits(values):
@@ -351,11 +351,11 @@ def _span(low, high):
     return high - low if high > low else 1.0  # a constant has one color
 
 
-def _apply_map(unit, known, row):
+def _apply_map(unit, valid, row):
     """Map values in [0, 1] to a row of the color maps, unknown ones to gray."""
     table = _tables()[row]
     index = np.round(np.clip(unit, 0, 1) * 255).astype(np.uint8)
-    return np.where(known[..., None], table[index], np.array(UNKNOWN, np.uint8))
+    return np.where(valid[..., None], table[index], np.array(UNKNOWN, np.uint8))
 
 
 @functools.cache

@@ -131,9 +131,9 @@ def _boards(spec, setting, views, rng):
     center = np.stack([width * rng.uniform(-0.4, 0.4, count), top + half_height], -1)
     light = linear_from_srgb(rng.uniform(0.05, 0.95, (count, 2, 3)))
     order = rng.permutation(spec.frames)
-    shown = np.isin(np.arange(count), order[: round(setting.boards * spec.frames)])
+    has_board = np.isin(np.arange(count), order[: round(setting.boards * spec.frames)])
     return {
-        "board_shown": shown,
+        "board_shown": has_board,
         "board_center": _single(center),
         "board_half": _single(np.stack([half_width, half_height], -1)),
         "board_depth": _single(distance * rng.uniform(0.25, 0.6, count)),
@@ -163,8 +163,8 @@ def in_front(
     """
     slope = exact_product(camera.camera_from_world, direction)[:2]
     place = (slope - photo.board_center) / photo.board_half
-    seen = photo.board_shown & jnp.all(jnp.abs(place) < 1)
-    seen = seen & (photo.board_depth < hit.distance)
+    in_view = photo.board_shown & jnp.all(jnp.abs(place) < 1)
+    in_view = in_view & (photo.board_depth < hit.distance)
     board = trace.Hit(
         photo.board_depth,
         jnp.asarray(spec.transient_id, jnp.int32),
@@ -172,7 +172,7 @@ def in_front(
         -direction,
     )
     return trace.Hit(
-        *(jnp.where(seen, new, old) for new, old in zip(board, hit, strict=True))
+        *(jnp.where(in_view, new, old) for new, old in zip(board, hit, strict=True))
     )
 
 

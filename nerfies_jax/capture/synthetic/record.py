@@ -43,8 +43,8 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
     moves = np.array([thing.moves() for thing in spec.all_things()] + [False])
     moving = moves[hits.thing]  # id -1, for no object, indexes the last entry
     ids = tuple(
-        f"{camera}_{instant:05d}"  # sorted by name, frames stay in this order
-        for instant, camera in zip(plan.instant, plan.camera_id, strict=True)
+        f"{camera}_{place_in_time:05d}"  # sorted by name, frames stay in this order
+        for place_in_time, camera in zip(plan.instant, plan.camera_id, strict=True)
     )
     scene_truth = _truth(spec, plan, hits, ids, programs, seed)
     visible = depths[(depths > 0) & (hits.thing != spec.transient_id)]
@@ -209,13 +209,13 @@ def _flow(plan, scene_truth):
     """The true flow as the flow of a capture."""
     rows = np.arange(len(plan.time))
     leaves = []
-    for step, shift, seen in (
+    for step, shift, valid in (
         (1, scene_truth.flow_forward, scene_truth.forward_seen),
         (-1, scene_truth.flow_backward, scene_truth.backward_seen),
     ):
         neighbor = np.clip(rows + step, 0, len(rows) - 1)
         same_camera = plan.camera_id[neighbor] == plan.camera_id[rows]
-        leaves += [shift, seen, np.where(same_camera, neighbor, rows).astype(np.int32)]
+        leaves += [shift, valid, np.where(same_camera, neighbor, rows).astype(np.int32)]
     return FrameFlow(*leaves)
 
 

@@ -58,28 +58,30 @@ def schedule(spec: SceneSpec, seed: int) -> Schedule:
         return _snapshot_schedule(spec, seed)
     instants = np.arange(spec.frames)
     second_instants = instants[spec.heldout_every // 2 :: spec.heldout_every]
-    instant = np.concatenate([instants, second_instants])
+    instant_index = np.concatenate([instants, second_instants])
     camera_id = np.repeat([0, 1], [len(instants), len(second_instants)])
     times = instants / (spec.frames - 1)
     learn = camera_id == 0
     if spec.skip_every is not None:
-        learn &= instant % spec.skip_every != spec.skip_every // 2
+        learn &= instant_index % spec.skip_every != spec.skip_every // 2
     arcs = [_arc(spec, times, seed, is_second) for is_second in (False, True)]
-    views = cameras.stack([arcs[c][i] for c, i in zip(camera_id, instant, strict=True)])
+    views = cameras.stack(
+        [arcs[c][i] for c, i in zip(camera_id, instant_index, strict=True)]
+    )
     views = _through_lens(spec, views)
-    frame_times = times[instant]
-    transient_shown = np.zeros(len(instant), bool)
+    frame_times = times[instant_index]
+    transient_shown = np.zeros(len(instant_index), bool)
     if spec.transient is not None:
         for start, stop in spec.transient.windows:
             in_window = (start <= frame_times) & (frame_times <= stop)
             transient_shown |= (camera_id == 0) & in_window
     return Schedule(
-        instant.astype(np.int32),
+        instant_index.astype(np.int32),
         camera_id.astype(np.int32),
         frame_times.astype(np.float32),
         learn,
         views,
-        _light_gain(spec, times, seed)[instant],
+        _light_gain(spec, times, seed)[instant_index],
         transient_shown,
     )
 
@@ -87,18 +89,18 @@ def schedule(spec: SceneSpec, seed: int) -> Schedule:
 def _collection_schedule(spec, seed):
     """Photographs, and views for evaluation with the appearance of some of them."""
     instants = np.arange(spec.frames)
-    known = instants[spec.heldout_every // 2 :: spec.heldout_every]
-    instant = np.concatenate([instants, known]).astype(np.int32)
-    taken = collection.photographs(spec, instant, seed)
+    heldout = instants[spec.heldout_every // 2 :: spec.heldout_every]
+    instant_index = np.concatenate([instants, heldout]).astype(np.int32)
+    photographs = collection.photographs(spec, instant_index, seed)
     return Schedule(
-        instant=instant,
-        camera_id=np.arange(len(instant), dtype=np.int32),
-        time=(instant / (spec.frames - 1)).astype(np.float32),
-        learn=np.arange(len(instant)) < spec.frames,
-        cameras=taken.cameras,
-        light_gain=taken.light_gain,
-        transient_shown=np.asarray(taken.photo.board_shown),
-        photo=taken.photo,
+        instant=instant_index,
+        camera_id=np.arange(len(instant_index), dtype=np.int32),
+        time=(instant_index / (spec.frames - 1)).astype(np.float32),
+        learn=np.arange(len(instant_index)) < spec.frames,
+        cameras=photographs.cameras,
+        light_gain=photographs.light_gain,
+        transient_shown=np.asarray(photographs.photo.board_shown),
+        photo=photographs.photo,
     )
 
 
@@ -297,7 +299,7 @@ def _arc(spec, times, seed, is_second):
         offset_right, offset_up, offset_back = setting.beside
         position = position + offset_right * right + offset_up * up + offset_back * back
     if setting.pan_rad:
-        target = position + _turned(target - position, setting.pan_rad * np.sin(sweep))
+        target = position + _rotate(target - position, setting.pan_rad * np.sin(sweep))
     focal_px = spec.size[0] / 2 / np.tan(setting.field_of_view_rad / 2)
     focals_px = focal_px * setting.zoom ** np.sin(np.pi * times) ** 2
     return [
@@ -306,7 +308,7 @@ def _arc(spec, times, seed, is_second):
     ]
 
 
-def _turned(vectors, angles):
+def _rotate(vectors, angles):
     """Rotate vectors [n, 3] about the vertical by angles [n], in radians."""
     x, y, z = vectors.T
     cos, sin = np.cos(angles), np.sin(angles)

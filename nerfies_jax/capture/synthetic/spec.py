@@ -385,5 +385,5 @@ class SceneSpec:
     @property
     def transient_id(self) -> int:
         """Id of the transient object or of boards, or -2, which no pixel has."""
-        there = self.transient is not None or self.collection is not None
-        return len(self.things) if there else -2
+        has_transient = self.transient is not None or self.collection is not None
+        return len(self.things) if has_transient else -2

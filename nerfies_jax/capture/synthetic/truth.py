@@ -133,7 +133,7 @@ def programs(spec: SceneSpec, plan: Schedule) -> Programs:
     """
     shape = jax.ShapeDtypeStruct
     frames, (width, height), points = len(plan.time), spec.size, spec.tracks
-    seen = (
+    frame_index = (
         shape((frames, height, width), np.int32),
         shape((frames, height, width, 3), np.float32),
         plan.cameras,
@@ -142,7 +142,7 @@ def programs(spec: SceneSpec, plan: Schedule) -> Programs:
     )
     if spec.photographed:  # consecutive photographs are not neighbors
         return Programs(None)
-    lowered = [data_parallel.lower_rows(flow, spec, seen)]
+    lowered = [data_parallel.lower_rows(flow, spec, frame_index)]
     if points and any(thing.moves() for thing in spec.things):
         thing, times = shape((points,), np.int32), shape((spec.frames,), np.float32)
         material = shape((points, 3), np.float32)
@@ -251,14 +251,16 @@ def _follow(spec, thing, material, times):
 @functools.partial(jax.jit, static_argnums=0)
 def _watch(spec, thing, points, plan):
     def frame(row):
-        points, camera, time, shown = row
+        points, camera, time, has_transient = row
         return jax.vmap(
-            lambda thing, point: trace.visible(spec, camera, thing, point, time, shown)
+            lambda thing, point: trace.visible(
+                spec, camera, thing, point, time, has_transient
+            )
         )(thing, points)
 
     rows = (jnp.swapaxes(points, 0, 1), plan.cameras, plan.time, plan.transient_shown)
-    pixel, seen = jax.lax.map(frame, rows)
-    return jnp.swapaxes(pixel, 0, 1), jnp.swapaxes(seen, 0, 1)
+    pixel, visible = jax.lax.map(frame, rows)
+    return jnp.swapaxes(pixel, 0, 1), jnp.swapaxes(visible, 0, 1)
 
 
 def save(truth: SceneTruth, path: pathlib.Path):

@@ -430,11 +430,11 @@ def _depth_term(
     """Compare the depth of the medium alone with that of the capture, normalized."""
     batch, level = context.batch, context.levels[-1]
     assert context.frames is not None
-    known = _pixels(context.frames.depths, batch.row, batch.pixel)
+    captured = _pixels(context.frames.depths, batch.row, batch.pixel)
     distance = flow_losses.expected_value(weight, level.distances[..., None])[..., 0]
     predicted = distance * batch.cosine / context.box.scale
     return flow_losses.normalized_depth(
-        predicted, known.astype(predicted.dtype), batch.valid & (known > 0)
+        predicted, captured.astype(predicted.dtype), batch.valid & (captured > 0)
     )
 
 
@@ -458,7 +458,7 @@ def _flow_term(
         (flow.backward, flow.backward_seen, flow.previous_row),
     )
     total = jnp.zeros((), level.point.dtype)
-    for sign, one, (shift, seen, rows) in zip(SIGNS, sides, pairs, strict=True):
+    for sign, one, (shift, visible, rows) in zip(SIGNS, sides, pairs, strict=True):
         other = rows[batch.row].astype(batch.row.dtype)
         elapsed = sign * (frames.times[other] - context.condition.time) / gap
         point = level.point + elapsed[:, None, None] * one.flow
@@ -469,7 +469,7 @@ def _flow_term(
             pixel.dtype
         )
         counted = (
-            _pixels(seen, batch.row, batch.pixel)
+            _pixels(visible, batch.row, batch.pixel)
             & (other != batch.row)
             & batch.valid
             & one.present

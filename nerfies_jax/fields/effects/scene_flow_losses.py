@@ -35,8 +35,8 @@ def fading(decay_steps: int, step: Int[Array, ""]) -> Scalar:
     Returns:
       A factor in (0, 1].
     """
-    passed = (step // decay_steps).astype(jnp.result_type(float))
-    return jnp.exp(-math.log(10) * passed)
+    periods = (step // decay_steps).astype(jnp.result_type(float))
+    return jnp.exp(-math.log(10) * periods)
 
 
 def weighted_mean(
@@ -227,8 +227,11 @@ def expected_value(
     Returns:
       Expected values, [rays, axes].
     """
-    passed = 1 - jnp.sum(weight, axis=-1, keepdims=True)
-    return jnp.sum(weight[..., None] * values, axis=-2) + passed * values[..., -1, :]
+    transmittance = 1 - jnp.sum(weight, axis=-1, keepdims=True)
+    return (
+        jnp.sum(weight[..., None] * values, axis=-2)
+        + transmittance * values[..., -1, :]
+    )
 
 
 def normalized_depth(
@@ -257,12 +260,12 @@ def normalized_depth(
     return mean_where(jnp.square(difference)[:, None], known)
 
 
-def _normalize(depth, known):
+def _normalize(depth, valid):
     """Normalize by median and mean deviation, with gradients. Unknown depths give 0."""
-    count = jnp.sum(known)
-    ordered = jnp.sort(jnp.where(known, depth, jnp.inf))
+    count = jnp.sum(valid)
+    ordered = jnp.sort(jnp.where(valid, depth, jnp.inf))
     median = ordered[jnp.maximum((count - 1) // 2, 0)]
-    offset = jnp.where(known, depth - jnp.where(count > 0, median, 0), 0)
-    spread = mean_where(jnp.abs(offset)[:, None], known)
+    offset = jnp.where(valid, depth - jnp.where(count > 0, median, 0), 0)
+    spread = mean_where(jnp.abs(offset)[:, None], valid)
     least = FLATTEST * jnp.abs(jax.lax.stop_gradient(jnp.where(count > 0, median, 1)))
     return offset / jnp.maximum(spread, jnp.where(least > 0, least, 1))

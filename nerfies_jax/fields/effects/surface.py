@@ -246,10 +246,10 @@ def costs_of(
     values = level.surfaces[NAME]
     weight = jnp.where(valid[:, None], jax.lax.stop_gradient(level.weight), 0)
     slope = jax.lax.stop_gradient(values["slope"])
-    known = jnp.any(slope != 0, axis=-1)
+    has_normal = jnp.any(slope != 0, axis=-1)
     error = jnp.sum((values["head"] - slope) ** 2, axis=-1)
     facing = exact_einsum("rsk,rk->rs", values["observed"], direction)
     return (
-        jnp.mean(jnp.where(known, weight * error, 0)),
+        jnp.mean(jnp.where(has_normal, weight * error, 0)),
         jnp.mean(weight * jnp.maximum(facing, 0) ** 2),
     )
