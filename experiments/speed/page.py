@@ -38,7 +38,8 @@ def page(stored: Mapping[str, Any]) -> str:
     if "job" in stored:
         parts += ["## The default command", _job(stored["job"])]
         if "jobs" in stored:
-            parts.append(_comparison(**stored["jobs"]))
+            jobs = (stored["jobs"][name] for name in ("first", "beside", "again"))
+            parts.append(_comparison(*jobs))
     if "raster" in stored:
         parts += ["## The rasterizer compared with a tuned C++ one", RASTER]
         parts.append(_raster(stored["raster"]["rows"]))
