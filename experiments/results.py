@@ -61,6 +61,7 @@ class Study(NamedTuple):
     module: str  # of experiments, whose docstring opens the page
     page: str  # of experiments, with `page(stored)`
     measured: str = ""  # the stored file, if it is not in experiments/measured
+    figure: str = ""  # of experiments, with `draw(stored, path)`
 
     @property
     def line(self) -> str:
@@ -80,7 +81,10 @@ def _package(about, command):
 
 _REAL = "CAPTURE --max-side 256 --heldout 8 --suite"
 STUDIES = {
-    "benchmark": _package("quality of the default command", "benchmark"),
+    "benchmark": _package("quality of the default command", "benchmark")._replace(
+        about="quality of the default command, and of methods over training time",
+        figure="benchmark.curves",
+    ),
     "ablate_tracked": _suite(
         "parts of the default preset", "--suite tracked --steps 900"
     ),
@@ -176,10 +180,18 @@ def main(args):
             keep(args.pages[0], args.measured)
         pages = {name: PAGES / f"{name}.md" for name in args.pages or kept()}
         for name, path in pages.items():
+            _draw(name)
             _write(path, page(name))
             console.say(path)
         _write(PAGES / "README.md", index())
     return {"pages": {name: str(path) for name, path in pages.items()}}
+
+
+def _draw(name):
+    """Draw the figure of a page, if it has one of its own."""
+    if STUDIES[name].figure and path_of(name).exists():
+        module = importlib.import_module(f"experiments.{STUDIES[name].figure}")
+        module.draw(json.loads(path_of(name).read_text()), PAGES / f"{name}.png")
 
 
 def _write(path, text):

@@ -4,9 +4,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from experiments import markdown
-from experiments.benchmark import suites
+from experiments.benchmark import curves, origin, suites
 from nerfies_jax.metrics.metric_table import METRICS
 
+# Of `origin.age`, in the tables.
+AGES = {"current": "today's", "old": "**old**", "unknown": "not stored"}
 # Columns: key of metrics.json, heading, digits behind the point, divisor.
 Column = tuple[str, str, int, float]
 GROUPS: tuple[tuple[Column, ...], ...] = (
@@ -50,7 +52,10 @@ Numbers are means over the seeds, ± their standard deviation. Scores are of the
 original, distorted held-out images. The *fitted PSNR* is NeRF-W's protocol: codes of
 each image are fitted to its left half, and its right half is evaluated. A run must
 exceed both baselines (*neighbors*, *time average*). Seconds are wall clock, on a
-machine that may have been busy. The *revision* is that of this repository when the runs
+machine that may have been busy. *CPU s* is processor time on all cores. The *settings*
+say if the preset has the same settings today as in the runs. They are *not stored* in
+rows of earlier versions, and rows of *old* settings no longer describe the preset of
+that name. The *revision* is that of this repository when the runs
 ended. A + marks changes that were not committed, or that only the revision before the
 numbers were committed is known."""
 
@@ -87,21 +92,31 @@ def _methods(benchmark):
 
 
 def _suite(label, benchmark):
-    parts = [f"## `{label}`", *_tables("method", _methods(benchmark))]
+    suite = suites.SUITES[benchmark["suite"]]
+    parts = [f"## `{label}`"]
+    if suite.steps:
+        parts.append(curves.table(benchmark))
+    parts += _tables("method", _methods(benchmark))
     if benchmark["claims"]:
         parts += ["### Claims", _claims(benchmark["claims"])]
-    context = suites.SUITES[benchmark["suite"]].context
-    return [*parts, context] if context else parts
+    return [*parts, suite.context] if suite.context else parts
 
 
 def _tables(kind, methods):
     """Format the settings of each row, and one table for each group of columns."""
     rows = [
-        [f"`{name}`", one["settings"], str(one["seeds"]), _short(one["revision"])]
+        [
+            f"`{name}`",
+            one["settings"],
+            AGES[origin.age(one.get("made_with"))],
+            str(one["seeds"]),
+            _short(one["revision"]),
+        ]
         for name, one in methods.items()
     ]
-    heads: tuple[str, ...] = (kind, "preset and changes", "seeds", "revision")
-    tables = [markdown.table(heads, rows, words=2)]
+    heads: tuple[str, ...] = (kind, "preset and changes", "settings")
+    heads += ("seeds", "revision")
+    tables = [markdown.table(heads, rows, words=3)]
     for group in GROUPS:
         columns = _measured_columns(group, methods.values())
         heads = (kind, *(column[1] for column in columns))

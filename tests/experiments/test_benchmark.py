@@ -7,13 +7,14 @@ import threading
 import time
 
 import numpy as np
+import PIL.Image
 import pytest
 import scipy.stats
 
 from experiments import cli
 from experiments.batch import task
 from experiments.benchmark import __main__ as benchmark
-from experiments.benchmark import origin, page, suites, verdicts
+from experiments.benchmark import curves, origin, page, suites, verdicts
 from experiments.benchmark.suites import SUITES, Claim
 from nerfies_jax.metrics.metric_table import METRICS
 from nerfies_jax.runs import representations
@@ -84,9 +85,39 @@ def test_a_method_says_if_its_preset_has_changed_since():
     assert origin.age(stored) == "current"
     before = origin.of_run({"config": specs.as_json(config), "spec": spec | {"x": 1}})
     assert origin.age(before) == "old"
+    other = origin.of_run({"config": specs.as_json(config), "spec": spec | {"x": None}})
+    assert origin.age(other) == "current"  # a later effect, which it does not have
     assert origin.age(stored | {"overrides": ["no_such_field=1"]}) == "old"
     assert origin.age(stored | {"preset": "no-such-preset"}) == "old"
     assert origin.age(None) == "unknown"
+
+
+def stored_curve(seconds, psnr, steps=(10, 20, 40)):
+    return {"steps": list(steps), "cpu_seconds": list(seconds), "psnr": list(psnr)}
+
+
+def test_curves_are_averaged_over_the_steps_that_all_seeds_have(tmp_path):
+    seeds = {
+        "0": stored_curve([1.0, 10.0, 90.0], [10.0, 20.0, 25.0]),
+        "1": stored_curve([3.0, 10.0, 110.0], [14.0, 20.0, None]),
+    }
+    methods = {"moba": {"curves": seeds}, "sonata": {}}  # an earlier row without curves
+    rows = {"methods": methods}
+    (line,) = curves.lines(rows).values()
+    assert line == ((2.0, 10.0), (12.0, 20.0), (10.0, 20.0), (14.0, 20.0))
+    # The middle of 2 and 10 on a logarithmic axis is at the root of 20, 4.5.
+    middle = 12 + 8 * math.log(5 / 2) / math.log(5)
+    assert f"| `moba` | {middle:.2f} | 20.00 | 20.00 | 10 |" in curves.table(rows)
+    stored = {"benchmarks": {"--scene fast --suite curves": rows}}
+    curves.draw(stored, tmp_path / "curves.png")
+    with PIL.Image.open(tmp_path / "curves.png") as picture:
+        assert picture.text[curves.DIGEST] == curves.digest(stored)
+
+
+def test_labels_of_lines_that_end_together_do_not_overlap():
+    heights = curves._spread([1.0, 5.0, 5.1, 5.2, 9.0], 1.0)
+    np.testing.assert_allclose(heights, [1.0, 4.1, 5.1, 6.1, 9.0])
+    assert (np.diff(curves._spread([0.0, 0.1, 1.2, 1.3], 1.0)) > 0.999).all()
 
 
 def test_interrupted_runs_continue_and_finished_ones_are_not_repeated(
@@ -129,7 +160,7 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(tmp_path, stand_in, caps
     assert run(*methods, "--seeds", "2", "--out", tmp_path / "out") == 1
     printed = capsys.readouterr().out
     assert "sonata-small, seed 1: failed with exit code 1: no such luck" in printed
-    assert "| `nerf-small` | nerf-small | 2 |" in printed
+    assert "| `nerf-small` | nerf-small | **old** | 2 |" in printed
     assert "| `sonata-small`" not in printed
 
 
@@ -229,6 +260,7 @@ def test_suites_are_consistent(name):
     judged = {method for claim in suite.claims for method in claim[1:3]}
     assert judged == (set(suite.methods) if suite.claims else set())
     assert set(suite.steps) in (set(suite.methods), set())
+    assert not suite.steps or set(curves.STYLES) == set(suite.methods)
 
 
 def test_every_column_has_an_explanation():

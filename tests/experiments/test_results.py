@@ -2,15 +2,26 @@
 
 import json
 
+import PIL.Image
 import pytest
 
 from experiments import results
+from experiments.benchmark import curves
 from experiments.results import PAGES, REVISIONS, ROOT, STUDIES
 
 
 @pytest.mark.parametrize("name", results.kept())
 def test_a_page_is_what_its_kept_numbers_make(name):
     assert (PAGES / f"{name}.md").read_text() == results.page(name)
+
+
+def test_the_figure_shows_the_kept_numbers():
+    stored = json.loads(results.path_of("benchmark").read_text())
+    path = PAGES / "benchmark.png"
+    assert path.exists() == bool(curves.panels(stored))
+    if path.exists():
+        with PIL.Image.open(path) as picture:
+            assert picture.text[curves.DIGEST] == curves.digest(stored)
 
 
 def test_the_index_lists_every_page_there_is():
@@ -49,7 +60,8 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
     results.main(["benchmark", "--measured", str(new)])
     written = (tmp_path / "benchmark.md").read_text()
     assert "| `--scene default` | 21.50 |" in written
-    assert "| nerf | 1 | aaaaaaaa+ |" in written
+    assert "| nerf | not stored | 1 | aaaaaaaa+ |" in written
+    assert not (tmp_path / "benchmark.png").exists()  # there are no curves
     assert "[benchmark.md]" in (tmp_path / "README.md").read_text()
     broken = {"machine": machine, "benchmarks": {"--scene default": {"suite": None}}}
     new.write_text(json.dumps(broken))
