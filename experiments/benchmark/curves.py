@@ -18,17 +18,17 @@ PANELS = {
     "--scene default --suite curves": "slow motion",
     "--scene fast --suite curves": "fast motion",
 }
-# Name in the figure, color and line style of each method: fields are dashed, and models
-# without a motion are gray. The colors keep a contrast of at least 4 with white.
+# Preset without "-small", color and line style of each method. Fields are dashed, and
+# models without a motion are gray. Colors keep a contrast of at least 4 with white.
 STYLES = {
-    "tracked": ("Shape of Motion", "#c2410c", "-"),
-    "space-time": ("Spacetime", "#1d6fd1", "-"),
-    "deformable": ("D3DGS", "#15803d", "-"),
-    "sonata": ("Sonata", "#9333ea", "-"),
-    "moba": ("MoBa-GS", "#db2777", "-"),
-    "static": ("static 3DGS", "#111827", "-"),
-    "d-nerf-grid": ("D-NeRF grid", "#0e7490", "--"),
-    "nerf-grid": ("NeRF grid", "#6b7280", "--"),
+    "tracked": ("splats-tracked", "#c2410c", "-"),
+    "space-time": ("spacetime", "#1d6fd1", "-"),
+    "deformable": ("splats-deformable", "#15803d", "-"),
+    "sonata": ("sonata", "#9333ea", "-"),
+    "moba": ("moba", "#db2777", "-"),
+    "static": ("splats-static", "#111827", "-"),
+    "d-nerf-grid": ("d-nerf-grid", "#0e7490", "--"),
+    "nerf-grid": ("nerf-grid", "#6b7280", "--"),
 }
 DIGEST = "Digest"  # key of the digest of the plotted numbers in the PNG
 TIMES = (5, 10, 20, 40, 80)  # processor seconds of the columns of the table
@@ -183,7 +183,6 @@ def _draw_panel(axes, title, curves):
     ticks = [at for at in (1, 3, 10, 30, 100, 300) if first <= at <= last * 1.1]
     axes.set_xticks(ticks, [f"{at}" for at in ticks])
     axes.minorticks_off()
-    axes.margins(y=0.1)  # room for labels above the highest line
     axes.tick_params(labelsize=8)
     axes.set_title(title, fontsize=10)
     axes.grid(alpha=0.25)
@@ -196,6 +195,7 @@ def _label(axes, curves):
     low, high = axes.get_ylim()
     spacing = (high - low) / 19  # height of a line of text
     heights = _spread([curves[name].psnr[-1] for name in names], spacing)
+    axes.set_ylim(top=max(high, heights[-1] + spacing))
     last = max(line.seconds[-1] for line in curves.values())
     for name, height in zip(names, heights, strict=True):
         text, color, _ = STYLES[name]
@@ -207,7 +207,12 @@ def _label(axes, curves):
             va="center",
             fontsize=7.5,
             color=color,
-            arrowprops={"arrowstyle": "-", "color": color, "lw": 0.5, "shrinkB": 2},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": color,
+                "linewidth": 0.5,
+                "relpos": (0, 0.5),  # begins left of the text
+            },
         )
 
 
