@@ -134,15 +134,12 @@ def given(source: CaptureSource) -> dict[str, Any]:
     return {name: value for name, value in vars(source).items() if value not in unsaid}
 
 
-def check_out_file(
-    path: pathlib.Path | None, option: str = "--out", continued: bool = False
-) -> None:
+def check_out_file(path: pathlib.Path | None, option: str) -> None:
     """Refuse, before anything is measured, what cannot become a new file.
 
     Args:
       path: The file, if one was named.
       option: The option that named it.
-      continued: Whether results are added to those that the file holds already.
 
     Raises:
       ValueError: The path is a folder, lies in none, or would be written over.
@@ -154,7 +151,7 @@ def check_out_file(
         raise ValueError(f"{option} {path}: a folder; name a file, as {example}")
     if not path.absolute().parent.is_dir():
         raise ValueError(f"{option} {path}: no folder {path.parent}; make it first")
-    if path.exists() and not continued:
+    if path.exists():
         raise ValueError(
             f"{option} {path}: already there; name another file, or move it away"
         )

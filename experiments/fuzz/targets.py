@@ -84,12 +84,12 @@ def _nerfies(folder):
     nerfies_format.write(_capture(), folder / "capture")
 
 
-def _images(folder, count=6, ending="png", channels=3):
+def _images(folder, count=6, channels=3):
     folder.mkdir(parents=True)
     rng = np.random.default_rng(1)
     for row in range(count):
         pixels = rng.integers(0, 256, (SIDE[1], SIDE[0], channels), np.uint8)
-        PIL.Image.fromarray(pixels).save(folder / f"f_{row}.{ending}")
+        PIL.Image.fromarray(pixels).save(folder / f"f_{row}.png")
 
 
 def _transforms(folder):

@@ -92,13 +92,6 @@ class MotionSpec:
         return Bound(self, run_steps, metadata.moments)
 
 
-# Forward and backward of 5k and 10k Gaussians on one core: 14 and 28 ms, about the time
-# to render them. The paper's size takes 281 and 562 ms, 4x128 takes 38 and 77 ms.
-SMALL_MOTION = MotionSpec(
-    position=EncodingSpec(6), time=EncodingSpec(4), depth=4, width=64, skips=()
-)
-
-
 class Motion(NamedTuple):
     """Parameters of the deformation network."""
 

@@ -186,7 +186,7 @@ def _subject(capture):
     return ((low + high) / 2, half_side) if half_side > 0 else None
 
 
-def _frustum_points(capture, near, far, depths=8):
+def _frustum_points(capture, near, far):
     """Corners, edge midpoints and centers of the images at some depths, in scene units.
 
     Skew and distortion are ignored, since the bounds are approximate.
@@ -201,7 +201,7 @@ def _frustum_points(capture, near, far, depths=8):
         offset = (np.array([x, y]) - middle) / focal
         ray = np.concatenate([offset, np.ones((len(capture.train), 1))], axis=1)
         world = np.einsum("fki,fk->fi", rotation, ray)
-        for depth in np.linspace(near, far, depths):
+        for depth in np.linspace(near, far, 8):
             points.append(views.position + depth * world)
     return np.concatenate(points)
 

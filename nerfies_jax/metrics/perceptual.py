@@ -139,7 +139,6 @@ def lpips_map(
     network: Network,
     image: Float[Array, "height width 3"],
     truth: Float[Array, "height width 3"],
-    scaling: Scaling = "standard",
 ) -> Float[Array, "height width"]:
     """Compute the LPIPS of each pixel: the bilinearly resized sum over all stages.
 
@@ -148,12 +147,11 @@ def lpips_map(
       network: Their network.
       image: Rendered image in [0, 1], [height, width, 3].
       truth: Ground truth of the same shape.
-      scaling: As for `lpips`.
 
     Returns:
       Distances, [height, width].
     """
-    distances = _stage_distances(params, network, image, truth, scaling)
+    distances = _stage_distances(params, network, image, truth, "standard")
     return sum(jax.image.resize(d, image.shape[:2], "bilinear") for d in distances)
 
 

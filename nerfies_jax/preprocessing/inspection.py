@@ -61,23 +61,18 @@ class Inspection:
         return next(one for one in self.findings if one.effect == effect)
 
 
-def inspect(
-    capture: Capture,
-    folder: pathlib.Path | None = None,
-    tell: Callable[[str], None] = lambda part: None,
-) -> Inspection:
+def inspect(capture: Capture, folder: pathlib.Path | None = None) -> Inspection:
     """Inspect a capture, in about 20 s for 60 frames of 176x132.
 
     Args:
       capture: The capture.
       folder: Cache folder of preprocessing. None for no cache.
-      tell: Called with the name of each part when it begins.
 
     Returns:
       The findings.
     """
     began = time.perf_counter()
-    read = _read(capture, folder, tell)
+    read = _read(capture, folder)
     findings = _findings(read, EFFECTS)
     with events.stage("drawing the contact sheet"):
         sheet = contact_sheet.followed(read.views, read.evidence)
@@ -122,11 +117,11 @@ class _Read(NamedTuple):
     static: np.ndarray  # the same, or of preprocessing where the capture has none
 
 
-def _read(capture, folder, tell=lambda part: None):
+def _read(capture, folder):
     if folder is None:
-        evidence = record.gather(capture, tell=tell)
+        evidence = record.gather(capture)
     else:
-        evidence = record.cached(capture, folder, tell=tell)
+        evidence = record.cached(capture, folder)
     looked = record.looked_at(capture, evidence.factor)
     points = view_set.own_points(looked)
     static = points

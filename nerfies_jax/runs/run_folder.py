@@ -44,12 +44,11 @@ def new_run_folder(out: pathlib.Path | None, stem: str) -> pathlib.Path:
     return out
 
 
-def newest_of(source: pathlib.Path, above: pathlib.Path | None = None) -> pathlib.Path:
-    """Find the newest run of a capture or video.
+def newest_of(source: pathlib.Path) -> pathlib.Path:
+    """Find the newest run of a capture or video in `runs`.
 
     Args:
       source: The capture or video.
-      above: Folder that contains the runs. None for `runs`.
 
     Returns:
       The run folder.
@@ -58,7 +57,7 @@ def newest_of(source: pathlib.Path, above: pathlib.Path | None = None) -> pathli
       ValueError: If there is none.
     """
     refuse_run(source)
-    above = pathlib.Path("runs") if above is None else above
+    above = pathlib.Path("runs")
     candidates = []
     for path in above.glob(f"*/{CONFIG}"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):

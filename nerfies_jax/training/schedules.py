@@ -188,34 +188,6 @@ def time_noise(frames: int, steps: int = 20_000, scale: float = 0.1) -> Schedule
     return ramp(scale / frames, 0.0, steps)
 
 
-def staircase(steps: tuple[int, ...], start: int = 0) -> Schedule:
-    """Make a schedule that increases by one at each of some steps.
-
-    The spherical-harmonics degree of 3DGS is `staircase((1000, 2000, 3000))`.
-
-    Args:
-      steps: Steps in ascending order, non-negative.
-      start: Value before the first of them.
-
-    Returns:
-      The schedule, with int32 values.
-
-    Raises:
-      ValueError: If the steps are not ascending or negative.
-    """
-    if list(steps) != sorted(set(steps)) or any(step < 0 for step in steps):
-        raise ValueError(
-            f"a staircase needs ascending, non-negative steps, got {steps}"
-        )
-    edges = jnp.asarray(steps, jnp.int32)
-
-    def schedule(step):
-        is_past = jnp.asarray(step, jnp.int32)[..., None] >= edges
-        return start + jnp.sum(is_past, axis=-1, dtype=jnp.int32)
-
-    return schedule
-
-
 def _share(step, steps, after=0):
     """Compute the fraction of the interval that has passed, from 0 to 1."""
     # Subtracted as integers, because float32 cannot count beyond 16.7 million steps.

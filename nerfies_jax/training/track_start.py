@@ -4,8 +4,7 @@ import dataclasses
 import math
 
 STARTS = ("tracks", "none")
-# Assignments for `specs.override`.
-FROM_TRACKS, FROM_REST = "start.motion=tracks", "start.motion=none"
+FROM_REST = "start.motion=none"  # an assignment for `specs.override`
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,7 +3,6 @@
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.training import schedules
@@ -73,12 +72,3 @@ def test_time_noise_is_a_tenth_of_a_frame_and_ends(dtype):
     schedule = schedules.time_noise(frames=50, steps=1000)
     values = evaluate(schedule, [0, 500, 1000, 2000], dtype)
     np.testing.assert_allclose(values, [0.002, 0.001, 0, 0], RTOL[dtype])
-
-
-def test_staircase_counts_completed_steps():
-    schedule = schedules.staircase((1000, 2000, 3000))
-    steps = np.int32([0, 999, 1000, 2500, 3000, 9000])
-    values = np.asarray(jax.jit(schedule)(steps))
-    assert list(values) == [0, 0, 1, 2, 3, 3]
-    assert values.dtype == jnp.int32
-    assert int(jax.jit(schedules.staircase((), start=2))(np.int32(7))) == 2
