@@ -71,9 +71,10 @@ class Reconstruct:
     device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
     """Device to compute on."""
     devices: int | None = None
-    """Number of devices that share a training step: the views of splats (batch_size) or
-    the rays of a field (micro_batches). The result is that of one device up to rounding
-    (default: all; of a CPU, as many as it has cores and the step has parts)."""
+    """Number of devices that share a training step: the views of splats (batch_size),
+    or bands of the image of one view, or the rays of a field (micro_batches). The
+    result is that of one device up to rounding (default: all; of a CPU, as many as it
+    has cores and the step has parts)."""
     coordinator: str | None = None
     """Train on several hosts, on each of which this command is started: HOST:PORT at
     which the first process listens, with --processes and --process, or auto if Slurm

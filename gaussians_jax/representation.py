@@ -379,6 +379,7 @@ GAUSSIANS = Representation(
         threads="one",
         shares=lambda spec: spec.batch_size,
         share_setting="batch_size",
+        divisible=True,  # by bands of the image
         estimate_memory_bytes=first_state.estimate_memory_bytes,
         memory_hint="lower init.points, init.random or raster.capacity",
         growth=growth,

@@ -42,6 +42,7 @@ def draw(
     *,
     mean2d_offset: Float[Array, "gaussians 2"] | None = None,
     depth: bool = True,
+    devices: int = 1,
 ) -> rendering.Frame:
     """Render Gaussians from a view, without the exposure of its image.
 
@@ -57,6 +58,7 @@ def draw(
       degree: Degree of the spherical harmonics in use.
       mean2d_offset: Shift of the projected means, as in `rendering.render`.
       depth: Whether to render the expected depth.
+      devices: Number of devices that rasterize the image, in horizontal bands.
 
     Returns:
       The rendered frame.
@@ -75,6 +77,7 @@ def draw(
             background,
             mean2d_offset=mean2d_offset,
             depth=depth,
+            devices=devices,
         )
     assert appearance.code is not None
     assert appearance.recolor is not None
@@ -94,6 +97,7 @@ def draw(
         background,
         mean2d_offset=mean2d_offset,
         depth=depth,
+        devices=devices,
     )
 
 

@@ -47,7 +47,7 @@ def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     numbers = count * (5 * (11 + harmonics) + 60)
     # A chunk holds keys, rows and blending inputs of every Gaussian-tile pair.
     numbers += 16 * (spec.raster.capacity or 0)
-    devices = data_parallel.device_count(spec.batch_size)
+    devices = data_parallel.device_count(spec.batch_size, divisible=True)
     return 4 * numbers + frame_bytes(capture, devices)
 
 

@@ -145,7 +145,7 @@ def _model(spec, metadata, effects):
     # Its update counts per Gaussian do not change the updates of shared parameters.
     optimizer = optimizer_of(spec)
     stages = _stages(spec, metadata, effects)
-    devices = data_parallel.device_count(spec.batch_size)
+    devices = data_parallel.device_count(spec.batch_size, divisible=True)
 
     def whole_frame(params, view, size, step):
         deformed = stages.deform(params, stages.prepare(params), view.time)
@@ -222,10 +222,11 @@ def _posed(effects, params, frames):
 def _stepper(spec, metadata, effects, optimizer, devices):
     """Return the pure function (state, frames) -> (state, metrics) of one step."""
     strategy = strategy_of(spec, metadata)
+    bands = devices if spec.batch_size == 1 else 1
 
     def one_view(index, state, frames):
         frame = _condition(spec, state, frames, index)
-        return _gradients(spec, metadata, effects, state, frames, *frame)
+        return _gradients(spec, metadata, effects, state, frames, *frame, bands)
 
     def step(state: TrainState, frames: Frames):
         size = frames.images.shape[2], frames.images.shape[1]
@@ -262,8 +263,8 @@ def _condition(spec, state, frames, index):
     return row, FrameCondition(frames.times[row], step=state.step, key=key)
 
 
-def _gradients(spec, metadata, effects, state, frames, row, condition):
-    """Compute metrics, gradients and the render of one frame."""
+def _gradients(spec, metadata, effects, state, frames, row, condition, bands):
+    """Compute metrics, gradients and the render of one frame, in bands of its image."""
     size = frames.images.shape[2], frames.images.shape[1]
     degree = splats.active_degree(state.step, spec.sh_every, spec.sh_degree)
 
@@ -295,6 +296,7 @@ def _gradients(spec, metadata, effects, state, frames, row, condition):
             degree,
             mean2d_offset=probe,
             depth=depth,
+            devices=bands,
         )
         exposed = drawing.exposed(effects, params, frame.rendering, view)
         observation = observe(posed, row, exposed)

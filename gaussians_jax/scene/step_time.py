@@ -31,7 +31,8 @@ def parts(
 
     Times are medians of warm calls in milliseconds. Each part is timed separately on
     the first frame and one device, and multiplied by the number of views per device and
-    step. "rest" is the remainder of the whole step.
+    step, also if several devices share the image of one view. "rest" is the remainder
+    of the whole step.
 
     Returns:
       The parts.
@@ -48,7 +49,7 @@ def parts(
     per_view = _drawing(spec, metadata, effects, rendered, frames)
     per_view |= _components(effects, state, frames, condition)
     per_step = _update(spec, metadata, effects, state, rendered, frames)
-    views = spec.batch_size // model.devices
+    views = max(spec.batch_size // model.devices, 1)
 
     def with_rest(timed):
         timed |= {name: views * timed[name] for name in per_view}

@@ -93,6 +93,7 @@ class Resources(NamedTuple):
     # Number of equal shares that a step of a spec can be divided into, one per device.
     shares: Callable[[Spec], int] = lambda spec: 1
     share_setting: str = ""  # field of the spec that sets this number
+    divisible: bool = False  # whether a step of one share can use any number of devices
     # (spec, capture) -> bytes of training frames, initial state and step. None disables
     # the check.
     estimate_memory_bytes: Callable[[Spec, Capture], int] | None = None

@@ -26,7 +26,11 @@ def check(run: Run) -> None:
     """
     if hosts.leads():
         resources = run.representation.resources
-        data_parallel.check_hosts(resources.shares(run.spec), resources.share_setting)
+        data_parallel.check_hosts(
+            resources.shares(run.spec),
+            resources.share_setting,
+            divisible=resources.divisible,
+        )
 
 
 @contextlib.contextmanager

@@ -71,17 +71,20 @@ def spans_hosts() -> bool:
     return _spanning
 
 
-def check_hosts(shares: int, setting: str) -> None:
+def check_hosts(shares: int, setting: str, *, divisible: bool = False) -> None:
     """Check that all processes get equal numbers of the shares of a step.
 
     Args:
       shares: Number of shares.
       setting: Name of the setting of this number, empty if there is none.
+      divisible: Whether a single share can be divided further.
 
     Raises:
       ValueError: If they do not.
     """
     processes = jax.process_count()
+    if divisible and shares == 1:
+        return
     if shares % processes:
         remedy = f"set {setting} to a multiple of {processes}, or " if setting else ""
         raise ValueError(
@@ -113,7 +116,7 @@ def idle_note(used: int, shares: int, setting: str) -> list[str]:
     return [line]
 
 
-def device_count(shares: int) -> int:
+def device_count(shares: int, *, divisible: bool = False) -> int:
     """Return the number of devices that equal shares of a step can use.
 
     A CPU is one device unless `jax_num_cpu_devices` is larger. `limit_devices` may
@@ -122,18 +125,22 @@ def device_count(shares: int) -> int:
 
     Args:
       shares: Number of shares.
+      divisible: Whether a single share can be divided further, among any number of
+        devices.
 
     Returns:
-      The largest divisor of `shares` that is at most the number of devices.
+      The largest divisor of `shares` that is at most the number of devices, or all
+      devices for a single share that is `divisible`.
 
     Raises:
       ValueError: If the processes of `spanning_hosts` cannot have equal numbers.
     """
+    processes = jax.process_count() if _spanning else 1
+    if divisible and shares == 1:
+        return processes * available()
     if _spanning:
         check_hosts(shares, "")
-        processes = jax.process_count()
-        return processes * _largest_divisor(shares // processes)
-    return _largest_divisor(shares)
+    return processes * _largest_divisor(shares // processes)
 
 
 def _largest_divisor(shares):
@@ -161,6 +168,26 @@ def on_devices(
     """
     mesh = None if devices == 1 else _mesh(devices)
     return _on_mesh(work, shares, mesh, *inputs)
+
+
+def assembled(work: Callable[..., PyTree], devices: int, *inputs: PyTree) -> PyTree:
+    """Compute one part of a result on each device, and copy all parts to all devices.
+
+    It can be differentiated in reverse mode. What follows it in a program is computed
+    on every device, as what precedes it.
+
+    Args:
+      work: Function `work(i, *inputs)` of the index of a part.
+      devices: Number of devices and parts, at least 2.
+      *inputs: Arrays, replicated to all devices.
+
+    Returns:
+      Results stacked along a new first axis.
+    """
+    parts = on_devices(work, devices, devices, *inputs)
+    return lax.with_sharding_constraint(
+        parts, NamedSharding(_mesh(devices), PartitionSpec())
+    )
 
 
 def _on_mesh(work, shares, mesh, *inputs):

@@ -71,6 +71,16 @@ def test_devices_take_equal_shares(shares, most, used, monkeypatch):
     assert data_parallel.device_count(shares) == used
 
 
+def test_a_divisible_share_takes_all_devices(monkeypatch):
+    monkeypatch.setattr(jax, "local_device_count", lambda: 3)
+    assert data_parallel.device_count(1, divisible=True) == 3
+    assert data_parallel.device_count(2, divisible=True) == 2
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    data_parallel.check_hosts(1, "batch_size", divisible=True)
+    with pytest.raises(ValueError, match="set batch_size to a multiple of 2"):
+        data_parallel.check_hosts(1, "batch_size")
+
+
 def test_a_share_counts_on_from_the_steps_where_x64_is_on():
     """As a batch does: of the steps, an int32, its size and the share."""
     with jax.enable_x64(True):
