@@ -32,6 +32,7 @@ class Halves(NamedTuple):
     rows: np.ndarray  # of the capture
     psnr: np.ndarray  # dB, of the 8-bit image
     ssim: np.ndarray
+    color: np.ndarray  # of the right halves, [rows, height, width - width // 2, 3]
 
 
 def score(
@@ -132,7 +133,8 @@ def score_right_halves(
         valid = None if capture.valid is None else capture.valid[row, :, half:]
         scores.append(jax.device_get(_score(color[:, half:], truth, valid)))
     psnr, ssim = np.asarray(scores).T
-    return Halves(np.asarray(rows), psnr, ssim)
+    right = np.stack([color[:, color.shape[1] // 2 :] for color in colors])
+    return Halves(np.asarray(rows), psnr, ssim, right)
 
 
 def _check_rows(rows, capture):

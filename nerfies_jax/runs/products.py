@@ -18,7 +18,7 @@ from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.json_files import merged_folder, write_json
 from nerfies_jax.capture.video import write_video
-from nerfies_jax.evaluation import Renderer, Scored, heldout
+from nerfies_jax.evaluation import Halves, Renderer, Scored, heldout
 from nerfies_jax.evaluation.representation import HalfScorer, Saved
 from nerfies_jax.metrics import clock
 from nerfies_jax.metrics.clock import Metric
@@ -48,6 +48,10 @@ COMPARISON_FRAMES = 4
 COMPARISON_CAPTION = (
     "Held-out frames, which the model was not trained on. Each row shows the observed "
     "image, the rendered image, the error between them, and the rendered depth."
+)
+HALVES = (
+    " Only right halves are shown, in the light of the image: the codes were fitted to "
+    "the left halves."
 )
 VIDEO_CAPTION = (
     "The reconstructed scene over time, from a camera that sways around the captured "
@@ -96,20 +100,24 @@ def make(
         # written. The player comes first, because its compilation uses all cores.
         with step_profile.profiling(run, state, extra.step_profile) as profile:
             figures = [*player]
+            seconds = ms_per_frame / 1e3
+            halves = fitted_halves(run, state, trained.scorer, scored, seconds)
             comparison = attempt(
-                None, _save_comparison, target / "comparison.png", run.observed, scored
+                None,
+                _save_comparison,
+                target / "comparison.png",
+                run.observed,
+                scored if halves is None else _right_halves(scored, halves),
             )
             if comparison is not None:
-                figures.append(report.Figure(comparison, COMPARISON_CAPTION))
+                caption = COMPARISON_CAPTION + ("" if halves is None else HALVES)
+                figures.append(report.Figure(comparison, caption))
             watched = [run.capture.ids[row] for row in trained.watched]
             course = curves.course_of(folder)
             history = trained.result.history
             attempt(None, curves.write, target, history, watched, course)
             path = target / "psnr_over_time.png"
-            seconds = ms_per_frame / 1e3
-            fitted_metrics, fit_notes = score_halves(
-                run, state, trained.scorer, scored, seconds
-            )
+            fitted_metrics, fit_notes = _fitted_metrics(scored, halves, run.capture)
             final = curve_figure.Result(
                 fitted_metrics[0].value
                 if fitted_metrics
@@ -284,13 +292,13 @@ def model_size(saved: Saved) -> list[Metric]:
 
 
 @events.stage("scoring halves of frames")
-def score_halves(
+def fitted_halves(
     run: Run,
     state: TrainState,
     scorer: HalfScorer | None,
     scored: Scored,
     frame_seconds: float,
-) -> tuple[list[Metric], tuple[str, ...]]:
+) -> Halves | None:
     """Evaluate the right halves of frames after fitting codes to their left halves.
 
     Args:
@@ -301,24 +309,31 @@ def score_halves(
       frame_seconds: Seconds to render a frame.
 
     Returns:
-      Metrics and notes, both empty if the model has no per-frame codes.
+      The right halves of as many frames as time allows, or None if the model has no
+      per-frame codes.
     """
     if scorer is None:
-        return [], ()
+        return None
     width, height = run.capture.size
     share = run.representation.scoring.fitted_rays / (width * height)
     count = budget.fitted_frames(frame_seconds, share, len(scored.rows))
     places = evaluation.spread(np.arange(len(scored.rows)), count)
-    rows = scored.rows[places]
-    halves = scorer(state, run.capture, rows)
-    before = evaluation.score_right_halves(run.capture, rows, scored.color[places])
+    return scorer(state, run.capture, scored.rows[places])
+
+
+def _fitted_metrics(scored, halves, capture):
+    """Return metrics of fitted right halves and a note, both empty without them."""
+    if halves is None:
+        return [], ()
+    colors = scored.color[np.isin(scored.rows, halves.rows)]
+    before = evaluation.score_right_halves(capture, halves.rows, colors)
     psnr, ssim = (evaluation.known_mean(each) for each in (halves.psnr, halves.ssim))
     unfitted = evaluation.known_mean(before.psnr)
     note = (
-        f"The main result follows {PROTOCOL}. The right halves of {count} held-out "
-        f"frames have {psnr:.2f} dB with codes fitted to the left halves, without the "
-        f"transient field, and {unfitted:.2f} dB without fitting, with codes "
-        "interpolated in time."
+        f"The main result follows {PROTOCOL}. The right halves of {len(colors)} "
+        f"held-out frames have {psnr:.2f} dB with codes fitted to the left halves, "
+        f"without the transient field, and {unfitted:.2f} dB without fitting, with "
+        "codes interpolated in time."
     )
     metrics = [
         metric("heldout.fitted_psnr", psnr, 0.2),
@@ -327,21 +342,40 @@ def score_halves(
     return metrics, (note,)
 
 
+def _right_halves(scored, halves):
+    """Return the fitted right halves of frames, with depths of the whole renders."""
+    same = np.isin(scored.rows, halves.rows)
+    left = scored.color.shape[2] - halves.color.shape[2]
+    return Scored(
+        halves.rows,
+        np.clip(halves.color, 0, 1),
+        scored.alpha[same, :, left:],
+        scored.depth[same, :, left:],
+        halves.psnr,
+        halves.ssim,
+    )
+
+
 @events.stage("drawing the comparison")
 def _save_comparison(
     path: pathlib.Path, capture: Capture, scored: Scored
 ) -> pathlib.Path:
-    """Save truth, render, error and depth of a few held-out frames."""
+    """Save truth, render, error and depth of a few held-out frames.
+
+    Renders that are narrower than the images show their right part.
+    """
     places = evaluation.spread(np.arange(len(scored.rows)), COMPARISON_FRAMES)
     captions = [
         f"frame {capture.ids[scored.rows[i]]}   {scored.psnr[i]:.2f} dB   "
         f"SSIM {scored.ssim[i]:.3f}"
         for i in places
     ]
-    truth, color = capture.images[scored.rows[places]], scored.color[places]
+    rows, color = scored.rows[places], scored.color[places]
+    left = capture.size[0] - color.shape[2]
+    truth = capture.images[rows, :, left:]
     # Pixels that were not observed are black in both, so that they show no error.
     if capture.valid is not None:
-        valid = capture.valid[scored.rows[places]][..., None]
+        valid = capture.valid[rows, :, left:, None]
         truth, color = np.where(valid, truth, 0), np.where(valid, color, 0)
     image = panels.comparison(
         truth,

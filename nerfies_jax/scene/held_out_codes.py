@@ -97,7 +97,7 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
             return solve(params, view, pixels, colors, step)
 
         def render(view: View, codes: Any) -> np.ndarray:
-            return draw(params, view.camera, view.time, codes, step).color
+            return np.asarray(draw(params, view.camera, view.time, codes, step).color)
 
         return evaluation.score_halves(fit_code, render, capture, rows)
 

@@ -298,3 +298,4 @@ def test_the_code_sees_the_left_half_and_the_score_the_right(masked):
         exact = -10 * np.log10(np.mean((right - level) ** 2))
         np.testing.assert_allclose(scored.psnr[place], exact, atol=1e-3)
         assert 0 < scored.ssim[place] < 1
+        np.testing.assert_allclose(scored.color[place], left.mean() / 255, rtol=1e-6)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from nerfies_jax import evaluation
 from nerfies_jax.capture import images, nerfies_format
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.evaluation.representation import Saved
@@ -142,6 +143,32 @@ def test_the_curve_and_the_headline_agree_visibly(tmp_path, monkeypatch):
         assert (f"2 of the 3 scored held-out frames ({names})" in caption) == (
             final is not None
         )
+
+
+def test_the_comparison_shows_right_halves_with_fitted_codes(tmp_path, monkeypatch):
+    capture = scenes.tiny_capture()
+    rows = np.arange(2)
+    truth = capture.images[rows] / np.float32(255)
+    height, width = truth.shape[1:3]
+    depth = np.arange(width) + np.zeros((2, height, 1))
+    unfitted = Scored(rows, 0 * truth, depth * 0 + 1, depth, np.ones(2), np.ones(2))
+    halves = evaluation.score_right_halves(capture, rows[1:], truth[1:])
+    shown = {}
+
+    def comparison(true, color, depth, captions, known_depth):
+        shown.update(true=true, color=color, depth=depth, captions=captions)
+        return np.zeros((4, 4, 3), np.uint8)
+
+    monkeypatch.setattr(panels, "comparison", comparison)
+    fitted = products._right_halves(unfitted, halves)
+    products._save_comparison(tmp_path / "comparison.png", capture, fitted)
+    half = width // 2
+    np.testing.assert_array_equal(shown["true"], capture.images[rows[1:], :, half:])
+    np.testing.assert_array_equal(shown["color"], truth[1:, :, half:])
+    np.testing.assert_array_equal(shown["depth"], depth[1:, :, half:])
+    (caption,) = shown["captions"]
+    assert capture.ids[rows[1]] in caption
+    assert f"{halves.psnr[0]:.2f} dB" in caption
 
 
 def test_twice_as_long_is_twice_as_long_whoever_set_the_steps():
