@@ -107,13 +107,13 @@ class NamedSource(CaptureSource):
         check_budget(self.preprocessing)
 
 
-def _headed(name: str) -> tuple:
+def _heading(name: str) -> tuple:
     """For `Annotated`: fields of settings by their own names, under a heading."""
     return tyro.conf.OmitArgPrefixes, tyro.conf.arg(name=name)
 
 
-Source = Annotated[(NamedSource, *_headed("capture"))]
-More = Annotated[(MoreMetrics, *_headed("scoring"))]
+Source = Annotated[(NamedSource, *_heading("capture"))]
+More = Annotated[(MoreMetrics, *_heading("scoring"))]
 
 
 def plain(source: CaptureSource) -> CaptureSource:
@@ -238,7 +238,7 @@ def command(settings: Any) -> Callable[[Callable], options.Command]:
             as_json = options.JSON in words
             words = [word for word in words if word != options.JSON]
             with user_errors():
-                args = parse(settings, words, _called(run))
+                args = parse(settings, words, _command_name(run))
             aside = _words_aside() if as_json else contextlib.nullcontext()
             with aside, user_errors((MissingExtra,)):
                 result = _interruptible(run, args)
@@ -305,7 +305,7 @@ def parse(settings: Any, arguments: list[str] | None = None, prog: str = "") -> 
     return options.parse(settings, words, prog or "nerfies")
 
 
-def _called(run):
+def _command_name(run):
     """Return the name that a user calls the command by."""
     name = run.__module__
     if name != "__main__":

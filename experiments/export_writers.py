@@ -155,7 +155,7 @@ def _cameras(args: Any, run: Any) -> str:
 def _path(args: Any, run: Any) -> str:
     from nerfies_jax.capture import path_files
 
-    planned = _planned(args, run)
+    planned = _camera_path(args, run)
     if args.kind == "path":
         path_files.write_nerfstudio(
             args.place,
@@ -169,7 +169,7 @@ def _path(args: Any, run: Any) -> str:
     return f"{len(planned.times)} cameras"
 
 
-def _planned(args: Any, run: Any) -> Any:
+def _camera_path(args: Any, run: Any) -> Any:
     """Return a path with its times, or with those of `nerfies render`."""
     from nerfies_jax.capture import camera_paths, path_files, pinholes
 
@@ -216,7 +216,7 @@ def _exr(args: Any, run: Any) -> str:
     from nerfies_jax import evaluation, runs
     from nerfies_jax.evaluation import exr_series
 
-    planned = _planned(args, run)
+    planned = _camera_path(args, run)
     like = evaluation.view_of(run.capture, int(run.capture.train[0]))
     move = _mover(run)
     exr_series.write(

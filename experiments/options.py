@@ -63,7 +63,7 @@ def parse(settings: Any, arguments: list[str], prog: str) -> Any:
     by_shown = {shown(kind, offering): kind for kind in _kinds(settings)}
     union = functools.reduce(operator.or_, by_shown)
     parsed: Any = tyro.cli(union, prog=prog, args=arguments, config=READ_BY)
-    return _settled(by_shown[type(parsed)], parsed)
+    return _settle(by_shown[type(parsed)], parsed)
 
 
 def offered(settings: Any) -> type:
@@ -172,7 +172,7 @@ def _words(doc, field):
     return words
 
 
-def _settled(settings, parsed):
+def _settle(settings, parsed):
     """Convert what tyro parsed to the settings themselves."""
     heading_of = _headings(settings)
     values = {}
@@ -182,6 +182,6 @@ def _settled(settings, parsed):
             parsed if heading is None else getattr(parsed, heading), field.name
         )
         values[field.name] = (
-            _settled(kind, value) if dataclasses.is_dataclass(kind) else value
+            _settle(kind, value) if dataclasses.is_dataclass(kind) else value
         )
     return settings(**values)

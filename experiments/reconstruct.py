@@ -162,7 +162,7 @@ def _outcome(args):
         platform.start_jax(
             args.device, *cores, devices=args.devices, cluster=cluster, wide=wide
         )
-        watched = _watched(args)
+        watched = _open_viewer(args)
     from nerfies_jax import runs
     from nerfies_jax.runs import multiple_hosts
     from nerfies_jax.runtime import hosts
@@ -184,7 +184,7 @@ def _outcome(args):
         with cli.user_errors((runs.Refused, hosts.Lost)):
             return runs.resume(
                 args.out,
-                expected=_expected(args),
+                expected=_expected_options(args),
                 overrides=(*steps, *args.set),
                 trusted=args.trust,
                 watched=watched,
@@ -220,7 +220,7 @@ def _with_seconds(args):
     return dataclasses.replace(args, seconds=QUALITY_SECONDS[args.quality])
 
 
-def _watched(args):
+def _open_viewer(args):
     """Open the viewer of --view, or return None; ValueError if it is not available."""
     if not args.view:
         return None
@@ -287,7 +287,7 @@ def _cores(args):
     return representations.cores(args.preset, args.set)
 
 
-def _expected(args):
+def _expected_options(args):
     """Collect the options that must agree with the run that is continued."""
     options = {"preset": args.preset, "seed": args.seed}
     options = {name: value for name, value in options.items() if value is not None}

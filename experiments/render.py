@@ -144,7 +144,7 @@ def main(args):
         names, views, own_size = _views(args, run)
         size = cli.sized(own_size, args.max_side)
         views = [evaluation.resized(view, own_size, size) for view in views]
-        views = _blended(args, run, views)
+        views = _blend(args, run, views)
         files = _files(args, names)
         may_go = render_folder.replaceable(out, args, settings, files)
     picture_of = _Pictures(args.show, move, trained, views)
@@ -223,7 +223,7 @@ def _faster(args, model, state):
     return variant.model, variant.state
 
 
-def _blended(args, run, views):
+def _blend(args, run, views):
     """Return views that interpolate between the two appearances, if requested."""
     import jax.numpy as jnp
 
@@ -328,14 +328,14 @@ class _Pictures:
         if self.show == "color":
             return evaluation.as_picture(rendering.color)
         if self.show == "flow":
-            return self._drawn_flow(rendering, place)
+            return self._draw_flow(rendering, place)
         opaque = rendering.alpha > 0.5
         colored = panels.color_depth(rendering.depth, opaque, self.limits)
         if opaque.any():
             self.limits = colored.low, colored.high
         return colored.picture
 
-    def _drawn_flow(self, rendering, place):
+    def _draw_flow(self, rendering, place):
         """Draw the flow to the next image; zero for the last one."""
         from nerfies_jax.evaluation import model_flow
         from nerfies_jax.visualization import panels

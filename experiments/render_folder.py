@@ -179,7 +179,7 @@ def _earlier(out):
 
 def _refuse_other(out, metadata, earlier):
     """Raise where an earlier render is not the one that would replace it."""
-    reason = _differs(metadata, earlier) or _edited(out, earlier)
+    reason = _differs(metadata, earlier) or _first_edit(out, earlier)
     if reason:
         raise ValueError(
             f"{out}: holds another render ({reason}); name another folder with "
@@ -205,7 +205,7 @@ def _words(value):
     return " ".join(value) if isinstance(value, list) else value
 
 
-def _edited(out, earlier):
+def _first_edit(out, earlier):
     """Name the first file that changed since it was rendered, or return an empty
     string.
     """

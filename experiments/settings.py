@@ -33,12 +33,12 @@ def main(args):
     with cli.user_errors():
         platform.start_jax("cpu")
         kind = representations.of_preset(args.preset)
-    described = _described_preset(kind, args.preset)
+    described = _describe_preset(kind, args.preset)
     console.say("\n".join(lines(described)))
     return described
 
 
-def _described_preset(kind: Any, preset: str) -> dict[str, Any]:
+def _describe_preset(kind: Any, preset: str) -> dict[str, Any]:
     """Describe the source of a preset and, by path, each field."""
     from nerfies_jax.training import spec_fields
 

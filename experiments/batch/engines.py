@@ -118,7 +118,7 @@ def dask(
         while running:
             for one in [one for one in running if one.done()]:
                 error = one.exception() if one.status != "finished" else None
-                yield running.pop(one), _failed(error) if error else one.result()
+                yield running.pop(one), _failure(error) if error else one.result()
             time.sleep(POLL_SECONDS)
             stopping.check()
 
@@ -160,7 +160,7 @@ def slurm(
                 try:
                     ending = job.result()
                 except Exception as error:  # of a job that could not report anything
-                    ending = _failed(error)
+                    ending = _failure(error)
                 yield running.pop(job), ending
             time.sleep(CLUSTER_POLL_SECONDS)
             stopping.check()
@@ -181,7 +181,7 @@ def _slot(tasks):
     return slot
 
 
-def _failed(error):
+def _failure(error):
     """Ending of a task whose supervisor died, so that the run can be continued."""
     lines = str(error).strip().splitlines() or [""]
     return Ending(1, f"{type(error).__name__}: {lines[0]}", interrupted=True)

@@ -92,7 +92,7 @@ class Task:
         stop = threading.Event() if stop is None else stop
         deadline = time.monotonic() + self.limits.seconds
         self.folder.parent.mkdir(parents=True, exist_ok=True)
-        ending = self._prepared(deadline, stop)
+        ending = self._prepare(deadline, stop)
         if ending.code:
             return ending
         words = [*self.words, "--out", str(self.folder)]
@@ -100,7 +100,7 @@ class Task:
             words.append("--resume")
         elif self.seconds is not None:
             words += ["--seconds", f"{self.seconds:g}"]
-        return self._supervised(["reconstruct", *words], deadline, stop)
+        return self._supervise(["reconstruct", *words], deadline, stop)
 
     def checkpoint(self) -> Any:
         """Save the state when Slurm preempts the job. Called by submitit.
@@ -118,7 +118,7 @@ class Task:
             psutil.wait_procs(processes, PATIENCE_SECONDS)
         return submitit.helpers.DelayedSubmission(self)
 
-    def _prepared(self, deadline, stop):
+    def _prepare(self, deadline, stop):
         """Convert the video of several runs to a capture once."""
         if not self.prepare:
             return Ending(0, "")
@@ -126,9 +126,9 @@ class Task:
         with filelock.FileLock(f"{capture}.lock"):
             if (capture / run_folder.PREPARED).is_file():
                 return Ending(0, "")
-            return self._supervised(["prepare", *self.prepare], deadline, stop)
+            return self._supervise(["prepare", *self.prepare], deadline, stop)
 
-    def _supervised(self, words, deadline, stop):
+    def _supervise(self, words, deadline, stop):
         """Run a command of this package until it ends or exceeds a limit."""
         process = self._start(words)
         _running.add(process)

@@ -222,14 +222,18 @@ def _spread(values: Sequence[float], spacing: float) -> list[float]:
     for value in values:
         groups.append([value])
         while len(groups) > 1:
-            below, above = (_stacked(group, spacing) for group in groups[-2:])
+            below, above = (
+                _positions_in_group(group, spacing) for group in groups[-2:]
+            )
             if above[0] - below[-1] >= spacing:
                 break
             groups[-2:] = [groups[-2] + groups[-1]]
-    return [height for group in groups for height in _stacked(group, spacing)]
+    return [
+        height for group in groups for height in _positions_in_group(group, spacing)
+    ]
 
 
-def _stacked(group, spacing):
+def _positions_in_group(group, spacing):
     """Positions of the values of a group, centered on their mean."""
     start = statistics.fmean(group) - spacing * (len(group) - 1) / 2
     return [start + spacing * k for k in range(len(group))]

@@ -60,12 +60,12 @@ def age(made_with: Mapping[str, Any] | None) -> Age:
 
 
 def _digest(spec):
-    text = json.dumps(_enabled(spec), sort_keys=True)
+    text = json.dumps(_without_disabled(spec), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
 
 
-def _enabled(spec):
+def _without_disabled(spec):
     """Remove disabled effects, so that a new one, which is None, changes nothing."""
     if isinstance(spec, dict):
-        return {key: _enabled(x) for key, x in spec.items() if x is not None}
-    return [_enabled(x) for x in spec] if isinstance(spec, list) else spec
+        return {key: _without_disabled(x) for key, x in spec.items() if x is not None}
+    return [_without_disabled(x) for x in spec] if isinstance(spec, list) else spec

@@ -61,15 +61,15 @@ def curve(measured: Curve) -> dict[str, Any]:
     """
     lists = {
         "steps": measured.steps,
-        "cpu_seconds": [_rounded(value, 2) for value in measured.cpu_seconds],
-        "psnr": [_rounded(value, 3) for value in measured.psnr],
-        "ssim": [_rounded(value, 4) for value in measured.ssim],
+        "cpu_seconds": [_round(value, 2) for value in measured.cpu_seconds],
+        "psnr": [_round(value, 3) for value in measured.psnr],
+        "ssim": [_round(value, 4) for value in measured.ssim],
     }
     values = {name: list(each) for name, each in lists.items()}
     return {"frames": len(measured.frames), **values}
 
 
-def _rounded(value, digits):
+def _round(value, digits):
     return round(value, digits) if math.isfinite(value) else None
 
 

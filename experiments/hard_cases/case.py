@@ -139,7 +139,8 @@ def _differences(function, row, order):
         columns = [(at((i, 1)) - at((i, -1))) / (2 * step) for i in axes]
         return [[float(each[m]) for each in columns] for m in range(len(columns[0]))]
     second = {
-        (i, j): (_mixed(at, i, j, 1) - _mixed(at, i, j, -1)) / (4 * step**2)
+        (i, j): (_mixed_difference(at, i, j, 1) - _mixed_difference(at, i, j, -1))
+        / (4 * step**2)
         for i in axes
         for j in axes
         if i <= j
@@ -150,7 +151,7 @@ def _differences(function, row, order):
     ]
 
 
-def _mixed(at, i, j, sign):
+def _mixed_difference(at, i, j, sign):
     return at((i, sign), (j, 1)) - at((i, sign), (j, -1))
 
 

@@ -124,7 +124,7 @@ _TURN = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]])
 _BACK = np.array([[-1, 2, 2], [-2, 1, -2], [-2, -2, 1]])
 
 
-def _stretched(stretches):
+def _matrix_of_stretches(stretches):
     """[3, 3] U diag(stretches) Vᵀ."""
     left, right = (constant(turn, stretches.dtype) for turn in (_TURN, _BACK))
     return jnp.sum(left[:, None] * stretches * right, axis=-1) / 9
@@ -135,7 +135,7 @@ def _exact_stretched(stretches):
 
 
 def _of_stretches(form):
-    return lambda stretches: form(_stretched(stretches))[None]
+    return lambda stretches: form(_matrix_of_stretches(stretches))[None]
 
 
 _LEAST = np.array([1e-5, 1e-4, 1e-3, 9.99e-3, 1.001e-2, 2e-2, 0.1, 0.5])

@@ -160,7 +160,7 @@ WINDOW = Case(
 _RAY = (1.0, 0.3, -0.2)
 
 
-def _contracted(contract):
+def _contract(contract):
     return lambda x: contract(x[0] * jnp.asarray(_RAY, x.dtype))
 
 
@@ -184,8 +184,8 @@ CONTRACTION = Case(
     switch="the box, |x| = 1",
     axis="|x|",
     at=_DISTANCES,
-    stable=_contracted(grids.contract),
-    textbook=_contracted(_contracted_as_printed),
+    stable=_contract(grids.contract),
+    textbook=_contract(_contracted_as_printed),
     exact=_exact_contraction,
     bounds={
         "bfloat16": (1e-2, 2e-2),

@@ -104,7 +104,7 @@ NEAR_PLANE = Case(
 BARREL = -0.5  # k1; folds at a slope of √(2/3), distorted to 0.5443
 
 
-def _undistorted(distorted):
+def _undistort(distorted):
     lens = (
         constant([BARREL, 0, 0], distorted.dtype),
         constant(np.zeros(2), distorted.dtype),
@@ -138,7 +138,7 @@ LENS_FOLD = Case(
     axis="distorted radius",
     at=_BENT,
     along=np.array([0.6, -0.8]),
-    stable=_undistorted,
+    stable=_undistort,
     textbook=_fixed_point,
     exact=_exact_undistorted,
     bounds={"float32": (4e-6, 2e-4, 3e-4), "float64": (4e-15, 1e-13, 2e-13)},

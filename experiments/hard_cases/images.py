@@ -13,12 +13,12 @@ _PATTERN = np.array([1.0, -0.25, 0.5, 0.125, 0.75, -0.5])
 _CONTRAST = np.array([0, 1e-22, 1e-15, 1e-6, 1e-3, 1, 1e10])
 
 
-def _transformed(pixels):
+def _transform(pixels):
     return jnp.fft.rfft2(pixels.reshape(2, 3), norm="ortho").reshape(-1)
 
 
 def _amplitudes_textbook(pixels):
-    spectrum = _transformed(pixels)
+    spectrum = _transform(pixels)
     return jnp.sqrt(spectrum.real**2 + spectrum.imag**2)
 
 

@@ -70,7 +70,7 @@ OUTSIDE = Case(
 )
 
 
-def _expanded(x):
+def _expand(x):
     """Expand the square as for a matrix product: |x|² - 2xμ + μ²."""
     center = 1024 + jnp.arange(KERNELS, dtype=x.dtype)
     squares = x**2 - 2 * x * center + center**2
@@ -85,7 +85,7 @@ FAR_AWAY = Case(
     axis="x",
     at=_OFFSETS,
     stable=lambda x: _edge(FAR_EDGE, x),
-    textbook=_expanded,
+    textbook=_expand,
     exact=lambda x: _exact_edge(x[0], 1024),
     bounds={"float32": (4e-7, 1e-6, 2e-6), "float64": (1e-15, 2e-15, 4e-15)},
     floors=(0, 0.3, 1),
@@ -148,7 +148,7 @@ WIDTH = Case(
 _PATTERN = np.array([1.0, -2.0, 0.5, 0.25])  # sums to -0.25, so the mean is not exact
 
 
-def _standardized(x):
+def _standardize(x):
     return kan.standardize(64 + x[0] * constant(_PATTERN, x.dtype))
 
 
@@ -176,7 +176,7 @@ NORM = Case(
     formula="mean square of what is centered, + 1e-6",
     axis="spread about 64",
     at=_SPREADS,
-    stable=_standardized,
+    stable=_standardize,
     textbook=_by_moments,
     exact=_exact_standardized,
     bounds={"float32": (1e-6, 1e-5), "float64": (1e-15, 1e-14)},

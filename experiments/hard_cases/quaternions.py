@@ -55,13 +55,13 @@ LOGARITHM = Case(
 )
 
 
-def _rotated(w):
+def _rotation(w):
     return quaternion.to_matrix(quaternion.exp(w))
 
 
 def _textbook_matrix_log(w):
     """Compute the logarithm from the arc cosine of the trace."""
-    rotation = _rotated(w)
+    rotation = _rotation(w)
     angle = jnp.arccos((jnp.trace(rotation) - 1) / 2)
     skew = rotation - rotation.T
     axis = jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
@@ -85,7 +85,7 @@ MATRIX_LOGARITHM = Case(
     axis="θ / rad",
     at=_ROUND,
     along=AXIS,
-    stable=lambda w: lie.log_so3(_rotated(w)),
+    stable=lambda w: lie.log_so3(_rotation(w)),
     textbook=_textbook_matrix_log,
     exact=_exact_wrapped,
     bounds={"float32": (1e-6, 1e-6, 2e-6), "float64": (2e-15, 2e-15, 2e-15)},

@@ -77,7 +77,7 @@ def _closed_by_infinity(density):
     return compositing.weights(density * spacing)
 
 
-def _subtracted(density):
+def _depth_in_front(density):
     """The depth in front of a sample as the sum up to it without it."""
     spacing = jnp.diff(constant([*DISTANCES, DISTANCES[-1] + 1e10], density.dtype))
     depth = density * spacing
@@ -97,7 +97,7 @@ LAST = Case(
     axis="density",
     **_times([1e-20, 1e-14, 1e-11, 1e-10, 1e-4, 0.1, 1, 10, 1e3], [1, 1, 0.5, 2, 1]),
     stable=_closed_by_infinity,
-    textbook=_subtracted,
+    textbook=_depth_in_front,
     exact=_exact_closed,
     bounds={"float32": (4e-7, 4e-7), "float64": (1e-15, 1e-15)},
     floors=(0, 1),
@@ -109,7 +109,7 @@ FAR = 3.0
 _SHARES = [0.5, 1.0, 0.25, 2.0, 0.25]  # sum to 4
 
 
-def _expected(weights):
+def _expected_distance(weights):
     distances = constant(DISTANCES, weights.dtype)
     far = constant(FAR, weights.dtype)
     return compositing.expected_distance(weights, distances, far)[None]
@@ -148,7 +148,7 @@ DISTANCE = Case(
         ],
         _SHARES,
     ),
-    stable=_expected,
+    stable=_expected_distance,
     textbook=_quotient,
     exact=_exact_expected,
     bounds={"float32": (3e-7, 1e-6), "float64": (8e-16, 2e-15)},
@@ -156,7 +156,7 @@ DISTANCE = Case(
 )
 
 
-def _thinned(x):
+def _thin(x):
     return compositing.thinned(x[0], x[1])[None]
 
 
@@ -194,7 +194,7 @@ THINNED = Case(
     axis="depth",
     at=_THINNED[:, 0],
     points=_THINNED,
-    stable=_thinned,
+    stable=_thin,
     textbook=_thinned_as_printed,
     exact=_exact_thinned,
     bounds={

@@ -58,7 +58,7 @@ def main(args):
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.metrics import clock
 
-    rows = _stored(args.out, args.seed)
+    rows = _stored_rows(args.out, args.seed)
     remaining = [
         fault for fault in faults if not any(_is_row_of(fault, r) for r in rows)
     ]
@@ -68,7 +68,7 @@ def main(args):
         concurrent.futures.ThreadPoolExecutor(args.jobs) as workers,
     ):
         for job in range(args.jobs):
-            copies.put(_copied(pathlib.Path(folder) / str(job)))
+            copies.put(_copy(pathlib.Path(folder) / str(job)))
 
         def with_copy(call):
             copy = copies.get()
@@ -77,7 +77,7 @@ def main(args):
             finally:
                 copies.put(copy)
 
-        reached = _reached(args.out, workers, with_copy)
+        reached = _reach(args.out, workers, with_copy)
         seconds = 60 * args.minutes
         tries = workers.map(
             lambda fault: with_copy(lambda copy: tried(fault, copy, reached, seconds)),
@@ -92,7 +92,7 @@ def main(args):
     return cli.stored(args.out)
 
 
-def _reached(out, workers, with_copy):
+def _reach(out, workers, with_copy):
     """Return the functions that each test file enters, cached next to `out` for this
     source.
     """
@@ -138,12 +138,12 @@ def _is_row_of(fault, row):
     return row["at"] == f"{fault.path}:{fault.line}" and row["text"] == fault.text
 
 
-def _stored(path, seed):
+def _stored_rows(path, seed):
     record = records.rows(path, rows=list)
     return record["rows"] if record.get("seed") == seed else []
 
 
-def _copied(folder):
+def _copy(folder):
     for name in _files():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes((ROOT / name).read_bytes())

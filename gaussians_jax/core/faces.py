@@ -66,13 +66,13 @@ def _face(first, second):
     second_axis, second_length = _unit(second)
     # If the first edge has no length, the second one determines the axes.
     first_axis = jnp.where(length > 0, first_axis, _across(second_axis))
-    rejection = _rejected(second_axis, first_axis)
+    rejection = _reject(second_axis, first_axis)
     collinear = jnp.max(jnp.abs(rejection)) < ONE_LINE * jnp.finfo(first_axis.dtype).eps
     rejection = jnp.where(collinear, _across(first_axis), rejection)
     rejection, _ = _unit(rejection)
     # Repeated, because the first rejection is mostly rounding if the edges are almost
     # collinear.
-    rejection, _ = _unit(_rejected(rejection, first_axis))
+    rejection, _ = _unit(_reject(rejection, first_axis))
     axes = jnp.stack([jnp.cross(first_axis, rejection), first_axis, rejection], axis=1)
     width = jnp.where(collinear, 0, second_length * jnp.sum(second_axis * rejection))
     return quaternion.from_matrix(axes), jnp.stack([length, width])
@@ -89,7 +89,7 @@ def _unit(vector):
     return scaled / length, jnp.where(is_zero, 0, length * divisor)
 
 
-def _rejected(vector: Vector, unit: Vector) -> Vector:
+def _reject(vector: Vector, unit: Vector) -> Vector:
     """Return the part of a vector that is perpendicular to a direction."""
     return vector - jnp.sum(vector * unit) * unit
 

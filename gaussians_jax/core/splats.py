@@ -278,10 +278,10 @@ def deactivate(splats: Splats, inactive: Bool[Array, " gaussians"]) -> Splats:
     Returns:
       Raw parameters with their opacity logits replaced.
     """
-    return _deactivated(splats, inactive)
+    return _deactivate(splats, inactive)
 
 
-def _deactivated(splats, inactive):
+def _deactivate(splats, inactive):
     logit = splats.opacity_logit
     mark = np.asarray(INACTIVE_LOGIT, logit.dtype)
     # Arrays of the host stay there: their length is that of a capture, and JAX would
@@ -315,7 +315,7 @@ def pad_rows(params: Params, capacity: int) -> Params:
     rows = np.concatenate([np.arange(count), np.zeros(capacity - count, int)])
     padded = jax.tree.map(lambda leaf: leaf[rows], params.rows)
     inactive = np.arange(capacity) >= count
-    padded["splats"] = _deactivated(padded["splats"], inactive)
+    padded["splats"] = _deactivate(padded["splats"], inactive)
     return params._replace(rows=padded)
 
 

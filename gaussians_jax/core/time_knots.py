@@ -89,7 +89,7 @@ def bake(
     rows = np.flatnonzero(moves)
     tracks = [_track(jax.tree.map(lambda leaf: leaf[rows], now)) for now in frames]
     track = Track(*(jnp.stack(leaves) for leaves in zip(*tracks, strict=True)))
-    track = track._replace(quaternion=_aligned(track.quaternion))
+    track = track._replace(quaternion=_align(track.quaternion))
     static = jax.tree.map(jnp.asarray, static)
     return Knots(times, track, static_rows.row_index(moves), static)
 
@@ -244,7 +244,7 @@ def _track(gaussians):
 
 
 @jax.jit
-def _aligned(turns):
+def _align(turns):
     """Choose the sign of each quaternion that is nearer to the previous knot."""
 
     def step(before, turn):

@@ -223,14 +223,14 @@ def _guess(effect: SplatRecord, paths: Paths, key: Key[Array, ""]) -> Guess:
     if effect.fit_to_paths is not None:
         return effect.fit_to_paths(paths, key)
     canonical = captured(positions_at_middle(paths))
-    params = _initialized(effect, canonical, key)
+    params = _initialize(effect, canonical, key)
     static, static_rows = None, None
     if params.shared is not None:
         static = resting(paths)
     if static is not None:
         # Parameters of all points from one initialization, static ones last.
         all_points = jnp.concatenate([canonical, static])
-        params, count = _initialized(effect, all_points, key), len(canonical)
+        params, count = _initialize(effect, all_points, key), len(canonical)
         static_rows = jax.tree.map(lambda leaf: leaf[count:], params.per_gaussian)
         rows = jax.tree.map(lambda leaf: leaf[:count], params.per_gaussian)
         params = params._replace(per_gaussian=rows)
@@ -261,7 +261,7 @@ def captured(values: Any) -> Array:
     return jax.device_put(np.asarray(values, np.float32))
 
 
-def _initialized(effect, positions, key):
+def _initialize(effect, positions, key):
     """Initialize the parameters of a motion for Gaussians at these positions."""
     blank = scene_of(effect, Points(positions, None, None))
     return effect.init(key, blank.rows["splats"])

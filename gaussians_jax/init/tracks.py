@@ -125,7 +125,7 @@ def _seeds(effect, points, visibility, evidence, views, times, unit, spec):
         distance, neighbors, weights = _carriers(position_then, observed)
 
         def mixed(leaf, neighbors=neighbors, weights=weights):
-            return _mixed(leaf, neighbors, weights)
+            return _mix(leaf, neighbors, weights)
 
         pixel_rows = None if point_rows is None else jax.tree.map(mixed, point_rows)
         start = observed + np.einsum(
@@ -187,7 +187,7 @@ def _carriers(positions, queries):
     return distance, neighbors, weights / weights.sum(1, keepdims=True)
 
 
-def _mixed(leaf, neighbors, weights):
+def _mix(leaf, neighbors, weights):
     return np.einsum("nk,nk...->n...", weights, leaf[neighbors]).astype(leaf.dtype)
 
 
@@ -234,7 +234,7 @@ def rows_at_rest(resting: Resting, positions: Float[Array, "places 3"]) -> PyTre
     """
     static, static_rows = jax.tree.map(np.asarray, resting)
     _, neighbors, weights = _carriers(static, np.asarray(positions))
-    return jax.tree.map(lambda leaf: _mixed(leaf, neighbors, weights), static_rows)
+    return jax.tree.map(lambda leaf: _mix(leaf, neighbors, weights), static_rows)
 
 
 def put_in(

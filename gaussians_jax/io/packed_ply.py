@@ -37,10 +37,10 @@ def encode(rows: Splats) -> bytes:
     opacity = opacity_of(rows)
     words = np.stack(
         [
-            _packed(position, _BITS),
-            _packed_rotations(rows.quaternion),
-            _packed(scale, _BITS),
-            _packed(np.column_stack([shade, opacity]), (8, 8, 8, 8)),
+            _pack(position, _BITS),
+            _pack_rotations(rows.quaternion),
+            _pack(scale, _BITS),
+            _pack(np.column_stack([shade, opacity]), (8, 8, 8, 8)),
         ],
         axis=-1,
     )
@@ -138,7 +138,7 @@ def _in_chunks(values):
     return (values - low[chunk]) / extent[chunk], np.concatenate([low, high], axis=1)
 
 
-def _packed(values, bits):
+def _pack(values, bits):
     """Quantize columns in [0, 1] and join them, the first in the highest bits."""
     word = np.zeros(len(values), np.uint32)
     for column, size in zip(values.T, bits, strict=True):
@@ -148,7 +148,7 @@ def _packed(values, bits):
     return word
 
 
-def _packed_rotations(quaternion):
+def _pack_rotations(quaternion):
     """Join the number of the largest component and the three others."""
     largest, level = smallest_three(quaternion)
-    return (largest.astype(np.uint32) << np.uint32(30)) | _packed(level, (10, 10, 10))
+    return (largest.astype(np.uint32) << np.uint32(30)) | _pack(level, (10, 10, 10))

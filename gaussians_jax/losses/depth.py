@@ -149,7 +149,7 @@ def _about_median(depth, valid):
     """Normalize by median and deviation, with gradients through both."""
     center = _median(depth, valid)
     offset = jnp.where(valid, depth - center, 0)
-    return _divided(offset, losses.masked_mean(jnp.abs(offset)[:, None], valid), center)
+    return _divide(offset, losses.masked_mean(jnp.abs(offset)[:, None], valid), center)
 
 
 def _about_mean(depth, valid):
@@ -159,10 +159,10 @@ def _about_mean(depth, valid):
     # Divided by at least 1e-3 of the mean, to bound the gradient of the square root.
     least = jnp.square(FLATTEST * jax.lax.stop_gradient(center))
     deviation = jnp.sqrt(jnp.where(variance > least, variance, 1))
-    return _divided(offset, jnp.where(variance > least, deviation, 0), center)
+    return _divide(offset, jnp.where(variance > least, deviation, 0), center)
 
 
-def _divided(offset, deviation, center):
+def _divide(offset, deviation, center):
     least = FLATTEST * jnp.abs(jax.lax.stop_gradient(center))
     return offset / jnp.maximum(deviation, jnp.where(least > 0, least, 1))
 

@@ -182,7 +182,7 @@ def _split(image):
     return ((a + b) + (c + d)) / 2, bands
 
 
-def _padded(
+def _fill_invalid(
     render: Float[Array, "height width channels"],
     truth: Float[Array, "height width channels"],
     valid: Bool[Array, "height width"] | None,
@@ -220,7 +220,7 @@ def wavelet_loss(
     Returns:
       The loss.
     """
-    render, truth = _padded(render, truth, valid)
+    render, truth = _fill_invalid(render, truth, valid)
     # The transform is linear, so one pyramid of the difference is enough.
     pyramid = haar_pyramid(render - truth, spec.levels)
     factors = [spec.level_factor**level for level in range(spec.levels)]
@@ -255,7 +255,7 @@ def fourier_loss(
     Returns:
       The loss.
     """
-    render, truth = _padded(render, truth, valid)
+    render, truth = _fill_invalid(render, truth, valid)
     width = truth.shape[1]
     difference = amplitudes(render) - amplitudes(truth)
     multiplicity = _times_in_whole_spectrum(width, truth.dtype)

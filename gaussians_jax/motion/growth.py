@@ -247,11 +247,11 @@ class MotionGuided:
     def events(self, steps: int) -> tuple[StrategyEvent, ...]:
         """Return the events of the guided strategy."""
         return tuple(
-            event._replace(apply=functools.partial(self._applied, event))
+            event._replace(apply=functools.partial(self._apply, event))
             for event in self.base.events(steps)
         )
 
-    def _applied(self, event, population):
+    def _apply(self, event, population):
         stats, travel = population.state
         if event.changes_rows:
             factor = grow_score(self.spec, self.extent, travel, population.step)

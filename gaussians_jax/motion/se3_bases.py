@@ -233,7 +233,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     logits[:, 0] = STILL_LOGIT
     logits[np.arange(len(position)), 1 + label] = MEMBER_LOGIT
     guess = Points(captured(canonical), captured(logits), bases)
-    unknown = captured(~_supported(times, known, label, spec))
+    unknown = captured(~_supported_intervals(times, known, label, spec))
     scale = captured(unit)
 
     def penalty(points, _times):
@@ -258,7 +258,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     return Guess(guess, rates, penalty, rigid=True)
 
 
-def _supported(times, known, label, spec):
+def _supported_intervals(times, known, label, spec):
     """Find the intervals between knots in which a path of each basis is known.
 
     An interval that contains no frame time belongs to the frame nearest to its middle.

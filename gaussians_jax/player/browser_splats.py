@@ -67,8 +67,8 @@ def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
                 backdrop = painter.backdrop(params, toward, code)
         # Compositing weights and transmittance sum to one, so an affine change of the
         # image is the same change of all colors and of the background.
-        color = _exposed(effects, params, color, appearance)
-        backdrop = _exposed(effects, params, backdrop[None], appearance)[0]
+        color = _expose(effects, params, color, appearance)
+        backdrop = _expose(effects, params, backdrop[None], appearance)[0]
         leaves: dict[str, Any] = dict(
             centers=gaussians.mean,
             covariances=jax.vmap(_covariance)(gaussians.quaternion, gaussians.scale),
@@ -100,7 +100,7 @@ def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
     return cloud
 
 
-def _exposed(effects, params, color, appearance):
+def _expose(effects, params, color, appearance):
     """Apply every exposure model to a list of colors, as one row of an image."""
     for effect in effects:
         if effect.expose is not None:

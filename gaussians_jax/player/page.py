@@ -71,11 +71,11 @@ def write(
     at, rows = gaussians_at(model, state), written_rows(model, state)
     statistics = seen_in_training(at, rows, raster, degree, capture)
     count = count_for(capture)
-    instants, packed = _packed(at, rows, capture, statistics, count)
+    instants, packed = _pack(at, rows, capture, statistics, count)
     if len(packed.data) > MOST_BYTES:
         fewer = int(count * MOST_BYTES / len(packed.data))
         count = max(fewer, FEWEST_INSTANTS)
-        instants, packed = _packed(at, rows, capture, statistics, count)
+        instants, packed = _pack(at, rows, capture, statistics, count)
     return compose(
         path, title, packed, _about(instants, packed, capture), raster, capture, poster
     )
@@ -122,7 +122,7 @@ def compose(
     return Player(path, f"{about} {path.stat().st_size / 1e6:.1f} MB.")
 
 
-def _packed(at, rows, capture, statistics, count):
+def _pack(at, rows, capture, statistics, count):
     instants = gathered(at, rows, statistics, count)
     return instants, packing.pack(instants, _still_distance(instants, capture))
 

@@ -83,7 +83,7 @@ def first_state(
     init = initialization.of_start(spec.init, tracked is not None, most)
     position, color = initialization.initial_points(init, capture, seed)
     if hidden is not None and most is not None:
-        hidden = _thinned(hidden, most - len(position) - len(tracked.position))
+        hidden = _thin(hidden, most - len(position) - len(tracked.position))
     hidden_rows = slice(len(position), len(position))
     if hidden is not None:
         position = np.concatenate([position, hidden.position])
@@ -139,7 +139,7 @@ def _from_tracks(spec, effects, capture, key):
     return seeds, hidden, capture
 
 
-def _thinned(points, most):
+def _thin(points, most):
     """Select at most `most` points, evenly over their order."""
     count = min(max(most, 0), len(points.position))
     indices = np.linspace(0, len(points.position) - 1, count).round().astype(int)

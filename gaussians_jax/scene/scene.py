@@ -210,7 +210,7 @@ def _stages(spec, metadata, effects):
     return Stages(prepare, deform, draw, rows)
 
 
-def _posed(effects, params, frames):
+def _refine_cameras(effects, params, frames):
     """Return the training frames with their refined cameras."""
     for effect in effects:
         if effect.pose is not None:
@@ -282,7 +282,7 @@ def _gradients(spec, metadata, effects, state, frames, row, condition, bands):
         canonical = splats.activate(params.rows["splats"])
         gaussians = deform(params, canonical)
         rows, rendered = deformation.rendered(effects, params, gaussians, condition)
-        posed = _posed(effects, params, frames)
+        posed = _refine_cameras(effects, params, frames)
         view = _view(posed, row)
         frame = drawing.draw(
             spec,

@@ -227,7 +227,7 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
             "leave it out as well (alternation=none)"
         )
     if spec.neighbors is not None:
-        _embedded(motion)
+        _embedding_name(motion)
     if (
         isinstance(motion, AnchorMotionSpec)
         and not motion.moves
@@ -337,7 +337,7 @@ def _fading(motion):
     return motion.fading if isinstance(motion, PolynomialMotionSpec) else None
 
 
-def _embedded(motion):
+def _embedding_name(motion):
     """Return the name of the motion parameter that neighbors keep similar."""
     if type(motion) not in EMBEDDED:
         raise ValueError(
@@ -407,7 +407,7 @@ def _regularizers(spec, metadata, motion):
     early, late = [spec.acceleration], [*spec.regularizers]
     # A trained scene may also be rendered without its motion.
     if spec.neighbors is not None and motion is not None:
-        name = _embedded(spec.motion)
+        name = _embedding_name(spec.motion)
         early.append(neighbors.Bound(spec.neighbors, metadata.extent, name))
     early += [spec.spectral, spec.depth, spec.opacity_scale, spec.smooth_depth]
     early += [spec.point_depth]

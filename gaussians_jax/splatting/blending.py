@@ -240,7 +240,7 @@ def _pixels(grid, dtype):
     return jnp.asarray(x.ravel(), dtype), jnp.asarray(y.ravel(), dtype)
 
 
-def _whitened(rows, center):
+def _whiten(rows, center):
     """Return u and v at the tile centers, and their gradients p, r and -r k."""
     mean_x, mean_y, p, k, r = rows[:5]
     dx, dy = center[0] - mean_x, center[1] - mean_y
@@ -249,7 +249,7 @@ def _whitened(rows, center):
 
 def _alphas(rows, center, spec, grid):
     """Compute opacity exp(-u^2 - v^2), and alpha: [chunk, batch, pixels]."""
-    u0, v0, u_x, v_y, v_x = (c[..., None] for c in _whitened(rows, center))
+    u0, v0, u_x, v_y, v_x = (c[..., None] for c in _whiten(rows, center))
     x, y = _pixels(grid, u0.dtype)
     u = u0 + u_x * x
     v = v0 + v_x * x + v_y * y
@@ -327,7 +327,7 @@ def _pair_gradients(rows, center, weight, grad, pixel_gradient, grid):
     """
     moments = _moments(grad, grid)
     total, x, y, xx, xy, yy = moments
-    u0, v0, u_x, v_y, v_x = _whitened(rows, center)
+    u0, v0, u_x, v_y, v_x = _whiten(rows, center)
     u_moment, v_moment = u_x * x, v_y * y + v_x * x
     sum_u = u0 * total + u_moment
     sum_v = v0 * total + v_moment

@@ -106,9 +106,9 @@ def project(
     x, y, z = (dot(world[i], offset) for i in range(3))
     x, y = x / z, y / z
     focal_x, focal_y = camera.focal_px, camera.focal_px * camera.pixel_aspect
-    bent_x, bent_y = _linearized(camera, x, y).bent
+    bent_x, bent_y = _linearize(camera, x, y).bent
     pixel = jnp.stack([focal_x * bent_x + camera.skew_px * bent_y, focal_y * bent_y])
-    near = _linearized(
+    near = _linearize(
         camera,
         jnp.clip(x, bounds.low[0], bounds.high[0]),
         jnp.clip(y, bounds.low[1], bounds.high[1]),
@@ -130,7 +130,7 @@ def project(
     return pixel + camera.principal_point_px, z, (first, second)
 
 
-def _linearized(camera: Camera, x: Float[Array, ""], y: Float[Array, ""]) -> LinearLens:
+def _linearize(camera: Camera, x: Float[Array, ""], y: Float[Array, ""]) -> LinearLens:
     """Distort one point of the image plane, with the Jacobian of the distortion."""
     squared = x * x + y * y
     if camera.fisheye is not None:

@@ -210,7 +210,7 @@ def rasterization(
         antialiased=rasterize_mode == "antialiased",
         distorted=distortion is not None,
     )
-    gaussians, colors, views = _checked(
+    gaussians, colors, views = _check(
         {
             "means": means,
             "quats": quats,
@@ -243,7 +243,7 @@ def _index(name, value):
     return number
 
 
-def _checked(arrays: dict[str, Any], sh_degree, coefficients):
+def _check(arrays: dict[str, Any], sh_degree, coefficients):
     """Check shapes, and return Gaussians, colors shared by all cameras, and views."""
     arrays = {
         name: None if value is None else jnp.asarray(value)

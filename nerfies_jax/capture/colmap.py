@@ -172,7 +172,7 @@ def _as_pinholes(path, model, files, stored, shrink_by):
     valid, notes = without_black_borders(images, valid)
     notes += masked
     full = image_files.read_header(files[0]).size
-    lenses = [_scaled(lens, full, size, path) for lens in model.lenses]
+    lenses = [_scale(lens, full, size, path) for lens in model.lenses]
     fisheyes = {_is_fisheye(lens) for lens in lenses}
     if not all(map(_is_supported, lenses)) or len(fisheyes) > 1:
         names = sorted({lens.model_name for lens in lenses})
@@ -345,7 +345,7 @@ def _masks(path, names, size, shrink_by):
     return white < 1, notes
 
 
-def _scaled(lens, stored, size, path):
+def _scale(lens, stored, size, path):
     """Return the lens for images of `size`, which are downscaled stored images."""
     if lens.is_spherical():
         raise CaptureError(

@@ -46,7 +46,7 @@ def read_exr(path: AnyPath) -> ExrPicture:
     with decoder.session() as child:
         about, _ = _decode(child, path, True)
         about, channels = _decode(child, path, False, about["numbers"])
-    return _cropped(channels, tuple(about["origin"]), tuple(about["display_size"]))
+    return _crop(channels, tuple(about["origin"]), tuple(about["display_size"]))
 
 
 def read_size(path: AnyPath) -> tuple[int, int]:
@@ -143,7 +143,7 @@ def _decode(child, path, header_only, numbers=0):
         ) from None
 
 
-def _cropped(channels, origin, display_size):
+def _crop(channels, origin, display_size):
     channels = {
         name: array if array.dtype == np.uint32 else array.astype(np.float32)
         for name, array in channels.items()

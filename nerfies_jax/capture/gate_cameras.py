@@ -40,7 +40,7 @@ def findings(capture: Capture) -> list[Finding]:
         _principal_point(capture),
         _lens(capture),
         _precision(capture),
-        *_rounded(capture),
+        *_is_rounded(capture),
     ]
 
 
@@ -218,21 +218,21 @@ def _precision(capture):
     return Finding("float32 step", value, problem, step_px > WRONG_PX)
 
 
-def _rounded(capture):
+def _is_rounded(capture):
     """Check if positions in the files were rounded to float32."""
-    results = _rounded_positions(capture, capture.cameras.position, "camera positions")
+    results = _find_rounding(capture, capture.cameras.position, "camera positions")
     if capture.points is not None and len(capture.points.position):
         points = capture.points.position
         points = points[:: max(1, len(points) // MOST_ROUNDED)]
         # Not refused, since points only initialize the scene.
         results += [
             finding._replace(refused=False)
-            for finding in _rounded_positions(capture, points, "points")
+            for finding in _find_rounding(capture, points, "points")
         ]
     return results
 
 
-def _rounded_positions(capture, position, name):
+def _find_rounding(capture, position, name):
     world = np.float64(position) / capture.scale + np.array(capture.center)
     steps = np.spacing(np.abs(world).max(0).astype(np.float32)).astype(float)
     # Positions in scene units are float32, which hides any finer rounding.

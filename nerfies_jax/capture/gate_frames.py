@@ -32,7 +32,7 @@ def findings(capture: Capture) -> list[Finding]:
     """
     return [
         _brightness(capture),
-        *_observed(capture),
+        *_find_unobserved(capture),
         *_moving(capture),
         *_times(capture),
     ]
@@ -51,7 +51,7 @@ def _brightness(capture):
     return Finding("brightness", value, problem)
 
 
-def _observed(capture):
+def _find_unobserved(capture):
     if capture.valid is None:
         return [Finding("observed pixels", "all")]
     share = capture.valid.mean((1, 2))
@@ -61,7 +61,7 @@ def _observed(capture):
     if train_share.mean() < LEAST_OBSERVED:
         problem = f"{train_share.mean():.2%} of the pixels are observed; {_MASKS}"
     elif (empty := capture.train[train_share == 0]).size:
-        problem = f"{_listed(capture, empty)} without an observed pixel; {_MASKS}"
+        problem = f"{_frame_list(capture, empty)} without an observed pixel; {_MASKS}"
     return [Finding("observed pixels", value, problem)]
 
 
@@ -80,13 +80,12 @@ def _moving(capture):
             "may be inverted"
         )
     elif (full := capture.train[train_share == 1]).size:
-        problem = (
-            f"{_listed(capture, full)} marked as moving everywhere; check their masks"
-        )
+        frames = _frame_list(capture, full)
+        problem = f"{frames} marked as moving everywhere; check their masks"
     return [Finding("moving pixels", value, problem)]
 
 
-def _listed(capture, rows):
+def _frame_list(capture, rows):
     names = ", ".join(capture.ids[row] for row in rows[:5])
     return f"{len(rows)} frames ({names}{', ...' if len(rows) > 5 else ''})"
 

@@ -52,7 +52,7 @@ def read_header(path: AnyPath) -> Header:
     """
     path = pathlib.Path(path)
     if path.suffix.lower() == EXR:
-        return _checked(path, Header(exr.read_size(path), "EXR", 1))
+        return _check(path, Header(exr.read_size(path), "EXR", 1))
     _existing(path)
     try:
         with warnings.catch_warnings():
@@ -65,7 +65,7 @@ def read_header(path: AnyPath) -> Header:
         ) from None
     except _PILLOW_ERRORS as error:
         raise _unreadable(path, error) from None
-    return _checked(path, header)
+    return _check(path, header)
 
 
 def _existing(path):
@@ -75,7 +75,7 @@ def _existing(path):
     safe_files.check(path)
 
 
-def _checked(path, header):
+def _check(path, header):
     width, height = header.size
     if width * height > MAX_PIXELS:
         raise CaptureError(

@@ -256,10 +256,10 @@ def decode(path: AnyPath) -> Stored:
       CaptureError: If it is not an image that may be a mask.
     """
     with images.opened(path) as image:
-        return _decoded(path, PIL.ImageOps.exif_transpose(image))
+        return _decode(path, PIL.ImageOps.exif_transpose(image))
 
 
-def _decoded(path, image):
+def _decode(path, image):
     if image.mode.startswith("I"):
         value = np.asarray(image)
         if not 0 <= value.min() <= value.max() <= 65535:

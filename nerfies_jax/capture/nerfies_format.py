@@ -255,7 +255,7 @@ def _check_image_size(file, full_size, source):
         )
 
 
-def _reduced(folder, total):
+def _stored_reduction(folder, total):
     """The smallest stored reduction that divides `total`, and the remaining factor."""
     for source in range(total, 0, -1):
         if total % source == 0 and (folder / f"{source}x").is_dir():
@@ -265,7 +265,7 @@ def _reduced(folder, total):
 
 def _masks(kind, ids, size, total, black):
     """Share of white per pixel, and notes. In NeRF-DS names end in .png.png."""
-    folder, shrink_by = _reduced(kind, total)
+    folder, shrink_by = _stored_reduction(kind, total)
     if folder is None:
         return None, ()
     paths = [text_files.find(folder, name, (".png.png", ".png")) for name in ids]
@@ -277,7 +277,7 @@ def _masks(kind, ids, size, total, black):
 
 def _depths(path, views, size, total):
     """Read z-depth in scene units from files in world units, with 0 where unknown."""
-    folder, shrink_by = _reduced(path / "depth", total)
+    folder, shrink_by = _stored_reduction(path / "depth", total)
     if folder is None:
         return None, ()
     if not any(folder.glob("*.npy")):
@@ -312,7 +312,7 @@ def _depths(path, views, size, total):
 
 
 def _flow(path, views, size, total):
-    folder, shrink_by = _reduced(path, total)
+    folder, shrink_by = _stored_reduction(path, total)
     if folder is None:
         return None
     return flow_files.read(path, total // shrink_by, shrink_by, views.ids, size)

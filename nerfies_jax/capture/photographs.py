@@ -65,7 +65,7 @@ def read_header(path: pathlib.Path) -> Header:
     """
     if path.suffix.lower() not in HEIC:
         return decode_header(path)
-    about = _decoded_apart(path, 0, header_only=True).about
+    about = _decode_apart(path, 0, header_only=True).about
     return Header(tuple(about["size"]), about["focal"], about["camera"])
 
 
@@ -86,10 +86,10 @@ def read_upright(path: pathlib.Path) -> np.ndarray:
     count = width * height
     if path.suffix.lower() not in HEIC and count <= images.LARGE_PIXELS:
         return decode_upright(path)
-    return _decoded_apart(path, count, header_only=False).arrays["pixels"]
+    return _decode_apart(path, count, header_only=False).arrays["pixels"]
 
 
-def _decoded_apart(path, count, header_only):
+def _decode_apart(path, count, header_only):
     """Decode a file of `count` pixels in a child process."""
     path = safe_files.check(path)
     try:
@@ -124,7 +124,7 @@ def decode_header(path: pathlib.Path) -> Header:
       Unreadable: As for `read_header`.
       TooLarge: As for `read_header`.
     """
-    with _opened(path) as image:
+    with _open(path) as image:
         tags = image.getexif()
         is_rotated = tags.get(_ORIENTATION, 1) in (5, 6, 7, 8)  # by 90 degrees
         size = image.size[::-1] if is_rotated else image.size
@@ -151,7 +151,7 @@ def decode_upright(path: pathlib.Path) -> np.ndarray:
     Raises:
       CaptureError: As for `read_upright`.
     """
-    with _opened(path) as image:
+    with _open(path) as image:
         image = PIL.ImageOps.exif_transpose(image)
         if image.mode == "F":
             raise CaptureError(
@@ -175,7 +175,7 @@ def decode_upright(path: pathlib.Path) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _opened(path):
+def _open(path):
     """Open an image as stored, and raise a one-line error for any defect."""
     try:
         with warnings.catch_warnings():

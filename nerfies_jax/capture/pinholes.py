@@ -51,7 +51,7 @@ def as_pinholes(capture: Capture) -> Capture:
     wide = canvas(capture)
     arrays = _last.arrays(capture)
     if arrays is None:
-        arrays = _undistorted(capture, wide)
+        arrays = _undistort(capture, wide)
         if arrays["images"].nbytes <= MOST_KEPT_BYTES:
             _last.keep(capture, arrays)
     observed = arrays["valid"]
@@ -96,9 +96,9 @@ class _Last:
 
     def given(self, capture, wide):
         if self.arrays(capture) is None:  # too large to be kept
-            return _undistorted_given(capture, capture.given, wide)
+            return _undistort_external(capture, capture.given, wide)
         if self._given[0] is not capture.given:
-            undistorted = _undistorted_given(capture, capture.given, wide)
+            undistorted = _undistort_external(capture, capture.given, wide)
             self._given = capture.given, undistorted
         return self._given[1]
 
@@ -111,7 +111,7 @@ def _others(capture):
 _last = _Last()
 
 
-def _undistorted(capture, wide):
+def _undistort(capture, wide):
     """Images, masks and depths by name, with booleans of the observed pixels."""
     shape = (len(capture.images), *wide.size[::-1])
     images = np.empty((*shape, 3), capture.images.dtype)
@@ -141,7 +141,7 @@ def _undistorted(capture, wide):
     return {"images": images, "valid": observed, **masks}
 
 
-def _undistorted_given(capture, external, wide):
+def _undistort_external(capture, external, wide):
     camera_of = [cameras.take(capture.cameras, row) for row in range(len(capture.ids))]
     maps = Maps(lambda camera, size: _source_pixels(camera, size, wide), capture.size)
     order = np.argsort(capture.times[capture.train], kind="stable")
@@ -314,9 +314,7 @@ def _source_pixels(camera, size, wide):
     Where the lens model folds back there is no pixel at all.
     """
     straight = cameras.crop(pinhole(camera), -wide.left, -wide.top)
-    distorted, single = _distorted_slopes(
-        _float32(camera), _slopes(straight, wide.size)
-    )
+    distorted, single = _distort(_float32(camera), _slopes(straight, wide.size))
     distorted = np.where(np.asarray(single)[:, None], np.asarray(distorted), np.nan)
     return resampling.array_places(_pixels(camera, distorted, wide.size), size)
 
@@ -332,7 +330,7 @@ def _straight(camera, distorted):
 
 
 @jax.jit
-def _distorted_slopes(camera, slopes):
+def _distort(camera, slopes):
     """Distorted image-plane positions, and booleans where the lens is one-to-one."""
     distorted = jax.vmap(lens.distort, (None, 0))(camera, slopes)
     return distorted, jax.vmap(lens.one_to_one, (None, 0))(camera, slopes)

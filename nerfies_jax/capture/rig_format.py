@@ -197,7 +197,7 @@ def _read_videos(path, files, shrink_by):
             for time, frame in video.read_video(file, damaged="skip"):
                 if len(seconds) == len(images):  # more frames than in the headers
                     images = np.concatenate([images, np.empty_like(images)])
-                images[len(seconds)] = _reduced(file, frame, shrink_by, (width, height))
+                images[len(seconds)] = _shrink(file, frame, shrink_by, (width, height))
                 seconds.append(time)
                 camera_ids.append(number)
             notes += tuple(
@@ -222,7 +222,7 @@ def _read_videos(path, files, shrink_by):
     )
 
 
-def _reduced(file, frame, shrink_by, size):
+def _shrink(file, frame, shrink_by, size):
     small = shrink(frame, shrink_by)
     if small.shape[1::-1] != size:
         raise CaptureError(

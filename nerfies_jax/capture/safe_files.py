@@ -29,7 +29,7 @@ _folder: contextvars.ContextVar[str | None] = contextvars.ContextVar(
 
 
 @contextlib.contextmanager
-def _confined(folder: AnyPath) -> Iterator[None]:
+def _confine(folder: AnyPath) -> Iterator[None]:
     """Refuse to open files outside of a folder within the block.
 
     The restriction does not extend to other threads. Wrap their functions with
@@ -60,7 +60,7 @@ def confines(
         path: AnyPath, *args: Parameters.args, **options: Parameters.kwargs
     ) -> Content:
         folder = path if os.path.isdir(path) else pathlib.Path(path).parent
-        with _confined(folder), decoder.session():
+        with _confine(folder), decoder.session():
             return read(path, *args, **options)
 
     return confined_read

@@ -124,7 +124,7 @@ def derive(
             points = np.asarray(old.read_keypoints(image.image_id))
             keep = _scales(points) >= least_scale
             if masks is not None:
-                keep &= _unmasked(points, masks / f"{image.name}.png")
+                keep &= _is_unmasked(points, masks / f"{image.name}.png")
             new_id[image.image_id] = id_of[image.name]
             new_row[image.image_id] = np.where(keep, np.cumsum(keep) - 1, -1)
             new.write_keypoints(
@@ -158,7 +158,7 @@ def _scales(points):
     return np.hypot(points[:, 2], points[:, 4])
 
 
-def _unmasked(points, file):
+def _is_unmasked(points, file):
     with PIL.Image.open(file) as image:
         mask = np.asarray(image.convert("L"))
     last = np.array(mask.shape[::-1]) - 1

@@ -101,7 +101,7 @@ def _attempt(rung: Rung, features, images, work, groups, spec, masks):
         if models:
             model, pieces = sfm_joining.join(models, database, images, folder, options)
             if rung.hold:
-                model = _refined(model, options)
+                model = _refine(model, options)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return model, _summarize(model, rung, count), pieces
@@ -129,7 +129,7 @@ def _options(rung):
     return options
 
 
-def _refined(model, options):
+def _refine(model, options):
     """Refine cameras that were held: the focal length, and then the distortion as well.
 
     A step that makes the intrinsics implausible is undone.

@@ -87,7 +87,7 @@ def find(
             if os.path.isfile(path):  # False of names too long for the system
                 return path
     for suffix in dict.fromkeys(map(str.lower, suffixes)):
-        path = _respelled(folder, plain + suffix)
+        path = _respell(folder, plain + suffix)
         if path is not None and os.path.isfile(path):
             return path
     return None
@@ -120,7 +120,7 @@ def find_local(
     return None
 
 
-def _respelled(folder, name):
+def _respell(folder, name):
     """Spell a path as on disk, or return None if no or several spellings match."""
     path = folder
     for part in pathlib.PurePosixPath(name).parts:

@@ -48,7 +48,7 @@ def frames(
         _check_size(stream.width, stream.height)
         stream.thread_type = "AUTO"
         aspect = stream.sample_aspect_ratio
-        for number, frame in enumerate(_decoded(av, container, stream, damaged)):
+        for number, frame in enumerate(_decode(av, container, stream, damaged)):
             size = size or (frame.width, frame.height)
             if (frame.width, frame.height) != size:
                 raise FileError(
@@ -200,7 +200,7 @@ def _shortfall(container, stream, count, last):
     )
 
 
-def _decoded(av, container, stream, damaged):
+def _decode(av, container, stream, damaged):
     """Decode frames. Unless damage is refused, skip those that cannot be decoded."""
     if damaged == "refuse":
         yield from container.decode(stream)

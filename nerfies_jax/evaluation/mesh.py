@@ -64,7 +64,7 @@ def extract(
     """
     import skimage.measure
 
-    observed = [_observed(draw, state, view) for view in views]
+    observed = [_observe(draw, state, view) for view in views]
     low, high = _bounds(observed)
     step = float((high - low).max()) / voxels
     sides = np.ceil((high - low) / step).astype(int) + 1
@@ -101,7 +101,7 @@ def extract(
     return Mesh(low + step * vertices, faces.astype(np.int32), bytes_of)
 
 
-def _observed(draw, state, view):
+def _observe(draw, state, view):
     rendering = draw(state, view)
     alpha = np.asarray(rendering.alpha)
     depth = np.asarray(rendering.depth, np.float32)

@@ -112,7 +112,7 @@ def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, 
     if followed is None or not len(known.path):
         return dict.fromkeys(names, float("nan"))
     errors = _endpoints(followed.path, known)
-    lost = 1 - followed.found[_scored(known)].mean()
+    lost = 1 - followed.found[_scored_mask(known)].mean()
     values = (errors.endpoint, errors.correct, lost, followed.drift, followed.strain)
     return {name: float(value) for name, value in zip(names, values, strict=True)}
 
@@ -132,7 +132,7 @@ def static_error(known: GroundTruth) -> float:
     return float(_endpoints(static, known)[0])
 
 
-def _scored(truth):
+def _scored_mask(truth):
     """Return a mask of the visible points, except at the start."""
     scored = truth.seen.copy()
     scored[:, truth.start] = False
@@ -140,7 +140,7 @@ def _scored(truth):
 
 
 def _endpoints(path, truth):
-    return _track_errors(path, truth.path, _scored(truth))
+    return _track_errors(path, truth.path, _scored_mask(truth))
 
 
 @jax.jit  # because its operations take longer to compile separately

@@ -114,9 +114,9 @@ def column(
     rows, columns, *_ = grid.shape
     across, right = _between(position[0] * ((columns - 1) / size[0]), columns)
     down, below = _between(position[1] * ((rows - 1) / size[1]), rows)
-    upper = _mixed(grid[down, across], grid[down, across + 1], right)
-    lower = _mixed(grid[down + 1, across], grid[down + 1, across + 1], right)
-    return _mixed(upper, lower, below)
+    upper = _mix(grid[down, across], grid[down, across + 1], right)
+    lower = _mix(grid[down + 1, across], grid[down + 1, across + 1], right)
+    return _mix(upper, lower, below)
 
 
 def along(
@@ -136,7 +136,7 @@ def along(
     share = (distance - ray.near) / jnp.where(length > 0, length, 1)
     corners = column.shape[0]
     before, past = _between(jnp.clip(share, 0, 1) * (corners - 1), corners)
-    return _mixed(column[before], column[before + 1], past[:, None])
+    return _mix(column[before], column[before + 1], past[:, None])
 
 
 def _between(place, corners):
@@ -145,5 +145,5 @@ def _between(place, corners):
     return before.astype(jnp.int32), place - before
 
 
-def _mixed(one, other, share):
+def _mix(one, other, share):
     return one + share * (other - one)

@@ -36,7 +36,7 @@ def first(field: Field) -> Cells | tuple[()]:
     if field.spec.sampling.occupancy is None:
         return ()
     params = jax.eval_shape(field.init, jax.random.key(0))
-    survey = functools.partial(_occupied, field)
+    survey = functools.partial(_occupied_cells, field)
     shapes = jax.eval_shape(survey, params, jnp.zeros((), jnp.int32))
     return jnp.ones(shapes.shape, bool)
 
@@ -64,7 +64,7 @@ def events(field: Field) -> tuple[Event, ...]:
             "surveyed once for all: it moves, has a transient medium, normals, or no "
             "extent; leave it out (sampling.occupancy=none)"
         )
-    survey = programs.Program(_occupied, field)
+    survey = programs.Program(_occupied_cells, field)
 
     def apply(state: TrainState, frames: Frames) -> TrainState:
         del frames
@@ -78,7 +78,7 @@ def events(field: Field) -> tuple[Event, ...]:
     return (Event("survey", when, apply),)
 
 
-def _occupied(field, params, step):
+def _occupied_cells(field, params, step):
     """Find the cells that are occupied in any level."""
     return field.survey(params, step)[skipping.GUIDE]
 

@@ -107,14 +107,14 @@ def centered(
     # density, but `jnp.arctan` is wrong with wide vectors (`runs.platform.start_jax`),
     # and all samples were drawn next to the far plane.
     start, end = (
-        _contracted(jnp.clip((side - middle) / width, -WIDTHS, WIDTHS))
+        _contract(jnp.clip((side - middle) / width, -WIDTHS, WIDTHS))
         for side in (near, far)
     )
     place = stratified(key, start, end, count)
     return jnp.clip(middle + width * place / (1 - jnp.abs(place)), near, far)
 
 
-def _contracted(x):
+def _contract(x):
     return x / (1 + jnp.abs(x))
 
 

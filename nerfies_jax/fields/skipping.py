@@ -126,7 +126,9 @@ def survey(
 
         index = jnp.arange(cells**3, dtype=jnp.int32)
         point = occupancy.random_points(key, index, cells, spec.extent, dtype)
-        density = _compacted(lambda cell: jax.vmap(densities)(point[cell]), to_evaluate)
+        density = _evaluate_compactly(
+            lambda cell: jax.vmap(densities)(point[cell]), to_evaluate
+        )
         above = {name: new * span > SKIPPED_DEPTH for name, new in density.items()}
         if guided:
             most = functools.reduce(jnp.maximum, density.values())
@@ -363,16 +365,19 @@ def _evaluate(
                 place = place_of(index)
                 return values_at(index, place), place if is_kept else None
 
-            answer, place = _compacted(jax.vmap(evaluate_new), mask)
+            answer, place = _evaluate_compactly(jax.vmap(evaluate_new), mask)
             evaluated = _Evaluated(mask, place) if is_kept else None
         else:
-            more = _compacted(jax.vmap(place_of), mask & ~before.known)
+            more = _evaluate_compactly(jax.vmap(place_of), mask & ~before.known)
             place = jax.tree.map(jnp.add, before.place, more)  # one of them is zero
 
             def evaluate_known(index):
                 return values_at(index, jax.tree.map(lambda x: x[index], place))
 
-            answer, evaluated = _compacted(jax.vmap(evaluate_known), mask), None
+            answer, evaluated = (
+                _evaluate_compactly(jax.vmap(evaluate_known), mask),
+                None,
+            )
         depth = answer[:, 0].reshape(spacing.shape) * spacing
         return passed_depth + jnp.sum(depth, axis=1), (answer, evaluated)
 
@@ -381,7 +386,7 @@ def _evaluate(
     return jax.tree.map(whole, results)
 
 
-def _compacted(
+def _evaluate_compactly(
     function: Callable[[Int[Array, " batch"]], PyTree], mask: Bool[Array, " places"]
 ) -> PyTree:
     """Evaluate a function at a subset of indices, batch by batch."""

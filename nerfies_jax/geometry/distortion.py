@@ -105,7 +105,7 @@ def undistort(
       ValueError: If an argument is bfloat16 or float16.
     """
     refuse_half("the distorted point or the lens", bent, radial)
-    slopes = _undistorted(radial, tangential, bent)
+    slopes = _undistort(radial, tangential, bent)
     return slopes, _solves(radial, tangential, bent, slopes)
 
 
@@ -130,7 +130,7 @@ def one_to_one(
     on_the_way = jnp.all(tangential == 0) | (
         jnp.min(_bernstein(radial, tangential, slopes)) > 0
     )
-    return _unfolded(radial, jnp.sum(slopes**2)) & at_end & on_the_way
+    return _is_unfolded(radial, jnp.sum(slopes**2)) & at_end & on_the_way
 
 
 def _bernstein(radial, tangential, slopes):
@@ -165,7 +165,7 @@ def _bernstein(radial, tangential, slopes):
 
 
 @jax.custom_jvp
-def _undistorted(radial, tangential, distorted):
+def _undistort(radial, tangential, distorted):
     start = _radial_root(radial, distorted)
 
     def newton(_, slopes):
@@ -178,12 +178,12 @@ def _undistorted(radial, tangential, distorted):
     return jnp.where(_solves(radial, tangential, distorted, slopes), slopes, start)
 
 
-@_undistorted.defjvp
-def _undistorted_jvp(primals, tangents):
+@_undistort.defjvp
+def _undistort_jvp(primals, tangents):
     """Implicit: J ds = d bent - ∂distort/∂(lens) d lens. Same rule at every order."""
     radial, tangential, distorted = primals
     radial_dot, tangential_dot, bent_dot = tangents
-    slopes = _undistorted(radial, tangential, distorted)
+    slopes = _undistort(radial, tangential, distorted)
     _, tangent = jax.jvp(
         lambda k, p: distort(k, p, slopes),
         (radial, tangential),
@@ -218,7 +218,7 @@ def _radial_root(radial, distorted):
         radius_sq = radius * radius
         stretch = 1 + radius_sq * (k1 + radius_sq * (k2 + radius_sq * k3))
         excess = radius * stretch - target
-        unfolded = _unfolded(radial, radius_sq)
+        unfolded = _is_unfolded(radial, radius_sq)
         beyond = (excess > 0) | ~unfolded
         low = jnp.where(beyond, low, radius)
         high = jnp.where(beyond, radius, high)
@@ -239,7 +239,7 @@ def _radial_root(radial, distorted):
     # Where the tangential terms alone reach the target, the radial search ends at the
     # fold, from where Newton has no way; it starts inside instead.
     radius = jnp.where(
-        _unfolded(radial, (radius / INSIDE) ** 2), radius, INSIDE * radius
+        _is_unfolded(radial, (radius / INSIDE) ** 2), radius, INSIDE * radius
     )
     return distorted * (radius / jnp.where(target > 0, target, 1))
 
@@ -250,7 +250,7 @@ def _radial_slope(radial, radius_sq):
     return 1 + radius_sq * (3 * k1 + radius_sq * (5 * k2 + radius_sq * 7 * k3))
 
 
-def _unfolded(radial, radius_sq):
+def _is_unfolded(radial, radius_sq):
     """Test if the radial derivative is positive from 0 to `radius_sq`.
 
     A cubic's least value lies at an end or where its derivative 3k1 + 10k2 s + 21k3 s²

@@ -73,7 +73,7 @@ def undistort(
       ValueError: If an argument is bfloat16 or float16.
     """
     refuse_half("the distorted point or the lens", bent, coefficients)
-    slopes = _undistorted(coefficients, bent)
+    slopes = _undistort(coefficients, bent)
     return slopes, _solves(coefficients, bent, slopes)
 
 
@@ -94,7 +94,7 @@ def one_to_one(
     """
     squared = jnp.sum(slopes * slopes)
     ratio, _ = _arctan_ratio(squared)
-    return _unfolded(coefficients, squared * ratio * ratio)
+    return _is_unfolded(coefficients, squared * ratio * ratio)
 
 
 def stretch(coefficients: Float[Array, "4"], squared: Float[Array, ""]) -> Stretch:
@@ -120,10 +120,10 @@ def stretch(coefficients: Float[Array, "4"], squared: Float[Array, ""]) -> Stret
 
 def _arctan_ratio(squared):
     """θ / tan θ and its derivative as functions of tan² θ."""
-    return jax.jvp(_quartered, (squared,), (jnp.ones_like(squared),))
+    return jax.jvp(_quarter_series, (squared,), (jnp.ones_like(squared),))
 
 
-def _quartered(squared):
+def _quarter_series(squared):
     """θ / tan θ from the series of a quarter of the angle.
 
     Smooth at zero, without a switch. `jnp.arctan` would be shorter, but XLA:CPU of JAX
@@ -139,7 +139,7 @@ def _quartered(squared):
     return 4 * series / (first * second)
 
 
-def _unfolded(coefficients, angle_sq):
+def _is_unfolded(coefficients, angle_sq):
     """Test if the derivative of the distorted radius is positive from 0 to θ²."""
     powers = angle_sq ** jnp.arange(5, dtype=angle_sq.dtype)
     odd = jnp.arange(1, 10, 2, dtype=angle_sq.dtype)
@@ -149,7 +149,7 @@ def _unfolded(coefficients, angle_sq):
 
 
 @jax.custom_jvp
-def _undistorted(coefficients, distorted):
+def _undistort(coefficients, distorted):
     target = jnp.sqrt(jnp.sum(distorted**2))
 
     def narrow(_, state):
@@ -185,12 +185,12 @@ def _radius(coefficients, angle):
     return radius, 1 + u * (3 * k1 + u * (5 * k2 + u * (7 * k3 + u * 9 * k4)))
 
 
-@_undistorted.defjvp
-def _undistorted_jvp(primals, tangents):
+@_undistort.defjvp
+def _undistort_jvp(primals, tangents):
     """Implicit: J ds = d bent - ∂distort/∂k dk, with J in its radial frame."""
     coefficients, distorted = primals
     coefficients_dot, bent_dot = tangents
-    slopes = _undistorted(coefficients, distorted)
+    slopes = _undistort(coefficients, distorted)
     _, tangent = jax.jvp(
         lambda k: distort(k, slopes), (coefficients,), (coefficients_dot,)
     )

@@ -83,17 +83,17 @@ _linear_call = Primitive("linear_call_with_transpose")
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _compiled(pair, *arrays):
+def _run_compiled(pair, *arrays):
     return pair(*arrays)
 
 
 def _run(*arrays, pair):
-    return _compiled(pair, *arrays)
+    return _run_compiled(pair, *arrays)
 
 
 def _shape(*arrays, pair):
     shapes = (jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays)
-    result = _compiled.eval_shape(pair, *shapes)
+    result = _run_compiled.eval_shape(pair, *shapes)
     return jax.core.ShapedArray(result.shape, result.dtype)
 
 

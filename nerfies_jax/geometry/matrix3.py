@@ -102,7 +102,7 @@ def displacement_log_energy(
 def _strain(displacement):
     """Compute JᵀJ - 1 of J = 1 + D as D + Dᵀ + DᵀD, without rounding 1 + D."""
     d = _entries(displacement)
-    return _stacked(
+    return _stack(
         _from_entries(
             lambda i, j: d[i][j] + d[j][i] + sum(row[i] * row[j] for row in d)
         )
@@ -127,12 +127,12 @@ def singular_values(matrix: Matrix) -> Float[Array, "3"]:
 
 @jax.custom_jvp
 def _singular_values(matrix):
-    return jnp.stack(_oriented(False, matrix)[1])
+    return jnp.stack(_orient(False, matrix)[1])
 
 
 @_singular_values.defjvp
 def _singular_values_jvp(primals, tangents):
-    left, values, right = _oriented(False, primals[0])
+    left, values, right = _orient(False, primals[0])
     rotated = _between(left, _entries(tangents[0]), right)
     return jnp.stack(values), jnp.stack([rotated[k][k] for k in range(3)])
 
@@ -166,14 +166,14 @@ def _energy_jvp(signed, primals, tangents):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _energy_and_gradient(signed, matrix):
-    return _energy_of(*_oriented(signed, matrix))
+    return _energy_of(*_orient(signed, matrix))
 
 
 def _energy_of(left, values, right):
     """Compute Σ f(σ) and its gradient U diag(f'(σ)) Vᵀ."""
     grad = _diagonal([_log_sq_derivative(value) for value in values])
     energy = sum(_log(value) ** 2 for value in values)
-    return energy, _stacked(_outer(left, grad, right))
+    return energy, _stack(_outer(left, grad, right))
 
 
 @_energy_and_gradient.defjvp
@@ -183,15 +183,15 @@ def _energy_and_gradient_jvp(signed, primals, tangents):
     This holds for any isotropic energy. See Smith, De Goes and Kim 2019, "Analytic
     eigensystems for isotropic distortion energies".
     """
-    left, values, right = _oriented(signed, primals[0])
+    left, values, right = _orient(signed, primals[0])
     one, other = jnp.stack(values)[:, None], jnp.stack(values)
     total = jnp.where(jnp.abs(one + other) < CONE, CONE, one + other)
     twist = (_log_sq_derivative(one) + _log_sq_derivative(other)) / total
     stretch = _derivative_difference(one, other)
-    rotated = _stacked(_between(left, _entries(tangents[0]), right))
+    rotated = _stack(_between(left, _entries(tangents[0]), right))
     change = (stretch * (rotated + rotated.T) + twist * (rotated - rotated.T)) / 2
     energy, grad = _energy_of(left, values, right)
-    grad_dot = _stacked(_outer(left, _entries(change), right))
+    grad_dot = _stack(_outer(left, _entries(change), right))
     return (energy, grad), (jnp.sum(grad * tangents[0]), grad_dot)
 
 
@@ -215,13 +215,13 @@ def _strain_energy_and_gradient(strain):
 def _strain_energy_of(values, basis):
     grad = _diagonal([jnp.log1p(value) / (2 * (1 + value)) for value in values])
     energy = sum(jnp.log1p(value) ** 2 for value in values) / 4
-    return energy, _stacked(_outer(basis, grad, basis))
+    return energy, _stack(_outer(basis, grad, basis))
 
 
 @_strain_energy_and_gradient.defjvp
 def _strain_energy_and_gradient_jvp(primals, tangents):
     values, basis = jacobi.eigen(primals[0])
-    rotated = _stacked(_between(basis, _entries(tangents[0]), basis))
+    rotated = _stack(_between(basis, _entries(tangents[0]), basis))
     one, other = jnp.stack(values)[:, None], jnp.stack(values)
     smaller = jnp.minimum(one, other)
     change = rotated * _log_quotient_difference(
@@ -230,7 +230,7 @@ def _strain_energy_and_gradient_jvp(primals, tangents):
         (1 + one) * (1 + other),
     )
     energy, grad = _strain_energy_of(values, basis)
-    grad_dot = _stacked(_outer(basis, _entries(change / 2), basis))
+    grad_dot = _stack(_outer(basis, _entries(change / 2), basis))
     return (energy, grad), (jnp.sum(grad * tangents[0]), grad_dot)
 
 
@@ -282,7 +282,7 @@ def _log_quotient_difference(excess, log_smaller, product):
     return (quotient - log_smaller) / product
 
 
-def _oriented(signed, matrix):
+def _orient(signed, matrix):
     """Compute U, σ and V. If not `signed`, U is a reflection for a negative σ3."""
     left, values, right = jacobi.svd(matrix)
     if signed:
@@ -293,7 +293,7 @@ def _oriented(signed, matrix):
 
 
 def _matrix(columns):
-    return _stacked([[column[i] for column in columns] for i in range(3)])
+    return _stack([[column[i] for column in columns] for i in range(3)])
 
 
 # Matrix products are written in scalars, because batched 3×3 `matmul`s are slower on a
@@ -304,7 +304,7 @@ def _entries(matrix):
     return [[matrix[i, j] for j in range(3)] for i in range(3)]
 
 
-def _stacked(rows):
+def _stack(rows):
     # One stack: nested stacks take 25 times as long under `vmap` on XLA:CPU, which then
     # recomputes all nine entries for each of them.
     return jnp.stack([entry for row in rows for entry in row]).reshape(3, 3)

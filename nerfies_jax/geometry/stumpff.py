@@ -37,7 +37,7 @@ def stumpff(order: int, angle_sq: Float[Array, "*batch"]) -> Float[Array, "*batc
     near = angle_sq < SERIES_BELOW
     # `where` differentiates both branches, so the unused one must stay finite.
     series = _series(order, jnp.where(near, angle_sq, 0))
-    closed = _closed(order, jnp.where(near, SERIES_BELOW, angle_sq))
+    closed = _closed_form(order, jnp.where(near, SERIES_BELOW, angle_sq))
     return jnp.where(near, series, closed)
 
 
@@ -60,7 +60,7 @@ def _series_jvp(order, primals, tangents):
     return _series(order, angle_sq), grad * angle_sq_dot
 
 
-def _closed(order, angle_sq):
+def _closed_form(order, angle_sq):
     """Evaluate c_k = (1/(k-2)! - c_{k-2}) / s, starting from cos θ or sin θ / θ."""
     angle = jnp.sqrt(angle_sq)
     if order % 2:

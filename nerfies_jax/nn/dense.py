@@ -64,7 +64,7 @@ def _type(inputs, weight):
     return ShapedArray((*inputs.shape[:-1], weight.shape[1]), inputs.dtype)
 
 
-def _batched(operands, axes):
+def _batch(operands, axes):
     (inputs, weight), (inputs_axis, weight_axis) = operands, axes
     if weight_axis is None:
         return PRODUCT.bind(jnp.moveaxis(inputs, inputs_axis, 0), weight), 0
@@ -96,5 +96,5 @@ def _transpose_weight(cotangent, inputs, weight):
 PRODUCT.def_impl(jax.jit(_product))
 PRODUCT.def_abstract_eval(_type)
 mlir.register_lowering(PRODUCT, mlir.lower_fun(_product, multiple_results=False))
-batching.primitive_batchers[PRODUCT] = _batched
+batching.primitive_batchers[PRODUCT] = _batch
 ad.defbilinear(PRODUCT, _transpose_inputs, _transpose_weight)

@@ -169,9 +169,9 @@ def encode(
             ]
             for level in levels
         ]
-        of_time = jnp.stack([_combined(spec, planes) for planes in by_level])
+        of_time = jnp.stack([_combine(spec, planes) for planes in by_level])
         inside = (time >= 0) & (time <= 1)
-        encoded = _refuse_outside(spec, _combined(spec, [encoded, of_time]), inside)
+        encoded = _refuse_outside(spec, _combine(spec, [encoded, of_time]), inside)
     return encoded.reshape(-1)
 
 
@@ -196,7 +196,7 @@ def space_features(
         for level in levels
     ]
     inside = jnp.all((place >= 0) & (place <= 1))
-    encoded = jnp.stack([_combined(spec, planes) for planes in by_level])
+    encoded = jnp.stack([_combine(spec, planes) for planes in by_level])
     return _refuse_outside(spec, encoded, inside)
 
 
@@ -230,7 +230,7 @@ def time_features(
         [linear(line, x) for line, x in zip(level, place, strict=True)]
         for level in lines
     ]
-    return jnp.stack([_combined(spec, level) for level in by_level])
+    return jnp.stack([_combine(spec, level) for level in by_level])
 
 
 def features(
@@ -248,7 +248,7 @@ def features(
     Returns:
       Features, [levels * features].
     """
-    return _combined(spec, [space, time]).reshape(-1)
+    return _combine(spec, [space, time]).reshape(-1)
 
 
 def bilinear(
@@ -367,7 +367,7 @@ def _cell(
     return before.astype(jnp.int32), scaled - before
 
 
-def _combined(spec, parts):
+def _combine(spec, parts):
     total = parts[0]
     for part in parts[1:]:
         total = total * part if spec.combination == "product" else total + part

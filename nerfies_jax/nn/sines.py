@@ -133,7 +133,7 @@ def _types(angle):
     return [angle, angle]
 
 
-def _batched(operands, axes):
+def _batch(operands, axes):
     return SINCOS.bind(*operands), [axes[0]] * 2
 
 
@@ -143,4 +143,4 @@ mlir.register_lowering(SINCOS, mlir.lower_fun(_sincos_xla, multiple_results=True
 mlir.register_lowering(
     SINCOS, mlir.lower_fun(_sincos_cpu, multiple_results=True), platform="cpu"
 )
-batching.primitive_batchers[SINCOS] = _batched
+batching.primitive_batchers[SINCOS] = _batch

@@ -147,7 +147,7 @@ def by_tracks(
     choice = choose(capture, seconds)
     changed, lines = _config_of_choice(config, choice), []
     other = choice.alternative
-    if other is not None and try_out is not None and _accepted(config, other):
+    if other is not None and try_out is not None and _is_accepted(config, other):
         trial = try_out(
             changed, _config_of_choice(config, other), capture, other.preset
         )
@@ -169,7 +169,7 @@ def _config_of_choice(config, choice):
     return dataclasses.replace(config, preset=choice.preset, overrides=overrides)
 
 
-def _accepted(config, choice):
+def _is_accepted(config, choice):
     """Test if a preset has all components that the user's overrides set."""
     try:
         scene_spec(_config_of_choice(config, choice))

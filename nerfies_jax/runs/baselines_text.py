@@ -33,9 +33,9 @@ def lines(numbers: Mapping[str, float]) -> list[str]:
     if "motion.gain" in numbers:
         region = ""
         if "motion.moving_gain" in numbers:
-            region = f", {_signed(numbers['motion.moving_gain'])} in dynamic regions"
+            region = f", {_with_sign(numbers['motion.moving_gain'])} in dynamic regions"
         text.append(
-            f"motion:     {_signed(numbers['motion.gain'])} compared with static "
+            f"motion:     {_with_sign(numbers['motion.gain'])} compared with static "
             f"renders{region}"
         )
     return text
@@ -85,6 +85,6 @@ def _cause(tracked_share):
     return f", although tracks were found near {tracked_share:.0%} of the moving pixels"
 
 
-def _signed(decibels):
+def _with_sign(decibels):
     """Format with a sign and two decimals. Zero is never negative."""
     return f"{round(decibels, 2) + 0.0:+.2f} dB"

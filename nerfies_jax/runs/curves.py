@@ -205,7 +205,7 @@ def read(folder: pathlib.Path) -> Curve:
                 "without further steps"
             )
         return _curve_of(logged)
-    curve = _stored(folder / CURVE)
+    curve = _stored_curve(folder / CURVE)
     last_step = max(curve.steps, default=0)
     if logged is not None and not logged.ended and logged.step > last_step:
         return _curve_of(logged)
@@ -226,7 +226,7 @@ def _curve_of(logged):
     )
 
 
-def _stored(path):
+def _stored_curve(path):
     try:
         content = read_json(path, dict[str, Any])
         rows = of_held_out(content["evaluations"])

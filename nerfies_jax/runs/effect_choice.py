@@ -157,7 +157,7 @@ def compare_configs(
         count = min(max(len(train) // LEFT_OUT, 1), MAX_LEFT_OUT)
         rows = validation.spread_over_time(train, times, count)
         without, with_effect = (
-            _score(run, short[1], _trained(run, rows), rows) for run in short
+            _score(run, short[1], _train(run, rows), rows) for run in short
         )
     return Trial(short[0].spec.steps, len(rows), without, with_effect)
 
@@ -170,7 +170,7 @@ def _short_run(config: RunConfig, capture: Capture) -> Run:
     return with_steps(run, min(max(steps, MIN_STEPS), run.spec.steps))
 
 
-def _trained(run: Run, rows: np.ndarray):
+def _train(run: Run, rows: np.ndarray):
     capture = dataclasses.replace(
         run.capture, train=np.setdiff1d(run.capture.train, rows), heldout=rows
     )

@@ -183,10 +183,10 @@ def _solve(scratch, source_images, how, tell) -> Solved:
         run_sfm, images, groups=groups, features=scratch / "features.db"
     )
     if how.masks is not None:
-        poses = register(scratch / "only", scratch / "masks", _accepted(spec, how))
+        poses = register(scratch / "only", scratch / "masks", _accept_pieces(spec, how))
         return Solved(poses, True, tuple(poses.lines()))
     if how.passes == 1:
-        poses = register(scratch / "first", None, _accepted(spec, how))
+        poses = register(scratch / "first", None, _accept_pieces(spec, how))
         return Solved(poses, False, tuple(poses.lines()))
     # The first pass uses coarse features, because most fine features of some images lie
     # on moving objects.
@@ -194,7 +194,7 @@ def _solve(scratch, source_images, how, tell) -> Solved:
     try:
         first = register(scratch / "first", None, coarse)
     except FewPlaced as error:
-        return _solve_masked(scratch, register, _accepted(spec, how), error, tell)
+        return _solve_masked(scratch, register, _accept_pieces(spec, how), error, tell)
     tell(f"{first.lines()[0]}; detecting moving objects")
     capture = colmap.read(first.folder)
     moving = movers.masks_of(capture)
@@ -237,7 +237,7 @@ def _camera_groups(source_images, how, spec):
     return [CameraGroup(source_images.names, spec.focal)]
 
 
-def _accepted(spec, how):
+def _accept_pieces(spec, how):
     """Settings of the last pass, which accept any piece of the images if requested."""
     return dataclasses.replace(spec, at_least=0.0) if how.piece else spec
 

@@ -93,7 +93,7 @@ def make(
     ms_per_frame = renderer.ms_per_frame(len(scored.rows))
     # Products of an earlier call are replaced together or not at all.
     attempt = Attempts(all_or_none=(folder / METRICS).exists())
-    with _staged(folder) as target:
+    with _stage(folder) as target:
         no_player: tuple[list[report.Figure], list[str]] = ([], [])
         player, player_notes = attempt(no_player, save_player, target, run, trained)
         # The parts of a step are compiled in the background while other products are
@@ -174,7 +174,7 @@ def make(
     attempt.finish()
 
 
-def _staged(folder):
+def _stage(folder):
     """Yield the folder to write products to.
 
     If the run has earlier products, it is a temporary folder, whose contents replace

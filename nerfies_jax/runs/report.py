@@ -164,11 +164,11 @@ def readable(value: float | int, unit: str) -> str:
             if abs(value) >= size:
                 return f"{value / size:.3g} {name}"
     exact = float(value).is_integer() and abs(value) < 1e15
-    number = f"{int(value):,}" if exact else _rounded(value)
+    number = f"{int(value):,}" if exact else _round(value)
     return f"{number} {unit}".rstrip() if unit not in ("", "1") else number
 
 
-def _rounded(value):
+def _round(value):
     """Format with four digits, or more if the integer part has more."""
     places = max(0, 3 - math.floor(math.log10(abs(value))))
     return f"{value:,.{places}f}" if places <= 6 else f"{value:.3e}"
@@ -210,7 +210,7 @@ def _figure(figure):
             f"{path}: images of a report must be PNG or JPEG; convert it first"
         )
     width, height = images.read_header(path).size  # errors name the file
-    source = f"data:image/{kind};base64,{_encoded(path)}"
+    source = f"data:image/{kind};base64,{_encode(path)}"
     caption = _safe(figure.caption)
     shape = f'width="{width}" height="{height}"'
     if width > WIDE_PX:
@@ -237,7 +237,7 @@ def _video(video, folder):
         return ""
     path = pathlib.Path(video.path)
     if path.stat().st_size <= EMBEDDED_VIDEO_BYTES:
-        source = f"data:video/mp4;base64,{_encoded(path)}"
+        source = f"data:video/mp4;base64,{_encode(path)}"
     else:
         source = pathlib.Path(os.path.relpath(path, folder)).as_posix()
     poster = f"data:image/jpeg;base64,{_jpeg(video.poster)}"
@@ -357,7 +357,7 @@ def _table(title, columns, rows, kind=""):
     )
 
 
-def _encoded(path):
+def _encode(path):
     return base64.b64encode(path.read_bytes()).decode("ascii")
 
 

@@ -281,7 +281,7 @@ def stored_capture(source: CaptureSource, seed: int = 0) -> Capture:
 
 def _load(source, seed):
     if source.capture is None:
-        return _built_in(source, seed)
+        return _built_in_capture(source, seed)
     heldout = source.heldout
     if heldout is not None and heldout.isdigit():
         heldout = int(heldout)
@@ -295,7 +295,7 @@ def _load(source, seed):
     )
 
 
-def _built_in(source, seed):
+def _built_in_capture(source, seed):
     if source.scene not in synthetic.PRESETS:
         raise ValueError(
             f"scene={source.scene}: no such built-in scene; "
@@ -401,7 +401,7 @@ def read_settings(folder: pathlib.Path, trusted: Collection[str] = ()) -> Settin
         ValueError, and nothing has been imported.
       FileError: If the settings cannot be read.
     """
-    content = _stored(folder)
+    content = _stored_settings(folder)
     with _readable(folder):
         kind = representations.named(content["representation"])
         config = specs.from_json(content["config"], RunConfig)
@@ -430,14 +430,14 @@ def read_config(folder: pathlib.Path) -> RunConfig:
     Raises:
       ValueError: If it cannot be read.
     """
-    content = _stored(folder)
+    content = _stored_settings(folder)
     with _readable(folder):
         config = specs.from_json(content["config"], RunConfig)
         _check_type(config, RunConfig)
     return config
 
 
-def _stored(folder):
+def _stored_settings(folder):
     path = folder / CONFIG
     if not path.is_file():
         raise ValueError(

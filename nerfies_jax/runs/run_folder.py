@@ -35,7 +35,7 @@ def new_run_folder(out: pathlib.Path | None, stem: str) -> pathlib.Path:
       ValueError: If `out` is not empty or cannot be written.
     """
     if out is None:
-        return _numbered(pathlib.Path("runs"), stem)
+        return _make_numbered(pathlib.Path("runs"), stem)
     check_free(out)
     with _write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -184,7 +184,7 @@ def _owner(folder):
         return "another process"
 
 
-def _numbered(above, stem):
+def _make_numbered(above, stem):
     """Create the first of STEM, STEM-2, ... that does not exist."""
     number, folder = 1, above / stem
     with _write_errors(folder):

@@ -89,10 +89,10 @@ class Viewer:
             folder,
             self._seconds,
             FRUSTUM_SHARE * distance,
-            self._deferred,
+            self._defer,
             self._show_time,
         )
-        self.training = TrainingPanel(self._server, self._deferred, in_training)
+        self.training = TrainingPanel(self._server, self._defer, in_training)
 
     @property
     def address(self) -> str:
@@ -186,7 +186,7 @@ class Viewer:
     def _show_time(self, time):
         self._time.value = round(float(time), 3)
 
-    def _deferred(self, action: Callable, argument: Callable | None = None):
+    def _defer(self, action: Callable, argument: Callable | None = None):
         """Return a callback of viser that lets the next `_update` call `action`.
 
         Arguments of the action are the client, its camera as an `Eye` or None, the

@@ -60,7 +60,7 @@ def guarded() -> Iterator[None]:
         def serve(*args: Any, process_request: Callable, **options: Any):
             return original(
                 *args,
-                process_request=_checked(process_request),
+                process_request=_check_access(process_request),
                 logger=_logger(),
                 **options,
             )
@@ -72,7 +72,7 @@ def guarded() -> Iterator[None]:
             websockets_server.serve = original
 
 
-def _checked(process_request):
+def _check_access(process_request):
     """Wrap a request handler to answer 403 if `_refusal` returns a reason."""
 
     def process(connection, request):

@@ -271,7 +271,7 @@ class PathPanel:
         path = self._path()
         if path is None:
             return
-        file = _numbered(self._folder / EXPORTS, "path-", ".json")
+        file = _next_name(self._folder / EXPORTS, "path-", ".json")
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             path_files.write_nerfstudio(file, path, RATE, keyframes=self.keyframes)
@@ -308,7 +308,7 @@ class PathPanel:
         path = self._path()
         if path is None:
             return
-        out = _numbered(self._folder / RENDERS, "path-", "")
+        out = _next_name(self._folder / RENDERS, "path-", "")
         screen, total = self._screen, len(path.times)
 
         def images():
@@ -363,7 +363,7 @@ def vertical_fov(camera: Camera, size: tuple[int, int]) -> float:
     return 2 * float(np.arctan2(size[1], 2 * vertical_px))
 
 
-def _numbered(folder: pathlib.Path, stem: str, suffix: str) -> pathlib.Path:
+def _next_name(folder: pathlib.Path, stem: str, suffix: str) -> pathlib.Path:
     """Return the first of STEM1, STEM2, ... that does not exist."""
     number = 1
     while (path := folder / f"{stem}{number}{suffix}").exists():

@@ -118,7 +118,7 @@ def checked(
             if name in values:
                 values[name] = _check(plan.title, check, values[name], sizes, batches)
         if batches and any(shape for shape, _ in batches):
-            return _mapped(plan, function, batches, values, positional)
+            return _map(plan, function, batches, values, positional)
         if key is not None and unchanged and len(valid) < CACHE_SIZE:
             valid.add(key)
         return _call(function, values, positional)
@@ -358,7 +358,7 @@ def _with_float_images(plan, values, images):
     return values | converted if converted else values
 
 
-def _mapped(plan, function, batches, values, positional):
+def _map(plan, function, batches, values, positional):
     """Map a function over the broadcast leading axes of its arrays."""
     try:
         batch = np.broadcast_shapes(*(shape for shape, _ in batches))

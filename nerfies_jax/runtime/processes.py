@@ -56,13 +56,13 @@ def _start_of(pid):
     try:
         stat = pathlib.Path(f"/proc/{pid}/stat").read_text()
     except OSError:
-        return None if pathlib.Path("/proc/self/stat").exists() else _created(pid)
+        return None if pathlib.Path("/proc/self/stat").exists() else _creation_time(pid)
     # The name of the program, in parentheses, may contain any characters.
     state, *fields = stat.rpartition(")")[2].split()
     return None if state in "ZX" else int(fields[18])  # clock ticks since boot
 
 
-def _created(pid):
+def _creation_time(pid):
     import psutil
 
     try:

@@ -94,7 +94,7 @@ def from_json(stored: Any, *kinds: type) -> Any:
       ValueError: If a type is not allowed, or a field is unknown, missing or out of
         range. Nothing is imported to check this.
     """
-    return _revived(stored, allowed_names(*kinds))
+    return _revive(stored, allowed_names(*kinds))
 
 
 def allowed_names(*kinds: type) -> dict[str, type]:
@@ -106,17 +106,17 @@ def allowed_names(*kinds: type) -> dict[str, type]:
     Returns:
       These types and, recursively, the types of their annotated fields.
     """
-    return {type_name(kind): kind for kind in _allowed(kinds)}
+    return {type_name(kind): kind for kind in _collect_records(kinds)}
 
 
-def _revived(stored, allowed):
+def _revive(stored, allowed):
     if isinstance(stored, list):
-        return tuple(_revived(item, allowed) for item in stored)
+        return tuple(_revive(item, allowed) for item in stored)
     if not isinstance(stored, dict):
         return stored
     if stored.keys() == {NUMBER}:
         return float(stored[NUMBER])
-    fields = {key: _revived(item, allowed) for key, item in stored.items()}
+    fields = {key: _revive(item, allowed) for key, item in stored.items()}
     if TYPE not in stored:
         return fields
     name = fields.pop(TYPE)
@@ -128,7 +128,7 @@ def _revived(stored, allowed):
     return build_record(allowed[name], fields)
 
 
-def _allowed(kinds):
+def _collect_records(kinds):
     """Collect the records among `kinds` and, recursively, in their fields."""
     records, pending = set(), [*kinds]
     while pending:

@@ -175,7 +175,7 @@ def comparison(
     error = color_error(render, truth, largest_error)
     colored_depth = color_depth(depth, known_depth)
     columns = [as_bytes(truth), as_bytes(render), error.picture, colored_depth.picture]
-    columns = [_enlarged(column) for column in columns]
+    columns = [_enlarge(column) for column in columns]
     width = columns[0].shape[2]
     titles = ("truth", "render", "error", "depth")
     rows = [_join_horizontally([_text(title, width) for title in titles])]
@@ -218,7 +218,7 @@ def contact_sheet(
             f"a contact sheet needs a caption for each image, got {len(pictures)} "
             f"images and {len(captions)} captions"
         )
-    enlarged = _enlarged(np.stack([as_bytes(picture) for picture in pictures]))
+    enlarged = _enlarge(np.stack([as_bytes(picture) for picture in pictures]))
     tiles = [
         _join_vertically([image, _text(caption, image.shape[1], color=CAPTION)])
         for image, caption in zip(enlarged, captions, strict=True)
@@ -385,7 +385,7 @@ def _bar(row, left, right, width):
     return _join_vertically([np.repeat(colors[None], TEXT_HEIGHT, 0), ends])
 
 
-def _enlarged(pictures):
+def _enlarge(pictures):
     """Enlarge by a whole factor without interpolation, so that pixels stay visible."""
     factor = max(1, math.ceil(PANEL_WIDTH / pictures.shape[2]))
     return pictures.repeat(factor, 1).repeat(factor, 2)

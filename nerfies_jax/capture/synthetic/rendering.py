@@ -174,7 +174,7 @@ def render(
         return image, center
 
     tiles = jax.lax.map(tile, _tiles(spec.size, time.dtype))
-    image, center = _untiled(tiles, spec.size)
+    image, center = _untile(tiles, spec.size)
     # Directions have z-depth one, so the distance is the z-depth.
     depth = jnp.where(center.thing == trace.NOTHING, 0, center.distance)
     return Frame(image, depth, center)
@@ -261,7 +261,7 @@ def _tiles(size, dtype):
     return tiles.reshape(rows * columns, TILE**2, 2)
 
 
-def _untiled(tree, size):
+def _untile(tree, size):
     """Arrays [tiles, TILE², ...] as [height, width, ...], without the padding."""
     width, height = size
     rows, columns = (-(-length // TILE) for length in (height, width))

@@ -143,7 +143,7 @@ def value_noise(
 
     def blend(axis, bits):
         if axis == 3:
-            return _mixed(bits).astype(point.dtype)
+            return _mix(bits).astype(point.dtype)
         low = blend(axis + 1, bits + low_bits[axis])
         high = blend(axis + 1, bits + high_bits[axis])
         return low + weights[axis] * (high - low)
@@ -151,7 +151,7 @@ def value_noise(
     return blend(0, start) * 2.0**-22 - 1
 
 
-def _mixed(bits):
+def _mix(bits):
     """23 well-mixed bits: Murmur3's final mixer."""
     bits = (bits ^ (bits >> 16)) * np.uint32(0x85EBCA6B)
     bits = (bits ^ (bits >> 13)) * np.uint32(0xC2B2AE35)
