@@ -16,6 +16,7 @@ GROUPS: tuple[tuple[Column, ...], ...] = (
         ("heldout.psnr", "PSNR", 2, 1),
         ("heldout.fitted_psnr", "fitted PSNR", 2, 1),
         ("heldout.ssim", "SSIM", 3, 1),
+        ("heldout.lpips", "LPIPS", 3, 1),
         ("heldout.moving_psnr", "moving PSNR", 2, 1),
         ("heldout.moving_ssim", "moving SSIM", 3, 1),
         ("heldout.static_psnr", "static PSNR", 2, 1),

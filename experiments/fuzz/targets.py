@@ -413,6 +413,7 @@ def _weights(folder):
     head = json.dumps({"w": entry}).encode()
     content = len(head).to_bytes(8, "little") + head + array.tobytes()
     (folder / "a.safetensors").write_bytes(content)
+    (folder / "c.ckpt").write_bytes(pickle.dumps({"w": {"kernel": array}}))
     pickled = io.BytesIO()
     pickle.Pickler(pickled, 2).dump({"w": 1, "b": (1, 2)})
     with zipfile.ZipFile(folder / "b.pth", "w") as archive:

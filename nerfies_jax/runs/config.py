@@ -177,13 +177,17 @@ class Preparation:
 
 @dataclasses.dataclass(frozen=True)
 class MoreMetrics:
-    """Metrics of held-out frames that are computed only on request."""
+    """Metrics of held-out frames that are computed only on request.
+
+    LPIPS is also computed without a request if the extra `lpips` is installed.
+    """
 
     lpips_weights: tuple[pathlib.Path | str, ...] = ()
     """Also compute LPIPS, with the weights of the network and of its linear heads in
-    these files (.pth, .safetensors, .npz)."""
+    these files (.pth, .safetensors, .npz; default: those of the extra lpips, if it is
+    installed)."""
     lpips_network: Literal["alex", "vgg"] = "alex"
-    """Network that the LPIPS weights belong to."""
+    """Network of LPIPS, to which the weights belong."""
     fit_heldout_cameras: int = 0
     """Optimize the cameras of this many held-out frames with the trained scene fixed,
     and evaluate these frames again."""

@@ -33,11 +33,12 @@ NETWORKS = {"alex": perceptual.ALEX, "vgg": perceptual.VGG}
 
 
 class Extra(NamedTuple):
-    """Additional metrics requested by the user."""
+    """Additional metrics that the user requested, or whose weights are installed."""
 
     lpips: Lpips | None
     camera_fits: int  # frames to score also with optimized cameras
     step_profile: bool  # True to measure the parts of a training step
+    requires_lpips: bool = False  # False if images may be too small for it
 
 
 NOTHING = Extra(None, 0, False)
@@ -55,25 +56,31 @@ def prepared(more: MoreMetrics) -> Extra:
     Raises:
       ValueError: If a file cannot be used.
     """
-    lpips = None
-    if more.lpips_weights:
-        network = NETWORKS[more.lpips_network]
+    lpips, network = None, NETWORKS[more.lpips_network]
+    if more.lpips_weights or perceptual.installed_weights(network) is not None:
         lpips = Lpips(network, perceptual.load(network, more.lpips_weights))
-    return Extra(lpips, more.fit_heldout_cameras, more.step_profile)
+    required = bool(more.lpips_weights)
+    return Extra(lpips, more.fit_heldout_cameras, more.step_profile, required)
 
 
-def check(extra: Extra, size: tuple[int, int]) -> None:
+def fitting(extra: Extra, size: tuple[int, int]) -> Extra:
     """Check that images are large enough for the additional metrics.
 
     Args:
       extra: Additional metrics.
       size: Width and height of the images in pixels.
 
+    Returns:
+      The metrics, without LPIPS if images are too small and it was not requested.
+
     Raises:
-      ValueError: If they are too small.
+      ValueError: If they are too small for requested metrics.
     """
-    if extra.lpips is not None:
+    if extra.requires_lpips and extra.lpips is not None:
         heldout.check_large_enough(extra.lpips.network, size)
+    if extra.lpips is not None and min(size) < extra.lpips.network.smallest:
+        return extra._replace(lpips=None)
+    return extra
 
 
 @events.stage("measuring quality")

@@ -120,7 +120,7 @@ def reconstruct(
             run = _new_run(config, effects, seconds)
             _describe(run)
             multiple_hosts.check(run)
-            quality.check(extra, run.capture.size)
+            extra = quality.fitting(extra, run.capture.size)
             state = initial_state(run)
             if seconds is not None and not run.config.validation:
                 left_out = validation.frames_to_leave_out(run, seconds)
@@ -199,7 +199,7 @@ def resume(
             run = saved_run(folder, overrides, new_paths, trusted)
             _describe(run)
             multiple_hosts.check(run)
-            quality.check(extra, run.capture.size)
+            extra = quality.fitting(extra, run.capture.size)
             state, history, after = _restore(folder, run)
             follow.begin(folder, run, after or 0)
             checkpoints = _open_checkpoints(stack, folder, run, state, after)

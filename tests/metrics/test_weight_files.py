@@ -58,6 +58,26 @@ def test_a_pickle_that_would_run_code_is_refused_and_does_not_run(tmp_path):
     assert not marker.exists()
 
 
+def test_a_pickle_of_arrays_reads_without_running_it(tmp_path, rng):
+    path = tmp_path / "w.ckpt"
+    kernel = np.asfortranarray(rng.normal(size=(2, 3)).astype(np.float32))
+    bias = np.arange(3, dtype=">f8")
+    path.write_bytes(pickle.dumps({"Conv_0": {"kernel": kernel, "bias": bias}}, 4))
+    tensors = weight_files.read_tensors(path)
+    assert tensors.keys() == {"Conv_0.kernel", "Conv_0.bias"}
+    np.testing.assert_array_equal(tensors["Conv_0.kernel"], kernel)
+    np.testing.assert_array_equal(tensors["Conv_0.bias"], bias)
+    for bad in ({"a": print}, {"a": np.array([{}], object)}, {"a": 3}):
+        path.write_bytes(pickle.dumps(bad))
+        with pytest.raises(ValueError, match=r"w\.ckpt: not a readable \.ckpt"):
+            weight_files.read_tensors(path)
+    # An array that claims to be larger than its bytes allocates nothing.
+    content = pickle.dumps({"a": np.zeros(7, np.float32)})
+    path.write_bytes(content.replace(b"K\x07", b"K\xff"))
+    with pytest.raises(ValueError, match="cannot reshape"):
+        weight_files.read_tensors(path)
+
+
 def test_npz_reads_numbers_and_refuses_objects(tmp_path, rng):
     path = tmp_path / "w.npz"
     value = rng.normal(size=(2, 3))

@@ -14,6 +14,7 @@ from nerfies_jax.capture import images, nerfies_format
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.evaluation.representation import Saved
 from nerfies_jax.evaluation.scores import Scored
+from nerfies_jax.metrics import perceptual
 from nerfies_jax.runs import (
     curve_figure,
     products,
@@ -21,7 +22,7 @@ from nerfies_jax.runs import (
     representations,
     step_profile,
 )
-from nerfies_jax.runs.config import CaptureSource, RunConfig
+from nerfies_jax.runs.config import CaptureSource, MoreMetrics, RunConfig
 from nerfies_jax.runs.run import Run, scene_spec, stored_capture
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.training.loop import History
@@ -49,6 +50,20 @@ def test_a_run_that_learned_nothing_has_no_report():
         FloatingPointError, match="none of the 1 scored held-out frames"
     ):
         quality.check_learned(learned, scored)
+
+
+def test_installed_lpips_is_left_out_where_images_are_too_small(monkeypatch):
+    monkeypatch.setattr(perceptual, "installed_weights", lambda network: None)
+    assert quality.prepared(MoreMetrics()) == quality.NOTHING
+    monkeypatch.setattr(perceptual, "installed_weights", lambda network: "a file")
+    params = perceptual.LpipsParams((), ())
+    monkeypatch.setattr(perceptual, "load", lambda network, files: params)
+    extra = quality.prepared(MoreMetrics())
+    assert quality.fitting(extra, (64, 31)).lpips.params == params
+    assert quality.fitting(extra, (64, 30)).lpips is None
+    asked = quality.prepared(MoreMetrics(lpips_weights=("a.npz",)))
+    with pytest.raises(ValueError, match="at least 31 pixels"):
+        quality.fitting(asked, (64, 30))
 
 
 def test_a_run_on_nothing_does_not_begin(tmp_path):
