@@ -103,6 +103,13 @@ def growth(spec: Any, state: TrainState) -> float:
     two. Built-in scene: 1.5 times from 4500 to 8379 under a cap of 10,000
     (`splats-static-small`, 600 steps), 1.1 times from 7000 to the cap
     (`splats-tracked-small`, 250 steps).
+
+    Args:
+      spec: The scene.
+      state: State after the first steps.
+
+    Returns:
+      A factor from 1 to 2.
     """
     if spec.strategy is None:
         return 1.0
@@ -116,7 +123,17 @@ def save(
     metadata: Any,
     state: TrainState,
 ) -> Saved:
-    """Write `model.npz`, the whole scene, and `gaussians.ply` for other viewers."""
+    """Write `model.npz`, the whole scene, and `gaussians.ply` for other viewers.
+
+    Args:
+      folder: Folder for the files.
+      spec: The scene.
+      metadata: Scene metadata.
+      state: Trained state.
+
+    Returns:
+      Bytes of the model, and notes for the report.
+    """
     if not splats.active_count(state.params.rows["splats"]):
         return Saved(notes=(f"No Gaussian is left, so there is no {MODEL}.",))
     about = {"spec": spec, "metadata": metadata, "step": int(state.step)}
@@ -161,7 +178,20 @@ def player(
     capture: Capture,
     poster: np.ndarray,
 ) -> Player:
-    """Write `player.html`, with a poster uint8 [height, width, 3]."""
+    """Write `player.html`, with a poster uint8 [height, width, 3].
+
+    Args:
+      path: The file.
+      title: Title of the page.
+      spec: The scene.
+      model: The model.
+      state: Trained state.
+      capture: The capture, whose cameras limit the views.
+      poster: Image to show before the page has loaded.
+
+    Returns:
+      Path and description of the page.
+    """
     degree = min(int(state.step) // spec.sh_every, spec.sh_degree)
     raster = raster_of(spec, model.spec[1])
     degree = jax.device_put(np.int32(degree))

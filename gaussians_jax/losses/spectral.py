@@ -290,7 +290,15 @@ def _times_in_whole_spectrum(width, dtype):
 
 
 def init(spec: SpectralSpec, dtype: DTypeLike = jnp.float32) -> Gates:
-    """Initialize the logits at the opening: g = 0 for one half, as in the paper."""
+    """Initialize the logits at the opening: g = 0 for one half, as in the paper.
+
+    Args:
+      spec: Settings of the losses.
+      dtype: Type of the logits.
+
+    Returns:
+      The logits, None where a loss is absent.
+    """
     opening = _start_of_sigmoid(spec)
     logit = jnp.asarray(math.log(opening) - math.log1p(-opening), dtype)
     return Gates(

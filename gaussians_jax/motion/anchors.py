@@ -136,7 +136,14 @@ class Anchors(NamedTuple):
 
 
 def residual_width(spec: AnchorMotionSpec) -> int:
-    """Return the number of residual features per child."""
+    """Return the number of residual features per child.
+
+    Args:
+      spec: Settings of the motion.
+
+    Returns:
+      The number.
+    """
     return spec.residual if spec.moves else spec.residual // 2
 
 
@@ -154,12 +161,26 @@ def _make_spec(spec: AnchorMotionSpec) -> MLPSpec:
 
 
 def coarse_spec(spec: AnchorMotionSpec) -> MLPSpec:
-    """Settings of the network from [reference, time code] to motion of an anchor."""
+    """Settings of the network from [reference, time code] to motion of an anchor.
+
+    Args:
+      spec: Settings of the motion.
+
+    Returns:
+      Settings of the network.
+    """
     return _moving_spec(spec, spec.reference)
 
 
 def fine_spec(spec: AnchorMotionSpec) -> MLPSpec:
-    """Settings of the network from [half of residual, time code] to child motion."""
+    """Settings of the network from [half of residual, time code] to child motion.
+
+    Args:
+      spec: Settings of the motion.
+
+    Returns:
+      Settings of the network.
+    """
     return _moving_spec(spec, spec.residual // 2)
 
 

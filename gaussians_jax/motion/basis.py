@@ -188,7 +188,16 @@ SMALL_BASIS_MOTION = BasisMotionSpec(
 def init(
     key: Key[Array, ""], spec: BasisMotionSpec, dtype: DTypeLike = jnp.float32
 ) -> BasisMotion:
-    """Initialize networks that hardly move anything."""
+    """Initialize networks that hardly move anything.
+
+    Args:
+      key: PRNG key.
+      spec: Settings of the motion.
+      dtype: Type of the parameters.
+
+    Returns:
+      Parameters of the networks.
+    """
     base_key, basis_key, weights_key = jax.random.split(key, 3)
     basis = None
     if spec.count is not None:
@@ -203,7 +212,16 @@ def init(
 def prepare_point(
     params: BasisMotion, spec: BasisMotionSpec, point: Float[Array, "3"]
 ) -> Prepared:
-    """Compute the cache of one canonical mean."""
+    """Compute the cache of one canonical mean.
+
+    Args:
+      params: Parameters of the networks.
+      spec: Settings of the motion.
+      point: Canonical mean in scene units.
+
+    Returns:
+      The part of the first layer that does not depend on time, and the basis vectors.
+    """
     encoded = encoding.encode(spec.position, point, None)
     base = encoded @ params.base.hidden[0].weight[: len(encoded)]
     if params.basis is None:
@@ -214,7 +232,16 @@ def prepare_point(
 def basis_vectors(
     basis: MLP, spec: BasisMotionSpec, encoded: Float[Array, " features"]
 ) -> Float[Array, "3 count"]:
-    """Compute V(p), equation 4, for one encoded canonical mean."""
+    """Compute V(p), equation 4, for one encoded canonical mean.
+
+    Args:
+      basis: Network of the basis.
+      spec: Settings of the motion.
+      encoded: Encoded canonical mean.
+
+    Returns:
+      The vectors as columns. Unless they are free, their length is at most one.
+    """
     directions = mlp.apply(_basis_spec(spec), basis, encoded)["directions"]
     directions = directions.reshape(3, spec.count)
     if spec.basis_form == "free":
@@ -262,7 +289,17 @@ def _base_displacement(
 def residual(
     weights: MLP, spec: BasisMotionSpec, slow_mean: Float[Array, "3"]
 ) -> dict[str, Float[Array, " outputs"]]:
-    """Compute w(p', t), equation 5, with rotation and scale, of one Gaussian."""
+    """Compute w(p', t), equation 5, with rotation and scale, of one Gaussian.
+
+    Args:
+      weights: Network of the weights at one time.
+      spec: Settings of the motion.
+      slow_mean: Mean after the slow motion, in scene units.
+
+    Returns:
+      Outputs by name: the weights of the basis vectors, and changes of rotation and
+      scale.
+    """
     encoded = encoding.encode(spec.position, slow_mean, None)
     position_only = dataclasses.replace(_weights_spec(spec), inputs=len(encoded))
     return mlp.apply(position_only, weights, encoded)

@@ -258,6 +258,14 @@ def effect(spec: CarriedSpec, steps: int, warm_up: int) -> SplatRecord:
 
     Opacities and colors are those of the canonical state: changes of the cores' opacity
     by a motion have no effect.
+
+    Args:
+      spec: Settings of the children.
+      steps: Length of the run in steps.
+      warm_up: Steps before the motion begins.
+
+    Returns:
+      The record.
     """
 
     def rates(step):

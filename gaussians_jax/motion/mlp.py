@@ -143,7 +143,16 @@ def _time_width(spec):
 def init(
     key: Key[Array, ""], spec: MotionSpec, dtype: DTypeLike = jnp.float32
 ) -> Motion:
-    """Initialize a network that hardly moves anything."""
+    """Initialize a network that hardly moves anything.
+
+    Args:
+      key: PRNG key.
+      spec: Settings of the motion.
+      dtype: Type of the parameters.
+
+    Returns:
+      Parameters of the networks.
+    """
     trunk_key, time_key = jax.random.split(key)
     trunk = mlp.init(trunk_spec(spec), trunk_key, dtype)
     if spec.time_code is None:
@@ -305,7 +314,14 @@ class BoundNetworks(BoundMotion):
         return MotionParams(shared=self.init_shared(shared_key, self.spec))
 
     def noisy_time(self, frame: FrameCondition) -> Float[Array, ""]:
-        """Return the time of a frame, with the noise of early training steps."""
+        """Return the time of a frame, with the noise of early training steps.
+
+        Args:
+          frame: Time, step and key of the frame.
+
+        Returns:
+          Time in units of the capture, which may leave [0, 1].
+        """
         smoothing = self.spec.smoothing
         if smoothing is None or frame.step is None:
             return frame.time

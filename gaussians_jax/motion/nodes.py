@@ -194,7 +194,16 @@ SMALL_NODE_MOTION = NodeMotionSpec(
 def init(
     key: Key[Array, ""], spec: NodeMotionSpec, dtype: DTypeLike = jnp.float32
 ) -> Nodes:
-    """Initialize nodes at the origin that hardly move anything (`_place_nodes`)."""
+    """Initialize nodes at the origin that hardly move anything (`_place_nodes`).
+
+    Args:
+      key: PRNG key.
+      spec: Settings of the motion.
+      dtype: Type of the parameters.
+
+    Returns:
+      The nodes.
+    """
     return Nodes(
         position=jnp.zeros((spec.nodes, 3), dtype),
         log_radius=jnp.zeros(spec.nodes, dtype),

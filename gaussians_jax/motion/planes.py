@@ -97,7 +97,14 @@ class Motion(NamedTuple):
 
 
 def network_spec(spec: PlaneMotionSpec) -> MLPSpec:
-    """Settings of the network from features to residuals, which are small at first."""
+    """Settings of the network from features to residuals, which are small at first.
+
+    Args:
+      spec: Settings of the motion.
+
+    Returns:
+      Settings of the network.
+    """
     heads = tuple((name, HeadSpec(3, "small")) for name in Offsets._fields)
     inputs = spec.planes.width(4)
     return MLPSpec(inputs, spec.depth, spec.width, heads, (), "relu", "he")
@@ -116,7 +123,16 @@ SMALL_PLANE_MOTION = PlaneMotionSpec(
 def init(
     key: Key[Array, ""], spec: PlaneMotionSpec, dtype: DTypeLike = jnp.float32
 ) -> Motion:
-    """Initialize planes and a network that hardly move anything."""
+    """Initialize planes and a network that hardly move anything.
+
+    Args:
+      key: PRNG key.
+      spec: Settings of the motion.
+      dtype: Type of the parameters.
+
+    Returns:
+      Parameters of the planes and the network.
+    """
     planes_key, network_key = jax.random.split(key)
     return Motion(
         planes.init(spec.planes, planes_key, dtype),
@@ -135,7 +151,16 @@ def _in_unit_cube(
 def prepare(
     params: Motion, spec: PlaneMotionSpec, position: Float[Array, "gaussians 3"]
 ) -> Features:
-    """Interpolate the spatial planes, which do not depend on the time."""
+    """Interpolate the spatial planes, which do not depend on the time.
+
+    Args:
+      params: Parameters of the motion.
+      spec: Settings of the motion.
+      position: Positions in the unit cube of the planes.
+
+    Returns:
+      The features of each position.
+    """
     return jax.vmap(
         lambda point: planes.space_features(spec.planes, params.planes, point)
     )(position)

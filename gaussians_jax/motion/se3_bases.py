@@ -127,7 +127,16 @@ class Motion(NamedTuple):
 def init(
     key: Key[Array, ""], spec: SE3BasesSpec, dtype: DTypeLike = jnp.float32
 ) -> Bases:
-    """Initialize bases with small motions. Equal bases would get equal gradients."""
+    """Initialize bases with small motions. Equal bases would get equal gradients.
+
+    Args:
+      key: PRNG key.
+      spec: Settings of the motion.
+      dtype: Type of the parameters.
+
+    Returns:
+      The bases.
+    """
     shape = (spec.bases, spec.knots, 3)
     shift = 1e-3 * jax.random.normal(key, shape, dtype)
     fine = Poses(jnp.zeros(shape, dtype), shift)
@@ -136,7 +145,16 @@ def init(
 
 
 def init_logits(spec: SE3BasesSpec, gaussians: int, dtype: DTypeLike = jnp.float32):
-    """Initialize logits [gaussians, 1 + bases] of static Gaussians."""
+    """Initialize logits [gaussians, 1 + bases] of static Gaussians.
+
+    Args:
+      spec: Settings of the motion.
+      gaussians: Number of Gaussians.
+      dtype: Type of the logits.
+
+    Returns:
+      The logits. The first column belongs to the static basis.
+    """
     # On the host, because the number of Gaussians depends on the capture.
     logits = np.zeros((gaussians, 1 + spec.bases), dtype)
     logits[:, 0] = spec.still_logit

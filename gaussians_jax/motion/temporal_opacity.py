@@ -92,7 +92,15 @@ def faded(rows: Fading, gaussians: Gaussians, time: Float[Array, ""]) -> Gaussia
 
 
 def always(gaussians: int, dtype) -> Fading:
-    """Return parameters of Gaussians that are visible at all times."""
+    """Return parameters of Gaussians that are visible at all times.
+
+    Args:
+      gaussians: Number of Gaussians.
+      dtype: Type of the parameters.
+
+    Returns:
+      Centers and logarithms of widths.
+    """
     center = jnp.full(gaussians, 0.5, dtype)
     return Fading(center, jnp.full(gaussians, ALWAYS, dtype))
 
@@ -142,5 +150,13 @@ class Bound:
         time: Float[np.ndarray, " gaussians"],
         followed: Float[np.ndarray, " gaussians"],
     ) -> Fading:
-        """Return the times and widths of Gaussians lifted from moving pixels."""
+        """Return the times and widths of Gaussians lifted from moving pixels.
+
+        Args:
+          time: Time at which each Gaussian was lifted, in [0, 1].
+          followed: Share of the video in which nearby tracks are visible.
+
+        Returns:
+          Parameters of the Gaussians, on the host.
+        """
         return _around(self.spec, time, followed)

@@ -120,7 +120,16 @@ SMALL_TIME_BASIS = TimeBasisSpec(time=EncodingSpec(4, times_pi=True), depth=2, w
 def init(
     key: Key[Array, ""], spec: TimeBasisSpec, dtype: DTypeLike = jnp.float32
 ) -> MLP:
-    """Initialize a network whose trajectories are all different."""
+    """Initialize a network whose trajectories are all different.
+
+    Args:
+      key: PRNG key.
+      spec: Settings of the motion.
+      dtype: Type of the parameters.
+
+    Returns:
+      Parameters of the network.
+    """
     return mlp.init(network_spec(spec), key, dtype)
 
 

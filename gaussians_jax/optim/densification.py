@@ -153,7 +153,14 @@ class Changed(NamedTuple):
 
 @jax.jit
 def empty_stats(rows: Splats) -> RowStats:
-    """Return the statistics before any view."""
+    """Return the statistics before any view.
+
+    Args:
+      rows: The Gaussians.
+
+    Returns:
+      Zeros, with the active Gaussians marked.
+    """
     like = rows.opacity_logit
     return RowStats(
         active=splats.active_mask(rows),

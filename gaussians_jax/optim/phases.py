@@ -91,7 +91,15 @@ class Trained(NamedTuple):
 
 
 def update_mask(spec: AlternationSpec | None, step: Int[Array, ""] | int) -> UpdateMask:
-    """Return the parameter groups that train at a step."""
+    """Return the parameter groups that train at a step.
+
+    Args:
+      spec: Settings of the alternation. None to train both groups.
+      step: Number of completed steps.
+
+    Returns:
+      Booleans of the groups.
+    """
     step = jnp.asarray(step, jnp.int32)
     if spec is None:
         return UpdateMask(jnp.asarray(True), jnp.asarray(True))

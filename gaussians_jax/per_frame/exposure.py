@@ -42,7 +42,15 @@ class ExposureSpec:
 
 
 def init(key: Key[Array, ""], exposures: int) -> Float[Array, "exposures 3 4"]:
-    """Initialize transforms that change nothing, with zero linear part and offset."""
+    """Initialize transforms that change nothing, with zero linear part and offset.
+
+    Args:
+      key: PRNG key, which is not used.
+      exposures: Number of trained appearance ids.
+
+    Returns:
+      One transform for each id.
+    """
     del key
     return jnp.zeros((exposures, 3, 4), jnp.float32)
 

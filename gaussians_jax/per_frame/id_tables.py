@@ -12,7 +12,14 @@ Places = tuple[tuple[int, int, float], ...] | Float[Array, "appearances 3"]
 
 
 def rows_of(places: Places) -> int:
-    """Return the number of rows of a table: the number of trained ids."""
+    """Return the number of rows of a table: the number of trained ids.
+
+    Args:
+      places: Interpolation of all ids between trained ones.
+
+    Returns:
+      The number.
+    """
     return 1 + max(max(left, right) for left, right, _ in places)
 
 

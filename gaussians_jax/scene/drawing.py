@@ -15,12 +15,26 @@ from nerfies_jax.training.model import Rendering, View
 
 
 def appearance_of(effects: tuple[SplatRecord, ...]) -> SplatRecord | None:
-    """Return the component that changes the colors of the Gaussians, or None."""
+    """Return the component that changes the colors of the Gaussians, or None.
+
+    Args:
+      effects: Records of the components.
+
+    Returns:
+      The record.
+    """
     return next((effect for effect in effects if effect.recolor is not None), None)
 
 
 def check_one_appearance(effects: tuple[SplatRecord, ...]) -> None:
-    """Raise ValueError if two components change the colors of the Gaussians."""
+    """Raise ValueError if two components change the colors of the Gaussians.
+
+    Args:
+      effects: Records of the components.
+
+    Raises:
+      ValueError: If two components do so.
+    """
     names = [effect.name for effect in effects if effect.recolor is not None]
     if len(names) > 1:
         raise ValueError(
@@ -127,7 +141,17 @@ def directions(
 def exposed(
     effects: tuple[SplatRecord, ...], params: Params, rendered: Rendering, view: View
 ) -> Rendering:
-    """Apply the exposure model of the view to a render."""
+    """Apply the exposure model of the view to a render.
+
+    Args:
+      effects: Records of the components.
+      params: Parameters of the scene.
+      rendered: The render.
+      view: Its view, with an appearance id.
+
+    Returns:
+      The render with changed colors.
+    """
     for effect in effects:
         if effect.expose is not None:
             own_params = params.nets.get(effect.name)

@@ -70,6 +70,13 @@ def mover(spec, metadata) -> Move | None:
     """Return a function that moves points from the time of one view to another's.
 
     The function moves points as `follow` does. None if the scene has no motion.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+
+    Returns:
+      The function, or None.
     """
     effects = scene.all_effects(spec, metadata)
     if all(effect.deform is None for effect in effects):

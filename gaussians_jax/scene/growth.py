@@ -37,7 +37,15 @@ def states_of(effects: tuple[SplatRecord, ...], params: Params) -> dict[str, PyT
 
 
 def stream_key(state: TrainState, stream: int) -> Key[Array, ""]:
-    """Return a PRNG key of this step that is independent of `loop.step_key`."""
+    """Return a PRNG key of this step that is independent of `loop.step_key`.
+
+    Args:
+      state: State of training.
+      stream: Number of the stream.
+
+    Returns:
+      The key.
+    """
     return _fold_in_both(state.key, np.uint32(stream), state.step)
 
 

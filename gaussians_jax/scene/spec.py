@@ -193,13 +193,27 @@ def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
 
 
 def optimizer_of(spec: SplatScene) -> Optimizer:
-    """Return the optimizer of a scene. Learning rates scale its updates."""
+    """Return the optimizer of a scene. Learning rates scale its updates.
+
+    Args:
+      spec: The scene.
+
+    Returns:
+      The optimizer.
+    """
     optimizer = spec.optimizer
     return OPTIMIZERS[optimizer]() if isinstance(optimizer, str) else optimizer
 
 
 def carried_count(spec: SplatScene) -> int | None:
-    """Return the number of children per Gaussian, None without children."""
+    """Return the number of children per Gaussian, None without children.
+
+    Args:
+      spec: The scene.
+
+    Returns:
+      The number, or None.
+    """
     if isinstance(spec.motion, AnchorMotionSpec):
         return spec.motion.count
     return None if spec.carried is None else spec.carried.count
@@ -210,6 +224,12 @@ def refuse_what_cannot_train(spec: SplatScene) -> None:
 
     This is not checked when the settings are constructed, because a trained scene may
     be rendered without its motion.
+
+    Args:
+      spec: The scene.
+
+    Raises:
+      ValueError: If a setting would have no effect.
     """
     motion = spec.motion
     if motion is None:
@@ -349,7 +369,15 @@ def _embedding_name(motion):
 
 
 def motion_of(spec: SplatScene, metadata: SceneMetadata) -> SplatRecord | None:
-    """Return the motion of a scene. An initialization from tracks skips its warm-up."""
+    """Return the motion of a scene. An initialization from tracks skips its warm-up.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+
+    Returns:
+      The record, or None without motion.
+    """
     motion = spec.motion
     if motion is None:
         return None
@@ -359,7 +387,15 @@ def motion_of(spec: SplatScene, metadata: SceneMetadata) -> SplatRecord | None:
 
 
 def strategy_of(spec: SplatScene, metadata: SceneMetadata) -> Strategy | None:
-    """Return the strategy of a scene, guided by its motion if the settings say so."""
+    """Return the strategy of a scene, guided by its motion if the settings say so.
+
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+
+    Returns:
+      The strategy, or None for a fixed number of Gaussians.
+    """
     if spec.strategy is None:
         return None
     strategy = protocols.bound(spec.strategy, spec.steps, metadata)

@@ -34,6 +34,13 @@ def parts(
     step, also if several devices share the image of one view. "rest" is the remainder
     of the whole step.
 
+    Args:
+      spec: The scene.
+      metadata: Scene metadata.
+      model: The model.
+      state: Trained state.
+      frames: Training frames on the device.
+
     Returns:
       The parts.
     """

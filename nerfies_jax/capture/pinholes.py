@@ -293,7 +293,14 @@ class Maps:
         self._kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def of(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the positions of one camera, and booleans of those that exist."""
+        """Return the positions of one camera, and booleans of those that exist.
+
+        Args:
+          camera: The camera.
+
+        Returns:
+          Positions [height, width, 2] in pixels, and booleans [height, width].
+        """
         leaves = jax.tree.leaves(camera[2:])
         key = b"".join(np.asarray(leaf).tobytes() for leaf in leaves)
         if key not in self._kept:

@@ -60,9 +60,7 @@ class _Process:
         self.reader, self.writer = socket.socketpair()
         self.writer.setblocking(False)
         self.before = _install_handler(self._note, NAMES)
-        self.wakeup_before = signal.set_wakeup_fd(
-            self.writer.fileno(), warn_on_full_buffer=False
-        )
+        signal.set_wakeup_fd(self.writer.fileno(), warn_on_full_buffer=False)
         self.thread = threading.Thread(target=self._watch, name="signals", daemon=True)
         self.thread.start()
 
@@ -85,7 +83,7 @@ class _Process:
                 received = self.reader.recv(16)
             except TimeoutError:
                 received = b""
-            except OSError:  # closed by `uninstall`
+            except OSError:  # closed as the process ends
                 return
             for number in received:
                 if number not in self.before:
@@ -152,17 +150,6 @@ def install() -> None:
     global _PROCESS
     if _PROCESS is None and threading.current_thread() is threading.main_thread():
         _PROCESS = _Process()
-
-
-def uninstall() -> None:
-    """Restore the handlers that `install` replaced."""
-    global _PROCESS
-    process, _PROCESS = _PROCESS, None
-    if process is not None:
-        signal.set_wakeup_fd(process.wakeup_before)
-        _restore(process.before)
-        process.reader.close()
-        process.writer.close()
 
 
 def install_for_program(package: str, script: str) -> None:

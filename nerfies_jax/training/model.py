@@ -33,7 +33,14 @@ class Frames(NamedTuple):
     image_rows: Any = None
 
     def image_row(self, row: Any) -> Any:
-        """Return the row of `images` that holds a training frame."""
+        """Return the row of `images` that holds a training frame.
+
+        Args:
+          row: Row of the training frame.
+
+        Returns:
+          The row of its image.
+        """
         return row if self.image_rows is None else self.image_rows[row]
 
 
