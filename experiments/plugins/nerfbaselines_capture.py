@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfies_jax.capture import frames, points
+from nerfies_jax.capture import points, world_points
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.points import Placement
 from nerfies_jax.geometry import camera
@@ -170,16 +170,16 @@ def _cloud(dataset):
         return None
     color = dataset.get("points3D_rgb")
     if color is None:
-        color = np.full(np.shape(position), frames.UNSEEN, np.uint8)
+        color = np.full(np.shape(position), world_points.UNSEEN, np.uint8)
     return PointCloud(np.asarray(position, np.float64), np.asarray(color, np.uint8))
 
 
 def _place(cameras, cloud, nears_fars, size):
     if cloud is not None:
-        local, position = frames.near_origin(cameras, cloud.position)
+        local, position = world_points.near_origin(cameras, cloud.position)
         depths = []
         for row in range(len(cameras.focal_px)):
-            _, depth, inside = frames.pixels_of(local, row, position, size)
+            _, depth, inside = world_points.pixels_of(local, row, position, size)
             depths.append(depth[inside])
         if sum(map(len, depths)):
             depth = np.concatenate(depths)

@@ -10,8 +10,10 @@ import numpy as np
 from nerfies_jax.capture import (
     frames,
     name_times,
+    splits,
     text_files,
     transforms_lens,
+    world_points,
 )
 from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import Capture, CaptureError
@@ -115,7 +117,7 @@ def read(
         heldout=np.flatnonzero(~is_train),
         near=placement.near if near is None else near,
         far=placement.far if far is None else far,
-        warp_ids=frames.dense(times),
+        warp_ids=splits.dense(times),
         appearance_ids=np.zeros(len(rows), np.int32),
         camera_ids=camera_ids,
         valid=frames.both(valid, loaded.observed),
@@ -124,7 +126,7 @@ def read(
         scale=placement.scale,
         center=placement.center,
         # z is up in Blender and nerfstudio. `up` is an extension of this library.
-        up=frames.unit(split.transforms.up) or (0.0, 0.0, 1.0),
+        up=world_points.unit(split.transforms.up) or (0.0, 0.0, 1.0),
         frames_per_second=split.transforms.fps,
         path=path,
         notes=(
@@ -237,9 +239,9 @@ def _pose(matrix, label):
 def _place(cameras, points, transforms, size):
     if points is not None and len(points.position) >= 3:
         depths = []
-        local, position = frames.near_origin(cameras, points.position)
+        local, position = world_points.near_origin(cameras, points.position)
         for row in range(len(cameras.focal_px)):
-            _, depth, inside = frames.pixels_of(local, row, position, size)
+            _, depth, inside = world_points.pixels_of(local, row, position, size)
             depths.append(depth[inside])
         depths = np.concatenate(depths)
         if depths.size:
@@ -280,7 +282,7 @@ def _times(entries, split):
         return np.zeros(count, np.float32), None, (note,)
     clock = name_times.clock(stems(entries))
     note = "no times: taken from the names of the images"
-    return frames.spread(clock.times), clock.cameras, (note, *clock.notes)
+    return splits.spread(clock.times), clock.cameras, (note, *clock.notes)
 
 
 def _camera_ids(entries, times, split, is_train):
@@ -293,7 +295,7 @@ def _camera_ids(entries, times, split, is_train):
     pairs = {(times[row], names[row]) for row in rows}
     if np.ptp(times) == 0 or len(pairs) == len({time for time, _ in pairs}):
         return np.zeros(len(entries), np.int32)
-    return frames.dense(names)
+    return splits.dense(names)
 
 
 def _unread_depths(entries):

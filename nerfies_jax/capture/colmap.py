@@ -5,7 +5,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax.capture import colmap_models, frames, name_times, text_files
+from nerfies_jax.capture import (
+    colmap_models,
+    frames,
+    name_times,
+    splits,
+    text_files,
+    world_points,
+)
 from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
@@ -89,14 +96,14 @@ def read(
     clock = name_times.clock(
         [pathlib.PurePosixPath(name).with_suffix("").as_posix() for name in model.names]
     )
-    times = frames.spread(clock.times)
+    times = splits.spread(clock.times)
     notes += clock.notes
     if clock.cameras is not None:  # a camera has only one frame at a time
         model = model._replace(camera_ids=clock.cameras)
-    interval = frames.HELD_OUT if heldout is None else heldout
+    interval = splits.HELD_OUT if heldout is None else heldout
     group = np.zeros(len(ids)) if clock.cameras is None else clock.cameras
-    train, heldout_rows = frames.hold_out_in_time(times, group, interval, str(path))
-    notes += (frames.held_out_note(heldout_rows, interval),)
+    train, heldout_rows = splits.hold_out_in_time(times, group, interval, str(path))
+    notes += (splits.held_out_note(heldout_rows, interval),)
     return Capture(
         name=path.resolve().name,
         source="colmap",
@@ -108,9 +115,9 @@ def read(
         heldout=heldout_rows,
         near=placement.near,
         far=placement.far,
-        warp_ids=frames.dense(times),
+        warp_ids=splits.dense(times),
         appearance_ids=np.arange(len(ids), dtype=np.int32),
-        camera_ids=frames.dense(model.camera_ids),
+        camera_ids=splits.dense(model.camera_ids),
         valid=valid,
         moving=moving,
         points=PointCloud(
@@ -118,7 +125,7 @@ def read(
         ),
         scale=scale,
         center=placement.center,
-        up=frames.up_direction(cameras),
+        up=world_points.up_direction(cameras),
         path=path,
         notes=(*notes, *skip_notes),
     )
@@ -142,7 +149,7 @@ def _with_physical_cameras(model):
     if len(np.unique(model.camera_ids)) < len(model.camera_ids):
         return model, ()
     folders = [pathlib.PurePosixPath(name).parent.as_posix() for name in model.names]
-    camera_ids = frames.dense(folders)
+    camera_ids = splits.dense(folders)
     guess = "one camera per folder" if camera_ids.any() else "one camera"
     note = f"each image has a COLMAP camera of its own: taken as {guess}"
     return model._replace(camera_ids=camera_ids), (note,)

@@ -3,8 +3,8 @@
 import numpy as np
 import scipy.spatial.transform
 
-from nerfies_jax.capture import frames
 from nerfies_jax.capture import images as image_files
+from nerfies_jax.capture import world_points
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath, replaced_folder
 from nerfies_jax.capture.transforms_writer import check_names, refuse_skew
@@ -107,7 +107,7 @@ def _observations(capture):
         return np.zeros((count, 0), bool), np.zeros((count, 0, 2))
     position = capture.points.position
     rows = [
-        frames.pixels_of(capture.cameras, row, position, capture.size)
+        world_points.pixels_of(capture.cameras, row, position, capture.size)
         for row in range(count)
     ]
     pixels = np.stack([np.asarray(pixel) for pixel, _, _ in rows])

@@ -1,16 +1,13 @@
-"""Selection, order, splits and decoding of frames, shared by all readers."""
+"""Selection and decoding of frames, shared by all readers."""
 
 import math
 import pathlib
 import re
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
 
 from nerfies_jax.capture import (
     decoder,
@@ -20,16 +17,12 @@ from nerfies_jax.capture import (
     text_files,
 )
 from nerfies_jax.capture import images as image_files
-from nerfies_jax.capture.capture import CaptureError, PointCloud, blocks, shrink
-from nerfies_jax.geometry import camera
-from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.capture.capture import CaptureError, blocks, shrink
 from nerfies_jax.runtime import events
 
 MAX_FRAMES = 100_000
 MAX_BYTES = 16 * 2**30  # of decoded images
-HELD_OUT = 8  # by default every 8th frame is held out, as in LLFF and Mip-NeRF 360
 OPAQUE = 128  # smallest alpha of opaque pixels
-UNSEEN = 128  # gray value of points that no frame shows
 SUFFIXES = (".png", ".jpg", ".jpeg")  # in lower case; files may use any case
 _ENDINGS = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
 
@@ -412,211 +405,3 @@ def read_masks(
     white = share[[path is not None for path in paths]].mean()
     note = masks.describe(files, len(paths), encoding, float(white), black)
     return share, (note,)
-
-
-def hold_out_in_time(
-    times: ArrayLike, camera_ids: ArrayLike, every: int, where: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """Apply `hold_out_every` in order of time, one camera after the other.
-
-    Args:
-      times: Frame times, in any order.
-      camera_ids: Physical camera of each frame.
-      every: Interval of held-out frames.
-      where: Name of the capture in error messages.
-
-    Returns:
-      Training rows and held-out rows, each in ascending order.
-    """
-    order = np.lexsort((np.asarray(times), np.asarray(camera_ids)))
-    train, heldout = hold_out_every(len(order), every, where)
-    return np.sort(order[train]), np.sort(order[heldout])
-
-
-def hold_out_every(count: int, every: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Hold out the middle frame of each group of `every` frames.
-
-    Held-out frames thus have training frames on both sides. One frame is held out if
-    there are fewer than `every`, and none if there are fewer than three.
-
-    Args:
-      count: Number of frames.
-      every: Interval of held-out frames, at least 2.
-      where: Name of the capture in error messages.
-
-    Returns:
-      Training rows and held-out rows.
-
-    Raises:
-      CaptureError: If `every` is below 2.
-    """
-    if every < 2:
-        raise CaptureError(
-            f"{where}: heldout={every} leaves no training frames; expected at least 2"
-        )
-    if count >= 3:
-        every = min(every, count)
-    rows = np.arange(count)
-    is_heldout = rows % every == every // 2
-    return rows[~is_heldout], rows[is_heldout]
-
-
-def held_out_note(heldout: np.ndarray | list[Any], every: int) -> str:
-    """Describe the frames that `hold_out_every` held out.
-
-    Args:
-      heldout: Rows of the held-out frames.
-      every: Distance between them in frames.
-
-    Returns:
-      A clause without a final period.
-    """
-    if not len(heldout):
-        return "no frames are held out: there are too few"
-    if len(heldout) == 1:
-        return "one frame is held out"
-    ending = {1: "st", 2: "nd", 3: "rd"}.get(every % 10, "th")
-    ending = "th" if every % 100 in (11, 12, 13) else ending
-    return f"every {every}{ending} frame is held out"
-
-
-def dense(values: ArrayLike) -> np.ndarray:
-    """Number distinct values in ascending order.
-
-    Args:
-      values: Values, [frames].
-
-    Returns:
-      int32 numbers 0..n-1, equal for equal values.
-    """
-    return np.unique(np.asarray(values), return_inverse=True)[1].astype(np.int32)
-
-
-def spread(values: ArrayLike) -> np.ndarray:
-    """Normalize times to [0, 1].
-
-    Args:
-      values: Times on any clock, [frames].
-
-    Returns:
-      float32 times, zeros if all are equal.
-    """
-    values = np.asarray(values, np.float64)
-    first, last = values.min(), values.max()
-    if last == first:
-        return np.zeros(len(values), np.float32)
-    return ((values - first) / (last - first)).astype(np.float32)
-
-
-def unit(up: Sequence[float] | None) -> tuple[float, float, float] | None:
-    """Normalize a direction from a file.
-
-    Args:
-      up: A direction, or None.
-
-    Returns:
-      The unit vector, or None if there is none or it is zero.
-    """
-    if up is None or not np.linalg.norm(up) > 0:
-        return None
-    return tuple((np.array(up) / np.linalg.norm(up)).tolist())
-
-
-def up_direction(cameras: Camera) -> tuple[float, float, float] | None:
-    """Return the mean up direction of cameras.
-
-    Args:
-      cameras: Cameras, [frames].
-
-    Returns:
-      A unit vector, or None if the directions cancel.
-    """
-    mean = -cameras.camera_from_world[:, 1].astype(np.float64).mean(0)
-    length = np.linalg.norm(mean)
-    if length < 0.1:  # the up directions cancel
-        return None
-    return tuple((mean / length).tolist())
-
-
-_project = jax.jit(
-    lambda one, points: (
-        *jax.vmap(camera.project, (None, 0))(one, points),
-        jax.vmap(camera.projectable, (None, 0))(one, points),
-    )
-)
-
-
-def pixels_of(
-    cameras: Camera, row: int, position: np.ndarray, size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project points into one frame.
-
-    Args:
-      cameras: Cameras, [frames].
-      row: Index of the frame.
-      position: Points in scene units, [points, 3].
-      size: Width and height of the image in pixels.
-
-    Returns:
-      Pixel positions [points, 2], z-depths [points], and booleans of the points inside
-      the image [points].
-    """
-    one = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), cameras)
-    pixel, depth, projectable = map(np.asarray, _project(one, jnp.asarray(position)))
-    inside = (pixel >= 0).all(-1) & (pixel < np.asarray(size)).all(-1)
-    return pixel, depth, inside & projectable & (depth > 0)
-
-
-def near_origin(cameras: Camera, position: np.ndarray) -> tuple[Camera, np.ndarray]:
-    """Move cameras and points of a world to the origin together, in float64.
-
-    Map coordinates of millions of meters have a resolution of half a meter in float32.
-
-    Args:
-      cameras: Cameras with float64 positions, [frames].
-      position: Points of the same world, [points, 3].
-
-    Returns:
-      Cameras and points in float32, with the median point at the origin.
-    """
-    origin = np.median(position, axis=0)
-    camera_position = (cameras.position - origin).astype(np.float32)
-    points = (position - origin).astype(np.float32)
-    return cameras._replace(position=camera_position), points
-
-
-def colored_points(
-    position: np.ndarray,
-    images: np.ndarray,
-    cameras: Camera,
-    rows: np.ndarray,
-    skip: np.ndarray | None,
-) -> PointCloud:
-    """Color points with the median over up to 16 frames.
-
-    Occlusion is not tested, but the median is robust to it in a minority of the frames.
-
-    Args:
-      position: Points in scene units, [points, 3].
-      images: uint8 images, [frames, height, width, 3].
-      cameras: Cameras, [frames].
-      rows: Frames to use.
-      skip: True for pixels to ignore, [frames, height, width], or None.
-
-    Returns:
-      The points with colors, gray if no frame shows them.
-    """
-    size = (images.shape[2], images.shape[1])
-    rows = rows[np.linspace(0, len(rows) - 1, min(16, len(rows))).astype(int)]
-    samples = np.full((len(rows), len(position), 3), np.nan, np.float32)
-    for sample, row in zip(samples, rows.tolist(), strict=True):
-        pixel, _, inside = pixels_of(cameras, row, position, size)
-        x, y = np.where(inside[:, None], pixel, 0).astype(int).T
-        if skip is not None:
-            inside &= ~skip[row, y, x]
-        sample[inside] = images[row, y, x][inside]
-    visible = ~np.isnan(samples[..., 0]).all(0)
-    color = np.full((len(position), 3), UNSEEN, np.uint8)
-    if visible.any():
-        color[visible] = np.round(np.nanmedian(samples[:, visible], axis=0))
-    return PointCloud(position, color)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerfies_jax.capture import frames, name_times, npz_files
+from nerfies_jax.capture import frames, name_times, npz_files, splits, world_points
 from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import Capture, CaptureError
@@ -80,13 +80,13 @@ def read(
     cameras = cameras_of(poses, placement, (images.shape[2], images.shape[1]))
     names = tuple(file.stem for file in files)
     clock = name_times.clock(names)
-    times = frames.spread(clock.times)
+    times = splits.spread(clock.times)
     notes += (*order_note(names), *clock.notes)
     camera_ids = np.zeros(len(files), np.int32)
     if clock.cameras is not None:
         camera_ids = clock.cameras
-    interval = frames.HELD_OUT if heldout is None else heldout
-    train, heldout_rows = frames.hold_out_in_time(
+    interval = splits.HELD_OUT if heldout is None else heldout
+    train, heldout_rows = splits.hold_out_in_time(
         times, camera_ids, interval, str(path)
     )
     return Capture(
@@ -100,15 +100,15 @@ def read(
         heldout=heldout_rows,
         near=placement.near,
         far=placement.far,
-        warp_ids=frames.dense(times),
+        warp_ids=splits.dense(times),
         appearance_ids=np.arange(len(files), dtype=np.int32),
         camera_ids=camera_ids,
         valid=valid,
         scale=placement.scale,
         center=placement.center,
-        up=frames.up_direction(cameras),
+        up=world_points.up_direction(cameras),
         path=path,
-        notes=(*notes, frames.held_out_note(heldout_rows, interval)),
+        notes=(*notes, splits.held_out_note(heldout_rows, interval)),
     )
 
 

@@ -14,6 +14,7 @@ from nerfies_jax.capture import (
     nerfies_colmap,
     npz_files,
     text_files,
+    world_points,
 )
 from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import (
@@ -106,7 +107,7 @@ def read(
         background=views.scene.background,
         scale=views.scene.scale,
         center=views.scene.center,
-        up=frames.unit(views.extra.up) or frames.up_direction(cameras),
+        up=world_points.unit(views.extra.up) or world_points.up_direction(cameras),
         frames_per_second=views.extra.fps,
         path=path,
         notes=(*views.notes, *notes, *skip_notes, *more, *unread),
@@ -343,5 +344,5 @@ def _points(path, images, cameras, views, moving):
                 f"{world.shape}, as points.npy"
             )
         return PointCloud(position, color[finite]), notes
-    cloud = frames.colored_points(position, images, cameras, views.train, moving)
+    cloud = world_points.colored_points(position, images, cameras, views.train, moving)
     return cloud, (*notes, "points.npy has no colors: sampled from the images")

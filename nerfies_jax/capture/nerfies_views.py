@@ -7,7 +7,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from nerfies_jax.capture import frames, name_times, unread_keys
+from nerfies_jax.capture import frames, name_times, splits, unread_keys
 from nerfies_jax.capture.capture import (
     MAX_ID,
     Capture,
@@ -148,9 +148,9 @@ def read_cameras(
         times=_times(entries, path, ids),
         train=np.sort([row[name] for name in train if name in row]).astype(int),
         heldout=np.sort([row[name] for name in scored if name in row]).astype(int),
-        warp_ids=frames.dense([_number(e.warp_id) for e in entries]),
-        appearance_ids=frames.dense([_number(e.appearance_id) for e in entries]),
-        camera_ids=frames.dense([e.camera_id for e in entries]),
+        warp_ids=splits.dense([_number(e.warp_id) for e in entries]),
+        appearance_ids=splits.dense([_number(e.appearance_id) for e in entries]),
+        camera_ids=splits.dense([e.camera_id for e in entries]),
         scene=scene,
         extra=extra,
         notes=(*notes, *skip_notes, *more, *_unread(path, ids)),
@@ -207,12 +207,12 @@ def _splits(path, heldout):
     if isinstance(heldout, str):
         return *_named_split(path, heldout), notes
     if isinstance(heldout, int) or not val:
-        step = frames.HELD_OUT if heldout is None else heldout
+        step = splits.HELD_OUT if heldout is None else heldout
         pool = all_names if isinstance(heldout, int) or not train else train
         pool = sorted(pool, key=frames.natural)
-        training, scored = frames.hold_out_every(len(pool), step, str(path))
+        training, scored = splits.hold_out_every(len(pool), step, str(path))
         if heldout is None:
-            notes += (f"no validation ids: {frames.held_out_note(scored, step)}",)
+            notes += (f"no validation ids: {splits.held_out_note(scored, step)}",)
         return [pool[row] for row in training], [pool[row] for row in scored], notes
     left_out = len(all_names) - len({*train, *val})
     if train and left_out:
@@ -412,7 +412,7 @@ def _times_of_names(entries, ids, note):
             msgspec.structs.replace(entry, camera_id=camera_id)
             for entry, camera_id in zip(entries, clock.cameras.tolist(), strict=True)
         ]
-    times = frames.spread(clock.times).tolist()
+    times = splits.spread(clock.times).tolist()
     entries = [
         msgspec.structs.replace(entry, time=time)
         for entry, time in zip(entries, times, strict=True)
@@ -423,7 +423,7 @@ def _times_of_names(entries, ids, note):
 def _with_warp_ids(entries, values):
     return [
         msgspec.structs.replace(entry, warp_id=warp_id)
-        for entry, warp_id in zip(entries, frames.dense(values).tolist(), strict=True)
+        for entry, warp_id in zip(entries, splits.dense(values).tolist(), strict=True)
     ]
 
 
@@ -439,8 +439,8 @@ def _times(entries, path, ids):
             )
         return times
     if all(entry.time_id is not None for entry in entries):
-        return frames.spread([entry.time_id for entry in entries])
-    return frames.spread([_number(entry.warp_id) for entry in entries])
+        return splits.spread([entry.time_id for entry in entries])
+    return splits.spread([_number(entry.warp_id) for entry in entries])
 
 
 def only(views, rows):

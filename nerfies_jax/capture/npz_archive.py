@@ -7,9 +7,9 @@ import numpy as np
 
 from nerfies_jax.capture import formats, npz_files
 from nerfies_jax.capture.capture import CaptureError, describe
-from nerfies_jax.capture.frames import HELD_OUT, hold_out_every
 from nerfies_jax.capture.images import write_png
 from nerfies_jax.capture.json_files import AnyPath, new_folder, write_json
+from nerfies_jax.capture.splits import HELD_OUT, hold_out_every
 
 SAME_POSE = 1e-6  # tolerance of matrix entries; a static camera repeats them exactly
 TRIPOD_ROWS = 5  # smallest number of rows with one pose that form a validation sweep

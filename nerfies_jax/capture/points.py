@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfies_jax.capture import ply_files
 from nerfies_jax.capture.capture import CaptureError, PointCloud
-from nerfies_jax.capture.frames import UNSEEN
+from nerfies_jax.capture.world_points import UNSEEN
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.rays import across_ray
 

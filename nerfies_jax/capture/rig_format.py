@@ -9,7 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerfies_jax.capture import formats, frames, llff_format, name_times, video
+from nerfies_jax.capture import (
+    formats,
+    frames,
+    llff_format,
+    name_times,
+    splits,
+    video,
+    world_points,
+)
 from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import Capture, CaptureError, shrink
 from nerfies_jax.capture.json_files import AnyPath
@@ -72,7 +80,7 @@ def read(
     placement = llff_format.placed(poses)
     size = recorded.images.shape[2:0:-1]
     fixed = llff_format.cameras_of(poses, placement, size)
-    times = frames.spread(recorded.numbers)
+    times = splits.spread(recorded.numbers)
     return Capture(
         name=path.resolve().name,
         source="rig",
@@ -84,13 +92,13 @@ def read(
         heldout=heldout_rows,
         near=placement.near,
         far=placement.far,
-        warp_ids=frames.dense(recorded.numbers),
+        warp_ids=splits.dense(recorded.numbers),
         appearance_ids=recorded.camera_ids,
         camera_ids=recorded.camera_ids,
         valid=recorded.valid,
         scale=placement.scale,
         center=placement.center,
-        up=frames.up_direction(fixed),
+        up=world_points.up_direction(fixed),
         frames_per_second=recorded.rate,
         path=path,
         notes=(*llff_format.order_note(names), *recorded.notes, note),
@@ -262,10 +270,10 @@ def _lengths(cameras, camera_ids):
 def _split(recorded, names, heldout, path):
     """Training rows, held-out rows and a note."""
     if isinstance(heldout, int):
-        train, heldout_rows = frames.hold_out_in_time(
+        train, heldout_rows = splits.hold_out_in_time(
             recorded.numbers, recorded.camera_ids, heldout, str(path)
         )
-        return train, heldout_rows, frames.held_out_note(heldout_rows, heldout)
+        return train, heldout_rows, splits.held_out_note(heldout_rows, heldout)
     test = names[0] if heldout is None else heldout
     if test not in names:
         raise CaptureError(

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nerfies_jax.capture import frames, safe_files, text_files
+from nerfies_jax.capture import frames, safe_files, splits, text_files
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.json_files import AnyPath, read_json
 
@@ -67,8 +67,8 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
     changed = not np.array_equal(camera_ids, capture.camera_ids)
     return dataclasses.replace(
         capture,
-        times=frames.spread(clock),
-        warp_ids=frames.dense(clock),
+        times=splits.spread(clock),
+        warp_ids=splits.dense(clock),
         camera_ids=camera_ids,
         flow=None if changed else capture.flow,  # flow is between frames of one camera
         notes=(*capture.notes, note, *notes, *more),
@@ -208,4 +208,4 @@ def _cameras(capture, clock):
         return capture.camera_ids, ()
     count = len({*groups})
     note = f"frames share times: taken as {count} cameras, identified by their names"
-    return frames.dense(groups), (note,)
+    return splits.dense(groups), (note,)

@@ -6,7 +6,7 @@ import pathlib
 import msgspec
 import numpy as np
 
-from nerfies_jax.capture import frames, name_times, text_files, unread_keys
+from nerfies_jax.capture import frames, name_times, splits, text_files, unread_keys
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import read_json
 from nerfies_jax.capture.nearest import known_names
@@ -273,14 +273,14 @@ def _split(file, transforms, heldout, missing):
         key=lambda row: (times[row], frames.natural(pool[row].file_path)),
     )
     ordered = [pool[row] for row in order]
-    interval = frames.HELD_OUT if heldout is None else heldout
-    train_rows, heldout_rows = frames.hold_out_every(len(ordered), interval, str(file))
+    interval = splits.HELD_OUT if heldout is None else heldout
+    train_rows, heldout_rows = splits.hold_out_every(len(ordered), interval, str(file))
     return Split(
         file,
         transforms,
         [ordered[row] for row in train_rows],
         [ordered[row] for row in heldout_rows],
-        (f"no other split: {frames.held_out_note(heldout_rows, interval)}", *empty),
+        (f"no other split: {splits.held_out_note(heldout_rows, interval)}", *empty),
     )
 
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.capture.frames import pixels_of
 from nerfies_jax.capture.json_files import AnyPath, refuse_existing, replaced_file
 from nerfies_jax.capture.units import Units, places_in
+from nerfies_jax.capture.world_points import pixels_of
 from nerfies_jax.evaluation import model_flow
 from nerfies_jax.evaluation.frames import spread, view_of
 from nerfies_jax.evaluation.model_flow import Move

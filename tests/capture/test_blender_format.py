@@ -9,7 +9,7 @@ import plyfile
 import pytest
 
 from nerfies_jax import capture as room
-from nerfies_jax.capture import blender_format, frames, points
+from nerfies_jax.capture import blender_format, points, world_points
 from nerfies_jax.capture.capture import CaptureError
 from tests.capture.broken import refused
 
@@ -83,7 +83,7 @@ def test_the_picture_is_upright_and_unmirrored(tmp_path):
     capture = room.load(make(tmp_path))
     # Camera 0 stands at (4, 0, 0) and looks along -x: z is up, y is to its right.
     points = np.float32([[0, 0, 0], [0, 0, 0.5], [0, 0.5, 0]])
-    pixel, depth, seen = frames.pixels_of(capture.cameras, 0, points, (10, 8))
+    pixel, depth, seen = world_points.pixels_of(capture.cameras, 0, points, (10, 8))
     assert seen.all()
     np.testing.assert_allclose(depth, 4, rtol=1e-6)
     np.testing.assert_allclose(pixel[0], [5, 4], atol=1e-5)

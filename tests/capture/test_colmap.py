@@ -10,7 +10,7 @@ import pytest
 import scipy.spatial.transform
 
 from nerfies_jax import capture as room
-from nerfies_jax.capture import colmap, decoder, frames
+from nerfies_jax.capture import colmap, decoder, frames, world_points
 from nerfies_jax.capture.borders import black_borders
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
@@ -97,7 +97,7 @@ def test_the_scene_has_unit_size_and_its_depths_lie_between_near_and_far(tmp_pat
     corners = np.concatenate([capture.points.position, capture.cameras.position])
     assert 0.95 < np.linalg.norm(np.ptp(corners, axis=0)) < 1.2
     for row in range(9):
-        _, depth, _ = frames.pixels_of(
+        _, depth, _ = world_points.pixels_of(
             capture.cameras, row, capture.points.position, SIZE
         )
         assert capture.near < depth.min() < depth.max() < capture.far
@@ -126,7 +126,7 @@ def test_our_cameras_project_as_colmap_does(tmp_path, lens):
         params=[float(number) for number in numbers],
     )
     for row in (0, 8):
-        pixel, *_ = frames.pixels_of(
+        pixel, *_ = world_points.pixels_of(
             capture.cameras, row, capture.points.position, SIZE
         )
         world = capture.points.position.astype(float) / capture.scale + capture.center

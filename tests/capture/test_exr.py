@@ -6,7 +6,15 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from nerfies_jax.capture import decoder, exr, exr_camera, formats, frames, images
+from nerfies_jax.capture import (
+    decoder,
+    exr,
+    exr_camera,
+    formats,
+    frames,
+    images,
+    world_points,
+)
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.geometry import camera
 
@@ -57,7 +65,7 @@ def test_a_header_takes_points_of_the_world_to_the_picture(tmp_path):
     exact = (points - one.position) @ one.camera_from_world.T
     np.testing.assert_allclose(inside[:, :3], exact, atol=1e-6)
     flat = rows @ read["worldToNDC"]
-    pixel, depth, _ = frames.pixels_of(
+    pixel, depth, _ = world_points.pixels_of(
         camera.stack([one]), 0, points.astype(np.float32), size
     )
     places = flat[:, :2] / flat[:, 3:] * size

@@ -12,9 +12,9 @@ from nerfies_jax.capture import (
     blender_format,
     colmap,
     formats,
-    frames,
     llff_format,
     nerfies_format,
+    world_points,
 )
 from nerfies_jax.capture.capture import CaptureError
 
@@ -133,7 +133,7 @@ def test_a_real_capture_projects_its_points_where_they_were_seen(
     position = np.float32((seen["xyz"] - np.array(capture.center)) * capture.scale)
     errors = []
     for row in range(len(capture.ids)):
-        pixel, *_ = frames.pixels_of(capture.cameras, row, position, size)
+        pixel, *_ = world_points.pixels_of(capture.cameras, row, position, size)
         here = seen["obs_image"] == row
         errors.append(pixel[seen["obs_point"][here]] - seen["obs_xy"][here])
     assert np.median(np.linalg.norm(np.concatenate(errors), axis=1)) < within_px

@@ -9,9 +9,9 @@ import pytest
 from nerfies_jax.capture import (
     colmap_writer,
     formats,
-    frames,
     nerfies_format,
     transforms_writer,
+    world_points,
 )
 from tests.capture.test_camera_files import SIZE, filmed
 
@@ -26,7 +26,7 @@ WRITERS = {
 def pixels(capture, world):
     place = (world - np.array(capture.center)) * capture.scale
     return {
-        name.removeprefix("images_"): frames.pixels_of(
+        name.removeprefix("images_"): world_points.pixels_of(
             capture.cameras, row, place.astype(np.float32), SIZE
         )[0]
         for row, name in enumerate(capture.ids)

@@ -8,7 +8,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from nerfies_jax.capture import frames, nerfies_format, nerfies_views
+from nerfies_jax.capture import nerfies_format, nerfies_views, world_points
 from nerfies_jax.capture.capture import CaptureError, PointCloud
 from nerfies_jax.geometry import camera
 from tests.capture.broken import refused
@@ -132,8 +132,8 @@ def test_a_factor_is_read_or_made_and_points_keep_their_place(
     full = nerfies_format.read_cameras(tmp_path)
     ratio = size[0] / SIZE[0]
     point = np.float32([[0.1, 0.2, 2.0]])
-    pixel, *_ = frames.pixels_of(capture.cameras, 0, point, size)
-    whole, *_ = frames.pixels_of(full.cameras, 0, point, SIZE)
+    pixel, *_ = world_points.pixels_of(capture.cameras, 0, point, size)
+    whole, *_ = world_points.pixels_of(full.cameras, 0, point, SIZE)
     np.testing.assert_allclose(pixel, whole * ratio, rtol=1e-6)
     if max(stored) == 1 and size != SIZE:
         step = SIZE[0] // size[0]
@@ -281,7 +281,7 @@ def test_points_are_scaled_and_colored_from_the_pictures(tmp_path):
     )
     assert capture.points.color[0, 0] in range(40, 46)
     assert (
-        capture.points.color[1].tolist() == [frames.UNSEEN] * 3
+        capture.points.color[1].tolist() == [world_points.UNSEEN] * 3
     )  # behind every camera
     assert any("1 points are not finite" in note for note in capture.notes)
 

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from nerfies_jax.capture import frames, path_files
 from nerfies_jax.capture import keyframes as keyframes_of_paths
+from nerfies_jax.capture import path_files, world_points
 from nerfies_jax.capture.camera_paths import CameraPath
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.keyframes import Keyframe
@@ -44,7 +44,7 @@ def test_a_nerfstudio_path_is_drawn_by_nerfstudio_as_by_us(tmp_path):
         focal = SIZE[1] / 2 / np.tan(np.radians(entry["fov"]) / 2)
         theirs = focal * np.array([x, -y]) / -z + np.divide(SIZE, 2)
         ours, back = (
-            frames.pixels_of(cameras, row, np.float32(point)[None], SIZE)[0][0]
+            world_points.pixels_of(cameras, row, np.float32(point)[None], SIZE)[0][0]
             for cameras in (planned.cameras, read.cameras)
         )
         # Square pixels are all it has: of ours it keeps the height.
