@@ -181,10 +181,10 @@ def planned(args: Benchmark) -> list[Run]:
 
 def _lengths(args, method):
     """Return the number of steps of a method, and those of its evaluations."""
-    own = {} if args.suite is None else suites.SUITES[args.suite].steps
-    if args.seconds is not None or method not in own:
+    suite_steps = {} if args.suite is None else suites.SUITES[args.suite].steps
+    if args.seconds is not None or method not in suite_steps:
         return args.steps, ()
-    steps = args.steps or own[method]
+    steps = args.steps or suite_steps[method]
     return steps, suites.evaluated_at(steps)
 
 

@@ -152,19 +152,19 @@ def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
     from nerfies_jax.capture.json_files import replaced_file
     from nerfies_jax.visualization import figures
 
-    shown = panels(stored)
-    if not shown:
+    panel_list = panels(stored)
+    if not panel_list:
         return
     figure = figures.new_figure(figsize=(8.4, 3.7), dpi=200, layout="constrained")
-    all_axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    for axes, (title, curves) in zip(all_axes, shown.items(), strict=True):
+    all_axes = figure.subplots(1, len(panel_list), sharey=True, squeeze=False)[0]
+    for axes, (title, curves) in zip(all_axes, panel_list.items(), strict=True):
         _draw_panel(axes, title, curves)
     all_axes[0].set_ylabel("PSNR of held-out frames (dB)", fontsize=9)
     figure.supxlabel(
         "processor seconds of training, without compilation and tracking", fontsize=9
     )
     # Positions of the labels depend on the limits that all panels share.
-    for axes, curves in zip(all_axes, shown.values(), strict=True):
+    for axes, curves in zip(all_axes, panel_list.values(), strict=True):
         _label(axes, curves)
     with replaced_file(path) as partial:
         figure.savefig(partial, facecolor="white", metadata={DIGEST: digest(stored)})

@@ -126,7 +126,7 @@ SHARES = Case(
     switch="-20 and 15",
     axis="distance, in distances of nodes",
     at=np.repeat(_AWAY, len(_RADII)),
-    points=np.array([[away, radius] for away in _AWAY for radius in _RADII]),
+    points=np.array([[distance, radius] for distance in _AWAY for radius in _RADII]),
     stable=_shares,
     textbook=_quotients,
     exact=_exact_shares,
@@ -163,7 +163,9 @@ BITS = Case(
     axis="distance, deviations",
     at=np.repeat(_FAR, len(_STEPS)),
     # Where a step is wide, from its end on.
-    points=np.array([[away + step // 2, step] for away in _FAR for step in _STEPS]),
+    points=np.array(
+        [[distance + step // 2, step] for distance in _FAR for step in _STEPS]
+    ),
     stable=_bits,
     textbook=_log_of_difference,
     exact=_exact_bits,

@@ -119,9 +119,9 @@ def _exact_trained(x):
 # One step of bfloat16 beside the kernel's center, 2^-6, is many narrow widths.
 _WIDTHS = np.array(
     [
-        [CHOSEN + beside, s]
+        [CHOSEN + offset, s]
         for s in (-200, -60, -10.25, -9.75, -4, 0, 3, 9.75, 10.25, 60, 200)
-        for beside in (0, 2.0**-17, 2.0**-6)
+        for offset in (0, 2.0**-17, 2.0**-6)
     ]
 )
 WIDTH = Case(

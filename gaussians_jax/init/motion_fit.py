@@ -359,18 +359,18 @@ def fit(
     Raises:
       ValueError: If no position is known.
     """
-    times, position, known, _, _, depth = paths
-    if not known.any():
+    times, position, valid, _, _, depth = paths
+    if not valid.any():
         raise ValueError("no path has a known position; a motion cannot be fitted")
     start, rates, penalty, rigid = _guess(effect, paths, key)
     rates = jax.tree.map(lambda relative: rate * relative, rates)
-    target = captured(np.moveaxis(np.where(known[..., None], position, 0), 1, 0))
-    weight = captured(known.T)
+    target = captured(np.moveaxis(np.where(valid[..., None], position, 0), 1, 0))
+    weight = captured(valid.T)
     # Component along the rays to remove from the distances.
     along_ray = np.zeros(target.shape)
     if rigid and depth is not None:
         along_ray = np.sqrt(1 - along(depth.deviation))[:, None, None] * depth.ray
-        along_ray = np.moveaxis(np.where(known[..., None], along_ray, 0), 1, 0)
+        along_ray = np.moveaxis(np.where(valid[..., None], along_ray, 0), 1, 0)
     ray_part, frame_times = captured(along_ray), captured(times)
     unit = captured(paths.unit)
     count = min(FRAMES_AT_ONCE, len(times))

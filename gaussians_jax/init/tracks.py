@@ -70,7 +70,7 @@ def start(
         raise ValueError(
             f"{capture.path or capture.name}: no initialization from tracks: {reason}"
         )
-    position, known, deviation = usable_paths.known_paths(evidence)
+    position, valid, deviation = usable_paths.known_paths(evidence)
     times = capture.times[evidence.row].astype(np.float32)
     unit = usable_paths.scene_unit(evidence)
     static_points = np.asarray(evidence.still.position, np.float32)
@@ -80,12 +80,12 @@ def start(
     depth = Depth(ray, deviation)
     fit_result = motion_fit.fit(
         effect,
-        Paths(times, position.astype(np.float32), known, unit, static_points, depth),
+        Paths(times, position.astype(np.float32), valid, unit, static_points, depth),
         key,
         rate=spec.fit_rate,
         steps=spec.fit_steps,
     )
-    visibility = known.mean(axis=1).astype(np.float32)
+    visibility = valid.mean(axis=1).astype(np.float32)
     return _seeds(
         effect, fit_result.points, visibility, evidence, views, times, unit, spec
     )

@@ -49,11 +49,11 @@ class PointDepthSpec:
             return {}
         camera = jax.tree.map(lambda leaf: leaf[observation.row], frames.cameras)
         points = jnp.asarray(frames.points, rendering.color.dtype)
-        error, known = relative_errors(
+        error, valid = relative_errors(
             camera, points, rendering.depth, rendering.alpha, self.reach
         )
-        count = jnp.maximum(jnp.sum(known), 1).astype(error.dtype)
-        value = jnp.sum(jnp.where(known, error, 0)) / count
+        count = jnp.maximum(jnp.sum(valid), 1).astype(error.dtype)
+        value = jnp.sum(jnp.where(valid, error, 0)) / count
         return {"error": Term(value, self.weight)}
 
 

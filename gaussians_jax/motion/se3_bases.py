@@ -214,12 +214,12 @@ def deform(
     table = jnp.concatenate([flat, motion.turn], axis=-1)
     mixed, mean = components(exact_product(weights, table)), components(gaussians.mean)
     linear, offset, turn = mixed[:9], mixed[9:12], stacked(mixed[12:])
-    moved = [
+    new_mean = [
         coordinate + (dot(linear[3 * i : 3 * i + 3], mean) + offset[i])
         for i, coordinate in enumerate(mean)
     ]
     return gaussians._replace(
-        mean=stacked(moved), quaternion=splats.rotate(gaussians, turn)
+        mean=stacked(new_mean), quaternion=splats.rotate(gaussians, turn)
     )
 
 
@@ -233,11 +233,11 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     Returns:
       Initial guess of a fit.
     """
-    times, position, known, unit, *_ = paths
+    times, position, valid, unit, *_ = paths
     canonical_frame = len(times) // 2
-    label = rigid_groups.labels(position, known, spec.bases)
-    bodies = rigid_groups.motion(position, known, label, canonical_frame)
-    canonical, middle = rigid_groups.centers(position, known, bodies)
+    label = rigid_groups.labels(position, valid, spec.bases)
+    bodies = rigid_groups.motion(position, valid, label, canonical_frame)
+    canonical, middle = rigid_groups.centers(position, valid, bodies)
     turn = rigid_groups.rotation_vectors(bodies.rotation, canonical_frame)
     middle_path = np.einsum("gtij,gj->gti", bodies.rotation, middle) + bodies.shift
     turn = _at_knots(rigid_groups.smoothed(turn), times, spec)
@@ -251,7 +251,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     logits[:, 0] = STILL_LOGIT
     logits[np.arange(len(position)), 1 + label] = MEMBER_LOGIT
     guess = Points(captured(canonical), captured(logits), bases)
-    unknown = captured(~_supported_intervals(times, known, label, spec))
+    unknown = captured(~_supported_intervals(times, valid, label, spec))
     scale = captured(unit)
 
     def penalty(points, _times):
@@ -262,9 +262,9 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
 
         fine = points.nets.fine
         shift, turn = bend(fine.shift) / scale, bend(fine.turn)
-        return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn + held(fine)
+        return SMOOTHNESS * shift + TURN_SMOOTHNESS * turn + change_where_unknown(fine)
 
-    def held(fine):
+    def change_where_unknown(fine):
         def steps(table):
             return jnp.mean(unknown[..., None] * jnp.abs(jnp.diff(table, axis=1)))
 
@@ -276,7 +276,7 @@ def fit_to_paths(spec: SE3BasesSpec, paths: Paths) -> Guess:
     return Guess(guess, rates, penalty, rigid=True)
 
 
-def _supported_intervals(times, known, label, spec):
+def _supported_intervals(times, valid, label, spec):
     """Find the intervals between knots in which a path of each basis is known.
 
     An interval that contains no frame time belongs to the frame nearest to its middle.
@@ -290,7 +290,7 @@ def _supported_intervals(times, known, label, spec):
     inside[np.arange(len(middle)), nearest] = True
     supported = np.ones((spec.bases, spec.knots - 1), bool)
     for group in np.unique(label):
-        supported[group] = (inside & known[label == group].any(0)).any(1)
+        supported[group] = (inside & valid[label == group].any(0)).any(1)
     return supported
 
 

@@ -44,8 +44,8 @@ def rasterize(
     def band(index, footprints, values):
         first = (index * rows).astype(footprints.mean_px.dtype)
         mean_px = footprints.mean_px - jnp.stack([jnp.zeros_like(first), first])
-        moved = footprints._replace(mean_px=mean_px)
-        return raster.rasterize(moved, values, (width, rows), spec)
+        in_band = footprints._replace(mean_px=mean_px)
+        return raster.rasterize(in_band, values, (width, rows), spec)
 
     image, transmittance = data_parallel.assembled(band, devices, footprints, values)
     image = image.reshape(-1, width, values.shape[1])

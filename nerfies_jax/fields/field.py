@@ -228,14 +228,14 @@ def _init(spec, metadata, effects, key):
     nets = {}
     keys = jax.random.split(key, 3)
     for number, (name, one) in enumerate(specs.templates_of(spec).items()):
-        own = jax.random.fold_in(keys[0], number)
+        component_key = jax.random.fold_in(keys[0], number)
         if not isinstance(one, template.TemplateSpec):
-            nets[name] = one.init(own, ambient_width, condition)
+            nets[name] = one.init(component_key, ambient_width, condition)
             continue
         extras = 0 if one.direction is None else one.direction.width(3)
         nets[name] = template.init(
             one,
-            own,
+            component_key,
             one.encoded_width + ambient_width,
             condition + extras,
         )
@@ -249,8 +249,8 @@ def _init(spec, metadata, effects, key):
         )
     for effect in effects:
         if effect.init is not None:
-            own = jax.random.fold_in(keys[2], stream(effect.name))
-            params[effect.name] = effect.init(own)
+            component_key = jax.random.fold_in(keys[2], stream(effect.name))
+            params[effect.name] = effect.init(component_key)
     return params
 
 

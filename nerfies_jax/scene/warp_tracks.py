@@ -154,14 +154,14 @@ def _flow_mover(field) -> Move | None:
 
     hopped = programs.Program(hop, field)
 
-    def move(state, points, here, there):
-        begin, end = float(here.time), float(there.time)
+    def move(state, points, source, target):
+        begin, end = float(source.time), float(target.time)
         hops = max(round(abs(end - begin) / gap), 1)
         length = in_default_precision(np.float32(abs(end - begin) / (hops * gap)))
         side = scene_flow.FORWARD if end >= begin else scene_flow.BACKWARD
         place = in_default_precision((points - center) * np.float32(metadata.scale))
         for time in np.linspace(begin, end, hops, endpoint=False):
-            view = here._replace(time=jnp.asarray(time, here.time.dtype))
+            view = source._replace(time=jnp.asarray(time, source.time.dtype))
             place = hopped(state.params, state.step, place, view, side, length)
         reached = np.asarray(place) / np.float32(metadata.scale) + center
         finite = np.isfinite(reached).all(axis=1)
@@ -185,23 +185,23 @@ def mover(spec, metadata) -> Move | None:
         return _flow_mover(field)
     center = np.asarray(metadata.center, np.float32)
 
-    def solve(field, params, step, points, here, there):
+    def solve(field, params, step, points, source, target):
         def condition_of(view):
             return FrameCondition(view.time, field.codes_at(params, view), step)
 
-        views = jax.tree.map(lambda *leaves: jnp.stack(leaves), here, there)
+        views = jax.tree.map(lambda *leaves: jnp.stack(leaves), source, target)
         conditions = jax.vmap(condition_of)(views)
         tracked = tracks.point_tracks(field.displace, params, points, conditions, 0)
         return tracked.points[:, 1], tracked.converged[:, 1]
 
     solved = programs.Program(solve, field)
 
-    def move(state, points, here, there):
+    def move(state, points, source, target):
         inside = in_default_precision((points - center) * np.float32(metadata.scale))
         reached, finite = jax.device_get(
-            solved(state.params, state.step, inside, here, there)
+            solved(state.params, state.step, inside, source, target)
         )
-        moved = reached / np.float32(metadata.scale) + center
-        return Moved(np.where(finite[:, None], moved, points), finite)
+        position = reached / np.float32(metadata.scale) + center
+        return Moved(np.where(finite[:, None], position, points), finite)
 
     return move

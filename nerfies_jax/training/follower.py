@@ -38,12 +38,12 @@ def follow(model: Model, example: TrainState, frames: Frames) -> str:
             hosts.check_frames(message, frames)
             compiles = message["kind"] == hosts.COMPILE
             if compiles or message["arrays"]:
-                given = hosts.received_state(message, example)
+                received = hosts.received_state(message, example)
             else:
-                given = state
-            program, _ = chunk.program(model, given, frames, message["steps"])
+                received = state
+            program, _ = chunk.program(model, received, frames, message["steps"])
             if compiles:
                 program.prepare(message["count"])
                 hosts.meet()
             else:
-                state, _ = program(given, frames, message["count"])
+                state, _ = program(received, frames, message["count"])
