@@ -117,7 +117,7 @@ More = Annotated[(MoreMetrics, *_heading("scoring"))]
 
 
 def plain(source: CaptureSource) -> CaptureSource:
-    """The same source as a run keeps it, however its folder was named."""
+    """Return the source as a run stores it, however its folder was named."""
     return CaptureSource(**given(source))
 
 
@@ -170,7 +170,7 @@ def check_out_folder(path: pathlib.Path | None) -> None:
 
 
 def check_presets(names: Iterable[str]) -> None:
-    """ValueError that names the presets there are, where --presets names another."""
+    """Raise ValueError, with the known presets, if --presets names another."""
     for name in names:
         if name not in PRESETS:
             raise ValueError(
@@ -343,7 +343,7 @@ def stored(path: pathlib.Path) -> Any:
 
 
 def formerly(option):
-    """For `Annotated`: the option is understood by its earlier name as well."""
+    """Mark an option, for `Annotated`, as having an earlier name."""
     return tyro.conf.arg(aliases=[option])
 
 
@@ -367,19 +367,19 @@ def check_frames(frames: int | None, path: str) -> None:
 
 
 def check_port(port: int) -> None:
-    """Raise for a number that is no port anybody may listen at."""
+    """Raise ValueError for a port below 1024 or above 65535."""
     if not 1024 <= port <= 65535:
         raise ValueError(f"--port {port}: choose one from 1024 to 65535")
 
 
 def check_max_side(max_side: int | None) -> None:
-    """Raise for a longest side without a pixel."""
+    """Raise ValueError for a longest side below one pixel."""
     if max_side is not None and max_side < 1:
         raise ValueError(f"--max-side {max_side}: draw at least one pixel")
 
 
 def sized(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
-    """A width and height as they are, or with `max_side` as the longer one."""
+    """Return a width and height, scaled to a longer side of `max_side` if given."""
     if max_side is None:
         return size
     factor = max_side / max(size)

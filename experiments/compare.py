@@ -220,7 +220,7 @@ def _legend(compared) -> list[str]:
 
 
 def table(compared, goals) -> str:
-    """One line for each run."""
+    """Format a table with a row for each run."""
     columns = _columns(compared)
     heads = ["run", *(c[1] for c in columns), *(f"s to {goal:g} dB" for goal in goals)]
     lines = [heads]
@@ -287,7 +287,7 @@ def remarks(compared) -> list[str]:
 
 
 def save(folder: pathlib.Path, compared, goals) -> None:
-    """compare.json and curves.png."""
+    """Write compare.json and curves.png."""
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.visualization import panels
 

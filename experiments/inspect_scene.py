@@ -69,7 +69,7 @@ def main(args):
 
 
 def report(inspected, advice, source):
-    """Lines for a person: the table, then the commands."""
+    """Format the table and the commands that follow from it."""
     from nerfies_jax.preprocessing import findings
     from nerfies_jax.runs import commands, prices
     from nerfies_jax.runs.config import RunConfig

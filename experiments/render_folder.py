@@ -32,6 +32,9 @@ def name(args: Any) -> str:
 
     Args:
       args: Settings of `nerfies render`.
+
+    Returns:
+      The name.
     """
     parts = [path_name(args.path)]
     if args.frames is not None:
@@ -66,6 +69,9 @@ def path_name(path: str) -> str:
 
     Args:
       path: A kind of path, or a file or folder of cameras.
+
+    Returns:
+      The name, for the name of a folder.
     """
     digest = _digest(path)
     stem = pathlib.PurePath(path).stem
@@ -111,6 +117,9 @@ def record(made: Made, args: Any, files: Iterable[str]) -> dict[str, Any]:
       made: Settings that determine the images.
       args: Settings of `nerfies render`.
       files: Files by their names in the folder.
+
+    Returns:
+      Content for JSON.
     """
     from nerfies_jax.training.provenance import provenance
 

@@ -49,6 +49,9 @@ def mutate(data: bytes, name: str, draw: random.Random) -> bytes:
       name: The file's name. What is packed in an archive is damaged inside it half of
         the time, and packed again.
       draw: Source of randomness.
+
+    Returns:
+      The damaged content.
     """
     inside = draw.random() < 0.5
     if inside and data[:4] == b"PK\x03\x04":

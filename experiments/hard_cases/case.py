@@ -156,7 +156,7 @@ def _mixed_difference(at, i, j, sign):
 
 
 def rounded(inputs: np.ndarray, dtype: str) -> np.ndarray:
-    """Inputs as that precision holds them, as float64."""
+    """Round inputs to a precision, and return them as float64."""
     return np.asarray(inputs).astype(jnp.dtype(dtype)).astype(np.float64)
 
 

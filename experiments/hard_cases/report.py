@@ -24,7 +24,7 @@ def number(values) -> str:
 
 
 def block(row) -> str:
-    """Lines for one case: errors by precision, then the cost."""
+    """Format the lines of one case: errors by precision, then the cost."""
     lines = [f"\n{row.case.name}: {row.case.breaks}"]
     for dtype, outcome in row.outcomes.items():
         for name, ours, theirs in zip(ORDERS, *outcome, strict=False):
@@ -68,7 +68,7 @@ def summary(rows) -> str:
 
 
 def table(rows) -> str:
-    """The table of docs/numerics.md."""
+    """Format the table of docs/numerics.md."""
     lines = [
         "| case | what breaks in the textbook form | formula used; switch | worst "
         "error f32: textbook → ours | f64 | time of ours / textbook: value, gradient "
@@ -129,7 +129,7 @@ def renew(path, rows) -> None:
 
 
 def save_numbers(folder, rows, args) -> None:
-    """All numbers as metrics, to hold a later run against."""
+    """Write all numbers as metrics, to compare later runs with."""
     metrics = []
     for row in rows:
         key = row.case.name.replace(" ", "_")

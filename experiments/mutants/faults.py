@@ -39,7 +39,7 @@ class Fault(NamedTuple):
 
 
 def drawn(count: int, seed: int, only: str = "") -> list[Fault]:
-    """Faults at random, one in each module before any module has two."""
+    """Sample faults, one in each module before any module has two."""
     chance = random.Random(seed)
     by_module = []
     for package in PACKAGES:
@@ -58,7 +58,7 @@ def drawn(count: int, seed: int, only: str = "") -> list[Fault]:
 
 
 def places(path: str, source: str) -> list[Fault]:
-    """Every fault that can be planted in the function bodies of a module."""
+    """Return all faults that can be planted in the functions of a module."""
     starts = [0]
     for line in source.encode().splitlines(keepends=True):
         starts.append(starts[-1] + len(line))

@@ -15,7 +15,7 @@ SAME: dict[tuple[str, str], str] = {
 
 
 def page(stored: dict) -> str:
-    """The faults, which tests noticed each, and what became of those none noticed."""
+    """Format the faults, the tests that notice each, and those that none notices."""
     rows = stored["rows"]
     counts = collections.Counter(map(_fate, rows))
     faults = len(rows) - counts[HARMLESS]

@@ -17,16 +17,16 @@ PYTEST += ["-p", "no:cacheprovider"]
 
 
 def default_tests(copy: pathlib.Path) -> list[str]:
-    """The files of tests of a checkout."""
+    """Return the test files of a checkout."""
     tests = (copy / "tests").rglob("test_*.py")
     return sorted(str(path.relative_to(copy)) for path in tests)
 
 
 def reached_by(test: str, copy: pathlib.Path) -> list[str]:
-    """ "file:line" of every function of the packages that a file of tests enters.
+    """Return "file:line" of each function of the packages that a test file enters.
 
-    Its default tests run in a process of their own, so that nothing is compiled before.
-    What a test runs in a process of its own is not seen.
+    Its default tests run in a separate process, so that nothing has been compiled.
+    Functions that a test runs in another process are not recorded.
     """
     answer = copy / f"{test.replace('/', '.')}.reached.json"
     command = [*PYTEST, "-m", DEFAULT, "-p", "experiments.mutants.reached", test]
@@ -45,7 +45,7 @@ def reached_by(test: str, copy: pathlib.Path) -> list[str]:
 def tried(
     fault: Fault, copy: pathlib.Path, reached: dict[str, set[str]], seconds: float
 ) -> dict:
-    """The fault, and up to three of the default tests that notice it."""
+    """Plant a fault, and return it with up to three tests that notice it."""
     path = copy / fault.path
     right = path.read_bytes()
     wrong = right[: fault.start] + fault.text.encode() + right[fault.end :]

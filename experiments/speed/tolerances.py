@@ -17,7 +17,7 @@ DECIBELS = {"heldout.psnr": 0.5, "heldout.moving_psnr": 1.0}  # four deviations
 
 
 def metrics(stored: Mapping[str, Any]) -> list[Metric]:
-    """All that is held: steps of presets, the rasterizer's ratios, the main job."""
+    """Collect step times of presets, ratios of the rasterizer, and the main job."""
     return [*_presets(stored.get("presets", {})), *_raster(stored), *_job(stored)]
 
 
