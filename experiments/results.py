@@ -114,6 +114,7 @@ STUDIES = {
         "speed.effects_page",
         "nerfies_jax/runs/effect_cost.json",
     ),
+    "on_device": _package("tests and timings on an accelerator", "on_device"),
     "fuzz": _package("damaged files", "fuzz --mutations 1000000"),
     "mutants": _package("faults that the tests detect", "mutants --count 44"),
     "mutants_unseen": _package("the same, other faults", "mutants --count 24 --seed 1"),

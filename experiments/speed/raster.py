@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from typing import Any
 
 from nerfies_jax.runs import platform
@@ -146,17 +147,27 @@ def _footprints_of(scene: dict, alpha_threshold: float):
     return Footprints(*(jnp.asarray(field, jnp.float32) for field in fields))
 
 
-def _median_ms(call) -> float:
-    """Milliseconds of a call, the median of several after one that warms up."""
+def median_ms(
+    call: Callable[[], Any], now: Callable[[], float] = time.process_time
+) -> float:
+    """Measure the milliseconds of a call.
+
+    Args:
+      call: Function without arguments that returns arrays.
+      now: Clock in seconds.
+
+    Returns:
+      The median of several calls after one that warms up.
+    """
     import jax
     import numpy as np
 
     jax.block_until_ready(call())
     times = []
     for _ in range(REPEATS):
-        start = time.process_time()
+        start = now()
         jax.block_until_ready(call())
-        times.append(1e3 * (time.process_time() - start))
+        times.append(1e3 * (now() - start))
     return float(np.median(times))
 
 
@@ -185,8 +196,8 @@ def time_case(text: str, reference: pathlib.Path | None) -> dict:
     forward, with_gradient = compiled(text, scene)
     row: dict[str, Any] = {
         "case": text,
-        "forward_ms": _median_ms(forward),
-        "forward_backward_ms": _median_ms(with_gradient),
+        "forward_ms": median_ms(forward),
+        "forward_backward_ms": median_ms(with_gradient),
     }
     if reference is not None:
         with tempfile.TemporaryDirectory() as folder:

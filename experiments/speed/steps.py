@@ -28,7 +28,9 @@ def prepare() -> None:
     record.cached(runs.built_in_scene("default"), platform.CACHE / "evidence")
 
 
-def measure(preset: str, all_cores: bool) -> dict[str, Any]:
+def measure(
+    preset: str, all_cores: bool, device: platform.Device = "cpu"
+) -> dict[str, Any]:
     """Measure seconds and bytes of a preset on the built-in scene.
 
     Motions are initialized as in the preset: tracks bring Gaussians of their own, and
@@ -38,12 +40,13 @@ def measure(preset: str, all_cores: bool) -> dict[str, Any]:
       preset: Name of the preset.
       all_cores: Use the cores that the preset wants, and time the step alone. Otherwise
         use one core.
+      device: Platform, or "auto".
 
     Returns:
       Measurements by name.
     """
     count = representations.cores(preset)
-    platform.start_jax("cpu", *(count if all_cores else ("one",)))
+    platform.start_jax(device, *(count if all_cores else ("one",)))
     import jax
 
     # Compilation is measured, too.
@@ -67,6 +70,8 @@ def measure(preset: str, all_cores: bool) -> dict[str, Any]:
         "compile_seconds": step.compile_seconds,
         "devices": model.devices,
     }
+    if (peak := clock.device_peak_bytes()) is not None:
+        record["device_peak_mb"] = peak / 1e6
     step_parts = representation.resources.step_parts
     if not all_cores and step_parts is not None:
         parts = step_parts(spec, metadata, model, state, frames).ms()
@@ -80,11 +85,14 @@ def measure(preset: str, all_cores: bool) -> dict[str, Any]:
     return record
 
 
-def default_command(checkout: pathlib.Path | None = None) -> dict[str, Any]:
+def default_command(
+    checkout: pathlib.Path | None = None, device: str = "auto"
+) -> dict[str, Any]:
     """Time the README's first command with empty caches.
 
     Args:
       checkout: Another checkout of the library, whose code is run. None for this one.
+      device: Platform, or "auto".
 
     Returns:
       Seconds, revision, metrics and machine.
@@ -97,6 +105,7 @@ def default_command(checkout: pathlib.Path | None = None) -> dict[str, Any]:
         if checkout is not None:
             environment["PYTHONPATH"] = str(checkout.resolve())
         command = [sys.executable, "-m", "experiments.reconstruct", "--out", str(run)]
+        command += [] if device == "auto" else ["--device", device]
         began = time.perf_counter()
         subprocess.run(
             command, check=True, env=environment, cwd=checkout, capture_output=True
