@@ -29,8 +29,8 @@ from .nn import kan as kan
 from .nn.encoding import coarse_to_fine_window as coarse_to_fine_window
 from .nn.encoding import positional_encoding as positional_encoding
 from .nn.kan import KANSpec as KANSpec
-from .runs.run import built_in_scene as built_in_scene
-from .runs.run import load_capture as load_capture
+from .runs.captures import built_in_scene as built_in_scene
+from .runs.captures import load_capture as load_capture
 from .runs.run import saved_run as saved_run
 from .runtime.contract import checked as checked
 from .scene.presets import PRESETS as PRESETS

@@ -1,3 +1,7 @@
+from .captures import built_in_scene as built_in_scene
+from .captures import load_capture as load_capture
+from .captures import read_capture as read_capture
+from .captures import stored_capture as stored_capture
 from .event_log import EventReader as EventReader
 from .event_log import read_events as read_events
 from .reconstruction import Outcome as Outcome
@@ -5,16 +9,12 @@ from .reconstruction import Refused as Refused
 from .reconstruction import reconstruct as reconstruct
 from .reconstruction import resume as resume
 from .run import Run as Run
-from .run import built_in_scene as built_in_scene
 from .run import free_memory as free_memory
 from .run import initial_state as initial_state
-from .run import load_capture as load_capture
 from .run import new_run as new_run
 from .run import open_run as open_run
-from .run import read_capture as read_capture
 from .run import restore as restore
 from .run import save_config as save_config
 from .run import saved_run as saved_run
 from .run import scene_spec as scene_spec
-from .run import stored_capture as stored_capture
 from .run import with_found_cameras as with_found_cameras

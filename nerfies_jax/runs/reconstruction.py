@@ -26,6 +26,7 @@ from nerfies_jax.runs import (
     train,
     validation,
 )
+from nerfies_jax.runs.captures import stored_capture
 from nerfies_jax.runs.config import MoreMetrics, Preparation, RunConfig
 from nerfies_jax.runs.following import following
 from nerfies_jax.runs.run import (
@@ -37,7 +38,6 @@ from nerfies_jax.runs.run import (
     save_config,
     saved_run,
     scene_spec,
-    stored_capture,
 )
 from nerfies_jax.runs.train import Pace
 from nerfies_jax.runtime import console, data_parallel, hosts, stopping

@@ -22,8 +22,9 @@ from nerfies_jax.runs import (
     representations,
     step_profile,
 )
+from nerfies_jax.runs.captures import stored_capture
 from nerfies_jax.runs.config import CaptureSource, MoreMetrics, RunConfig
-from nerfies_jax.runs.run import Run, scene_spec, stored_capture
+from nerfies_jax.runs.run import Run, scene_spec
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.training.loop import History
 from nerfies_jax.training.model import Rendering, TrainState
