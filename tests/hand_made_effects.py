@@ -5,7 +5,7 @@ import dataclasses
 
 import pytest
 
-from gaussians_jax.core import protocols
+from gaussians_jax.core import components
 from gaussians_jax.losses import acceleration, depth, neighbors, spectral
 from gaussians_jax.losses import flow as motion_flow
 from gaussians_jax.motion import (
@@ -155,37 +155,37 @@ def of_splats(spec, metadata):
         if module is plane_motion:
             seen = (extent, metadata.box)
         own = module.Bound(motion, spec.steps, *seen)
-        effects.append(protocols.compile_motion(own))
+        effects.append(components.compile_motion(own))
     if spec.temporal_opacity is not None:
         own = temporal_opacity.Bound(spec.temporal_opacity)
-        effects.append(protocols.compile_motion(own))
+        effects.append(components.compile_motion(own))
     if spec.carried is not None:
         still = 0 if motion is None else motion.warm_up
         effects.append(carried.effect(spec.carried, spec.steps, still))
     if spec.acceleration is not None:
         own = acceleration.Bound(spec.acceleration, extent, frames)
-        effects.append(protocols.compile_regularizer(own))
+        effects.append(components.compile_regularizer(own))
     if spec.neighbors is not None:
         own = neighbors.Bound(spec.neighbors, extent, effects[0].name)
-        effects.append(protocols.compile_regularizer(own))
+        effects.append(components.compile_regularizer(own))
     if spec.spectral is not None:
         own = spec.spectral.bind(spec.steps, metadata)
-        effects.append(protocols.compile_regularizer(own))
+        effects.append(components.compile_regularizer(own))
     if spec.depth is not None:
-        effects.append(protocols.compile_regularizer(spec.depth))
+        effects.append(components.compile_regularizer(spec.depth))
     if spec.exposure is not None:
         own = exposure.Bound(spec.exposure, spec.steps, metadata.exposures)
-        effects.append(protocols.compile_appearance(own))
+        effects.append(components.compile_appearance(own))
     if spec.appearance is not None:
         own = gaussian_appearance.Bound(spec.appearance, spec.steps, metadata.exposures)
-        effects.append(protocols.compile_gaussian_appearance(own))
+        effects.append(components.compile_gaussian_appearance(own))
     if spec.flow is not None:
         own = motion_flow.Bound(spec.flow, spec.raster)
-        effects.append(protocols.compile_regularizer(own))
+        effects.append(components.compile_regularizer(own))
     if spec.poses is not None:
         seen = frames, metadata.depth
         own = pose_refinement.Bound(spec.poses, spec.steps, *seen)
-        effects.append(protocols.compile_camera_optimizer(own))
+        effects.append(components.compile_camera_optimizer(own))
     return tuple(effects)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Key
 
-from gaussians_jax.core import protocols, splats
+from gaussians_jax.core import components, splats
 from gaussians_jax.core.protocols import Strategy
 from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Params
@@ -108,7 +108,7 @@ def first_state(
     rows = initialization.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
     params = Params({"splats": jax.device_put(rows)}, {})
-    params = protocols.initialized(effects, start_key, params)
+    params = components.initialized(effects, start_key, params)
     if tracked is not None:
         params = track_start.put_in(params, effects, tracked)
     params = params._replace(rows=jax.tree.map(np.asarray, params.rows))

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 
-from gaussians_jax.core import protocols
+from gaussians_jax.core import components
 from gaussians_jax.core.metadata import SceneMetadata
 from gaussians_jax.core.protocols import (
     Appearance,
@@ -382,8 +382,8 @@ def motion_of(spec: SplatScene, metadata: SceneMetadata) -> SplatRecord | None:
     if motion is None:
         return None
     if spec.start.motion == "tracks":
-        motion = protocols.moving_at_once(motion)
-    return protocols.compile_motion(protocols.bound(motion, spec.steps, metadata))
+        motion = components.moving_at_once(motion)
+    return components.compile_motion(components.bound(motion, spec.steps, metadata))
 
 
 def strategy_of(spec: SplatScene, metadata: SceneMetadata) -> Strategy | None:
@@ -398,7 +398,7 @@ def strategy_of(spec: SplatScene, metadata: SceneMetadata) -> Strategy | None:
     """
     if spec.strategy is None:
         return None
-    strategy = protocols.bound(spec.strategy, spec.steps, metadata)
+    strategy = components.bound(spec.strategy, spec.steps, metadata)
     if spec.motion_growth is None:
         return strategy
     return MotionGuided(strategy, spec.motion_growth, metadata.extent)
@@ -416,25 +416,25 @@ def effects_of(spec: SplatScene, metadata: SceneMetadata) -> tuple[SplatRecord, 
     """
 
     def bound(part):
-        return protocols.bound(part, spec.steps, metadata)
+        return components.bound(part, spec.steps, metadata)
 
     motion = motion_of(spec, metadata)
     effects = [] if motion is None else [motion]
     if spec.temporal_opacity is not None:
-        effects.append(protocols.compile_motion(bound(spec.temporal_opacity)))
+        effects.append(components.compile_motion(bound(spec.temporal_opacity)))
     if spec.carried is not None:
         # Children rotate on their own as soon as their parents move.
         warm_up = 0 if motion is None else motion.warm_up
         effects.append(carried.effect(spec.carried, spec.steps, warm_up))
     early, late = _regularizers(spec, metadata, motion)
-    effects += [protocols.compile_regularizer(one) for one in early]
+    effects += [components.compile_regularizer(one) for one in early]
     if spec.exposure is not None:
-        effects.append(protocols.compile_appearance(bound(spec.exposure)))
+        effects.append(components.compile_appearance(bound(spec.exposure)))
     if spec.appearance is not None:
-        effects.append(protocols.compile_gaussian_appearance(bound(spec.appearance)))
-    effects += [protocols.compile_regularizer(one) for one in late]
+        effects.append(components.compile_gaussian_appearance(bound(spec.appearance)))
+    effects += [components.compile_regularizer(one) for one in late]
     if spec.poses is not None:
-        effects.append(protocols.compile_camera_optimizer(bound(spec.poses)))
+        effects.append(components.compile_camera_optimizer(bound(spec.poses)))
     return tuple(effects)
 
 
@@ -452,6 +452,6 @@ def _regularizers(spec, metadata, motion):
         flow = dataclasses.replace(spec.flow, start=0) if starts_at_once else spec.flow
         late.insert(0, motion_flow.Bound(flow, raster_of(spec, metadata)))
     return tuple(
-        [protocols.bound(one, spec.steps, metadata) for one in some if one is not None]
+        [components.bound(one, spec.steps, metadata) for one in some if one is not None]
         for some in (early, late)
     )

@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from gaussians_jax.core import protocols
+from gaussians_jax.core import components
 from gaussians_jax.core.metadata import SceneMetadata
 from gaussians_jax.core.protocols import Motion
 from gaussians_jax.core.records import SplatRecord
@@ -144,8 +144,8 @@ def fit_tracks(
     unit = max(unit, float(np.finfo(np.float32).tiny) ** 0.5)
     box = tuple(observed.min(0) - unit), tuple(observed.max(0) + unit)
     metadata = SceneMetadata(unit, (0.0, 0.0, 0.0), count, box=box)
-    component = protocols.bound(protocols.moving_at_once(motion), steps, metadata)
-    effect = protocols.compile_motion(component)
+    component = components.bound(components.moving_at_once(motion), steps, metadata)
+    effect = components.compile_motion(component)
     fraction = (times - times[0]) / (times[-1] - times[0])
     solution = motion_fit.fit(
         effect,

@@ -1,6 +1,6 @@
 """Motions bound to a small scene, as `gaussians_jax.scene.scene.build` binds them."""
 
-from gaussians_jax.core import protocols
+from gaussians_jax.core import components
 from gaussians_jax.core.metadata import SceneMetadata
 
 
@@ -11,4 +11,4 @@ def motion(spec, steps=100, extent=1.0, frames=9, box=None):
 
 def record(spec, **sizes):
     """The internal record of the same motion."""
-    return protocols.compile_motion(motion(spec, **sizes))
+    return components.compile_motion(motion(spec, **sizes))

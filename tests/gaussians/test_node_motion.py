@@ -10,7 +10,7 @@ import pytest
 import scipy.special
 from scipy.spatial.transform import Rotation
 
-from gaussians_jax.core import protocols, splats
+from gaussians_jax.core import components, splats
 from gaussians_jax.core.protocols import MotionParams
 from gaussians_jax.core.splats import Params
 from gaussians_jax.init import motion_fit
@@ -49,7 +49,7 @@ def motion_of(name="nodes"):
 
 @functools.cache
 def effect(name="nodes"):
-    return protocols.compile_motion(motion_of(name))
+    return components.compile_motion(motion_of(name))
 
 
 def params_of(gaussians, dtype, size=0.5, name="nodes"):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gaussians_jax.core import protocols
+from gaussians_jax.core import components
 from gaussians_jax.core.splats import Params
 from gaussians_jax.losses import spectral
 from gaussians_jax.losses.spectral import FourierSpec, Gates, SpectralSpec, WaveletSpec
@@ -285,7 +285,7 @@ def test_the_effect_weighs_logs_and_trains_what_its_gate_has(gate, rng):
     spec = SpectralSpec(gate=gate, after=3)
     regularizer, shot = bound.motion(spec, 10), shot_of(rng)
     learned = gate in spectral.LEARNED
-    effect = protocols.compile_regularizer(regularizer)
+    effect = components.compile_regularizer(regularizer)
     assert (effect.init is not None) == (effect.learning_rate is not None) == learned
     gates = put(spectral.init(spec), "float32") if learned else None
 
