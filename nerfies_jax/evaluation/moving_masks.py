@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.preprocessing import frame_masks, record
+from nerfies_jax.preprocessing import findings, frame_masks, inspection, record
 
 MAX_PIXELS = 4_000_000  # of all frames together, which take 45 s on one core
 
@@ -25,7 +25,8 @@ def with_masks(capture: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
       folder: Cache folder of preprocessing.
 
     Returns:
-      The capture and a note. The capture has no masks if tracking fails.
+      The capture and a note. The capture has no masks if tracking fails, or if nothing
+      moves: what is left then are pixels that could not be tracked.
     """
     if capture.moving is not None or not len(capture.heldout):
         return capture, ""
@@ -42,6 +43,12 @@ def with_masks(capture: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
         return capture, (
             f"Dynamic regions are not evaluated separately, because the capture has no "
             f"masks and tracking failed: {unusable}."
+        )
+    (motion,) = inspection.find(video, (findings.MOTION,), folder)
+    if motion.wanted is False:
+        return capture, (
+            "Dynamic regions are not evaluated separately, because nothing moves: "
+            f"{motion.evidence}."
         )
     for row, mask in zip(rows, frame_masks.of_frames(evidence, video), strict=True):
         moving[row] = frame_masks.enlarged(mask, factor, capture.size)
