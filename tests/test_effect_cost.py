@@ -36,6 +36,7 @@ from nerfies_jax.metrics import clock
 from nerfies_jax.nn import entropy, planes
 from nerfies_jax.scene import presets as field_presets
 from nerfies_jax.scene import scene as field_scene
+from nerfies_jax.scene import steps as field_steps
 from tests import bare_scenes, hand_made_effects, scenes
 from tests.bare_scenes import parts_of, without
 from tests.hand_made_effects import FIELD_MODULES
@@ -125,7 +126,7 @@ def same_program(ours, by_hand, *args):
 )
 def test_a_field_without_effects_is_the_static_one_bit_for_bit(name):
     run = started_field(bare(bare_scenes.tiny_field(name)))
-    step = bare_scenes.field_step(run.spec, run.metadata, field_scene.draw_batch)
+    step = bare_scenes.field_step(run.spec, run.metadata, field_steps.draw_batch)
     same_program(run.model.step, step, run.state, run.frames)
 
 

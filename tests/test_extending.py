@@ -19,6 +19,7 @@ from gaussians_jax.io import model_file
 from gaussians_jax.scene.spec import SplatScene
 from nerfies_jax import evaluation
 from nerfies_jax.scene import scene
+from nerfies_jax.scene import steps as field_steps
 from nerfies_jax.training import specs
 from tests import bare_scenes, scenes
 
@@ -158,8 +159,8 @@ def color_of(medium):
     @jax.jit
     def value(key):
         params = field.init(key)
-        batch = scene.draw_batch(frames, 4, key)
-        terms = scene.loss_terms(field, params, frames, batch, jnp.int32(0), key)
+        batch = field_steps.draw_batch(frames, 4, key)
+        terms = field_steps.loss_terms(field, params, frames, batch, jnp.int32(0), key)
         return terms["color"].value
 
     return value(jax.random.key(0))

@@ -4,6 +4,7 @@ import jax
 
 from nerfies_jax.metrics.part_time import StepParts, part
 from nerfies_jax.scene import scene
+from nerfies_jax.scene import steps as field_steps
 from nerfies_jax.training import loop, rate
 from nerfies_jax.training.effects import weighted_sum
 from nerfies_jax.training.model import Frames, Model, TrainState
@@ -36,15 +37,15 @@ def parts(
     batch_key, loss_key = jax.random.split(loop.step_key(state))
 
     def draw(state, frames, key):
-        return scene.micro_batch(field, state, frames, key)
+        return field_steps.micro_batch(field, state, frames, key)
 
     batch, guide = jax.jit(draw)(state, frames, batch_key)
 
     def descend(state, grads):
-        return scene.descend(spec, field.effects, state, grads)
+        return field_steps.descend(spec, field.effects, state, grads)
 
     def loss(params, frames, batch):
-        terms = scene.loss_terms(
+        terms = field_steps.loss_terms(
             field, params, frames, batch, state.step, loss_key, guide
         )
         return weighted_sum(terms)

@@ -13,7 +13,7 @@ import pytest
 from nerfies_jax import evaluation
 from nerfies_jax.capture import frame_memory
 from nerfies_jax.capture.images import write_png
-from nerfies_jax.scene import scene as radiance
+from nerfies_jax.scene import steps
 from tests.capture.test_capture import make
 
 
@@ -30,7 +30,7 @@ def test_large_captures_are_trained_on_where_they_lie(monkeypatch):
     assert copied.image_rows is None
     assert len(copied.images) == len(capture.train) < len(shared.images)
     both = [
-        radiance.draw_batch(frames, 64, jax.random.key(0))
+        steps.draw_batch(frames, 64, jax.random.key(0))
         for frames in (shared, copied)
     ]
     for one, other in zip(*map(jax.tree.leaves, both), strict=True):

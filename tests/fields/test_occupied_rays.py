@@ -17,6 +17,7 @@ from nerfies_jax.fields.spec import SamplingSpec
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.nn.grids import HashGridSpec
 from nerfies_jax.scene import scene
+from nerfies_jax.scene import steps as field_steps
 from nerfies_jax.training import loop
 from tests import scenes
 from tests.fields.test_skipping import GRID, TWO_LEVELS, with_holes
@@ -104,7 +105,7 @@ def test_valid_rays_that_meet_something_are_learned_from():
     metadata = scene.metadata_of(capture, SPEC)
     field = scene.field(SPEC, metadata)
     frames = evaluation.frames_of(capture, frozenset())
-    draw = jax.jit(scene.draw_batch, static_argnums=1)
+    draw = jax.jit(field_steps.draw_batch, static_argnums=1)
     every = jax.tree.map(np.asarray, draw(frames, 160, jax.random.key(1)))
     every = every._replace(valid=every.valid & (np.arange(160) % 3 > 0))
     cells = np.zeros((CELLS,) * 3, bool)

@@ -27,6 +27,7 @@ from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.nn.planes import PlanesSpec
 from nerfies_jax.scene import presets, scene
+from nerfies_jax.scene import steps as field_steps
 from nerfies_jax.scene.scene import RadianceScene
 from nerfies_jax.training import loop
 from nerfies_jax.training.effects import FrameCondition, weighted_sum
@@ -364,10 +365,10 @@ def test_gradient_of_a_whole_step(float64):
     frames = jax.tree.map(
         lambda x: x.astype(float64) if x.dtype == jnp.float32 else x, frames
     )
-    batch = scene.draw_batch(frames, 6, jax.random.key(1))
+    batch = field_steps.draw_batch(frames, 6, jax.random.key(1))
 
     def loss(params):
-        terms = scene.loss_terms(
+        terms = field_steps.loss_terms(
             field, params, frames, batch, jnp.int32(4), jax.random.key(2)
         )
         return weighted_sum(terms)
@@ -440,11 +441,13 @@ def test_micro_batches_go_down_the_mean_of_all_rays():
     def part(index):
         key = jax.random.fold_in(loop.step_key(state), index)
         batch_key, field_key = jax.random.split(key)
-        batch = scene.draw_batch(frames, STATIC.rays // 2, batch_key)
+        batch = field_steps.draw_batch(frames, STATIC.rays // 2, batch_key)
 
         def loss(params):
             return weighted_sum(
-                scene.loss_terms(field, params, frames, batch, state.step, field_key)
+                field_steps.loss_terms(
+                    field, params, frames, batch, state.step, field_key
+                )
             )
 
         return jax.jit(jax.value_and_grad(loss))(state.params)

@@ -13,6 +13,7 @@ from nerfies_jax.fields.effects import scene_flow
 from nerfies_jax.fields.effects.appearance import AppearanceSpec
 from nerfies_jax.fields.effects.records import FieldRecord
 from nerfies_jax.scene import presets, scene, warp_fit
+from nerfies_jax.scene import steps as field_steps
 from nerfies_jax.scene.warp_fit import FilmPaths
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
@@ -145,7 +146,7 @@ def test_what_tracks_have_found_learns_slowly_at_first(start, first):
     codes = {"motion": None, "appearance": None}
     params = dict.fromkeys(("warp", "template")) | {"codes": codes}
     for step, share in ((0, first), (spec.steps // 2, first**0.5), (spec.steps, 1)):
-        rates = scene.learning_rates(spec, effects, params, jnp.int32(step))
+        rates = field_steps.learning_rates(spec, effects, params, jnp.int32(step))
         of_codes = rates["codes"]
         if start is TRACKS:
             np.testing.assert_allclose(of_codes["appearance"], rates["template"])
@@ -161,7 +162,7 @@ def test_a_motion_of_one_s_own_may_have_no_parameters():
     field = field._replace(effects=(*field.effects, own))
     params = field.init(jax.random.key(0))
     assert "own" not in params
-    rates = scene.learning_rates(field.spec, field.effects, params, jnp.int32(0))
+    rates = field_steps.learning_rates(field.spec, field.effects, params, jnp.int32(0))
     assert rates.keys() == params.keys()
     start = dataclasses.replace(TRACKS, fit_steps=2)
     fitted = warp_fit.fit(field, params, film(), jax.random.key(0), start)
@@ -174,7 +175,7 @@ def test_a_flow_with_a_trunk_of_its_own_learns_slowly_at_first_and_its_medium_no
     spec = dataclasses.replace(small, start=TRACKS, scene_flow=flow)
     field = scene.field(spec, field_of("nsff-small").metadata)
     params = field.init(jax.random.key(0))
-    rates = scene.learning_rates(spec, field.effects, params, jnp.int32(0))
+    rates = field_steps.learning_rates(spec, field.effects, params, jnp.int32(0))
     (own, common) = rates["scene_flow"], rates["template"]
     for slow in (own.flow, own.flow_trunk):
         np.testing.assert_allclose(slow / common, spec.start.first_rate, rtol=1e-5)
@@ -188,7 +189,7 @@ def test_a_flow_that_was_not_fitted_is_not_held_back():
     spec = dataclasses.replace(preset, start=TRACKS, warp=warp)
     field = scene.field(spec, field_of("nsff-small").metadata)
     params = jax.eval_shape(field.init, jax.random.key(0))
-    rates = scene.learning_rates(spec, field.effects, params, jnp.int32(0))
+    rates = field_steps.learning_rates(spec, field.effects, params, jnp.int32(0))
     own, common = rates["scene_flow"], rates["scene_flow"].blend
     assert own.flow == own.flow_trunk == common
     np.testing.assert_allclose(rates["warp"] / common, spec.start.first_rate, rtol=1e-5)
@@ -200,7 +201,7 @@ def test_a_medium_on_tables_learns_at_the_rate_of_the_template(motion):
     spec = dataclasses.replace(preset, start=FieldStartSpec(motion=motion))
     field = scene.field(spec, field_of("nsff-small").metadata)
     params = jax.eval_shape(field.init, jax.random.key(0))
-    rates = scene.learning_rates(spec, field.effects, params, jnp.int32(0))
+    rates = field_steps.learning_rates(spec, field.effects, params, jnp.int32(0))
     own = rates["scene_flow"]
     assert own.network == rates["template"] == spec.template_rate * own.blend
 
@@ -209,7 +210,7 @@ def test_codes_learn_at_a_rate_of_their_own():
     preset = presets.PRESETS["nerf-w-grid-small"]
     field = scene.field(preset, field_of("nsff-small").metadata)
     params = jax.eval_shape(field.init, jax.random.key(0))
-    rates = scene.learning_rates(preset, field.effects, params, jnp.int32(0))
+    rates = field_steps.learning_rates(preset, field.effects, params, jnp.int32(0))
     assert set(params["codes"]) == {"appearance", "transient"}
     expected = preset.code_rate * preset.learning_rate
     np.testing.assert_allclose(rates["codes"], expected, rtol=1e-6)

@@ -16,6 +16,7 @@ from nerfies_jax.fields.spec import SamplingSpec
 from nerfies_jax.fields.template import TemplateSpec
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.scene import presets, scene
+from nerfies_jax.scene import steps as field_steps
 from nerfies_jax.scene.scene import RadianceScene
 from nerfies_jax.training.effects import APPEARANCE, FrameCondition, Table, weighted_sum
 from tests import drawn, gradients, scenes
@@ -129,10 +130,10 @@ def test_codes_of_every_preset_learn(name):
     frames = evaluation.frames_of(capture, scene.build(spec, metadata).required_data)
     params = field.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1))
-    batch = scene.draw_batch(frames, spec.rays, keys[0])
+    batch = field_steps.draw_batch(frames, spec.rays, keys[0])
 
     def loss(codes):
-        terms = scene.loss_terms(
+        terms = field_steps.loss_terms(
             field,
             params | {"codes": codes},
             frames,
