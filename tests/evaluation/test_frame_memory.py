@@ -30,8 +30,7 @@ def test_large_captures_are_trained_on_where_they_lie(monkeypatch):
     assert copied.image_rows is None
     assert len(copied.images) == len(capture.train) < len(shared.images)
     both = [
-        steps.draw_batch(frames, 64, jax.random.key(0))
-        for frames in (shared, copied)
+        steps.draw_batch(frames, 64, jax.random.key(0)) for frames in (shared, copied)
     ]
     for one, other in zip(*map(jax.tree.leaves, both), strict=True):
         np.testing.assert_array_equal(one, other)
