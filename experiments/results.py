@@ -25,6 +25,12 @@ PAGES = ROOT / "docs" / "results"
 INDEX = """\
 # Results
 
+![PSNR against processor seconds of training](benchmark.png)
+
+PSNR of held-out frames of built-in scenes, against processor seconds of training on one
+core. All motions start from the same tracks. Each line is one schedule, so an earlier
+point is below what a run of that length would reach ([benchmark.md](benchmark.md)).
+
 `nerfies study results` writes every page from a file of this repository, and a
 test compares each page with its file. The command next to a page measures again. If a
 page has rows of several captures or presets, the command was run once for each.

@@ -88,20 +88,28 @@ def table(benchmark: Mapping[str, Any]) -> str:
     heads = ("method", *(f"{at} s" for at in TIMES), "at the end", "after CPU s")
     rows = []
     for name, line in curves.items():
-        cells = [markdown.number(_at(line, at), 2) for at in TIMES]
+        cells = [markdown.number(psnr_at(line, at), 2) for at in TIMES]
         last = markdown.number(line.psnr[-1], 2), markdown.number(line.seconds[-1], 0)
         rows.append([f"`{name}`", *cells, *last])
     if not rows:
         return ""
     return (
-        "PSNR of all held-out frames during training, in dB, after so many processor "
-        "seconds of training\n(interpolated over the logarithm of the time).\n\n"
+        "PSNR of all held-out frames in dB, after so many processor seconds of "
+        "training\n(interpolated over the logarithm of the time).\n\n"
         + markdown.table(heads, rows)
     )
 
 
-def _at(line, seconds):
-    """Interpolate a line. None outside of its evaluations."""
+def psnr_at(line: Line, seconds: float | int) -> float | None:
+    """Interpolate a line over the logarithm of the time.
+
+    Args:
+      line: The line.
+      seconds: Processor seconds.
+
+    Returns:
+      PSNR in dB, or None before the first evaluation and after the last.
+    """
     if not line.seconds[0] <= seconds <= line.seconds[-1]:
         return None
     return float(np.interp(math.log(seconds), np.log(line.seconds), line.psnr))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import nerfies_jax as nj
+from experiments.benchmark import curves
 from tests import scenes
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -51,6 +52,23 @@ def test_the_table_of_presets_shows_kept_numbers():
         assert len(cells) == 3
         number = statistics.mean(cell["numbers"]["psnr"] for cell in cells)
         assert f"{number:.2f}" == value, preset
+
+
+def test_the_default_leads_at_every_time_where_the_scene_moves():
+    """As README says below the figure."""
+    assert "`splats-tracked` leads at every time, and after 10\nseconds it" in README
+    path = ROOT / "experiments/measured/benchmark.json"
+    shown = curves.panels(json.loads(path.read_text()))
+    moving = [lines for title, lines in shown.items() if "motion" in title]
+    assert moving
+    for lines in moving:
+        for at in curves.TIMES:
+            scores = {name: curves.psnr_at(line, at) for name, line in lines.items()}
+            known = {name: x for name, x in scores.items() if x is not None}
+            assert max(known, key=known.get) == "tracked"
+        after_ten = curves.psnr_at(lines["tracked"], 10)
+        fields = [lines[name].psnr[-1] for name in lines if name.endswith("-grid")]
+        assert after_ten > max(fields)
 
 
 def test_every_link_leads_to_a_file():
