@@ -120,6 +120,13 @@ STUDIES = {
         "speed.effects_page",
         "nerfies_jax/runs/effect_cost.json",
     ),
+    "growth": Study(
+        "growth of time and memory with the size of a scene",
+        "growth",
+        "growth.__main__",
+        "growth.page",
+        figure="growth.page",
+    ),
     "on_device": _package("tests and timings on an accelerator", "on_device"),
     "fuzz": _package("damaged files", "fuzz --mutations 1000000"),
     "mutants": _package("faults that the tests detect", "mutants --count 44"),

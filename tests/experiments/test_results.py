@@ -7,6 +7,7 @@ import pytest
 
 from experiments import results
 from experiments.benchmark import curves
+from experiments.growth import page as growth
 from experiments.results import PAGES, REVISIONS, ROOT, STUDIES
 
 
@@ -22,6 +23,13 @@ def test_the_figure_shows_the_kept_numbers():
     if path.exists():
         with PIL.Image.open(path) as picture:
             assert picture.text[curves.DIGEST] == curves.digest(stored)
+
+
+@pytest.mark.skipif("growth" not in results.kept(), reason="no stored numbers")
+def test_the_figure_of_growth_shows_the_kept_numbers():
+    stored = json.loads(results.path_of("growth").read_text())
+    with PIL.Image.open(PAGES / "growth.png") as picture:
+        assert picture.text[growth.DIGEST] == growth.digest(stored)
 
 
 def test_the_index_lists_every_page_there_is():
