@@ -11,7 +11,7 @@ import numpy as np
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.synthetic import SceneTruth
 from nerfies_jax.capture.synthetic import truth as truths
-from nerfies_jax.preprocessing import dense_flow, paths, record, view_set
+from nerfies_jax.preprocessing import dense_flow, paths, record, short_tracks, view_set
 from nerfies_jax.preprocessing import tracks as tracking
 from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.preprocessing.tracks import Tracks
@@ -119,7 +119,7 @@ def _track_error(tracks: Tracks, points):
 
 
 def _path_error(capture, views, evidence, tracks, points):
-    long = tracks.seen.sum(1) >= min(record.SHORTEST_PATH, len(views.row))
+    long = tracks.seen.sum(1) >= min(short_tracks.USUAL.path, len(views.row))
     tracks = tracks.take(long)
     if not long.any():
         return np.nan

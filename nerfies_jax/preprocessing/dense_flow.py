@@ -130,7 +130,7 @@ def reduced(shift: np.ndarray, times: int) -> np.ndarray:
     return cv2.resize(shift, size, interpolation=cv2.INTER_AREA) / times
 
 
-def _enlarged_flow(shift: np.ndarray, times: int) -> np.ndarray:
+def enlarged_flow(shift: np.ndarray, times: int) -> np.ndarray:
     """Convert flow to flow between enlarged images. Inverts `reduced`."""
     size = times * shift.shape[1], times * shift.shape[0]
     return times * cv2.resize(np.ascontiguousarray(shift), size)
@@ -209,7 +209,7 @@ def between_neighbors(
             tuple(_smaller(image, times) for image in pair),
             step,
             place(step),
-            lambda guess: reduced(search(*pair, _enlarged_flow(guess, times)), times),
+            lambda guess: reduced(search(*pair, enlarged_flow(guess, times)), times),
             span,
         )
 
@@ -284,7 +284,7 @@ def _continue_motion(flow, frame, images, search):
     times = images.shape[2] // width
 
     def search_from(one, other, guess):
-        guess = _enlarged_flow(guess, times)
+        guess = enlarged_flow(guess, times)
         return reduced(search(images[one], images[other], guess), times)
 
     ahead = search_from(frame, frame + 1, -flow.backward[frame])

@@ -96,6 +96,7 @@ def fitted(
     static: tuple[Tracks, RestPoints],
     depths: AlignedDepth | None,
     watch: Watch,
+    least_known: int = rigid_bodies.LEAST_KNOWN,
 ) -> Paths:
     """Fit 3D paths to moving tracks.
 
@@ -106,6 +107,8 @@ def fitted(
       static: Static tracks and their points.
       depths: Depth maps, or None.
       watch: Work budget.
+      least_known: Minimum number of frames of a path. Shorter ones than
+        `rigid_bodies.LEAST_KNOWN` are used on rigid objects only.
 
     Returns:
       The paths.
@@ -119,6 +122,8 @@ def fitted(
         what = "depths of rigid bodies"
         return watch.has_room(FOR_BODIES, what, 1e-6 * A_BODY_TERM * terms)
 
+    if depths is None and least_known < rigid_bodies.LEAST_KNOWN:
+        return rigid_bodies.refined_short(views, moved, alone, least_known, has_room)
     if depths is None:
         return rigid_bodies.refined(views, moved, alone, has_room)
     measured = _measured(depths.depth, moved)

@@ -142,7 +142,7 @@ def _fitted(views, wanted, penalty, noise):
     for row, visible in enumerate(wanted.seen):
         first, last = np.flatnonzero(visible)[[0, -1]]
         span = slice(first, last + 1)
-        stencils = np.sqrt(penalty) * _second_differences(views.time[span])
+        stencils = np.sqrt(penalty) * second_differences(views.time[span])
         along = unit[row, span]
         weight, pulled = visible[span].astype(float), wanted.pull[row, span]
         across = across_ray(along)
@@ -183,10 +183,14 @@ def _deviation(stencils, path, offset, miss):
     return np.sqrt(hidden / shown) if shown > 0 else np.inf
 
 
-def _second_differences(time):
-    """Return weights [frames - 2, 3] of three frames for their acceleration.
+def second_differences(time: np.ndarray) -> np.ndarray:
+    """Return the weights of three consecutive frames for their acceleration.
 
-    The unit is one per squared median step.
+    Args:
+      time: Times in increasing order, [frames].
+
+    Returns:
+      Weights, [frames - 2, 3], for accelerations per squared median step.
     """
     if len(time) < 3:
         return np.zeros((0, 3))

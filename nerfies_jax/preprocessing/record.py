@@ -22,10 +22,12 @@ from nerfies_jax.capture.given import Given
 from nerfies_jax.preprocessing import (
     dense_flow,
     given_depth,
+    lost_regions,
     moving,
     path_depths,
     paths,
     rest_points,
+    short_tracks,
     still_pictures,
     still_points,
     taken,
@@ -46,8 +48,7 @@ from nerfies_jax.preprocessing.watch import (
 )
 from nerfies_jax.runtime import console
 
-# Minimum number of frames of a path and of a video.
-SHORTEST_PATH, SHORTEST_FILM = 10, 6
+SHORTEST_FILM = 6  # minimum number of frames of a video
 MOVES = 0.5  # score above which a track is considered as moving
 MOST_PATHS = 1500
 MOST_PIXELS = 16_000_000  # of all frames together, at 17 bytes each for their flow
@@ -95,16 +96,18 @@ def _gathered(capture, use_depths, watch):
     views = view_set.in_time_order(capture)
     pictures = dense_flow.leveled(views)
     flow = taken.flow(given, views)
+    # Images of one moment are no video: there is nothing to search twice for.
+    film = np.ptp(views.time) > 0
+    span = view_set.depth_span(capture, views) if film else None
+    least = short_tracks.USUAL if span is None else short_tracks.lengths(views, span)
     if flow is None:
-        # Images of one moment are no video: there is nothing to search twice for.
-        film = np.ptp(views.time) > 0
-        span = view_set.depth_span(capture, views) if film else None
-        flow = _flow(views, pictures, span, watch)
+        flow = _flow(views, pictures, span, least, watch)
     watch.begin("tracks")
     every = 1e-6 * A_TRACK_FRAME * tracking.work(views)
     few = not watch.has_room(FOR_TRACKS, "half of the tracks", every)
     watch.spend(every / 2 if few else 0.0)
-    tracks, first = _tracks(given, views, flow, pictures, 2 if few else 1)
+    starts = tracking.grid(views, 2 if few else 1)
+    tracks, first = _tracks(given, views, flow, pictures, starts, least)
     rest = rest_points.fit(views, tracks)
     watch.begin("moving")
     mask = taken.moving(given, views)
@@ -118,12 +121,18 @@ def _gathered(capture, use_depths, watch):
     unusable = _unusable(views, flow)
     which = np.zeros(0, int)
     if not unusable:
-        which = _moved(tracks, score, first)
+        if least == short_tracks.SHORT and not first:
+            tracks, rest, score = short_tracks.with_more(
+                views, flow, pictures, mask, (tracks, rest, score), watch
+            )
+        which = _moved(tracks, score, first, least.path)
     still = np.flatnonzero(score < paths.AT_REST)
     static = tracks.take(still), rest.take(still)
     depths = path_depths.known(capture, given, views, static, use_depths)
     moved = tracks.take(which)
-    moved_paths = path_depths.fitted(capture, views, moved, static, depths, watch)
+    moved_paths = path_depths.fitted(
+        capture, views, moved, static, depths, watch, least.known
+    )
     watch.begin("still")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     points_work = 1e-6 * A_POINT_FRAME * still_points.work(views)
@@ -138,6 +147,7 @@ def _gathered(capture, use_depths, watch):
         rest=rest,
         moved=which,
         paths=moved_paths,
+        least_known=least.known,
         still=dense,
         unusable=unusable,
         told=given.moving is not None or given.track_pixel is not None,
@@ -148,7 +158,7 @@ def _gathered(capture, use_depths, watch):
     )
 
 
-def _flow(views, pictures, span, watch):
+def _flow(views, pictures, span, least, watch):
     pixels = dense_flow.searched_pixels(views, pictures)
     a_search = 1e-6 * A_SEARCHED_PIXEL * pixels
     watch.spend(2 * (len(views.row) - 1) * a_search)
@@ -157,7 +167,11 @@ def _flow(views, pictures, span, watch):
         what, each = "a second search for flow", dense_flow.SECOND_LOOK * a_search
         return watch.room_for(count, FOR_WIDE_STEPS, what, each)
 
-    return dense_flow.between_neighbors(views, pictures, span, room_for)
+    flow = dense_flow.between_neighbors(views, pictures, span, room_for)
+    frames = [] if least == short_tracks.USUAL else lost_regions.pairs(views, flow)
+    each = lost_regions.SEARCHES * a_search
+    room = watch.room_for(len(frames), FOR_WIDE_STEPS, "flow of lost regions", each)
+    return lost_regions.recovered(views, pictures, flow, frames[:room])
 
 
 def _rounded(flow):
@@ -169,13 +183,13 @@ def _rounded(flow):
     return flow._replace(forward=forward, backward=backward)
 
 
-def _tracks(given, views, flow, pictures, sparser):
+def _tracks(given, views, flow, pictures, starts, least):
     """Return all tracks, and the index of the first one whose path is computed.
 
     External tracks follow the computed ones, which are still needed for static points:
     other tools may have tracked only moving objects.
     """
-    own = tracking.from_flow(views, flow, pictures, sparser)
+    own = tracking.from_flow(views, flow, pictures, starts, least.track)
     others = taken.tracks(given, views)
     if others is None:
         return own, 0
@@ -271,8 +285,8 @@ def carried(views: Views, flow: NeighborFlow) -> float:
     return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
 
 
-def _moved(tracks, score, first):
-    long = tracks.seen.sum(1) >= min(SHORTEST_PATH, tracks.seen.shape[1])
+def _moved(tracks, score, first, shortest):
+    long = tracks.seen.sum(1) >= min(shortest, tracks.seen.shape[1])
     wanted = np.arange(len(score)) >= first
     which = np.flatnonzero(long & wanted & (score > MOVES))
     if len(which) > MOST_PATHS:

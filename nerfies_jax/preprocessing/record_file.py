@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.watch import Seconds
 
-VERSION = 13
+VERSION = 15
 
 
 class Evidence(NamedTuple):
@@ -30,6 +30,7 @@ class Evidence(NamedTuple):
     rest: RestPoints  # static point that explains each track best
     moved: np.ndarray  # [paths] tracks with a path
     paths: Paths
+    least_known: int  # minimum number of frames in which a usable path is known
     still: PointCloud  # dense static points
     unusable: str  # reason why tracking failed, or empty
     told: bool  # masks or tracks are external, so that even few of them are trusted
@@ -132,6 +133,7 @@ def load(path: pathlib.Path) -> Evidence:
             parts[name] = arrays[name]
     parts["seconds"] = Seconds(*(float(part) for part in parts["seconds"]))
     kinds_of_one = {"unusable": str, "left_out": str, "told": bool, "factor": int}
+    kinds_of_one["least_known"] = int
     kinds_of_one["depth_miss"] = float
     parts |= {name: kind(parts[name]) for name, kind in kinds_of_one.items()}
     flow = parts["flow"]

@@ -11,9 +11,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from nerfies_jax.preprocessing import bundle, rigid_groups
+from nerfies_jax.preprocessing import body_scale, bundle, rigid_groups
 from nerfies_jax.preprocessing.bundle import Body
 from nerfies_jax.preprocessing.paths import Paths
+from nerfies_jax.preprocessing.rest_points import track_rays
 from nerfies_jax.preprocessing.tracks import TRACK_PX, Tracks
 from nerfies_jax.preprocessing.view_set import Views
 
@@ -31,6 +32,14 @@ BADLY_TOLD = 0.05
 FEWEST_SEEN = 6  # visible tracks that determine the pose of a body in a frame
 GROWTHS = 5  # rounds in which a body is extended to more frames
 LEAST_KNOWN = 6  # frames in which a path is known
+# Paths of short tracks are too uncertain for grouping, so the tracks that one object
+# explains are found by its adjustment, with more tracks in fewer frames.
+MOST_OF_SHORT, MOST_BODIES = 1000, 3
+ROUNDS_OF_SHORT = 3  # work relative to that of long tracks
+LEAST_OF_SHORT = 0.1  # minimum share of all tracks that another object is sought in
+MOST_DEVIATION = (
+    0.25  # of a scale from smoothness. Otherwise that of the paths is used.
+)
 
 
 def refined(
@@ -83,8 +92,89 @@ def refined(
     return Paths(position, known, depth, paths.depth_deviation)
 
 
-def _work(own, paths):
-    return min(len(own), MOST) * paths.known.shape[1] ** 2
+def refined_short(
+    views: Views,
+    tracks: Tracks,
+    paths: Paths,
+    least_known: int,
+    has_room: Callable[[int], bool] = lambda terms: True,
+) -> Paths:
+    """Fit rigid objects to tracks of few frames, whose own paths are too near.
+
+    The scale of an object follows from the smoothness of its motion, where this
+    determines it. Other paths are not known, unless no object is found and they are
+    long.
+
+    Args:
+      views: The frames.
+      tracks: The tracks.
+      paths: Their paths.
+      least_known: Minimum number of frames of a path on an object.
+      has_room: As for `refined`.
+
+    Returns:
+      The paths.
+    """
+    position, known = paths.position.copy(), paths.known.copy()
+    deviation = paths.depth_deviation.copy()
+    known[known.sum(1) < LEAST_KNOWN] = False
+    left = tracks.seen.sum(1) >= least_known
+    fewest = max(FEWEST, LEAST_OF_SHORT * left.sum())
+    for number in range(MOST_BODIES):
+        rows = np.flatnonzero(left)
+        if len(rows) < fewest or not has_room(
+            ROUNDS_OF_SHORT * _work(rows, paths, MOST_OF_SHORT)
+        ):
+            break
+        flat = _at_one_depth(views, tracks, paths)
+        found = _body(views, tracks, flat, rows, MOST_OF_SHORT)
+        if found is None:
+            break
+        own, body = found
+        there = flat.known[own].sum(0) >= FEWEST_SEEN
+        body, miss = _on(views, tracks, flat, body, rows, there, least_known)
+        fits = miss < WITHIN_PX
+        if fits.sum() < FEWEST:
+            break
+        own, body = rows[fits], body._replace(point=body.point[fits])
+        seen = tracks.seen[own] & there
+        shown = np.flatnonzero(seen.sum(0) >= FEWEST_SEEN)
+        center = body.world()[:, shown].mean(0)
+        scale = body_scale.from_smoothness(
+            views.time[shown], views.position[shown], center
+        )
+        is_determined = scale.deviation < MOST_DEVIATION
+        if number and not is_determined:
+            break
+        if is_determined:
+            position[own] = bundle.scaled(views, body, scale.factor).world()
+            known[own] = seen
+        else:
+            position[own], known[own] = _at_paths_scale(views, paths, own, body)
+        deviation[own] = scale.deviation
+        left[own] = False
+        known[left] = False
+    depth = views.depth_of(position)
+    known &= np.nan_to_num(depth, nan=-1.0) > 0
+    return Paths(position, known, depth, deviation)
+
+
+def _at_one_depth(views, tracks, paths):
+    """Place all points at one depth.
+
+    The adjustment of a rigid object converges from there, while paths of few frames are
+    at depths that differ by more than the size of the object.
+    """
+    depth = np.median(paths.depth[paths.known]) if paths.known.any() else 1.0
+    position = views.position + depth * track_rays(views, tracks)
+    position = np.where(tracks.seen[..., None], position, np.nan)
+    return paths._replace(
+        position=position, known=tracks.seen, depth=np.where(tracks.seen, depth, np.nan)
+    )
+
+
+def _work(own, paths, most=MOST):
+    return min(len(own), most) * paths.known.shape[1] ** 2
 
 
 def _some_frames(views, tracks, paths, every):
@@ -140,9 +230,9 @@ def _grown(views, tracks, paths, own, rows, has_room):
     return rows[fits], body._replace(point=body.point[fits])
 
 
-def _body(views, tracks, paths, own):
+def _body(views, tracks, paths, own, most=MOST):
     """Return tracks on one rigid object, and the object, or None."""
-    own = _fewer(paths, own)
+    own = _fewer(paths, own, most)
     for _ in range(2):  # a second time without the outliers
         body = _first(paths, own)
         seen = bundle.sight(views, tracks.take(own), paths.known[own])
@@ -157,10 +247,10 @@ def _body(views, tracks, paths, own):
     return own, body
 
 
-def _fewer(paths, own):
-    """Select at most `MOST` tracks, first those visible in frames with few tracks."""
+def _fewer(paths, own, most=MOST):
+    """Select at most `most` tracks, first those visible in frames with few tracks."""
     rare = paths.known[own] / np.maximum(paths.known[own].sum(0), 1)
-    return own[np.argsort(-rare.sum(1), kind="stable")[:MOST]]
+    return own[np.argsort(-rare.sum(1), kind="stable")[:most]]
 
 
 def _first(paths, own):
@@ -173,7 +263,7 @@ def _first(paths, own):
     return Body(point - middle, motion.rotation[0], shift)
 
 
-def _on(views, tracks, paths, body, rows, there):
+def _on(views, tracks, paths, body, rows, there, least_known=LEAST_KNOWN):
     """Return the body with a point for each path, and reprojection errors in px.
 
     Only the frames `there` are used. The error is infinite if a path is known in too
@@ -183,7 +273,7 @@ def _on(views, tracks, paths, body, rows, there):
     local = paths.position[rows] - body.shift
     local = np.einsum("fji,nfj->nfi", body.rotation, local)
     local = np.where(known[..., None], local, np.nan)
-    enough = known.sum(1) >= LEAST_KNOWN
+    enough = known.sum(1) >= least_known
     point = np.zeros((len(rows), 3))
     point[enough] = np.nanmedian(local[enough], axis=1)
     seen = bundle.sight(views, tracks.take(rows), known & enough[:, None])

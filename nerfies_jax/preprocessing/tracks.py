@@ -12,6 +12,7 @@ from nerfies_jax.preprocessing.view_set import Views
 # Starting points: columns of a grid over the width of an image, and interval between
 # frames with a grid. These are about 10,000 tracks for 60 frames of any size.
 GRID_STEPS, EVERY_FRAMES = 29, 3
+MOST_ON_MASK = 20_000  # starting points on moving pixels
 MOST_PLACES = 30_000_000  # tracks times frames, at about 30 bytes each
 SHORTEST = 8  # minimum number of frames
 # Errors of flow accumulate along a track, so each point is aligned with the frame in
@@ -90,6 +91,24 @@ def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
     return np.concatenate(starts)
 
 
+def grid_on(mask: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Return starting points on the pixels of a mask, on a finer grid in all frames.
+
+    Args:
+      mask: Pixels to start from, [frames, height, width] bool.
+      seed: Seed for the choice if there are more than `MOST_ON_MASK`.
+
+    Returns:
+      Frame, column and row in pixels, [starts, 3].
+    """
+    step = max(round(mask.shape[2] / GRID_STEPS / 2), 1)
+    starts = np.argwhere(mask[:, ::step, ::step])[:, [0, 2, 1]] * [1, step, step]
+    if len(starts) > MOST_ON_MASK:
+        rng = np.random.default_rng(seed)
+        starts = starts[np.sort(rng.choice(len(starts), MOST_ON_MASK, replace=False))]
+    return starts + np.array([0, 0.5, 0.5])
+
+
 def work(views: Views, sparser: int = 1) -> int:
     """Return the work of the tracks of a grid.
 
@@ -154,21 +173,17 @@ def _step(pixel, shift, usable):
     return moved, kept
 
 
-def long_enough(tracks: Tracks) -> Tracks:
+def long_enough(tracks: Tracks, frames: int = SHORTEST) -> Tracks:
     """Select long tracks.
 
     Args:
       tracks: The tracks.
+      frames: Minimum number of frames. In shorter videos, tracks span all frames.
 
     Returns:
-      The long ones, by `_is_long`.
+      The long ones.
     """
-    return tracks.take(_is_long(tracks))
-
-
-def _is_long(tracks: Tracks) -> np.ndarray:
-    """Find tracks of at least `SHORTEST` frames, or of a whole shorter video."""
-    return tracks.seen.sum(1) >= min(SHORTEST, tracks.seen.shape[1])
+    return tracks.take(tracks.seen.sum(1) >= min(frames, tracks.seen.shape[1]))
 
 
 def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tracks:
@@ -220,18 +235,24 @@ def _enlarged(pixel, times):
 
 
 def from_flow(
-    views: Views, flow: NeighborFlow, pictures: np.ndarray, sparser: int = 1
+    views: Views,
+    flow: NeighborFlow,
+    images: np.ndarray,
+    starts: np.ndarray | None = None,
+    shortest: int = SHORTEST,
 ) -> Tracks:
-    """Track points from a regular grid through a video.
+    """Track points through a video.
 
     Args:
       views: The frames.
       flow: Flow between neighboring frames.
-      pictures: Enlarged images from `dense_flow.leveled`.
-      sparser: As for `grid`.
+      images: Enlarged images from `dense_flow.leveled`.
+      starts: Starting points. None for those of `grid`.
+      shortest: Minimum number of frames of a track.
 
     Returns:
       Long tracks, static and moving ones.
     """
-    tracks = long_enough(chain(flow, grid(views, sparser)))
-    return long_enough(realigned(tracks, pictures, views.size))
+    starts = grid(views) if starts is None else starts
+    tracks = long_enough(chain(flow, starts), shortest)
+    return long_enough(realigned(tracks, images, views.size), shortest)

@@ -14,7 +14,6 @@ from nerfies_jax.preprocessing.moving import picture_scale
 from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.training.track_start import TrackStartSpec
 
-LEAST_SEEN = 6  # minimum number of frames in which a path is known
 # Minimum share of the moving pixels of all frames that have a known path near them.
 # With less, most of what moves would have a motion that nothing determines.
 LEAST_COVERAGE = 0.1
@@ -111,7 +110,7 @@ def coverage(evidence: Evidence) -> float:
 
 def _is_known(evidence):
     """Find the paths that are known in enough frames."""
-    return evidence.paths.known.sum(1) >= LEAST_SEEN
+    return evidence.paths.known.sum(1) >= evidence.least_known
 
 
 def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
@@ -138,7 +137,7 @@ def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
 
 
 def known_paths(evidence: Evidence) -> KnownPaths:
-    """Select the paths that are known in at least `LEAST_SEEN` frames.
+    """Select the paths that are known in enough frames.
 
     Args:
       evidence: Preprocessing.
