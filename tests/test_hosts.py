@@ -4,15 +4,19 @@ import dataclasses
 import os
 import pathlib
 import pickle
+import signal
 import socket
 import subprocess
 import sys
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental import multihost_utils
 
+from nerfies_jax.runs import multiple_hosts
 from nerfies_jax.runtime import data_parallel, hosts
 from nerfies_jax.training import follower
 from nerfies_jax.training.model import Event
@@ -103,6 +107,35 @@ def compare(spec, capture):
             # Adam amplifies the rounding of gradients close to zero.
             new, old = np.asarray(new, float), np.asarray(old, float)
             assert np.linalg.norm(new - old) <= 1e-4 * np.linalg.norm(old)
+
+
+def lose_the_other():
+    """End process 1 while process 0 trains, whose steps then fail."""
+    connected()
+    both = multihost_utils.broadcast_one_to_all
+    both(np.ones(3))  # connects the devices
+    hosts.meet()
+    if not hosts.leads():
+        os.kill(os.getpid(), signal.SIGKILL)
+    run = types.SimpleNamespace(code=(), model=types.SimpleNamespace(devices=2))
+    multiple_hosts.rebuilt = lambda run: run
+    try:
+        with hosts.dismissing(), multiple_hosts.sharing(pathlib.Path("RUN"), run):
+            while True:
+                np.asarray(both(np.ones(3)))
+    except hosts.Lost as error:
+        sys.exit(f"error: {error}")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL")
+def test_the_death_of_a_host_ends_process_0_with_its_error():
+    """JAX would wait for the dead process, and abort."""
+    first, second = started("from tests import test_hosts as t; t.lose_the_other()")
+    code, output = ended(first)
+    assert code == hosts.LOST_CODE, output
+    assert "error: RUN: training on 2 processes failed (" in output
+    assert ended(second)[0] == -signal.SIGKILL
 
 
 @pytest.mark.full

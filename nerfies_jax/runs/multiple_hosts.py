@@ -59,7 +59,10 @@ def sharing(folder: pathlib.Path, run: Run) -> Iterator[Run]:
         )
         try:
             yield shared
-        except jax.errors.JaxRuntimeError as error:
+        except (jax.errors.JaxRuntimeError, ValueError) as error:
+            if not hosts.is_loss(error):
+                raise
+            hosts.abandon()
             reason = str(error).splitlines()[0]
             raise hosts.Lost(
                 f"{folder}: training on {jax.process_count()} processes failed "

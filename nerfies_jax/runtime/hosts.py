@@ -7,8 +7,11 @@ cannot disagree. Messages go through the coordination service of JAX, and arrays
 its collectives. If a process dies, the service ends the others.
 """
 
+import atexit
 import contextlib
 import json
+import os
+import sys
 import weakref
 from collections.abc import Iterator
 from typing import Any
@@ -31,6 +34,9 @@ _messages = 0  # sent or received by this process
 _barriers = 0
 # Leaves of the state that the last chunk returned, which all processes have.
 _sent_leaves: list[weakref.ref] = []
+
+
+LOST_CODE = 2  # exit code, that of other errors which are not bugs
 
 
 class Lost(ValueError):
@@ -113,6 +119,36 @@ def dismissing() -> Iterator[None]:
     finally:
         if leads():
             send(END, error=error)
+
+
+def is_loss(error: Exception) -> bool:
+    """Test if an error of a program can come from the death of another process.
+
+    Args:
+      error: The error.
+
+    Returns:
+      True for errors of the runtime. JAX raises those of collectives on CPUs as a
+      ValueError if they occur before a program returns.
+    """
+    return isinstance(error, jax.errors.JaxRuntimeError) or (
+        isinstance(error, ValueError) and "Gloo" in str(error)
+    )
+
+
+def abandon() -> None:
+    """Let this process end with `LOST_CODE`, because another process has died.
+
+    At exit, JAX would wait for the dead process, and abort after `SHUTDOWN_SECONDS`.
+    """
+    atexit.register(_end_at_once)  # called before the functions that JAX has registered
+
+
+def _end_at_once():
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):  # closed
+            stream.flush()
+    os._exit(LOST_CODE)
 
 
 def send(kind: str, **content: Any) -> None:
