@@ -74,7 +74,7 @@ class Reconstruct:
     """Number of devices that share a training step: the views of splats (batch_size),
     or bands of the image of one view, or the rays of a field (micro_batches). The
     result is that of one device up to rounding (default: all; of a CPU, as many as it
-    has cores and the step has parts)."""
+    has cores and the step has parts; one for the image of one view)."""
     coordinator: str | None = None
     """Train on several hosts, on each of which this command is started: HOST:PORT at
     which the first process listens, with --processes and --process, or auto if Slurm

@@ -71,8 +71,10 @@ def test_devices_take_equal_shares(shares, most, used, monkeypatch):
     assert data_parallel.device_count(shares) == used
 
 
-def test_a_divisible_share_takes_all_devices(monkeypatch):
-    monkeypatch.setattr(jax, "local_device_count", lambda: 3)
+def test_a_divisible_share_takes_the_devices_that_are_asked_for(monkeypatch):
+    monkeypatch.setattr(jax, "local_device_count", lambda: 4)
+    assert data_parallel.device_count(1, divisible=True) == 1  # not by itself
+    monkeypatch.setattr(data_parallel, "_limit", 3)
     assert data_parallel.device_count(1, divisible=True) == 3
     assert data_parallel.device_count(2, divisible=True) == 2
     monkeypatch.setattr(jax, "process_count", lambda: 2)
