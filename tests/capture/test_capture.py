@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from nerfies_jax.capture import capture as capturing
-from nerfies_jax.capture import frames as frames_of_files
-from nerfies_jax.capture import name_times
+from nerfies_jax.capture import name_times, splits
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.geometry import camera
 from tests import scenes
@@ -64,7 +63,7 @@ def test_lengths_that_float32_cannot_compute_with_are_refused(changes, what):
     [(2, 8, []), (3, 8, [1]), (5, 8, [2]), (60, 1000, [30]), (16, 8, [4, 12])],
 )
 def test_few_frames_hold_one_out_and_two_none(count, every, expected):
-    learned, scored = frames_of_files.hold_out_every(count, every, "here")
+    learned, scored = splits.hold_out_every(count, every, "here")
     assert scored.tolist() == expected
     assert sorted([*learned, *scored]) == list(range(count))
 

@@ -34,9 +34,11 @@ def test_a_run_is_no_capture(tmp_path):
     run = tmp_path / "run"
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.json").write_text("{}")
-    for look in (run_folder.newest_of, preparation.prepare):
-        with pytest.raises(ValueError, match=r"a run folder, .* runs\.resume\("):
-            look(run, tmp_path / "out")
+    refusal = r"a run folder, .* runs\.resume\("
+    with pytest.raises(ValueError, match=refusal):
+        run_folder.newest_of(run)
+    with pytest.raises(ValueError, match=refusal):
+        preparation.prepare(run, tmp_path / "out")
     with pytest.raises(reconstruction.Refused, match="a run folder, not a capture"):
         reconstruction.reconstruct(RunConfig(None, CaptureSource(run)))
 
