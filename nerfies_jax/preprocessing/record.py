@@ -69,6 +69,8 @@ def gather(
     capture: Capture,
     use_depths: bool = False,
     tell: Callable[[str], None] = lambda part: None,
+    *,
+    rough_cameras: bool = False,
 ) -> Evidence:
     """Preprocess a capture, in about 0.25 s per frame of 176x132 or 480x270.
 
@@ -80,15 +82,17 @@ def gather(
         here.
       use_depths: True to constrain paths by the depth maps of the capture, if any.
       tell: Called with the name of each part when it begins, and with skipped parts.
+      rough_cameras: True if the cameras are only estimated from images that may show
+        motion. Short tracks would take their errors for motion.
 
     Returns:
       The results, with the names of skipped parts.
     """
     with contextlib.closing(Watch(tell, capture.preprocessing * ENOUGH_WORK)) as watch:
-        return _gathered(capture, use_depths, watch)
+        return _gathered(capture, use_depths, rough_cameras, watch)
 
 
-def _gathered(capture, use_depths, watch):
+def _gathered(capture, use_depths, rough_cameras, watch):
     watch.begin("flow")
     capture = pinholes.as_pinholes(capture)
     factor, given = _factor(capture), capture.given or Given(capture.size)
@@ -99,9 +103,14 @@ def _gathered(capture, use_depths, watch):
     # Images of one moment are no video: there is nothing to search twice for.
     film = np.ptp(views.time) > 0
     span = view_set.depth_span(capture, views) if film else None
-    least = short_tracks.USUAL if span is None else short_tracks.lengths(views, span)
+    is_computed = flow is None
     if flow is None:
-        flow = _flow(views, pictures, span, least, watch)
+        flow = _flow(views, pictures, span, watch)
+    least = short_tracks.USUAL
+    if span is not None and not rough_cameras:
+        least = short_tracks.lengths(views, span, carried(views, flow))
+    if is_computed and least == short_tracks.SHORT:
+        flow = _recovered(views, pictures, flow, watch)
     watch.begin("tracks")
     every = 1e-6 * A_TRACK_FRAME * tracking.work(views)
     few = not watch.has_room(FOR_TRACKS, "half of the tracks", every)
@@ -158,18 +167,26 @@ def _gathered(capture, use_depths, watch):
     )
 
 
-def _flow(views, pictures, span, least, watch):
-    pixels = dense_flow.searched_pixels(views, pictures)
-    a_search = 1e-6 * A_SEARCHED_PIXEL * pixels
+def _search_work(views, pictures):
+    """Return the work of one search for flow."""
+    return 1e-6 * A_SEARCHED_PIXEL * dense_flow.searched_pixels(views, pictures)
+
+
+def _flow(views, pictures, span, watch):
+    a_search = _search_work(views, pictures)
     watch.spend(2 * (len(views.row) - 1) * a_search)
 
     def room_for(count):
         what, each = "a second search for flow", dense_flow.SECOND_LOOK * a_search
         return watch.room_for(count, FOR_WIDE_STEPS, what, each)
 
-    flow = dense_flow.between_neighbors(views, pictures, span, room_for)
-    frames = [] if least == short_tracks.USUAL else lost_regions.pairs(views, flow)
-    each = lost_regions.SEARCHES * a_search
+    return dense_flow.between_neighbors(views, pictures, span, room_for)
+
+
+def _recovered(views, pictures, flow, watch):
+    """Search for the flow of lost regions, within the budget."""
+    frames = lost_regions.pairs(views, flow)
+    each = lost_regions.SEARCHES * _search_work(views, pictures)
     room = watch.room_for(len(frames), FOR_WIDE_STEPS, "flow of lost regions", each)
     return lost_regions.recovered(views, pictures, flow, frames[:room])
 

@@ -19,6 +19,10 @@ from nerfies_jax.preprocessing.watch import A_TRACK_FRAME, Watch
 # Median angle between two positions of the camera, seen from the scene, above which
 # tracks may be short. It is 0.17 for `rig`, and 0.06 or less for other built-in scenes.
 WIDE_RAD = 0.1
+# Minimum share of textured pixels with consistent flow to the next frame. Without flow,
+# short tracks are chance: photographs of a static scene in no order (`static-20`) have
+# 0.56, and would show motion. `rig` has 0.79.
+LEAST_CARRIED = 0.7
 FOR_MORE = 0.6  # share of the budget above which no more tracks are added
 
 
@@ -34,17 +38,19 @@ USUAL = Lengths(tracking.SHORTEST, 10, rigid_bodies.LEAST_KNOWN)
 SHORT = Lengths(3, 3, 3)
 
 
-def lengths(views: Views, span: tuple[float, float]) -> Lengths:
+def lengths(views: Views, span: tuple[float, float], carried: float) -> Lengths:
     """Return the minimum lengths of tracks and paths.
 
     Args:
       views: The frames.
       span: Nearest and farthest z-depth in scene units.
+      carried: Share of the textured pixels with consistent flow to the next frame.
 
     Returns:
-      `SHORT` if the cameras move far between frames, otherwise `USUAL`.
+      `SHORT` if the cameras move far between frames with consistent flow, otherwise
+      `USUAL`.
     """
-    if len(views.row) < 2:
+    if len(views.row) < 2 or carried < LEAST_CARRIED:
         return USUAL
     step = np.median(np.linalg.norm(np.diff(views.position, axis=0), axis=-1))
     distance = 2 / (1 / span[0] + 1 / span[1])

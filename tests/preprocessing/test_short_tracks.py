@@ -100,12 +100,14 @@ def test_tracks_without_a_body_are_known_if_they_are_long():
     np.testing.assert_array_equal(fitted.known, alone.known & long[:, None])
 
 
-def test_short_tracks_are_for_cameras_far_from_each_other():
-    assert short_tracks.lengths(rig(), SPAN) == short_tracks.SHORT
+def test_short_tracks_are_for_cameras_far_apart_with_flow_between_them():
+    assert short_tracks.lengths(rig(), SPAN, 0.8) == short_tracks.SHORT
+    shuffled = short_tracks.lengths(rig(), SPAN, 0.6)
+    assert shuffled == short_tracks.USUAL
     near = rig(step=0.02, rise=0.0)
-    assert short_tracks.lengths(near, SPAN) == short_tracks.USUAL
+    assert short_tracks.lengths(near, SPAN, 1.0) == short_tracks.USUAL
     turning = near._replace(position=np.zeros((FRAMES, 3)))
-    assert short_tracks.lengths(turning, SPAN) == short_tracks.USUAL
+    assert short_tracks.lengths(turning, SPAN, 1.0) == short_tracks.USUAL
 
 
 def test_a_region_that_jumps_is_found_again():

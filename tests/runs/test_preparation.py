@@ -110,7 +110,8 @@ def test_masks_are_of_every_frame_and_of_its_size(monkeypatch):
     small = np.random.default_rng(0).random((7, 7, 10)) < 0.2  # a quarter, and 2 rest
     moving = types.SimpleNamespace(unusable="", moving=small, row=order, factor=4)
 
-    def gather(mapper):
+    def gather(mapper, rough_cameras):
+        assert rough_cameras  # of the first pass
         assert mapper.train.tolist() == list(range(7))  # held-out ones too
         return moving
 
