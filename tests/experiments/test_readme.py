@@ -54,9 +54,10 @@ def test_the_table_of_presets_shows_kept_numbers():
         assert f"{number:.2f}" == value, preset
 
 
-def test_the_default_leads_at_every_time_where_the_scene_moves():
-    """As README says below the figure."""
-    assert "`splats-tracked` leads at every time, and after 10\nseconds it" in README
+def test_the_curves_are_as_the_text_below_them_says():
+    text = " ".join(README.split())
+    assert "`splats-tracked` leads at every time, and after 10 seconds it" in text
+    assert "Where nothing moves, `splats-static` leads from 30 seconds on" in text
     path = ROOT / "experiments/measured/benchmark.json"
     shown = curves.panels(json.loads(path.read_text()))
     moving = [lines for title, lines in shown.items() if "motion" in title]
@@ -69,6 +70,11 @@ def test_the_default_leads_at_every_time_where_the_scene_moves():
         after_ten = curves.psnr_at(lines["tracked"], 10)
         fields = [lines[name].psnr[-1] for name in lines if name.endswith("-grid")]
         assert all(after_ten > at_the_end for at_the_end in fields)
+    (static,) = (lines for title, lines in shown.items() if "motion" not in title)
+    for at in (x for x in curves.TIMES if x >= 30):
+        scores = {name: curves.psnr_at(line, at) for name, line in static.items()}
+        known = {name: x for name, x in scores.items() if x is not None}
+        assert max(known, key=known.get) == "static"
 
 
 def test_every_link_leads_to_a_file():
