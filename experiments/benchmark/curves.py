@@ -1,7 +1,5 @@
 """Quality over processor time: the figure of the suite `curves`, and its table."""
 
-import hashlib
-import json
 import math
 import pathlib
 import statistics
@@ -30,7 +28,6 @@ STYLES = {
     "d-nerf-grid": ("d-nerf-grid", "#0e7490", "--"),
     "nerf-grid": ("nerf-grid", "#6b7280", "--"),
 }
-DIGEST = "Digest"  # key of the digest of the plotted numbers in the PNG
 TIMES = (5, 10, 20, 40, 80)  # processor seconds of the columns of the table
 
 
@@ -133,18 +130,6 @@ def panels(stored: Mapping[str, Any]) -> dict[str, dict[str, Line]]:
     return {title: curves for title, curves in collected.items() if curves}
 
 
-def digest(stored: Mapping[str, Any]) -> str:
-    """Return a digest of the numbers that the figure shows.
-
-    Args:
-      stored: The stored results.
-
-    Returns:
-      Hexadecimal digits, which the PNG keeps under `DIGEST`.
-    """
-    return hashlib.sha256(json.dumps(panels(stored)).encode()).hexdigest()
-
-
 def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
     """Plot PSNR over processor seconds, with one panel for each scene.
 
@@ -157,7 +142,6 @@ def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
     Raises:
       MissingExtra: If matplotlib is not installed.
     """
-    from nerfies_jax.capture.json_files import replaced_file
     from nerfies_jax.visualization import figures
 
     panel_list = panels(stored)
@@ -174,8 +158,7 @@ def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
     # Positions of the labels depend on the limits that all panels share.
     for axes, curves in zip(all_axes, panel_list.values(), strict=True):
         _label(axes, curves)
-    with replaced_file(path) as partial:
-        figure.savefig(partial, facecolor="white", metadata={DIGEST: digest(stored)})
+    figures.save(figure, path, panel_list)
 
 
 def _draw_panel(axes, title, curves):

@@ -1,7 +1,5 @@
 """The page of `experiments.growth` in docs/results, and its figure."""
 
-import hashlib
-import json
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +7,6 @@ from typing import Any
 from experiments import markdown
 from experiments.growth.axes import AXES, fit
 
-DIGEST = "Digest"  # key of the digest of the plotted numbers in the PNG
 STEPS = 30_000  # of a run at the size of the papers
 CLIP_FRAMES, CLIP_PIXELS = 300 * 30, 1920 * 1080  # five minutes at 30 frames per second
 CAPTURES = 1_000
@@ -38,7 +35,7 @@ def page(stored: Mapping[str, Any]) -> str:
     Returns:
       Markdown.
     """
-    axes = _with_memory(stored)
+    axes = plotted(stored)
     steepest = {
         name: fit(points, "cpu_seconds").steepest for name, points in axes.items()
     }
@@ -55,8 +52,15 @@ def page(stored: Mapping[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def _with_memory(stored):
-    """Return the measurements in the order of `AXES`, with the memory of a step."""
+def plotted(stored: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float]]]:
+    """Return the measurements in the order of `AXES`, with the memory of a step.
+
+    Args:
+      stored: The stored results.
+
+    Returns:
+      Measurements by axis and size.
+    """
     return {
         name: {
             size: point | {"memory": point["temporary_bytes"] + point["input_bytes"]}
@@ -143,18 +147,6 @@ def _goal(goal, point, needed, available):
     ]
 
 
-def digest(stored: Mapping[str, Any]) -> str:
-    """Return a digest of the numbers that the figure shows.
-
-    Args:
-      stored: The stored results.
-
-    Returns:
-      Hexadecimal digits, which the PNG keeps under `DIGEST`.
-    """
-    return hashlib.sha256(json.dumps(_with_memory(stored)).encode()).hexdigest()
-
-
 def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
     """Plot time and memory over all sizes, each relative to the smallest.
 
@@ -165,15 +157,15 @@ def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
     Raises:
       MissingExtra: If matplotlib is not installed.
     """
-    from nerfies_jax.capture.json_files import replaced_file
     from nerfies_jax.visualization import figures
 
+    plotted_axes = plotted(stored)
     figure = figures.new_figure(figsize=(8.4, 3.9), dpi=200, layout="constrained")
     panels = figure.subplots(1, 2, sharex=True)
     titles = {"cpu_seconds": "time of a step", "memory": "memory of a step"}
     for axes, (key, title) in zip(panels, titles.items(), strict=True):
         most = 1.0
-        for name, points in _with_memory(stored).items():
+        for name, points in plotted_axes.items():
             sizes = [int(size) / int(next(iter(points))) for size in points]
             values = [point[key] for point in points.values()]
             relative = [value / values[0] for value in values]
@@ -188,5 +180,4 @@ def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
     panels[0].legend(fontsize=7, frameon=False)
     panels[0].set_ylabel("relative to the smallest size", fontsize=9)
     figure.supxlabel("size, relative to the smallest", fontsize=9)
-    with replaced_file(path) as partial:
-        figure.savefig(partial, facecolor="white", metadata={DIGEST: digest(stored)})
+    figures.save(figure, path, plotted_axes)

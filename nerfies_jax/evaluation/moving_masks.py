@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.preprocessing import findings, frame_masks, inspection, record
+from nerfies_jax.preprocessing import frame_masks, motion, record, view_set
 
 MAX_PIXELS = 4_000_000  # of all frames together, which take 45 s on one core
 
@@ -44,11 +44,12 @@ def with_masks(capture: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
             f"Dynamic regions are not evaluated separately, because the capture has no "
             f"masks and tracking failed: {unusable}."
         )
-    (motion,) = inspection.find(video, (findings.MOTION,), folder)
-    if motion.wanted is False:
+    views = view_set.in_time_order(record.looked_at(video, evidence.factor))
+    finding = motion.motion(views, evidence)
+    if finding.wanted is False:
         return capture, (
             "Dynamic regions are not evaluated separately, because nothing moves: "
-            f"{motion.evidence}."
+            f"{finding.evidence}."
         )
     for row, mask in zip(rows, frame_masks.of_frames(evidence, video), strict=True):
         moving[row] = frame_masks.enlarged(mask, factor, capture.size)

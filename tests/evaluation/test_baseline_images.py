@@ -11,7 +11,7 @@ from nerfies_jax.capture import pinholes
 from nerfies_jax.evaluation import baseline_images, moving_masks
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.rays import pixel_rays
-from nerfies_jax.preprocessing import findings, inspection, record
+from nerfies_jax.preprocessing import findings, motion, record
 from nerfies_jax.runs import baselines_text
 from nerfies_jax.training.model import Rendering, TrainState
 from tests.preprocessing import films
@@ -179,7 +179,7 @@ def looked(tmp_path, monkeypatch):
 
     monkeypatch.setattr(record, "cached", cached)
     moves = findings.Finding(findings.MOTION, "", "", True, findings.CERTAIN)
-    monkeypatch.setattr(inspection, "find", lambda *_: (moves,))
+    monkeypatch.setattr(motion, "motion", lambda *_: moves)
     width, height = films.SIZE
     monkeypatch.setattr(moving_masks, "MAX_PIXELS", 12 * width * height // 4)
     return looked_at
@@ -222,7 +222,7 @@ def test_masks_of_what_moves_come_from_all_frames(lens, looked, tmp_path):
 
 def test_nothing_moves_so_no_mask_is_evaluated(looked, tmp_path, monkeypatch):
     rest = findings.Finding(findings.MOTION, "0 of 9", "", False, findings.LIKELY)
-    monkeypatch.setattr(inspection, "find", lambda *_: (rest,))
+    monkeypatch.setattr(motion, "motion", lambda *_: rest)
     capture = without_masks()
     masked, note = moving_masks.with_masks(capture, tmp_path)
     assert masked is capture

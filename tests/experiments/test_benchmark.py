@@ -21,6 +21,7 @@ from nerfies_jax.runs import representations
 from nerfies_jax.runs.config import RunConfig
 from nerfies_jax.runs.run import scene_spec
 from nerfies_jax.training import specs
+from nerfies_jax.visualization import figures
 from tests.experiments import stand_in_run
 
 
@@ -111,7 +112,7 @@ def test_curves_are_averaged_over_the_steps_that_all_seeds_have(tmp_path):
     stored = {"benchmarks": {"--scene fast --suite curves": rows}}
     curves.draw(stored, tmp_path / "curves.png")
     with PIL.Image.open(tmp_path / "curves.png") as picture:
-        assert picture.text[curves.DIGEST] == curves.digest(stored)
+        assert picture.text[figures.DIGEST] == figures.digest(curves.panels(stored))
 
 
 def test_labels_of_lines_that_end_together_do_not_overlap():

@@ -9,6 +9,7 @@ from experiments import results
 from experiments.benchmark import curves
 from experiments.growth import page as growth
 from experiments.results import PAGES, REVISIONS, ROOT, STUDIES
+from nerfies_jax.visualization import figures
 
 
 @pytest.mark.parametrize("name", results.kept())
@@ -22,14 +23,14 @@ def test_the_figure_shows_the_kept_numbers():
     assert path.exists() == bool(curves.panels(stored))
     if path.exists():
         with PIL.Image.open(path) as picture:
-            assert picture.text[curves.DIGEST] == curves.digest(stored)
+            assert picture.text[figures.DIGEST] == figures.digest(curves.panels(stored))
 
 
 @pytest.mark.skipif("growth" not in results.kept(), reason="no stored numbers")
 def test_the_figure_of_growth_shows_the_kept_numbers():
     stored = json.loads(results.path_of("growth").read_text())
     with PIL.Image.open(PAGES / "growth.png") as picture:
-        assert picture.text[growth.DIGEST] == growth.digest(stored)
+        assert picture.text[figures.DIGEST] == figures.digest(growth.plotted(stored))
 
 
 def test_the_index_lists_every_page_there_is():
