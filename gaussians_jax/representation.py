@@ -204,6 +204,14 @@ def advise(
     """Choose a preset and overrides for the needs of a capture.
 
     A `family` outside of `ADVISED` is kept, unless it has no motion and needs one.
+
+    Args:
+      wanted: Decisions of an inspection by effect, None where it is undecided.
+      full: True for presets of the published size, False for small ones.
+      family: Preset without its size that the user prefers, or None.
+
+    Returns:
+      The preset, the overrides and notes.
     """
     overrides, notes = [], []
     moves = wanted.get(MOTION)
@@ -291,6 +299,13 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
     an appearance model for photographs in changing light, and a polynomial per Gaussian
     otherwise. The number of Gaussians follows from the image size, the length of the
     tracks and the planned seconds of training.
+
+    Args:
+      capture: The capture.
+      seconds: Planned seconds of training, or None.
+
+    Returns:
+      The preset, the overrides and notes.
     """
     preprocessed = record.cached(capture, CACHE / "evidence")
     reason = usable_paths.unusable(preprocessed)

@@ -28,7 +28,15 @@ class AuxState(NamedTuple):
 
 
 def states_of(effects: tuple[SplatRecord, ...], params: Params) -> dict[str, PyTree]:
-    """Initialize the state of each component, on the host."""
+    """Initialize the state of each component, on the host.
+
+    Args:
+      effects: The components.
+      params: Initial parameters.
+
+    Returns:
+      States by the names of the components that have one.
+    """
     return {
         effect.name: effect.state(params)
         for effect in effects

@@ -131,7 +131,15 @@ def reduced(shift: np.ndarray, times: int) -> np.ndarray:
 
 
 def enlarged_flow(shift: np.ndarray, times: int) -> np.ndarray:
-    """Convert flow to flow between enlarged images. Inverts `reduced`."""
+    """Convert flow to flow between enlarged images. Inverts `reduced`.
+
+    Args:
+      shift: Displacements in pixels, [height, width, 2].
+      times: Integer enlargement of the images.
+
+    Returns:
+      Displacements in pixels of the enlarged images.
+    """
     size = times * shift.shape[1], times * shift.shape[0]
     return times * cv2.resize(np.ascontiguousarray(shift), size)
 
