@@ -2,6 +2,7 @@
 
     nerfies inspect_scene CAPTURE
     nerfies inspect_scene --scene transient
+    nerfies inspect_scene CAPTURE --seconds 60
 
 Prints a table of decisions and the commands to continue with, and writes a contact
 sheet.
@@ -24,6 +25,8 @@ class InspectScene:
     """Seed of the built-in scene."""
     full: bool = False
     """Advise presets of the papers' sizes instead of those for a CPU."""
+    seconds: float | None = None
+    """Seconds of training to advise presets for (default: complete runs)."""
     picture: pathlib.Path | None = None
     """Contact sheet, PNG (default: runs/inspect-CAPTURE.png, or the first of
     inspect-CAPTURE-2.png, ... that is free)."""
@@ -31,6 +34,8 @@ class InspectScene:
     """Write findings and advice to this file as well."""
 
     def __post_init__(self):
+        if self.seconds is not None and not self.seconds > 0:
+            raise ValueError(f"--seconds {self.seconds:g}: must be above 0")
         cli.check_out_file(self.picture, "--picture")
         cli.check_out_file(self.findings, "--findings")
 
@@ -54,8 +59,8 @@ def main(args):
         for line in (*describe(capture), "", *gate.table(capture), ""):
             console.say(line)
         inspected = inspection.inspect(capture, CACHE / "evidence")
-        advice = adviser.advise_all(inspected.findings, args.full)
-        for line in report(inspected, advice, source):
+        advice = adviser.advise_all(inspected.findings, args.full, args.seconds)
+        for line in report(inspected, advice, source, args.seconds):
             console.say(line)
         path = args.picture or _free(pathlib.Path("runs"), f"inspect-{_name(capture)}")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +73,7 @@ def main(args):
     return record
 
 
-def report(inspected, advice, source):
+def report(inspected, advice, source, seconds=None):
     """Format the table and the commands that follow from it."""
     from nerfies_jax.preprocessing import findings
     from nerfies_jax.runs import commands, prices
@@ -77,10 +82,11 @@ def report(inspected, advice, source):
     costs = prices.format_prices(inspected.findings)
     lines = ["", *findings.table(inspected.findings, costs), ""]
     lines += [prices.legend(), ""]
+    budget = "" if seconds is None else f" --seconds {seconds:g}"
     for one in advice:
         lines.append(f"{one.representation}:")
         config = RunConfig(one.preset, source, overrides=one.overrides)
-        lines.append(f"  {commands.reconstruct(config)}")
+        lines.append(f"  {commands.reconstruct(config)}{budget}")
         lines += [f"  note: {note}" for note in one.notes]
     lines.append(f"looked for {inspected.seconds:.0f} s")
     return lines

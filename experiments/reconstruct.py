@@ -46,9 +46,10 @@ class Reconstruct:
     edgs, d-miso, adc-gs, motion-gs. Radiance fields: nerf, nerf-w, d-nerf, t-nerf,
     nerfies, hypernerf, nsff, tineuvox, nerf-ds. Each has a version for a CPU with the
     suffix -small. nerf-grid, nerf-w-grid, d-nerf-grid, nerfies-grid, hypernerf-grid and
-    nsff-grid, on feature grids, exist with -small only (default: splats-tracked-small,
-    splats-static-small if nothing moves, splats-collection-small for photographs in
-    changing light, or spacetime-small without tracks if tracking fails)."""
+    nsff-grid, on feature grids, exist with -small only (default: the best measured in
+    the time of --seconds, which is splats-tracked-small, or splats-static-small if
+    nothing moves; splats-collection-small for photographs in changing light, and
+    spacetime-small without tracks if tracking fails)."""
     effects: Literal["preset", "auto"] | None = None
     """auto: inspect the capture first. Without --preset, compensation of exposures and
     a depth loss are enabled where they are certainly needed, and tried in a short run

@@ -68,6 +68,8 @@ class Study(NamedTuple):
     page: str  # of experiments, with `page(stored)`
     measured: str = ""  # the stored file, if it is not in experiments/measured
     figure: str = ""  # of experiments, with `draw(stored, path)`
+    # File of the library with what `advice(stored)` of the same module selects.
+    advice: str = ""
 
     @property
     def line(self) -> str:
@@ -90,6 +92,7 @@ STUDIES = {
     "benchmark": _package("quality of the default command", "benchmark")._replace(
         about="quality of the default command, and of methods over training time",
         figure="benchmark.curves",
+        advice="nerfies_jax/evaluation/method_curves.json",
     ),
     "ablate_tracked": _suite(
         "parts of the default preset", "--suite tracked --steps 900"
@@ -195,6 +198,7 @@ def main(args):
         pages = {name: PAGES / f"{name}.md" for name in args.pages or kept()}
         for name, path in pages.items():
             _draw(name)
+            _advise(name)
             _write(path, page(name))
             console.say(path)
         _write(PAGES / "README.md", index())
@@ -206,6 +210,18 @@ def _draw(name):
     if STUDIES[name].figure and path_of(name).exists():
         module = importlib.import_module(f"experiments.{STUDIES[name].figure}")
         module.draw(json.loads(path_of(name).read_text()), PAGES / f"{name}.png")
+
+
+def _advise(name):
+    """Write the file of the library that a page has, if there are numbers for it."""
+    from nerfies_jax.capture.json_files import write_json
+
+    study = STUDIES[name]
+    if study.advice:
+        module = importlib.import_module(f"experiments.{study.figure}")
+        selected = module.advice(json.loads(path_of(name).read_text()))
+        if selected:
+            write_json(ROOT / study.advice, selected)
 
 
 def _write(path, text):

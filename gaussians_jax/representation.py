@@ -11,6 +11,7 @@ from gaussians_jax.io import files, model_file
 from gaussians_jax.motion import anchor_motion, deformation
 from gaussians_jax.motion.anchors import AnchorMotionSpec
 from gaussians_jax.motion.basis import BasisMotionSpec
+from gaussians_jax.motion.se3_bases import SE3BasesSpec
 from gaussians_jax.player import browser_splats, page
 from gaussians_jax.scene import (
     first_state,
@@ -24,6 +25,7 @@ from gaussians_jax.scene import (
 from gaussians_jax.scene.spec import OF_MOTION, raster_of
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation import method_curves
 from nerfies_jax.evaluation.representation import (
     MODEL,
     Choice,
@@ -199,7 +201,10 @@ def player(
 
 
 def advise(
-    wanted: dict[str, bool | None], full: bool, family: str | None = None
+    wanted: dict[str, bool | None],
+    full: bool,
+    family: str | None = None,
+    seconds: float | int | None = None,
 ) -> Choice:
     """Choose a preset and overrides for the needs of a capture.
 
@@ -209,27 +214,27 @@ def advise(
       wanted: Decisions of an inspection by effect, None where it is undecided.
       full: True for presets of the published size, False for small ones.
       family: Preset without its size that the user prefers, or None.
+      seconds: Planned seconds of training, or None.
 
     Returns:
       The preset, the overrides and notes.
     """
-    overrides, notes = [], []
+    notes = []
     moves = wanted.get(MOTION)
-    preset = "splats-deformable" if full else UNTRACKED
+    preset, overrides = ("splats-deformable", []) if full else (UNTRACKED, [FROM_REST])
     if wanted.get(COLLECTION) and family in (None, *ADVISED):
         moves, family = False, OF_PHOTOGRAPHS
     if moves is not None:
-        preset = "splats-tracked" if moves else "splats-static"
+        best = _best(moves, seconds)
+        preset, overrides = best.preset.removesuffix("-small"), [*best.overrides]
     if family is not None and family not in ADVISED:
         if moves and _spec_of(family, full).motion is None:
             notes.append(
                 f"{MOTION}: preset {family} is static, so {preset} is used instead"
             )
         else:
-            preset = family
+            preset, overrides = family, []
     spec = _spec_of(preset, full)
-    if preset == UNTRACKED != family:
-        overrides.append(FROM_REST)
     if moves is False:
         present = (name for name in MOTION_PARTS if getattr(spec, name) is not None)
         overrides += [f"{name}=none" for name in present]
@@ -288,6 +293,11 @@ def _validates(spec: Any) -> bool:
     return all(part is None for part in parts)
 
 
+def _best(moves, seconds):
+    """Return the best measured small preset of a static or a moving scene."""
+    return method_curves.ranking(presets.PRESETS, moves, seconds)[0]
+
+
 def _spec_of(family, full):
     return presets.PRESETS[family if full else f"{family}-small"]
 
@@ -295,10 +305,11 @@ def _spec_of(family, full):
 def default_preset(capture: Capture, seconds: float | int | None = None) -> Choice:
     """Choose a small preset by the tracks of a capture, from the cache or computed.
 
-    SE(3) bases are used if there are usable tracks, no motion if the scene is static,
-    an appearance model for photographs in changing light, and a polynomial per Gaussian
-    otherwise. The number of Gaussians follows from the image size, the length of the
-    tracks and the planned seconds of training.
+    With usable tracks, and for a static scene, it is the best that was measured in the
+    planned time (`method_curves.ranking`). Photographs in changing light get an
+    appearance model, and motion without usable tracks a polynomial per Gaussian. The
+    number of Gaussians follows from the image size, the length of the tracks and the
+    planned seconds of training.
 
     Args:
       capture: The capture.
@@ -309,32 +320,35 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
     """
     preprocessed = record.cached(capture, CACHE / "evidence")
     reason = usable_paths.unusable(preprocessed)
-    without_tracks: tuple[str, ...] = ()
-    name, notes = "splats-tracked-small", []
     static = bool(reason) and usable_paths.stands_still(preprocessed, capture.times)
     inspected = preprocessed.unusable or (reason and not static)
     inspection_result = _findings(capture, preprocessed) if inspected else ()
     motion = next((one for one in inspection_result if one.effect == MOTION), None)
+    start: tuple[str, ...]
+    name, start, notes = f"{UNTRACKED}-small", (FROM_REST,), []
     if findings.is_collection(inspection_result):
-        name = f"{OF_PHOTOGRAPHS}-small"
+        name, start = f"{OF_PHOTOGRAPHS}-small", ()
         notes = ["photographs of one scene in changing light"]
     elif static:
-        name, notes = "splats-static-small", [f"nothing moves: {reason}"]
+        name, start, _ = _best(False, seconds)
+        notes = [f"nothing moves: {reason}"]
     elif motion and motion.wanted is False and motion.confidence == CERTAIN:
-        name, notes = "splats-static-small", [f"nothing moves: {motion.evidence}"]
+        name, start, _ = _best(False, seconds)
+        notes = [f"nothing moves: {motion.evidence}"]
     elif reason:
-        name, without_tracks = f"{UNTRACKED}-small", (FROM_REST,)
         notes = [f"tracks are not usable: {reason}"]
-    spec = specs.override(presets.PRESETS[name], without_tracks)
+    else:
+        name, start, _ = _best(True, seconds)
+    spec = specs.override(presets.PRESETS[name], start)
     paths = usable_paths.known_paths(preprocessed)
     share = 1.0 if reason else float(paths.known.mean())
-    overrides = without_tracks + capacity(spec, capture.size, share, seconds)
-    if overrides != without_tracks:
+    overrides = start + capacity(spec, capture.size, share, seconds)
+    if overrides != start:
         size = "x".join(map(str, capture.size))
         size += "" if seconds is None else f" in {seconds:g} s"
         coverage = f" and tracks of {share:.0%} of the video" if share < LONG else ""
         notes.append(f"for images of {size}{coverage}")
-    if not reason:
+    if isinstance(spec.motion, SE3BasesSpec) and not reason:
         bases = rigid_groups.enough(paths.position, paths.known, BASES, EXPLAINED)
         if bases > spec.motion.bases:
             overrides += (f"motion.bases={bases}",)
@@ -360,9 +374,9 @@ def _alternative(preprocessed, size, seconds):
     covered = usable_paths.coverage(preprocessed)
     if covered >= WELL_COVERED and deviation <= WELL_PLACED:
         return None
-    static = "splats-static-small"
-    overrides = capacity(presets.PRESETS[static], size, seconds=seconds)
-    return Choice(static, overrides)
+    static, start, _ = _best(False, seconds)
+    spec = specs.override(presets.PRESETS[static], start)
+    return Choice(static, start + capacity(spec, size, seconds=seconds))
 
 
 def capacity(

@@ -1,5 +1,6 @@
 """The representation of radiance fields of the NeRF family, for `nerfies_jax.runs`."""
 
+from nerfies_jax.evaluation import method_curves
 from nerfies_jax.evaluation.representation import (
     Choice,
     Pair,
@@ -20,19 +21,21 @@ from nerfies_jax.scene import (
 )
 from nerfies_jax.training.track_start import FROM_REST
 
-# Presets between which `advise` chooses by whether the scene moves. Grids exist in the
-# small size only, where they are the best fields in equal time: after 90 processor
-# seconds on the built-in scene `d-nerf-grid-small` has 27.8 dB and `nerfies-small` 21.2
-# (docs/results/league.md).
+# Presets between which `advise` chooses by whether the scene moves, where no grid is
+# wanted. The best of the small sizes are grids, which have no other size: after 90
+# processor seconds on the built-in scene `d-nerf-grid-small` has 27.8 dB and
+# `nerfies-small` 21.2 (docs/results/league.md).
 ADVISED = ("nerf", "nerfies")
-ADVISED_GRIDS = ("nerf-grid", "d-nerf-grid")
 MOTIONS = ("warp", "time", "scene_flow")
 # These and the effects that depend on them, in the order in which they can be removed.
 MOTION_PARTS = ("elastic", "background", "mask", "ambient", *MOTIONS)
 
 
 def advise(
-    wanted: dict[str, bool | None], full: bool, family: str | None = None
+    wanted: dict[str, bool | None],
+    full: bool,
+    family: str | None = None,
+    seconds: float | int | None = None,
 ) -> Choice:
     """Recommend a preset and overrides for the effects that a capture needs.
 
@@ -41,6 +44,7 @@ def advise(
       full: True for the sizes of the papers.
       family: A preset without "-small". One that is not advised is kept, unless it is
         static and motion is needed.
+      seconds: Planned seconds of training, or None.
 
     Returns:
       The recommendation.
@@ -49,7 +53,7 @@ def advise(
     light_changes, has_transients = wanted.get(LIGHT), wanted.get(TRANSIENT)
     moves = wanted.get(MOTION)
     grid = not full and (family is None or family.endswith("-grid"))
-    static, dynamic = ADVISED_GRIDS if grid else ADVISED
+    static, dynamic = _best_grids(seconds) if grid else ADVISED
     preset = static if moves is False else dynamic
     if family is not None and family not in (static, dynamic):
         if moves and not _parts(_spec_of(family, full), MOTIONS):
@@ -90,6 +94,13 @@ def advise(
     if is_dynamic and spec.background is not None and wanted.get(BACKGROUND) is False:
         overrides.append("background=none")
     return Choice(preset, tuple(overrides), tuple(notes))
+
+
+def _best_grids(seconds):
+    """Return the best measured presets without and with motion, without "-small"."""
+    grids = [name for name in presets.PRESETS if name.endswith("-grid-small")]
+    best = (method_curves.ranking(grids, moves, seconds)[0] for moves in (False, True))
+    return [one.preset.removesuffix("-small") for one in best]
 
 
 def _spec_of(family, full):

@@ -112,6 +112,28 @@ def psnr_at(line: Line, seconds: float | int) -> float | None:
     return float(np.interp(math.log(seconds), np.log(line.seconds), line.psnr))
 
 
+def advice(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Select the curves that `nerfies_jax.evaluation.method_curves` ranks presets by.
+
+    Args:
+      stored: The stored results.
+
+    Returns:
+      Mean curves over the seeds by scene, and by preset and changes.
+    """
+    scenes: dict[str, Any] = {}
+    for label in PANELS:
+        benchmark = stored["benchmarks"].get(label, {"methods": {}})
+        for name, line in lines(benchmark).items():
+            curve = {
+                "seconds": [round(at, 2) for at in line.seconds],
+                "psnr": [round(psnr, 3) for psnr in line.psnr],
+            }
+            settings = benchmark["methods"][name]["settings"]
+            scenes.setdefault(label.split()[1], {})[settings] = curve
+    return scenes
+
+
 def panels(stored: Mapping[str, Any]) -> dict[str, dict[str, Line]]:
     """Collect what the figure shows.
 

@@ -150,8 +150,11 @@ class Recommendation(NamedTuple):
     """Presets and settings for a capture."""
 
     # ({effect: True if needed, None if undecided}, True for the sizes of the papers,
-    # preset of the user without "-small" or None) -> recommendation
-    advise: Callable[[dict[str, bool | None], bool, str | None], Choice]
+    # preset of the user without "-small" or None, planned seconds of training or None)
+    # -> recommendation
+    advise: Callable[
+        [dict[str, bool | None], bool, str | None, float | int | None], Choice
+    ]
     # (capture, planned seconds of training or None) -> preset if the user names none
     default_preset: Callable[[Capture, float | int | None], Choice] | None = None
     # ({effect: True if needed, None if undecided}, spec) -> overrides that enable or

@@ -4,9 +4,11 @@ import dataclasses
 from collections.abc import Callable
 
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.evaluation import method_curves
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.preprocessing.findings import (
     COLLECTION,
+    MOTION,
     Finding,
     is_collection,
     table,
@@ -41,6 +43,7 @@ def advise(
     representation: Representation,
     full: bool = False,
     family: str | None = None,
+    seconds: float | int | None = None,
 ) -> Advice:
     """Recommend a preset of a representation for the findings about a capture.
 
@@ -55,6 +58,7 @@ def advise(
         train.
       family: Name of a preset without "-small", which is kept if it supports the
         required effects.
+      seconds: Planned seconds of training, or None.
 
     Returns:
       The recommendation.
@@ -73,7 +77,10 @@ def advise(
             f"the {representation.name} representation recommends no presets"
         )
     needs[COLLECTION] = is_collection(findings)
-    choice = representation.recommendation.advise(needs, full, family)
+    choice = representation.recommendation.advise(needs, full, family, seconds)
+    if not full and family is None:
+        moves = None if needs[COLLECTION] else needs.get(MOTION)
+        notes += _measured(representation, moves, seconds)
     return Advice(
         representation.name,
         choice.preset if full else f"{choice.preset}-small",
@@ -82,18 +89,34 @@ def advise(
     )
 
 
-def advise_all(findings: tuple[Finding, ...], full: bool = False) -> list[Advice]:
+def _measured(representation, moves, seconds):
+    """Report the best curves of the presets, if the advice follows from them."""
+    if moves is None:
+        return []
+    ranked = method_curves.ranking(representation.presets, moves, seconds)
+    best = ", ".join(f"{one.preset} {one.psnr:.1f} dB" for one in ranked[:3])
+    when = "complete runs" if seconds is None else f"{seconds:g} s of training"
+    scenes = "with motion" if moves else "without motion"
+    return [f"{when} on built-in scenes {scenes}: {best}"] if ranked else []
+
+
+def advise_all(
+    findings: tuple[Finding, ...],
+    full: bool = False,
+    seconds: float | int | None = None,
+) -> list[Advice]:
     """Recommend a preset of each installed representation.
 
     Args:
       findings: Findings about the capture.
       full: True for models of the size in the papers.
+      seconds: Planned seconds of training, or None.
 
     Returns:
       One recommendation for each representation.
     """
     return [
-        advise(findings, each, full)
+        advise(findings, each, full, seconds=seconds)
         for each in representations.installed().values()
         if each.recommendation is not None
     ]

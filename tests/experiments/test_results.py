@@ -26,6 +26,13 @@ def test_the_figure_shows_the_kept_numbers():
             assert picture.text[figures.DIGEST] == figures.digest(curves.panels(stored))
 
 
+def test_presets_are_ranked_by_the_kept_curves():
+    stored = json.loads(results.path_of("benchmark").read_text())
+    advice = json.loads((ROOT / STUDIES["benchmark"].advice).read_text())
+    assert advice == curves.advice(stored)
+    assert set(advice) == {"static", "default", "fast"}
+
+
 @pytest.mark.skipif("growth" not in results.kept(), reason="no stored numbers")
 def test_the_figure_of_growth_shows_the_kept_numbers():
     stored = json.loads(results.path_of("growth").read_text())

@@ -7,6 +7,7 @@ import pytest
 
 from gaussians_jax import representation
 from gaussians_jax.scene.presets import PRESETS
+from nerfies_jax.evaluation import method_curves
 from nerfies_jax.preprocessing import record, rigid_groups, usable_paths
 from nerfies_jax.preprocessing.findings import (
     CERTAIN,
@@ -60,6 +61,24 @@ def test_what_moves_and_cannot_be_followed_is_no_still_scene(monkeypatch):
     choice = representation.default_preset(films.film(**MOVES, frames=24))
     assert choice.preset == UNTRACKED
     assert "of the moving pixels are near a track" in "".join(choice.notes)
+
+
+def test_the_preset_is_the_best_curve_in_the_planned_time(monkeypatch):
+    early, late = "splats-deformable-small start.motion=tracks", UNTRACKED
+    curves = {
+        early: {"seconds": [10, 100], "psnr": [25, 26]},
+        late: {"seconds": [10, 100], "psnr": [20, 30]},
+    }
+    scenes = {"static": curves, "default": curves}
+    monkeypatch.setattr(method_curves, "curves", lambda: scenes)
+    for moves in (MOVES, {}):
+        film = films.film(**moves, frames=24)
+        for seconds, expected in ((20, early), (100, late)):
+            choice = representation.default_preset(film, seconds)
+            preset, *overrides = expected.split()
+            assert choice.preset == preset
+            assert choice.overrides[: len(overrides)] == tuple(overrides)
+            specs.override(PRESETS[preset], choice.overrides)
 
 
 @pytest.mark.parametrize("stops", [1.0, 0.2])

@@ -1,13 +1,16 @@
 """Every combination of decisions becomes a run that can be built."""
 
+import functools
 import itertools
 import json
+import math
 import pathlib
 
 import pytest
 
 from gaussians_jax.per_frame.exposure import ExposureSpec
 from gaussians_jax.scene.spec import refuse_what_cannot_train
+from nerfies_jax.evaluation import method_curves
 from nerfies_jax.evaluation.representation import Choice
 from nerfies_jax.fields.effects.appearance import AppearanceSpec
 from nerfies_jax.preprocessing.findings import CANNOT_TELL, CERTAIN, Finding
@@ -71,10 +74,15 @@ def in_the_league():
     return scores
 
 
+@functools.cache
+def benchmarks():
+    stored = json.loads((ROOT / "experiments/measured/benchmark.json").read_text())
+    return stored["benchmarks"]
+
+
 def over_time(scene):
     """PSNR of presets after about the same processor seconds, at today's revision."""
-    stored = json.loads((ROOT / "experiments/measured/benchmark.json").read_text())
-    benchmark = stored["benchmarks"].get(f"--scene {scene} --suite curves")
+    benchmark = benchmarks().get(f"--scene {scene} --suite curves")
     methods = {} if benchmark is None else benchmark["methods"]
     return {
         method["made_with"]["preset"]: method["mean"]["heldout.psnr"]
@@ -101,6 +109,59 @@ def test_the_advised_preset_is_the_best_that_was_measured(name, place):
         pytest.skip(f"no numbers of {place}")
     advice = adviser.advise(findings(motion=moves), kind)
     assert (advice.preset, advice.overrides) == (max(scores, key=scores.get), ())
+
+
+@pytest.mark.parametrize("scene", ["static", "default", "fast"])
+@pytest.mark.parametrize("name", ["gaussians", "radiance"])
+@pytest.mark.parametrize("seconds", [10, 30, 60, 120, 1200])
+def test_the_advice_for_a_time_is_the_best_curve_of_every_scene(name, scene, seconds):
+    """Interpolated here between stored evaluations, of which the best so far counts."""
+    benchmark = benchmarks()[f"--scene {scene} --suite curves"]
+    kind, scores = representations.named(name), {}
+    for method in benchmark["methods"].values():
+        preset, *changes = method["settings"].split()
+        if preset in kind.presets:
+            runs = [run_psnr(run, seconds) for run in method["curves"].values()]
+            scores[preset, tuple(changes)] = sum(runs) / len(runs)
+    advice = adviser.advise(findings(motion=scene != "static"), kind, seconds=seconds)
+    assert (advice.preset, advice.overrides) == max(scores, key=scores.get)
+    assert advice.preset in advice.notes[-1]
+
+
+def run_psnr(run, seconds):
+    """PSNR of a stored run after a time, which its first evaluation precedes."""
+    points = list(zip(run["cpu_seconds"], run["psnr"], strict=True))
+    before = [point for point in points if point[0] <= seconds]
+    best = max(psnr for _, psnr in before)
+    if len(before) == len(points):
+        return best
+    (t0, psnr0), (t1, psnr1) = points[len(before) - 1 : len(before) + 1]
+    between = psnr0 + (psnr1 - psnr0) * math.log(seconds / t0) / math.log(t1 / t0)
+    return max(best, between)
+
+
+def test_commands_without_a_preset_use_the_cores_of_the_best_one():
+    """`cores` reads no curves, as it runs before JAX is imported."""
+    splats = representations.named("gaussians").presets
+    assert method_curves.ranking(splats, True)[0].preset == representations.USUAL
+
+
+def test_a_measured_budget_changes_the_advice(monkeypatch):
+    """Two curves that cross, of which the later one is better from 40 s on."""
+    early = {"seconds": [5.0, 20.0, 80.0], "psnr": [25.0, 28.0, 28.0]}
+    late = {"seconds": [10.0, 40.0, 80.0], "psnr": [20.0, 28.0, 30.0]}
+    crossing = {"early-small": early, "late-small x=1": late, "other": late}
+    scenes = {"static": {}, "default": crossing, "fast": crossing}
+    monkeypatch.setattr(method_curves, "curves", lambda: scenes)
+    candidates = ("early-small", "late-small", "unknown")
+    for seconds, best in ((1, "early"), (20, "early"), (60, "late"), (None, "late")):
+        ranked = method_curves.ranking(candidates, True, seconds)
+        assert ranked[0].preset == f"{best}-small"
+        assert len(ranked) == 2
+    assert ranked[0].overrides == ("x=1",)
+    # Before the first evaluation of all, at its time: 26.5 after 10 of 5 to 20 s.
+    assert method_curves.ranking(candidates, True, 1)[0].psnr == pytest.approx(26.5)
+    assert method_curves.ranking(["unknown"], True, 1) == []
 
 
 def test_a_still_scene_gets_no_motion_and_a_moving_one_gets_it():
