@@ -37,6 +37,8 @@ page has rows of several captures or presets, the command was run once for each.
 `nerfies study results benchmark --measured benchmark.json`, for example, stores
 the result of a command and rewrites its page.
 
+{summaries}
+
 {pages}
 
 {missing}Errors and costs of single formulas are in [numerics.md](../numerics.md), which
@@ -165,6 +167,8 @@ FINISHED = {
     "faults": "signals, full disks, closed pipes",
     "player_speed": "frames of the browser player",
 }
+# Pages of `experiments` that compare the numbers of others, and have none of their own.
+SUMMARIES = {"claims": "benchmark.claims"}
 # The last revision with the code of each.
 REVISIONS = dict.fromkeys(FINISHED, "99f3f69")
 REVISIONS |= dict.fromkeys(
@@ -201,6 +205,8 @@ def main(args):
             _advise(name)
             _write(path, page(name))
             console.say(path)
+        for name in SUMMARIES:
+            _write(PAGES / f"{name}.md", summary(name))
         _write(PAGES / "README.md", index())
     return {"pages": {name: str(path) for name, path in pages.items()}}
 
@@ -337,6 +343,11 @@ def page(name: str) -> str:
     return _page_of(name, json.loads(path.read_text()))
 
 
+def summary(name: str) -> str:
+    """Write the page NAME.md of `SUMMARIES`."""
+    return importlib.import_module(f"experiments.{SUMMARIES[name]}").page()
+
+
 def index() -> str:
     """Write the list of pages.
 
@@ -352,6 +363,10 @@ def index() -> str:
         f"`{study.line}`" for name, study in STUDIES.items() if name not in kept()
     ]
     return INDEX.format(
+        summaries=markdown.bullets(
+            f"[{name}.md]({name}.md): {summary(name).splitlines()[0][2:]}"
+            for name in SUMMARIES
+        ),
         pages=markdown.table(("page", "subject", "measured by"), rows, words=3),
         missing=MISSING.format(commands=markdown.bullets(absent)) if absent else "",
         finished=markdown.bullets(

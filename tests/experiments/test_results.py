@@ -8,13 +8,18 @@ import pytest
 from experiments import results
 from experiments.benchmark import curves
 from experiments.growth import page as growth
-from experiments.results import PAGES, REVISIONS, ROOT, STUDIES
+from experiments.results import PAGES, REVISIONS, ROOT, STUDIES, SUMMARIES
 from nerfies_jax.visualization import figures
 
 
 @pytest.mark.parametrize("name", results.kept())
 def test_a_page_is_what_its_kept_numbers_make(name):
     assert (PAGES / f"{name}.md").read_text() == results.page(name)
+
+
+@pytest.mark.parametrize("name", SUMMARIES)
+def test_a_summary_is_what_the_numbers_of_its_pages_make(name):
+    assert (PAGES / f"{name}.md").read_text() == results.summary(name)
 
 
 def test_the_figure_shows_the_kept_numbers():
@@ -43,7 +48,7 @@ def test_the_figure_of_growth_shows_the_kept_numbers():
 def test_the_index_lists_every_page_there_is():
     assert (PAGES / "README.md").read_text() == results.index()
     there = {path.stem for path in PAGES.glob("*.md")} - {"README"}
-    assert there == {*results.kept(), *REVISIONS}
+    assert there == {*results.kept(), *REVISIONS, *SUMMARIES}
     measured = {path.name for path in (ROOT / "experiments/measured").iterdir()}
     known = {results.path_of(name).name for name in STUDIES}
     assert measured <= known
@@ -74,6 +79,7 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
     machine = {"cpu": "a core", "backend": "cpu", "jax": "0"}
     new.write_text(json.dumps({"machine": machine, "benchmarks": benchmarks}))
     results.main(["benchmark", "--measured", str(new)])
+    assert (tmp_path / "claims.md").exists()
     written = (tmp_path / "benchmark.md").read_text()
     assert "| `--scene default` | 21.50 |" in written
     assert "| nerf | not stored | 1 | aaaaaaaa+ |" in written
