@@ -26,7 +26,7 @@ from nerfies_jax.fields.effects.transient import TransientSpec
 from nerfies_jax.fields.effects.warp import WarpSpec
 from nerfies_jax.fields.occupancy import OccupancySpec
 from nerfies_jax.fields.template import TemplateSpec
-from nerfies_jax.training import schedules
+from nerfies_jax.training import schedules, step_counts
 from nerfies_jax.training.effects import Table
 from nerfies_jax.training.extensions import Settings, check
 from nerfies_jax.training.protocols import Optimizer, Regularizer
@@ -91,6 +91,9 @@ class RadianceScene:
     )
     sampling: SamplingSpec = SamplingSpec()
     rays: int = 1024  # per step
+    # Curriculum of D-NeRF: until this step, rays are of the first frames in time alone,
+    # whose number grows linearly from three to all. None for all frames from the start.
+    curriculum_steps: int | None = step_counts.steps(None)
     # Number of equal parts of a step, on several devices or one after the other to save
     # memory. The losses of a part are means over its own valid rays.
     micro_batches: int = 1
@@ -139,6 +142,11 @@ class RadianceScene:
             raise ValueError(
                 f"train for at least one step of one ray, got steps={self.steps}, "
                 f"rays={self.rays}"
+            )
+        if self.curriculum_steps is not None and self.curriculum_steps < 1:
+            raise ValueError(
+                f"curriculum_steps={self.curriculum_steps} must be at least 1, or None "
+                "for all frames from the start"
             )
         if self.micro_batches < 1 or self.rays % self.micro_batches:
             raise ValueError(

@@ -61,14 +61,15 @@ NERF_W = dataclasses.replace(
 )
 
 # Pumarola et al. 2020, arXiv:2011.13961, and its code: one network for both levels,
-# 500 rays, 800k steps with a rate that decays by ten every 500k. Not implemented are
-# the curriculum, which adds the frames one by one over the first 10k steps, the crop of
+# 500 rays, 800k steps with a rate that decays by ten every 500k, and a curriculum that
+# adds the frames one by one over the first 10k steps. Not implemented are the crop of
 # the center and the total variation over time. The rays of a step are from all frames.
 # In the published code they are from one.
 D_NERF = dataclasses.replace(
     NERF,
     steps=800_000,
     rays=500,
+    curriculum_steps=10_000,
     sampling=SamplingSpec(64, 128, shared=True),
     learning_rate_end=5e-4 * 10 ** (-8 / 5),
     warp=WarpSpec(
@@ -90,7 +91,8 @@ T_NERF = dataclasses.replace(D_NERF, warp=None, time=TimeSpec())
 # scaling of the losses are those of the code, but the elastic loss uses 4 samples per
 # ray instead of all 128, and a fold has a cost of 1.0 instead of 0 (see `ElasticSpec`).
 # There are no camera codes, and codes between two frames are interpolated linearly
-# instead of by a cubic spline.
+# instead of by a cubic spline. The warp has eight bands. `warp.position.bands=6` is
+# that of HyperNeRF, and `background.width=none` the background loss without ρ.
 NERFIES = RadianceScene(
     steps=250_000,
     rays=6144,

@@ -2,12 +2,13 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Int, Key
 
 from nerfies_jax.fields import field_ray, occupied_rays, render_ray
 from nerfies_jax.fields.effects import scene_flow, transient
@@ -95,9 +96,12 @@ def micro_batch(
     """
     spec = radiance.spec
     count, plan = spec.rays // spec.micro_batches, spec.sampling.occupancy
+    choice = None
+    if spec.curriculum_steps is not None:
+        choice = curriculum(frames.times, state.step, spec.curriculum_steps)
     if plan is None:
-        return draw_batch(frames, count, key), None
-    batch = draw_batch(frames, plan.candidates * count, key)
+        return draw_batch(frames, count, key, choice), None
+    batch = draw_batch(frames, plan.candidates * count, key, choice)
     cells = state.aux_state
     return occupied_rays.learned_from(radiance, cells, batch), cells
 
@@ -195,20 +199,53 @@ def learning_rates(
     return rates | {"template": template}
 
 
-def draw_batch(frames: Frames, count: int, key: Key[Array, ""]) -> Batch:
-    """Sample rays through random pixels of all frames, uniformly.
+class Choice(NamedTuple):
+    """Frames to sample rays from: the first ones of an order."""
+
+    order: Int[Array, " frames"]
+    number: Int[Array, ""]
+
+
+def curriculum(
+    times: Float[Array, " frames"], step: Int[Array, ""], steps: int
+) -> Choice:
+    """Choose the frames of the curriculum of D-NeRF at a step.
+
+    Args:
+      times: Times of the training frames.
+      step: Number of completed steps.
+      steps: Number of steps until all frames are chosen.
+
+    Returns:
+      The frames in the order of their times, and the number of them to use. It is that
+      of the published code: the share of the steps, rounded down, and at least three.
+    """
+    frames = len(times)
+    added_at = np.ceil(np.arange(1, frames + 1) * steps / frames).astype(np.int32)
+    number = jnp.maximum(jnp.sum(step >= added_at), min(3, frames))
+    return Choice(jnp.argsort(times), number)
+
+
+def draw_batch(
+    frames: Frames, count: int, key: Key[Array, ""], choice: Choice | None = None
+) -> Batch:
+    """Sample rays through random pixels, uniformly.
 
     Args:
       frames: Training frames.
       count: Number of rays.
       key: PRNG key.
+      choice: Frames to use, None for all.
 
     Returns:
       The rays and their observed colors.
     """
     row_key, column_key, line_key = jax.random.split(key, 3)
     number, (height, width) = len(frames.times), frames.images.shape[1:3]
-    row = jax.random.randint(row_key, (count,), 0, number)
+    if choice is None:
+        row = jax.random.randint(row_key, (count,), 0, number)
+    else:
+        row = choice.order[jax.random.randint(row_key, (count,), 0, choice.number)]
     column = jax.random.randint(column_key, (count,), 0, width)
     line = jax.random.randint(line_key, (count,), 0, height)
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)

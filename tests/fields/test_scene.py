@@ -378,6 +378,32 @@ def test_gradient_of_a_whole_step(float64):
     assert gradients.directional_error(loss, params) < 1e-5
 
 
+def test_a_curriculum_adds_the_frames_in_the_order_of_time(rng):
+    """As many as in the loop of the published code, and rays of all of these."""
+    _, state, frames = started(STATIC)
+    times = rng.permutation(12).astype(np.float32) / 11
+    some = rng.integers(0, len(frames.times), 12)
+    many = frames._replace(
+        times=times,
+        images=np.asarray(frames.images)[some],
+        cameras=jax.tree.map(lambda leaf: np.asarray(leaf)[some], frames.cameras),
+    )
+    spec = dataclasses.replace(STATIC, curriculum_steps=100)
+    radiance = scene.field(spec, METADATA)
+
+    @jax.jit
+    def rows(step, many):
+        now = state._replace(step=step)
+        keys = jax.random.split(jax.random.key(5), 4)
+        rays = [field_steps.micro_batch(radiance, now, many, key)[0] for key in keys]
+        return jnp.concatenate([one.row for one in rays])
+
+    for step in (0, 24, 26, 50, 90, 99, 100, 1000):
+        number = 12 if step >= 100 else max(int(step / 100 * 12), 3)
+        drawn_from = np.unique(rows(jnp.int32(step), many))
+        np.testing.assert_array_equal(drawn_from, np.sort(np.argsort(times)[:number]))
+
+
 @pytest.mark.parametrize("levels", [1, 2])
 def test_shared_and_single_levels(levels):
     plan = SamplingSpec(8, 8 if levels == 2 else 0, shared=levels == 2)

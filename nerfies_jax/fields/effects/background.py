@@ -23,7 +23,8 @@ class BackgroundSpec:
 
     `noise` (standard deviation) and `width` are in units of the field, whose box is the
     captured volume. In the official code the volume fills a box of diagonal one.
-    `width` is the displacement at which ρ stops being quadratic. `scaling` is that of
+    `width` is the displacement at which ρ stops being quadratic. None is for the mean
+    distance without ρ, as the loss is printed in the paper. `scaling` is that of
     the official code by default, for which a `weight` of one corresponds to 1e-3 with
     the ρ of the paper (`losses.geman_mcclure`).
 
@@ -32,7 +33,7 @@ class BackgroundSpec:
 
     points: int = 16_384
     noise: float = 1e-3
-    width: float = 1e-3
+    width: float | None = 1e-3
     scaling: str = "official"
     weight: float = 1.0
 
@@ -46,7 +47,8 @@ class BackgroundSpec:
             value = getattr(self, name)
             if not 0 <= value < float("inf"):
                 raise ValueError(f"{name}={value} must be finite and not negative")
-        losses.check_geman_mcclure(self.width, self.scaling)
+        if self.width is not None:
+            losses.check_geman_mcclure(self.width, self.scaling)
 
     def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
         """Compute the cost of displacements of static points in random frames."""
@@ -54,7 +56,7 @@ class BackgroundSpec:
 
 
 def drift(spec: BackgroundSpec, context: PenaltyContext) -> Scalar:
-    """Compute the mean over static points of ρ(|displacement|²).
+    """Compute the mean over static points of ρ(|displacement|²), or of |displacement|.
 
     All points are used if there are at most `spec.points`. Otherwise that many are
     sampled with replacement. Each point is evaluated in a random frame, with noise.
@@ -87,7 +89,7 @@ def mean_drift(
     point: Float[Array, "points 3"],
     rows: Int[Array, " points"],
 ) -> Scalar:
-    """Compute the mean of ρ(|displacement|²) over points.
+    """Compute the mean of ρ(|displacement|²), or of |displacement|, over points.
 
     Args:
       spec: Settings.
@@ -104,5 +106,10 @@ def mean_drift(
     displacement = jax.vmap(context.displace)(point, conditions)
     # The squared length, because the length has no gradient at zero.
     squares = jnp.sum(displacement**2, axis=-1)
+    if spec.width is None:
+        # The gradient of the length is not defined at zero, and is zero here.
+        positive = squares > 0
+        length = jnp.sqrt(jnp.where(positive, squares, 1))
+        return jnp.mean(jnp.where(positive, length, 0))
     costs = losses.geman_mcclure(squares, spec.width, spec.scaling)
     return jnp.mean(costs)

@@ -130,7 +130,39 @@ def test_a_still_warp_costs_nothing_and_has_a_finite_slope(dtype, rng):
         np.testing.assert_allclose(grad, 1e3 * size, rtol=1e-5)
 
 
-def test_gradients(float64, rng):
+@pytest.mark.hard_cases
+def test_without_a_robust_loss_it_is_the_mean_distance(dtype, rng):
+    """Points that stay put are among them, and have no gradient."""
+    points = rng.normal(size=(20, 3)) + CENTER
+
+    @jax.jit
+    @jax.value_and_grad
+    def drift(shift):
+        def displace(x, condition):
+            return jnp.where(x[0] > 0, shift * x, 0)
+
+        here = context(displace, points, 1, dtype)
+        return background.drift(BackgroundSpec(width=None, noise=0.0), here)
+
+    shift = np.asarray([0.3, -0.1, 0.2], dtype)
+    value, grad = drift(shift)
+    at = (points - CENTER) * SCALE
+    moving = [shift * x for x in at if x[0] > 0]
+    assert 0 < len(moving) < 20
+    lengths = [np.sqrt(x @ x) for x in moving]
+    np.testing.assert_allclose(value, sum(lengths) / 20, rtol=1e-5)
+    # of |s x|: s x^2 / |s x|
+    slopes = [
+        shift * x**2 / length
+        for x, length in zip([x for x in at if x[0] > 0], lengths, strict=True)
+    ]
+    np.testing.assert_allclose(grad, np.sum(slopes, axis=0) / 20, rtol=1e-5)
+    value, grad = drift(np.zeros(3, dtype))
+    np.testing.assert_array_equal([value, *grad], 0)
+
+
+@pytest.mark.parametrize("width", [0.1, None])
+def test_gradients(width, float64, rng):
     points = rng.normal(size=(30, 3)) + CENTER
 
     def total(params):
@@ -138,7 +170,7 @@ def test_gradients(float64, rng):
             return jnp.sin(params @ x + condition.time)
 
         here = context(displace, points, 4, "float64")
-        return background.drift(BackgroundSpec(width=0.1, scaling="paper"), here)
+        return background.drift(BackgroundSpec(width=width, scaling="paper"), here)
 
     params = 0.1 * rng.normal(size=(3, 3))
     assert gradients.directional_error(total, params, step=1e-6) < 1e-6
