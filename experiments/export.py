@@ -4,7 +4,8 @@ nerfies export RUN ply --time 0.4          # the scene at one time
 nerfies export RUN ply --frames 48         # a numbered sequence
 nerfies export RUN splat
 nerfies export RUN spz --units world
-nerfies export RUN sog --up -y            # compressed, for PlayCanvas
+nerfies export RUN sog --up -y             # compressed, for PlayCanvas
+nerfies export RUN glb --keep seen         # glTF, for Babylon.js, three.js, Cesium
 nerfies export RUN splatv                  # all times in one file
 nerfies export RUN transforms              # cameras, images, points
 nerfies export RUN colmap --units world
@@ -36,6 +37,7 @@ MOST_VOXELS = 512  # 5 GB along all three sides
 OPTIONS = {
     **{"ply": GAUSSIANS, "splat": GAUSSIANS, "spz": GAUSSIANS},
     **{"compressed-ply": GAUSSIANS, "sog": GAUSSIANS, "usda": GAUSSIANS},
+    "glb": GAUSSIANS,
     "mesh": ("time", "units", "up", "voxels"),
     **{"splatv": (), "nerfies": ()},
     **{"transforms": ("units",), "colmap": ("units",)},
@@ -67,6 +69,7 @@ class Export:
             "spz",
             "sog",
             "usda",
+            "glb",
             "splatv",
             "mesh",
             "transforms",
@@ -79,12 +82,12 @@ class Export:
         ]
         | None
     ] = None
-    """Gaussians as ply, compressed-ply (SuperSplat), splat, spz, sog (PlayCanvas) or
-    usda (OpenUSD), or with their motion, on cubics, as splatv. A mesh with vertex
-    colors (ply). Training images with cameras and points as nerfstudio's transforms, a
-    colmap model or a nerfies directory. A camera path as nerfstudio's camera_path.json
-    (path) or Nerfies' folder (nerfies-path). Tracks of points of a dynamic scene (npz).
-    exr images with camera and motion."""
+    """Gaussians as ply, compressed-ply (SuperSplat), splat, spz, sog (PlayCanvas),
+    usda (OpenUSD) or glb (glTF), or with their motion, on cubics, as splatv. A mesh
+    with vertex colors (ply). Training images with cameras and points as nerfstudio's
+    transforms, a colmap model or a nerfies directory. A camera path as nerfstudio's
+    camera_path.json (path) or Nerfies' folder (nerfies-path). Tracks of points of a
+    dynamic scene (npz). exr images with camera and motion."""
     program: Annotated[
         Literal["supersplat", "blender", "usd", "gsplat", "nerfstudio"] | None,
         tyro.conf.arg(name="for"),
@@ -107,7 +110,7 @@ class Export:
     scene)."""
     up: Axis | None = None
     """Axis of the file that points up, by the mean of the training cameras (default:
-    axes as in the capture, but y for usda)."""
+    axes as in the capture, but y for usda and glb)."""
     keep: Literal["all", "seen"] | None = None
     """Gaussians to write: all, or those that a training camera saw (default: all)."""
     voxels: int | None = None
@@ -153,6 +156,8 @@ class Export:
             raise ValueError(f"--voxels {self.voxels}: choose from 8 to {MOST_VOXELS}")
         if self.kind == "usda" and self.axis not in ("y", "z"):
             raise ValueError(f"--up {self.axis}: OpenUSD has y or z up")
+        if self.kind == "glb" and self.axis != "y":
+            raise ValueError(f"--up {self.axis}: glTF has y up")
 
     @property
     def kind(self) -> str:
@@ -162,7 +167,7 @@ class Export:
     @property
     def axis(self) -> Axis | None:
         """The axis that points up, or None for the axes of the capture."""
-        default: Any = "y" if self.kind == "usda" else None
+        default: Any = "y" if self.kind in ("usda", "glb") else None
         return self.up or self._of_program("up") or default
 
     @property

@@ -233,7 +233,7 @@ def _exr(args: Any, run: Any) -> str:
 
 WRITERS = {
     **dict.fromkeys(
-        ("ply", "compressed-ply", "splat", "spz", "sog", "usda"), _gaussians
+        ("ply", "compressed-ply", "splat", "spz", "sog", "usda", "glb"), _gaussians
     ),
     "mesh": _mesh,
     "splatv": _splatv,

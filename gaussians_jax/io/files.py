@@ -1,6 +1,6 @@
 """Gaussian files: 3DGS .ply, antimatter15 .splat and Niantic .spz.
 
-Compressed PLY, SOG and OpenUSD files are written, and not read.
+Compressed PLY, SOG, OpenUSD and glTF files are written, and not read.
 
 docs/formats.md lists what each format stores. Files are written to a temporary name
 next to the target and renamed, so a crash leaves the old file or the new one.
@@ -17,7 +17,8 @@ import numpy as np
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.splats import SH_DC, Splats
-from gaussians_jax.io import packed_ply, sog, spz, usd
+from gaussians_jax.io import gltf, packed_ply, sog, spz, usd
+from gaussians_jax.io.activated import opacity_of, unit_quaternion
 from nerfies_jax.capture import ply_files, safe_files, text_files
 from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.json_files import replaced_file
@@ -25,7 +26,7 @@ from nerfies_jax.capture.json_files import replaced_file
 MOST_HEADER_BYTES = ply_files.MAX_HEADER  # 62 properties take 1.5 kB
 MOST_BYTES = 4 * 2**30  # of a .splat or .spz file: 100 million Gaussians
 SUFFIXES = (".ply", ".splat", ".spz")
-WRITTEN = (*SUFFIXES, packed_ply.SUFFIX, sog.SUFFIX, usd.SUFFIX)
+WRITTEN = (*SUFFIXES, packed_ply.SUFFIX, sog.SUFFIX, usd.SUFFIX, gltf.SUFFIX)
 MOST_ROUNDING = 0.1  # of float64 coordinates, relative to the median scale
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -94,7 +95,8 @@ def save(
     """Save the active Gaussians in the format of the suffix.
 
     Args:
-      path: File to write, ending in .ply, .splat, .spz, .compressed.ply, .sog or .usda.
+      path: File to write, ending in .ply, .splat, .spz, .compressed.ply, .sog, .usda or
+        .glb.
       rows: Raw parameters. Inactive Gaussians are left out.
       spz_version: Version of SPZ files.
       usd_up: Axis that OpenUSD files name as up.
@@ -116,6 +118,7 @@ def save(
         packed_ply.SUFFIX: packed_ply.encode,
         sog.SUFFIX: sog.encode,
         usd.SUFFIX: lambda rows: usd.encode(rows, usd_up),
+        gltf.SUFFIX: gltf.encode,
     }
     if suffix not in encoders:
         raise ValueError(
@@ -317,15 +320,9 @@ def _splat_bytes(rows):
     table = np.zeros(len(rows.mean), _SPLAT_ROW)
     table["mean"] = rows.mean
     table["scale"] = np.exp(log_scale)
-    logit = np.clip(rows.opacity_logit.astype(np.float64), -700, 700)
-    rgba = np.concatenate(
-        [0.5 + SH_DC * rows.sh_dc[:, 0], 1 / (1 + np.exp(-logit))[:, None]], axis=1
-    )
+    rgba = np.column_stack([0.5 + SH_DC * rows.sh_dc[:, 0], opacity_of(rows)])
     table["rgba"] = _nearest_byte(rgba * 255)
-    length = np.linalg.norm(rows.quaternion.astype(np.float64), axis=1, keepdims=True)
-    turn = np.where(length > 0, rows.quaternion / np.where(length > 0, length, 1), 0)
-    turn[length[:, 0] == 0] = [1, 0, 0, 0]
-    table["turn"] = _nearest_byte(turn * 128 + 128)
+    table["turn"] = _nearest_byte(unit_quaternion(rows.quaternion) * 128 + 128)
     return table.tobytes()
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gaussians_jax.core.splats import SH_DC, Splats
+from gaussians_jax.io.activated import opacity_of, unit_quaternion
 
 CHUNK = 256
 SUFFIX = ".compressed.ply"
@@ -82,18 +83,6 @@ def along_curve(rows: Splats) -> Splats:
     return Splats(*leaves)
 
 
-def opacity_of(rows: Splats) -> np.ndarray:
-    """Compute opacities, without overflow for logits of any size.
-
-    Args:
-      rows: Raw parameters in NumPy.
-
-    Returns:
-      Opacities in [0, 1], [gaussians].
-    """
-    return 1 / (1 + np.exp(-np.clip(rows.opacity_logit, -700, 700)))
-
-
 def smallest_three(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split rotations into the index of the largest component and the three others.
 
@@ -105,10 +94,7 @@ def smallest_three(quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
       quaternion whose largest one is positive, mapped from [-1/sqrt(2), 1/sqrt(2)] to
       [0, 1].
     """
-    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    unit = np.where(
-        length > 0, quaternion / np.where(length > 0, length, 1), [1, 0, 0, 0]
-    )
+    unit = unit_quaternion(quaternion)
     largest = np.argmax(np.abs(unit), axis=1)
     row = np.arange(len(unit))
     unit = unit * np.where(unit[row, largest] < 0, -1, 1)[:, None]

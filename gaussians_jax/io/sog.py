@@ -18,6 +18,7 @@ from PIL import Image
 
 from gaussians_jax.core.splats import Splats
 from gaussians_jax.io import packed_ply
+from gaussians_jax.io.activated import opacity_of
 
 SUFFIX = ".sog"
 CODEBOOK = 256
@@ -42,7 +43,7 @@ def encode(rows: Splats) -> bytes:
         np.clip(rows.log_scale, *packed_ply.SCALE_RANGE)
     )
     color_codes, color_book = _in_codebook(rows.sh_dc[:, 0])
-    opacity = packed_ply.opacity_of(rows)
+    opacity = opacity_of(rows)
     files = {
         "means_l": _image(low),
         "means_u": _image(high),

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gaussians_jax.core.splats import LOG_SCALE_RANGE
+from gaussians_jax.io.activated import unit_quaternion
 from nerfies_jax.capture import extras
 
 MAGIC = b"NGSP"
@@ -110,7 +111,7 @@ def encode(rows: Unpacked, version: int = 3) -> bytes:
             "SPZ ends at 2048; write a .ply file, or scale the scene down"
         )
     mean = np.ascontiguousarray(steps.astype("<i4")[..., None]).view(np.uint8)[..., :3]
-    quaternion = _normalize(rows.quaternion) * _TURN_SIGN
+    quaternion = unit_quaternion(rows.quaternion) * _TURN_SIGN
     pack = _pack_first_three if version == 2 else _pack_smallest_three
     # Clamped before scaling, because coefficients above 2e36 would overflow float32.
     # Their largest bytes stand for 1 and 10 / 3.
@@ -261,15 +262,6 @@ def _byte(values):
     return np.clip(np.floor(np.asarray(values, np.float64) + 0.5), 0, 255).astype(
         np.uint8
     )
-
-
-def _normalize(quaternion):
-    quaternion = quaternion.astype(np.float64)
-    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    unit = np.divide(
-        quaternion, length, where=length > 0, out=np.zeros_like(quaternion)
-    )
-    return np.where(length > 0, unit, [1.0, 0.0, 0.0, 0.0])
 
 
 def _first_three(bytes_):

@@ -174,6 +174,8 @@ def test_a_program_decides_format_axes_and_crop(splats, tmp_path, capsys):
     assert "name a format (ply, " in capsys.readouterr().err
     assert main(splats, "--for", "usd", "--up", "x") == 2
     assert "OpenUSD has y or z up" in capsys.readouterr().err
+    assert main(splats, "glb", "--up", "z") == 2
+    assert "--up z: glTF has y up" in capsys.readouterr().err
     assert main(splats, "transforms", "--keep", "seen") == 2
     assert "--keep is not for transforms, but for ply" in capsys.readouterr().err
 

@@ -1,6 +1,9 @@
 """Gaussians in the formats and axes of other programs."""
 
+import json
+import math
 import re
+import struct
 
 import jax
 import numpy as np
@@ -8,7 +11,7 @@ import plyfile
 import pytest
 
 from gaussians_jax.core.splats import SH_DC
-from gaussians_jax.io import files, turned
+from gaussians_jax.io import files, gltf, turned
 from gaussians_jax.splatting import harmonics
 from tests.gaussians.shared import rotations
 from tests.gaussians.test_files import opacities, same_rotation, some_splats
@@ -100,6 +103,74 @@ def test_a_usd_stage_holds_linear_values(degree, tmp_path):
     ours = np.concatenate([rows.sh_dc, rows.sh_rest], axis=1).reshape(-1, 3)
     np.testing.assert_allclose(colors, ours, rtol=1e-6)
     assert f"sphericalHarmonicsDegree = {degree}\n" in text
+
+
+def glb_attributes(path):
+    """The vertex attributes of a .glb, by the text of glTF 2.0."""
+    data = path.read_bytes()
+    magic, version, total = struct.unpack("<4sII", data[:12])
+    assert (magic, version, total) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack("<I4s", data[12:20])
+    document, rest = json.loads(data[20 : 20 + size]), data[20 + size :]
+    assert kind == b"JSON"
+    assert struct.unpack("<I4s", rest[:8]) == (len(rest) - 8, b"BIN\0")
+    assert size % 4 == 0 == len(rest) % 4
+    assert document["buffers"] == [{"byteLength": len(rest) - 8}]
+    (mesh,) = document["meshes"]
+    (primitive,) = mesh["primitives"]
+    assert primitive["mode"] == 0
+    assert (
+        document["extensionsUsed"]
+        == ["KHR_gaussian_splatting"]
+        == list(primitive["extensions"])
+    )
+    read, at = {}, 8
+    for name, number in primitive["attributes"].items():
+        accessor = document["accessors"][number]
+        view = document["bufferViews"][accessor["bufferView"]]
+        dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        values = np.frombuffer(rest, dtype, accessor["count"] * width, at)
+        assert view["byteOffset"] == at - 8
+        assert view["byteLength"] == values.nbytes
+        at += values.nbytes
+        read[name] = values.reshape(-1, width)
+        if name == "POSITION":
+            assert accessor["min"] == read[name].min(axis=0).tolist()
+            assert accessor["max"] == read[name].max(axis=0).tolist()
+    return read
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_glb_holds_linear_values(degree, tmp_path):
+    """Ratified KHR_gaussian_splatting, which splat-transform 3.7 writes equally."""
+    rows = some_splats(degree=degree)
+    assert files.save(tmp_path / "a.glb", rows) == 20
+    rows = jax.tree.map(np.asarray, rows)
+    read = glb_attributes(tmp_path / "a.glb")
+    opacity = opacities(rows)[0]
+    kinds = {name.removeprefix("KHR_gaussian_splatting:"): read[name] for name in read}
+    np.testing.assert_array_equal(kinds.pop("POSITION"), rows.mean)
+    np.testing.assert_allclose(kinds.pop("SCALE"), np.exp(rows.log_scale), rtol=1e-6)
+    np.testing.assert_allclose(kinds.pop("OPACITY")[:, 0], opacity, rtol=1e-6)
+    wxyz = np.roll(kinds.pop("ROTATION"), 1, axis=1)
+    assert same_rotation(wxyz, rows.quaternion).max() < 1e-12
+    color = np.clip(0.5 + SH_DC * rows.sh_dc[:, 0], 0, 1)
+    fallback = np.column_stack([color, opacity])
+    np.testing.assert_allclose(kinds.pop("COLOR_0") / 255, fallback, atol=0.51 / 255)
+    ours = np.concatenate([rows.sh_dc, rows.sh_rest], axis=1)
+    for row, values in enumerate(ours.swapaxes(0, 1)):
+        band = math.isqrt(row)
+        name = f"SH_DEGREE_{band}_COEF_{row - band**2}"
+        np.testing.assert_array_equal(kinds.pop(name), values)
+    assert not kinds
+
+
+def test_too_many_gaussians_for_a_glb_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(gltf, "MOST_BYTES", 4000)
+    with pytest.raises(ValueError, match="at most 4000: write fewer"):
+        files.save(tmp_path / "a.glb", some_splats())
+    assert not list(tmp_path.iterdir())
 
 
 def test_turned_gaussians_look_the_same_from_a_turned_camera():
