@@ -1,6 +1,6 @@
 """Values of Gaussians for files that store them after their activations."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,14 +34,12 @@ def activate(rows: Splats) -> Activated:
     Returns:
       The activated Gaussians.
     """
-    leaves: Any = (np.asarray(leaf, np.float64) for leaf in rows)
-    rows = Splats(*leaves)
     return Activated(
-        rows.mean,
-        unit_quaternion(rows.quaternion),
-        np.exp(np.clip(rows.log_scale, *LOG_SCALE_RANGE)),
+        np.asarray(rows.mean, np.float64),
+        unit_quaternion(np.asarray(rows.quaternion)),
+        np.exp(np.clip(np.asarray(rows.log_scale, np.float64), *LOG_SCALE_RANGE)),
         opacity_of(rows),
-        np.concatenate([rows.sh_dc, rows.sh_rest], axis=1),
+        np.concatenate([rows.sh_dc, rows.sh_rest], axis=1).astype(np.float64),
     )
 
 
