@@ -151,7 +151,7 @@ def flow_error(
     if observation.valid is not None:
         valid = valid & observation.valid
     if spec.moving_only and frames.moving is not None:
-        valid = valid & frames.moving[row]
+        valid = valid & frames.moving[frames.image_row(row)]
     object_flow = shift - camera_flow(pair, rendered.depth, raster_spec.distorted)
     return error(rendered.flow, object_flow, valid), jnp.mean(valid.astype(shift.dtype))
 

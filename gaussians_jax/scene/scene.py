@@ -392,11 +392,12 @@ def observe(
     Returns:
       The observation, with the frame as floats in [0, 1].
     """
+    image_row = frames.image_row(row)
     return Observation(
         rendering,
-        frames.images[frames.image_row(row)].astype(frames.times.dtype) / 255,
-        None if frames.valid is None else frames.valid[row],
-        None if frames.depths is None else frames.depths[row],
+        frames.images[image_row].astype(frames.times.dtype) / 255,
+        None if frames.valid is None else frames.valid[image_row],
+        None if frames.depths is None else frames.depths[image_row],
         frames,
         row,
     )

@@ -3,17 +3,34 @@
 JAX on the CPU uses the memory of a NumPy array if it is aligned, and copies it
 otherwise. Readers therefore decode into aligned arrays, and training indexes all frames
 of a large capture instead of copying the training frames.
+
+Arrays above `MOST_IN_MEMORY` are mapped from a temporary file: the system reads the
+frames that are used from the disk, and drops them again if memory is short.
 """
 
+import contextlib
+import errno
 import math
+import mmap
+import os
+import pathlib
+import shutil
+import tempfile
+import threading
+import time
+import weakref
 from typing import Any
 
 import jax
 import numpy as np
 
+from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 
 ALIGNMENT = 64  # bytes, of arrays that XLA uses without a copy
+MOST_IN_MEMORY = 2 * 2**30  # bytes of an array; larger ones are mapped from a file
+FOLDER = CACHE / "frames"  # of these files, which have no names
+UNMAP_SECONDS = 0.25
 # Images in memory while a capture is read: four threads, each with a decoded image and
 # its array.
 READING_IMAGES = 8
@@ -22,20 +39,75 @@ READING_IMAGES = 8
 LEAST_SHARED_BYTES = 2**26
 
 
-def aligned_empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """Allocate an array that JAX on the CPU uses without a copy.
+def allocate(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """Allocate an array of frames that JAX on the CPU uses without a copy.
 
     Args:
       shape: Its shape.
       dtype: Its type.
 
     Returns:
-      The array, not initialized.
+      The array, filled with zeros. It is mapped from a file if it is large.
+
+    Raises:
+      OSError: If the disk has no space for the file.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    memory = np.empty(size + ALIGNMENT, np.uint8)
+    if size > MOST_IN_MEMORY:
+        return np.ndarray(shape, dtype, _mapping(size, FOLDER))
+    memory = np.zeros(size + ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % ALIGNMENT
     return memory[start : start + size].view(dtype).reshape(shape)
+
+
+def is_mapped(array: np.ndarray) -> bool:
+    """Test if an array is mapped from a file.
+
+    Args:
+      array: An array or a view of it.
+
+    Returns:
+      True if it is.
+    """
+    owner: Any = array
+    while isinstance(owner, np.ndarray):
+        owner = owner.base
+    return isinstance(owner, mmap.mmap)
+
+
+def _mapping(size: int, folder: pathlib.Path) -> mmap.mmap:
+    """Map a temporary file, which the system deletes with the mapping."""
+    folder.mkdir(parents=True, exist_ok=True)
+    free = shutil.disk_usage(folder).free
+    if free < size:
+        reason = f"{size / 2**30:.1f} GiB are needed and {free / 2**30:.1f} are free"
+        raise OSError(errno.ENOSPC, reason, str(folder))
+    with tempfile.TemporaryFile(dir=folder) as file:
+        # Writing to a page for which the disk has no space would end the process.
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            file.truncate(size)
+        mapping = mmap.mmap(file.fileno(), size)
+    if hasattr(mapping, "madvise"):
+        unmapping = threading.Thread(
+            target=_unmap_pages, args=(weakref.ref(mapping),), daemon=True
+        )
+        unmapping.start()
+    return mapping
+
+
+def _unmap_pages(mapping: weakref.ref) -> None:
+    """Return pages of a mapping to the system, while the mapping exists.
+
+    They stay in the system's cache as long as memory is free, and do not count as
+    memory of this process.
+    """
+    while (pages := mapping()) is not None:
+        with contextlib.suppress(OSError, ValueError):  # closed
+            pages.madvise(mmap.MADV_DONTNEED)
+        del pages
+        time.sleep(UNMAP_SECONDS)
 
 
 def is_shared(capture: Capture) -> bool:
@@ -53,7 +125,6 @@ def is_shared(capture: Capture) -> bool:
         and images.flags.c_contiguous
         and images.ctypes.data % ALIGNMENT == 0
         and jax.default_backend() == "cpu"
-        and jax.local_device_count() == 1
     )
 
 
@@ -67,11 +138,12 @@ def frame_bytes(capture: Capture, devices: int = 1) -> int:
     Returns:
       Bytes of the capture on the host, plus the larger of two: the images that are
       decoded at a time, or the copies of the training frames on the host and on each
-      device.
+      device. CPU devices share one copy.
     """
     image = capture.images[:1].nbytes
     copies = 0
     if not is_shared(capture):
+        devices = 1 if jax.default_backend() == "cpu" else devices
         copies = len(capture.train) * (devices + 1)
     return capture_bytes(capture) + image * max(copies, READING_IMAGES)
 

@@ -21,7 +21,7 @@ from nerfies_jax.capture.capture import CaptureError, blocks, shrink
 from nerfies_jax.runtime import events
 
 MAX_FRAMES = 100_000
-MAX_BYTES = 16 * 2**30  # of decoded images
+MAX_BYTES = 64 * 2**30  # of decoded images
 OPAQUE = 128  # smallest alpha of opaque pixels
 SUFFIXES = (".png", ".jpg", ".jpeg")  # in lower case; files may use any case
 _ENDINGS = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
@@ -241,8 +241,48 @@ class Frames(NamedTuple):
         Returns:
           Booleans [frames, height, width], None for all.
         """
-        opaque = None if self.alpha is None else self.alpha == 255
-        return both(opaque, self.observed)
+        if self.alpha is None:
+            return self.observed
+        opaque = frame_memory.allocate(self.alpha.shape, np.bool_)
+        np.equal(self.alpha, 255, out=opaque)
+        return opaque if self.observed is None else opaque & self.observed
+
+
+def allocated(shape: tuple[int, int, int, int], where: str) -> np.ndarray:
+    """Allocate the images of a capture, and say so if a file holds them.
+
+    Args:
+      shape: Frames, height, width and channels.
+      where: Name of the capture in error messages.
+
+    Returns:
+      uint8 array of zeros.
+
+    Raises:
+      CaptureError: If they need more than `MAX_BYTES` or than the disk has.
+    """
+    count, height, width, _ = shape
+    total = math.prod(shape)
+    size = f"{count:,} images of {width}x{height}"
+    if total > MAX_BYTES:
+        raise CaptureError(
+            f"{where}: {size} need {total / 2**30:.0f} GiB, more than "
+            f"{MAX_BYTES / 2**30:.0f}; read them smaller with factor= or max_side="
+        )
+    try:
+        images = frame_memory.allocate(shape, np.uint8)
+    except OSError as error:
+        raise CaptureError(
+            f"{where}: {size} need a temporary file ({error}); free space, set "
+            "XDG_CACHE_HOME to another disk, or read smaller images with factor= or "
+            "max_side="
+        ) from error
+    if frame_memory.is_mapped(images):
+        events.message(
+            f"frames are streamed from disk: {size} take {total / 2**30:.1f} GiB, "
+            f"more than {frame_memory.MOST_IN_MEMORY / 2**30:.0f} GiB"
+        )
+    return images
 
 
 def both(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray | None:
@@ -302,16 +342,10 @@ def read_frames(
             f"{paths[0]}: {size} pixels cannot be reduced by {shrink_by}; use a "
             "smaller factor"
         )
-    if len(paths) * width * height * 3 > MAX_BYTES:
-        raise CaptureError(
-            f"{paths[0].parent}: {len(paths)} images of {width}x{height} need "
-            f"{len(paths) * width * height * 3 / 2**30:.0f} GiB, more than "
-            f"{MAX_BYTES / 2**30:.0f}; read them smaller with factor= or max_side="
-        )
-    colors = frame_memory.aligned_empty((len(paths), height, width, 3), np.uint8)
+    colors = allocated((len(paths), height, width, 3), str(paths[0].parent))
     # 255 - alpha: the zeros of opaque images, as of most captures, use no memory until
     # they are written.
-    transparencies = np.zeros((len(paths), height, width), np.uint8)
+    transparencies = frame_memory.allocate((len(paths), height, width), np.uint8)
 
     def decode(row):
         alpha = is_observed = None
@@ -383,7 +417,8 @@ def read_masks(
       CaptureError: If a mask has another size, or all masks are black.
     """
     width, height = size
-    share = np.ones((len(paths), height, width), np.float32)
+    share = frame_memory.allocate((len(paths), height, width), np.float32)
+    share.fill(1)
     files = [path for path in paths if path is not None]
     encoding = masks.find_encoding(files)
     for row, path in enumerate(paths):
@@ -402,6 +437,7 @@ def read_masks(
                 "that of the mask be an integer multiple"
             )
         share[row] = blocks(mask, factor).mean((-3, -1))
-    white = share[[path is not None for path in paths]].mean()
-    note = masks.describe(files, len(paths), encoding, float(white), black)
+    has_file = np.array([path is not None for path in paths])[:, None, None]
+    white = float(share.mean(where=has_file))
+    note = masks.describe(files, len(paths), encoding, white, black)
     return share, (note,)

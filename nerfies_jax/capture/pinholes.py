@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from nerfies_jax.capture import given_lens, resampling
+from nerfies_jax.capture import frame_memory, given_lens, resampling
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import lens, rays
@@ -114,10 +114,10 @@ _last = _Last()
 def _undistort(capture, wide):
     """Images, masks and depths by name, with booleans of the observed pixels."""
     shape = (len(capture.images), *wide.size[::-1])
-    images = np.empty((*shape, 3), capture.images.dtype)
-    observed = np.empty(shape, bool)
+    images = frame_memory.allocate((*shape, 3), capture.images.dtype)
+    observed = frame_memory.allocate(shape, np.bool_)
     masks: dict[str, Any] = {
-        name: None if array is None else np.empty(shape, array.dtype)
+        name: None if array is None else frame_memory.allocate(shape, array.dtype)
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
     }
 
@@ -232,14 +232,18 @@ def scorable(filmed: Capture) -> Capture:
     if not has_lens(filmed.cameras):
         return filmed
     maps = Maps(_straight_pixels, filmed.size)
-    scorable_pixels = np.stack(
-        [
-            maps.of(cameras.take(filmed.cameras, row))[1]
-            for row in range(len(filmed.ids))
-        ]
-    )
+    each = [
+        maps.of(cameras.take(filmed.cameras, row))[1] for row in range(len(filmed.ids))
+    ]
+    if all(pixels.all() for pixels in each):
+        return filmed
+    scorable_pixels = frame_memory.allocate(filmed.images.shape[:3], np.bool_)
+    np.stack(each, out=scorable_pixels)
+    valid = scorable_pixels
+    if filmed.valid is not None:
+        valid = frame_memory.allocate(scorable_pixels.shape, np.bool_)
+        np.logical_and(filmed.valid, scorable_pixels, out=valid)
     depths = filmed.depths
-    valid = scorable_pixels if filmed.valid is None else filmed.valid & scorable_pixels
     before = 1.0 if filmed.valid is None else filmed.valid.mean()
     if valid.mean() == before:
         return filmed

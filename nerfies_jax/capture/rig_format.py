@@ -5,7 +5,7 @@ camera has one video (`cam00.mp4`) or one folder of images (`cam00/`, `cam00/ima
 """
 
 import pathlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -188,14 +188,7 @@ def _read_videos(path, files, shrink_by):
     """Decode all videos. Equal times are equal numbers of frame intervals."""
     count = sum(video.stated_frames(file) for file in files)
     width, height = (side // shrink_by for side in _size_of(files[0]))
-    total = count * width * height * 3
-    if total > frames.MAX_BYTES:
-        raise CaptureError(
-            f"{path}: {count} frames of {width}x{height} in {len(files)} videos "
-            f"need {total / 2**30:.0f} GiB, more than {frames.MAX_BYTES / 2**30:.0f}; "
-            "read them smaller with factor= or max_side="
-        )
-    images: Any = np.empty((count + SPARE, height, width, 3), np.uint8)
+    images = frames.allocated((count + SPARE, height, width, 3), str(path))
     seconds: list[float] = []
     camera_ids: list[int] = []
     notes: tuple[str, ...] = ()
@@ -204,7 +197,9 @@ def _read_videos(path, files, shrink_by):
             first = len(seconds)
             for time, frame in video.read_video(file, damaged="skip"):
                 if len(seconds) == len(images):  # more frames than in the headers
-                    images = np.concatenate([images, np.empty_like(images)])
+                    more = frames.allocated((2 * len(images), *images.shape[1:]), path)
+                    more[: len(images)] = images
+                    images = more
                 images[len(seconds)] = _shrink(file, frame, shrink_by, (width, height))
                 seconds.append(time)
                 camera_ids.append(number)

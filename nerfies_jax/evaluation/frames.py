@@ -31,28 +31,29 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
     Returns:
       The frames.
     """
-    rows = capture.train
-    extras = {}
+    rows, extras = capture.train, {}
+    shared = frame_memory.is_shared(capture)
+
+    def pixels(array):
+        # Unlike `jnp.asarray`, `device_put` does not copy the array.
+        return jax.device_put(array) if shared else array[rows]
+
     if "depths" in required_data and capture.depths is not None:
-        extras["depths"] = capture.depths[rows]
+        extras["depths"] = pixels(capture.depths)
     if "points" in required_data and capture.points is not None:
         extras["points"] = capture.points.position
     if "flow" in required_data and capture.flow is not None:
         extras["flow"] = training_flow(capture)
     if "moving" in required_data and capture.moving is not None:
-        extras["moving"] = capture.moving[rows]
-    if frame_memory.is_shared(capture):
-        # Unlike `jnp.asarray`, this does not copy the array.
-        images = jax.device_put(capture.images)
+        extras["moving"] = pixels(capture.moving)
+    if shared:
         extras["image_rows"] = rows.astype(np.int32)
-    else:
-        images = capture.images[rows]
     frames = Frames(
-        images=images,
+        images=pixels(capture.images),
         cameras=cameras.take(capture.cameras, rows),
         times=capture.times[rows],
         appearance=capture.appearance_ids[rows],
-        valid=None if capture.valid is None else capture.valid[rows],
+        valid=None if capture.valid is None else pixels(capture.valid),
         **extras,
     )
     return in_default_precision(frames)

@@ -276,10 +276,10 @@ def _one_each(work, fixed, devices, rows):
 
 
 def shared(tree: PyTree, devices: int) -> PyTree:
-    """Replicate arrays without a copy on the first device.
+    """Replicate arrays without a copy on the first device, or on any CPU device.
 
     Args:
-      tree: A pytree of arrays, which must never be donated to a program.
+      tree: A pytree of arrays of numbers, which must never be donated to a program.
       devices: Number of devices.
 
     Returns:
@@ -287,6 +287,13 @@ def shared(tree: PyTree, devices: int) -> PyTree:
     """
     if devices == 1:
         return tree
+    if jax.local_devices()[0].platform == "cpu":
+        tree = jax.tree.map(np.asarray, tree)  # memory that all CPU devices use
+    return _on_each(tree, devices)
+
+
+def _on_each(tree, devices):
+    """Replicate arrays, which does not compare those of several processes."""
     mesh = _mesh(devices)
     sharding = NamedSharding(mesh, PartitionSpec())
 
@@ -310,7 +317,7 @@ def replicate(tree: PyTree, devices: int) -> PyTree:
     if devices == 1:
         return tree
     if _spanning:  # `device_put` would compare the arrays of all processes
-        return shared(tree, devices)
+        return _on_each(tree, devices)
     return jax.device_put(tree, NamedSharding(_mesh(devices), PartitionSpec()))
 
 

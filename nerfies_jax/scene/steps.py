@@ -251,10 +251,11 @@ def draw_batch(
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     pixel = jnp.stack([column, line], axis=1).astype(camera.position.dtype) + 0.5
     ray = jax.vmap(rays.pixel_ray)(camera, pixel)
-    color = frames.images[frames.image_row(row), line, column].astype(pixel.dtype) / 255
+    pixels = frames.image_row(row), line, column
+    color = frames.images[pixels].astype(pixel.dtype) / 255
     valid = ray.valid
     if frames.valid is not None:
-        valid = valid & frames.valid[row, line, column]
+        valid = valid & frames.valid[pixels]
     # Masked here for all losses, because unobserved pixels may be NaN, which a weight
     # of zero does not remove.
     color = jnp.where(valid[:, None], color, 0)

@@ -28,18 +28,18 @@ class Frames(NamedTuple):
     points: Any = None  # [points, 3] float32 static scene points, scene units
     flow: FrameFlow | None = None  # its rows are training frames
     moving: Any = None  # [frames, height, width] bool, True for moving objects
-    # Rows of the training frames in `images` if it has all frames of the capture. None
-    # if it has only the training frames.
+    # Rows of the training frames in `images`, `valid`, `depths` and `moving` if these
+    # have all frames of the capture. None if they have only the training frames.
     image_rows: Any = None
 
     def image_row(self, row: Any) -> Any:
-        """Return the row of `images` that holds a training frame.
+        """Return the row of the arrays of pixels that holds a training frame.
 
         Args:
           row: Row of the training frame.
 
         Returns:
-          The row of its image.
+          The row of its image, masks and depth.
         """
         return row if self.image_rows is None else self.image_rows[row]
 

@@ -3,24 +3,33 @@
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
+import time
+from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from nerfies_jax import evaluation
-from nerfies_jax.capture import frame_memory
-from nerfies_jax.capture.images import write_png
+from nerfies_jax.capture import formats, frame_memory
+from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.images import read_image, write_png
+from nerfies_jax.runtime import events
 from nerfies_jax.scene import steps
+from tests import scenes
 from tests.capture.test_capture import make
+from tests.test_devices import model_of
+from tests.training import toy
 
 
 @pytest.mark.full
 def test_large_captures_are_trained_on_where_they_lie(monkeypatch):
     capture = make(frames=6)
-    images = frame_memory.aligned_empty(capture.images.shape, np.uint8)
+    images = frame_memory.allocate(capture.images.shape, np.uint8)
     images[:] = capture.images
     aligned = dataclasses.replace(capture, images=images)
     copied = evaluation.frames_of(aligned)
@@ -37,8 +46,60 @@ def test_large_captures_are_trained_on_where_they_lie(monkeypatch):
     image, own = capture.images[:1].nbytes, frame_memory.capture_bytes(aligned)
     assert frame_memory.frame_bytes(aligned) == own + 8 * image
     monkeypatch.setattr(frame_memory, "LEAST_SHARED_BYTES", 2**40)
-    copies = 5 * len(capture.train)
+    copies = 2 * len(capture.train)  # CPU devices share one
     assert frame_memory.frame_bytes(aligned, 4) == own + copies * image
+
+
+@pytest.fixture
+def on_disk(monkeypatch, tmp_path):
+    """Let arrays of any size be mapped from files in a folder."""
+    monkeypatch.setattr(frame_memory, "MOST_IN_MEMORY", 0)
+    monkeypatch.setattr(frame_memory, "FOLDER", tmp_path / "files")
+    return tmp_path / "files"
+
+
+def test_large_captures_are_streamed_from_a_file_that_is_deleted(tmp_path, on_disk):
+    frames(tmp_path / "capture", 4, (64, 48))
+    messages = []
+    with events.subscribe(messages.append):
+        loaded = formats.load(tmp_path / "capture")
+    assert frame_memory.is_mapped(loaded.images)
+    (line,) = (m["text"] for m in messages if m["kind"] == "message")
+    assert line.startswith("frames are streamed from disk: 4 images of 64x48 take ")
+    assert list(on_disk.iterdir()) == []  # also if the process is killed
+    image = read_image(tmp_path / "capture/images/0.png")[0]
+    for _ in range(2):
+        np.testing.assert_array_equal(loaded.images, 4 * [image])
+        time.sleep(2 * frame_memory.UNMAP_SECONDS)  # its pages are unmapped meanwhile
+
+
+def test_frames_that_do_not_fit_on_the_disk_are_refused(tmp_path, on_disk, monkeypatch):
+    frames(tmp_path / "capture", 4, (64, 48))
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=100))
+    with pytest.raises(
+        CaptureError, match="images: 4 images of 64x48 need a temporary"
+    ):
+        formats.load(tmp_path / "capture")
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("spec", [scenes.TINY_SPLATS, scenes.TINY_FIELD])
+def test_streamed_frames_train_as_those_in_memory(spec, on_disk, monkeypatch):
+    """Bit for bit."""
+    capture = scenes.tiny_capture()
+    images = frame_memory.allocate(capture.images.shape, np.uint8)
+    images[:] = capture.images
+    states = []
+    for least, each in (
+        (0, dataclasses.replace(capture, images=images)),
+        (1e9, capture),
+    ):
+        monkeypatch.setattr(frame_memory, "LEAST_SHARED_BYTES", least)
+        model, state, frames = model_of(spec, each)
+        assert (frames.image_rows is None) == (least > 0)
+        states.append(toy.fit(frames, state, model, steps=5).state)
+    for one, other in zip(*map(jax.tree.leaves, states), strict=True):
+        assert jnp.array_equal(one, other)
 
 
 MEASURE = """

@@ -52,6 +52,8 @@ def test_each_row_is_worked_on_once_and_in_order():
 def both(devices):
     assert jax.local_device_count() == devices
     assert sums_of_rows() == [12.0, 30.0, 48.0]
+    images = data_parallel.shared(jnp.ones((64, 64)), devices).addressable_shards
+    assert len({each.data.unsafe_buffer_pointer() for each in images}) == 1
     one, several = trained(1), trained(devices)
     for ours, plain in zip(
         *map(jax.tree.leaves, (several.state, one.state)), strict=True

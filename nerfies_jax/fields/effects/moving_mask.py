@@ -167,7 +167,7 @@ def penalty(
         return {}
     batch = context.batch
     column, line = jnp.floor(batch.pixel).astype(jnp.int32).T
-    moves = frames.moving[batch.row, line, column]
+    moves = frames.moving[frames.image_row(batch.row), line, column]
     predict = jax.vmap(jax.vmap(functools.partial(share, spec, params), (0, None)))
     error = total(
         difference(predict(level.point, context.condition), level, moves, batch.valid)

@@ -430,7 +430,8 @@ def _depth_term(
     """Compare the depth of the medium alone with that of the capture, normalized."""
     batch, level = context.batch, context.levels[-1]
     assert context.frames is not None
-    captured = _pixels(context.frames.depths, batch.row, batch.pixel)
+    image_row = context.frames.image_row(batch.row)
+    captured = _pixels(context.frames.depths, image_row, batch.pixel)
     distance = flow_losses.expected_value(weight, level.distances[..., None])[..., 0]
     predicted = distance * batch.cosine / context.box.scale
     return flow_losses.normalized_depth(
