@@ -66,6 +66,7 @@ class KanMotionSpec:
     base: bool = True
     norm: bool = True
     trainable_kernels: bool = False
+    width_jitter: float | None = None  # as for `nn.kan.KANSpec`
     network: str = "kan"
     mlp_width: int | None = None
     position: bool = True
@@ -188,6 +189,7 @@ def _kan_spec(spec):
         base=spec.base,
         norm=spec.norm,
         trainable_kernels=spec.trainable_kernels,
+        width_jitter=spec.width_jitter,
         basis="bspline" if spec.network == "bspline" else "rbf",
     )
 

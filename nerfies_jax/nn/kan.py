@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Key
 
@@ -43,6 +44,12 @@ NORM_VARIANCE = 1e-6
 # Trained log-widths are clipped to this distance from their initial value, a factor of
 # 2e4 in either direction. 1 / width overflows float32 beyond 88.
 LOG_WIDTH_RANGE = 10.0
+# A KAN of 1, 16 and 1 features with 16 kernels, fitted to five sines (1 to 31 half
+# periods over the grid) at 256 points by 2000 steps of Adam, five seeds, RMS error
+# between the points: 0.011 ± 0.003 with equal widths, 0.015 ± 0.009 with a jitter of
+# 0.2, 0.035 ± 0.019 with 0.4, 0.127 ± 0.030 with 0.8, and 0.011 ± 0.008 with trained
+# centers and widths.
+MAX_WIDTH_JITTER = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +72,8 @@ class KANSpec:
     (appendix A.3): with one width and even spacing all Gaussians have one spectrum,
     exp(-sigma^2 w^2 / 2), and the weights alone shape that of the sum by their
     interference, sum_g C_g exp(-i w mu_g). Unequal widths and gaps break that up.
+    `width_jitter` makes the widths of a layer unequal, to measure this: it is the
+    standard deviation of their logarithms, which are fixed random numbers.
     """
 
     in_features: int
@@ -78,6 +87,7 @@ class KANSpec:
     base: bool = True  # adds the SiLU term
     norm: bool = True
     trainable_kernels: bool = False
+    width_jitter: float | None = None
     basis: str = "rbf"
 
     def __post_init__(self):
@@ -132,10 +142,16 @@ class KANSpec:
                 f"kernels={self.kernels} must be at least {DEGREE + 1}, the number of "
                 "cubic B-splines on a grid of one interval"
             )
-        if self.basis == "bspline" and self.trainable_kernels:
+        for name in ("trainable_kernels", "width_jitter"):
+            if self.basis == "bspline" and getattr(self, name):
+                raise ValueError(
+                    f'{name}={getattr(self, name)} requires basis="rbf": B-spline '
+                    "knots are fixed and uniform"
+                )
+        if not 0 <= (self.width_jitter or 0) <= MAX_WIDTH_JITTER:
             raise ValueError(
-                'trainable_kernels=True requires basis="rbf": B-spline knots are fixed '
-                "and uniform"
+                f"width_jitter={self.width_jitter} must be from 0 to "
+                f"{MAX_WIDTH_JITTER}, or None; beyond it kernels leave gaps"
             )
 
     @property
@@ -240,6 +256,25 @@ def width(spec: KANSpec, layer: int) -> float:
     return math.sqrt(2) * spec.width_ratio * spacing(spec, layer)
 
 
+def kernel_widths(spec: KANSpec, layer: int) -> np.ndarray:
+    """Return the width of each of a layer's kernels, as for `width`.
+
+    With `width_jitter` they differ, by factors that depend on the layer alone.
+
+    Args:
+      spec: The network's settings.
+      layer: Index of the layer, counted from 0.
+
+    Returns:
+      Widths, [kernels].
+    """
+    widths = np.full(spec.kernels, width(spec, layer))
+    if spec.width_jitter is None:
+        return widths
+    noise = np.random.default_rng(layer).normal(size=spec.kernels)
+    return widths * np.exp(spec.width_jitter * noise)
+
+
 @checked
 def init(key: Key[Array, ""], spec: KANSpec, dtype: DTypeLike = jnp.float32) -> KAN:
     """Initialize the parameters of a network.
@@ -274,7 +309,10 @@ def init(key: Key[Array, ""], spec: KANSpec, dtype: DTypeLike = jnp.float32) -> 
         kernels = tuple(
             Kernels(
                 jnp.tile(centers(spec, layer, dtype)[:, None], (1, inputs)),
-                jnp.full((spec.kernels, inputs), math.log(width(spec, layer)), dtype),
+                jnp.asarray(
+                    np.tile(np.log(kernel_widths(spec, layer))[:, None], (1, inputs)),
+                    dtype,
+                ),
             )
             for layer, inputs in enumerate(widths)
         )
@@ -511,7 +549,7 @@ def _sum_over_inputs(spec, index, layer, kernels, inputs):
     clamped = hold(inputs, spec.grid_of(index), margin)
     if kernels is None:
         center = centers(spec, index, dtype)
-        per_width = jnp.full_like(center, 1 / width(spec, index))
+        per_width = jnp.asarray(1 / kernel_widths(spec, index), dtype)
     else:
         center = kernels.center
         initial = math.log(width(spec, index))

@@ -29,6 +29,7 @@ VARIANTS = {
     "no base": dataclasses.replace(SPEC, base=False),
     "no norm": dataclasses.replace(SPEC, norm=False),
     "trained kernels": dataclasses.replace(SPEC, trainable_kernels=True),
+    "unequal widths": dataclasses.replace(SPEC, width_jitter=0.4),
     "no hidden": dataclasses.replace(SPEC, hidden=()),
     "B-splines": dataclasses.replace(SPEC, basis="bspline", kernels=6),
 }
@@ -103,6 +104,9 @@ def by_hand(spec, params, x):
             features = features / np.sqrt(np.mean(features**2) + 1e-6)
         center = np.linspace(*grid, spec.kernels)[:, None]
         scale = math.sqrt(2) * sigma
+        if spec.width_jitter is not None:
+            noise = np.random.default_rng(index).normal(size=spec.kernels)
+            scale = scale * np.exp(spec.width_jitter * noise)[:, None]
         if spec.trainable_kernels:
             center = params.kernels[index].center
             scale = np.exp(params.kernels[index].log_width)
