@@ -92,9 +92,9 @@ COLLECTION = SplatScene(
 
 # Yang et al. 2023, arXiv:2309.13101, for real captures: the network, the warm-up and
 # the smoothing are defaults of `MotionSpec`. The rates of the means decay until the
-# end, in the paper until step 30,000. Gaussians grow from a mean gradient of 2e-4 on, as
-# in the paper and 3DGS. The threshold of the current public code, 7e-4, is for absolute
-# values of gradients, summed over pixels, which are larger.
+# end, in the paper until step 30,000. Gaussians grow from a mean gradient of 2e-4 on,
+# as in the paper and 3DGS. The threshold of the current public code, 7e-4, is for
+# absolute values of gradients, summed over pixels, which are larger.
 DEFORMABLE = SplatScene(
     steps=40_000,
     learning_rates=LearningRateSpec(log_scale=1e-3),
