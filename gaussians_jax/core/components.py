@@ -17,6 +17,7 @@ from gaussians_jax.core.protocols import (
 )
 from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Params
+from nerfies_jax.training import programs
 from nerfies_jax.training.effects import stream
 from nerfies_jax.training.protocols import (
     Regularizer,
@@ -107,6 +108,26 @@ def compile_motion(motion: Motion) -> SplatRecord:
         fit_to_paths=getattr(motion, "fit", None),
         **hooks,
     )
+
+
+def motion_of_capture(motion: Any, steps: int, metadata: SceneMetadata) -> SplatRecord:
+    """Bind a motion to a run on a capture and compile it.
+
+    Args:
+      motion: The motion, or its settings.
+      steps: Number of training steps.
+      metadata: Metadata of the capture.
+
+    Returns:
+      The record, whose programs take the numbers of the capture as arguments.
+    """
+
+    def build_with(numbers):
+        renewed = dataclasses.replace(metadata, **numbers)
+        return compile_motion(bound(motion, steps, renewed))
+
+    record = compile_motion(bound(motion, steps, metadata))
+    return programs.taking(record, metadata.numbers, build_with)
 
 
 def compile_appearance(appearance: Appearance) -> SplatRecord:

@@ -55,10 +55,13 @@ class SceneMetadata:
         instead (`scene.spec.raster_of`), because the settings of the rasterizer must be
         hashable.
         """
+        exposures: Any = self.exposures
+        if not isinstance(exposures, jax.Array):
+            exposures = np.asarray(exposures, float)
         return {
             "extent": self.extent,
             "background": self.background,
-            "exposures": np.asarray(self.exposures, float),
+            "exposures": exposures,
             "box": self.box,
             "depth": self.depth,
         }

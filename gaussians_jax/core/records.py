@@ -73,3 +73,7 @@ class SplatRecord(Record):
     # steps `revise_at`. Host side.
     revise: Callable[[PyTree, int], PyTree] | None = None
     revise_at: tuple[int, ...] = ()
+    # Numbers of the capture that the hooks of a motion read, and a function (record,
+    # numbers) -> the record for other numbers (`training.programs`).
+    numbers: PyTree = None
+    with_numbers: Callable[["SplatRecord", PyTree], "SplatRecord"] | None = None

@@ -359,6 +359,7 @@ def fit(
     Raises:
       ValueError: If no position is known.
     """
+    effect = programs.with_numbers(effect, jax.tree.map(captured, effect.numbers))
     times, position, valid, _, _, depth = paths
     if not valid.any():
         raise ValueError("no path has a known position; a motion cannot be fitted")

@@ -23,6 +23,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.preprocessing import record, usable_paths, view_set
 from nerfies_jax.preprocessing.moving import picture_scale
 from nerfies_jax.preprocessing.record import Evidence
+from nerfies_jax.training import programs
 
 DEPTH_TRACKS, DEPTH_REACH_PX = 6, 8.0  # tracks that give a moving pixel its depth
 CARRIERS = 3  # points of the fit that determine a Gaussian's motion parameters
@@ -101,9 +102,7 @@ def _seeds(effect, points, visibility, evidence, views, times, unit, spec):
     frame, row, column = frame[selection], row[selection], column[selection]
     canonical = np.asarray(points.canonical)
     point_rows = None if points.rows is None else jax.tree.map(np.asarray, points.rows)
-    positions_at = jax.jit(
-        lambda points, time: motion_fit.positions_at(effect, points, time)
-    )
+    positions_at = programs.Program(motion_fit.positions_at, effect)
     # Empty arrays, because there may be no frame with enough tracks.
     empty = np.zeros((0, 3), np.float32)
     positions, colors, spans = [empty], [empty], [np.zeros((2, 0))]

@@ -303,6 +303,9 @@ def _find(
     )
 
 
+_find_linked = functools.partial(jax.jit, static_argnums=1)(_find)
+
+
 def displace(
     nodes: Nodes,
     now: Moves,
@@ -364,7 +367,7 @@ def fit_to_paths(
       Initial guess of a fit.
     """
     canonical = motion_fit.positions_at_middle(paths)
-    unit, unit_extent = map(motion_fit.captured, (paths.unit, extent))
+    unit = motion_fit.captured(paths.unit)
     static_points = np.zeros((0, 3))
     if paths.still is not None:
         static_points = np.asarray(paths.still, np.float64)
@@ -388,7 +391,7 @@ def fit_to_paths(
             static = static._replace(mask=all_nodes.mask[static_rows])
 
         def motion(time):
-            now = moves(static, spec, unit_extent, time)
+            now = moves(static, spec, extent, time)
             return now.turn[:, 1:], now.shift
 
         return motion_fit.rest_loss(motion, unit, times)
@@ -433,10 +436,9 @@ class Bound(BoundMotion):
         mean = gaussians.mean
         return _find(params.shared, self.spec, self.extent, mean, linked=False)
 
-    @functools.partial(jax.jit, static_argnums=0)
     def refresh(self, params: MotionParams, gaussians: Splats) -> Neighborhoods:
         """Find nodes near Gaussians and each other, for a new set of Gaussians."""
-        return _find(params.shared, self.spec, self.extent, gaussians.mean)
+        return _find_linked(params.shared, self.spec, self.extent, gaussians.mean)
 
     def apply(
         self,

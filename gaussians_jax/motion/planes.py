@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Key
 
@@ -237,9 +238,7 @@ class Bound(BoundMotion):
     def __post_init__(self):
         if is_traced(self.box):
             return
-        if self.box is None or not all(
-            low < high for low, high in zip(*self.box, strict=True)
-        ):
+        if self.box is None or not np.all(np.less(*self.box)):
             raise ValueError(
                 f"the planes of a motion need a bounding box, got box={self.box}; pass "
                 "the minimum and maximum corner to SceneMetadata, as scene.metadata_of "

@@ -383,7 +383,7 @@ def motion_of(spec: SplatScene, metadata: SceneMetadata) -> SplatRecord | None:
         return None
     if spec.start.motion == "tracks":
         motion = components.moving_at_once(motion)
-    return components.compile_motion(components.bound(motion, spec.steps, metadata))
+    return components.motion_of_capture(motion, spec.steps, metadata)
 
 
 def strategy_of(spec: SplatScene, metadata: SceneMetadata) -> Strategy | None:

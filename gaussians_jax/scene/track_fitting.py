@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 from gaussians_jax.core import components
 from gaussians_jax.core.metadata import SceneMetadata
 from gaussians_jax.core.protocols import Motion
-from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Params
 from gaussians_jax.init import motion_fit
 from gaussians_jax.init.motion_fit import Paths, Points
+from nerfies_jax.training import programs
 from nerfies_jax.training.extensions import check
 
 
@@ -35,7 +35,7 @@ class TrackFit:
     params: Params
     error_before: float
     error_after: float
-    _effect: SplatRecord
+    _positions: programs.Program
     _points: Points
     _span: tuple[float, float]
 
@@ -56,10 +56,9 @@ class TrackFit:
         if fraction.ndim != 1:
             raise ValueError(f"times must have shape [times], got {fraction.shape}")
         dtype = self._points.canonical.dtype
-        return _positions(self._effect, self._points, jnp.asarray(fraction, dtype))
+        return self._positions(self._points, jnp.asarray(fraction, dtype))
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def _positions(effect, points, times):
     position_at = functools.partial(motion_fit.positions_at, effect, points)
     return jnp.swapaxes(jax.vmap(position_at)(times), 0, 1)
@@ -144,8 +143,8 @@ def fit_tracks(
     unit = max(unit, float(np.finfo(np.float32).tiny) ** 0.5)
     box = tuple(observed.min(0) - unit), tuple(observed.max(0) + unit)
     metadata = SceneMetadata(unit, (0.0, 0.0, 0.0), count, box=box)
-    component = components.bound(components.moving_at_once(motion), steps, metadata)
-    effect = components.compile_motion(component)
+    motion = components.moving_at_once(motion)
+    effect = components.motion_of_capture(motion, steps, metadata)
     fraction = (times - times[0]) / (times[-1] - times[0])
     solution = motion_fit.fit(
         effect,
@@ -163,7 +162,7 @@ def fit_tracks(
         motion_fit.scene_of(effect, solution.points),
         solution.first,
         solution.last,
-        effect,
+        programs.Program(_positions, effect),
         solution.points,
         (float(times[0]), float(times[-1])),
     )

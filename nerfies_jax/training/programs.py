@@ -7,13 +7,15 @@ shapes reuses the programs of the first.
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from jax.extend import core
 
 from nerfies_jax.training.model import Model, PyTree
+
+Owner = TypeVar("Owner")
 
 # A component from another package converts a number of the capture to a Python or NumPy
 # one, or branches on it, which is not possible for a traced number.
@@ -24,29 +26,39 @@ _CONCRETE_NUMBERS_NEEDED = (
 )
 
 
-def taking(model: Model, numbers: PyTree, build: Callable[[PyTree], Model]) -> Model:
+def taking(owner: Owner, numbers: PyTree, build: Callable[[PyTree], Owner]) -> Owner:
     """Let the programs of a model take the numbers of its capture as arguments.
 
     Args:
-      model: The model, with the numbers compiled in.
+      owner: The model, or the record of a component, with the numbers compiled in. It
+        has fields `numbers` and `with_numbers`.
       numbers: The numbers, a pytree of floats and arrays.
-      build: Function of numbers, which may be traced, that returns the model for them.
+      build: Function of numbers, which may be traced, that returns the owner for them.
 
     Returns:
-      The model with `numbers` and `with_numbers`. Functions of it that the caller
+      The owner with `numbers` and `with_numbers`. Functions of it that the caller
       replaces later stay as they are. If `build` needs concrete numbers, they stay
       compiled into the programs; its other errors are raised.
     """
+    original = _fields(owner)
 
     def renewed(current, numbers):
         try:
-            rebuilt = build(numbers)
+            rebuilt = _fields(build(numbers))
         except _CONCRETE_NUMBERS_NEEDED:
             return current
-        fields = zip(current, model, rebuilt, strict=True)
-        return Model(*(new if mine is old else mine for mine, old, new in fields))
+        fields = _fields(current)
+        same = {
+            name: rebuilt[name] for name in fields if fields[name] is original[name]
+        }
+        return type(owner)(**fields | same)
 
-    return model._replace(numbers=numbers, with_numbers=renewed)
+    return type(owner)(**original | {"numbers": numbers, "with_numbers": renewed})
+
+
+def _fields(owner):
+    """Return the fields of a named tuple or a dataclass, by name."""
+    return owner._asdict() if isinstance(owner, tuple) else vars(owner)
 
 
 def with_numbers(owner: Any, numbers: PyTree) -> Any:

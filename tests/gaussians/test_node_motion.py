@@ -21,6 +21,7 @@ from gaussians_jax.motion.nodes import MaskSpec, NodeMotionSpec
 from gaussians_jax.motion.skinning import Links, Moves
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
+from tests import compilations
 from tests.gaussians import bound
 from tests.gaussians.shared import put, rows_of, some_gaussians
 from tests.gradients import directional_error
@@ -449,6 +450,17 @@ def test_no_motion_of_nothing(changes, words):
     of = MASKED.mask if "sparsity" in changes else MOTION
     with pytest.raises(ValueError, match=words):
         dataclasses.replace(of, **changes)
+
+
+def test_the_extent_of_the_scene_is_not_compiled_into_the_neighborhoods(tmp_path):
+    params = params_of(some_gaussians(ROWS, "float32"), "float32")
+    own, counts = MotionParams(shared=params.nets[NAME]), []
+    with compilations.counted(tmp_path) as since:
+        for extent in (EXTENT, 1.1 * EXTENT):
+            motion = bound.motion(MOTION, extent=extent)
+            motion.refresh(own, params.rows["splats"])
+            counts.append(since())
+    assert counts == [1, 0]
 
 
 def test_without_rigidity_and_mask_nothing_is_found_for_them_and_nothing_costs():

@@ -6,9 +6,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import gaussians_jax as gj
+from gaussians_jax.motion.nodes import NodeMotionSpec
+from gaussians_jax.motion.planes import PlaneMotionSpec
 from gaussians_jax.motion.time_basis import TimeBasisSpec
+from nerfies_jax.nn.planes import PlanesSpec
+from tests import compilations
 
 TIMES = np.linspace(0, 1, 10)
+# Motions whose translations have the scene extent as unit.
+EXTENTS = (
+    TimeBasisSpec(count=2, depth=1, width=4),
+    PlaneMotionSpec(
+        planes=PlanesSpec(vertices=4, multiples=(1,), moments=4, features=2),
+        width=4,
+    ),
+    NodeMotionSpec(nodes=5, depth=1, width=4, skips=(), links=3),
+)
 
 
 def rigid_tracks(rng, count=20):
@@ -42,6 +55,20 @@ def test_rigid_tracks_are_recovered_where_they_are_hidden(motion, rng):
     means = fit.params.rows["splats"].mean
     assert means.shape == (40, 3)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(fit.params))
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("motion", EXTENTS, ids=lambda motion: type(motion).__name__)
+def test_a_fit_in_another_unit_compiles_nothing(motion, rng, tmp_path):
+    """The scene extent and the box are arguments of all programs."""
+    tracks, counts = rigid_tracks(rng, 4), []
+    with compilations.counted(tmp_path) as since:
+        for scale in (1.0, 1.1):
+            jax.clear_caches()
+            fit = gj.fit_tracks(motion, scale * tracks, steps=2)
+            fit.positions(TIMES[:2])
+            counts.append(since())
+    assert counts[0] > counts[1] == 0
 
 
 TRACKS = np.zeros((4, 5, 3))
