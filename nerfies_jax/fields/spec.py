@@ -202,6 +202,12 @@ class RadianceScene:
                 "a mask of what moves guides a warp, and there is none that reads it; "
                 "set warp=WarpSpec or mask=none"
             )
+        flow, guided = self.scene_flow, self.sampling.occupancy is not None
+        if flow is not None and flow.moving_rays is not None and guided:
+            raise ValueError(
+                f"scene_flow.moving_rays={flow.moving_rays} chooses rays, and so does "
+                "sampling.occupancy; set one of them to none"
+            )
         moves = self.warp is not None or self.scene_flow is not None
         if self.start.motion == "tracks" and not moves:
             raise ValueError(

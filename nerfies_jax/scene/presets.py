@@ -142,16 +142,16 @@ NERF_DS = dataclasses.replace(
 
 # Li et al. 2021, arXiv:2011.13084, and its code: one level of 128 samples, 1024 rays.
 # Normalized device coordinates, which only fit forward-facing captures, are not used,
-# so the bound on the flow is one unit of the field. The kinetic term is added once.
-# Chains over two frames and additional rays where the error is large are not
-# implemented. Flow and depth are used if a capture has them. Otherwise it trains on
-# colors only.
+# so the bound on the flow is one unit of the field. The kinetic term is added once. The
+# rays on moving objects are a third of the 1024, and count in the loss of the blended
+# image, where the public code adds 512 that do not. Masks, flow and depth are used if a
+# capture has them. Otherwise it trains on colors only.
 NSFF = dataclasses.replace(
     NERF,
     steps=360_000,
     rays=1024,
     sampling=SamplingSpec(128, 0),
-    scene_flow=SceneFlowSpec(),
+    scene_flow=SceneFlowSpec(moving_rays=1 / 3, chain_steps=100_000),
 )
 
 # Fang et al. 2022, arXiv:2205.15285, the larger published model for captures of

@@ -15,6 +15,7 @@ from nerfies_jax.fields.effects.appearance import AppearanceSpec
 from nerfies_jax.fields.effects.background import BackgroundSpec
 from nerfies_jax.fields.effects.elastic import ElasticSpec
 from nerfies_jax.fields.effects.moving_mask import MovingMaskSpec
+from nerfies_jax.fields.effects.scene_flow import SceneFlowSpec
 from nerfies_jax.fields.effects.time_condition import TimeSpec
 from nerfies_jax.fields.effects.warp import WarpSpec
 from nerfies_jax.fields.occupancy import OccupancySpec
@@ -68,6 +69,15 @@ def sample_pdf(edges, weights, count):
         (lambda: SamplingSpec(coarse=1), "coarse=1"),
         (lambda: RadianceScene(steps=1, density_noise=-1.0), "density_noise=-1.0"),
         (lambda: RadianceScene(steps=1, density_noise=np.nan), "density_noise=nan"),
+        (lambda: RadianceScene(steps=1, curriculum_steps=0), "curriculum_steps=0"),
+        (
+            lambda: RadianceScene(
+                steps=1,
+                scene_flow=SceneFlowSpec(moving_rays=0.3),
+                sampling=SamplingSpec(occupancy=OccupancySpec()),
+            ),
+            "moving_rays=0.3 chooses rays, and so does sampling.occupancy",
+        ),
         (lambda: SamplingSpec(spacing="log"), "spacing='log'"),
         (
             lambda: SamplingSpec(spacing="disparity", occupancy=OccupancySpec()),

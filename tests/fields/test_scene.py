@@ -404,6 +404,42 @@ def test_a_curriculum_adds_the_frames_in_the_order_of_time(rng):
         np.testing.assert_array_equal(drawn_from, np.sort(np.argsort(times)[:number]))
 
 
+def test_more_rays_are_of_moving_objects_at_first():
+    """Where masks have them: a third, in addition to their share of the pixels."""
+    flow = SceneFlowSpec(
+        network=TINY_TEMPLATE, time=EncodingSpec(2), moving_rays=1 / 3, decay_steps=10
+    )
+    spec = dataclasses.replace(STATIC, rays=3000, scene_flow=flow)
+    _, state, frames = started(STATIC)
+    radiance = scene.field(spec, METADATA)
+    shape = frames.images.shape[:3]
+    masks = np.zeros(shape, bool)
+    masks[1:, : shape[1] // 2, : shape[2] // 3] = True
+
+    @jax.jit
+    def rays(step, masks):
+        now, seen = state._replace(step=step), frames._replace(moving=masks)
+        batch, _ = field_steps.micro_batch(radiance, now, seen, jax.random.key(1))
+        column, line = jnp.floor(batch.pixel).astype(jnp.int32).T
+        return batch.row, line, column, batch.color
+
+    for step, share in ((0, 1 / 3), (9, 1 / 3), (10, 0.0)):
+        row, line, column, color = map(np.asarray, rays(jnp.int32(step), masks))
+        moves = masks[row, line, column]
+        expected = share + (1 - share) * masks.mean()
+        assert abs(moves.mean() - expected) < 0.04
+        # A ray misses them with a probability of up to 0.88^32 = 0.02.
+        assert share == 0 or moves[: round(share * 3000)].mean() > 0.96
+        assert len(np.unique(row[moves])) == shape[0] - 1
+        images = np.asarray(frames.images)
+        np.testing.assert_allclose(color, images[row, line, column] / 255, atol=1e-6)
+    # Nothing moves: the rays are as without it.
+    row, *_ = rays(jnp.int32(0), np.zeros(shape, bool))
+    draw = jax.jit(field_steps.draw_batch, static_argnums=1)
+    uniform = draw(frames, 3000, jax.random.key(1))
+    np.testing.assert_array_equal(row, uniform.row)
+
+
 @pytest.mark.parametrize("levels", [1, 2])
 def test_shared_and_single_levels(levels):
     plan = SamplingSpec(8, 8 if levels == 2 else 0, shared=levels == 2)

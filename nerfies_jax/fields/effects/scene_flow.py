@@ -4,8 +4,8 @@ Li et al. 2021, arXiv:2011.13084. There is no canonical scene and no warp. A sec
 field of point and time is blended with the static field and predicts its flow to the
 next and previous timestamps. The field at the next timestamp, evaluated at the points
 to which the flow leads, is supervised by the current image. Weights and sizes are those
-of the public code. Chains over two timestamps (its last stage) and extra rays on moving
-regions (its first) are not implemented.
+of the public code, and so are its first stage, with more rays on moving objects
+(`moving_rays`), and its last, with chains over two timestamps (`chain_steps`).
 """
 
 import dataclasses
@@ -71,6 +71,12 @@ class SceneFlowSpec:
     during the first steps of the medium. In the public code flow shares the trunk of
     the medium. A network on planes with `moments` (HexPlane) reads features of point
     and time instead of a positional encoding.
+
+    `moving_rays` is the share of the rays of a step that are of moving objects up to
+    `decay_steps`, if the capture has masks. In the public code a third is. From
+    `chain_steps` completed steps on, the flow is also followed over two timestamps, in
+    turn to the next and the previous ones, and the color there is compared with the
+    weight of `warped`. In the public code that is after twice the `decay_steps`.
     """
 
     network: TemplateSpec = TemplateSpec()
@@ -79,6 +85,8 @@ class SceneFlowSpec:
     weights: FlowWeights = FlowWeights()
     decay_steps: int = steps(50_000)
     flow_trunk: bool = False
+    moving_rays: float | None = None
+    chain_steps: int | None = steps(None)
 
     def __post_init__(self):
         if not (math.isfinite(self.flow_bound) and self.flow_bound > 0):
@@ -88,6 +96,16 @@ class SceneFlowSpec:
             )
         if self.decay_steps < 1:
             raise ValueError(f"decay_steps={self.decay_steps} must be at least 1")
+        if self.moving_rays is not None and not 0 < self.moving_rays <= 1:
+            raise ValueError(
+                f"moving_rays={self.moving_rays} must be a share from above 0 to 1, or "
+                "None"
+            )
+        if self.chain_steps is not None and self.chain_steps < 0:
+            raise ValueError(
+                f"chain_steps={self.chain_steps} must not be negative, or None for no "
+                "chains"
+            )
         if self.network.anneal_steps is not None:
             raise ValueError(
                 f"network.anneal_steps={self.network.anneal_steps} is not supported by "
@@ -131,11 +149,13 @@ class Neighbor(NamedTuple):
     point: Float[Array, "rays samples 3"]  # at the other timestamp
     flow: Float[Array, "rays samples 3"]  # from now to there, over one interval
     back: Float[Array, "rays samples 3"]  # from there to now, over one interval
+    onward: Float[Array, "rays samples 3"]  # from there further on, over one interval
     visible: Float[Array, "rays samples"]  # 1 - disocclusion
     disocclusion: Float[Array, "rays samples"]
     color: Float[Array, "rays 3"]  # of the medium at the other timestamp
     weight: Float[Array, "rays samples"]  # rendering weights of this color
     present: Bool[Array, " rays"]  # True if the capture has the other timestamp
+    time: Float[Array, " rays"]  # the other timestamp
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +178,7 @@ class Bound:
         """Data of the capture that its losses read."""
         weights = self.spec.weights
         weight_of = {"depths": weights.depth, "flow": weights.flow}
+        weight_of["moving"] = self.spec.moving_rays or 0.0
         return frozenset(name for name, weight in weight_of.items() if weight > 0)
 
     def init(self, key: Key[Array, ""], features: int) -> "SceneFlow":
@@ -314,26 +335,73 @@ def neighbor(
     time, present = timestamps.neighbor(times, now, SIGNS[side])
     intervals = jnp.abs(time - now) / timestamps.interval(len(times))
     point = level.point + intervals[:, None, None] * flow
-
-    def evaluate(point, direction, time):
-        return dynamic(spec, params, point, direction, time)
-
-    # Nested, because the samples of a ray share its direction and time.
-    neighbor_medium = jax.vmap(jax.vmap(evaluate, (0, None, None)))(
-        point, context.batch.direction, time
-    )
+    neighbor_medium = _along_rays(spec, params, point, context.batch.direction, time)
     weight = flow_losses.dynamic_weights(level.spacing, neighbor_medium.density)
     logit = extras["disocclusion"][..., side]
     return Neighbor(
         point=point,
         flow=flow,
         back=neighbor_medium.flow[..., 1 - side, :],
+        onward=neighbor_medium.flow[..., side, :],
         visible=jax.nn.sigmoid(-logit),  # 1 - sigmoid(logit) rounds to 0
         disocclusion=jax.nn.sigmoid(logit),
         color=_medium_color(level, weight, neighbor_medium.color),
         weight=weight,
         present=present,
+        time=time,
     )
+
+
+def _along_rays(spec, params, point, direction, time):
+    """Evaluate the medium at the samples of rays, each ray at its time."""
+
+    def evaluate(point, direction, time):
+        return dynamic(spec, params, point, direction, time)
+
+    # Nested, because the samples of a ray share its direction and time.
+    nested = jax.vmap(jax.vmap(evaluate, (0, None, None)))
+    return nested(point, direction, time)
+
+
+def chained(
+    spec: SceneFlowSpec,
+    times: tuple[float, ...] | Float[Array, " times"],
+    params: SceneFlow,
+    context: PenaltyContext,
+    sides: list[Neighbor],
+    mask: Float[Array, " rays"],
+) -> Scalar:
+    """Compute the squared error of the colors two timestamps away.
+
+    The flow of the neighboring timestamp leads on from the points to which that of this
+    timestamp leads. Even steps go forward and odd ones backward.
+
+    Args:
+      spec: Settings.
+      times: Training timestamps in ascending order.
+      params: Parameters.
+      context: Context of the step.
+      sides: The neighbors, forward and backward.
+      mask: Weights of rays.
+
+    Returns:
+      The error. Rays without a timestamp two away are left out.
+    """
+    level = context.levels[-1]
+    ends = [
+        timestamps.neighbor(times, one.time, sign)
+        for one, sign in zip(sides, SIGNS, strict=True)
+    ]
+    forward = context.step % 2 == 0
+    (one, (time, present)) = jax.tree.map(
+        lambda *leaves: jnp.where(forward, *leaves), *zip(sides, ends, strict=True)
+    )
+    intervals = jnp.abs(time - one.time) / timestamps.interval(len(times))
+    point = one.point + intervals[:, None, None] * one.onward
+    medium = _along_rays(spec, params, point, context.batch.direction, time)
+    weight = flow_losses.dynamic_weights(level.spacing, medium.density)
+    error = jnp.square(_medium_color(level, weight, medium.color) - context.batch.color)
+    return flow_losses.weighted_mean(error, jnp.where(one.present & present, mask, 0))
 
 
 def penalty(
@@ -395,6 +463,13 @@ def penalty(
     for name, value in values.items():
         if getattr(spec.weights, name) > 0:
             terms[name] = Term(value(), getattr(spec.weights, name))
+    if spec.chain_steps is not None and spec.weights.warped > 0:
+        error = jax.lax.cond(
+            context.step >= spec.chain_steps,
+            lambda: chained(spec, times, params, context, sides, mask),
+            lambda: jnp.zeros((), mask.dtype),
+        )
+        terms["chain"] = Term(error, spec.weights.warped)
     frames = context.frames
     assert frames is not None
     if spec.weights.depth > 0 and frames.depths is not None:

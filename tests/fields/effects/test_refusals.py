@@ -53,6 +53,8 @@ REFUSED = [
     (SceneFlowSpec, {"flow_bound": 0.0}, "flow_bound=0"),
     (SceneFlowSpec, {"flow_bound": math.nan}, "flow_bound=nan"),
     (SceneFlowSpec, {"decay_steps": 0}, "decay_steps=0"),
+    (SceneFlowSpec, {"chain_steps": -1}, "chain_steps=-1"),
+    (SceneFlowSpec, {"moving_rays": 1.5}, "moving_rays=1.5 must be a share"),
     (SceneFlowSpec, {"network": TemplateSpec(anneal_steps=9)}, "anneal_steps=9.*none"),
     (SceneFlowSpec, {"network": STRICT}, "before the first.*clamp"),
     (FlowWeights, {"cycle": -1.0}, "cycle=-1"),

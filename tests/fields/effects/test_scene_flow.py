@@ -14,8 +14,9 @@ from nerfies_jax.fields.effects.effect import Sample
 from nerfies_jax.fields.effects.scene_flow import FlowWeights
 from nerfies_jax.nn.planes import PlanesSpec
 from nerfies_jax.training.effects import FrameCondition
-from tests import drawn, gradients
+from tests import drawn, gradients, scene_flow_rays
 from tests.scene_flow_rays import (
+    BOX_SCALE,
     FEATURES,
     MOMENTS,
     ROWS,
@@ -268,3 +269,61 @@ def test_the_blending_says_what_width_it_was_built_for():
     condition = FrameCondition(jnp.float32(0), {}, jnp.int32(0))
     with pytest.raises(ValueError, match=r"reads 7 features.* has 8"):
         scene_flow.medium(TINY, params, sample, condition)
+
+
+def chain_by_hand(params, frames, batch, arrays, step):
+    """The error two timestamps away as a sum over rays, by the oracle's network."""
+    params, frames, batch = jax.tree.map(
+        lambda x: np.asarray(x, np.float64) if x.dtype.kind == "f" else np.asarray(x),
+        (params, frames, batch),
+    )
+    distances, _, blend_weight = (np.asarray(x, np.float64) for x in arrays)
+    side, sign = step % 2, (1, -1)[step % 2]
+    errors = []
+    for r, row in enumerate(ROWS):
+        if not (0 <= row + 2 * sign < MOMENTS and batch.valid[r]):
+            continue
+        origin = (batch.origin[r] - scene_flow_rays.BOX_CENTER) * BOX_SCALE
+        points = [origin + d * batch.direction[r] for d in distances[r]]
+        for k in (row, row + sign):
+            gap = abs(TIMES[k + sign] - TIMES[k]) * (MOMENTS - 1)
+            flows = [
+                scene_flow_rays.dynamic(params, x, batch.direction[r], TIMES[k])[2]
+                for x in points
+            ]
+            points = [x + gap * f[side] for x, f in zip(points, flows, strict=True)]
+        there = [
+            scene_flow_rays.dynamic(params, x, batch.direction[r], TIMES[k + sign])
+            for x in points
+        ]
+        weight = scene_flow_rays.composite([t[0] for t in there], distances[r], None)
+        color = sum(w * t[1] for w, t in zip(weight, there, strict=True))
+        error = np.mean((color - batch.color[r]) ** 2)
+        errors.append((error, blend_weight[r].sum()))
+    return scene_flow_rays.weighted(errors)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("step", [200, 201])
+def test_a_chain_leads_two_timestamps_on_in_turn_to_either_side(dtype, step):
+    params, frames, batch, arrays = given = scenario(dtype)
+    weights = FlowWeights(**dict.fromkeys(NAMES, 0.0) | {"warped": 0.5})
+    spec = dataclasses.replace(TINY, weights=weights, chain_steps=200)
+    term = terms_of(spec, *given, step)["chain"]
+    expected = chain_by_hand(params, frames, batch, arrays, step)
+    bound = {"float32": 3e-5, "float64": 1e-11}[dtype]
+    np.testing.assert_allclose(term.value, expected, rtol=bound)
+    assert term.weight == 0.5
+    assert terms_of(spec, *given, 199)["chain"].value == 0
+    assert "chain" not in terms_of(TINY, *given, step)
+
+
+@pytest.mark.full
+def test_a_chain_has_the_slope_of_its_differences(float64):
+    params, frames, batch, arrays = scenario("float64")
+    spec = dataclasses.replace(TINY, chain_steps=0)
+
+    def loss(params):
+        return terms_of(spec, params, frames, batch, arrays, 200)["chain"].value
+
+    assert gradients.directional_error(loss, params, step=1e-6) < 1e-6
