@@ -6,8 +6,11 @@ Deviations from the paper are stated at each preset. All presets deviate as foll
 
 - Densities use a softplus instead of a ReLU, fine samples are stratified instead of
   independent, and encodings include the identity and have no factor of pi.
-- `nerf` and presets derived from it train without the crop of the first 500 steps, in
-  Euclidean space only (no normalized device coordinates), without noise on densities.
+- `nerf` and presets derived from it train without the crop of the first 500 steps and
+  without noise on densities, in Euclidean space only: all effects convert points of the
+  field to scene units by one scale, which normalized device coordinates do not have.
+  For forward-facing cameras in a plane, `sampling.spacing=disparity` places samples
+  that are even in these coordinates, and feature grids contract what is far.
 - None of the full sizes has been trained to its end, because they need a GPU.
 """
 

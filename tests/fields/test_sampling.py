@@ -118,6 +118,19 @@ def test_the_last_sample_in_disparity_is_the_far_end(ratio, dtype):
     assert np.all(np.diff(samples) >= 0)
 
 
+def test_samples_in_disparity_are_even_in_normalized_device_coordinates(float64):
+    """NeRF's coordinates of forward-facing cameras in a plane (appendix C)."""
+    focal, near, far = 1.3, 1.0, 50.0
+    direction = np.array([0.2, -0.4, -1.0])  # cameras look along -z
+    length = np.linalg.norm(direction)
+    distance = stratified(None, near * length, far * length, 33, "disparity")
+    x, y, z = ([0.3, -0.2, 0.0] + np.asarray(distance)[:, None] * direction / length).T
+    device = np.stack([-focal * x / z, -focal * y / z, 1 + 2 * near / z], axis=1)
+    even = np.linspace(device[0], device[-1], 33)
+    np.testing.assert_allclose(device, even, atol=1e-12)
+    np.testing.assert_allclose(device[[0, -1], 2], [-1, 1 - 2 * near / far], atol=1e-12)
+
+
 def test_distances_follow_near_and_far(float64):
     key = jax.random.key(2)
 
