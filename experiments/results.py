@@ -205,7 +205,8 @@ def main(args):
             _advise(name)
             _write(path, page(name))
             console.say(path)
-        for name in SUMMARIES:
+        for name, module in SUMMARIES.items():
+            importlib.import_module(f"experiments.{module}").draw(PAGES / f"{name}.png")
             _write(PAGES / f"{name}.md", summary(name))
         _write(PAGES / "README.md", index())
     return {"pages": {name: str(path) for name, path in pages.items()}}

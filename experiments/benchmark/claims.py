@@ -124,8 +124,8 @@ def comparisons(league: Mapping[str, Any], notes: Mapping[str, str]) -> list[Row
             gains = tuple(
                 {
                     capture: _paired(
-                        contest[_row(contest, table.preset, start)],
-                        contest[_row(contest, other, start)],
+                        row_of(contest, table.preset, start),
+                        row_of(contest, other, start),
                     )
                     for capture, contest in contests.items()
                 }
@@ -138,9 +138,18 @@ def comparisons(league: Mapping[str, Any], notes: Mapping[str, str]) -> list[Row
     return rows
 
 
-def _row(rows, preset, start):
-    """Name the row of a preset by how its motion is initialized."""
-    return f"{preset}+{start}" if f"{preset}+{start}" in rows else preset
+def row_of(rows: Mapping[str, Any], preset: str, start: str) -> Any:
+    """Return the row of a preset whose motion is initialized in a way.
+
+    Args:
+      rows: Rows of the league on one capture, by name.
+      preset: Name of the preset.
+      start: "tracks" or "rest".
+
+    Returns:
+      The row. A preset without motion has one for both.
+    """
+    return rows.get(f"{preset}+{start}", rows[preset])
 
 
 def _paired(better, worse):
@@ -166,8 +175,7 @@ def _margin(ours, theirs):
 
 def _reason(preset, other, rows, notes):
     """Name what the two presets differ in besides the motion."""
-    steps = rows[_row(rows, preset, "tracks")]["steps"]
-    others = rows[_row(rows, other, "tracks")]["steps"]
+    steps, others = (row_of(rows, name, "tracks")["steps"] for name in (preset, other))
     in_time = f"{steps:,} steps on `default` against {others:,}"
     if other in FIELDS:
         return f"the field needs more time: {in_time}"
@@ -228,6 +236,10 @@ def page() -> str:
         "## Margins over other methods",
         "Every preset trained for 90 processor seconds ([league.md](league.md)).",
         _table("compared with", margins, ("from tracks", "from rest")),
+        "![Radar charts of Sonata's Table 1 and of the same methods here](claims.png)",
+        "The methods of Sonata's Table 1 as published and here, with every axis from "
+        "the lowest to the highest of them (as in its Figure 7). SC-GS is not in the "
+        "first chart, because the table has no SSIM of it.",
         "## Margins over a method without one of its parts",
         f"Motion is initialized from tracks, and all methods of a page have the same "
         f"number of steps ({links}).",
@@ -240,6 +252,17 @@ def page() -> str:
         "links.",
     ]
     return "\n\n".join(blocks) + "\n"
+
+
+def draw(path: pathlib.Path) -> None:
+    """Draw the figure of the page.
+
+    Args:
+      path: The PNG file.
+    """
+    from experiments.benchmark import radar
+
+    radar.draw(_read(LEAGUE), path)
 
 
 def _read(path):
@@ -309,9 +332,9 @@ def _cost(league):
         ours, others = (
             {
                 seed: cell["numbers"]
-                for seed, cell in contest["rows"][
-                    _row(contest["rows"], name, "tracks")
-                ]["cells"].items()
+                for seed, cell in row_of(contest["rows"], name, "tracks")[
+                    "cells"
+                ].items()
             }
             for name in ("moba-small", "d-miso-small")
         )

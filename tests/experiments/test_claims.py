@@ -3,10 +3,14 @@
 import json
 import re
 
+import numpy as np
+import PIL.Image
 import pytest
 
-from experiments.benchmark import claims, published
+from experiments import results
+from experiments.benchmark import claims, published, radar
 from experiments.benchmark.claims import FAILS, HOLDS, ROOT, UNDECIDED, UNKNOWN, Gain
+from nerfies_jax.visualization import figures
 
 LEAGUE = ROOT / "docs/results/league.md"
 START = {"tracks": 0, "rest": 1}
@@ -56,6 +60,31 @@ def test_margins_and_gains_are_those_of_the_finished_comparison():
                 assert {1: "shows", 0: "none", -1: "opposite"}[gain.sign] == word
             checked += 1
     assert checked == 2 * 26
+
+
+def test_the_radar_charts_show_the_kept_numbers():
+    stored = json.loads((ROOT / claims.LEAGUE).read_text())
+    shown = radar.panels(stored)
+    with PIL.Image.open(results.PAGES / "claims.png") as picture:
+        assert picture.text[figures.DIGEST] == figures.digest(shown)
+    paper, here = shown.values()
+    # Table 1: the lowest of all axes is 3D-GS, but that of LPIPS (TiNeuVox is lower).
+    assert paper["splats-static-small"][:2] == (0, 0)
+    assert paper["sonata-small"] == (1, 1, 1)
+    assert "sc-gs-small" not in paper
+    assert set(here) == {published.TABLES[0].preset, *published.TABLES[0].others}
+    psnr = {}
+    for name in here:
+        rows = [
+            claims.row_of(contest["rows"], name, "tracks")["cells"].values()
+            for contest in stored["contests"]
+            if contest["film"] in claims.CAPTURES
+        ]
+        means = [np.mean([cell["numbers"]["psnr"] for cell in row]) for row in rows]
+        psnr[name] = np.mean(means)
+    low, high = min(psnr.values()), max(psnr.values())
+    for name, value in psnr.items():
+        assert here[name][0] == pytest.approx((value - low) / (high - low))
 
 
 def test_every_ablation_of_the_papers_has_a_row_and_a_verdict():
