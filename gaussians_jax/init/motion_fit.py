@@ -344,7 +344,7 @@ def fit(
     The distance is smooth near zero and not squared, so that single wrong paths have
     little influence. If points move rigidly, distances along rays have a lower weight
     (`along`). The penalty of the initialization is added to the mean distance, in
-    `unit`s.
+    `unit`s. Points are padded to a bucket (`splats.capacity_for`).
 
     Args:
       effect: The motion.
@@ -365,14 +365,20 @@ def fit(
         raise ValueError("no path has a known position; a motion cannot be fitted")
     start, rates, penalty, rigid = _guess(effect, paths, key)
     rates = jax.tree.map(lambda relative: rate * relative, rates)
-    target = captured(np.moveaxis(np.where(valid[..., None], position, 0), 1, 0))
-    weight = captured(valid.T)
+    size = len(position)
+    start = padded(start)
+
+    def by_frame(values):
+        known = np.where(valid[..., None], values, 0)
+        unused = len(start.canonical) - size
+        return captured(np.moveaxis(np.pad(known, [(0, unused), (0, 0), (0, 0)]), 1, 0))
+
+    target, weight = by_frame(position), by_frame(valid[..., None])[..., 0]
     # Component along the rays to remove from the distances.
-    along_ray = np.zeros(target.shape)
+    along_ray = np.zeros(position.shape)
     if rigid and depth is not None:
         along_ray = np.sqrt(1 - along(depth.deviation))[:, None, None] * depth.ray
-        along_ray = np.moveaxis(np.where(valid[..., None], along_ray, 0), 1, 0)
-    ray_part, frame_times = captured(along_ray), captured(times)
+    ray_part, frame_times = by_frame(along_ray), captured(times)
     unit = captured(paths.unit)
     count = min(FRAMES_AT_ONCE, len(times))
 
@@ -401,4 +407,27 @@ def fit(
     mean_distance = jax.jit(separate)
     solution = descended(loss, start, rates, key, steps)
     first, last = (float(mean_distance(arrays, p)) for p in (start, solution))
-    return PathFit(solution, first, last)
+    return PathFit(_take(solution, slice(size)), first, last)
+
+
+def padded(points: Points) -> Points:
+    """Repeat the last point up to a bucket, so that captures share programs.
+
+    Args:
+      points: The points, at least one.
+
+    Returns:
+      The points, as many as `splats.capacity_for` says.
+    """
+    count = len(points.canonical)
+    return _take(points, np.minimum(np.arange(splats.capacity_for(count)), count - 1))
+
+
+def _take(points, selection):
+    """Select points with their parameters, in NumPy, which compiles nothing."""
+
+    def take(leaf):
+        return jax.device_put(np.asarray(leaf)[selection])
+
+    rows = None if points.rows is None else jax.tree.map(take, points.rows)
+    return points._replace(canonical=take(points.canonical), rows=rows)

@@ -100,7 +100,7 @@ def _seeds(effect, points, visibility, evidence, views, times, unit, spec):
     # Twice as many as needed, because some are dropped.
     selection = rng.permutation(len(frame))[: 2 * spec.moving_points]
     frame, row, column = frame[selection], row[selection], column[selection]
-    canonical = np.asarray(points.canonical)
+    canonical, padded_fit = np.asarray(points.canonical), motion_fit.padded(points)
     point_rows = None if points.rows is None else jax.tree.map(np.asarray, points.rows)
     positions_at = programs.Program(motion_fit.positions_at, effect)
     # Empty arrays, because there may be no frame with enough tracks.
@@ -120,7 +120,8 @@ def _seeds(effect, points, visibility, evidence, views, times, unit, spec):
             views.position[current]
             + ray * depth[current][row[pixels], column[pixels], None]
         )
-        position_then = np.asarray(positions_at(points, times[current]))
+        position_then = np.asarray(positions_at(padded_fit, times[current]))
+        position_then = position_then[: len(canonical)]
         distance, neighbors, weights = _carriers(position_then, observed)
 
         def mixed(leaf, neighbors=neighbors, weights=weights):

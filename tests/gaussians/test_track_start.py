@@ -93,10 +93,10 @@ def test_a_fit_to_other_paths_compiles_nothing(tmp_path):
     known = np.ones(position.shape[:2], bool)
     effect, counts = effect_of(MOTIONS["bases"]), []
     with compilations.counted(tmp_path) as since:
-        for scale in (1.0, 1.1):
-            path = (scale * position).astype(np.float32)
-            depth = Depth(np.ones_like(path) / 3**0.5, np.full(len(path), 0.02))
-            paths = Paths(time, path, known, scale, depth=depth)
+        for scale, count in ((1.0, 30), (1.1, 25)):
+            path = (scale * position[:count]).astype(np.float32)
+            depth = Depth(np.ones_like(path) / 3**0.5, np.full(count, 0.02))
+            paths = Paths(time, path, known[:count], scale, depth=depth)
             motion_fit.fit(effect, paths, jax.random.key(int(9 * scale)), steps=10)
             counts.append(since())
     assert counts[0] > counts[1] == 0
