@@ -256,18 +256,8 @@ def width(spec: KANSpec, layer: int) -> float:
     return math.sqrt(2) * spec.width_ratio * spacing(spec, layer)
 
 
-def kernel_widths(spec: KANSpec, layer: int) -> np.ndarray:
-    """Return the width of each of a layer's kernels, as for `width`.
-
-    With `width_jitter` they differ, by factors that depend on the layer alone.
-
-    Args:
-      spec: The network's settings.
-      layer: Index of the layer, counted from 0.
-
-    Returns:
-      Widths, [kernels].
-    """
+def _kernel_widths(spec, layer):
+    """Width of each kernel of a layer, with factors that depend on the layer alone."""
     widths = np.full(spec.kernels, width(spec, layer))
     if spec.width_jitter is None:
         return widths
@@ -310,7 +300,7 @@ def init(key: Key[Array, ""], spec: KANSpec, dtype: DTypeLike = jnp.float32) -> 
             Kernels(
                 jnp.tile(centers(spec, layer, dtype)[:, None], (1, inputs)),
                 jnp.asarray(
-                    np.tile(np.log(kernel_widths(spec, layer))[:, None], (1, inputs)),
+                    np.tile(np.log(_kernel_widths(spec, layer))[:, None], (1, inputs)),
                     dtype,
                 ),
             )
@@ -549,7 +539,7 @@ def _sum_over_inputs(spec, index, layer, kernels, inputs):
     clamped = hold(inputs, spec.grid_of(index), margin)
     if kernels is None:
         center = centers(spec, index, dtype)
-        per_width = jnp.asarray(1 / kernel_widths(spec, index), dtype)
+        per_width = jnp.asarray(1 / _kernel_widths(spec, index), dtype)
     else:
         center = kernels.center
         initial = math.log(width(spec, index))
