@@ -1,5 +1,6 @@
 """Training on several processes, which are connected by `jax.distributed`."""
 
+import contextlib
 import dataclasses
 import os
 import pathlib
@@ -40,11 +41,22 @@ def shrunk(state, _frames):
 EVENT = Event("shrink", (2,), shrunk)
 
 
-def started(code, *more, processes=2):
-    """Start processes that run `code` with the arguments of `hosts.join`."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
+def free_port(first=0, last=0):
+    """Return a port that nothing listens on, between two numbers or any."""
+    for port in range(first, last + 1):
+        with socket.socket() as free, contextlib.suppress(OSError):
+            free.bind(("localhost", port))
+            return free.getsockname()[1]
+    raise OSError("all ports are used")
+
+
+def started(code, *more, processes=2, launched=None):
+    """Start processes that run `code` with the arguments of `hosts.join`.
+
+    `launched` is a function that returns the variables of a launcher for the number of
+    a process.
+    """
+    port = free_port()
     env = dict(os.environ, JAX_PLATFORMS="cpu", JAX_NUM_CPU_DEVICES="1")
     env["XLA_FLAGS"] = "--xla_backend_optimization_level=0"  # compiles sooner
     return [
@@ -54,7 +66,7 @@ def started(code, *more, processes=2):
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            env=env,
+            env=env if launched is None else env | launched(i),
         )
         for i in range(processes)
     ]
@@ -136,6 +148,62 @@ def test_the_death_of_a_host_ends_process_0_with_its_error():
     assert code == hosts.LOST_CODE, output
     assert "error: RUN: training on 2 processes failed (" in output
     assert ended(second)[0] == -signal.SIGKILL
+
+
+def by_slurm(job, number):
+    """Variables of `srun`: the job, and the hosts and the numbers of its processes."""
+    names = {"JOB_ID": job, "STEP_NODELIST": "localhost,node[2-4]", "NTASKS": 2}
+    names |= {"PROCID": number, "LOCALID": number}
+    return {f"SLURM_{name}": str(value) for name, value in names.items()}
+
+
+def by_open_mpi(job, number):
+    """Numbers of a process that all versions of `mpirun` set."""
+    numbers = {"SIZE": 2, "RANK": number, "LOCAL_RANK": number}
+    return {f"OMPI_COMM_WORLD_{name}": str(value) for name, value in numbers.items()}
+
+
+def by_open_mpi_4(job, number):
+    uri = f"{job * 2**12}.0;tcp://127.0.0.1,10.148.0.1:34911"
+    return {**by_open_mpi(job, number), "OMPI_MCA_orte_hnp_uri": uri}
+
+
+def by_open_mpi_5(job, number):
+    """Of 5.0.11. The name of the job ends with the process id of `mpirun`."""
+    name = f"prterun-localhost-{job}@1"
+    return {**by_open_mpi(job, number), "PMIX_NAMESPACE": name}
+
+
+def join_by_launcher():
+    hosts.join(None)
+    leader = multihost_utils.broadcast_one_to_all(np.int32(jax.process_index() + 5))
+    print("process", jax.process_index(), "of", jax.process_count(), "hears", leader)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("launcher", [by_slurm, by_open_mpi_4, by_open_mpi_5])
+def test_processes_are_connected_by_the_variables_of_a_launcher(launcher):
+    job = free_port(61440 + 7, 65535) - 61440  # the port follows from it
+    processes = started(
+        "from tests import test_hosts as t; t.join_by_launcher()",
+        launched=lambda number: launcher(job, number),
+    )
+    for number, process in enumerate(processes):
+        code, output = ended(process)
+        assert code == 0, output
+        assert f"process {number} of 2 hears 5" in output
+
+
+def test_open_mpi_5_names_the_host_of_mpirun_in_the_job():
+    name = {"PMIX_NAMESPACE": "prterun-node-01.lab-70000@2"}
+    assert hosts.open_mpi_address(name) is None  # another program of PMIx
+    variables = by_open_mpi(0, 1) | name
+    address = f"node-01.lab:{61440 + 70000 % 4096}"
+    assert hosts.open_mpi_address(variables) == (address, 2, 1, [1])
+    variables |= {"JAX_COORDINATOR_PORT": "9876", "JAX_LOCAL_DEVICE_IDS": "0,1"}
+    assert hosts.open_mpi_address(variables) == ("node-01.lab:9876", 2, 1, None)
+    variables["PMIX_NAMESPACE"] = "slurm.pmix.12.0"
+    assert hosts.open_mpi_address(variables) is None
 
 
 @pytest.mark.full

@@ -11,9 +11,10 @@ import atexit
 import contextlib
 import json
 import os
+import re
 import sys
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -28,6 +29,7 @@ HEARTBEAT_SECONDS = 30  # without a sign of life, after which a process is dead
 SHUTDOWN_SECONDS = 15  # that processes which have ended wait for each other
 POLL_SECONDS = 1
 BARRIER_SECONDS = 3600  # one process may still be compiling
+LEAST_PORT, PORTS = 61440, 4096  # from which JAX chooses the port under a launcher
 END, RUN, COMPILE, STEPS = "end", "run", "compile", "steps"  # kinds of messages
 
 _messages = 0  # sent or received by this process
@@ -58,12 +60,13 @@ def join(
       ValueError: If the launcher is not recognized, or the others cannot be reached.
     """
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    address = coordinator, processes, process, None
+    if coordinator is None:
+        address = open_mpi_address(os.environ) or address
     try:
         with stopping.keeps_handlers():
             jax.distributed.initialize(
-                coordinator,
-                processes,
-                process,
+                *address,
                 heartbeat_timeout_seconds=HEARTBEAT_SECONDS,
                 shutdown_timeout_seconds=SHUTDOWN_SECONDS,
             )
@@ -83,6 +86,36 @@ def join(
             "limit them with the variables of the platform, such as "
             "CUDA_VISIBLE_DEVICES or JAX_NUM_CPU_DEVICES"
         )
+
+
+def open_mpi_address(
+    environment: Mapping[str, str],
+) -> tuple[str, int, int, list[int] | None] | None:
+    """Read the variables of `mpirun` of Open MPI 5, which JAX 0.10 does not recognize.
+
+    The name of a job has the host and the process id of `mpirun`. JAX also takes this
+    host for that of process 0, under earlier versions of Open MPI.
+
+    Args:
+      environment: Environment variables.
+
+    Returns:
+      HOST:PORT of process 0, the number of processes, that of this process, and the
+      numbers of its local devices, or None for those that JAX reads. None if Open MPI 5
+      has not started this process.
+    """
+    namespace = environment.get("PMIX_NAMESPACE", "")
+    job = re.fullmatch(r"prterun-(?P<host>.+)-(?P<pid>\d+)@\d+", namespace)
+    if job is None or "OMPI_COMM_WORLD_RANK" not in environment:
+        return None
+    port = environment.get("JAX_COORDINATOR_PORT")
+    port = port or LEAST_PORT + int(job["pid"]) % PORTS
+    count, number, local = (
+        int(environment[f"OMPI_COMM_WORLD_{name}"])
+        for name in ("SIZE", "RANK", "LOCAL_RANK")
+    )
+    devices = None if "JAX_LOCAL_DEVICE_IDS" in environment else [local]
+    return f"{job['host']}:{port}", count, number, devices
 
 
 def joined() -> bool:
