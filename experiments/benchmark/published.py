@@ -113,7 +113,7 @@ ABLATIONS = (
             Part("scales", Score(24.16, 0.848, 0.151), "full", "no-scale"),
             Part("rotations", Score(23.99, 0.840, 0.165), "full", "no-rotation"),
             Part(
-                "KAN, but an MLP",
+                "KAN (MLP instead)",
                 Score(22.87, 0.802, 0.214),
                 *("full", "mlp"),
                 "same inputs and as many parameters here; the paper's MLP also has "
@@ -149,10 +149,10 @@ ABLATIONS = (
                 "threshold guides nothing",
             ),
             Part("basis", Score(23.48, 0.841, 0.221), "full", "no-basis", SPAN),
-            Part("K = 8, but 2", Score(23.54, 0.840, 0.222), "full", "k2"),
-            Part("K = 8, but 4", Score(23.62, 0.847, 0.216), "full", "k4", SPAN),
-            Part("K = 8, but 16", Score(23.54, 0.845, 0.216), "full", "k16", SPAN),
-            Part("K = 8, but 32", Score(23.44, 0.841, 0.218), "full", "k32", SPAN),
+            Part("K = 8 (2 instead)", Score(23.54, 0.840, 0.222), "full", "k2"),
+            Part("K = 8 (4 instead)", Score(23.62, 0.847, 0.216), "full", "k4", SPAN),
+            Part("K = 8 (16 instead)", Score(23.54, 0.845, 0.216), "full", "k16", SPAN),
+            Part("K = 8 (32 instead)", Score(23.44, 0.841, 0.218), "full", "k32", SPAN),
         ),
         ("ablate_moba", "ablate_moba_bookshelf"),
     ),

@@ -375,6 +375,34 @@ def deform(
     )
 
 
+def blending_weights(
+    params: BasisMotion,
+    spec: BasisMotionSpec,
+    mean: Float[Array, "gaussians 3"],
+    time: Float[Array, ""],
+    prepared: Prepared,
+) -> Float[Array, "gaussians count"]:
+    """Evaluate the weights w(p', t) of the basis, equation 5, at a time.
+
+    Args:
+      params: Shared parameters.
+      spec: Settings.
+      mean: Canonical means that `prepared` was computed from.
+      time: Normalized time.
+      prepared: Result of `prepare`.
+
+    Returns:
+      Weights, in scene units if the basis is bounded.
+    """
+    at_time = _fold_time(params, spec, time)
+
+    def weights(point, row):
+        slow = point + _base_displacement(at_time.base, spec, row.base)
+        return residual(at_time.weights, spec, slow)["weights"]
+
+    return in_blocks(jax.vmap(weights), (mean, prepared), None, spec.block)
+
+
 def _network_input(spec, mean):
     return jax.lax.stop_gradient(mean) if spec.detach else mean
 

@@ -65,6 +65,29 @@ def test_offsets_are_those_of_the_equations(spec, dtype):
     assert {leaf.dtype.name for leaf in offsets} == {dtype}
 
 
+def test_weights_and_basis_make_the_residual(dtype):
+    """V w is the displacement without the slow one of the base network."""
+    params = strong("basis", SMALL, dtype)
+    mean, time = some_gaussians(17, dtype).mean, np.asarray(0.7, dtype)
+
+    @jax.jit
+    def parts(params, mean, time):
+        prepared = motion_basis.prepare(params, SMALL, mean)
+        given = params, SMALL, mean, time, prepared
+        return motion_basis.blending_weights(*given), prepared.basis
+
+    weights, basis = map(np.asarray, parts(params, mean, time))
+    offsets = np.asarray(uncached(params, SMALL, mean, time).mean)
+    exact = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params)
+    tolerance = {"float32": 2e-5, "float64": 1e-13}[dtype]
+    for row, point in enumerate(np.asarray(mean, np.float64)):
+        placed = networks.waves(SMALL.position, point)
+        inputs = np.concatenate([placed, networks.waves(SMALL.base_time, float(time))])
+        slow = networks.heads(exact.base, inputs, activation=silu)["mean"]
+        made = slow + basis[row] @ weights[row]
+        np.testing.assert_allclose(offsets[row], made, atol=tolerance)
+
+
 @jax.jit
 def directions_and_slopes(params):
     """The directions of one point, and their slopes in the bias of the head."""
