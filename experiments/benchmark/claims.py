@@ -19,6 +19,7 @@ from experiments.benchmark.suites import Claim
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 LEAGUE = "docs/results/league.json"
+RADAR_ABLATION = "experiments/measured/ablate_sonata.json"
 CAPTURES = ("default", "nrnerf_bookshelf")
 PSNR = "heldout.psnr"
 HOLDS, FAILS, UNDECIDED, UNKNOWN = "holds", "does not", "undecided", "not measured"
@@ -236,10 +237,10 @@ def page() -> str:
         "## Margins over other methods",
         "Every preset trained for 90 processor seconds ([league.md](league.md)).",
         _table("compared with", margins, ("from tracks", "from rest")),
-        "![Radar charts of Sonata's Table 1 and of the same methods here](claims.png)",
-        "The methods of Sonata's Table 1 as published and here, with every axis from "
-        "the lowest to the highest of them (as in its Figure 7). SC-GS is not in the "
-        "first chart, because the table has no SSIM of it.",
+        "![Radar charts of Sonata's tables and of the same methods here](claims.png)",
+        "The methods of Sonata's Table 1 and of its ablation, as published and here, "
+        "with every axis from the lowest to the highest of them (as in its Figures 3 "
+        "and 7). SC-GS is not in the first chart, because the table has no SSIM of it.",
         "## Margins over a method without one of its parts",
         f"Motion is initialized from tracks, and all methods of a page have the same "
         f"number of steps ({links}).",
@@ -262,7 +263,7 @@ def draw(path: pathlib.Path) -> None:
     """
     from experiments.benchmark import radar
 
-    radar.draw(_read(LEAGUE), path)
+    radar.draw(_read(LEAGUE), _read(RADAR_ABLATION), path)
 
 
 def _read(path):

@@ -1,55 +1,75 @@
-"""Radar charts of the methods of a table, as published and as measured here.
+"""Radar charts of Sonata and what it is compared with, as published and as measured.
 
-As in Figure 7 of Sonata, every axis is normalized to the lowest and the highest of the
-methods.
+As in Figures 3 and 7 of the paper, every axis is normalized to the lowest and the
+highest of the methods.
 """
 
 import math
 import pathlib
 import statistics
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from experiments.benchmark import claims, published
-from experiments.benchmark.curves import STYLES
+from experiments.benchmark.published import Score
 
-Scores = dict[str, tuple[float, ...]]  # of each axis, by small preset
-AXES = {
-    "as published: NeRF-DS": ("PSNR", "SSIM", "1 - LPIPS"),
-    "here: small presets from tracks": ("PSNR", "SSIM", "moving PSNR"),
-}
-# Colors of methods that the figure of the curves does not have.
-COLORS = {
-    "tineuvox-small": "#a16207",
-    "hypernerf-small": "#6b7280",
-    "nerf-ds-small": "#0e7490",
-    "sc-gs-small": "#1d6fd1",
-    "adc-gs-small": "#c2410c",
-    "4dgs-small": "#db2777",
-} | {f"{name}-small": color for name, color, _ in STYLES.values()}
+Scores = dict[str, tuple[float, ...]]  # of each axis, by method
+OURS = ("PSNR", "SSIM", "moving PSNR")
+PUBLISHED = ("PSNR", "SSIM", "1 - LPIPS")
+COLORS = (
+    *("#9333ea", "#111827", "#a16207", "#6b7280", "#0e7490"),
+    *("#15803d", "#1d6fd1", "#c2410c", "#db2777"),
+)
 
 
-def panels(league: Mapping[str, Any]) -> dict[str, Scores]:
+class Panel(NamedTuple):
+    """One chart."""
+
+    title: str
+    axes: tuple[str, ...]
+    scores: Scores  # normalized, in [0, 1]
+
+
+def panels(league: Mapping[str, Any], ablation: Mapping[str, Any]) -> list[Panel]:
     """Collect what the figure shows.
 
     Args:
       league: Contents of docs/results/league.json.
+      ablation: Contents of experiments/measured/ablate_sonata.json.
 
     Returns:
-      Normalized scores in [0, 1] by panel and method. Methods without a score of an
-      axis are left out.
+      Charts of the methods of Table 1 and of the ablation, each as published and as
+      measured here. Methods without a published score of an axis are left out there.
     """
-    table = published.TABLES[0]
-    scores = {table.preset: table.score, **table.others}
-    known = {
+    table, parts = published.TABLES[0], published.ABLATIONS[0]
+    methods = {table.preset: table.score, **table.others}
+    ablated = {"full": parts.score} | {one.worse: one.score for one in parts.parts}
+    (benchmark,) = ablation["benchmarks"].values()
+    of_parts = {name: benchmark["methods"][name]["mean"] for name in ablated}
+    keys = ("heldout.psnr", "heldout.ssim", "heldout.moving_psnr")
+    return [
+        Panel("Table 1, as published", PUBLISHED, normalized(_known(methods))),
+        Panel(
+            "the same small presets here",
+            OURS,
+            normalized({name: _measured(league, name) for name in methods}),
+        ),
+        Panel("ablation, as published", PUBLISHED, normalized(_known(ablated))),
+        Panel(
+            "the same ablation here",
+            OURS,
+            normalized(
+                {name: tuple(m[key] for key in keys) for name, m in of_parts.items()}
+            ),
+        ),
+    ]
+
+
+def _known(scores: Mapping[str, Score]) -> Scores:
+    return {
         name: (one.psnr, one.ssim, 1 - one.lpips)
         for name, one in scores.items()
         if one.ssim is not None and one.lpips is not None
-    }
-    measured = {name: _measured(league, name) for name in scores}
-    return {
-        title: normalized(each)
-        for title, each in zip(AXES, (known, measured), strict=True)
     }
 
 
@@ -84,11 +104,14 @@ def normalized(scores: Scores) -> Scores:
     }
 
 
-def draw(league: Mapping[str, Any], path: pathlib.Path) -> None:
-    """Plot one triangle for each method, in one panel as published and one as measured.
+def draw(
+    league: Mapping[str, Any], ablation: Mapping[str, Any], path: pathlib.Path
+) -> None:
+    """Plot one triangle for each method in each chart.
 
     Args:
       league: Contents of docs/results/league.json.
+      ablation: Contents of experiments/measured/ablate_sonata.json.
       path: The PNG file.
 
     Raises:
@@ -96,25 +119,31 @@ def draw(league: Mapping[str, Any], path: pathlib.Path) -> None:
     """
     from nerfies_jax.visualization import figures
 
-    shown = panels(league)
-    figure = figures.new_figure(figsize=(8.4, 4.2), dpi=110, layout="constrained")
-    all_axes = figure.subplots(1, len(shown), subplot_kw={"projection": "polar"})
-    for axes, (title, scores) in zip(all_axes, shown.items(), strict=True):
-        angles = [math.pi / 2 + 2 * math.pi * k / 3 for k in range(3)]
-        for name, each in scores.items():
-            wide = 2.2 if name == published.TABLES[0].preset else 1.2
-            axes.plot(
-                [*angles, angles[0]],
-                [*each, each[0]],
-                color=COLORS[name],
-                linewidth=wide,
-                label=name.removesuffix("-small"),
-            )
-        axes.set_xticks(angles, AXES[title], fontsize=8)
-        axes.tick_params(axis="x", pad=9)
-        axes.set_yticks([0.5, 1.0], ["", ""])
-        axes.set_ylim(0, 1.05)
-        axes.set_title(title, fontsize=10)
-    handles, labels = all_axes[-1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
+    shown = panels(league, ablation)
+    figure = figures.new_figure(figsize=(8.4, 7.6), dpi=110, layout="constrained")
+    rows = figure.subfigures(2, 1)
+    for row, pair in zip(rows, (shown[:2], shown[2:]), strict=True):
+        all_axes = row.subplots(1, 2, subplot_kw={"projection": "polar"})
+        colors = dict(zip(pair[1].scores, COLORS, strict=False))
+        for axes, panel in zip(all_axes, pair, strict=True):
+            _draw_panel(axes, panel, colors)
+        handles, labels = all_axes[-1].get_legend_handles_labels()
+        row.legend(handles, labels, loc="outside right center", fontsize=8)
     figures.save(figure, path, shown)
+
+
+def _draw_panel(axes, panel, colors):
+    angles = [math.pi / 2 + 2 * math.pi * k / 3 for k in range(3)]
+    for name, scores in panel.scores.items():
+        axes.plot(
+            [*angles, angles[0]],
+            [*scores, scores[0]],
+            color=colors[name],
+            linewidth=2.2 if name in ("sonata-small", "full") else 1.2,
+            label=name.removesuffix("-small"),
+        )
+    axes.set_xticks(angles, panel.axes, fontsize=8)
+    axes.tick_params(axis="x", pad=9)
+    axes.set_yticks([0.5, 1.0], ["", ""])
+    axes.set_ylim(0, 1.05)
+    axes.set_title(panel.title, fontsize=10)

@@ -64,10 +64,16 @@ def test_margins_and_gains_are_those_of_the_finished_comparison():
 
 def test_the_radar_charts_show_the_kept_numbers():
     stored = json.loads((ROOT / claims.LEAGUE).read_text())
-    shown = radar.panels(stored)
+    ablation = json.loads((ROOT / claims.RADAR_ABLATION).read_text())
+    shown = radar.panels(stored, ablation)
     with PIL.Image.open(results.PAGES / "claims.png") as picture:
         assert picture.text[figures.DIGEST] == figures.digest(shown)
-    paper, here = shown.values()
+    paper, here, paper_parts, parts = (panel.scores for panel in shown)
+    assert paper_parts["full"][:2] == (1, 1)
+    assert paper_parts["full"][2] == pytest.approx(1)
+    assert paper_parts["mlp"][:2] == (0, 0)
+    assert set(parts) == set(paper_parts)
+    assert parts["mlp"][0] == 1  # contrary to the paper
     # Table 1: the lowest of all axes is 3D-GS, but that of LPIPS (TiNeuVox is lower).
     assert paper["splats-static-small"][:2] == (0, 0)
     assert paper["sonata-small"] == (1, 1, 1)
