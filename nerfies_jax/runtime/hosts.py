@@ -60,13 +60,18 @@ def join(
       ValueError: If the launcher is not recognized, or the others cannot be reached.
     """
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    address = coordinator, processes, process, None
-    if coordinator is None:
-        address = open_mpi_address(os.environ) or address
+    launched = open_mpi_address(os.environ) if coordinator is None else None
+    coordinator, processes, process, devices = launched or (
+        *(coordinator, processes, process),
+        None,
+    )
     try:
         with stopping.keeps_handlers():
             jax.distributed.initialize(
-                *address,
+                coordinator,
+                processes,
+                process,
+                devices,
                 heartbeat_timeout_seconds=HEARTBEAT_SECONDS,
                 shutdown_timeout_seconds=SHUTDOWN_SECONDS,
             )
@@ -108,8 +113,8 @@ def open_mpi_address(
     job = re.fullmatch(r"prterun-(?P<host>.+)-(?P<pid>\d+)@\d+", namespace)
     if job is None or "OMPI_COMM_WORLD_RANK" not in environment:
         return None
-    port = environment.get("JAX_COORDINATOR_PORT")
-    port = port or LEAST_PORT + int(job["pid"]) % PORTS
+    port = LEAST_PORT + int(job["pid"]) % PORTS
+    port = int(environment.get("JAX_COORDINATOR_PORT", port))
     count, number, local = (
         int(environment[f"OMPI_COMM_WORLD_{name}"])
         for name in ("SIZE", "RANK", "LOCAL_RANK")
