@@ -6,7 +6,7 @@ import PIL.Image
 import pytest
 
 from experiments import results
-from experiments.benchmark import curves
+from experiments.benchmark import claims, curves
 from experiments.growth import page as growth
 from experiments.results import PAGES, REVISIONS, ROOT, STUDIES, SUMMARIES
 from nerfies_jax.visualization import figures
@@ -67,6 +67,7 @@ def test_new_numbers_are_kept_only_where_they_make_a_page(
 ):
     monkeypatch.setattr(results, "ROOT", tmp_path)
     monkeypatch.setattr(results, "PAGES", tmp_path)
+    monkeypatch.setattr(claims, "draw", lambda path: None)
     monkeypatch.setitem(
         STUDIES, "benchmark", STUDIES["benchmark"]._replace(measured="kept.json")
     )
