@@ -212,7 +212,9 @@ class Ended(NamedTuple):
     code: int
 
 
-def command(settings: Any) -> Callable[[Callable], options.Command]:
+def command(
+    settings: Any, completed: Callable[[list[str]], list[str]] = list
+) -> Callable[[Callable], options.Command]:
     """Make `main(arguments)` of a function of settings that returns the result as JSON.
 
     With `--json` the result is printed as one document, and all other output, also of
@@ -222,6 +224,7 @@ def command(settings: Any) -> Callable[[Callable], options.Command]:
 
     Args:
       settings: Dataclass of options.
+      completed: Function that adds words which users may omit to the command line.
 
     Returns:
       A decorator.
@@ -238,7 +241,7 @@ def command(settings: Any) -> Callable[[Callable], options.Command]:
             as_json = options.JSON in words
             words = [word for word in words if word != options.JSON]
             with user_errors():
-                args = parse(settings, words, _command_name(run))
+                args = parse(settings, completed(words), _command_name(run))
             aside = _words_aside() if as_json else contextlib.nullcontext()
             with aside, user_errors((MissingExtra,)):
                 result = _interruptible(run, args)

@@ -3,6 +3,8 @@
 nerfies prepare npz FILE OUT       images, poses, times, focal in one .npz
 nerfies prepare video FILE OUT     sharp frames, cameras by COLMAP
 nerfies prepare pictures DIR OUT   cameras by COLMAP
+
+Without npz, video or pictures, the source itself says which it is.
 """
 
 import dataclasses
@@ -16,6 +18,7 @@ from experiments import cli
 from nerfies_jax.runs.config import Preparation
 from nerfies_jax.runtime import console
 
+KINDS = ("npz", "video", "pictures")
 How = Annotated[Preparation, tyro.conf.OmitArgPrefixes]
 
 
@@ -59,7 +62,29 @@ class Pictures:
     how: How = Preparation()
 
 
-@cli.command(Npz | Video | Pictures)
+def with_kind(words: list[str]) -> list[str]:
+    """Name the kind of a source that a command line begins with.
+
+    Args:
+      words: The command line, with or without a kind.
+
+    Returns:
+      The command line with a kind, unless it begins with another word or an option.
+    """
+    if not words or words[0] in KINDS or words[0].startswith("-"):
+        return words
+    from nerfies_jax.capture.formats import VIDEOS  # loads JAX
+
+    source = pathlib.Path(words[0])
+    suffix = source.suffix.lower()
+    if source.is_dir():
+        return ["pictures", *words]
+    if suffix == ".npz" or suffix in VIDEOS:
+        return ["npz" if suffix == ".npz" else "video", *words]
+    return words
+
+
+@cli.command(Npz | Video | Pictures, with_kind)
 def main(args):
     """Convert. Wrong input ends with exit code 2."""
     record = None  # arrays come with cameras

@@ -57,6 +57,19 @@ def test_rows_can_be_named(tmp_path):
     assert (capture.train.size, capture.heldout.size) == (3, 4)
 
 
+def test_a_source_says_its_kind(tmp_path, capsys, monkeypatch):
+    archive(tmp_path / "a.npz")
+    prepare.main([str(tmp_path / "a.npz"), str(tmp_path / "out")])
+    assert room.load(tmp_path / "out").train.size == 10
+    assert prepare.with_kind([str(tmp_path), "out"])[0] == "pictures"
+    assert prepare.with_kind(["clip.MP4", "out"])[0] == "video"
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "video").mkdir()
+    unchanged = (["video", "clip.mp4", "out"], ["--help"], [], ["notes.txt", "out"])
+    for words in unchanged:
+        assert prepare.with_kind(words) == words
+
+
 BAD = {
     "no focal": (dict(focal=None), [], "'focal'"),
     "focal zero": (dict(focal=np.array(0.0)), [], "focal = 0"),
