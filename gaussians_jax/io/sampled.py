@@ -4,14 +4,13 @@ import math
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.splats import Gaussians, Splats
 from gaussians_jax.io.instants import At
-from gaussians_jax.splatting import harmonics, rendering
+from gaussians_jax.splatting import harmonics, projection, raster
 from gaussians_jax.splatting.raster_spec import RasterSpec
 from nerfies_jax import evaluation
 from nerfies_jax.capture.capture import Capture
@@ -121,7 +120,7 @@ def count_for(capture: Capture) -> int:
 def seen_in_training(
     at: At,
     rows: Splats,
-    raster: RasterSpec,
+    raster_spec: RasterSpec,
     degree: Int[Array, ""],
     capture: Capture,
 ) -> Seen:
@@ -133,7 +132,7 @@ def seen_in_training(
     Args:
       at: Function from time to Gaussians.
       rows: Raw parameters.
-      raster: Settings of the rasterizer.
+      raster_spec: Settings of the rasterizer.
       degree: Degree of the spherical harmonics in use.
       capture: The capture.
 
@@ -158,7 +157,7 @@ def seen_in_training(
             variants.append((static, view.camera))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *variants)
         weights = list(
-            data_parallel.rows_on_devices(_appearance, (size, raster), stacked)
+            data_parallel.rows_on_devices(_weights, (size, raster_spec), stacked)
         )
         most = np.maximum(most, np.max(weights, axis=0) * factor**2)
         weight = np.sum(weights, axis=0)
@@ -169,19 +168,11 @@ def seen_in_training(
     return Seen(np.asarray(most), color / total_weight[:, None])
 
 
-def _appearance(how, gaussians: Gaussians, camera: Camera):
-    """Sum the compositing weights of each Gaussian over the pixels.
-
-    An image is a weighted sum of colors, so the summed weights of a Gaussian are the
-    gradient of the sum of the image with respect to the Gaussian's color.
-    """
-    size, raster = how
-
-    def total(colors: Float[Array, "gaussians 3"]):
-        frame = rendering.render(gaussians, colors, camera, size, raster, depth=False)
-        return jnp.sum(frame.rendering.color)
-
-    return jax.grad(total)(jnp.zeros_like(gaussians.mean))[:, 0]
+def _weights(how, gaussians: Gaussians, camera: Camera):
+    """Sum the compositing weights of each Gaussian over the pixels."""
+    size, spec = how
+    footprints = projection.project(gaussians, camera, size, spec)
+    return raster.summed_weights(footprints, size, spec)
 
 
 def _moves(at, capture):

@@ -96,12 +96,56 @@ def rasterize(
         shape = (grid.height, grid.width)
         blank = jnp.zeros((*shape, values.shape[1]), values.dtype)
         return blank, jnp.ones(shape, values.dtype)
-    state = _raster(layout, *_in_depth_order(footprints, values, grid))
+    rects, table, _ = _in_depth_order(footprints, values, grid)
+    state = _raster(layout, rects, table)
     return _to_image(state[:, 1:], grid), _to_image(state[:, :1], grid)[..., 0]
 
 
+@checked
+def summed_weights(
+    footprints: Footprints, size: tuple[int, int], spec: RasterSpec
+) -> Float[Array, " gaussians"]:
+    """Sum the compositing weights of each Gaussian over all pixels.
+
+    The sum is the gradient of the sum of all pixels with respect to the value of the
+    Gaussian. The pass of the gradient alone computes it, without an image.
+
+    Args:
+      footprints: N projected Gaussians, at least one.
+      size: (width, height) of the image in pixels.
+      spec: Thresholds and tile sizes.
+
+    Returns:
+      The sums, in pixels.
+    """
+    layout = _layout(footprints, size, spec)
+    grid, dtype = layout.grid, footprints.mean_px.dtype
+    values = jnp.zeros((len(footprints.depth), 1), dtype)
+    rects, table, order = _in_depth_order(footprints, values, grid)
+    ones = _to_tiles(jnp.ones((grid.height, grid.width, 1), dtype), grid)
+    rows = _with_transparent_row(table)
+
+    def body(carry):
+        cursor, state, gradient = carry
+        isects, cursor = _next_intersections(layout, cursor, rects, table, state)
+        state, gradient = blending.blend_gradient(
+            state, gradient, isects, rows, ones, spec, grid, layout.step
+        )
+        return cursor, state, gradient
+
+    start = (
+        Cursor(jnp.int32(0), jnp.int32(0)),
+        _blank(layout, 1, dtype),
+        jnp.zeros_like(rows),
+    )
+    *_, gradient = lax.while_loop(
+        lambda carry: _has_more(carry[0], carry[1], rects), body, start
+    )
+    return jnp.zeros(len(order), dtype).at[order].set(gradient[:-1, SHAPE_COLUMNS])
+
+
 def _in_depth_order(footprints, values, grid):
-    """Sort the tile rectangles and the table by depth."""
+    """Sort the tile rectangles and the table by depth, and return the order."""
     rects = binning.tile_rects(
         lax.stop_gradient(footprints.mean_px), footprints.extent_px, grid
     )
@@ -114,7 +158,7 @@ def _in_depth_order(footprints, values, grid):
         log_opacity[:, None],
         values[order],
     ]
-    return rects, jnp.concatenate(table, axis=1)
+    return rects, jnp.concatenate(table, axis=1), order
 
 
 def _layout(footprints, size, spec):

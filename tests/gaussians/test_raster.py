@@ -119,6 +119,23 @@ def test_tiles_cut_by_the_edge_equal_the_dense_compositor(dtype, rng):
     check_against_dense(image, left, footprints, conics, values, SIZE, dtype)
 
 
+@pytest.mark.full
+def test_summed_weights_are_the_sums_of_the_dense_images_of_one_gaussian_each(
+    dtype, rng
+):
+    footprints, conics = some_footprints(rng, COUNT, SIZE, dtype, sigma=6.0)
+    spec = dataclasses.replace(QUICK, capacity=64)  # several chunks
+    weights = jitted(raster.summed_weights, static_argnums=(1, 2))
+    result = weights(footprints, SIZE, spec)
+    each = np.eye(COUNT, dtype=dtype)
+    images, _ = composite(
+        footprints.mean_px, conics, *footprints[2:4], each, SIZE, QUICK
+    )
+    tolerance = {"float32": 1e-4, "float64": 1e-12}[dtype]
+    np.testing.assert_allclose(result, images.sum(0), rtol=tolerance, atol=tolerance)
+    assert np.count_nonzero(result) > COUNT / 2
+
+
 def drawn(mean_px, sigma_px, opacity, depth, values, dtype):
     """Picture and what is left behind a few round Gaussians of one size.
 
