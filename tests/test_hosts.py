@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 import types
 
 import jax
@@ -137,6 +138,34 @@ def lose_the_other():
                 np.asarray(both(np.ones(3)))
     except hosts.Lost as error:
         sys.exit(f"error: {error}")
+
+
+def wait_for_the_other():
+    """End one process outside of a step. The other one waits, as for an evaluation."""
+    hosts.HEARTBEAT_SECONDS = 3
+    connected()
+    hosts.meet()
+    if jax.process_index() == int(sys.argv[4]):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if hosts.leads():
+        time.sleep(60)
+    else:
+        hosts.receive()
+
+
+@pytest.mark.full
+@pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL")
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_host_that_dies_in_silence_ends_the_other_with_an_error(lost):
+    """JAX would abort with a stack trace of C++."""
+    code = "from tests import test_hosts as t; t.wait_for_the_other()"
+    processes = started(code, lost)
+    exit_code, output = ended(processes[1 - lost])
+    assert exit_code == hosts.LOST_CODE, output
+    assert output.splitlines()[-1].startswith("error: another process has died or ")
+    assert "stack trace" not in output
+    assert "Traceback" not in output
+    assert ended(processes[lost])[0] == -signal.SIGKILL
 
 
 @pytest.mark.slow

@@ -90,6 +90,11 @@ def follow(trusted: Collection[str] = ()) -> None:
             build = run.model.example or run.model.init
             state = build(run.capture, jax.random.key(0))
             frames = validation.training_frames(run)
-            error = follower.follow(run.model, state, frames)
+            try:
+                error = follower.follow(run.model, state, frames)
+            except (jax.errors.JaxRuntimeError, ValueError) as cause:
+                if hosts.is_loss(cause):
+                    hosts.end_without_others(cause)
+                raise
     if error:
         raise ValueError(f"process 0 ended with an error: {error}")

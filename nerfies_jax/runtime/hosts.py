@@ -4,18 +4,22 @@ Process 0 leads. It does all that a single process does, and sends every chunk o
 training steps to the others, which compute their shares of it (`training.follower`).
 Only process 0 reads the clock, applies events and writes files, so the processes
 cannot disagree. Messages go through the coordination service of JAX, and arrays through
-its collectives. If a process dies, the service ends the others.
+its collectives. If a process dies, the others end with an error of one line.
 """
 
 import atexit
 import contextlib
+import ctypes
+import functools
 import json
 import os
 import re
+import signal
 import sys
+import threading
 import weakref
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +40,7 @@ _messages = 0  # sent or received by this process
 _barriers = 0
 # Leaves of the state that the last chunk returned, which all processes have.
 _sent_leaves: list[weakref.ref] = []
-
+_ending = threading.Lock()  # of `end_without_others`
 
 LOST_CODE = 2  # exit code, that of other errors which are not bugs
 
@@ -66,7 +70,7 @@ def join(
         None,
     )
     try:
-        with stopping.keeps_handlers():
+        with stopping.keeps_handlers(), _ending_with_others():
             jax.distributed.initialize(
                 coordinator,
                 processes,
@@ -182,11 +186,55 @@ def abandon() -> None:
     atexit.register(_end_at_once)  # called before the functions that JAX has registered
 
 
-def _end_at_once():
+def _end_at_once() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # closed
             stream.flush()
     os._exit(LOST_CODE)
+
+
+def end_without_others(reason: object) -> NoReturn:
+    """End this process with `LOST_CODE` and one line, because another one has died.
+
+    Args:
+      reason: The error of JAX.
+    """
+    _ending.acquire()  # never released, so only one thread prints the line
+    line = (str(reason).splitlines() or [""])[0]
+    print(
+        f"error: another process has died or cannot be reached ({line}); start all "
+        "again, fewer if need be, and resume the run",
+        file=sys.stderr,
+    )
+    _end_at_once()
+
+
+@contextlib.contextmanager
+def _ending_with_others():
+    """Let the client that `jax.distributed` creates in the block end without a trace.
+
+    By default it aborts with a stack trace of C++ when another process has sent no
+    heartbeat. JAX does not pass the argument for another function. jaxlib 0.10 fails to
+    convert the argument of that function, and aborts, which a signal handler in C must
+    catch: those of Python are called by the main thread, later.
+    """
+    from jax._src import distributed
+
+    module, name = distributed._jax, "get_distributed_runtime_client"
+    create = getattr(module, name)
+    ending = functools.partial(create, missed_heartbeat_callback=end_without_others)
+    setattr(module, name, ending)
+    try:
+        yield
+    finally:
+        setattr(module, name, create)
+    if os.name == "posix":
+        ctypes.CDLL(None).signal(int(signal.SIGABRT), _on_abort)
+
+
+@ctypes.CFUNCTYPE(None, ctypes.c_int)
+def _on_abort(_):
+    end_without_others("see the messages of JAX above")
 
 
 def send(kind: str, **content: Any) -> None:
@@ -216,7 +264,7 @@ def receive() -> dict[str, Any]:
             )
         except jax.errors.JaxRuntimeError as error:
             if "DEADLINE_EXCEEDED" not in str(error):
-                raise
+                end_without_others(error)
             continue
         _messages += 1
         return json.loads(text)
