@@ -111,21 +111,40 @@ def _unmap_pages(mapping: weakref.ref) -> None:
 
 
 def is_shared(capture: Capture) -> bool:
-    """Test if training on this device indexes all images of a capture in place.
+    """Test if training indexes all images of a capture, without a copy on the host.
 
     Args:
       capture: The capture.
 
     Returns:
-      True if no copy of the images is needed.
+      True for large captures on a CPU device, and for those mapped from a file.
     """
     images = capture.images
     return (
         images.nbytes >= LEAST_SHARED_BYTES
         and images.flags.c_contiguous
         and images.ctypes.data % ALIGNMENT == 0
-        and jax.default_backend() == "cpu"
+        and (jax.default_backend() == "cpu" or is_mapped(images))
     )
+
+
+def check_device(needed: int) -> None:
+    """Check that training frames fit in the memory of the device.
+
+    Args:
+      needed: Bytes of their images, masks and depths.
+
+    Raises:
+      ValueError: If they do not. The memory of a CPU device is not checked.
+    """
+    statistics = jax.local_devices()[0].memory_stats() or {}
+    limit = statistics.get("bytes_limit", math.inf)
+    if needed > limit:
+        raise ValueError(
+            f"the training frames need {needed / 2**30:.1f} GiB of memory on the "
+            f"device, which has {limit / 2**30:.1f} GiB; read smaller images with "
+            "max_side=..., or select fewer frames"
+        )
 
 
 def frame_bytes(capture: Capture, devices: int = 1) -> int:

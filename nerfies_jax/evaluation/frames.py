@@ -1,6 +1,7 @@
 """Frames of a capture on the device, and views to render."""
 
 from collections.abc import Set
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,31 +31,32 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
 
     Returns:
       The frames.
+
+    Raises:
+      ValueError: If they do not fit in the memory of the device.
     """
-    rows, extras = capture.train, {}
-    shared = frame_memory.is_shared(capture)
-
-    def pixels(array):
-        # Unlike `jnp.asarray`, `device_put` does not copy the array.
-        return jax.device_put(array) if shared else array[rows]
-
-    if "depths" in required_data and capture.depths is not None:
-        extras["depths"] = pixels(capture.depths)
-    if "points" in required_data and capture.points is not None:
-        extras["points"] = capture.points.position
-    if "flow" in required_data and capture.flow is not None:
-        extras["flow"] = training_flow(capture)
-    if "moving" in required_data and capture.moving is not None:
-        extras["moving"] = pixels(capture.moving)
+    rows, shared = capture.train, frame_memory.is_shared(capture)
+    names = ("images", "valid", *sorted(required_data & {"depths", "moving"}))
+    arrays = {name: getattr(capture, name) for name in names}
+    data: dict[str, Any] = {
+        name: array if shared or array is None else array[rows]
+        for name, array in arrays.items()
+    }
+    pixels = [array for array in data.values() if array is not None]
+    frame_memory.check_device(sum(array.nbytes for array in pixels))
     if shared:
-        extras["image_rows"] = rows.astype(np.int32)
+        # Unlike `jnp.asarray`, this does not copy the arrays.
+        data = jax.device_put(data)
+        data["image_rows"] = rows.astype(np.int32)
+    if "points" in required_data and capture.points is not None:
+        data["points"] = capture.points.position
+    if "flow" in required_data and capture.flow is not None:
+        data["flow"] = training_flow(capture)
     frames = Frames(
-        images=pixels(capture.images),
         cameras=cameras.take(capture.cameras, rows),
         times=capture.times[rows],
         appearance=capture.appearance_ids[rows],
-        valid=None if capture.valid is None else pixels(capture.valid),
-        **extras,
+        **data,
     )
     return in_default_precision(frames)
 

@@ -82,6 +82,19 @@ def test_frames_that_do_not_fit_on_the_disk_are_refused(tmp_path, on_disk, monke
         formats.load(tmp_path / "capture")
 
 
+def test_frames_that_do_not_fit_on_the_device_are_refused(monkeypatch):
+    statistics = {"bytes_limit": 5 * 300 * 200 * 4}  # five frames with their masks
+    device = SimpleNamespace(memory_stats=lambda: statistics)
+    monkeypatch.setattr(jax, "local_devices", lambda: [device])
+    monkeypatch.setattr(frame_memory, "is_shared", lambda capture: False)
+    capture = make(frames=6, size=(300, 200))
+    evaluation.frames_of(capture)
+    statistics["bytes_limit"] -= 1
+    needed = "the training frames need 0.0 GiB of memory on the device, which has 0.0"
+    with pytest.raises(ValueError, match=needed):
+        evaluation.frames_of(capture)
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("spec", [scenes.TINY_SPLATS, scenes.TINY_FIELD])
 def test_streamed_frames_train_as_those_in_memory(spec, on_disk, monkeypatch):
