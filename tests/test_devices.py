@@ -3,6 +3,7 @@
 import re
 
 import jax
+import numpy as np
 import pytest
 
 from gaussians_jax.scene import scene as splat_scene
@@ -50,6 +51,17 @@ def test_idle_devices_are_named(present, used, lines, monkeypatch):
     monkeypatch.setattr(jax, "local_device_count", lambda: present)
     monkeypatch.setattr(data_parallel, "_limit", None)
     assert data_parallel.idle_note(used, used, "batch_size") == lines
+
+
+def test_an_uncommitted_state_is_bound_to_no_device():
+    values = np.arange(4, dtype=np.float32)
+    bound = jax.device_put((values, jax.random.key(3)), jax.devices()[0])
+    free, key = data_parallel.uncommitted(bound)
+    assert bound[0].committed
+    assert not free.committed
+    assert free.unsafe_buffer_pointer() != bound[0].unsafe_buffer_pointer()
+    np.testing.assert_array_equal(free, values)
+    assert key is bound[1]
 
 
 SCENES = {

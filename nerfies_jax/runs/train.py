@@ -14,7 +14,7 @@ from nerfies_jax.evaluation.representation import HalfScorer
 from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.runs import budget, curves, run_folder, validation
 from nerfies_jax.runs.run import Run
-from nerfies_jax.runtime import console, events
+from nerfies_jax.runtime import console, data_parallel, events
 from nerfies_jax.training import checkpoint, chunk, loop, losses
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.loop import FitResult, History, Hook
@@ -153,6 +153,8 @@ def train(
         checkpoint_seconds=pace.checkpoint_every,
         history=history,
     )
+    # The products then share programs with the renderer and with later commands.
+    result = result._replace(state=data_parallel.uncommitted(result.state))
     result = _with_best(run, result, checkpoints)
     return Trained(result, renderer, renderer, rows, scorer)
 

@@ -339,6 +339,28 @@ def first_copy(tree: PyTree, devices: int) -> PyTree:
     return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
 
+def uncommitted(tree: PyTree) -> PyTree:
+    """Return arrays that are not bound to a device, like those of an initial state.
+
+    A program of arrays that are bound to one of several devices has another key in the
+    compilation cache.
+
+    Args:
+      tree: A pytree of arrays on the first device, such as a trained state.
+
+    Returns:
+      The pytree with copies of the arrays. PRNG keys stay as they are.
+    """
+
+    def copied(leaf):
+        is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        if is_key or not isinstance(leaf, jax.Array) or not leaf.committed:
+            return leaf
+        return jax.device_put(np.array(leaf, copy=True), may_alias=False)
+
+    return jax.tree.map(copied, tree)
+
+
 def _mesh(devices):
     """Return the mesh of a step: local devices, or equal numbers of each process."""
     if not _spanning:
