@@ -49,12 +49,22 @@ class Benchmark:
 
     source: cli.Source = cli.NamedSource()
     suite: (
-        Literal["curves", "fields", "tracked", "poses", "sonata", "moba", "presets"]
+        Literal[
+            "curves",
+            "fields",
+            "tracked",
+            "poses",
+            "sonata",
+            "moba",
+            "weights",
+            "presets",
+        ]
         | None
     ) = None
     """Methods to compare: one of each kind, over time; radiance fields; the parts of
-    splats-tracked-small; pose refinement; the ablations of Sonata or MoBa-GS; or every
-    small preset (default: one method, the preset)."""
+    splats-tracked-small; pose refinement; the ablations of Sonata or MoBa-GS; weights
+    that papers do not print; or every small preset (default: one method, the
+    preset)."""
     methods: tuple[str, ...] = ()
     """Methods of the suite (default: all)."""
     preset: cli.Preset = None

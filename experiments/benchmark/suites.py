@@ -310,6 +310,45 @@ CURVES = Suite(
     },
 )
 
+# Weights that the papers do not print, from none to the largest.
+_SWEPT = {
+    "sonata": (
+        "Sonata's Equation 18",
+        f"sonata-small {TRACKS} neighbors.weight",
+        ("0", "0.01", "0.1", "1"),
+    ),
+    "moba": (
+        "MoBa's acceleration penalty",
+        f"moba-small {TRACKS} acceleration.weight",
+        ("0", "0.001", "0.01", "0.1"),
+    ),
+    "e-d3dgs": (
+        "E-D3DGS' local smoothness",
+        "e-d3dgs-small neighbors.weight",
+        ("0", "0.01", "0.1", "1"),
+    ),
+    "dynmf": (
+        "DynMF's sparsity",
+        "dynmf-small motion.sparsity",
+        ("none", "1e-4", "1e-3", "1e-2"),
+    ),
+}
+WEIGHTS = Suite(
+    {
+        f"{name}-{value}": f"{settings}={value}"
+        for name, (_, settings, values) in _SWEPT.items()
+        for value in values
+    },
+    tuple(
+        Claim(
+            f"{part} helps with a weight of {value}",
+            *(f"{name}-{value}", f"{name}-{values[0]}", TRACKED),
+        )
+        for name, (part, _, values) in _SWEPT.items()
+        for value in values[1:]
+    ),
+)
+
 SUITES = {
     "curves": CURVES,
     "fields": FIELDS,
@@ -317,5 +356,6 @@ SUITES = {
     "poses": POSES,
     "sonata": SONATA,
     "moba": MOBA,
+    "weights": WEIGHTS,
     "presets": Suite({name: name for name in PRESETS if name.endswith("-small")}),
 }
