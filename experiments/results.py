@@ -269,7 +269,8 @@ def kept() -> list[str]:
 def keep(name: str, measured: pathlib.Path) -> None:
     """Store a result as the numbers of a page.
 
-    Benchmarks are added to the stored ones and replace those of the same options.
+    Benchmarks are added to the stored ones. Their methods replace those of the same
+    options.
 
     Args:
       name: Name of the page.
@@ -297,12 +298,12 @@ def keep(name: str, measured: pathlib.Path) -> None:
 
 
 def _add(record, path):
-    """Add the benchmarks of a result to a stored file."""
+    from experiments.benchmark import verdicts
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.metrics import clock
 
     stored = json.loads(path.read_text())
-    record["benchmarks"] = stored["benchmarks"] | record["benchmarks"]
+    record["benchmarks"] = verdicts.merged(stored["benchmarks"], record["benchmarks"])
     record["machine"] = clock.beside(record["machine"], stored["machine"])
     write_json(path, record)
 

@@ -238,6 +238,7 @@ def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
             settings = settings if suites.parsed(settings)[0] else " / ".join(presets)
             methods[method] = {
                 "settings": settings,
+                "revision": revision(),
                 "made_with": origin.of_run(of_method[min(of_method)].settings),
                 **verdicts.summary([one.metrics for one in of_method.values()]),
                 "curves": {

@@ -89,7 +89,7 @@ def page(stored: Mapping[str, Any]) -> str:
 def _methods(benchmark):
     """Return the methods of a benchmark by name, each with its revision."""
     common = {"revision": benchmark["revision"]}
-    return {name: one | common for name, one in benchmark["methods"].items()}
+    return {name: common | one for name, one in benchmark["methods"].items()}
 
 
 def _suite(label, benchmark):

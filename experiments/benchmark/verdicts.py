@@ -119,3 +119,35 @@ def _verdict(claim, metric, gains):
         text = text if abs(gain) > half_width else "not significant"
     statement, better, worse, _ = claim
     return Verdict(statement, better, worse, metric, gain, half_width, text)
+
+
+def merged(
+    earlier: Mapping[str, dict[str, Any]], later: Mapping[str, dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """Replace benchmarks, and methods and claims of benchmarks, by later ones.
+
+    Args:
+      earlier: Stored benchmarks by their label.
+      later: New benchmarks, of all or some of the methods.
+
+    Returns:
+      All benchmarks. Each method has the revision that measured it.
+    """
+    both = dict(earlier)
+    for label, new in later.items():
+        old = both.get(label, {"methods": {}, "claims": []})
+        methods = {
+            name: {"revision": old["revision"]} | one
+            for name, one in old["methods"].items()
+        }
+        # Others compared a method that was measured again.
+        claims = [
+            one
+            for one in old["claims"]
+            if not {one["better"], one["worse"]} & set(new["methods"])
+        ]
+        both[label] = new | {
+            "methods": methods | new["methods"],
+            "claims": [*claims, *new["claims"]],
+        }
+    return both

@@ -249,6 +249,30 @@ def test_a_claim_without_both_numbers_is_not_judged():
     assert verdicts.judge(numbers, [CLAIM]) == []
 
 
+def test_methods_that_are_measured_again_replace_only_themselves():
+    def claim(better, worse):
+        return {"better": better, "worse": worse, "claim": better, "metric": "m"}
+
+    old = {
+        "revision": "old",
+        "methods": {"a": {"mean": 1}, "b": {"mean": 2}, "c": {"mean": 3}},
+        "claims": [claim("a", "b"), claim("b", "c")],
+    }
+    new = {
+        "revision": "new",
+        "methods": {"a": {"mean": 4, "revision": "new"}},
+        "claims": [],
+    }
+    merged = verdicts.merged({"one": old, "other": old}, {"one": new, "third": new})
+    assert list(merged) == ["one", "other", "third"]
+    assert merged["other"] == old
+    one = merged["one"]
+    revisions = {name: of["revision"] for name, of in one["methods"].items()}
+    assert revisions == {"a": "new", "b": "old", "c": "old"}
+    assert one["methods"]["a"]["mean"] == 4
+    assert one["claims"] == [claim("b", "c")]
+
+
 @pytest.mark.parametrize("name", SUITES)
 def test_suites_are_consistent(name):
     suite = SUITES[name]
