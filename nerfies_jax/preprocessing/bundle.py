@@ -18,7 +18,7 @@ from nerfies_jax.preprocessing.view_set import Views
 
 ROUNDS = 40
 SOFT_PX = 0.5  # scale of the Cauchy loss
-# Penalty on second differences of the poses, in pixels over the distance: negligible,
+# Weight of second differences of the shifts, in pixels over the distance: negligible,
 # but sufficient in frames that do not show the object.
 BEND_PX = 0.1
 POINT_PRIOR = 1e-3  # relative to the information of a typical point
@@ -101,18 +101,19 @@ def _projected(views, sight, body):
     return pixel - sight.place, gradient, arm
 
 
-def adjusted(views: Views, sight: Sight, body: Body) -> Body:
+def adjusted(views: Views, sight: Sight, body: Body, bend_px: float = BEND_PX) -> Body:
     """Adjust points and poses to the observations.
 
     Args:
       views: The frames.
       sight: Observations.
       body: Initial object.
+      bend_px: Weight of second differences of the shifts, in pixels over the distance.
 
     Returns:
       The adjusted object.
     """
-    return _minimize(views, sight, body, _step_of_all)
+    return _minimize(views, sight, body, _step_of_all, bend_px)
 
 
 def posed(views: Views, sight: Sight, body: Body) -> Body:
@@ -129,8 +130,8 @@ def posed(views: Views, sight: Sight, body: Body) -> Body:
     return _minimize(views, sight, body, _step_of_poses)
 
 
-def _minimize(views, sight, body, step):
-    smoothness = _smoothness(views, body)
+def _minimize(views, sight, body, step, bend_px=BEND_PX):
+    smoothness = _smoothness(views, body, bend_px)
     cost, damping = _cost(views, sight, body, smoothness), DAMPING
     for _ in range(ROUNDS):
         system = _system(views, sight, body, smoothness)
@@ -149,12 +150,12 @@ def _minimize(views, sight, body, step):
     return body
 
 
-def _smoothness(views, body):
+def _smoothness(views, body, bend_px):
     """Return the penalty [frames, frames] on second differences of shifts."""
     frames = len(body.shift)
     second = np.diff(np.eye(frames), 2, axis=0)
     distance = np.median(np.linalg.norm(body.shift - views.position, axis=-1))
-    return (BEND_PX / max(distance, 1e-30)) ** 2 * second.T @ second
+    return (bend_px / max(distance, 1e-30)) ** 2 * second.T @ second
 
 
 def _cost(views, sight, body, smoothness):

@@ -89,3 +89,37 @@ def arc():
 def test_what_smoothness_cannot_tell_is_said(camera, center):
     time = np.arange(len(camera))
     assert body_scale.from_smoothness(time, camera, center).deviation > 0.2
+
+
+def sweep(frames=60):
+    """A camera that sweeps on an arc while it moves closer."""
+    time = np.linspace(0, 1, frames)
+    angle = 0.38 * np.sin(5 * np.pi * time)
+    distance = 0.66 - 0.05 * np.sin(2.5 * np.pi * time) ** 2
+    position = np.stack([np.sin(angle), 0.1 + 0 * time, np.cos(angle)], -1)
+    return time, distance[:, None] * position
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("factor", [0.96, 1.04])
+def test_a_door_that_slides_in_step_with_the_camera_has_its_scale(factor, dtype):
+    time, camera = sweep()
+    slide = 0.02 * np.cos(4 * np.pi * time)[:, None] * [1.0, 0, 0]
+    center = slide + np.array([0.1, 0.03, -0.07])
+    rng = np.random.default_rng(0)
+    noisy = camera + (center - camera) * rng.normal(1, 5e-4, (len(time), 1))
+    path = seen_at(factor, camera, noisy)
+    closed = body_scale.from_smoothness(time, camera, path).factor
+    assert abs(closed / factor - 1) > 0.02
+    likely = body_scale.most_likely(time, dtype(camera), dtype(path), 0.03)
+    # A factor of the grid is within 0.08 % of any other.
+    assert likely == pytest.approx(factor, rel=0.005)
+
+
+def test_a_scale_that_the_likelihood_cannot_tell_is_that_of_the_paths():
+    time, camera = sweep()
+    center = np.stack([0.1 * np.sin(9 * time), 0.1 * time**2, 0 * time], -1)
+    assert body_scale.most_likely(time[:20], camera[:20], center[:20], 0.1) == 1
+    uniform = time[:, None] * [0.3, 0, 0]
+    assert body_scale.most_likely(time, uniform, center, 0.1) == pytest.approx(1)
+    assert body_scale.most_likely(time, camera, center, 0.0) == 1

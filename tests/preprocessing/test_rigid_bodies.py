@@ -117,6 +117,52 @@ def test_what_bends_keeps_its_own_paths():
     np.testing.assert_array_equal(refined.position, alone.position)
 
 
+def sliding(monkeypatch):
+    """A body that slides in step with a sweeping camera, and paths 4 % too far."""
+    monkeypatch.setattr(rigid_bodies, "GROUPS", 1)
+    monkeypatch.setattr(rigid_bodies, "LARGE_GROUPS", 1)
+    monkeypatch.setitem(globals(), "FRAMES", 60)
+    time = np.linspace(0, 1, FRAMES)
+    sweep = 0.25 * np.sin(5 * np.pi * time)
+    camera = np.stack([sweep, 0 * time, sweep**2], -1)
+    seen_from = views()._replace(position=camera)
+    rng = np.random.default_rng(0)
+    point = rng.uniform(-0.1, 0.1, (POINTS, 1, 3))
+    slide = 0.03 * np.cos(4 * np.pi * time)[:, None] * [1.0, 0, 0]
+    world = point + slide + [0, 0, 1.2]
+    tracks = tracks_of(seen_from, world, noise_px=0.05)
+    tracks = Tracks(0 * tracks.start, tracks.pixel, np.ones_like(tracks.seen))
+    offset = 1.04 * (world - camera)
+    position = np.where(tracks.seen[..., None], camera + offset, np.nan)
+    deviation = np.full(POINTS, 0.03)
+    alone = Paths(position, tracks.seen, offset[..., 2], deviation)
+    true = world[..., 2] - camera[:, 2]
+    return seen_from, tracks, alone, true
+
+
+@pytest.mark.full
+def test_a_precisely_rigid_body_has_the_scale_of_its_likely_motion(monkeypatch):
+    seen_from, tracks, alone, true = sliding(monkeypatch)
+    refined = rigid_bodies.refined(seen_from, tracks, alone)
+    assert abs(np.median((refined.depth / true)[refined.known]) - 1) < 0.01
+    # With coarse tracks and an uncertainty like that, a body may be a piece of cloth.
+    pixel = np.random.default_rng(1).normal(tracks.pixel, 0.3)
+    coarse = rigid_bodies.refined(seen_from, tracks._replace(pixel=pixel), alone)
+    np.testing.assert_array_equal(coarse.position, alone.position)
+
+
+@pytest.mark.full
+def test_a_body_that_no_rigid_motion_fits_well_is_scaled_as_a_whole(monkeypatch):
+    seen_from, tracks, alone, true = sliding(monkeypatch)
+    monkeypatch.setattr(rigid_bodies, "TRACK_PX", 0.0)  # no error is small enough
+    alone = alone._replace(depth_deviation=np.full(POINTS, 0.1))
+    refined = rigid_bodies.refined(seen_from, tracks, alone)
+    ratio = (refined.depth / alone.depth)[alone.known]
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-9)
+    assert abs(np.median((refined.depth / true)[alone.known]) - 1) < 0.02
+    np.testing.assert_array_equal(refined.known, alone.known)
+
+
 def test_few_paths_are_left_as_they_are():
     seen_from, world = views(), turning_body()[:5]
     tracks = tracks_of(seen_from, world)
