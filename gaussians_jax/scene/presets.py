@@ -130,7 +130,8 @@ TRACKED = SplatScene(
 # time codes as frames, read by a coarse and a fine network, with a smoothness penalty.
 # Rotations are rotation vectors. Depth is used only if a capture has it, with a
 # correlation loss, which the paper leaves open. Codes are initialized as waves, not as
-# zeros: see `SMALL_SONATA`. `motion.network=bspline` is the KAN of Equation 4.
+# zeros, and Equation 18 has a small weight: see `SMALL_SONATA`.
+# `motion.network=bspline` is the KAN of Equation 4.
 SONATA = SplatScene(
     steps=60_000,
     batch_size=2,
@@ -145,7 +146,7 @@ SONATA = SplatScene(
         opacity=1e-4,
         warm_up=3000,
     ),
-    neighbors=NeighborSpec(start=3000),
+    neighbors=NeighborSpec(weight=0.01, start=3000),
     spectral=SpectralSpec(),
     depth=DepthSpec(),
 )
