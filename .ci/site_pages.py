@@ -120,7 +120,7 @@ def gallery(paths):
     """Return the page of players."""
     parts = ["# Gallery", "Reconstructions of built-in scenes. Drag to look around."]
     if not paths:
-        parts[1] = "![A reconstruction in the player](pictures/player.jpg)"
+        parts[1] = "![A reconstruction in the player](images/player.jpg)"
         parts.append(
             "This copy of the site was built without players. The published one has "
             "a live player of each built-in scene."

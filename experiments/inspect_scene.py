@@ -27,7 +27,7 @@ class InspectScene:
     """Advise presets of the papers' sizes instead of those for a CPU."""
     seconds: float | None = None
     """Seconds of training to advise presets for (default: complete runs)."""
-    picture: pathlib.Path | None = None
+    image: pathlib.Path | None = None
     """Contact sheet, PNG (default: runs/inspect-CAPTURE.png, or the first of
     inspect-CAPTURE-2.png, ... that is free)."""
     findings: pathlib.Path | None = None
@@ -36,7 +36,7 @@ class InspectScene:
     def __post_init__(self):
         if self.seconds is not None and not self.seconds > 0:
             raise ValueError(f"--seconds {self.seconds:g}: must be above 0")
-        cli.check_out_file(self.picture, "--picture")
+        cli.check_out_file(self.image, "--image")
         cli.check_out_file(self.findings, "--findings")
 
 
@@ -62,7 +62,7 @@ def main(args):
         advice = adviser.advise_all(inspected.findings, args.full, args.seconds)
         for line in report(inspected, advice, source, args.seconds):
             console.say(line)
-        path = args.picture or _free(pathlib.Path("runs"), f"inspect-{_name(capture)}")
+        path = args.image or _free(pathlib.Path("runs"), f"inspect-{_name(capture)}")
         path.parent.mkdir(parents=True, exist_ok=True)
         panels.save(inspected.sheet, path)
         console.say(f"contact sheet: {path}")

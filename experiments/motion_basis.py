@@ -30,7 +30,7 @@ class MotionBasis:
     times: int = 4
     """Observed images to draw."""
     out: pathlib.Path = pathlib.Path("basis.png")
-    """The picture, PNG."""
+    """The image, PNG."""
 
     def __post_init__(self):
         for name in ("bases", "times"):
@@ -46,8 +46,8 @@ def main(args):
         platform.start_jax("cpu", "one")
         rows = pictures(args.run, args.bases, args.times)
     draw(rows, args.out)
-    console.say(f"picture: {args.out}")
-    return {"picture": str(args.out)}
+    console.say(f"image: {args.out}")
+    return {"image": str(args.out)}
 
 
 def pictures(folder: pathlib.Path, bases: int, times: int) -> dict[str, list]:

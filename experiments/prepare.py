@@ -2,9 +2,9 @@
 
 nerfies prepare npz FILE OUT       images, poses, times, focal in one .npz
 nerfies prepare video FILE OUT     sharp frames, cameras by COLMAP
-nerfies prepare pictures DIR OUT   cameras by COLMAP
+nerfies prepare images DIR OUT     cameras by COLMAP
 
-Without npz, video or pictures, the source itself says which it is.
+Without npz, video or images, the source itself says which it is.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from experiments import cli
 from nerfies_jax.runs.config import Preparation
 from nerfies_jax.runtime import console
 
-KINDS = ("npz", "video", "pictures")
+KINDS = ("npz", "video", "images")
 How = Annotated[Preparation, tyro.conf.OmitArgPrefixes]
 
 
@@ -52,7 +52,7 @@ class Video:
 
 
 @dataclasses.dataclass(frozen=True)
-class Pictures:
+class Images:
     """Convert a folder of images, with cameras from COLMAP."""
 
     file: cli.Positional[pathlib.Path]
@@ -78,13 +78,13 @@ def with_kind(words: list[str]) -> list[str]:
     source = pathlib.Path(words[0])
     suffix = source.suffix.lower()
     if source.is_dir():
-        return ["pictures", *words]
+        return ["images", *words]
     if suffix == ".npz" or suffix in VIDEOS:
         return ["npz" if suffix == ".npz" else "video", *words]
     return words
 
 
-@cli.command(Npz | Video | Pictures, with_kind)
+@cli.command(Npz | Video | Images, with_kind)
 def main(args):
     """Convert. Wrong input ends with exit code 2."""
     record = None  # arrays come with cameras

@@ -170,7 +170,7 @@ def _files(args, names):
     """Names of all files of a render."""
     kinds = [kind for kind in args.formats if kind != "mp4"]
     files = [f"{name}.{kind}" for name in names for kind in kinds]
-    return files + (["film.mp4"] if "mp4" in args.formats else [])
+    return files + (["video.mp4"] if "mp4" in args.formats else [])
 
 
 def _model(args, run):
@@ -292,7 +292,7 @@ def _write(args, out, renderer, state, names, views, picture_of):
 
     with events.stage("rendering images", len(views)) as stage:
         if "mp4" in args.formats:
-            video.write_video(out / "film.mp4", rendered_images(stage), cli.RATE)
+            video.write_video(out / "video.mp4", rendered_images(stage), cli.RATE)
         else:
             for _ in rendered_images(stage):
                 pass

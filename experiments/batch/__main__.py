@@ -222,7 +222,7 @@ def planned(args: Batch) -> list[Run]:
             source = path.absolute()
             prepare: tuple[str, ...] = ()
             if path in clips:
-                kind = "video" if path.is_file() else "pictures"
+                kind = "video" if path.is_file() else "images"
                 capture = out / name / "capture"
                 prepare, source = (kind, str(source), str(capture)), capture
             for preset in args.preset or (None,):

@@ -197,7 +197,7 @@ def recognize(path: AnyPath) -> Format:
     if images >= 2:
         raise CaptureError(
             f"{path}: {images} images without cameras; estimate those with "
-            f"nerfies prepare pictures {shlex.quote(str(path))} OUT"
+            f"nerfies prepare images {shlex.quote(str(path))} OUT"
         )
     videos = videos_in(path)
     if len(videos) > 1:

@@ -11,7 +11,7 @@ from nerfies_jax.capture.json_files import replaced_folder
 from nerfies_jax.evaluation import Renderer, as_picture
 from nerfies_jax.training.model import TrainState, View
 
-VIDEO = "film.mp4"
+VIDEO = "video.mp4"
 
 
 def render(

@@ -47,7 +47,7 @@ def test_what_is_no_capture_yet_is_refused_with_the_way_out(tmp_path):
     made = tmp_path / "runs/a-capture/colmap/sparse/0"
     made.mkdir(parents=True)
     (made / "cameras.bin").touch()
-    with pytest.raises(CaptureError, match=r"2 images without.*prepare pictures"):
+    with pytest.raises(CaptureError, match=r"2 images without.*prepare images"):
         room.load(tmp_path)
 
 

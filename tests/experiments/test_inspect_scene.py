@@ -20,7 +20,7 @@ def test_the_command_line_prints_the_table_and_writes_both_files(
     names = ("sheet.png", "findings.json")
     sheet, findings = (tmp_path / name for name in names)
     inspect_scene.main(
-        [str(tmp_path / "film"), "--picture", str(sheet), "--findings", str(findings)]
+        [str(tmp_path / "film"), "--image", str(sheet), "--findings", str(findings)]
     )
     printed = capsys.readouterr().out
     assert "splats-static-small" in printed

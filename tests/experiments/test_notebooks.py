@@ -14,10 +14,10 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 # Constants of each, small. COLMAP finds the cameras of no fewer and smaller pictures;
 # what is learned from them may be smaller.
 SMALL = {
-    "fit_a_picture": {"GAUSSIANS": 300, "STEPS": 120, "WIDTH": 64},
+    "fit_an_image": {"GAUSSIANS": 300, "STEPS": 120, "WIDTH": 64},
     "own_motion": {"STEPS": 8, "SIZE": (48, 36), "FRAMES": 8},
     "own_nerf": {"STEPS": 500, "RAYS": 256, "WIDTH": 32, "SAMPLES": 16, "FACTOR": 4},
-    "film_to_page": {
+    "video_to_page": {
         "FRAMES": 14,
         "STEPS": 20,
         "PASSES": 1,
@@ -69,7 +69,7 @@ def test_a_notebook_runs(notebook, tmp_path):
     # Of several threads COLMAP finds other cameras on a busy machine: once it placed 8
     # of these 14 pictures.
     program = program.replace("passes=PASSES)", "passes=PASSES, threads=1)")
-    assert ("threads=1" in program) == (notebook == "film_to_page")
+    assert ("threads=1" in program) == (notebook == "video_to_page")
     (tmp_path / path.name).write_text(program)
     folders = {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path), "MPLBACKEND": "agg"}
     done = subprocess.run(

@@ -61,7 +61,7 @@ def test_a_source_says_its_kind(tmp_path, capsys, monkeypatch):
     archive(tmp_path / "a.npz")
     prepare.main([str(tmp_path / "a.npz"), str(tmp_path / "out")])
     assert room.load(tmp_path / "out").train.size == 10
-    assert prepare.with_kind([str(tmp_path), "out"])[0] == "pictures"
+    assert prepare.with_kind([str(tmp_path), "out"])[0] == "images"
     assert prepare.with_kind(["clip.MP4", "out"])[0] == "video"
     monkeypatch.chdir(tmp_path)
     (tmp_path / "video").mkdir()

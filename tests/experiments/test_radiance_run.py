@@ -88,7 +88,7 @@ def test_the_canonical_view_is_rendered(run, tmp_path):
     path = ("--path", "sway", "--frames", "2", "--max-side", "20")
     for name, more in (("all", ()), ("canonical", ("--without", "warp"))):
         assert main(render, run, *path, *more, "--out", tmp_path / name) == 0
-        assert len(list(video.read_video(tmp_path / name / "film.mp4"))) == 2
+        assert len(list(video.read_video(tmp_path / name / "video.mp4"))) == 2
     whole, canonical = (pictures(tmp_path / name) for name in ("all", "canonical"))
     assert canonical[0].shape == (15, 20, 3)
     assert not np.array_equal(whole, canonical)

@@ -248,7 +248,7 @@ def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
     ]
     picture, _ = images.read_image(out / "0000.png")
     assert picture.shape == (16, 32, 3)
-    assert len(list(video.read_video(out / "film.mp4"))) == 3
+    assert len(list(video.read_video(out / "video.mp4"))) == 3
     assert exr.read_exr(out / "0001.exr").depth.shape == (16, 32)
 
 

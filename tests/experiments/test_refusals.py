@@ -87,7 +87,7 @@ def test_what_cannot_be_is_refused(name, words, refusal, tmp_path, monkeypatch, 
     [
         ("compare a b", "--out FOLDER"),
         ("preprocess --scene fast", "--out FOLDER"),
-        *(("inspect_scene", f"--{name} FILE") for name in ("picture", "findings")),
+        *(("inspect_scene", f"--{name} FILE") for name in ("image", "findings")),
     ],
 )
 def test_results_of_earlier_measurements_are_kept(
