@@ -8,6 +8,7 @@ of its own, and its pipeline answers `ns-eval` with the metrics of that run.
 import dataclasses
 import json
 import pathlib
+import shlex
 import shutil
 import subprocess
 from typing import Any
@@ -16,6 +17,8 @@ import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
+
+from nerfies_jax.runtime import console
 
 NAME = "nerfies-jax"
 RUN = "run"  # the run folder, next to nerfstudio's own files
@@ -94,7 +97,7 @@ class NerfiesJaxTrainer:
         """
         folder = pathlib.Path(self.config.get_base_dir()).resolve() / RUN
         command = command_line(self.config, folder)
-        print(" ".join(command), flush=True)
+        console.say(shlex.join(command))
         code = subprocess.run(command, check=False).returncode
         if code:
             raise RuntimeError(f"{command[0]} ended with code {code}")

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nerfies_jax.runtime import stopping
+from nerfies_jax.runtime import console, stopping
 
 PyTree = Any
 
@@ -201,10 +201,9 @@ def end_without_others(reason: object) -> NoReturn:
     """
     _ending.acquire()  # never released, so only one thread prints the line
     line = (str(reason).splitlines() or [""])[0]
-    print(
-        f"error: another process has died or cannot be reached ({line}); start all "
-        "again, fewer if need be, and resume the run",
-        file=sys.stderr,
+    console.error(
+        f"another process has died or cannot be reached ({line}); start all again, "
+        "fewer if need be, and resume the run"
     )
     _end_at_once()
 
