@@ -215,8 +215,8 @@ for name in [*names.split(), "distributed"]:
     sys.modules[name] = None
 for package in ("nerfies_jax", "gaussians_jax", "experiments"):
     for path in sorted(pathlib.Path(package).rglob("*.py")):
-        # One does its work when it is loaded, and nerfbaselines loads the other.
-        if path.stem not in ("worker", "nerfbaselines_spec"):
+        # One does its work when it is loaded, and other packages load the others.
+        if path.stem not in ("worker", "nerfbaselines_spec", "nerfstudio_method"):
             importlib.import_module(".".join(path.with_suffix("").parts))
 """
 
