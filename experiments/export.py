@@ -33,6 +33,11 @@ GAUSSIANS = ("time", "frames", "units", "up", "keep")
 PATHS = ("frames", "path")
 # That of `nerfies_jax.capture.axes`, which loads JAX.
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+# Of formats that define it: name, and the axes that may point up, the default first.
+UP: dict[str, tuple[str, tuple[Axis, ...]]] = {
+    "usda": ("OpenUSD", ("y", "z")),
+    "glb": ("glTF", ("y",)),
+}
 MOST_VOXELS = 512  # 5 GB along all three sides
 OPTIONS = {
     **{"ply": GAUSSIANS, "splat": GAUSSIANS, "spz": GAUSSIANS},
@@ -154,10 +159,9 @@ class Export:
             raise ValueError(f"--points {self.points}: track at least one")
         if self.voxels is not None and not 8 <= self.voxels <= MOST_VOXELS:
             raise ValueError(f"--voxels {self.voxels}: choose from 8 to {MOST_VOXELS}")
-        if self.kind == "usda" and self.axis not in ("y", "z"):
-            raise ValueError(f"--up {self.axis}: OpenUSD has y or z up")
-        if self.kind == "glb" and self.axis != "y":
-            raise ValueError(f"--up {self.axis}: glTF has y up")
+        if self.kind in UP and self.axis not in UP[self.kind][1]:
+            name, axes = UP[self.kind]
+            raise ValueError(f"--up {self.axis}: {name} has {' or '.join(axes)} up")
 
     @property
     def kind(self) -> str:
@@ -167,7 +171,7 @@ class Export:
     @property
     def axis(self) -> Axis | None:
         """The axis that points up, or None for the axes of the capture."""
-        default: Any = "y" if self.kind in ("usda", "glb") else None
+        default = UP[self.kind][1][0] if self.kind in UP else None
         return self.up or self._of_program("up") or default
 
     @property

@@ -109,7 +109,7 @@ class NerfiesJaxTrainer:
 
 
 class NerfiesJaxPipeline(Pipeline):
-    """A trained run, for `ns-eval`.
+    """A trained run, for `ns-eval`, which calls nothing else of a pipeline.
 
     Args:
       config: Settings of the pipeline.
@@ -163,36 +163,6 @@ class NerfiesJaxPipeline(Pipeline):
         if output_path is not None:
             shutil.copy(self._folder / "comparison.png", output_path)
         return {name: numbers[key] for name, key in METRICS.items() if key in numbers}
-
-    def get_eval_image_metrics_and_images(self, step: int) -> Any:
-        """Refuse, as only nerfstudio's own trainer calls this.
-
-        Args:
-          step: Ignored.
-
-        Raises:
-          NotImplementedError: Always.
-        """
-        raise NotImplementedError(f"the trainer of {NAME} evaluates after training")
-
-    def get_training_callbacks(self, training_callback_attributes: Any) -> list:
-        """Return no callbacks.
-
-        Args:
-          training_callback_attributes: Ignored.
-
-        Returns:
-          An empty list.
-        """
-        return []
-
-    def get_param_groups(self) -> dict[str, list]:
-        """Return no parameters, as none are torch's.
-
-        Returns:
-          An empty dictionary.
-        """
-        return {}
 
 
 def command_line(config: NerfiesJaxConfig, folder: pathlib.Path) -> list[str]:
