@@ -23,6 +23,7 @@ COMPILED = "/jax/core/compile/backend_compile_duration"
 MORE_PROGRAMS, FEW_PROGRAMS = 1.25, 150
 MORE_SECONDS, FEW_SECONDS = 4.0, 30.0
 PACED_SECONDS, PACED_FILES = 1.0, 10  # shorter files, and fewer of them, tell no pace
+COLLECTED = pytest.StashKey[set[tuple[str, str]]]()  # also what a run leaves out
 
 
 def pytest_addoption(parser):
@@ -33,6 +34,13 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     config.pluginmanager.register(Cost(config))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    config.stash[COLLECTED] = {
+        (tier_of(item), item.nodeid.partition("::")[0]) for item in items
+    }
 
 
 def processor_seconds():

@@ -46,3 +46,8 @@ def test_a_run_keeps_what_it_did_not_touch(tmp_path, monkeypatch):
     (tmp_path / "gone.py").unlink()
     budget.write({("full", "b.py"): (5, 2.0)})
     assert budget.read() == {("core", "a.py"): [3, 1.3], ("full", "b.py"): [5, 2.0]}
+
+
+def test_the_budget_names_every_file_of_every_tier(pytestconfig):
+    unnamed = pytestconfig.stash[budget.COLLECTED] - budget.read().keys()
+    assert not unnamed, "run these files with --write-budget"
