@@ -5,7 +5,7 @@
 
 The runs must have the same training frames of the same capture. Prints a table of
 metrics, times and sizes, and the seconds of training until each run reached a PSNR.
-Saves compare.json, curves.png, and pictures.png with held-out frames side by side.
+Saves compare.json, curves.png, and frames.png with held-out frames side by side.
 Seconds are those of each run's machine, and the table says where machines differ.
 Unfinished runs are compared as far as they got.
 """
@@ -49,7 +49,7 @@ class Compare:
     frames: int = 2
     """Held-out frames in the image. 0 renders none."""
     out: pathlib.Path | None = None
-    """Folder for compare.json, curves.png and pictures.png (default: runs/compare)."""
+    """Folder for compare.json, curves.png and frames.png (default: runs/compare)."""
     trust: cli.Code = ()
     """Code from other packages that the run was trained with, as MODULE:NAME. It is
     loaded only if it is named here again."""
@@ -97,7 +97,7 @@ def main(args):
                 "all" if "all" in threads else "one",
                 wide=not args.trust,
             )
-            draw(folder / "pictures.png", compared, args.frames, args.trust)
+            draw(folder / "frames.png", compared, args.frames, args.trust)
     console.say(f"saved in {folder}")
     return cli.stored(folder / "compare.json")
 
@@ -329,11 +329,11 @@ def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
     tiles, captions = [], []
     for place, row in enumerate(scored[0].rows):
         truth = capture.images[row]
-        renders = [evaluation.as_picture(each.color[place]) for each in scored]
+        renders = [evaluation.to_uint8(each.color[place]) for each in scored]
         if capture.valid is not None:  # unobserved pixels are no error
             valid = capture.valid[row][..., None]
             truth, renders = truth * valid, [image * valid for image in renders]
-        errors = [panels.color_error(x, truth, LARGEST_ERROR).picture for x in renders]
+        errors = [panels.color_error(x, truth, LARGEST_ERROR).image for x in renders]
         blank = truth * 0 + 255
         tiles += [truth, *renders, blank, *errors]
         captions += [capture.ids[row]]

@@ -44,13 +44,13 @@ def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
         platform.start_jax("cpu", "one")
-        rows = pictures(args.run, args.bases, args.times)
+        rows = images(args.run, args.bases, args.times)
     draw(rows, args.out)
     console.say(f"image: {args.out}")
     return {"image": str(args.out)}
 
 
-def pictures(folder: pathlib.Path, bases: int, times: int) -> dict[str, list]:
+def images(folder: pathlib.Path, bases: int, times: int) -> dict[str, list]:
     """Render the rows of the figure.
 
     Args:

@@ -34,7 +34,7 @@ class Render:
         "camera": ("path", "frames", "freeze", "slow"),
         "scene": ("without", "appearance", "hide_moving"),
         "speed": ("knots", "interpolation", "static_threshold"),
-        "pictures": ("show", "out", "formats", "max_side"),
+        "images": ("show", "out", "formats", "max_side"),
     }
 
     run: cli.Positional[pathlib.Path]
@@ -147,11 +147,11 @@ def main(args):
         views = _blend(args, run, views)
         files = _files(args, names)
         may_go = render_folder.replaceable(out, args, settings, files)
-    picture_of = _Pictures(args.show, move, trained, views)
+    image_of = _Images(args.show, move, trained, views)
     renderer = evaluation.Renderer(model, size)
     replaced = json_files.replaced_folder(out, True, may_go)
     with cli.user_errors((CaptureError, OSError)), replaced as partial:
-        _write(args, partial, renderer, state, names, views, picture_of)
+        _write(args, partial, renderer, state, names, views, image_of)
         record = render_folder.record(settings, args, files)
         json_files.write_json(partial / render_folder.RECORD, record)
     return _report(out, renderer, len(names), files)
@@ -273,7 +273,7 @@ def _views(args, run):
     return names, evaluation.path_views(path.cameras, times, like), path.size
 
 
-def _write(args, out, renderer, state, names, views, picture_of):
+def _write(args, out, renderer, state, names, views, image_of):
     """Render view after view and write each as it comes."""
     from nerfies_jax.capture import images, video
     from nerfies_jax.evaluation import exr_series
@@ -281,7 +281,7 @@ def _write(args, out, renderer, state, names, views, picture_of):
     def rendered_images(stage):
         for place, (name, view) in enumerate(zip(names, views, strict=True)):
             rendering = renderer(state, view)
-            image = picture_of(rendering, place)
+            image = image_of(rendering, place)
             if "png" in args.formats:
                 images.write_png(out / f"{name}.png", image)
             if "exr" in args.formats:
@@ -311,7 +311,7 @@ def _report(out, renderer, count, files):
     }
 
 
-class _Pictures:
+class _Images:
     """Convert renderings to 8-bit images.
 
     Depth and flow are normalized by the range of the first image that has any.
@@ -326,14 +326,14 @@ class _Pictures:
         from nerfies_jax.visualization import panels
 
         if self.show == "color":
-            return evaluation.as_picture(rendering.color)
+            return evaluation.to_uint8(rendering.color)
         if self.show == "flow":
             return self._draw_flow(rendering, place)
         opaque = rendering.alpha > 0.5
         colored = panels.color_depth(rendering.depth, opaque, self.limits)
         if opaque.any():
             self.limits = colored.low, colored.high
-        return colored.picture
+        return colored.image
 
     def _draw_flow(self, rendering, place):
         """Draw the flow to the next image; zero for the last one."""
@@ -341,11 +341,11 @@ class _Pictures:
         from nerfies_jax.visualization import panels
 
         start, end = self._views[place], self._views[place : place + 2][-1]
-        flow = model_flow.picture_flow(self._move, self._state, start, end, rendering)
+        flow = model_flow.image_flow(self._move, self._state, start, end, rendering)
         colored = panels.color_flow(flow, self.limits)
         if np.nanmax(np.abs(flow), initial=0) > 0:
             self.limits = colored.high
-        return colored.picture
+        return colored.image
 
 
 if __name__ == "__main__":

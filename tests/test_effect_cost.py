@@ -381,7 +381,7 @@ def test_what_stays_starts_from_the_numbers_it_had(preset, part):
     ],
     ids=["field", "splats"],
 )
-def test_a_picture_without_effects_asks_none(start, spec):
+def test_an_image_without_effects_asks_none(start, spec):
     run = start(spec)
     view = evaluation.view_of(run.capture, 0)
     modules = hand_made_effects.absent_modules(spec)

@@ -17,7 +17,7 @@ FIELDS = ("nerf-w", "hypernerf", "nsff")
 
 
 def one_step(name):
-    """The first parameters, and shapes of the second state, its log and its picture."""
+    """The first parameters, and shapes of the second state, its log and its image."""
     if name in SPLATS:
         capture, spec, kind = (
             scenes.tiny_capture(),

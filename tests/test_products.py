@@ -109,7 +109,7 @@ def test_a_product_of_places_is_found():
     assert rounded_products(jax.make_jaxpr(turned)(jnp.eye(3), jnp.ones(3))) != set()
 
 
-def test_a_picture_is_the_same_under_every_default():
+def test_an_image_is_the_same_under_every_default():
     gaussians = some_gaussians(400, "float32")
     camera = cameras.pinhole(np.eye(3), np.array([0, 0, -4.0]), 40.0, (32, 24))
 
@@ -117,11 +117,11 @@ def test_a_picture_is_the_same_under_every_default():
         seen = projection.project(gaussians, camera, (32, 24), GSPLAT)
         return raster.rasterize(seen, gaussians.scale, (32, 24), GSPLAT)
 
-    pictures = []
+    images = []
     for default in (None, "BF16_BF16_F32"):
         with jax.default_matmul_precision(default):
-            pictures.append(jax.jit(drawn)(gaussians))
-    same_bits(*pictures)
+            images.append(jax.jit(drawn)(gaussians))
+    same_bits(*images)
 
 
 def moved_by_bases(dtype):

@@ -35,7 +35,7 @@ import nerfies_jax as nj
 GAUSSIANS = 1200
 STEPS = 400
 WIDTH = 160  # pixels
-PICTURE = None  # a file of yours; None takes a frame of the built-in scene
+IMAGE_FILE = None  # a file of yours; None takes a frame of the built-in scene
 
 # %% [markdown]
 # ## The image
@@ -43,13 +43,13 @@ PICTURE = None  # a file of yours; None takes a frame of the built-in scene
 # Colors lie in [0, 1]. `height, width, 3`, as everywhere in this library.
 
 # %%
-if PICTURE is None:
+if IMAGE_FILE is None:
     capture = nj.built_in_scene("static")
-    picture = Image.fromarray(capture.images[0])
+    image = Image.fromarray(capture.images[0])
 else:
-    picture = Image.open(PICTURE).convert("RGB")
-height = round(WIDTH * picture.height / picture.width)
-truth = jnp.asarray(np.asarray(picture.resize((WIDTH, height))) / 255, jnp.float32)
+    image = Image.open(IMAGE_FILE).convert("RGB")
+height = round(WIDTH * image.height / image.width)
+truth = jnp.asarray(np.asarray(image.resize((WIDTH, height))) / 255, jnp.float32)
 size = (WIDTH, height)
 
 # %% [markdown]
@@ -65,7 +65,7 @@ camera = nj.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), float(WIDTH), size)
 
 
 def scattered(key, count):
-    """Random Gaussians over the picture, a few pixels wide and half transparent."""
+    """Random Gaussians over the image, a few pixels wide and half transparent."""
     place_key, depth_key, color_key = jax.random.split(key, 3)
     reach = jnp.array([0.5, 0.5 * height / WIDTH])
     place = jax.random.uniform(place_key, (count, 2), minval=-reach, maxval=reach)

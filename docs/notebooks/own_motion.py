@@ -89,7 +89,7 @@ models = {
 #
 # In float64, along random directions, against central differences: first the motion by
 # itself, at times where the sine is flat and where it is steep; then the penalty. A
-# motion that is smooth has to agree to far more digits than a picture does, so this is
+# motion that is smooth has to agree to far more digits than an image does, so this is
 # where an error in the formula would show. Then the same in float32, as it is trained.
 
 
@@ -170,7 +170,7 @@ plt.show()
 # ## What it has learned
 #
 # The reach of most Gaussians stays near zero, for most of the scene stands still; a few
-# swing. Was that worth it? The two numbers above the pictures say.
+# swing. Was that worth it? The two numbers above the images say.
 
 # %%
 params = states["with swing"].params

@@ -41,7 +41,7 @@ FRAMES = 24
 STEPS = 600
 PASSES = 2
 PRESET = "splats-deformable-small"
-MAX_SIDE = None  # of the pictures to learn from, pixels; None takes the capture's
+MAX_SIDE = None  # of the images to learn from, pixels; None takes the capture's
 OUT = pathlib.Path(tempfile.mkdtemp(prefix="film-to-page-"))
 
 # %% [markdown]

@@ -228,7 +228,7 @@ def _image_files(folder):
     PIL.Image.fromarray(gray.astype(np.uint16) * 257).save(folder / "deep.png")
 
 
-def _read_pictures(folder):
+def _read_images(folder):
     from nerfies_jax.capture import images
 
     for path in sorted(folder.iterdir()):
@@ -524,7 +524,7 @@ TARGETS = {
     "rig of cameras": Target(_rig, lambda f: _load(f / "capture"), 10),
     "frame times": Target(_times, _read_times, 200),
     "photographs": Target(_photographs, _read_photographs, 100),
-    "images": Target(_image_files, _read_pictures, 200),
+    "images": Target(_image_files, _read_images, 200),
     "masks": Target(_masks, _read_masks, 100),
     "EXR": Target(_exr, _read_exr, 50),
     "npy": Target(_npy, _read_npy, 500),

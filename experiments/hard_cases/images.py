@@ -57,7 +57,7 @@ AMPLITUDE = Case(
 
 # Dyadic numbers: level + offset + contrast * pattern is exact in float32, so all that
 # is lost is lost by the similarity.
-_PICTURE = np.random.default_rng(0).integers(-2, 3, (11, 11, 1)).astype(float)
+_IMAGE = np.random.default_rng(0).integers(-2, 3, (11, 11, 1)).astype(float)
 _OTHER = np.random.default_rng(1).integers(-2, 3, (11, 11, 1)).astype(float)
 _LEVELS = [
     (0.875, 0.0, 0.0),
@@ -73,7 +73,7 @@ _LEVELS = [
 
 def _pair(x):
     level, offset, contrast = x
-    image, target = (constant(p, x.dtype) for p in (_PICTURE, _OTHER))
+    image, target = (constant(p, x.dtype) for p in (_IMAGE, _OTHER))
     return level + offset + contrast * image, level + contrast * target
 
 
@@ -96,7 +96,7 @@ def _exact_dssim(x):
     line = [mpmath.exp(-mpmath.mpf(k * k) / 4.5) for k in range(-5, 6)]
     total = sum(line)
     weight = [u * v / total**2 for u in line for v in line]
-    image = [level + offset + contrast * p for p in _PICTURE.ravel().tolist()]
+    image = [level + offset + contrast * p for p in _IMAGE.ravel().tolist()]
     target = [level + contrast * p for p in _OTHER.ravel().tolist()]
 
     def mean(values):
@@ -126,7 +126,7 @@ DSSIM = Case(
 )
 
 
-# A picture of 2 x 2 about a bright level: the bands are differences of its pixels.
+# An image of 2 x 2 about a bright level: the bands are differences of its pixels.
 _SOFT = np.array([0, 1e-3, 0.01, 0.1, 1, 100])
 _QUAD = np.array([3.1, -2.2, 5.3, 1.7])
 

@@ -21,7 +21,7 @@ from gaussians_jax.init.motion_fit import Depth, Paths, Points, PyTree, Resting
 from gaussians_jax.init.points import StartSpec
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.preprocessing import record, usable_paths, view_set
-from nerfies_jax.preprocessing.moving import picture_scale
+from nerfies_jax.preprocessing.moving import image_scale
 from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.training import programs
 
@@ -212,7 +212,7 @@ def moving_depths(evidence: Evidence) -> np.ndarray:
             np.stack([column, row], -1) + 0.5, DEPTH_TRACKS
         )
         depth = np.median(evidence.paths.depth[rows, frame][neighbors], axis=1)
-        depth[distance[:, 0] > DEPTH_REACH_PX * picture_scale(mask.shape[1])] = 0
+        depth[distance[:, 0] > DEPTH_REACH_PX * image_scale(mask.shape[1])] = 0
         depths[frame, row, column] = depth
     return depths
 

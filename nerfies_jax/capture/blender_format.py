@@ -174,10 +174,10 @@ def _image_file(root, entry, file):
     """The image of a frame. The suffix may differ, since copies are often converted."""
     name = entry.file_path
     inside(root, name, file)
-    image = frames.find_picture(root, name)
+    image = frames.find_image(root, name)
     suffix = pathlib.PurePosixPath(name).suffix
     if image is None and suffix.lower() in frames.SUFFIXES:
-        image = frames.find_picture(root, name.removesuffix(suffix))
+        image = frames.find_image(root, name.removesuffix(suffix))
     return image
 
 

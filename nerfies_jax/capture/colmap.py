@@ -192,16 +192,16 @@ def _as_pinholes(path, model, files, stored, shrink_by):
     return images, valid, moving, lenses, notes
 
 
-def name_of(picture: str) -> str:
+def name_of(image: str) -> str:
     """Return the id of an image: its path without suffix, usable as a file name.
 
     Args:
-      picture: Path of the image in the model.
+      image: Path of the image in the model.
 
     Returns:
       The id.
     """
-    return pathlib.PurePosixPath(picture).with_suffix("").as_posix().replace("/", "_")
+    return pathlib.PurePosixPath(image).with_suffix("").as_posix().replace("/", "_")
 
 
 def read_model(folder: pathlib.Path) -> Model:
@@ -322,7 +322,7 @@ def _find(path, subfolder, name):
     stem = pathlib.PurePosixPath(name).with_suffix("").as_posix()
     for each in (name, stem):
         # From the capture's folder, since the case of `subfolder` may differ as well.
-        file = frames.find_picture(path, f"{subfolder}/{each}" if subfolder else each)
+        file = frames.find_image(path, f"{subfolder}/{each}" if subfolder else each)
         if file is not None:
             return file
     return None
@@ -343,7 +343,7 @@ def _masks(path, names, size, shrink_by):
     if not folder.is_dir():
         return None, ()
     paths = [
-        frames.find_picture(folder, f"{name}.png") or _find(path, "masks", name)
+        frames.find_image(folder, f"{name}.png") or _find(path, "masks", name)
         for name in names
     ]
     if not any(paths):

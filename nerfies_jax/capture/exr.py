@@ -15,7 +15,7 @@ SECONDS_PER_NUMBER = 1e-6  # decoding time with a slow codec on a slow machine
 _TYPES = (np.float16, np.float32, np.uint32)
 
 
-class ExrPicture(NamedTuple):
+class ExrImage(NamedTuple):
     """Channels of an EXR image. NaN and infinity are replaced by 0."""
 
     color: np.ndarray | None  # [height, width, 3] float32, linear light
@@ -28,7 +28,7 @@ class ExrPicture(NamedTuple):
     display_size: tuple[int, int]  # width, height of the display window
 
 
-def read_exr(path: AnyPath) -> ExrPicture:
+def read_exr(path: AnyPath) -> ExrImage:
     """Read the data window of the first part of an EXR file.
 
     A luminance channel Y is returned as gray color if there are no RGB channels.
@@ -66,7 +66,7 @@ def read_size(path: AnyPath) -> tuple[int, int]:
         return tuple(_decode(child, path, True).about["display_size"])
 
 
-def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
+def in_display_window(path: AnyPath, image: ExrImage) -> ExrImage:
     """Crop or pad an image to the display window, which cameras refer to.
 
     Renderers store a crop or overscan as a data window of another size. Pixels without
@@ -75,7 +75,7 @@ def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
 
     Args:
       path: The file, for error messages.
-      picture: The channels of the data window.
+      image: The channels of the data window.
 
     Returns:
       The channels of the display window.
@@ -83,10 +83,10 @@ def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
     Raises:
       CaptureError: If the windows do not overlap, so no pixel of the image is stored.
     """
-    (left, top), (width, height) = picture.origin, picture.display_size
-    data_height, data_width = picture.finite.shape
+    (left, top), (width, height) = image.origin, image.display_size
+    data_height, data_width = image.finite.shape
     if (left, top, data_width, data_height) == (0, 0, width, height):
-        return picture
+        return image
     rows = slice(max(top, 0), min(top + data_height, height))
     columns = slice(max(left, 0), min(left + data_width, width))
     if rows.start >= rows.stop or columns.start >= columns.stop:
@@ -106,15 +106,15 @@ def in_display_window(path: AnyPath, picture: ExrPicture) -> ExrPicture:
         ]
         return window
 
-    return ExrPicture(
-        color=fit(picture.color),
-        alpha=fit(picture.alpha),
-        depth=fit(picture.depth),
-        extra={name: fit(array) for name, array in picture.extra.items()},
-        finite=fit(picture.finite),
-        color_finite=fit(picture.color_finite),
+    return ExrImage(
+        color=fit(image.color),
+        alpha=fit(image.alpha),
+        depth=fit(image.depth),
+        extra={name: fit(array) for name, array in image.extra.items()},
+        finite=fit(image.finite),
+        color_finite=fit(image.color_finite),
         origin=(0, 0),
-        display_size=picture.display_size,
+        display_size=image.display_size,
     )
 
 
@@ -163,7 +163,7 @@ def _crop(channels, origin, display_size):
     elif "Y" in channels:
         color = np.repeat(channels.pop("Y")[..., None], 3, axis=-1)
     alpha, depth = channels.pop("A", None), channels.pop("Z", None)
-    return ExrPicture(
+    return ExrImage(
         color, alpha, depth, channels, finite, color_finite, origin, display_size
     )
 

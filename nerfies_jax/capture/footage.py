@@ -52,16 +52,16 @@ def kind_of(path: pathlib.Path) -> str | None:
       path: A file or folder.
 
     Returns:
-      "film" for a video, "pictures" for a folder with at least two images, or None.
+      "film" for a video, "images" for a folder with at least two images, or None.
     """
     if path.is_file() and path.suffix.lower() in VIDEOS:
         return "film"
-    if path.is_dir() and len(pictures_in(path)) >= 2:
-        return "pictures"
+    if path.is_dir() and len(images_in(path)) >= 2:
+        return "images"
     return None
 
 
-def pictures_in(folder: pathlib.Path) -> list[pathlib.Path]:
+def images_in(folder: pathlib.Path) -> list[pathlib.Path]:
     """List the image files of a folder, by their suffix.
 
     Args:
@@ -70,7 +70,7 @@ def pictures_in(folder: pathlib.Path) -> list[pathlib.Path]:
     Returns:
       Paths in natural order.
     """
-    files = frames.pictures_in(folder, (*PLAIN, *HEIC))
+    files = frames.images_in(folder, (*PLAIN, *HEIC))
     return sorted(files, key=lambda file: frames.natural(file.name))
 
 
@@ -167,7 +167,7 @@ def _frame_count(path, times, count, per_second):
 
 
 def _masks_of_video(folder, count):
-    files = pictures_in(folder)
+    files = images_in(folder)
     if len(files) != count:
         raise CaptureError(
             f"{folder}: {len(files)} masks for a video of {count} frames; there must "
@@ -177,7 +177,7 @@ def _masks_of_video(folder, count):
 
 
 @decoder.session()
-def from_pictures(
+def from_images(
     folder: pathlib.Path,
     out: pathlib.Path,
     max_side: int = 960,
@@ -250,7 +250,7 @@ def from_pictures(
 
 def _readable(folder):
     """Return the headers of readable images, and notes on the others."""
-    files = pictures_in(folder)
+    files = images_in(folder)
     heic_names = [file.name for file in files if file.suffix.lower() in HEIC]
     notes = ()
     if heic_names and not photographs.heic_is_read():

@@ -166,7 +166,7 @@ FORMATS = (
 def _count_images(path):
     from nerfies_jax.capture import footage  # imports decoders, which are slow to load
 
-    return len(footage.pictures_in(path)) if path.is_dir() else 0
+    return len(footage.images_in(path)) if path.is_dir() else 0
 
 
 def recognize(path: AnyPath) -> Format:

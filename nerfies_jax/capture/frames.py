@@ -104,7 +104,7 @@ def least_factor(side: int, max_side: int) -> int:
     return side // (max_side + 1) + 1
 
 
-def find_picture(folder: pathlib.Path, name: str) -> pathlib.Path | None:
+def find_image(folder: pathlib.Path, name: str) -> pathlib.Path | None:
     """Find an image by its name, which may lack its suffix.
 
     The spelling on disk may differ as described in `text_files.find`.
@@ -154,7 +154,7 @@ def moved_note(names: Sequence[str], local: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-def pictures_in(
+def images_in(
     folder: pathlib.Path, suffixes: Sequence[str] = SUFFIXES
 ) -> list[pathlib.Path]:
     """List the image files of a folder.

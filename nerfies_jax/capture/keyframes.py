@@ -10,7 +10,7 @@ from nerfies_jax.capture.camera_paths import CameraPath
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 
-MAX_PICTURES = 100_000  # an hour of video; larger requests are mistakes
+MAX_FRAMES = 100_000  # an hour of video; larger requests are mistakes
 MOST_KEYFRAMES = 24  # of a path that is edited by hand
 
 
@@ -45,10 +45,10 @@ def through(keyframes: list[Keyframe], size: tuple[int, int], count: int) -> Cam
         raise ValueError(
             f"{len(keyframes)} keyframe(s); a camera path needs at least two"
         )
-    if not len(keyframes) <= count <= MAX_PICTURES:
+    if not len(keyframes) <= count <= MAX_FRAMES:
         raise ValueError(
             f"{count} images through {len(keyframes)} keyframes; expected "
-            f"{len(keyframes)} to {MAX_PICTURES} images"
+            f"{len(keyframes)} to {MAX_FRAMES} images"
         )
     knots = np.arange(len(keyframes), dtype=np.float64)
     positions = np.linspace(0, knots[-1], count)

@@ -71,7 +71,7 @@ def read(
         available, poses.size, factor, max_side, str(path)
     )
     # In lexicographic order, as in LLFF's script.
-    files = frames.pictures_in(available[source])
+    files = frames.images_in(available[source])
     loaded = frames.read_frames(files, shrink_by, orientation="stored")
     images = loaded.images
     valid, notes = without_black_borders(images, loaded.valid())
@@ -208,7 +208,7 @@ def _folders(path, poses):
     """Folders by reduction, with as many images as there are poses."""
     available = {}
     for folder in sorted(path.glob("images*")):
-        files = frames.pictures_in(folder) if folder.is_dir() else []
+        files = frames.images_in(folder) if folder.is_dir() else []
         if not files:
             continue
         if len(files) != len(poses.positions):

@@ -63,7 +63,7 @@ def read(
     path = pathlib.Path(path)
     views = read_cameras(path, heldout, missing)
     folder, source, shrink_by, notes = _stored_images(path, views, factor, max_side)
-    paths = [frames.find_picture(folder, name) for name in views.ids]
+    paths = [frames.find_image(folder, name) for name in views.ids]
     rows, skip_notes = frames.keep_found(paths, views.ids, missing, str(folder))
     views = only(views, rows)
     loaded = frames.read_frames([paths[row] for row in rows], shrink_by)

@@ -135,7 +135,7 @@ def _sources(path, poses):
 
 def _size_of(source):
     if source.is_dir():
-        first_file = frames.pictures_in(_images_folder(source))[0]
+        first_file = frames.images_in(_images_folder(source))[0]
         return image_files.read_header(first_file).size
     _, first = next(video.read_video(source, most=1))
     return first.shape[1], first.shape[0]
@@ -148,7 +148,7 @@ def _images_folder(folder):
 
 def _read_folders(path, folders, shrink_by):
     """Read the images of all cameras. Images of equal names have equal times."""
-    files = [frames.pictures_in(_images_folder(folder)) for folder in folders]
+    files = [frames.images_in(_images_folder(folder)) for folder in folders]
     camera_ids = np.repeat(np.arange(len(files)), [len(group) for group in files])
     all_files = [file for group in files for file in group]
     names = [

@@ -120,7 +120,7 @@ class Poses(NamedTuple):
     """Registered cameras, and quality measures of the static points."""
 
     folder: pathlib.Path  # with images and sparse/0
-    pictures: int  # number of images
+    images: int  # number of images
     placed: int  # number of registered images
     points: int  # observed in at least `MIN_TRACK` images
     error_px: float  # median over the points of their mean reprojection errors
@@ -135,7 +135,7 @@ class Poses(NamedTuple):
           Lines of text.
         """
         lines = [
-            f"cameras: {self.placed} of {self.pictures} images registered; "
+            f"cameras: {self.placed} of {self.images} images registered; "
             f"{self.points:,} static points, reprojection error {self.error_px:.2f} "
             f"px, triangulation angle {self.angle_deg:.1f} degrees",
             *self.notes,
@@ -151,10 +151,10 @@ class Poses(NamedTuple):
                 f"below {DOUBTED_ANGLE_DEG:g}, so depth is unreliable; walk while "
                 "recording"
             )
-        if self.placed < LEAST_PLACED * self.pictures:
+        if self.placed < LEAST_PLACED * self.images:
             lines.append(
-                f"doubtful: {self.pictures - self.placed} images could not be "
-                f"registered and are left out; {_more_overlap(self.pictures)}"
+                f"doubtful: {self.images - self.placed} images could not be "
+                f"registered and are left out; {_more_overlap(self.images)}"
             )
         return lines
 
@@ -208,7 +208,7 @@ def run_sfm(
     images, out = pathlib.Path(images).resolve(), pathlib.Path(out).resolve()
     if not images.is_dir():
         raise CaptureError(f"{images}: no such folder; pass a folder with images")
-    names = [file.name for file in frames.pictures_in(images)]
+    names = [file.name for file in frames.images_in(images)]
     if len(names) < MIN_TRACK:
         raise CaptureError(
             f"{images}: {len(names)} images; a reconstruction needs at least "

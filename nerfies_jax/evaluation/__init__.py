@@ -8,7 +8,7 @@ from nerfies_jax.evaluation.frames import (
     spread,
     view_of,
 )
-from nerfies_jax.evaluation.renderer import Renderer, as_picture
+from nerfies_jax.evaluation.renderer import Renderer, to_uint8
 from nerfies_jax.evaluation.scores import (
     Halves,
     Scored,
@@ -23,7 +23,6 @@ __all__ = [
     "Renderer",
     "Scored",
     "as_found",
-    "as_picture",
     "frames_of",
     "known_mean",
     "path_views",
@@ -32,5 +31,6 @@ __all__ = [
     "score_halves",
     "score_right_halves",
     "spread",
+    "to_uint8",
     "view_of",
 ]

@@ -41,7 +41,7 @@ def write(
             flow = None
             if move is not None:
                 target = views[min(index + 1, len(views) - 1)]
-                flow = model_flow.picture_flow(move, state, view, target, rendering)
+                flow = model_flow.image_flow(move, state, view, target, rendering)
             write_frame(partial / name, rendering, view, flow)
 
 

@@ -61,7 +61,7 @@ def photometric_loss(
     model: Model,
     state: TrainState,
     view: View,
-    picture: UInt8[Array, "height width 3"],
+    image: UInt8[Array, "height width 3"],
     valid: Bool[Array, "height width"] | None,
     depth: Float[Array, ""],
 ) -> Callable[[Float[Array, "6"]], Float[Array, ""]]:
@@ -71,15 +71,15 @@ def photometric_loss(
       model: The model.
       state: Trained state.
       view: View of the frame with its initial camera.
-      picture: The frame, [height, width, 3].
+      image: The frame, [height, width, 3].
       valid: True for observed pixels, [height, width], or None for all.
       depth: z-depth in scene units at which twists are measured in pixels.
 
     Returns:
       A function from a twist (rotation, translation) in pixels, [6], to the loss.
     """
-    size = picture.shape[1], picture.shape[0]
-    truth = picture.astype(view.camera.position.dtype) / LEVELS
+    size = image.shape[1], image.shape[0]
+    truth = image.astype(view.camera.position.dtype) / LEVELS
     render = _camera_renderer(model, state, view, size)
 
     def loss(twist_px):
@@ -147,11 +147,11 @@ def fit_cameras(
     # The smaller image does not contain the remaining pixels at the right and bottom.
     cropped = size[0] * factor, size[1] * factor
     program = jax.jit(
-        lambda params, step, view, picture, valid, depth: _fit_camera(
+        lambda params, step, view, image, valid, depth: _fit_camera(
             model,
             state._replace(params=params, step=step),
             view,
-            picture,
+            image,
             valid,
             depth,
             spec,

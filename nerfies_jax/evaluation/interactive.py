@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerfies_jax.evaluation.renderer import as_picture
+from nerfies_jax.evaluation.renderer import to_uint8
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.training.model import Rendering
@@ -184,9 +184,9 @@ def as_channel(
         `distance`.
     """
     if channel == "color":
-        return Colored(as_picture(np.asarray(rendering.color)), 0.0, 1.0)
+        return Colored(to_uint8(np.asarray(rendering.color)), 0.0, 1.0)
     if channel == "opacity":
-        gray = as_picture(np.asarray(rendering.alpha))[..., None]
+        gray = to_uint8(np.asarray(rendering.alpha))[..., None]
         return Colored(np.repeat(gray, 3, axis=-1), 0.0, 1.0)
     if channel == "depth":
         solid = np.asarray(rendering.alpha) > 0.5

@@ -67,7 +67,7 @@ def _pixel_flow(
     return np.where(valid[:, None], np.asarray(target) - pixels, np.nan)
 
 
-def picture_flow(
+def image_flow(
     move: Move, state: TrainState, here: View, there: View, rendering: Rendering
 ) -> np.ndarray:
     """Compute the flow of a whole rendered image to another view.
@@ -89,7 +89,7 @@ def picture_flow(
     return flow.reshape(*rendering.alpha.shape, 2)
 
 
-def picture_distance(
+def image_distance(
     move: Move, state: TrainState, here: View, there: View, rendering: Rendering
 ) -> np.ndarray:
     """Compute the distance that visible surfaces have moved between two times.

@@ -210,7 +210,7 @@ def _compile_all(model, *lowered):
     ]
 
 
-def as_picture(color: np.ndarray) -> np.ndarray:
+def to_uint8(color: np.ndarray) -> np.ndarray:
     """Convert colors to 8 bits.
 
     Args:

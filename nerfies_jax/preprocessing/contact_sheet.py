@@ -36,17 +36,17 @@ def followed(views: Views, evidence: Evidence) -> np.ndarray:
     cells, captions = [], []
     for frame in shown:
         mask = evidence.moving[frame]
-        picture = views.image[frame].astype(float)
-        picture = _tinted(picture, mask, MOVING, 0.4).round().astype(np.uint8)
-        picture = np.ascontiguousarray(picture.repeat(times, 0).repeat(times, 1))
-        _draw_tracks(picture, evidence, frame, times)
-        cells.append(picture)
+        image = views.image[frame].astype(float)
+        image = _tinted(image, mask, MOVING, 0.4).round().astype(np.uint8)
+        image = np.ascontiguousarray(image.repeat(times, 0).repeat(times, 1))
+        _draw_tracks(image, evidence, frame, times)
+        cells.append(image)
         time, share = views.time[frame], mask.mean()
         captions.append(f"time {time:.2f}: {share:.1%} moving")
     return panels.contact_sheet(cells, captions)
 
 
-def _draw_tracks(picture, evidence, frame, times):
+def _draw_tracks(image, evidence, frame, times):
     tracks, moves = evidence.tracks, evidence.score > MOVES
     rows = np.flatnonzero(tracks.seen[:, frame])
     chosen = [_spread(rows[moves[rows] == kind], TRACKS // 2) for kind in (False, True)]
@@ -57,13 +57,13 @@ def _draw_tracks(picture, evidence, frame, times):
         gap = np.flatnonzero(~tracks.seen[row, tail])
         tail = tail[gap[-1] + 1 :] if len(gap) else tail
         line = np.round(tracks.pixel[row, tail] * times * 16).astype(np.int32)
-        cv2.polylines(picture, [line], False, color, 1, cv2.LINE_AA, shift=4)
-        cv2.circle(picture, tuple(line[-1].tolist()), 24, color, -1, cv2.LINE_AA, 4)
+        cv2.polylines(image, [line], False, color, 1, cv2.LINE_AA, shift=4)
+        cv2.circle(image, tuple(line[-1].tolist()), 24, color, -1, cv2.LINE_AA, 4)
 
 
 def _spread(rows, most):
     return rows[:: max(1, -(-len(rows) // most))]
 
 
-def _tinted(picture, where, color, share):
-    return np.where(where[..., None], (1 - share) * picture + share * color, picture)
+def _tinted(image, where, color, share):
+    return np.where(where[..., None], (1 - share) * image + share * color, image)

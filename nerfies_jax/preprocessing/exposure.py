@@ -107,14 +107,14 @@ def _sightings(views: Views, points: np.ndarray) -> np.ndarray:
     light = np.full((len(views.row), len(points), 3), np.nan)
     for index in range(len(views.row)):
         pixel, depth = view_set.project(views, index, points)
-        inside = view_set.in_picture(views, pixel, depth, 2)
-        picture = linear_from_srgb(views.image[index] / 255)
+        inside = view_set.in_image(views, pixel, depth, 2)
+        image = linear_from_srgb(views.image[index] / 255)
         # A pixel's blur: points are known to a fraction of one.
-        picture = cv2.GaussianBlur(picture, (0, 0), 1)
+        image = cv2.GaussianBlur(image, (0, 0), 1)
         place = pixel[inside]
         at = (place - 0.5).astype(np.float32)[:, None]
         # OpenCV takes one map of pairs, which its stubs do not know.
-        value = cv2.remap(picture, at, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+        value = cv2.remap(image, at, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
         value = value[:, 0]
         visible = views.valid[index][tuple(place[:, ::-1].astype(int).T)]
         usable = ((value > DARK) & (value < BRIGHT)).all(-1) & visible

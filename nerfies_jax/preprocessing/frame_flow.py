@@ -36,8 +36,8 @@ def with_flow(capture: Capture) -> Capture:
         # Images with one timestamp are not a video and need no second search.
         film = np.ptp(views.time) > 0
         span = view_set.depth_span(capture, views) if film else None
-        pictures = dense_flow.leveled(views)
-        neighbors = dense_flow.between_neighbors(views, pictures, span)
+        images = dense_flow.leveled(views)
+        neighbors = dense_flow.between_neighbors(views, images, span)
         flow.forward[views.row] = neighbors.forward
         flow.forward_seen[views.row] = neighbors.forward_seen & views.valid
         flow.next_row[views.row[:-1]] = views.row[1:]

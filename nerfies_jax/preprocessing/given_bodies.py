@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing import rigid_groups
 from nerfies_jax.preprocessing.paths import Paths
 from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
-from nerfies_jax.preprocessing.view_set import Views, in_picture, project
+from nerfies_jax.preprocessing.view_set import Views, in_image, project
 
 GROUPS = 12
 FEWEST = 6  # positions that determine a factor
@@ -112,7 +112,7 @@ def _bounds(views, tracks, measured, static, rest):
     for frame in range(measured.shape[1]):
         here = np.flatnonzero(tracks.seen[:, frame] & (measured[:, frame] > 0))
         pixel, depth = project(views, frame, points)
-        hidden = in_picture(views, pixel, depth) & ~visible[:, frame]
+        hidden = in_image(views, pixel, depth) & ~visible[:, frame]
         if not len(here) or not hidden.any():
             continue
         gap, near = cKDTree(pixel[hidden]).query(tracks.pixel[here, frame])

@@ -25,7 +25,7 @@ from nerfies_jax.capture.given import Given, GivenFiles
 from nerfies_jax.preprocessing import given_arrays, given_tracks, networks
 
 FLO_MAGIC = 202021.25  # of Middlebury's .flo
-PICTURES, DEPTHS = (".png",), (".exr", ".png", ".npy")
+IMAGES, DEPTHS = (".png",), (".exr", ".png", ".npy")
 
 
 @decoder.session()
@@ -97,7 +97,7 @@ def _files(folder, suffixes, capture, what):
 
 
 def _masks(folder, capture):
-    paths, rows = _files(folder, PICTURES, capture, "masks")
+    paths, rows = _files(folder, IMAGES, capture, "masks")
     moving = np.zeros(capture.images.shape[:3], bool)
     encoding = masks.find_encoding(paths)
     for path, row in zip(paths, rows, strict=True):
@@ -134,37 +134,37 @@ def _fitted(array, capture, path, what):
 def _depths(path, capture):
     if path.is_dir():
         paths, rows = _files(path, DEPTHS, capture, "depths")
-        pictures = [_depth_picture(one) for one in paths]
+        maps = [_depth_map(one) for one in paths]
     else:
-        paths, pictures = [path], _stack(path)
-        rows = given_arrays.frames_of(len(pictures), capture, path, "depths")
+        paths, maps = [path], _stack(path)
+        rows = given_arrays.frames_of(len(maps), capture, path, "depths")
         paths = paths * len(rows)
     depths = np.full(capture.images.shape[:3], np.nan, np.float32)
-    for where, picture, row in zip(paths, pictures, rows, strict=True):
-        positive = np.isfinite(picture) & (picture > 0)
+    for where, depth_map, row in zip(paths, maps, rows, strict=True):
+        positive = np.isfinite(depth_map) & (depth_map > 0)
         if not positive.any():
             raise CaptureError(
                 f"{where}: no positive depth for frame {capture.ids[row]!r}; use the "
                 "depth map as the tool wrote it"
             )
-        depth = np.where(positive, picture, np.nan)
+        depth = np.where(positive, depth_map, np.nan)
         depths[row] = _fitted(depth, capture, where, "depth")
     return depths
 
 
-def _depth_picture(path):
+def _depth_map(path):
     if path.suffix.lower() == ".npy":
-        picture = npz_files.load_array(path, images.MAX_PIXELS).squeeze()
+        depth_map = npz_files.load_array(path, images.MAX_PIXELS).squeeze()
     elif path.suffix.lower() == ".exr":
         stored = exr.in_display_window(path, exr.read_exr(path))
-        picture = stored.depth
-        if picture is None and stored.color is not None:
-            picture = stored.color[..., 0]
+        depth_map = stored.depth
+        if depth_map is None and stored.color is not None:
+            depth_map = stored.color[..., 0]
     else:
-        picture = images.read_numbers(path)
-    if picture is None or picture.ndim != 2:
+        depth_map = images.read_numbers(path)
+    if depth_map is None or depth_map.ndim != 2:
         raise CaptureError(f"{path}: not a depth map; expected one channel")
-    return picture.astype(np.float32)
+    return depth_map.astype(np.float32)
 
 
 def _stack(path):
@@ -215,15 +215,15 @@ def _flow(path, capture):
 
 def _flo_stack(folder):
     paths = _flo_files(folder)
-    pictures = [_flo(one) for one in paths]
-    for path, picture in zip(paths, pictures, strict=True):
-        if picture.shape != pictures[0].shape:
-            (height, width), (tall, wide) = picture.shape[:2], pictures[0].shape[:2]
+    fields = [_flo(one) for one in paths]
+    for path, field in zip(paths, fields, strict=True):
+        if field.shape != fields[0].shape:
+            (height, width), (tall, wide) = field.shape[:2], fields[0].shape[:2]
             raise CaptureError(
                 f"{path}: {width}x{height} pixels, but {paths[0].name} has "
                 f"{wide}x{tall}; all must have the size of the images as they are read"
             )
-    return np.stack(pictures)
+    return np.stack(fields)
 
 
 def _flo_files(folder) -> Sequence[pathlib.Path]:

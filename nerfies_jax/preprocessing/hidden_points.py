@@ -56,7 +56,7 @@ def _seen_from(views, frame, places, colors, moving):
     row, column = every * row, every * column
     at = np.stack([column, row], -1) + 0.5
     pixel, depth = view_set.project(views, frame, places)
-    inside = view_set.in_picture(views, pixel, depth, 0)
+    inside = view_set.in_image(views, pixel, depth, 0)
     none = np.zeros((0, 3)), colors[:0]
     if not inside.any() or not len(at):
         return none

@@ -69,7 +69,7 @@ def moving_in(folder: pathlib.Path) -> dict[str, np.ndarray]:
     Raises:
       ValueError: If there are too few images, or they differ in size.
     """
-    names = [file.name for file in frames.pictures_in(folder)]
+    names = [file.name for file in frames.images_in(folder)]
     if len(names) <= min(LATER):
         raise ValueError(
             f"{folder}: {len(names)} images are too few to detect moving objects; "

@@ -104,7 +104,7 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
         place = tracks.pixel[rows, frame]
         theirs = color[pixel_of(place, (height, width))]
         distance, near = cKDTree(place).query(at + 0.5 * VOTE_STEP, VOTES)
-        distance = (distance / picture_scale(width)).astype(np.float32)
+        distance = (distance / image_scale(width)).astype(np.float32)
         unlike = color[at[:, 1], at[:, 0], None] - theirs[near]
         unlike = np.einsum("pvc,pvc->pv", unlike, unlike) / VOTE_COLOR**2
         weight = np.exp(-0.5 * ((distance / VOTE_PX) ** 2 + unlike))
@@ -126,7 +126,7 @@ def may_move(share: np.ndarray) -> np.ndarray:
     Returns:
       Booleans, [frames, height, width].
     """
-    size = 2 * round(RIM_PX * picture_scale(share.shape[2])) + 1
+    size = 2 * round(RIM_PX * image_scale(share.shape[2])) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     seeds = (share > OPEN).astype(np.uint8)
     return np.stack([cv2.dilate(one, disc) > 0 for one in seeds])
@@ -138,7 +138,7 @@ def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
     Args:
       views: The frames.
       share: Probabilities from `votes`, [frames, height, width].
-      odds: Log odds from `still_pictures.log_odds`, [frames, height, width].
+      odds: Log odds from `photo_consistency.log_odds`, [frames, height, width].
 
     Returns:
       Booleans, [frames, height, width].
@@ -208,7 +208,7 @@ def _smooth(values, color):
     return total / weights
 
 
-def picture_scale(width: int) -> float:
+def image_scale(width: int) -> float:
     """Return the factor for constants that were tuned at a width of 176 pixels.
 
     Args:

@@ -109,7 +109,7 @@ def _uncovered(
 
 def _pixels(views, index, points):
     pixel, depth = view_set.project(views, index, points)
-    inside = view_set.in_picture(views, pixel, depth, 0)
+    inside = view_set.in_image(views, pixel, depth, 0)
     place = np.where(inside[:, None], pixel, 0).astype(int)
     return np.minimum(place, np.array(views.size) - 1), inside
 

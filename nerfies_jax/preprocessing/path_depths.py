@@ -146,9 +146,9 @@ def fitted(
 def _measured(depths, tracks):
     """Return z-depths of tracks, NaN if unknown or at a depth discontinuity."""
     measured = np.full(tracks.seen.shape, np.nan)
-    for frame, picture in enumerate(depths):
+    for frame, depth_map in enumerate(depths):
         rows = np.flatnonzero(tracks.seen[:, frame])
-        depth = _steady_depth(picture)
+        depth = _steady_depth(depth_map)
         at = tracking.pixel_of(tracks.pixel[rows, frame], depth.shape)
         measured[rows, frame] = depth[at]
     return measured

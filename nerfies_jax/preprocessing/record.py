@@ -26,9 +26,9 @@ from nerfies_jax.preprocessing import (
     moving,
     path_depths,
     paths,
+    photo_consistency,
     rest_points,
     short_tracks,
-    still_pictures,
     still_points,
     taken,
     view_set,
@@ -98,25 +98,25 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     factor, given = _factor(capture), capture.given or Given(capture.size)
     capture = looked_at(capture, factor)
     views = view_set.in_time_order(capture)
-    pictures = dense_flow.leveled(views)
+    images = dense_flow.leveled(views)
     flow = taken.flow(given, views)
     # Images of one moment are no video: there is nothing to search twice for.
     film = np.ptp(views.time) > 0
     span = view_set.depth_span(capture, views) if film else None
     is_computed = flow is None
     if flow is None:
-        flow = _flow(views, pictures, span, watch)
+        flow = _flow(views, images, span, watch)
     least = short_tracks.USUAL
     if span is not None and not rough_cameras:
         least = short_tracks.lengths(views, span, carried(views, flow))
     if is_computed and least == short_tracks.SHORT:
-        flow = _recovered(views, pictures, flow, watch)
+        flow = _recovered(views, images, flow, watch)
     watch.begin("tracks")
     every = 1e-6 * A_TRACK_FRAME * tracking.work(views)
     few = not watch.has_room(FOR_TRACKS, "half of the tracks", every)
     watch.spend(every / 2 if few else 0.0)
     starts = tracking.grid(views, 2 if few else 1)
-    tracks, first = _tracks(given, views, flow, pictures, starts, least)
+    tracks, first = _tracks(given, views, flow, images, starts, least)
     rest = rest_points.fit(views, tracks)
     watch.begin("moving")
     mask = taken.moving(given, views)
@@ -132,7 +132,7 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     if not unusable:
         if least == short_tracks.SHORT and not first:
             tracks, rest, score = short_tracks.with_more(
-                views, flow, pictures, mask, (tracks, rest, score), watch
+                views, flow, images, mask, (tracks, rest, score), watch
             )
         which = _moved(tracks, score, first, least.path)
     still = np.flatnonzero(score < paths.AT_REST)
@@ -167,28 +167,28 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     )
 
 
-def _search_work(views, pictures):
+def _search_work(views, images):
     """Return the work of one search for flow."""
-    return 1e-6 * A_SEARCHED_PIXEL * dense_flow.searched_pixels(views, pictures)
+    return 1e-6 * A_SEARCHED_PIXEL * dense_flow.searched_pixels(views, images)
 
 
-def _flow(views, pictures, span, watch):
-    a_search = _search_work(views, pictures)
+def _flow(views, images, span, watch):
+    a_search = _search_work(views, images)
     watch.spend(2 * (len(views.row) - 1) * a_search)
 
     def room_for(count):
         what, each = "a second search for flow", dense_flow.SECOND_LOOK * a_search
         return watch.room_for(count, FOR_WIDE_STEPS, what, each)
 
-    return dense_flow.between_neighbors(views, pictures, span, room_for)
+    return dense_flow.between_neighbors(views, images, span, room_for)
 
 
-def _recovered(views, pictures, flow, watch):
+def _recovered(views, images, flow, watch):
     """Search for the flow of lost regions, within the budget."""
     frames = lost_regions.pairs(views, flow)
-    each = lost_regions.SEARCHES * _search_work(views, pictures)
+    each = lost_regions.SEARCHES * _search_work(views, images)
     room = watch.room_for(len(frames), FOR_WIDE_STEPS, "flow of lost regions", each)
-    return lost_regions.recovered(views, pictures, flow, frames[:room])
+    return lost_regions.recovered(views, images, flow, frames[:room])
 
 
 def _rounded(flow):
@@ -200,13 +200,13 @@ def _rounded(flow):
     return flow._replace(forward=forward, backward=backward)
 
 
-def _tracks(given, views, flow, pictures, starts, least):
+def _tracks(given, views, flow, images, starts, least):
     """Return all tracks, and the index of the first one whose path is computed.
 
     External tracks follow the computed ones, which are still needed for static points:
     other tools may have tracked only moving objects.
     """
-    own = tracking.from_flow(views, flow, pictures, starts, least.track)
+    own = tracking.from_flow(views, flow, images, starts, least.track)
     others = taken.tracks(given, views)
     if others is None:
         return own, 0
@@ -228,7 +228,7 @@ def _mask(views, flow, tracks, score, watch):
     work += 1e-6 * A_COMPARED_PIXEL * views.valid.size
     if watch.has_room(FOR_COLORS, "colors for detecting moving objects", work):
         still = still_points.dense(views, flow, open_to_doubt)
-        odds = still_pictures.log_odds(small, still)
+        odds = photo_consistency.log_odds(small, still)
     masks = moving.mask(small, share, odds)
     return _enlarged(masks, height, width) & views.valid
 

@@ -38,7 +38,7 @@ def _coverage(views: Views, points: np.ndarray) -> float:
     held = shown = 0
     for index in range(len(views.row)):
         pixel, depth = view_set.project(views, index, points)
-        inside = view_set.in_picture(views, pixel, depth, 0)
+        inside = view_set.in_image(views, pixel, depth, 0)
         column = np.clip(pixel[inside, 0] * across / width, 0, across - 1).astype(int)
         line = np.clip(pixel[inside, 1] * down / height, 0, down - 1).astype(int)
         has = np.zeros((down, across), bool)
@@ -65,7 +65,7 @@ def _moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> fl
         if moving.mean() < LEAST_MOVING:
             continue
         pixel, depth = view_set.project(views, index, points)
-        inside = view_set.in_picture(views, pixel, depth)
+        inside = view_set.in_image(views, pixel, depth)
         place = pixel[inside].astype(int)
         near = np.zeros((height, width), bool)
         near[place[:, 1], place[:, 0]] = True
@@ -169,7 +169,7 @@ def _stays(views, evidence, frame, points):
     shows no depth, and only tests that the surface at the point stays with the point.
     """
     pixel, depth = view_set.project(views, frame, points)
-    which = np.flatnonzero(view_set.in_picture(views, pixel, depth))
+    which = np.flatnonzero(view_set.in_image(views, pixel, depth))
     span = slice(max(0, frame - REACH), frame + REACH + 1)
     near, at = still_points.view_slice(views, span), frame - span.start
     starts = np.concatenate([np.full((len(which), 1), at), pixel[which]], axis=-1)

@@ -45,12 +45,12 @@ def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
     threshold = f"{KNOWN_SHARE:.0%} of the pixels, with an error of {DEPTH_ERROR:.0%}"
     if capture.depths is None:
         return Finding(DEPTH, "the capture has none", threshold, False, CERTAIN)
-    pictures = capture.depths[views.row]
-    share = float((pictures > 0).mean())
+    depths = capture.depths[views.row]
+    share = float((depths > 0).mean())
     if share < KNOWN_SHARE:
         measurement = f"depth for {share:.1%} of the pixels"
         return Finding(DEPTH, measurement, threshold, False, CERTAIN, {"share": share})
-    ratio = _over_parallax(pictures, views, evidence)
+    ratio = _over_parallax(depths, views, evidence)
     if len(ratio) < MIN_POINTS:
         return cannot_tell(
             DEPTH,
@@ -69,14 +69,14 @@ def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
     return Finding(DEPTH, measurement, threshold, agrees, confidence, numbers)
 
 
-def _over_parallax(pictures, views, evidence):
+def _over_parallax(depths, views, evidence):
     """Return the ratios of stored depth to the depth of static tracks."""
     still = np.flatnonzero((evidence.score < AT_REST) & (not evidence.unusable))
     tracks, rest = evidence.tracks.take(still), evidence.rest.take(still)
     sure = still_points.depth_deviation(views, tracks, rest) < DEPTH_SURE
     tracks, rest = tracks.take(sure), rest.take(sure)
-    row, column = pixel_of(tracks.pixel, pictures.shape[1:])
-    own = pictures[np.arange(len(pictures)), row, column]
+    row, column = pixel_of(tracks.pixel, depths.shape[1:])
+    own = depths[np.arange(len(depths)), row, column]
     known = tracks.seen & (own > 0) & (rest.depth > 0)
     return own[known] / rest.depth[known]
 

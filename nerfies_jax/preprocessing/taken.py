@@ -87,10 +87,10 @@ def depth(given: Given, views: Views) -> np.ndarray | None:
     )
 
 
-def _resized(picture, size, how=cv2.INTER_AREA):
-    if picture.shape[1::-1] == size:
-        return picture
-    return cv2.resize(picture, size, interpolation=how)
+def _resized(image, size, how=cv2.INTER_AREA):
+    if image.shape[1::-1] == size:
+        return image
+    return cv2.resize(image, size, interpolation=how)
 
 
 def _resized_flow(shift, size):

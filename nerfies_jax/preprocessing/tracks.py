@@ -186,7 +186,7 @@ def long_enough(tracks: Tracks, frames: int = SHORTEST) -> Tracks:
     return tracks.take(tracks.seen.sum(1) >= min(frames, tracks.seen.shape[1]))
 
 
-def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tracks:
+def realigned(tracks: Tracks, images: np.ndarray, size: tuple[int, int]) -> Tracks:
     """Align each point with the image in which it begins, by Lucas-Kanade.
 
     The search starts at the position from flow, without a pyramid. Observations that
@@ -194,13 +194,13 @@ def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tr
 
     Args:
       tracks: The tracks.
-      pictures: Enlarged images from `dense_flow.leveled`.
+      images: Enlarged images from `dense_flow.leveled`.
       size: Width and height in pixels of the images of the tracks.
 
     Returns:
       The tracks.
     """
-    times = pictures.shape[2] // size[0]
+    times = images.shape[2] // size[0]
     pixel, seen = tracks.pixel.copy(), tracks.seen.copy()
     criteria = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ROUNDS, PRECISION_PX
     for start in np.unique(tracks.start):
@@ -212,8 +212,8 @@ def realigned(tracks: Tracks, pictures: np.ndarray, size: tuple[int, int]) -> Tr
             first = _enlarged(tracks.pixel[which, start], times)
             guess = _enlarged(tracks.pixel[which, frame], times)
             place, status, _ = cv2.calcOpticalFlowPyrLK(
-                pictures[start],
-                pictures[frame],
+                images[start],
+                images[frame],
                 first,
                 guess.copy(),
                 winSize=(WINDOW_PX, WINDOW_PX),

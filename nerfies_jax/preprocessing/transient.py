@@ -110,15 +110,15 @@ def _jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
     textured = views.textured[:-1] & flow.forward_seen[:-1]
     carried = textured.sum((1, 2)) / np.maximum(views.textured[:-1].sum((1, 2)), 1)
     views = view_set.smaller(views, part)
-    pictures = [_leveled(gray) for gray in views.gray]
+    images = [_leveled(gray) for gray in views.gray]
     shares = []
     for one in range(len(views.row) - 1):
         there = _way(flow.forward[one], flow.forward_seen[one], part)
         back = _way(flow.backward[one + 1], flow.backward_seen[one + 1], part)
         shares.append(
             min(
-                _gone(views, pictures, (one, one + 1), there, back.flow),
-                _gone(views, pictures, (one + 1, one), back, there.flow),
+                _gone(views, images, (one, one + 1), there, back.flow),
+                _gone(views, images, (one + 1, one), back, there.flow),
             )
         )
     return np.array(shares), carried
@@ -154,10 +154,10 @@ def _leveled(gray):
     return detail / (5 * spread) if spread > 0 else detail
 
 
-def _gone(views, pictures, pair, there, back):
+def _gone(views, images, pair, there, back):
     """Return the share of pixels of a frame that are not visible in another one."""
-    picture, target = (pictures[index] for index in pair)
-    lost = _lost(views, pair[0], picture, target, there, back)
+    image, target = (images[index] for index in pair)
+    lost = _lost(views, pair[0], image, target, there, back)
     tried = np.argwhere(lost & views.textured[pair[0]])
     if not len(tried):
         return 0.0
@@ -166,13 +166,13 @@ def _gone(views, pictures, pair, there, back):
         tried = tried[rng.choice(len(tried), MOST_PATCHES, replace=False)]
     shift = there.shift.round().astype(int)
     missing = sum(
-        not _found(picture, target, line, column, shift, there.reach)
+        not _found(image, target, line, column, shift, there.reach)
         for line, column in tried
     )
     return float(lost.mean() * missing / len(tried))
 
 
-def _lost(views, index, picture, target, there, back):
+def _lost(views, index, image, target, there, back):
     """Find pixels [height, width] without a match that should be in the other frame."""
     width, height = views.size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
@@ -183,7 +183,7 @@ def _lost(views, index, picture, target, there, back):
     )
     gap = np.linalg.norm(there.flow + led_back, axis=-1)
     open_end = gap > LOST_PX + LOST_SHARE * np.linalg.norm(there.flow, axis=-1)
-    changed = cv2.GaussianBlur(np.abs(picture - color), (0, 0), 1.5) > LOST_COLOR
+    changed = cv2.GaussianBlur(np.abs(image - color), (0, 0), 1.5) > LOST_COLOR
     # Pixels may leave the image by the common shift, or by the larger shift of near
     # objects, and need a margin for the patch.
     rim = PATCH + there.reach
@@ -196,10 +196,8 @@ def _lost(views, index, picture, target, there, back):
     return nd.binary_opening(lost, iterations=max(1, round(OPENED_SHARE * width)))
 
 
-def _found(picture, target, line, column, shift, reach):
-    patch = picture[
-        line - PATCH : line + PATCH + 1, column - PATCH : column + PATCH + 1
-    ]
+def _found(image, target, line, column, shift, reach):
+    patch = image[line - PATCH : line + PATCH + 1, column - PATCH : column + PATCH + 1]
     span = reach + PATCH
     middle = line + shift[1], column + shift[0]
     low = [max(0, at - span) for at in middle]

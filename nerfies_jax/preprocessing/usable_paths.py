@@ -10,7 +10,7 @@ from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.preprocessing import record
 from nerfies_jax.preprocessing import tracks as tracking
-from nerfies_jax.preprocessing.moving import picture_scale
+from nerfies_jax.preprocessing.moving import image_scale
 from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.training.track_start import TrackStartSpec
 
@@ -99,7 +99,7 @@ def coverage(evidence: Evidence) -> float:
     pixel = evidence.tracks.pixel[evidence.moved[usable]]
     valid = evidence.paths.known[usable]
     shape = evidence.moving.shape[1:]
-    reach, near = NEAR_PX * picture_scale(shape[1]), 0
+    reach, near = NEAR_PX * image_scale(shape[1]), 0
     for frame in np.flatnonzero(valid.any(0)):
         away = np.ones(shape, np.uint8)
         away[tracking.pixel_of(pixel[valid[:, frame], frame], shape)] = 0

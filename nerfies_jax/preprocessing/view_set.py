@@ -146,10 +146,10 @@ def smaller(views: Views, factor: int) -> Views:
     width, height = (side // factor for side in views.size)
     trimmed = np.s_[:, : height * factor, : width * factor]
 
-    def shrunk(pictures):
+    def shrunk(images):
         parts = [
             cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA)
-            for one in pictures[trimmed]
+            for one in images[trimmed]
         ]
         return np.stack(parts)
 
@@ -246,7 +246,7 @@ def project(
         return pixel[:, :2] / pixel[:, 2:], depth
 
 
-def in_picture(
+def in_image(
     views: Views, pixel: np.ndarray, depth: np.ndarray, rim: float | int = 1.0
 ):
     """Find the positions in front of the camera and inside the image.
@@ -312,7 +312,7 @@ def depth_span(capture: Capture, views: Views) -> tuple[float, float]:
     depths = []
     for index in range(len(views.row)):
         pixel, depth = project(views, index, points)
-        depths.append(depth[in_picture(views, pixel, depth)])
+        depths.append(depth[in_image(views, pixel, depth)])
     depth = np.concatenate(depths)
     if not len(depth):
         return capture.near, capture.far

@@ -52,7 +52,7 @@ def is_wide(views: Views, pair: tuple[int, int], flow: np.ndarray) -> bool:
 
 def improved(
     views: Views,
-    pictures: tuple[np.ndarray, np.ndarray],
+    images: tuple[np.ndarray, np.ndarray],
     pair: tuple[int, int],
     flow: np.ndarray,
     search: Search,
@@ -62,7 +62,7 @@ def improved(
 
     Args:
       views: The frames.
-      pictures: Images of the pair, in the pixels of the views.
+      images: Images of the pair, in the pixels of the views.
       pair: Indices of the two frames.
       flow: Flow of the first search, [height, width, 2].
       search: Search from an initial flow.
@@ -78,10 +78,10 @@ def improved(
     )
     share = (np.arange(count) + 0.5) / count
     inverse = share / span[0] + (1 - share) / span[1]
-    best, lowest = flow.copy(), OWN * unlike(pictures, flow)
+    best, lowest = flow.copy(), OWN * unlike(images, flow)
     for depth in 1 / inverse:
         guided = search(_plane_flow(views, pair, depth))
-        cost = unlike(pictures, guided)
+        cost = unlike(images, guided)
         better = cost < lowest
         best[better], lowest[better] = guided[better], cost[better]
     return best
@@ -102,17 +102,17 @@ def _plane_flow(views: Views, pair: tuple[int, int], depth: float) -> np.ndarray
     )
 
 
-def unlike(pictures, flow):
+def unlike(images, flow):
     """Compute the mean color difference around each pixel along the flow.
 
     Args:
-      pictures: Images of the pair, [height, width].
+      images: Images of the pair, [height, width].
       flow: Flow in pixels, [height, width, 2].
 
     Returns:
       Differences in gray levels, [height, width].
     """
-    one, other = pictures
+    one, other = images
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     at = x + flow[..., 0], y.astype(np.float32) + flow[..., 1]

@@ -8,7 +8,7 @@ import numpy as np
 from nerfies_jax.capture import images, video
 from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.json_files import replaced_folder
-from nerfies_jax.evaluation import Renderer, as_picture
+from nerfies_jax.evaluation import Renderer, to_uint8
 from nerfies_jax.training.model import TrainState, View
 
 VIDEO = "video.mp4"
@@ -39,7 +39,7 @@ def render(
     with replaced_folder(out) as folder:
         paths = [folder / f"{number:04d}.png" for number in range(len(views))]
         for number, (path, view) in enumerate(zip(paths, views, strict=True), 1):
-            images.write_png(path, as_picture(np.asarray(renderer(state, view).color)))
+            images.write_png(path, to_uint8(np.asarray(renderer(state, view).color)))
             yield number
         try:
             video.library()

@@ -98,7 +98,7 @@ def prepare(
             f"{source}: neither a video ({', '.join(formats.VIDEOS)}) nor a folder "
             f"with two or more images ({', '.join((*footage.PLAIN, *footage.HEIC))})"
         )
-    if kind == "pictures" and (how.frames or how.fps):
+    if kind == "images" and (how.frames or how.fps):
         raise ValueError(
             f"frames={how.frames}, fps={how.fps}: these select frames of a video, but "
             f"{source} is a folder, whose images are all used; remove them"
@@ -159,7 +159,7 @@ def _source_images(kind, source, scratch, how) -> Taken:
         return footage.from_film(
             source, scratch, how.frames, how.fps, how.max_side, how.masks
         )
-    return footage.from_pictures(source, scratch, how.max_side, how.masks)
+    return footage.from_images(source, scratch, how.max_side, how.masks)
 
 
 def _solve(scratch, source_images, how, tell) -> Solved:
@@ -306,7 +306,7 @@ def _checksum(path):
 
     Files of file managers (.DS_Store, Thumbs.db) are ignored.
     """
-    files = [path] if path.is_file() else sorted(footage.pictures_in(path))
+    files = [path] if path.is_file() else sorted(footage.images_in(path))
     checksum = hashlib.blake2b(digest_size=12)
     for each in files:
         checksum.update(each.name.encode(errors="surrogateescape"))

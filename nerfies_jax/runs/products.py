@@ -420,7 +420,7 @@ def save_video(
     def frames(stage):
         for view in views:
             rendering = renderer(state, evaluation.resized(view, size, plan.size))
-            yield evaluation.as_picture(rendering.color)
+            yield evaluation.to_uint8(rendering.color)
             stage.advance()
 
     with events.stage("rendering the video", plan.frames) as stage:
@@ -453,7 +453,7 @@ def save_player(
     first = evaluation.view_of(run.capture, int(run.capture.train[0]))
     try:
         state = trained.result.state
-        poster = evaluation.as_picture(np.asarray(trained.renderer(state, first).color))
+        poster = evaluation.to_uint8(np.asarray(trained.renderer(state, first).color))
         player = write(
             folder / "player.html",
             f"{run.capture.name}: {run.config.preset}",

@@ -22,7 +22,6 @@ _LABELS = {
     "size": "the dimensions of the images",
     "frames to learn from": "the training frames",
     "held-out frames": "the held-out frames",
-    "pictures": "images",
 }
 
 
@@ -80,7 +79,7 @@ def _signature(capture):
         "bounds, scale or center": bounds,
         "times": capture.times,
         **cameras,
-        "pictures": np.stack([_means(image) for image in capture.images]),
+        "images": np.stack([_means(image) for image in capture.images]),
     }
 
 
@@ -105,7 +104,7 @@ def _difference(before, now):
             if not np.array_equal(old, new):
                 return f"{label} have changed"
             continue
-        images = name == "pictures"
+        images = name == "images"
         bound = LEVEL_TOLERANCE if images else TOLERANCE * (1 + np.abs(old))
         outside = ~(np.abs(new.astype(np.float64) - old) <= bound)
         if outside.any():

@@ -137,7 +137,7 @@ class Screen:
         distance = None
         if look.channel == "motion" and self._move is not None:
             start = view._replace(time=in_default_precision(np.float32(0)))
-            distance = model_flow.picture_distance(
+            distance = model_flow.image_distance(
                 self._move, state, view, start, rendering
             )
             if level and limits is not None:
@@ -151,7 +151,7 @@ class Screen:
         elapsed = renderer.seconds[-1] if first else time.perf_counter() - start_time
         recent = self._seconds.setdefault(key, collections.deque(maxlen=TIMED_TILES))
         recent.append(elapsed)
-        return image.picture
+        return image.image
 
     def model(self, without: tuple[str, ...]) -> Model:
         """Return the model with some effects disabled.

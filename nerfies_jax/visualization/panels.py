@@ -35,7 +35,7 @@ OUTLIER_SHARE = 0.01
 class Colored(NamedTuple):
     """A color-mapped image, with the values of the two ends of the color map."""
 
-    picture: np.ndarray  # [..., height, width, 3] uint8
+    image: np.ndarray  # [..., height, width, 3] uint8
     low: float
     high: float
 
@@ -174,7 +174,7 @@ def comparison(
         )
     error = color_error(render, truth, largest_error)
     colored_depth = color_depth(depth, known_depth)
-    columns = [as_bytes(truth), as_bytes(render), error.picture, colored_depth.picture]
+    columns = [as_bytes(truth), as_bytes(render), error.image, colored_depth.image]
     columns = [_enlarge(column) for column in columns]
     width = columns[0].shape[2]
     titles = ("truth", "render", "error", "depth")
@@ -198,12 +198,12 @@ def comparison(
 
 
 def contact_sheet(
-    pictures: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
+    cells: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
 ) -> np.ndarray:
     """Arrange captioned images of one size in a grid, row by row.
 
     Args:
-      pictures: Images, [height, width, 3].
+      cells: Images, [height, width, 3].
       captions: One for each image.
       columns: Number of columns.
 
@@ -213,12 +213,12 @@ def contact_sheet(
     Raises:
       ValueError: If the numbers of images and captions differ.
     """
-    if not len(pictures) == len(captions) > 0:
+    if not len(cells) == len(captions) > 0:
         raise ValueError(
-            f"a contact sheet needs a caption for each image, got {len(pictures)} "
+            f"a contact sheet needs a caption for each image, got {len(cells)} "
             f"images and {len(captions)} captions"
         )
-    enlarged = _enlarge(np.stack([as_bytes(picture) for picture in pictures]))
+    enlarged = _enlarge(np.stack([as_bytes(cell) for cell in cells]))
     tiles = [
         _join_vertically([image, _text(caption, image.shape[1], color=CAPTION)])
         for image, caption in zip(enlarged, captions, strict=True)
@@ -307,30 +307,28 @@ def _mark_final(axes, final):
     )
 
 
-def save(picture: np.ndarray, path: str | pathlib.Path) -> None:
+def save(image: np.ndarray, path: str | pathlib.Path) -> None:
     """Write an image as PNG, atomically.
 
     Args:
-      picture: uint8 image.
+      image: uint8 image.
       path: The file.
     """
-    images.write_png(path, picture)
+    images.write_png(path, image)
 
 
-def as_bytes(picture: np.ndarray) -> np.ndarray:
+def as_bytes(image: np.ndarray) -> np.ndarray:
     """Convert an image to uint8.
 
     Args:
-      picture: uint8, or floats in [0, 1].
+      image: uint8, or floats in [0, 1].
 
     Returns:
       uint8 values, black for NaN.
     """
-    if picture.dtype == np.uint8:
-        return picture
-    return np.round(np.clip(np.nan_to_num(picture, nan=0.0), 0, 1) * 255).astype(
-        np.uint8
-    )
+    if image.dtype == np.uint8:
+        return image
+    return np.round(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 255).astype(np.uint8)
 
 
 def _as_unit(image: np.ndarray) -> np.ndarray:
@@ -361,8 +359,8 @@ def _apply_map(unit, valid, row):
 @functools.cache
 def _tables():
     file = pathlib.Path(__file__).with_name("color_maps.png")
-    with PIL.Image.open(file) as picture:
-        return np.asarray(picture)
+    with PIL.Image.open(file) as image:
+        return np.asarray(image)
 
 
 @functools.cache
@@ -385,10 +383,10 @@ def _bar(row, left, right, width):
     return _join_vertically([np.repeat(colors[None], TEXT_HEIGHT, 0), ends])
 
 
-def _enlarge(pictures):
+def _enlarge(cells):
     """Enlarge by a whole factor without interpolation, so that pixels stay visible."""
-    factor = max(1, math.ceil(PANEL_WIDTH / pictures.shape[2]))
-    return pictures.repeat(factor, 1).repeat(factor, 2)
+    factor = max(1, math.ceil(PANEL_WIDTH / cells.shape[2]))
+    return cells.repeat(factor, 1).repeat(factor, 2)
 
 
 def _blank(height, width):

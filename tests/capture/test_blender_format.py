@@ -30,7 +30,7 @@ def pose(turn, radius=4.0):
     return [[column[row] for column in columns] for row in range(3)] + [[0, 0, 0, 1]]
 
 
-def picture(seed, channels=4):
+def image(seed, channels=4):
     return np.random.default_rng(seed).integers(0, 256, (8, 10, channels), np.uint8)
 
 
@@ -41,7 +41,7 @@ def make(root, splits=None, times=True, radius=4.0, top=None, **extra):
         entries = []
         for row in range(count):
             name = f"./{split or 'images'}/r_{row}"
-            pixels = picture(100 * number + row)
+            pixels = image(100 * number + row)
             target = root / f"{name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             PIL.Image.fromarray(pixels).save(target)
@@ -66,7 +66,7 @@ def test_everything_in_the_files_arrives(tmp_path):
         capture.times, [0, 1 / 3, 2 / 3, 1, 0, 0.5, 1], atol=1e-7
     )
     assert capture.warp_ids.tolist() == [0, 1, 3, 4, 0, 2, 4]  # equal times, one moment
-    pixels = picture(2).astype(float)
+    pixels = image(2).astype(float)
     cover = pixels[..., 3:] / 255
     white = pixels[..., :3] * cover + 255 * (1 - cover)
     assert (np.abs(capture.images[2] - white) <= 0.501).all()
@@ -79,7 +79,7 @@ def test_everything_in_the_files_arrives(tmp_path):
     np.testing.assert_array_equal(capture.cameras.principal_point_px, [[5, 4]] * 7)
 
 
-def test_the_picture_is_upright_and_unmirrored(tmp_path):
+def test_the_image_is_upright_and_unmirrored(tmp_path):
     capture = room.load(make(tmp_path))
     # Camera 0 stands at (4, 0, 0) and looks along -x: z is up, y is to its right.
     points = np.float32([[0, 0, 0], [0, 0, 0.5], [0, 0.5, 0]])
@@ -113,9 +113,9 @@ def test_a_single_file_can_be_named(tmp_path):
     assert len(capture.ids) == 16
 
 
-def test_background_and_smaller_pictures(tmp_path):
+def test_background_and_smaller_images(tmp_path):
     capture = blender_format.read(make(tmp_path), background=(0.0, 0.0, 0.0), factor=2)
-    pixels = picture(0).astype(float)
+    pixels = image(0).astype(float)
     black = np.round(pixels[..., :3] * pixels[..., 3:] / 255)
     assert capture.size == (5, 4)
     assert abs(capture.images[0, 0, 0, 0] - black[:2, :2, 0].mean()) <= 0.5
@@ -177,10 +177,10 @@ LENS = {
 }  # fmt: skip
 
 
-def test_nerfstudio_lens_scales_with_the_pictures(tmp_path):
+def test_nerfstudio_lens_scales_with_the_images(tmp_path):
     capture = blender_format.read(make(tmp_path, {"": 9}, top=LENS))
     cameras = capture.cameras
-    # Pictures are half size.
+    # Images are half size.
     np.testing.assert_allclose(cameras.focal_px, 20, rtol=1e-6)
     np.testing.assert_allclose(cameras.pixel_aspect, 1.1, rtol=1e-6)
     np.testing.assert_allclose(cameras.principal_point_px, [[5.5, 3.5]] * 9)
@@ -284,7 +284,7 @@ def test_of_frames_listed_to_learn_from_alone_some_are_held_out(tmp_path):
         blender_format.read(tmp_path, heldout=0)
 
 
-def test_missing_pictures_are_listed_or_left_out(tmp_path):
+def test_missing_images_are_listed_or_left_out(tmp_path):
     make(tmp_path)
     (tmp_path / "train/r_1.png").unlink()
     (tmp_path / "test/r_0.png").unlink()
@@ -344,14 +344,14 @@ BAD = {
     "fourth radial": (first_frame(k4=0.1), "k4"),
     "frame twice": (first_frame(file_path="train/r_1"), "'train_r_1' appears 2 times"),
     "leak": (first_frame(file_path="test/r_1"), "'test_r_1' appears 2 times"),
-    "picture cut short": (
+    "image cut short": (
         lambda root: (root / "train/r_0.png").write_bytes(
             (root / "train/r_0.png").read_bytes()[:200]
         ),
         "r_0.png",
     ),
-    "picture of another size": (
-        lambda root: PIL.Image.fromarray(picture(0)[:4]).save(root / "train/r_2.png"),
+    "image of another size": (
+        lambda root: PIL.Image.fromarray(image(0)[:4]).save(root / "train/r_2.png"),
         "r_2.png: 10x4",
     ),
     "no points file": (top_level(ply_file_path="x.ply"), "x.ply"),

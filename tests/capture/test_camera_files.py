@@ -34,8 +34,8 @@ def filmed(bent=True, frames=9):
         "tangential": bool(bent) * rng.normal(scale=1e-3, size=(frames, 2)),
     }
     lens = {name: value.astype(np.float32) for name, value in lens.items()}
-    pictures = frames, SIZE[1], SIZE[0]
-    valid = np.ones(pictures, bool)
+    images = frames, SIZE[1], SIZE[0]
+    valid = np.ones(images, bool)
     valid[:, :2] = False
     if bent == "fisheye":
         lens["fisheye"] = rng.normal(scale=1e-2, size=(frames, 4)).astype(np.float32)
@@ -46,7 +46,7 @@ def filmed(bent=True, frames=9):
         name="hand-made",
         source="test",
         ids=tuple(f"f_{row:03d}" for row in range(frames)),
-        images=rng.integers(40, 256, (*pictures, 3), np.uint8),
+        images=rng.integers(40, 256, (*images, 3), np.uint8),
         cameras=cameras._replace(**lens),
         times=np.linspace(0, 1, frames, dtype=np.float32) ** 2,
         train=ids[ids % 4 != 1],

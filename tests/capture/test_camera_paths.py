@@ -49,7 +49,7 @@ def test_axes_that_meet_behind_the_cameras_are_not_believed():
     assert offset @ flipped.camera_from_world[:, 2, :].mean(axis=0) > 0
 
 
-def test_up_is_the_mean_of_the_pictures_up():
+def test_up_is_the_mean_of_the_images_up():
     np.testing.assert_allclose(camera_paths.mean_up(rig(np.zeros(3)))[1], 1, atol=0.05)
 
 
@@ -69,8 +69,8 @@ def test_every_path_looks_at_the_scene_with_proper_rotations(kind):
 
 @pytest.mark.parametrize("tilt", [0.0, 1e-7, 0.1])
 @pytest.mark.parametrize("kind", ["sway", "orbit", "lemniscate"])
-def test_a_camera_overhead_keeps_what_its_pictures_call_up(kind, tilt):
-    """What is up lies along the view: no picture may be undefined, or turn over."""
+def test_a_camera_overhead_keeps_what_its_images_call_up(kind, tilt):
+    """What is up lies along the view: no image may be undefined, or turn over."""
     place = np.array([0.0, -2 * np.sin(tilt), 2 * np.cos(tilt)])
     one = cameras.look_at(place, np.zeros(3), (0.0, 1.0, 0.0), 40.0, (40, 30))
     filmed = cameras.stack([one] * 10)

@@ -20,13 +20,13 @@ def make(frames=4, size=(6, 4), **changes):
         [camera.look_at(e, e * 0 + 3, [0, 0, 1], 7.0, size) for e in eye]
     )
     cameras = cameras._replace(skew_px=np.full(frames, 0.5, np.float32))
-    pictures = (frames, height, width)
+    images = (frames, height, width)
     rows = np.arange(frames)
     values = dict(
         name="test",
         source="nerfies",
         ids=tuple(f"f{i}" for i in range(frames)),
-        images=rng.integers(0, 256, (*pictures, 3), np.uint8),
+        images=rng.integers(0, 256, (*images, 3), np.uint8),
         cameras=cameras,
         times=np.linspace(0, 1, frames, dtype=np.float32),
         train=rows[1:],
@@ -36,9 +36,9 @@ def make(frames=4, size=(6, 4), **changes):
         warp_ids=rows.astype(np.int32),
         appearance_ids=rows.astype(np.int32),
         camera_ids=np.zeros(frames, np.int32),
-        valid=rng.random(pictures) < 0.8,
-        moving=rng.random(pictures) < 0.2,
-        depths=np.where(rng.random(pictures) < 0.6, 2, 0).astype(np.float32),
+        valid=rng.random(images) < 0.8,
+        moving=rng.random(images) < 0.2,
+        depths=np.where(rng.random(images) < 0.6, 2, 0).astype(np.float32),
         points=PointCloud(eye.astype(np.float32), np.zeros((frames, 3), np.uint8)),
     )
     return Capture(**(values | changes))
@@ -126,7 +126,7 @@ def test_names_tell_times_and_cameras(names, times, cameras):
         (["a_20241301_000001", "a_20241301_000061"], [60]),  # no date: a count
     ],
 )
-def test_phones_name_pictures_by_date_and_time_of_day(stems, gaps):
+def test_phones_name_images_by_date_and_time_of_day(stems, gaps):
     moments, _, notes = name_times.clock(stems)
     assert np.diff(moments).tolist() == gaps
     assert notes == ()

@@ -37,7 +37,7 @@ def position(row):
     return np.array([0.3 * row - 1, 0.1 * row, -0.05 * row])
 
 
-def picture(row, size=SIZE):
+def image(row, size=SIZE):
     rng = np.random.default_rng(row)
     return rng.integers(40, 256, (size[1], size[0], 3), np.uint8)
 
@@ -66,7 +66,7 @@ def make(
     (root / folder).mkdir(exist_ok=True)
     for row in range(count):
         file = root / folder / f"f_{row:03d}.png"
-        PIL.Image.fromarray(picture(row, size)).save(file)
+        PIL.Image.fromarray(image(row, size)).save(file)
     return root
 
 
@@ -77,7 +77,7 @@ def test_everything_in_the_files_arrives(tmp_path):
     assert capture.heldout.tolist() == [4]
     np.testing.assert_allclose(capture.times, np.linspace(0, 1, 9), atol=1e-7)
     for row in range(9):
-        np.testing.assert_array_equal(capture.images[row], picture(row))
+        np.testing.assert_array_equal(capture.images[row], image(row))
         np.testing.assert_allclose(
             capture.cameras.camera_from_world[row], rotation(row).as_matrix(), atol=1e-6
         )
@@ -184,7 +184,7 @@ def test_other_lenses_are_undistorted_to_where_their_rays_point(tmp_path, lens):
 
 
 @pytest.mark.parametrize("in_alpha", [False, True])
-def test_masks_follow_their_pictures_through_undistortion(tmp_path, in_alpha):
+def test_masks_follow_their_images_through_undistortion(tmp_path, in_alpha):
     lens = "RADIAL_FISHEYE 96 64 60 48 32 0.05 0.01"
     make(tmp_path, count=3, lens=lens, size=(96, 64))
     (tmp_path / "masks").mkdir()
@@ -215,7 +215,7 @@ def test_masks_follow_their_pictures_through_undistortion(tmp_path, in_alpha):
         ("", SIZE, {}, SIZE),
     ],
 )
-def test_pictures_may_be_fractions_of_the_model(
+def test_images_may_be_fractions_of_the_model(
     tmp_path, folder, size, options, expected
 ):
     make(tmp_path, folder=folder, size=size, ending="jpg")  # found under another ending
@@ -252,11 +252,11 @@ def test_times_follow_the_numbers_when_frames_are_missing(tmp_path):
     [
         (("", ""), range(1, 10), [0] * 9),
         (("left/", "right/"), range(1, 10), [0] * 4 + [1] * 5),
-        # Two pictures share a lens: COLMAP's cameras are those of the user.
+        # Two images share a lens: COLMAP's cameras are those of the user.
         (("left/", "right/"), (1, 1, *range(2, 9)), [0, *range(8)]),
     ],
 )
-def test_a_lens_for_each_picture_is_no_physical_camera(
+def test_a_lens_for_each_image_is_no_physical_camera(
     tmp_path, folders, lenses, expected
 ):
     make(tmp_path)
@@ -325,17 +325,17 @@ BAD = {
         "0 points observed",
     ),
     "climbs": (spoil_text("images.txt", "f_000.png", "../../x.png"), "leads outside"),
-    "no pictures": (
+    "no images": (
         lambda root: [file.unlink() for file in (root / "images").iterdir()],
         "none of its images (f_000.png",
     ),
-    "picture of another shape": (
-        lambda root: PIL.Image.fromarray(picture(0, (16, 24))).save(
+    "image of another shape": (
+        lambda root: PIL.Image.fromarray(image(0, (16, 24))).save(
             root / "images/f_000.png"
         ),
         "f_000.png: 16x24",
     ),
-    "picture cut short": (
+    "image cut short": (
         lambda root: (root / "images/f_001.png").write_bytes(
             (root / "images/f_001.png").read_bytes()[:300]
         ),

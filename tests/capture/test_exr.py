@@ -37,17 +37,17 @@ def test_float_channels_come_back_bit_for_bit(tmp_path):
         tmp_path / "a.exr", color, DEPTH / 1000, DEPTH, {"flow.x": flow, "id": counts}
     )
     np.testing.assert_array_equal(color, COLOR)  # OpenEXR keeps hands off our arrays
-    picture = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(picture.color, COLOR)
-    np.testing.assert_array_equal(picture.alpha, DEPTH / 1000)
-    np.testing.assert_array_equal(picture.depth, DEPTH)
-    np.testing.assert_array_equal(picture.extra["flow.x"], flow)
-    np.testing.assert_array_equal(picture.extra["id"], counts)
-    assert picture.finite.all()
+    image = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(image.color, COLOR)
+    np.testing.assert_array_equal(image.alpha, DEPTH / 1000)
+    np.testing.assert_array_equal(image.depth, DEPTH)
+    np.testing.assert_array_equal(image.extra["flow.x"], flow)
+    np.testing.assert_array_equal(image.extra["id"], counts)
+    assert image.finite.all()
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
 
-def test_a_header_takes_points_of_the_world_to_the_picture(tmp_path):
+def test_a_header_takes_points_of_the_world_to_the_image(tmp_path):
     size = (7, 5)
     one = camera.look_at((0.3, 0.2, -2), (0, 0.1, 0), (0, 1, 0), 9.0, size)
     one = one._replace(
@@ -78,9 +78,9 @@ def test_a_header_takes_points_of_the_world_to_the_picture(tmp_path):
 @pytest.mark.hard_cases
 def test_half_rounds_color_but_not_depth(tmp_path):
     exr.write_exr(tmp_path / "a.exr", COLOR, depth=DEPTH, half=True)
-    picture = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(picture.color, COLOR.astype(np.float16))
-    np.testing.assert_array_equal(picture.depth, DEPTH)
+    image = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(image.color, COLOR.astype(np.float16))
+    np.testing.assert_array_equal(image.depth, DEPTH)
 
 
 @pytest.mark.hard_cases
@@ -88,25 +88,25 @@ def test_nan_and_infinity_are_zeroed_and_marked(tmp_path):
     depth = DEPTH.copy()
     depth[1, 2], depth[3, 4] = np.nan, np.inf
     exr.write_exr(tmp_path / "a.exr", COLOR, depth=depth)
-    picture = exr.read_exr(tmp_path / "a.exr")
+    image = exr.read_exr(tmp_path / "a.exr")
     bad = ~np.isfinite(depth)
-    np.testing.assert_array_equal(picture.finite, ~bad)
-    np.testing.assert_array_equal(picture.depth, np.where(bad, 0, DEPTH))
+    np.testing.assert_array_equal(image.finite, ~bad)
+    np.testing.assert_array_equal(image.depth, np.where(bad, 0, DEPTH))
 
 
 def test_a_strided_view_is_written_as_it_looks(tmp_path):
     exr.write_exr(tmp_path / "a.exr", COLOR[::2, ::-1])
-    picture = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(picture.color, COLOR[::2, ::-1])
+    image = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(image.color, COLOR[::2, ::-1])
 
 
 def test_a_file_without_our_channels(tmp_path):
     with OpenEXR.File({}, {"Y": DEPTH.copy(), "mask": DEPTH.copy()}) as file:
         file.write(str(tmp_path / "a.exr"))
-    picture = exr.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(picture.color[..., 2], DEPTH)
-    assert (picture.alpha, picture.depth) == (None, None)
-    assert list(picture.extra) == ["mask"]
+    image = exr.read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(image.color[..., 2], DEPTH)
+    assert (image.alpha, image.depth) == (None, None)
+    assert list(image.extra) == ["mask"]
 
 
 @pytest.mark.parametrize("kept", [0, 4, 300, 0.9])
@@ -217,9 +217,9 @@ def test_other_peoples_files(data_dir):
     files = sorted(folder.glob("*/*.exr"))
     assert len(files) >= 16
     for file in files:
-        picture = exr.read_exr(file)
-        assert picture.color is not None or picture.extra, file
-        assert picture.finite.any()
+        image = exr.read_exr(file)
+        assert image.color is not None or image.extra, file
+        assert image.finite.any()
     ball = exr.read_exr(folder / "Beachball/singlepart.0001.exr")
     assert ball.origin == (654, 245)
     assert ball.color.shape == (876, 911, 3)

@@ -1,4 +1,4 @@
-"""Films and photographs become pictures of one size, upright and in order."""
+"""Films and photographs become images of one size, upright and in order."""
 
 import os
 import struct
@@ -92,9 +92,9 @@ def test_a_film_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
     assert taken.seconds == pytest.approx((times[-1] - times[0]) / 1000)
     for name, time in zip(taken.names, times, strict=True):
         number = moments.index(time)
-        picture = images.read_pixels(tmp_path / "images" / name)
-        assert picture.shape == (10, 16, 3)
-        assert abs(picture.astype(int) - 10 * number).max() <= 3
+        image = images.read_pixels(tmp_path / "images" / name)
+        assert image.shape == (10, 16, 3)
+        assert abs(image.astype(int) - 10 * number).max() <= 3
         mask = masks.read_mask(tmp_path / "masks" / f"{name}.png")
         assert mask.shape == (10, 16)
         assert mask[0].sum() == 16 - 2 * number
@@ -143,16 +143,16 @@ def test_frames_stay_in_order_where_times_are_those_of_decoding(tmp_path):
     assert min(np.diff(shown)) > 10
 
 
-def test_a_picture_of_floats_is_refused_by_name(tmp_path):
+def test_an_image_of_floats_is_refused_by_name(tmp_path):
     for name in ("0.tif", "1.tif", "2.tif"):
         PIL.Image.fromarray(np.ones((32, 32), np.float32)).save(tmp_path / name)
     with pytest.raises(CaptureError, match=r"0\.tif: .*32-bit floats.*8 or 16 bits"):
-        footage.from_pictures(tmp_path, tmp_path / "out")
+        footage.from_images(tmp_path, tmp_path / "out")
     deep = np.full((32, 32), 70_000, np.int32)
     for name in ("0.tif", "1.tif", "2.tif"):
         PIL.Image.fromarray(deep).save(tmp_path / name)
     with pytest.raises(CaptureError, match=r"0\.tif: 32-bit gray up to 70000"):
-        footage.from_pictures(tmp_path, tmp_path / "out")
+        footage.from_images(tmp_path, tmp_path / "out")
 
 
 def test_masks_of_zero_and_one_are_written_as_meant(tmp_path):
@@ -160,22 +160,22 @@ def test_masks_of_zero_and_one_are_written_as_meant(tmp_path):
     mask = np.ones((32, 32), np.uint8)
     mask[8:24, 8:24] = 0
     for name in ("0.png", "1.png", "2.png"):
-        picture = np.full((32, 32, 3), 90, np.uint8)
-        PIL.Image.fromarray(picture).save(tmp_path / name)
+        image = np.full((32, 32, 3), 90, np.uint8)
+        PIL.Image.fromarray(image).save(tmp_path / name)
         PIL.Image.fromarray(mask).save(tmp_path / "masks" / name)
-    taken = footage.from_pictures(tmp_path, tmp_path / "out", masks=tmp_path / "masks")
+    taken = footage.from_images(tmp_path, tmp_path / "out", masks=tmp_path / "masks")
     written = images.read_pixels(tmp_path / "out/masks/1.png.png")[..., 0]
     np.testing.assert_array_equal(written, 255 * mask)
     assert "3 masks of values 0 and 1 (white); 25.0%" in taken.notes[-1]
 
 
-def test_what_is_cut_out_of_a_picture_is_black(tmp_path):
+def test_what_is_cut_out_of_an_image_is_black(tmp_path):
     """The color that an editor leaves behind transparency is not to be matched."""
     pixels = np.full((32, 32, 4), 200, np.uint8)
     pixels[:, :, 3] = np.repeat([0, 255], 16)[:, None]
     for name in ("0.png", "1.png", "2.png"):
         PIL.Image.fromarray(pixels).save(tmp_path / name)
-    footage.from_pictures(tmp_path, tmp_path / "out")
+    footage.from_images(tmp_path, tmp_path / "out")
     read = images.read_pixels(tmp_path / "out/images/0.png")
     assert (read[:16] == 0).all()
     assert (read[16:] == 200).all()
@@ -189,8 +189,7 @@ def test_photographs_come_upright_of_one_size_whatever_their_ending(
     upright = rng.integers(0, 256, (5, 8, 8, 3)).astype(np.uint8)
     upright = upright.repeat(4, 1).repeat(8, 2)  # 64 x 32, flat blocks
     stored = [
-        np.rot90(picture, k)
-        for picture, k in zip(upright, (0, 1, 0, 0, 0), strict=True)
+        np.rot90(image, k) for image, k in zip(upright, (0, 1, 0, 0, 0), strict=True)
     ]
     turned = PIL.Image.Exif()
     turned[0x0112] = 6  # a viewer turns it by a quarter to the right
@@ -200,12 +199,12 @@ def test_photographs_come_upright_of_one_size_whatever_their_ending(
     best = {"quality": 100, "subsampling": 0}
     options = {"1.JPG": {"exif": turned, **best}, "2.WebP": {"lossless": True}}
     names = ("0.PNG", "1.JPG", "2.WebP", "10.tif", "3.png")
-    for picture, name in zip(stored, names, strict=True):
-        PIL.Image.fromarray(picture).save(folder / name, **options.get(name, {}))
+    for image, name in zip(stored, names, strict=True):
+        PIL.Image.fromarray(image).save(folder / name, **options.get(name, {}))
     PIL.Image.fromarray(upright[0, :, :16]).save(folder / "small.png")
     (folder / "4.HEIC").write_bytes(b"")
     (folder / "notes.txt").touch()
-    taken = footage.from_pictures(folder, tmp_path / "out", max_side=32)
+    taken = footage.from_images(folder, tmp_path / "out", max_side=32)
     assert taken.names == ("0.png", "1.png", "2.png", "3.png", "10.png")
     assert taken.focal == 27 / 36
     left_out = " ".join(taken.notes)
@@ -225,12 +224,12 @@ def test_a_folder_is_told_by_what_is_in_it(tmp_path):
     assert footage.kind_of(tmp_path / "a.MOV") == "film"
     for name in ("a.jpg", "b.JPG"):
         (tmp_path / name).write_bytes(b"broken")
-    assert footage.kind_of(tmp_path) == "pictures"
+    assert footage.kind_of(tmp_path) == "images"
     with pytest.raises(CaptureError, match=r"0 images.*not readable.*: a\.jpg, b\."):
-        footage.from_pictures(tmp_path, tmp_path / "out")
+        footage.from_images(tmp_path, tmp_path / "out")
 
 
-def test_what_cannot_be_read_is_left_out_and_what_is_hidden_is_no_picture(tmp_path):
+def test_what_cannot_be_read_is_left_out_and_what_is_hidden_is_no_image(tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()
     for row in range(5):
@@ -248,9 +247,9 @@ def test_what_cannot_be_read_is_left_out_and_what_is_hidden_is_no_picture(tmp_pa
         header = bytearray((folder / name).read_bytes())
         header[18:26] = struct.pack("<2i", *size)
         (folder / name).write_bytes(header)
-    assert len(footage.pictures_in(folder)) == 7
-    assert len(frames.pictures_in(folder, footage.PLAIN)) == 7
-    taken = footage.from_pictures(folder, tmp_path / "out")
+    assert len(footage.images_in(folder)) == 7
+    assert len(frames.images_in(folder, footage.PLAIN)) == 7
+    taken = footage.from_images(folder, tmp_path / "out")
     assert taken.names == ("0.png", "3.png", "für.png")
     left_out = [note.rpartition(": ")[2] for note in taken.notes]
     assert left_out == ["1.jpg", "5.bmp, 6.bmp", "2.jpg"]
@@ -258,7 +257,7 @@ def test_what_cannot_be_read_is_left_out_and_what_is_hidden_is_no_picture(tmp_pa
     assert written == ["0.png", "3.png", "für.png"]
     (folder / "3.jpg").unlink()
     with pytest.raises(CaptureError, match=r"2 images; .*at least 3.*1\.jpg.*2\.jpg"):
-        footage.from_pictures(folder, tmp_path / "again")
+        footage.from_images(folder, tmp_path / "again")
 
 
 def test_what_files_say_of_a_lens_may_be_anything(tmp_path):
@@ -268,7 +267,7 @@ def test_what_files_say_of_a_lens_may_be_anything(tmp_path):
         told[0x0112] = 9  # no orientation that there is
         told.get_ifd(0x8769)[0xA405] = value
         PIL.Image.new("RGB", (48, 32)).save(tmp_path / name, exif=told)
-    taken = footage.from_pictures(tmp_path, tmp_path / "out")
+    taken = footage.from_images(tmp_path, tmp_path / "out")
     assert taken.names == ("0.png", "1.png", "2.png", "3.png")
     assert taken.focal == 18 / 36
 

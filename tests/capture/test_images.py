@@ -110,7 +110,7 @@ def write_png_by_hand(path, size, depth, kind, rows):
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])
 @pytest.mark.parametrize("orientation", [1, 6])
-def test_a_turned_picture_is_refused_or_read_as_stored(tmp_path, ending, orientation):
+def test_a_turned_image_is_refused_or_read_as_stored(tmp_path, ending, orientation):
     image = PIL.Image.fromarray(COLOR)
     tags = image.getexif()
     tags[0x0112] = orientation
@@ -130,7 +130,7 @@ def test_a_turned_picture_is_refused_or_read_as_stored(tmp_path, ending, orienta
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])
 @pytest.mark.parametrize("kept", [0, 40, 0.95])
-def test_a_picture_cut_short_is_refused(tmp_path, ending, kept):
+def test_an_image_cut_short_is_refused(tmp_path, ending, kept):
     noise = RNG.integers(0, 256, (64, 64, 3), np.uint8)
     path = save(tmp_path / f"a.{ending}", noise)
     data = path.read_bytes()
@@ -142,7 +142,7 @@ def test_a_picture_cut_short_is_refused(tmp_path, ending, kept):
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_no_picture_is_refused(tmp_path):
+def test_what_is_no_image_is_refused(tmp_path):
     with pytest.raises(CaptureError, match="no such image"):
         images.read_image(tmp_path / "a.png")
     (tmp_path / "b.png").write_text("hello")
@@ -169,7 +169,7 @@ def test_laying_over_a_background(tmp_path):
     assert np.abs(pixels - exact).max() <= 0.5 + 1e-4
 
 
-def test_a_picture_comes_back_as_it_was_written(tmp_path):
+def test_an_image_comes_back_as_it_was_written(tmp_path):
     images.write_png(tmp_path / "a.png", COLOR)
     np.testing.assert_array_equal(images.read_image(tmp_path / "a.png")[0], COLOR)
     images.write_png(tmp_path / "m.png", ALPHA > 100)

@@ -33,10 +33,10 @@ def make(folder, poses=None, folders=("images",), count=COUNT):
     for name in folders:
         (folder / name).mkdir()
         for row in range(count):
-            picture = models.picture(row)
+            image = models.image(row)
             if name == "images_2":
-                picture = picture[::2, ::2]
-            images.write_png(folder / name / f"f_{row:03d}.png", picture)
+                image = image[::2, ::2]
+            images.write_png(folder / name / f"f_{row:03d}.png", image)
     return folder
 
 
@@ -65,7 +65,7 @@ def test_a_stored_reduction_is_read_with_its_own_pixels(tmp_path):
     whole = room.load(make(tmp_path / "llff", folders=("images", "images_2")))
     half = room.load(tmp_path / "llff", factor=2)
     assert (whole.size, half.size) == (models.SIZE, (12, 8))
-    np.testing.assert_array_equal(half.images[3], models.picture(3)[::2, ::2])
+    np.testing.assert_array_equal(half.images[3], models.image(3)[::2, ::2])
     np.testing.assert_allclose(half.cameras.focal_px, 15)
     np.testing.assert_allclose(half.cameras.principal_point_px[0], [6, 4])
 
@@ -82,8 +82,8 @@ BROKEN = {
     "bounds turned": ({"poses": changed(5, 15, 20.0)}, "row 5 has bounds [20.0, 9.0]"),
     "two sizes": ({"poses": changed(1, 4, 99.0)}, "several sizes"),
     "another size": ({"poses": table((100, 40))}, "24x16 pixels"),
-    "a picture missing": ({"count": 8}, "8 images for 9 poses"),
-    "no pictures": ({"folders": ()}, "but no images; put them"),
+    "an image missing": ({"count": 8}, "8 images for 9 poses"),
+    "no images": ({"folders": ()}, "but no images; put them"),
 }
 
 

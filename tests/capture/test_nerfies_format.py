@@ -22,7 +22,7 @@ def dump(path, value):
     path.write_text(json.dumps(value))
 
 
-def save_picture(path, pixels):
+def save_image(path, pixels):
     path.parent.mkdir(parents=True, exist_ok=True)
     PIL.Image.fromarray(pixels).save(path, format=path.suffix[1:])
 
@@ -32,7 +32,7 @@ def orientation(angle):
     return [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]
 
 
-def picture(row, size=SIZE, channels=3):
+def image(row, size=SIZE, channels=3):
     rng = np.random.default_rng(row)
     return rng.integers(0, 256, (size[1], size[0], channels), np.uint8)
 
@@ -65,9 +65,9 @@ def make(folder, count=6, factors=(1,), channels=3):
         dump(folder / "camera" / f"{name}.json", entry)
         for factor in factors:
             size = (SIZE[0] // factor, SIZE[1] // factor)
-            save_picture(
+            save_image(
                 folder / "rgb" / f"{factor}x" / f"{name}.png",
-                picture(row, size, channels),
+                image(row, size, channels),
             )
     return folder
 
@@ -81,7 +81,7 @@ def test_everything_in_the_files_arrives(tmp_path):
     assert capture.name == "scene"
     assert capture.ids == ("000", "001", "002", "003", "004", "005")
     for row in range(6):
-        np.testing.assert_array_equal(capture.images[row], picture(row))
+        np.testing.assert_array_equal(capture.images[row], image(row))
     assert capture.train.tolist() == [0, 2, 4]
     assert capture.heldout.tolist() == [1, 3, 5]
     assert capture.warp_ids.tolist() == [
@@ -137,7 +137,7 @@ def test_a_factor_is_read_or_made_and_points_keep_their_place(
     np.testing.assert_allclose(pixel, whole * ratio, rtol=1e-6)
     if max(stored) == 1 and size != SIZE:
         step = SIZE[0] // size[0]
-        block = picture(0)[:step, :step].reshape(-1, 3).mean(0)
+        block = image(0)[:step, :step].reshape(-1, 3).mean(0)
         assert (np.abs(capture.images[0, 0, 0] - block) <= 0.5).all()
 
 
@@ -231,7 +231,7 @@ def test_nerf_ds_masks_are_black_where_it_moves(tmp_path, ending):
         mask = np.full((8, 12), 255, np.uint8)
         mask[2:4, 3:7] = 0
         target = tmp_path / "resized_mask" / "1x" / f"00{row}{ending}"
-        save_picture(target, mask)
+        save_image(target, mask)
     capture = nerfies_format.read(tmp_path)
     expected = np.zeros((8, 12), bool)
     expected[2:4, 3:7] = True
@@ -245,9 +245,7 @@ def test_nerf_ds_masks_are_black_where_it_moves(tmp_path, ending):
 def test_dycheck_alpha_marks_pixels_that_were_filmed(tmp_path):
     make(tmp_path, channels=4)
     capture = nerfies_format.read(tmp_path)
-    np.testing.assert_array_equal(
-        capture.valid[2], picture(2, channels=4)[..., 3] == 255
-    )
+    np.testing.assert_array_equal(capture.valid[2], image(2, channels=4)[..., 3] == 255)
 
 
 def test_dycheck_depth_is_scaled_and_may_be_absent(tmp_path):
@@ -266,10 +264,10 @@ def test_dycheck_depth_is_scaled_and_may_be_absent(tmp_path):
     assert half[0, 0] == pytest.approx(corner[corner > 0].mean())
 
 
-def test_points_are_scaled_and_colored_from_the_pictures(tmp_path):
+def test_points_are_scaled_and_colored_from_the_images(tmp_path):
     make(tmp_path)
     for row in range(6):
-        save_picture(
+        save_image(
             tmp_path / "rgb/1x" / f"00{row}.png",
             np.full((8, 12, 3), 40 + row, np.uint8),
         )
@@ -286,7 +284,7 @@ def test_points_are_scaled_and_colored_from_the_pictures(tmp_path):
     assert any("1 points are not finite" in note for note in capture.notes)
 
 
-def test_no_pictures_is_an_error_that_offers_the_cameras(tmp_path):
+def test_no_images_is_an_error_that_offers_the_cameras(tmp_path):
     make(tmp_path, factors=())
     with pytest.raises(CaptureError, match="read_cameras"):
         nerfies_format.read(tmp_path)
@@ -295,7 +293,7 @@ def test_no_pictures_is_an_error_that_offers_the_cameras(tmp_path):
     assert views.cameras.focal_px.shape == (6,)
 
 
-def test_missing_pictures_are_listed_or_left_out(tmp_path):
+def test_missing_images_are_listed_or_left_out(tmp_path):
     make(tmp_path)
     for name in ("001", "004"):
         (tmp_path / f"rgb/1x/{name}.png").unlink()
@@ -337,8 +335,8 @@ def replaced(old, new):
     return spoil
 
 
-def pictured(name, pixels):
-    return lambda folder: save_picture(folder / name, pixels)
+def imaged(name, pixels):
+    return lambda folder: save_image(folder / name, pixels)
 
 
 def filled(name, text):
@@ -362,10 +360,10 @@ def without_ids(folder):
 
 def all_small(folder):
     for row in range(6):
-        save_picture(folder / f"rgb/1x/00{row}.png", SMALL)
+        save_image(folder / f"rgb/1x/00{row}.png", SMALL)
 
 
-SMALL = picture(0, (6, 4))
+SMALL = image(0, (6, 4))
 LATE = {f"00{row}": {"warp_id": row, "time": 0.5 * row} for row in range(6)}
 CLIMBS = {"train_ids": ["../../x"], "val_ids": ["001"]}
 MIRRORED = np.diag([1.0, 1.0, -1.0]).tolist()
@@ -380,10 +378,10 @@ BAD = {
     ),
     "camera absent": (lambda f: (f / "camera/002.json").unlink(), "002.json"),
     "camera size": (one_camera(image_size=[8, 12]), "002.json: image_size"),
-    "picture not its camera's": (pictured("rgb/1x/000.png", SMALL), "6x4"),
-    "no picture its camera's": (all_small, "000.png: 6x4 pixels, but 1/"),
-    "picture cut short": (lambda f: truncate(f / "rgb/1x/003.png"), "003.png"),
-    "picture empty": (filled("rgb/1x/003.png", ""), "003.png"),
+    "image not its camera's": (imaged("rgb/1x/000.png", SMALL), "6x4"),
+    "no image its camera's": (all_small, "000.png: 6x4 pixels, but 1/"),
+    "image cut short": (lambda f: truncate(f / "rgb/1x/003.png"), "003.png"),
+    "image empty": (filled("rgb/1x/003.png", ""), "003.png"),
     "id without metadata": (
         written("metadata.json", {"000": {"warp_id": 0}}),
         "no entry for frame '001'",
@@ -404,7 +402,7 @@ BAD = {
     "points flat": (points(np.zeros(6)), "expected [points, 3]"),
     "points cut short": (points(np.zeros((100, 3)), whole=False), "points.npy"),
     "mask of another size": (
-        pictured("resized_mask/1x/000.png.png", np.zeros((4, 4), np.uint8)),
+        imaged("resized_mask/1x/000.png.png", np.zeros((4, 4), np.uint8)),
         "000.png.png: a mask of 4x4",
     ),
 }
@@ -512,7 +510,7 @@ def test_writing_refuses_a_folder_in_use_and_names_that_climb(tmp_path):
 
 
 @pytest.mark.full
-def test_a_real_dycheck_capture_has_its_cameras_without_pictures(data_dir):
+def test_a_real_dycheck_capture_has_its_cameras_without_images(data_dir):
     scene = data_dir / "dycheck_windmill_cameras"
     views = nerfies_views.read_cameras(scene)
     assert (len(views.ids), views.train.size, views.heldout.size) == (696, 277, 419)

@@ -1,4 +1,4 @@
-"""Taking the lens out of the pictures."""
+"""Taking the lens out of the images."""
 
 import dataclasses
 
@@ -40,7 +40,7 @@ def pattern(camera, capture):
     return np.round(127 + 120 * np.sin(3 * direction)).astype(np.uint8)
 
 
-def test_an_undistorted_picture_is_the_pinhole_s_own():
+def test_an_undistorted_image_is_the_pinhole_s_own():
     capture = scenes.tiny_capture()
     bent = through_a_lens(capture, (-0.2, 0.05, 0.0), (0.003, -0.002))
     flat = pinholes.as_pinholes(bent)
@@ -69,7 +69,7 @@ def test_resampling_there_and_back_keeps_fine_texture(rng):
 
 def test_pixels_the_lens_did_not_film_are_marked():
     capture = scenes.tiny_capture()
-    # Barrel distortion: the pinhole's corners lie outside the round picture.
+    # Barrel distortion: the pinhole's corners lie outside the round image.
     flat = pinholes.as_pinholes(through_a_lens(capture, (0.4, 0.0, 0.0)))
     assert flat.valid is not None
     assert not flat.valid[:, 0, 0].any()
@@ -77,7 +77,7 @@ def test_pixels_the_lens_did_not_film_are_marked():
     assert "unobserved" in flat.notes[-1]
 
 
-def test_masks_and_depth_move_with_the_picture():
+def test_masks_and_depth_move_with_the_image():
     capture = scenes.tiny_capture()
     bent = through_a_lens(capture, (-0.1, 0.0, 0.0))
     flat, wide = pinholes.as_pinholes(bent), pinholes.canvas(bent)

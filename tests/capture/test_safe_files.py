@@ -53,8 +53,8 @@ def colmap_text(root):
 def llff(root):
     (root / "images").mkdir(parents=True)
     for row in range(9):
-        picture = test_colmap.picture(row)
-        PIL.Image.fromarray(picture).save(root / f"images/{row}.png")
+        image = test_colmap.image(row)
+        PIL.Image.fromarray(image).save(root / f"images/{row}.png")
     table = np.zeros((9, 17))
     table[:, :15] = np.c_[np.eye(3), np.zeros(3), [16, 24, 30]].ravel()
     table[:, 3], table[:, 15:] = np.arange(9), (1, 5)

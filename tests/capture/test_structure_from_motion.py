@@ -1,4 +1,4 @@
-"""Cameras from pictures of a textured room, in a process of their own."""
+"""Cameras from images of a textured room, in a process of their own."""
 
 import dataclasses
 
@@ -24,15 +24,15 @@ def render(one, textures):
     focal = float(one.focal_px)
     inner = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, x * 0 + 1], -1)
     ray = inner @ one.camera_from_world.astype(float)
-    picture = None
+    image = None
     for depth, texture in zip((4.0, 3.0), textures, strict=True):
         reach = (depth - one.position[2]) / ray[..., 2]
         hit = one.position + reach[..., None] * ray
         place = np.stack([hit[..., 1] * 90 + 400, hit[..., 0] * 90 + 400])
         seen = scipy.ndimage.map_coordinates(texture, place, order=1, mode="mirror")
         front = hit[..., 0] > 0
-        picture = seen if picture is None else np.where(front, seen, picture)
-    return np.repeat(np.clip(picture, 0, 255).astype(np.uint8)[..., None], 3, -1)
+        image = seen if image is None else np.where(front, seen, image)
+    return np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, -1)
 
 
 def walk(count):
@@ -73,7 +73,7 @@ def aligned(guess, true):
 
 @pytest.mark.slow
 def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
-    cameras = film(tmp_path / "pictures", 8)
+    cameras = film(tmp_path / "images", 8)
     masks = tmp_path / "masks"
     masks.mkdir()
     for row in range(8):
@@ -86,9 +86,7 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the child runs elsewhere
     received = []
     with events.subscribe(received.append):
-        poses = mapping.run_sfm(
-            "pictures", "out", "masks", spec, features="features.db"
-        )
+        poses = mapping.run_sfm("images", "out", "masks", spec, features="features.db")
     capture = room.load(poses.folder)
     assert len(capture.ids) == 8
     true = np.array([one.position for one in cameras], float)
@@ -98,7 +96,7 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
     assert not capture.moving[:, 20:].any()
     files = sorted(path.name for path in poses.folder.iterdir())
     assert files == ["images", "masks", "sparse"]
-    assert (poses.pictures, poses.placed) == (8, 8)
+    assert (poses.images, poses.placed) == (8, 8)
     assert 0 < poses.error_px < 1
     # The farthest two of eight cameras, 1.8 apart, look at 3 to 4 units away.
     assert 5 < poses.angle_deg < 40
@@ -108,7 +106,7 @@ def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
     later = []
     with events.subscribe(later.append):
         again = mapping.run_sfm(
-            "pictures",
+            "images",
             "again",
             "masks",
             dataclasses.replace(spec, threads=1),
@@ -149,9 +147,9 @@ def pan(count):
     ],
 )
 def test_cameras_that_zoom_or_turn_are_found(views, count, error, tmp_path):
-    cameras = film(tmp_path / "pictures", count, views=views)
+    cameras = film(tmp_path / "images", count, views=views)
     spec = mapping.MappingSpec(threads=2, features=1500)
-    poses = mapping.run_sfm(tmp_path / "pictures", tmp_path / "out", spec=spec)
+    poses = mapping.run_sfm(tmp_path / "images", tmp_path / "out", spec=spec)
     assert poses.placed == count
     capture = room.load(poses.folder)
     true = np.array([one.position for one in cameras], float)
@@ -163,20 +161,20 @@ def test_cameras_that_zoom_or_turn_are_found(views, count, error, tmp_path):
 
 
 @pytest.mark.slow
-def test_pictures_without_texture_are_refused_and_leave_nothing(tmp_path):
-    film(tmp_path / "pictures", 3, plain=True)
+def test_images_without_texture_are_refused_and_leave_nothing(tmp_path):
+    film(tmp_path / "images", 3, plain=True)
     with pytest.raises(CaptureError, match="only 0 of 3 images"):
-        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
-    assert [p.name for p in tmp_path.iterdir()] == ["pictures"]
+        mapping.run_sfm(tmp_path / "images", tmp_path / "out")
+    assert [p.name for p in tmp_path.iterdir()] == ["images"]
 
 
 def test_what_cannot_work_is_said_before_it_starts(tmp_path):
     lost = [mapping.CameraGroup(("f00.png", "f01.png"), 1.0)]
     with pytest.raises(CaptureError, match="no such folder"):
-        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
-    film(tmp_path / "pictures", 2)
+        mapping.run_sfm(tmp_path / "images", tmp_path / "out")
+    film(tmp_path / "images", 2)
     with pytest.raises(CaptureError, match="2 images"):
-        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
+        mapping.run_sfm(tmp_path / "images", tmp_path / "out")
     film(tmp_path / "more", 3)
     with pytest.raises(ValueError, match="each image of the folder once"):
         mapping.run_sfm(tmp_path / "more", tmp_path / "out", groups=lost)
@@ -199,15 +197,15 @@ def test_doubtful_cameras_say_what_to_do():
 
 
 def test_a_child_that_dies_is_an_error_not_our_end(tmp_path, monkeypatch):
-    film(tmp_path / "pictures", 3)
+    film(tmp_path / "images", 3)
     monkeypatch.setattr(mapping.sys, "executable", "/bin/false")
     with pytest.raises(CaptureError, match="ended with code 1"):
-        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out")
+        mapping.run_sfm(tmp_path / "images", tmp_path / "out")
     slow = tmp_path / "slow"
     slow.write_text("#!/bin/sh\nexec sleep 60\n")
     slow.chmod(0o755)
     monkeypatch.setattr(mapping.sys, "executable", str(slow))
     spec = mapping.MappingSpec(seconds=0.2)
     with pytest.raises(CaptureError, match=r"no cameras after 0\.2 s"):
-        mapping.run_sfm(tmp_path / "pictures", tmp_path / "out", spec=spec)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["pictures", "slow"]
+        mapping.run_sfm(tmp_path / "images", tmp_path / "out", spec=spec)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["images", "slow"]

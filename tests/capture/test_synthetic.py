@@ -1,4 +1,4 @@
-"""What a synthetic scene says of itself, against NumPy, SciPy and its own pictures."""
+"""What a synthetic scene says of itself, against NumPy, SciPy and its own images."""
 
 import dataclasses
 
@@ -74,7 +74,7 @@ def test_the_capture_has_the_frames_and_rows_that_were_asked_for(scene):
     assert np.allclose(capture.times, capture.warp_ids / 6)
     assert (capture.near < capture.depths).all()
     assert (capture.far > capture.depths).all()
-    assert (truth.things >= 0).all()  # the stage fills every picture
+    assert (truth.things >= 0).all()  # the stage fills every image
     assert 0.05 < capture.moving.mean() < 0.4
     gap = capture.cameras.position[7:] - capture.cameras.position[[1, 3, 5]]
     assert np.allclose(np.linalg.norm(gap, axis=-1), np.hypot(0.09, 0.05), atol=1e-6)
@@ -219,14 +219,14 @@ def test_points_lie_on_static_surfaces_with_little_noise(scene):
 
 
 @pytest.mark.full
-def test_supersampling_is_the_mean_light_of_a_finer_picture(small):
+def test_supersampling_is_the_mean_light_of_a_finer_image(small):
     capture, _ = small
     fine = dataclasses.replace(SMALL, size=(96, 72), supersampling=1)
     plan = rendering.schedule(fine, 0)
-    picture = jax.jit(rendering.render, static_argnums=0)(
+    image = jax.jit(rendering.render, static_argnums=0)(
         fine, cameras.take(plan.cameras, 2), plan.time[2], plan.light_gain[2], False
     )
-    light = linear(np.asarray(picture.image) * 255)
+    light = linear(np.asarray(image.image) * 255)
     mean = light.reshape(36, 2, 48, 2, 3).mean((1, 3))
     # Eight-bit rounding, and one count where float32 rounds the other way.
     assert np.abs(linear(capture.images[2]) - mean).max() < 1.2 * 0.5 * 0.0090
@@ -262,7 +262,7 @@ def test_exposure_changes_the_light_alone(small):
     # Brighter than filmed without it, single samples of a pixel may be clipped.
     clean = (gain[:, None, None] <= 1) & (expected > 0.05)
     assert clean.mean() > 0.2
-    # 8 bits: half a count in either picture is 2% of light 0.05.
+    # 8 bits: half a count in either image is 2% of light 0.05.
     assert np.abs(after / np.maximum(expected, 1e-9) - 1)[clean].max() < 0.035
 
 
@@ -318,9 +318,9 @@ def test_lumps_merge_and_part_and_a_shutter_opens_and_shuts():
     film = capture.camera_ids == 0
 
     def parts(*names):
-        """Connected parts of these things in each picture of the first camera."""
+        """Connected parts of these things in each image of the first camera."""
         shown = np.isin(truth.things[film], [spec.id_of(name) for name in names])
-        return [scipy.ndimage.label(picture)[1] for picture in shown]
+        return [scipy.ndimage.label(image)[1] for image in shown]
 
     # At eighths of the film: the lumps are one twice, the shutter at its middle and
     # both ends.

@@ -34,7 +34,7 @@ def test_colors_and_times_survive_odd_sizes(tmp_path):
     for number, (seconds, frame) in enumerate(decoded):
         assert seconds == pytest.approx(number / 12.5, abs=1e-4)
         error = np.abs(frame[:31, :45].astype(int) - frames[number])
-        # Chroma is halved and everything quantized: 2 levels on smooth pictures.
+        # Chroma is halved and everything quantized: 2 levels on smooth images.
         assert error.mean() < 3
         np.testing.assert_allclose(frame[31], frame[30], atol=12)
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
@@ -97,8 +97,8 @@ def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected, mark):
             pytest.skip("this PyAV cannot write the tag")
         stream.set_display_rotation(turn)  # degrees against the clock
         for _ in range(3):
-            picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            container.mux(stream.encode(picture))
+            image = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            container.mux(stream.encode(image))
         container.mux(stream.encode())
     _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
     assert decoded.shape[:2] == expected
@@ -112,9 +112,9 @@ def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected, mark):
 def test_a_mirror_is_no_turn(tmp_path, across, down, expected):
     """Quadrants R G over B W; the matrix of the track (ISO 14496-12) mirrors them."""
     colors = {"R": (255, 0, 0), "G": (0, 255, 0), "B": (0, 0, 255), "W": (255,) * 3}
-    picture = np.reshape([*colors.values()], (2, 2, 3)).astype(np.uint8)
-    picture = picture.repeat(16, 0).repeat(24, 1)
-    video.write_video(tmp_path / "a.mp4", [picture] * 2, quality=2)
+    image = np.reshape([*colors.values()], (2, 2, 3)).astype(np.uint8)
+    image = image.repeat(16, 0).repeat(24, 1)
+    video.write_video(tmp_path / "a.mp4", [image] * 2, quality=2)
     data = bytearray((tmp_path / "a.mp4").read_bytes())
     start = data.index(b"tkhd") + 44
     one, shift = 1 << 16, (48 << 16 if across < 0 else 0, 32 << 16 if down < 0 else 0)
@@ -145,12 +145,12 @@ def test_a_mirror_is_no_turn(tmp_path, across, down, expected):
 )
 def test_a_film_without_color_tags_has_those_of_its_size(tmp_path, height, space):
     color = np.array([200, 30, 40])
-    picture = np.zeros((height, 64, 3), np.uint8) + color.astype(np.uint8)
+    image = np.zeros((height, 64, 3), np.uint8) + color.astype(np.uint8)
     with av.open(str(tmp_path / "a.mp4"), "w") as container:
         stream = container.add_stream("h264", rate=10)
         stream.width, stream.height, stream.pix_fmt = 64, height, "yuv420p"
         for _ in range(2):
-            coded = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
+            coded = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(
                 format="yuv420p", dst_colorspace=space, dst_color_range="MPEG"
             )
             coded.colorspace = 2  # not told
@@ -165,8 +165,8 @@ def test_of_rows_alone_nothing_behind_the_last_is_decoded(tmp_path):
     with av.open(str(tmp_path / "a.mov"), "w") as container:
         stream = container.add_stream("png", rate=10)
         stream.width, stream.height, stream.pix_fmt = 45, 31, "rgb24"
-        for picture in film(60):
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        for image in film(60):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     data = bytearray((tmp_path / "a.mov").read_bytes())
@@ -178,8 +178,8 @@ def test_of_rows_alone_nothing_behind_the_last_is_decoded(tmp_path):
     with pytest.raises(CaptureError, match="not a readable video"):
         list(video.read_video(tmp_path / "a.mov"))
     shown = list(video.read_video(tmp_path / "a.mov", rows=(1, 6)))
-    for (_, picture), number in zip(shown, (1, 6), strict=True):
-        np.testing.assert_array_equal(picture, film()[number])
+    for (_, image), number in zip(shown, (1, 6), strict=True):
+        np.testing.assert_array_equal(image, film()[number])
 
 
 def pq_code(nits):
@@ -236,12 +236,12 @@ def test_a_film_of_high_dynamic_range_is_told_and_tone_mapped(tmp_path):
         context.color_primaries, context.color_trc = 9, 18  # BT.2020, HLG
         context.colorspace, context.color_range = 9, 1
         for _ in range(2):
-            picture = av.VideoFrame(48, 32, "yuv420p10le")
-            for plane, values in zip(picture.planes, (luma, 512, 512), strict=True):
+            image = av.VideoFrame(48, 32, "yuv420p10le")
+            for plane, values in zip(image.planes, (luma, 512, 512), strict=True):
                 rows = np.frombuffer(memoryview(plane), np.uint16)
                 rows = rows.reshape(plane.height, -1)
                 rows[:, : plane.width] = values
-            container.mux(stream.encode(picture))
+            container.mux(stream.encode(image))
         container.mux(stream.encode())
     _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
     code = np.uint16([round(0.75 * 65535)] * 3)
@@ -290,8 +290,8 @@ def write(path, shapes, count=30, **options):
             for stream in streams:
                 shape = (stream.height, stream.width, 3)
                 noise = rng.integers(0, 256, shape, np.uint8)
-                picture = av.VideoFrame.from_ndarray(noise, format="rgb24")
-                container.mux(stream.encode(picture))
+                image = av.VideoFrame.from_ndarray(noise, format="rgb24")
+                container.mux(stream.encode(image))
         for stream in streams:
             container.mux(stream.encode())
 

@@ -1,4 +1,4 @@
-"""Pictures that cost nothing against slow loops, and renders through a lens."""
+"""Images that cost nothing against slow loops, and renders through a lens."""
 
 import dataclasses
 
@@ -143,7 +143,7 @@ def test_rays_through_a_lens_are_scored_but_where_it_has_none():
     lens = np.tile(np.float32([-0.2, 0.03, 0.0]), (3, 1))
     bent = dataclasses.replace(capture, cameras=capture.cameras._replace(radial=lens))
     assert pinholes.scorable(bent) is bent
-    # A fold inside the picture: beyond it no ray is bent there.
+    # A fold inside the image: beyond it no ray is bent there.
     lens = np.tile(np.float32([-3.0, 0.0, 0.0]), (3, 1))
     bent = dataclasses.replace(capture, cameras=capture.cameras._replace(radial=lens))
     scored = pinholes.scorable(bent)
@@ -229,7 +229,7 @@ def test_nothing_moves_so_no_mask_is_evaluated(looked, tmp_path, monkeypatch):
     assert note.endswith("because nothing moves: 0 of 9.")
 
 
-def test_pictures_that_jump_between_cameras_are_followed_in_one(looked, tmp_path):
+def test_images_that_jump_between_cameras_are_followed_in_one(looked, tmp_path):
     ids = np.repeat(np.int32([1, 0]), 6)
     rig = without_masks(camera_ids=ids)
     masked, _ = moving_masks.with_masks(rig, tmp_path)

@@ -36,7 +36,7 @@ def blobs(params, view, size, step):
     points, colors = params
     place, depth = jax.vmap(lambda point: cameras.project(view.camera, point))(points)
     away = rays.pixel_centers(size, place.dtype)[:, :, None] - place
-    # As wide as its distance makes it, on the picture of whatever size.
+    # As wide as its distance makes it, on the image of whatever size.
     width = WIDTH_PX * view.camera.focal_px / 40 / depth
     near = jnp.exp(-jnp.sum(away**2, axis=-1) / (2 * width**2))
     # A mean of colors: none is clipped by eight bits, which the fit would feel.
@@ -54,10 +54,10 @@ def capture():
     film = scenes.tiny_capture()
     params = in_default_precision((CLOUD + film_center(film), COLORS))
     draw = jax.jit(lambda view: blobs(params, view, film.size, None).color)
-    pictures = [draw(evaluation.view_of(film, row)) for row in range(len(film.ids))]
+    images = [draw(evaluation.view_of(film, row)) for row in range(len(film.ids))]
     return dataclasses.replace(
         film,
-        images=evaluation.as_picture(np.stack(pictures)),
+        images=evaluation.to_uint8(np.stack(images)),
         train=np.array([0]),
         heldout=np.arange(1, 6),
         moving=None,
@@ -134,7 +134,7 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
     )
     angles = Rotation.from_matrix(turns).magnitude()
     # Measured: 4e-4 units and 6e-4 rad from eight bits and a valley in which turns and
-    # shifts trade; 2e-3 and 4e-3 from pictures half as wide, of pixels that are
+    # shifts trade; 2e-3 and 4e-3 from images half as wide, of pixels that are
     # means where the scene is drawn at their centers.
     bound = 1e-3 if most_pixels == 5000 else 6e-3
     assert apart.max() < bound
@@ -208,10 +208,10 @@ def test_the_slope_of_the_error_is_that_of_both_representations(kind, float64):
     state = model.init(film, jax.random.key(1))
     small = (12, 9)
     view = evaluation.resized(evaluation.view_of(film, 2), film.size, small)
-    picture = jnp.asarray(film.images[2, 1::3, 1::3][: small[1], : small[0]])
+    image = jnp.asarray(film.images[2, 1::3, 1::3][: small[1], : small[0]])
     valid = jnp.ones(small[::-1], bool).at[2:4].set(False)
     depth = jnp.asarray(0.6, float64)
-    loss = fitted_cameras.photometric_loss(model, state, view, picture, valid, depth)
+    loss = fitted_cameras.photometric_loss(model, state, view, image, valid, depth)
     screw = jnp.asarray([0.3, -0.2, 0.5, 0.1, 0.4, -0.3])  # pixels
     # A Gaussian enters or leaves a pixel by less than 1/255 of its color.
     bound = {"gaussians": 1e-4, "radiance": 1e-6}[kind]

@@ -68,8 +68,8 @@ def drawn(capture, rng):
 masked_ssim = jax.jit(image_quality.masked_ssim)
 
 
-def psnr(picture, truth, mask):
-    return -10 * np.log10(np.mean((picture - truth)[mask] ** 2))
+def psnr(image, truth, mask):
+    return -10 * np.log10(np.mean((image - truth)[mask] ** 2))
 
 
 def test_a_frame_of_which_nothing_was_filmed_spoils_no_mean(rng):
@@ -102,16 +102,16 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
     assert set(numbers) == (ALWAYS | MASKED | DEPTHS | BASELINES | unscored) - lost
     assert numbers["heldout.psnr"] == pytest.approx(scored.psnr.mean())
     rows = capture.heldout
-    picture = np.round(scored.color.astype(float) * 255) / 255
+    image = np.round(scored.color.astype(float) * 255) / 255
     truth = capture.images[rows] / 255
     known = valid[rows] if filmed else np.ones_like(valid[rows])
     moving = capture.moving[rows]
     for name, mask in (("moving", moving & known), ("static", ~moving & known)):
-        frames = zip(picture, truth, mask, strict=True)
+        frames = zip(image, truth, mask, strict=True)
         exact = np.mean([psnr(*frame) for frame in frames])
         assert numbers[f"heldout.{name}_psnr"] == pytest.approx(exact, abs=1e-4)
     for key, mask in (("gain", known[-1]), ("moving_gain", (moving & known)[-1])):
-        own = psnr(picture[-1], truth[-1], mask)
+        own = psnr(image[-1], truth[-1], mask)
         gain = own - psnr(np.full_like(truth[-1], 102 / 255), truth[-1], mask)
         assert numbers[f"motion.{key}"] == pytest.approx(gain, abs=1e-4)
     if filmed:
@@ -119,7 +119,7 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
         assert numbers["heldout.unscored"] == pytest.approx(share)
     ssim = [
         masked_ssim(np.float32(a), np.float32(b), m)
-        for a, b, m in zip(picture, truth, moving & known, strict=True)
+        for a, b, m in zip(image, truth, moving & known, strict=True)
     ]
     assert numbers["heldout.moving_ssim"] == pytest.approx(np.mean(ssim), abs=1e-5)
     depth = capture.depths[rows]
@@ -151,7 +151,7 @@ def test_what_a_capture_has_not_is_not_among_the_numbers(rng):
 
 
 @pytest.mark.full
-def test_large_pictures_get_ms_ssim_and_weights_lpips(rng, tmp_path):
+def test_large_images_get_ms_ssim_and_weights_lpips(rng, tmp_path):
     small = scenes.tiny_capture()
     rows = small.heldout[:1]
     capture = dataclasses.replace(
@@ -168,12 +168,12 @@ def test_large_pictures_get_ms_ssim_and_weights_lpips(rng, tmp_path):
     scored = drawn(capture, rng)
     numbers = heldout_metrics(scored, capture, lpips=lpips)
     assert set(numbers) == ALWAYS | {"heldout.ms_ssim", "heldout.lpips"}
-    picture = np.round(scored.color[0] * 255) / np.float32(255)
+    image = np.round(scored.color[0] * 255) / np.float32(255)
     truth = np.float32(capture.images[rows[0]] / 255)
-    exact = jax.jit(image_quality.ms_ssim)(picture, truth)
+    exact = jax.jit(image_quality.ms_ssim)(image, truth)
     assert numbers["heldout.ms_ssim"] == pytest.approx(float(exact), abs=1e-5)
     exact = jax.jit(perceptual.lpips, static_argnums=1)(
-        lpips.params, TINY, picture, truth
+        lpips.params, TINY, image, truth
     )
     assert numbers["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
 
@@ -183,7 +183,7 @@ def test_large_pictures_get_ms_ssim_and_weights_lpips(rng, tmp_path):
     numbers = heldout_metrics(scored, capture, lpips=lpips)
     assert "heldout.ms_ssim" not in numbers  # it has no masked form
     exact = jax.jit(perceptual.masked_lpips, static_argnums=1)(
-        lpips.params, TINY, picture, truth, filmed[rows[0]]
+        lpips.params, TINY, image, truth, filmed[rows[0]]
     )
     assert numbers["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
     with pytest.raises(ValueError, match="9 pixels on the shorter side"):

@@ -1,4 +1,4 @@
-"""Cameras, sizes and pictures for who looks around."""
+"""Cameras, sizes and images for who looks around."""
 
 import jax
 import numpy as np
@@ -14,8 +14,8 @@ TURN = Rotation.from_rotvec([0.3, -0.5, 0.2])
 
 
 @pytest.mark.parametrize("aspect", [0.5, 2.2])
-def test_a_picture_of_any_size_fills_the_window(aspect):
-    """The corners of the window, by its own field of view, are those of the picture."""
+def test_an_image_of_any_size_fills_the_window(aspect):
+    """The corners of the window, by its own field of view, are those of the image."""
     quaternion = tuple(TURN.as_quat(scalar_first=True).tolist())
     eye = Eye(quaternion, (0.1, -2.0, 3.0), fov_rad=0.8, aspect=aspect)
     size = (40, 30)
@@ -81,22 +81,22 @@ def test_channels_show_what_they_are_called():
     color, depth = np.float32([[[0, 0, 0], [1, 0.5, 2]]]), np.float32([[0.0, 3.0]])
     rendering = Rendering(color, alpha, depth)
 
-    def picture(channel, **rest):
+    def image(channel, **rest):
         return interactive.as_channel(channel, rendering, **rest)
 
-    assert picture("color").picture[0, 1].tolist() == [255, 128, 255]
-    assert picture("opacity").picture[0].tolist() == [[0] * 3, [255] * 3]
-    shown = picture("depth", limits=(1.0, 3.0)).picture[0]
+    assert image("color").image[0, 1].tolist() == [255, 128, 255]
+    assert image("opacity").image[0].tolist() == [[0] * 3, [255] * 3]
+    shown = image("depth", limits=(1.0, 3.0)).image[0]
     assert shown[0].tolist() == [128] * 3  # nothing there
     assert shown[1, 2] > shown[1, 0]  # far: the dark end of viridis
     distance = np.float32([[np.nan, 0.2]])
-    near = picture("motion", distance=distance)
-    far = picture("motion", distance=distance, limits=(0.0, 2.0))
+    near = image("motion", distance=distance)
+    far = image("motion", distance=distance, limits=(0.0, 2.0))
     assert (near.high, far.high) == (pytest.approx(0.2), 2.0)
-    assert near.picture[0, 0].tolist() == [128] * 3
-    assert near.picture[0, 1].sum() > far.picture[0, 1].sum() > 0
+    assert near.image[0, 0].tolist() == [128] * 3
+    assert near.image[0, 1].sum() > far.image[0, 1].sum() > 0
     # What moved nothing at all is black, not the middle of a range of no length.
-    still = picture("motion", distance=np.zeros((1, 2), np.float32))
-    assert still.picture.max() < 10
+    still = image("motion", distance=np.zeros((1, 2), np.float32))
+    assert still.image.max() < 10
     with pytest.raises(ValueError, match="must be one of color, depth"):
-        picture("heat")
+        image("heat")

@@ -23,7 +23,7 @@ def state_at(step, level):
 
 
 def flat(params, view, size, step):
-    """A gray picture: parameters, time and step show in it."""
+    """A gray image: parameters, time and step show in it."""
     shape = size[::-1]
     level = params + view.time / 10 + step.astype(jnp.float32) / 100
     return Rendering(
@@ -63,9 +63,9 @@ def test_a_renderer_sees_parameters_time_and_step_and_compiles_once_a_shape():
     renderer = evaluation.Renderer(MODEL._replace(render=render), SIZE)
     view = evaluation.view_of(capture, 3)
     for step, level in ((0, 0.1), (7, 0.4), (20, 0.2)):
-        picture = renderer(state_at(step, level), view).color
+        image = renderer(state_at(step, level), view).color
         expected = level + float(capture.times[3]) / 10 + step / 100
-        np.testing.assert_allclose(picture, expected, atol=1e-6)
+        np.testing.assert_allclose(image, expected, atol=1e-6)
     renderer(state_at(0, [0.1, 0.2]), view)
     assert len(renderer.seconds) == 4
     assert len(traced) == 2
@@ -113,10 +113,10 @@ class Counted:
         """What ran in the meantime, as (prepare, deform, draw)."""
         jax.effects_barrier()
         before = dict(self.calls)
-        picture = act()
+        image = act()
         jax.effects_barrier()
         ran = tuple(self.calls[name] - before[name] for name in before)
-        return ran, float(picture.color[0, 0, 0])
+        return ran, float(image.color[0, 0, 0])
 
 
 def test_a_renderer_keeps_what_stays_and_drops_what_changes():
@@ -169,9 +169,9 @@ def test_a_survey_is_made_once_for_trained_parameters_and_their_step():
         [(first, 0), (first, 0), (first, 7), (other, 7), (other, 7)]
     ):
         state = TrainState(params, (), (), jnp.int32(step), None)
-        picture = renderer(state, view).color
+        image = renderer(state, view).color
         expected = 0.1 + float(view.time) / 10 + step / 100
-        np.testing.assert_allclose(picture, expected, atol=1e-6)
+        np.testing.assert_allclose(image, expected, atol=1e-6)
         jax.effects_barrier()
         assert len(surveyed) == [1, 1, 2, 3, 3][number]
 
@@ -223,11 +223,11 @@ def test_a_scene_in_stages_is_drawn_as_in_one(moving):
     first, last = (whole(state, view).color for view in (views[0], views[-1]))
     assert np.abs(first - last).max() > 0.05
     for view in views:
-        picture, expected = staged(state, view), whole(state, view)
+        image, expected = staged(state, view), whole(state, view)
         # Depth is a quotient by an opacity, and processors differ in how sums are cut.
         for name, rtol in (("color", 1e-7), ("alpha", 1e-7), ("depth", 3e-5)):
             np.testing.assert_allclose(
-                getattr(picture, name),
+                getattr(image, name),
                 getattr(expected, name),
                 rtol=rtol,
                 atol=3e-6,
@@ -235,18 +235,18 @@ def test_a_scene_in_stages_is_drawn_as_in_one(moving):
             )
 
 
-def test_scores_are_those_of_the_picture_as_eight_bits():
+def test_scores_are_those_of_the_image_as_eight_bits():
     capture = scenes.tiny_capture()
     renderer = evaluation.Renderer(MODEL, SIZE)
     scored = evaluation.score(renderer, state_at(10, 0.3), capture, capture.heldout)
     for place, row in enumerate(capture.heldout):
         level = 0.3 + 0.1 + float(capture.times[row]) / 10
-        picture = np.full((30, 40, 3), np.round(level * 255) / 255)
+        image = np.full((30, 40, 3), np.round(level * 255) / 255)
         truth = capture.images[row] / 255
-        mse = np.mean((picture - truth) ** 2)
+        mse = np.mean((image - truth) ** 2)
         np.testing.assert_allclose(scored.psnr[place], -10 * np.log10(mse), atol=1e-4)
         ssim = skimage.metrics.structural_similarity(
-            picture,
+            image,
             truth,
             channel_axis=-1,
             data_range=1,
@@ -282,9 +282,9 @@ def test_the_code_sees_the_left_half_and_the_score_the_right(masked):
         return left.mean() / 255
 
     def render(view, code):
-        picture = np.full((30, 40, 3), code, np.float32)
-        picture[:, :20] = 5.0  # what is wrong on the left costs nothing
-        return picture
+        image = np.full((30, 40, 3), code, np.float32)
+        image[:, :20] = 5.0  # what is wrong on the left costs nothing
+        return image
 
     scored = evaluation.score_halves(fit_code, render, capture, capture.heldout)
     np.testing.assert_array_equal(scored.rows, capture.heldout)

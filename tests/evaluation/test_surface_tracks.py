@@ -1,4 +1,4 @@
-"""Points picked from a picture and followed, in closed form."""
+"""Points picked from an image and followed, in closed form."""
 
 import dataclasses
 
@@ -63,7 +63,7 @@ def test_points_are_followed_until_they_leave_or_are_hidden(capture):
     right = (tracks.positions - tracks.positions[:, [start]]) @ one.camera_from_world[0]
     np.testing.assert_allclose(right[1:], np.tile(way, (39, 1)), atol=1e-5)
     np.testing.assert_allclose(right[0], 0, atol=1e-6)
-    # Where it went in the picture, and what is drawn there
+    # Where it went in the image, and what is drawn there
     across = pixels[:, :1] + float(one.focal_px) * way / DEPTH
     np.testing.assert_allclose(tracks.pixels[1:, :, 0], across[1:], atol=1e-3)
     inside = (across >= 0) & (across < capture.size[0])
@@ -75,7 +75,7 @@ def test_points_are_followed_until_they_leave_or_are_hidden(capture):
     assert hidden.any()
 
 
-def test_a_picture_that_shows_nothing_has_no_points(capture):
+def test_an_image_that_shows_nothing_has_no_points(capture):
     def empty(state, view):
         rendering = drawn(state, view)
         return rendering._replace(alpha=0 * rendering.alpha)

@@ -111,8 +111,8 @@ def test_curves_are_averaged_over_the_steps_that_all_seeds_have(tmp_path):
     assert f"| `moba` | {middle:.2f} | 20.00 | 20.00 | 10 |" in curves.table(rows)
     stored = {"benchmarks": {"--scene fast --suite curves": rows}}
     curves.draw(stored, tmp_path / "curves.png")
-    with PIL.Image.open(tmp_path / "curves.png") as picture:
-        assert picture.text[figures.DIGEST] == figures.digest(curves.panels(stored))
+    with PIL.Image.open(tmp_path / "curves.png") as image:
+        assert image.text[figures.DIGEST] == figures.digest(curves.panels(stored))
 
 
 def test_labels_of_lines_that_end_together_do_not_overlap():

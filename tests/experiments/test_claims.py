@@ -66,8 +66,8 @@ def test_the_radar_charts_show_the_kept_numbers():
     stored = json.loads((ROOT / claims.LEAGUE).read_text())
     ablation = json.loads((ROOT / claims.RADAR_ABLATION).read_text())
     shown = radar.panels(stored, ablation)
-    with PIL.Image.open(results.PAGES / "claims.png") as picture:
-        assert picture.text[figures.DIGEST] == figures.digest(shown)
+    with PIL.Image.open(results.PAGES / "claims.png") as image:
+        assert image.text[figures.DIGEST] == figures.digest(shown)
     paper, here, paper_parts, parts = (panel.scores for panel in shown)
     assert paper_parts["full"][:2] == (1, 1)
     assert paper_parts["full"][2] == pytest.approx(1)

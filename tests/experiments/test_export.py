@@ -69,13 +69,13 @@ def main(*words):
     return 0
 
 
-def test_cameras_leave_with_pictures_in_three_layouts(splats, tmp_path, capsys):
+def test_cameras_leave_with_images_in_three_layouts(splats, tmp_path, capsys):
     capture = scenes.tiny_capture()
     for layout in ("transforms", "colmap", "nerfies"):
         assert main(splats, layout) == 0
         read = load(splats / "exports" / layout)
-        pictures = sorted(image.tobytes() for image in read.images)
-        assert pictures == sorted(image.tobytes() for image in capture.images)
+        images = sorted(image.tobytes() for image in read.images)
+        assert images == sorted(image.tobytes() for image in capture.images)
     # The same folder once more, and the cameras of the world
     assert main(splats, "transforms", "--units", "world", "--overwrite") == 0
     table = (splats / "exports" / "transforms" / "transforms.json").read_text()
@@ -205,22 +205,22 @@ def test_a_scene_leaves_with_all_its_motion_and_how_far_it_is_off(splats, capsys
 
 
 @pytest.mark.full
-def test_pictures_leave_with_their_camera_and_motion(splats, capsys, monkeypatch):
+def test_images_leave_with_their_camera_and_motion(splats, capsys, monkeypatch):
     path = ("--path", "captured", "--frames", 3)
     assert main(splats, "exr", *path) == 0
     assert "and flow" in capsys.readouterr().out
-    pictures = sorted((splats / "exports" / "exr-captured").iterdir())
-    assert [picture.name for picture in pictures] == [
+    images = sorted((splats / "exports" / "exr-captured").iterdir())
+    assert [image.name for image in images] == [
         "0000.exr",
         "0001.exr",
         "0002.exr",
     ]
     # What a person put there is named before anything is rendered again.
-    (pictures[0].parent / "notes.txt").write_text("mine")
+    (images[0].parent / "notes.txt").write_text("mine")
     monkeypatch.setattr(exr_series, "write_frame", None)
     assert main(splats, "exr", *path, "--overwrite") == 2
     assert "holds notes.txt, which would be lost" in capsys.readouterr().err
-    first, _, last = (exr.read_exr(picture) for picture in pictures)
+    first, _, last = (exr.read_exr(image) for image in images)
     capture = scenes.tiny_capture()
     assert first.depth.shape == capture.images.shape[1:3]
     assert first.finite.all()
@@ -229,7 +229,7 @@ def test_pictures_leave_with_their_camera_and_motion(splats, capsys, monkeypatch
     assert np.abs(first.extra["flow.x"][known]).max() > 0.1
     # Nothing follows the last: to rounding, it stands still.
     assert np.abs([last.extra["flow.x"], last.extra["flow.y"]]).max() < 1e-3
-    with OpenEXR.File(str(pictures[0]), header_only=True) as file:
+    with OpenEXR.File(str(images[0]), header_only=True) as file:
         header = dict(file.header())
     row = capture.train[np.argmin(capture.times[capture.train])]
     assert header["sceneTime"] == capture.times[row]
@@ -268,10 +268,10 @@ def field(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_field_leaves_as_pictures_tracks_and_cameras_alone(field, capsys):
+def test_a_field_leaves_as_images_tracks_and_cameras_alone(field, capsys):
     assert main(field, "exr", "--frames", 2) == 0
-    picture = exr.read_exr(field / "exports" / "exr" / "0000.exr")
-    assert {"flow.x", "flow.y", "flow.A"} == {*picture.extra}
+    image = exr.read_exr(field / "exports" / "exr" / "0000.exr")
+    assert {"flow.x", "flow.y", "flow.A"} == {*image.extra}
     assert main(field, "path") == 0
     assert main(field, "transforms") == 0
     assert main(field, "tracks", "--points", 5, "--frames", 2) == 0

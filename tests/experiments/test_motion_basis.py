@@ -1,4 +1,4 @@
-"""The picture of a motion basis: its colors, its order, and one of a whole run."""
+"""The image of a motion basis: its colors, its order, and one of a whole run."""
 
 import types
 
@@ -64,7 +64,7 @@ def test_a_run_is_drawn_and_one_without_a_basis_is_named(tmp_path, monkeypatch, 
         return params._replace(nets=jax.tree.map(shake, params.nets))
 
     run = saved(tmp_path / "moba", "moba-small", TINY, shaken)
-    rows = motion_basis.pictures(run, 2, 2)
+    rows = motion_basis.images(run, 2, 2)
     observed, vectors, weights = rows.values()
     assert [len(images) for images in rows.values()] == [2, 2, 2]
     assert all(image.shape == observed[0].shape for image in (*vectors, *weights))
@@ -73,8 +73,8 @@ def test_a_run_is_drawn_and_one_without_a_basis_is_named(tmp_path, monkeypatch, 
     assert np.abs(weights[0] - weights[1]).max() > 0.01
     out = tmp_path / "basis.png"
     motion_basis.main([str(run), "--bases", "2", "--times", "2", "--out", str(out)])
-    with PIL.Image.open(out) as picture:
-        assert picture.size[0] > 300
+    with PIL.Image.open(out) as image:
+        assert image.size[0] > 300
     without = saved(tmp_path / "mlp", "splats-deformable-small", SPLATS, shaken)
     with pytest.raises(SystemExit) as stop:
         motion_basis.main([str(without), "--out", str(tmp_path / "other.png")])

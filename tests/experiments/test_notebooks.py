@@ -11,7 +11,7 @@ import tomllib
 import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-# Constants of each, small. COLMAP finds the cameras of no fewer and smaller pictures;
+# Constants of each, small. COLMAP finds the cameras of no fewer and smaller images;
 # what is learned from them may be smaller.
 SMALL = {
     "fit_an_image": {"GAUSSIANS": 300, "STEPS": 120, "WIDTH": 64},
@@ -67,7 +67,7 @@ def test_a_notebook_runs(notebook, tmp_path):
         )
         assert count == 1
     # Of several threads COLMAP finds other cameras on a busy machine: once it placed 8
-    # of these 14 pictures.
+    # of these 14 images.
     program = program.replace("passes=PASSES)", "passes=PASSES, threads=1)")
     assert ("threads=1" in program) == (notebook == "video_to_page")
     (tmp_path / path.name).write_text(program)

@@ -82,7 +82,7 @@ BAD = {
     "no time": (dict(times=np.full(20, np.nan)), [], "a.npz: holds NaN"),
     "no length": (dict(focal=np.zeros(0)), [], "focal is empty"),
     "one number": (dict(images=np.float32(1)), [], "images ()"),
-    "no pictures": (dict(images=np.zeros((0, 8, 10, 3))), [], "(0, 8, 10, 3)"),
+    "no images": (dict(images=np.zeros((0, 8, 10, 3))), [], "(0, 8, 10, 3)"),
     "rows outside": ({}, ["--heldout", "15:25"], "15:25"),
     "rows as words": ({}, ["--heldout", "some"], "some"),
     "train alone": ({}, ["--train", "0:5"], "--heldout"),

@@ -54,7 +54,7 @@ def run(filmed):
     return out
 
 
-def pictures(folder):
+def read_images(folder):
     return [images.read_image(path)[0] for path in sorted(folder.glob("*.png"))]
 
 
@@ -77,10 +77,10 @@ def test_a_field_leaves_the_files_and_metrics_of_a_run_and_no_gaussians(run):
     assert "codes fitted to the left halves" in page
     assert "backward" in page
     capture = scenes.tiny_capture()
-    picture = exr.read_exr(next((run / "depth").glob("*.exr")))
-    seen = picture.alpha > 0.1  # twelve steps leave it thin
+    image = exr.read_exr(next((run / "depth").glob("*.exr")))
+    seen = image.alpha > 0.1  # twelve steps leave it thin
     assert seen.mean() > 0.5
-    inside = (picture.depth > 0.9 * capture.near) & (picture.depth < 1.1 * capture.far)
+    inside = (image.depth > 0.9 * capture.near) & (image.depth < 1.1 * capture.far)
     assert inside[seen].all()
 
 
@@ -89,7 +89,7 @@ def test_the_canonical_view_is_rendered(run, tmp_path):
     for name, more in (("all", ()), ("canonical", ("--without", "warp"))):
         assert main(render, run, *path, *more, "--out", tmp_path / name) == 0
         assert len(list(video.read_video(tmp_path / name / "video.mp4"))) == 2
-    whole, canonical = (pictures(tmp_path / name) for name in ("all", "canonical"))
+    whole, canonical = (read_images(tmp_path / name) for name in ("all", "canonical"))
     assert canonical[0].shape == (15, 20, 3)
     assert not np.array_equal(whole, canonical)
 

@@ -103,7 +103,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["train.steps"] == runs.saved_run(out).config.steps == 2
     assert 0 < metrics["heldout.psnr"] < 60
-    # Nothing moves in it, so its renders over time are all one picture.
+    # Nothing moves in it, so its renders over time are all one image.
     assert metrics["motion.gain"] == 0
     np.testing.assert_allclose(
         metrics["baseline.static"], metrics["heldout.psnr"], atol=1e-4
@@ -174,7 +174,7 @@ def test_a_representation_needs_six_fields_only(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_runs_are_drawn_beside_each_other(run, tmp_path, monkeypatch, capsys):
-    """A run beside a copy of itself: the truth, twice the same picture and error."""
+    """A run beside a copy of itself: the truth, twice the same image and error."""
     shutil.copytree(run, tmp_path / "again")
     laid, sheet = {}, panels.contact_sheet
 
@@ -197,7 +197,7 @@ def test_runs_are_drawn_beside_each_other(run, tmp_path, monkeypatch, capsys):
     assert np.abs(one.astype(float) - truth).mean() < 60  # it is of this scene
     psnr = json.loads((run / "metrics.json").read_text())["heldout.psnr"]
     assert f": {psnr:.2f} dB" in laid["captions"][1]
-    for name in ("pictures.png", "curves.png", "compare.json"):
+    for name in ("frames.png", "curves.png", "compare.json"):
         assert (out / name).stat().st_size > 300, name
 
 
@@ -213,10 +213,10 @@ def test_a_run_leaves_its_metrics_depth_and_report(run):
     np.testing.assert_allclose(speed, 1000)
     capture = scenes.tiny_capture()
     (depth,) = (run / "depth").glob("*.exr")
-    picture = exr.read_exr(depth)
-    seen = picture.alpha > 0.05  # twelve steps leave it thin
+    image = exr.read_exr(depth)
+    seen = image.alpha > 0.05  # twelve steps leave it thin
     assert seen.mean() > 0.5
-    inside = (picture.depth > 0.3 * capture.near) & (picture.depth < 3 * capture.far)
+    inside = (image.depth > 0.3 * capture.near) & (image.depth < 3 * capture.far)
     assert inside[seen].mean() > 0.95
     page = (run / "report.html").read_text()
     for words in ("data:image/png;base64", "data:video/mp4;base64"):
@@ -235,7 +235,7 @@ def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
     path.write_text(json.dumps(table))
     arguments = [str(run), "--path", str(path), "--freeze", "0.5"]
     formats = ["--formats", "png", "mp4", "exr", "--max-side", "32"]
-    out = tmp_path / "pictures"
+    out = tmp_path / "images"
     out.mkdir()
     mine = out / "0000.png"
     mine.write_text("not a render's")
@@ -246,8 +246,8 @@ def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
     assert sorted(path.name for path in out.glob("*.png")) == [
         f"{number:04d}.png" for number in range(3)
     ]
-    picture, _ = images.read_image(out / "0000.png")
-    assert picture.shape == (16, 32, 3)
+    image, _ = images.read_image(out / "0000.png")
+    assert image.shape == (16, 32, 3)
     assert len(list(video.read_video(out / "video.mp4"))) == 3
     assert exr.read_exr(out / "0001.exr").depth.shape == (16, 32)
 
@@ -257,16 +257,16 @@ def test_the_canonical_scene_and_its_depth_are_rendered(run, tmp_path):
     arguments = [str(run), "--without", "motion", "--formats", "png"]
     folder = run / "renders" / "heldout-without-motion-depth-png"
     render.main([*arguments, "--show", "depth"])
-    (picture,) = folder.glob("*.png")
-    picture, _ = images.read_image(picture)
+    (image,) = folder.glob("*.png")
+    image, _ = images.read_image(image)
     near, far = (255 * np.array(colormaps["viridis"](end)[:3]) for end in (1.0, 0.0))
-    known = picture[(picture != 128).any(axis=-1)].astype(float)
+    known = image[(image != 128).any(axis=-1)].astype(float)
     assert np.abs(known - near).max(axis=1).min() < 20
     assert np.abs(known - far).max(axis=1).min() < 20
 
 
 @pytest.mark.slow
-def test_the_flow_from_picture_to_picture_is_drawn(run, tmp_path):
+def test_the_flow_from_image_to_image_is_drawn(run, tmp_path):
     arguments = ["--path", "sway", "--frames", "2", "--formats", "png"]
     render.main([str(run), *arguments, "--show", "flow", "--out", str(tmp_path)])
     first, last = (images.read_image(tmp_path / f"000{n}.png")[0] for n in range(2))

@@ -50,9 +50,7 @@ def test_a_broken_capture_is_refused_by_name(filmed, tmp_path, capsys):
     assert not (tmp_path / "run").exists()
 
 
-def test_frames_without_their_picture_are_left_out_where_asked(
-    filmed, tmp_path, capsys
-):
+def test_frames_without_their_image_are_left_out_where_asked(filmed, tmp_path, capsys):
     lost = min((filmed / "rgb/1x").iterdir())
     lost.unlink()
     assert "--missing skip" in refused(capsys, filmed, "--out", tmp_path / "run")
@@ -80,9 +78,7 @@ def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_pictures_that_are_too_small_for_lpips_are_refused(
-    filmed, capsys, tmp_path, rng
-):
+def test_images_that_are_too_small_for_lpips_are_refused(filmed, capsys, tmp_path, rng):
     weights = tmp_path / "alex.npz"
     np.savez(weights, **state_dict("alex", rng))
     asked = "--out", tmp_path / "run", "--lpips-weights", weights

@@ -114,12 +114,12 @@ def test_a_render_that_fails_leaves_the_earlier_one_as_it_was(run, monkeypatch, 
             fail_at(failure[0], patch, *failure[1:])
             assert main(run, *SWAY) in (2, 130), failure
         assert contents(renders) == before, failure
-    # The film cannot be written where the pictures of a sequence have two sizes.
+    # The film cannot be written where the images of a sequence have two sizes.
     with monkeypatch.context() as patch:
-        as_picture = evaluation.as_picture
+        to_uint8 = evaluation.to_uint8
         sizes = iter((24, 24, 8))
-        cut = lambda color: as_picture(color)[:, : next(sizes)]  # noqa: E731
-        patch.setattr(evaluation, "as_picture", cut)
+        cut = lambda color: to_uint8(color)[:, : next(sizes)]  # noqa: E731
+        patch.setattr(evaluation, "to_uint8", cut)
         with pytest.raises(ValueError, match="frame 2 is"):
             main(run, *SWAY)
     assert contents(renders) == before

@@ -27,8 +27,8 @@ def test_the_figure_shows_the_kept_numbers():
     path = PAGES / "benchmark.png"
     assert path.exists() == bool(curves.panels(stored))
     if path.exists():
-        with PIL.Image.open(path) as picture:
-            assert picture.text[figures.DIGEST] == figures.digest(curves.panels(stored))
+        with PIL.Image.open(path) as image:
+            assert image.text[figures.DIGEST] == figures.digest(curves.panels(stored))
 
 
 def test_presets_are_ranked_by_the_kept_curves():
@@ -41,8 +41,8 @@ def test_presets_are_ranked_by_the_kept_curves():
 @pytest.mark.skipif("growth" not in results.kept(), reason="no stored numbers")
 def test_the_figure_of_growth_shows_the_kept_numbers():
     stored = json.loads(results.path_of("growth").read_text())
-    with PIL.Image.open(PAGES / "growth.png") as picture:
-        assert picture.text[figures.DIGEST] == figures.digest(growth.plotted(stored))
+    with PIL.Image.open(PAGES / "growth.png") as image:
+        assert image.text[figures.DIGEST] == figures.digest(growth.plotted(stored))
 
 
 def test_the_index_lists_every_page_there_is():

@@ -178,7 +178,7 @@ def test_no_command_runs_what_a_folder_names(
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith("error: ")
     assert re.search(words, said), said
-    assert not list(stranger.rglob("pictures.png"))
+    assert not list(stranger.rglob("frames.png"))
 
 
 def test_code_that_is_named_again_is_loaded(stranger, finished, capsys):

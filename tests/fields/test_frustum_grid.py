@@ -32,7 +32,7 @@ def bound_of(*effects, metadata=METADATA):
 
 
 def read(displace, dtype, size=SIZE, metadata=METADATA):
-    """(points, their displacements as read on the grid) in a picture of that size."""
+    """(points, their displacements as read on the grid) in an image of that size."""
     bound = bound_of(FieldRecord("own", displace=displace), metadata=metadata)
 
     @jax.jit
@@ -67,7 +67,7 @@ FLAT = dataclasses.replace(METADATA, far=METADATA.near)
 @pytest.mark.parametrize(
     ("size", "metadata"),
     [(SIZE, METADATA), ((1, 1), FLAT), ((130, 1), METADATA)],
-    ids=["a picture", "a pixel without depth", "a row"],
+    ids=["an image", "a pixel without depth", "a row"],
 )
 def test_what_is_linear_in_space_comes_back_as_it_is(size, metadata, dtype):
     point, moved = read(linear, dtype, size, metadata)

@@ -22,18 +22,18 @@ def repainted(rows):
     capture, (metadata, params, _) = scenes.tiny_capture(), scenes.tiny_field()
     field = nerf_scene.field(TINY_FIELD, metadata)
     draw = jax.jit(field.render, static_argnums=4)
-    step, pictures = jnp.asarray(10, jnp.int32), capture.images.copy()
+    step, images = jnp.asarray(10, jnp.int32), capture.images.copy()
     for row in rows:
         view = evaluation.view_of(capture, int(row))
         codes = field.codes_at(params, view)
         codes["appearance"] = jnp.asarray([3.0, -4.0, 2.0])
         color = draw(params, view.camera, view.time, codes, capture.size, step).color
-        pictures[row] = evaluation.as_picture(np.asarray(color))
-    return dataclasses.replace(capture, images=pictures)
+        images[row] = evaluation.to_uint8(np.asarray(color))
+    return dataclasses.replace(capture, images=images)
 
 
 @pytest.mark.slow
-def test_a_code_is_found_again_from_half_a_picture_if_that_was_filmed():
+def test_a_code_is_found_again_from_half_an_image_if_that_was_filmed():
     metadata, params, _ = scenes.tiny_field()
     rows = scenes.tiny_capture().heldout[:1]
     filmed = repainted(rows)
@@ -60,7 +60,7 @@ def test_a_code_is_found_again_from_half_a_picture_if_that_was_filmed():
 
 
 @pytest.mark.slow
-def test_codes_are_fitted_to_the_samples_that_a_picture_is_made_of():
+def test_codes_are_fitted_to_the_samples_that_an_image_is_made_of():
     spec = dataclasses.replace(GUIDED, appearance=AppearanceSpec(2))
     model, params = full_of_holes(spec, ORANGE)
     metadata, capture = model.spec[1], scenes.tiny_capture()
@@ -70,7 +70,7 @@ def test_codes_are_fitted_to_the_samples_that_a_picture_is_made_of():
     codes["appearance"] = jnp.asarray([3.0, -4.0])
     draw = jax.jit(field.render, static_argnums=4)
     color = draw(params, view.camera, view.time, codes, capture.size, step).color
-    capture.images[rows[0]] = evaluation.as_picture(np.asarray(color))
+    capture.images[rows[0]] = evaluation.to_uint8(np.asarray(color))
     state = TrainState(params, (), (), step, jax.random.key(0))
     score = held_out_codes.scorer(spec, metadata, capture.size)
     scored = score(state, capture, rows)

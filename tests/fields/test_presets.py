@@ -89,7 +89,7 @@ def test_a_small_preset_learns_more_than_one_color(name):
         state, metrics = step(state, frames)
         errors.append(float(metrics["mse"]))
     assert np.isfinite(errors).all()
-    # Papers' on waves reach 0.85 to 0.88 of it; a picture of one color has all of it.
-    pictures = capture.images[capture.train] / 255
-    variance = np.mean((pictures - pictures.mean((0, 1, 2))) ** 2)
+    # Papers' on waves reach 0.85 to 0.88 of it; an image of one color has all of it.
+    images = capture.images[capture.train] / 255
+    variance = np.mean((images - images.mean((0, 1, 2))) ** 2)
     assert np.mean(errors[-40:]) < 0.9 * variance

@@ -176,7 +176,7 @@ def plain_nerf(net, ray, distances, behind):
 
 
 @pytest.mark.full
-def test_blocks_of_rays_do_not_show_in_a_picture():
+def test_blocks_of_rays_do_not_show_in_an_image():
     # 91 pixels in blocks of 97 and 10
     plan = dataclasses.replace(STATIC.sampling, block=10)
     whole, other = (
@@ -231,7 +231,7 @@ def test_a_step_takes_no_more_memory_than_the_estimate():
 
 
 @pytest.mark.slow
-def test_memory_of_a_render_does_not_grow_with_the_picture():
+def test_memory_of_a_render_does_not_grow_with_the_image():
     model, state, _ = started(STATIC)
     view = evaluation.view_of(scenes.tiny_capture(), 0)
 
@@ -255,9 +255,9 @@ def test_depth_is_along_the_viewing_axis_in_scene_units():
         head = net.trunk.heads["density"]
         net.trunk.heads["density"] = head._replace(bias=head.bias + 1e6)
     view = evaluation.view_of(capture, 0)
-    picture = jax.jit(lambda p: model.render(p, view, (9, 7), jnp.int32(0)))(params)
-    np.testing.assert_allclose(picture.depth, metadata.near, rtol=1e-4)
-    np.testing.assert_allclose(picture.alpha, 1, atol=1e-6)
+    image = jax.jit(lambda p: model.render(p, view, (9, 7), jnp.int32(0)))(params)
+    np.testing.assert_allclose(image.depth, metadata.near, rtol=1e-4)
+    np.testing.assert_allclose(image.alpha, 1, atol=1e-6)
 
 
 def codes_by(field, dtype):

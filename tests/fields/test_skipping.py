@@ -131,7 +131,7 @@ def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     assert np.abs(skipped.depth - whole.depth)[seen].mean() < most * span
     if frame_by_frame:
         return
-    # Were nothing occupied, samples would be skipped that the picture is made of.
+    # Were nothing occupied, samples would be skipped that the image is made of.
     nothing = jax.tree.map(jnp.zeros_like, occupied)
     bare = draw(params, nothing, view, SIZE, STEP)
     assert np.abs(bare.color - whole.color).max() > 10 * most
@@ -177,14 +177,14 @@ def test_a_frame_does_not_depend_on_how_it_is_cut(pixels, monkeypatch):
     model, params = full_of_holes(TAKEN_OVER, ORANGE)
     view = evaluation.view_of(scenes.tiny_capture(), 3)
     occupied = jax.jit(model.surveyed.survey)(params, STEP)
-    pictures = []
+    images = []
     for block, batch, stages in ((16384, 2048, 4), (100, 37, 1)):
         for name, value in (("BLOCK", block), ("BATCH", batch), ("STAGES", stages)):
             monkeypatch.setattr(skipping, name, value)
         draw = jax.jit(functools.partial(model.surveyed.draw), static_argnums=3)
-        pictures.append(draw(params, occupied, view, pixels, STEP))
+        images.append(draw(params, occupied, view, pixels, STEP))
     limit = np.exp(-skipping.OPAQUE_DEPTH)
-    np.testing.assert_allclose(pictures[0].color, pictures[1].color, atol=limit)
+    np.testing.assert_allclose(images[0].color, images[1].color, atol=limit)
 
 
 def test_a_survey_finds_a_small_thing_whichever_cell_it_is_in():

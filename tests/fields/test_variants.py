@@ -30,22 +30,22 @@ def drawn(seen, without=(), blended=False):
     metadata, params, _ = scenes.tiny_field()
     draw = variants.without_effects(TINY_FIELD, metadata, without, blended)
     step = jnp.asarray(10, jnp.int32)
-    picture = jax.jit(draw.render, static_argnums=2)(params, seen, SIZE, step)
-    return np.asarray(picture.color)
+    image = jax.jit(draw.render, static_argnums=2)(params, seen, SIZE, step)
+    return np.asarray(image.color)
 
 
 @pytest.mark.full
 def test_a_field_without_its_warp_is_the_template():
     metadata, params, view = scenes.tiny_field()
-    picture = drawn(view, without=("warp",))
+    image = drawn(view, without=("warp",))
     still = dataclasses.replace(TINY_FIELD, warp=None)
     codes = {"appearance": params["codes"]["appearance"]}
     model = nerf_scene.build(still, metadata)
     expected = jax.jit(model.render, static_argnums=2)(
         {"template": params["template"], "codes": codes}, view, SIZE, jnp.int32(10)
     ).color
-    np.testing.assert_allclose(picture, expected, atol=1e-6)
-    assert np.abs(picture - drawn(view)).max() > 1e-3
+    np.testing.assert_allclose(image, expected, atol=1e-6)
+    assert np.abs(image - drawn(view)).max() > 1e-3
 
 
 @pytest.mark.full

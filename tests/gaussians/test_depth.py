@@ -1,4 +1,4 @@
-"""Depth losses: their values, their blindness, and pictures that say nothing."""
+"""Depth losses: their values, their blindness, and images that say nothing."""
 
 import functools
 
@@ -98,7 +98,7 @@ def test_the_affine_loss_is_level_where_every_pixel_is_on_the_wrong_side(dtype):
     assert np.abs(grad).max() < 1e-6
 
 
-def hard_pictures():
+def hard_images():
     rng = np.random.default_rng(0)
     ramp = np.linspace(1, 3, COUNT)
     flat = np.full(COUNT, 2.0)
@@ -125,13 +125,13 @@ def hard_pictures():
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", depth.KINDS)
-@pytest.mark.parametrize("name", hard_pictures())
-def test_pictures_that_say_little_stay_finite(kind, name, dtype):
-    drawn, truth, known = hard_pictures()[name]
+@pytest.mark.parametrize("name", hard_images())
+def test_images_that_say_little_stay_finite(kind, name, dtype):
+    drawn, truth, known = hard_images()[name]
     value, grad = SLOPES[kind](drawn.astype(dtype), truth.astype(dtype), known)
     assert np.isfinite(value)
     assert np.isfinite(grad).all()
-    # Slopes are at most a thousand over the depth of the picture.
+    # Slopes are at most a thousand over the depth of the image.
     assert np.abs(grad).max() * np.median(drawn) < 1100
     if known.sum() < 2 and kind != "metric":
         assert value == 0

@@ -37,7 +37,7 @@ def built():
     return model, metadata, state._replace(params=params)
 
 
-def pictures(model, state, rows):
+def rendered(model, state, rows):
     renderer = evaluation.Renderer(model, CAPTURE.size)
     views = [evaluation.view_of(CAPTURE, row) for row in rows]
     return np.stack([renderer(state, view).color for view in views])
@@ -48,12 +48,12 @@ def test_a_frame_is_drawn_in_its_light_and_one_never_seen_between_its_neighbors(
     rows = [int(row) for row in CAPTURE.train]
     between = int(CAPTURE.heldout[0])
     neutral = variants.without_effects(SPEC, metadata, ("exposure",), False)
-    plain = pictures(neutral, state, [*rows, between])
+    plain = rendered(neutral, state, [*rows, between])
     assert plain.max() > 0.1
-    drawn = pictures(model, state, [*rows, between])
+    drawn = rendered(model, state, [*rows, between])
     shares = np.array([*range(6), 2.5]) - 2.5  # beside the mean
-    for picture, shown, share in zip(plain, drawn, shares, strict=True):
-        expected = picture + share * (picture @ CHANGE[:, :3].T + CHANGE[:, 3])
+    for image, shown, share in zip(plain, drawn, shares, strict=True):
+        expected = image + share * (image @ CHANGE[:, :3].T + CHANGE[:, 3])
         np.testing.assert_allclose(shown, expected, atol=2e-6)
     assert variants.parts(SPEC, metadata).appearance
 
@@ -66,7 +66,7 @@ def test_a_step_teaches_the_exposure_of_its_frame_and_of_no_other(built):
     assert sorted(np.asarray(moved).any(axis=(1, 2))) == [False] * 5 + [True]
 
 
-def test_what_all_exposures_have_in_common_changes_no_picture(dtype):
+def test_what_all_exposures_have_in_common_changes_no_image(dtype):
     rng = np.random.default_rng(1)
     table = rng.normal(size=(3, 3, 4)).astype(dtype)
     places = ((0, 0, 0.0), (1, 1, 0.0), (1, 2, 0.25), (2, 2, 0.0))
@@ -83,18 +83,18 @@ def test_what_all_exposures_have_in_common_changes_no_picture(dtype):
 def test_half_a_frame_tells_the_light_of_the_other_half(built):
     _, metadata, state = built
     neutral = variants.without_effects(SPEC, metadata, ("exposure",), False)
-    plain = pictures(neutral, state, CAPTURE.heldout)
+    plain = rendered(neutral, state, CAPTURE.heldout)
     lit = plain * 0.7 + 0.2 + plain @ CHANGE[:, :3].T
     images = CAPTURE.images.copy()
     images[CAPTURE.heldout] = np.round(255 * lit.clip(0, 1))
     filmed = dataclasses.replace(CAPTURE, images=images)
     score = held_out_exposure.scorer(SPEC, metadata, filmed.size)
     halves = score(state, filmed, filmed.heldout)
-    # 8 bits of both pictures leave 56 dB; nothing else is between them
+    # 8 bits of both images leave 56 dB; nothing else is between them
     assert halves.psnr.min() > 50
     still = dataclasses.replace(SPEC, exposure=None)
     assert held_out_exposure.scorer(still, metadata, filmed.size) is None
-    # Of a black picture nothing can be told but the offset.
+    # Of a black image nothing can be told but the offset.
     black = np.zeros((4, 5, 3))
     change = exposure.fit(black, black + 0.25, None)
     np.testing.assert_allclose(change, [[0, 0, 0, 0.25]] * 3, atol=1e-5)

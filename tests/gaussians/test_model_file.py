@@ -60,13 +60,13 @@ def test_active_rows_networks_and_settings_come_back_bit_for_bit(trained, saved)
 @pytest.mark.full
 def test_a_frame_is_drawn_from_the_file_alone(trained, saved):
     view = evaluation.view_of(scenes.tiny_capture(), 3)
-    pictures = []
+    images = []
     for params, about in (trained, model_file.load(saved)):
         model = scene.build(about["spec"], about["metadata"])
         draw = jitted(model.render, static_argnums=2)
-        pictures.append(draw(params, view, SIZE, np.int32(about["step"])).color)
-    assert np.ptp(pictures[0]) > 0.1
-    np.testing.assert_allclose(pictures[1], pictures[0], atol=1e-6)
+        images.append(draw(params, view, SIZE, np.int32(about["step"])).color)
+    assert np.ptp(images[0]) > 0.1
+    np.testing.assert_allclose(images[1], images[0], atol=1e-6)
 
 
 def test_float64_is_stored_in_float32(trained, tmp_path, float64):

@@ -191,7 +191,7 @@ def test_flow_and_slopes_are_finite_of(name, dtype):
 
 @pytest.mark.full
 def test_gradients_go_through_both_ends_and_no_weight(float64):
-    """Of the way alone: means, turns and sizes in the next camera's picture."""
+    """Of the way alone: means, turns and sizes in the next camera's image."""
     here, there = scattered("float64")
     both, weight = pair("float64"), np.random.default_rng(5).normal(size=(9, 13, 2))
 

@@ -72,7 +72,7 @@ def moving_scene():
 
 @functools.cache
 def drawn(row, time):
-    """The model's picture from a camera of the capture."""
+    """The model's image from a camera of the capture."""
     _, state, capture = moving_scene()
     view = evaluation.view_of(capture, row)._replace(time=jnp.asarray(time, "float32"))
     return renderer()(state, view).color
@@ -88,7 +88,7 @@ def renderer():
 def page(tmp_path_factory):
     path = tmp_path_factory.mktemp("player") / "player.html"
     model, state, capture = moving_scene()
-    poster = evaluation.as_picture(drawn(0, 0.0))
+    poster = evaluation.to_uint8(drawn(0, 0.0))
     title = "</script>{{data}}"
     written = representation.player(path, title, SPEC, model, state, capture, poster)
     assert written.path == path
@@ -146,9 +146,9 @@ def test_what_is_in_the_page_draws_as_the_model_does(page, time):
     gaussians, colors = unpacked(page, time)
     for row in capture.heldout:
         view = evaluation.view_of(capture, row)
-        picture = compiled_render()(gaussians, colors, view.camera)
+        image = compiled_render()(gaussians, colors, view.camera)
         # 73 dB at an instant; halfway between two, 64: a straight line for an arc.
-        assert psnr(picture, drawn(int(row), time)) > 60
+        assert psnr(image, drawn(int(row), time)) > 60
     active = int(splats.active_mask(state.params.rows["splats"]).sum())
     assert len(colors) <= active - BEHIND
 
@@ -326,7 +326,7 @@ def test_what_moves_does_not_hide_what_stands_behind_it():
     mean = np.concatenate([np.repeat(ahead[:1], 9, axis=0), ahead[1:]])
     rows = splats.from_points(mean, np.full((10, 3), 0.25), degree=0)
     moves = np.arange(10) < 9
-    scale = np.where(moves, 1.0, 0.02)  # sheets that fill every picture
+    scale = np.where(moves, 1.0, 0.02)  # sheets that fill every image
     opacity = put(np.where(moves, 0.95, 0.9), "float32")
 
     def at(time):

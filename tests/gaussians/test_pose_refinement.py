@@ -148,7 +148,7 @@ def test_cameras_that_are_off_are_found():
 
 @jax.jit
 def misplaced_px(given, true):
-    """Median distance in a picture of where points of the scene are seen."""
+    """Median distance in an image of where points of the scene are seen."""
     see = jax.vmap(jax.vmap(cameras.project, (None, 0)), (0, None))
     points = jnp.asarray(EVEN.points.position)
     away = see(given, points)[0] - see(true, points)[0]

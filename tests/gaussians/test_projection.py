@@ -186,7 +186,7 @@ def footprint_and_slopes(gaussians, camera):
     return (plain, plain.visible), sharp, grads
 
 
-def test_what_lies_beside_the_picture_is_visible_and_not_seen(rng):
+def test_what_lies_beside_the_image_is_visible_and_not_seen(rng):
     """Density control divides by the views in which a Gaussian was."""
     gaussians = some_gaussians(rng, 300, "float32")
     drawn, visible, seen = footprints_seen(

@@ -55,19 +55,19 @@ def compiled_slopes(footprints, values, size, spec):
         image, left = raster.rasterize(moved, values, size, spec)
         return jnp.sum(jnp.sin(3 * image)) + jnp.sum(left**2), (image, left)
 
-    grads, picture = jax.grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(
+    grads, image = jax.grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(
         *footprints[:3], values
     )
-    return picture, grads
+    return image, grads
 
 
-def picture_and_slopes(*args):
-    """Picture and transmittance, and slopes in footprints and values, as NumPy's."""
+def image_and_slopes(*args):
+    """Image and transmittance, and slopes in footprints and values, as NumPy's."""
     return jax.tree.map(np.asarray, compiled_slopes(*args))
 
 
 @pytest.mark.full
-def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
+def test_the_capacity_never_changes_image_or_gradient(float64, rng):
     footprints, _ = some_footprints(rng, COUNT, SIZE, "float64")
     # Three Gaussians cover every tile, 6 of them, more than a chunk of 5 pairs holds.
     whitening, extent = (np.array(x) for x in (footprints[1], footprints[4]))
@@ -75,9 +75,9 @@ def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
     extent[:3] *= 50.0
     footprints = footprints._replace(whitening=whitening, extent_px=extent)
     values = rng.uniform(size=(COUNT, 3))
-    whole = picture_and_slopes(footprints, values, SIZE, QUICK)
+    whole = image_and_slopes(footprints, values, SIZE, QUICK)
     spec = dataclasses.replace(QUICK, capacity=5, kept_chunks=3)
-    close(picture_and_slopes(footprints, values, SIZE, spec), whole, 1e-12)
+    close(image_and_slopes(footprints, values, SIZE, spec), whole, 1e-12)
     # Slopes by each column of the whitening, against differences.
     for column in range(3):
         along = np.zeros_like(whitening)
@@ -85,7 +85,7 @@ def test_the_capacity_never_changes_picture_or_gradient(float64, rng):
 
         def at(step, along=along):
             moved = footprints._replace(whitening=whitening + step * along)
-            image, left = picture_and_slopes(moved, values, SIZE, QUICK)[0]
+            image, left = image_and_slopes(moved, values, SIZE, QUICK)[0]
             return np.sin(3 * image).sum() + (left**2).sum()
 
         slope = (at(1e-6) - at(-1e-6)) / 2e-6
@@ -115,7 +115,7 @@ def check_against_dense(image, left, footprints, conics, values, size, dtype):
 def test_tiles_cut_by_the_edge_equal_the_dense_compositor(dtype, rng):
     footprints, conics = some_footprints(rng, COUNT, SIZE, dtype)
     values = rng.normal(size=(COUNT, 3)).astype(dtype)  # of either sign
-    (image, left), _ = picture_and_slopes(footprints, values, SIZE, QUICK)
+    (image, left), _ = image_and_slopes(footprints, values, SIZE, QUICK)
     check_against_dense(image, left, footprints, conics, values, SIZE, dtype)
 
 
@@ -137,7 +137,7 @@ def test_summed_weights_are_the_sums_of_the_dense_images_of_one_gaussian_each(
 
 
 def drawn(mean_px, sigma_px, opacity, depth, values, dtype):
-    """Picture and what is left behind a few round Gaussians of one size.
+    """Image and what is left behind a few round Gaussians of one size.
 
     With rows that are not drawn they are `COUNT`, and go through the shared program.
     """
@@ -150,7 +150,7 @@ def drawn(mean_px, sigma_px, opacity, depth, values, dtype):
     extent = np.where(np.arange(COUNT)[:, None] < count, footprints.extent_px, 0)
     footprints = footprints._replace(extent_px=extent)
     values = np.asarray(values, dtype)[rows]
-    return picture_and_slopes(footprints, values, SIZE, QUICK)[0]
+    return image_and_slopes(footprints, values, SIZE, QUICK)[0]
 
 
 @pytest.mark.hard_cases
@@ -179,7 +179,7 @@ def test_nothing_to_draw_leaves_the_background(count, dtype, rng):
     footprints, _ = some_footprints(rng, count, SIZE, dtype)
     footprints = footprints._replace(extent_px=np.zeros((count, 2), dtype))
     values = np.ones((count, 3), dtype)
-    (image, left), grads = picture_and_slopes(footprints, values, SIZE, QUICK)
+    (image, left), grads = image_and_slopes(footprints, values, SIZE, QUICK)
     np.testing.assert_array_equal(image, np.zeros((*SIZE[::-1], 3)))
     np.testing.assert_array_equal(left, np.ones(SIZE[::-1]))
     assert not any(grad.any() for grad in grads)

@@ -170,7 +170,7 @@ def some_rows(count=7):
 
 
 def footprints(size):
-    """Nothing to draw on a picture of this size, by one device or by several."""
+    """Nothing to draw on an image of this size, by one device or by several."""
     two = Footprints(*(np.zeros((2, *shape)) for shape in [(2,), (3,), (), (), (2,)]))
     return put(two, "float32"), put(np.ones((2, 3)), "float32"), size, GSPLAT
 

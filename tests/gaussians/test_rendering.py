@@ -128,39 +128,37 @@ def test_render_and_all_gradients_equal_the_dense_renderer(spec, float64, rng):
             features=values[:, 3:],
             mean2d_offset=offset,
         )
-        picture = frame.rendering
-        depth = picture.depth * jnp.maximum(picture.alpha, 1e-10)
+        image = frame.rendering
+        depth = image.depth * jnp.maximum(image.alpha, 1e-10)
         return jnp.concatenate(
             [
-                picture.color,
+                image.color,
                 frame.features,
-                picture.alpha[..., None],
+                image.alpha[..., None],
                 depth[..., None],
             ],
             -1,
         )
 
     def dense(gaussians, values, background, offset, pose):
-        picture = dense_splats.render(gaussians, values, pose, size, spec, offset)
-        color = picture.color.at[..., :3].add(
-            background * (1 - picture.alpha)[..., None]
-        )
+        image = dense_splats.render(gaussians, values, pose, size, spec, offset)
+        color = image.color.at[..., :3].add(background * (1 - image.alpha)[..., None])
         return jnp.concatenate(
-            [color, picture.alpha[..., None], picture.depth[..., None]], -1
+            [color, image.alpha[..., None], image.depth[..., None]], -1
         )
 
     args = (gaussians, values, background, put(np.zeros((60, 2))), camera)
 
     def differentiate(draw):
         def loss(*args):
-            picture = draw(*args)
-            return jnp.sum(picture * toward), picture
+            image = draw(*args)
+            return jnp.sum(image * toward), image
 
         return jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3, 4), has_aux=True))(*args)
 
-    (got, picture), (want, exact) = differentiate(ours), differentiate(dense)
+    (got, image), (want, exact) = differentiate(ours), differentiate(dense)
     # Products of a hundred factors in another order: a few hundred ulps of 1.
-    np.testing.assert_allclose(picture, exact, atol=2e-13, rtol=0)
+    np.testing.assert_allclose(image, exact, atol=2e-13, rtol=0)
     close(got, want, 1e-10, least=1e-12)
 
 
@@ -181,7 +179,7 @@ def test_render_gradient_equals_central_differences(float64, rng):
 
     def loss(gaussians, colors):
         frame = rendering.render(gaussians, colors, camera, size)
-        picture = frame.rendering
-        return jnp.sum(picture.color * toward) + jnp.sum(picture.depth)
+        image = frame.rendering
+        return jnp.sum(image.color * toward) + jnp.sum(image.depth)
 
     assert gradients.directional_error(loss, gaussians, colors) < 1e-6

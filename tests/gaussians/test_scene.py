@@ -99,7 +99,7 @@ def test_descent_scales_each_kind_of_row_by_its_rate():
     np.testing.assert_allclose(step.quaternion, -0.2, rtol=1e-5)
 
 
-def test_events_grow_the_scene_and_keep_its_picture_learnable():
+def test_events_grow_the_scene_and_keep_its_image_learnable():
     model, _, frames = started(scenes.TINY_SPLATS)
     state, _ = stepped(scenes.TINY_SPLATS, 10)
     grow = next(event for event in model.events if event.name == "densify")

@@ -31,7 +31,7 @@ fourier_loss = jitted(spectral.fourier_loss, static_argnums=0)
 TINY = {"float32": 1e-6, "float64": 1e-14}
 
 
-def picture(rng, height, width, dtype="float64", channels=3):
+def random_image(rng, height, width, dtype="float64", channels=3):
     return rng.uniform(size=(height, width, channels)).astype(dtype)
 
 
@@ -59,7 +59,7 @@ def pyramid_by_matrices(image, levels):
 @pytest.mark.hard_cases
 @EVERY_SIZE
 def test_the_pyramid_is_that_of_explicit_orthonormal_matrices(size, dtype, rng):
-    image = picture(rng, *size, dtype)
+    image = random_image(rng, *size, dtype)
     pyramid = haar_pyramid(image, 3)
     for channel in range(3):
         high, low = pyramid_by_matrices(image[..., channel], 3)
@@ -83,7 +83,7 @@ def test_a_constant_has_no_high_bands_whatever_its_size(size, level, dtype):
 
 @EVERY_SIZE
 def test_the_wavelet_loss_is_the_mean_square_of_every_high_band(size, dtype, rng):
-    render, truth = picture(rng, *size, dtype), picture(rng, *size, dtype)
+    render, truth = random_image(rng, *size, dtype), random_image(rng, *size, dtype)
     spec = WaveletSpec(levels=3, level_factor=0.25)
     expected = 0.0
     for level in range(3):
@@ -101,7 +101,7 @@ def test_the_wavelet_loss_is_the_mean_square_of_every_high_band(size, dtype, rng
 @pytest.mark.hard_cases
 @EVERY_SIZE
 def test_the_half_spectrum_counts_like_the_whole_one(size, dtype, rng):
-    render, truth = picture(rng, *size, dtype), picture(rng, *size, dtype)
+    render, truth = random_image(rng, *size, dtype), random_image(rng, *size, dtype)
     whole = [
         np.abs(np.fft.fft2(np.asarray(image, np.float64), axes=(0, 1), norm="ortho"))
         for image in (render, truth)
@@ -115,7 +115,7 @@ def test_the_half_spectrum_counts_like_the_whole_one(size, dtype, rng):
 
 
 @pytest.mark.full
-def test_the_fourier_loss_does_not_grow_with_the_picture(rng):
+def test_the_fourier_loss_does_not_grow_with_the_image(rng):
     small, large = (
         fourier_loss(FourierSpec(), *rng.uniform(size=(2, side, side, 3)).astype("f4"))
         for side in (32, 128)
@@ -125,7 +125,7 @@ def test_the_fourier_loss_does_not_grow_with_the_picture(rng):
 
 @pytest.mark.parametrize("size", [(7, 5), *full(((1, 1),), ((8, 6),))])
 def test_both_losses_have_the_slopes_of_central_differences(size, float64, rng):
-    render, truth = put(picture(rng, *size)), put(picture(rng, *size))
+    render, truth = put(random_image(rng, *size)), put(random_image(rng, *size))
 
     def wavelet(render):
         spec = WaveletSpec(levels=2, level_factor=0.5)
@@ -156,7 +156,7 @@ def values_and_slopes(render, truth, valid):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("hole", [np.nan, 1e30, *full(np.inf)])
 def test_pixels_that_are_not_valid_teach_nothing_whatever_they_hold(hole, dtype, rng):
-    render, truth = picture(rng, *PATCH, dtype), picture(rng, *PATCH, dtype)
+    render, truth = random_image(rng, *PATCH, dtype), random_image(rng, *PATCH, dtype)
     valid = rng.uniform(size=PATCH) < 0.7
     keep = valid[..., None]
     by_hand = np.where(keep, render, truth)
@@ -188,13 +188,13 @@ def test_pixels_that_are_not_valid_teach_nothing_whatever_they_hold(hole, dtype,
 @pytest.mark.hard_cases
 def test_nothing_valid_costs_nothing(dtype, rng):
     weight = Gates(np.asarray(0.1, dtype), np.asarray(0.1, dtype))
-    pictures = (picture(rng, *PATCH, dtype) for _ in range(2))
+    images = (random_image(rng, *PATCH, dtype) for _ in range(2))
 
     @jitted
     def cost(*args):
         return weighted_sum(spectral.terms(SpectralSpec(), *args))
 
-    assert cost(weight, *pictures, ~EVERYWHERE) == 0
+    assert cost(weight, *images, ~EVERYWHERE) == 0
 
 
 weights_at = jitted(spectral.weights, static_argnums=(0, 3))
@@ -214,7 +214,7 @@ def test_the_slope_of_a_learned_gate_is_never_negative_and_the_closed_form(
     float64, rng
 ):
     spec = SpectralSpec()
-    render, truth = picture(rng, 12, 10), picture(rng, 12, 10)
+    render, truth = random_image(rng, 12, 10), random_image(rng, 12, 10)
 
     def value(gates):
         weight = spectral.weights(spec, gates, jnp.int32(0), 10)
@@ -275,7 +275,7 @@ def test_a_schedule_falls_along_half_a_cosine_to_exactly_nothing():
 
 
 def shot_of(rng, size=(6, 6)):
-    render, truth = (picture(rng, *size, "float32") for _ in range(2))
+    render, truth = (random_image(rng, *size, "float32") for _ in range(2))
     flat = np.zeros(size, np.float32)
     return put(Observation(Rendering(render, flat, flat), truth, None, None))
 

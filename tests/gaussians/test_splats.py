@@ -212,7 +212,7 @@ def test_a_tripod_has_no_extent_of_its_own():
 
 @pytest.mark.full
 @pytest.mark.hard_cases
-def test_inactive_rows_change_neither_the_picture_nor_learn_anything(rng):
+def test_inactive_rows_change_neither_the_image_nor_learn_anything(rng):
     splats = some_splats(rng, dtype="float32", degree=0)
     camera = jax.tree.map(lambda leaf: leaf[0], ring_of_cameras(1))
     camera = put(camera, "float32")

@@ -64,7 +64,7 @@ def test_what_is_not_lifted_is_seen_all_the_time(time, dtype):
     assert all(np.isfinite(leaf).all() for leaf in slope(fading))
 
 
-def test_the_lifted_ones_start_around_their_pictures():
+def test_the_lifted_ones_start_around_their_images():
     rows = rows_of(some_gaussians(5, "float32"))
     first = EFFECT.init(jax.random.key(0), rows).per_gaussian
     params = Params({"splats": rows, NAME: first}, {})

@@ -26,12 +26,12 @@ def test_splats_without_motion_are_the_canonical_ones(swaying):
     without = variants.without_effects(*model.spec, ("motion",), False)
     static = scene.build(scenes.TINY_SPLATS, model.spec[1])
     view = evaluation.view_of(scenes.tiny_capture(), 0)
-    picture, expected = (
+    image, expected = (
         jitted(each.render, static_argnums=2)(state.params, view, SIZE, state.step)
-        for each in (without, static)  # with its motion it is another picture
+        for each in (without, static)  # with its motion it is another image
     )
-    assert np.ptp(picture.color) > 0.1
-    np.testing.assert_array_equal(picture.color, expected.color)
+    assert np.ptp(image.color) > 0.1
+    np.testing.assert_array_equal(image.color, expected.color)
 
 
 @pytest.mark.parametrize("name", [n for n, s in PRESETS.items() if s.motion])
@@ -159,7 +159,7 @@ def test_what_cannot_be_drawn_otherwise_is_refused(swaying, make, words):
 @pytest.mark.full
 def test_what_moves_may_be_left_out(swaying):
     model, state = swaying
-    # Slower, so that all stay in the picture
+    # Slower, so that all stay in the image
     nets = jax.tree.map(lambda leaf: put(np.asarray(leaf) / 2), state.params.nets)
     state = state_of(state.params._replace(nets=nets))
     distance, active = farthest(model, state), active_rows(state)
@@ -172,10 +172,10 @@ def test_what_moves_may_be_left_out(swaying):
     # What is left is drawn as it was, wherever it still moves a little
     alone = jax.jit(splats.take_rows)(state.params, np.flatnonzero(shown))
     view = evaluation.view_of(scenes.tiny_capture(), 0)
-    picture, expected = (
+    image, expected = (
         evaluation.Renderer(model, SIZE)(one, view).color
         for one in (left, state._replace(params=alone))
     )
-    np.testing.assert_allclose(picture, expected, atol=1e-6)
+    np.testing.assert_allclose(image, expected, atol=1e-6)
     everything = evaluation.Renderer(model, SIZE)(state, view).color
-    assert np.abs(picture - everything).max() > 0.02
+    assert np.abs(image - everything).max() > 0.02

@@ -68,7 +68,7 @@ def oracle_pixel(camera, point):
 
 
 def seen_points(rng, camera, count=64):
-    """World points that fall well inside the picture."""
+    """World points that fall well inside the image."""
     depth = rng.uniform(0.5, 6, count)
     grads = rng.uniform(-0.45, 0.45, (count, 2))
     local = np.concatenate([grads * depth[:, None], depth[:, None]], axis=1)
@@ -149,7 +149,7 @@ def test_points_at_and_behind_the_camera_stay_finite(dtype):
         assert np.all(np.isfinite(gradient))
         assert z_depth == point[2] or abs(depth) < 1e-29  # XLA flushes denormals
         assert not projectable or depth >= 1e-6 > lateral
-        if lateral >= 1 and depth < 1e-6:  # off the picture, not somewhere inside it
+        if lateral >= 1 and depth < 1e-6:  # off the image, not somewhere inside it
             assert np.max(np.abs(pixel)) > 1e4
 
 

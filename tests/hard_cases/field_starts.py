@@ -77,7 +77,7 @@ def from_the_lens(capture: Capture) -> Capture:
 
 
 def rounded(frames: Frames) -> Frames:
-    """Pictures as bfloat16 shares."""
+    """Images as bfloat16 shares."""
     shares = (frames.images / 255).astype(jnp.bfloat16)
     return frames._replace(images=255 * shares.astype(np.float32))
 

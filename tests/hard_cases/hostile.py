@@ -43,7 +43,7 @@ def _first(frames, *names):
 
 
 def duplicated(frames):
-    """One frame again and again: picture, camera, time and codes."""
+    """One frame again and again: image, camera, time and codes."""
     names = [
         name
         for name in ("images", "cameras", "times", "appearance", "depths")

@@ -62,25 +62,25 @@ def trained(name, start, folder=None):
     params = start.params(jax.tree.map(np.asarray, run.state.params))
     state = run.state._replace(params=params, aux_state=place)
     ended = hostile.train(run.model, state, frames, folder, steps=tiny_fields.STEPS)
-    return ended, picture_of(run, ended.result.state, frames, 0)
+    return ended, image_of(run, ended.result.state, frames, 0)
 
 
-def picture_of(run, state, frames, row):
+def image_of(run, state, frames, row):
     """The view of that frame."""
     view = jax.tree.map(lambda leaf: leaf[row], (frames.cameras, frames.times))
-    return run.picture(*hostile.on_device((state, *view)))
+    return run.image(*hostile.on_device((state, *view)))
 
 
 @pytest.mark.parametrize(("name", "start"), RUNS)
 def test_a_field_stays_finite_from(name, start, tmp_path):
     folder = tmp_path if start == "as filmed" else None
-    ended, picture = trained(name, STARTS[start], folder)
+    ended, image = trained(name, STARTS[start], folder)
     # The loop may stop with a word; none of these starts gives it a reason.
     assert ended.result.stopped_by == "steps", ended.result.message
-    assert not hostile.not_finite(picture)
-    assert np.all((picture.color > -1e-5) & (picture.color < 2 + 1e-5))
-    assert np.all((picture.alpha > -1e-5) & (picture.alpha < 1 + 1e-5))
-    assert np.all(picture.depth >= 0)
+    assert not hostile.not_finite(image)
+    assert np.all((image.color > -1e-5) & (image.color < 2 + 1e-5))
+    assert np.all((image.alpha > -1e-5) & (image.alpha < 1 + 1e-5))
+    assert np.all(image.depth >= 0)
     if start == "as filmed":
         assert ended.last["mse"] < 0.9 * ended.first["mse"]
 
@@ -130,9 +130,9 @@ def test_a_step_with_the_elastic_penalty_is_finite_from(displacement, name):
         return params | {"warp": linear_warps.linear_warp(params["warp"], strain)}
 
     # Its gradients are taken and not followed: every step has the same strain.
-    ended, picture = trained(name, Start(params=bent, speed=0.0))
+    ended, image = trained(name, Start(params=bent, speed=0.0))
     assert ended.result.stopped_by == "steps", ended.result.message
-    assert not hostile.not_finite(picture)
+    assert not hostile.not_finite(image)
     expected = linear_warps.cost(tiny_fields.tiny(name).elastic, strain)
     measured = ended.first["elastic/elastic"]
     if displacement == "huge":

@@ -88,7 +88,7 @@ def hostile_spec(name):
 
 
 class Ready(NamedTuple):
-    """A model, where it would start, its frames and its picture."""
+    """A model, where it would start, its frames and its image."""
 
     model: Model
     start: TrainState
@@ -193,10 +193,10 @@ def of_every_kind(rows):
 
 
 def run(prepared, start, frames, folder=None, steps=STEPS):
-    """Train, hold the run to its promises and look at its picture."""
+    """Train, hold the run to its promises and look at its image."""
     trained = hostile.train(prepared.model, start, frames, folder, steps=steps)
-    picture = drawn(prepared, trained.result.state, frames, 0)
-    for name, leaf in picture._asdict().items():
+    image = drawn(prepared, trained.result.state, frames, 0)
+    for name, leaf in image._asdict().items():
         assert np.isfinite(np.asarray(leaf)).all(), name
     return trained
 

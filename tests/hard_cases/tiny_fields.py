@@ -30,7 +30,7 @@ PAPERS = ("nerf-w", "d-nerf", "nerfies", "nsff")
 SYSTEMS = ("tineuvox", "nerf-ds")
 RENDERED = ("d-nerf",)  # its scenes are, before a plain background
 STEPS = 100
-PICTURE = (8, 6)
+IMAGE_SIZE = (8, 6)
 
 
 class Place(NamedTuple):
@@ -50,7 +50,7 @@ class Run(NamedTuple):
     capture: Capture
     model: Model
     state: TrainState
-    picture: Any  # (state, camera, time) -> Rendering, compiled
+    image: Any  # (state, camera, time) -> Rendering, compiled
 
 
 def tiny(name: str) -> RadianceScene:
@@ -114,7 +114,7 @@ def place_of(metadata: SceneMetadata, speed: float = 1.0) -> Place:
 
 
 def frames_of(capture: Capture, required_data: frozenset[str]) -> Frames:
-    """Frames whose pictures can hold any number, with a mask in any case."""
+    """Frames whose images can hold any number, with a mask in any case."""
     frames = hostile.frames_of(capture, required_data)
     return frames._replace(images=frames.images.astype(np.float32))
 
@@ -146,11 +146,11 @@ def start(spec: RadianceScene, capture: Capture) -> Run:
     view = evaluation.view_of(capture, int(capture.train[0]))
 
     @jax.jit
-    def picture(state, camera, time) -> Rendering:
+    def image(state, camera, time) -> Rendering:
         here = scene.build(spec, moved(metadata, state.aux_state))
         seen = view._replace(camera=camera, time=time)
-        return here.render(state.params, seen, PICTURE, state.step)
+        return here.render(state.params, seen, IMAGE_SIZE, state.step)
 
     state = model.init(capture, jax.random.key(0))
     state = state._replace(aux_state=place_of(metadata))
-    return Run(spec, capture, model._replace(step=step), state, picture)
+    return Run(spec, capture, model._replace(step=step), state, image)

@@ -156,7 +156,7 @@ def ms_ssim_and_slope(image, truth):
 
 
 @pytest.mark.hard_cases
-def test_ms_ssim_of_a_negative_picture_is_zero_with_a_finite_gradient(dtype, rng):
+def test_ms_ssim_of_a_negative_image_is_zero_with_a_finite_gradient(dtype, rng):
     image, _ = arrays(*pair(rng, (*SMALL, 3)), dtype=dtype)
     value, grad = ms_ssim_and_slope(1 - image, image)
     assert value == 0
@@ -266,7 +266,7 @@ ssim_and_slope = jax.jit(jax.value_and_grad(image_quality.ssim))
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("name", ["ssim", "ms_ssim", "masked_ssim"])
-def test_equal_constant_pictures_score_one_with_gradient_zero(name, dtype):
+def test_equal_constant_images_score_one_with_gradient_zero(name, dtype):
     score, rest = {
         "ssim": (ssim_and_slope, ()),
         "ms_ssim": (ms_ssim_and_slope, ()),
@@ -290,7 +290,7 @@ def test_high_dynamic_range_loses_no_variance(dtype, rng):
     assert abs(value - exact) < {"float32": 2e-3, "float64": 1e-4}[dtype]
 
 
-def test_pictures_smaller_than_the_window_are_refused():
+def test_images_smaller_than_the_window_are_refused():
     small, image = np.zeros((12, 10, 3)), np.zeros((160, 300, 3))
     inside = np.ones((12, 10), bool)
     for call, words in (

@@ -61,9 +61,9 @@ def state_dict(name, rng):
     return state
 
 
-def slow_features(state, name, picture):
+def slow_features(state, name, image):
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-    x = ((picture - shift) / scale).transpose(2, 0, 1)
+    x = ((image - shift) / scale).transpose(2, 0, 1)
     for layer in LAYERS[name].split():
         if layer[0] == "C":
             index, _, _, _, stride, padding = map(int, layer[1:].split(","))
@@ -140,7 +140,7 @@ def tiny():
 
 
 @pytest.mark.hard_cases
-def test_lpips_is_zero_for_equal_pictures_and_its_gradient_is_finite(tiny, rng):
+def test_lpips_is_zero_for_equal_images_and_its_gradient_is_finite(tiny, rng):
     truth = pair(rng, (17, 14))[1].astype(np.float32)
 
     def score(params, image, truth):
@@ -165,7 +165,7 @@ def test_lpips_is_zero_for_equal_pictures_and_its_gradient_is_finite(tiny, rng):
 
 @pytest.mark.full
 @pytest.mark.hard_cases
-def test_half_precision_pictures_are_compared_in_float32(tiny, rng):
+def test_half_precision_images_are_compared_in_float32(tiny, rng):
     half = [x.astype(jnp.bfloat16) for x in rng.random((2, 17, 14, 3))]
     wide = [x.astype(np.float32) for x in half]
     distance, expected = (compiled(tiny, TINY, *pair) for pair in (half, wide))
@@ -289,7 +289,7 @@ def test_another_networks_file_is_refused(trained, tmp_path, monkeypatch):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", ["alex", "vgg"])
-def test_the_smallest_picture_is_the_smallest(name, rng):
+def test_the_smallest_image_is_the_smallest(name, rng):
     network = NETWORKS[name]
     zeros = {
         key: np.zeros(x.shape, x.dtype) for key, x in state_dict(name, rng).items()
@@ -298,10 +298,10 @@ def test_the_smallest_picture_is_the_smallest(name, rng):
     size = network.smallest
 
     def last(width):
-        picture = jax.ShapeDtypeStruct((size, width, 3), np.float32)
-        return jax.eval_shape(
-            lambda x: perceptual.features(params, network, x), picture
-        )[-1]
+        image = jax.ShapeDtypeStruct((size, width, 3), np.float32)
+        return jax.eval_shape(lambda x: perceptual.features(params, network, x), image)[
+            -1
+        ]
 
     assert min(last(size).shape[:2]) == 1
     with pytest.raises(ValueError, match=f"needs {size} pixels"):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 
-class Picture(NamedTuple):
+class Image(NamedTuple):
     color: jax.Array  # [height, width, channels]
     alpha: jax.Array  # [height, width]
     depth: jax.Array  # sum of w z, not divided
@@ -107,4 +107,4 @@ def render(gaussians, values, camera, size, spec, mean2d_offset=None):
     width, height = size
     image = image.reshape(height, width, -1)
     left = left.reshape(height, width)
-    return Picture(image[..., :-1], 1 - left, image[..., -1])
+    return Image(image[..., :-1], 1 - left, image[..., -1])

@@ -113,21 +113,21 @@ def test_a_folder_that_cannot_be_written_costs_the_next_command_alone(tmp_path, 
 def test_as_many_wide_steps_as_there_is_room_for_are_searched_again(monkeypatch):
     looked = []
 
-    def improved(views, pictures, pair, flow, search, span):
+    def improved(views, images, pair, flow, search, span):
         looked.append(pair)
         return flow
 
     monkeypatch.setattr(dense_flow.wide_steps, "improved", improved)
     monkeypatch.setattr(dense_flow.wide_steps, "is_wide", lambda *_: True)
     views = record.view_set.in_time_order(films.film(frames=6))
-    pictures = dense_flow.leveled(views)
+    images = dense_flow.leveled(views)
     asked = []
 
     def room_for(count):
         asked.append(count)
         return 3
 
-    dense_flow.between_neighbors(views, pictures, (1.0, 3.0), room_for)
+    dense_flow.between_neighbors(views, images, (1.0, 3.0), room_for)
     assert asked == [10]
     assert sorted(looked) == [(0, 1), (1, 2), (2, 3)]
 

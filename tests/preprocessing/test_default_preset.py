@@ -33,7 +33,7 @@ def one_cache(tmp_path_factory):
 
 
 def noisy():
-    """Every picture of its own: there is nothing to carry from one to the next."""
+    """Every image of its own: there is nothing to carry from one to the next."""
     film = films.film(frames=12)
     noise = np.random.default_rng(0).integers(0, 255, film.images.shape, np.uint8)
     return dataclasses.replace(film, images=noise)
@@ -180,7 +180,7 @@ def test_long_films_get_more_knots(a_knot, knots, monkeypatch):
         (UNTRACKED, (representation.FROM_REST,)),
     ],
 )
-def test_larger_pictures_get_more_gaussians(preset, changes):
+def test_larger_images_get_more_gaussians(preset, changes):
     spec = specs.override(PRESETS[preset], changes)
     assert representation.capacity(spec, (176, 132)) == ()
     assert representation.capacity(spec, (88, 66)) == ()

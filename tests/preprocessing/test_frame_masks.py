@@ -11,7 +11,7 @@ from tests import scenes
 
 
 def found(capture, factor, unusable=""):
-    """Evidence of a capture, at pictures so many times smaller: its first pixel moves
+    """Evidence of a capture, at images so many times smaller: its first pixel moves
     in every frame, the others as they are drawn.
     """
     height, width = (side // factor for side in capture.images.shape[1:3])
@@ -24,7 +24,7 @@ def found(capture, factor, unusable=""):
 
 
 @pytest.mark.parametrize("factor", [1, 5])
-def test_masks_are_the_evidence_s_at_the_size_of_the_pictures(factor, monkeypatch):
+def test_masks_are_the_evidence_s_at_the_size_of_the_images(factor, monkeypatch):
     bare = dataclasses.replace(scenes.tiny_capture(), moving=None)
     evidence = found(bare, factor)
     monkeypatch.setattr(frame_masks.record, "cached", lambda *_: evidence)
@@ -46,8 +46,8 @@ def test_masks_are_the_evidence_s_at_the_size_of_the_pictures(factor, monkeypatc
 
 def test_a_film_that_cannot_be_followed_stays_without_masks(monkeypatch):
     bare = dataclasses.replace(scenes.tiny_capture(), moving=None)
-    evidence = found(bare, 1, "one picture is no film")
+    evidence = found(bare, 1, "one image is no film")
     monkeypatch.setattr(frame_masks.record, "cached", lambda *_: evidence)
     capture = frame_masks.with_masks(bare)
     assert capture.moving is None
-    assert "one picture is no film" in capture.notes[-1]
+    assert "one image is no film" in capture.notes[-1]

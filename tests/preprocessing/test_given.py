@@ -27,7 +27,7 @@ def with_files(capture=None, **files):
 
 
 def tapir(path, **changes):
-    """Exact tracks of the card, [tracks, frames, 2]; the picture begins at 0."""
+    """Exact tracks of the card, [tracks, frames, 2]; the image begins at 0."""
     capture, evidence = gathered()
     points = card_points(capture, evidence.row)
     arrays = {"tracks": points.pixel, "visibles": points.seen} | changes
@@ -116,7 +116,7 @@ def test_a_mover_that_was_marked_is_no_noise_however_small():
     assert not usable_paths.stands_still(marked, times)
 
 
-def test_tracks_of_larger_pictures_are_brought_to_those_that_are_read(tmp_path):
+def test_tracks_of_larger_images_are_brought_to_those_that_are_read(tmp_path):
     _, points = tapir(tmp_path / "t.npz")
     size = 4 * np.array(films.SIZE)
     path, _ = tapir(tmp_path / "t.npz", tracks=4 * points.pixel, size=size)

@@ -218,7 +218,7 @@ def test_a_lens_is_measured_in_pixels():
 
 
 @pytest.mark.parametrize("period_px", [4.0, 12.0])
-def test_the_finest_detail_is_that_of_the_picture(period_px):
+def test_the_finest_detail_is_that_of_the_image(period_px):
     film = films.film()
     width, height = films.SIZE
     wave = 0.5 + 0.3 * np.sin(2 * np.pi * np.arange(width) / period_px)

@@ -1,4 +1,4 @@
-"""Masks for structure from motion, from pictures alone."""
+"""Masks for structure from motion, from images alone."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from nerfies_jax.preprocessing import masks_without_cameras
 
 
 @pytest.mark.slow
-def test_what_moves_is_found_in_a_folder_of_pictures(tmp_path):
+def test_what_moves_is_found_in_a_folder_of_images(tmp_path):
     small = dataclasses.replace(
         synthetic.PRESETS["default"], size=(112, 84), frames=40, heldout_every=20
     )
@@ -28,6 +28,6 @@ def test_what_moves_is_found_in_a_folder_of_pictures(tmp_path):
     assert (~masked[~true]).mean() > 0.85
 
 
-def test_too_few_pictures_say_how_many_it_takes(tmp_path):
+def test_too_few_images_say_how_many_it_takes(tmp_path):
     with pytest.raises(ValueError, match=r"0 images are too few .* more than 6"):
         masks_without_cameras.moving_in(tmp_path)

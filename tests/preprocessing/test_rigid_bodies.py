@@ -1,4 +1,4 @@
-"""Rigid things placed by their own size in the pictures."""
+"""Rigid things placed by their own size in the images."""
 
 import numpy as np
 import pytest

@@ -22,7 +22,7 @@ def views_of(capture):
 
 
 def card_points(capture, rows):
-    """The truth of a few points of the card, seen wherever they are in the picture."""
+    """The truth of a few points of the card, seen wherever they are in the image."""
     views = views_of(capture)
     inner = np.linspace(-0.6, 0.6, 4) * films.CARD
     offset = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 1, 2)
@@ -32,7 +32,7 @@ def card_points(capture, rows):
     for frame in range(len(rows)):
         at, depth = view_set.project(views, frame, place[:, frame])
         pixel.append(at)
-        seen.append(view_set.in_picture(views, at, depth))
+        seen.append(view_set.in_image(views, at, depth))
     return TruePoints(np.stack(pixel, 1), np.stack(seen, 1), place)
 
 

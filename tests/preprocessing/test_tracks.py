@@ -13,9 +13,9 @@ from nerfies_jax.preprocessing import (
     motion,
     moving,
     paths,
+    photo_consistency,
     record,
     rest_points,
-    still_pictures,
     still_points,
     tracks,
     view_set,
@@ -46,7 +46,7 @@ def card_path(capture, rows):
 
 @functools.cache
 def hand_held(frames=24):
-    """Views of a camera that shakes, in scene units; pictures are of no matter."""
+    """Views of a camera that shakes, in scene units; images are of no matter."""
     capture = films.film(camera=shaking, frames=frames, blank=True)
     return view_set.in_time_order(capture)
 
@@ -94,16 +94,16 @@ def test_flow_that_does_not_lead_back_is_not_trusted():
 def test_flow_that_a_thing_lost_is_found_from_how_it_came():
     capture = films.film(shown=lambda time: False, frames=6)
     views = view_set.in_time_order(capture)
-    pictures = dense_flow.leveled(views)
-    true = dense_flow.between_neighbors(views, pictures)
+    images = dense_flow.leveled(views)
+    true = dense_flow.between_neighbors(views, images)
     flow = NeighborFlow(*(part.copy() for part in true))
     area = np.s_[20:50, 30:70]
     for frame, shift, seen in ((2, *flow[:2]), (3, *flow[2:])):
         shift[frame][area], seen[frame][area] = 9.0, False
     assert dense_flow._lost(flow, 2)
     assert not dense_flow._lost(true, 2)
-    search = dense_flow.dis(pictures.shape[2] // views.size[0])
-    dense_flow._continue_motion(flow, 2, pictures, search)
+    search = dense_flow.dis(images.shape[2] // views.size[0])
+    dense_flow._continue_motion(flow, 2, images, search)
     for frame, flow_of_frame, exact in (
         (2, flow[:2], true[:2]),
         (3, flow[2:], true[2:]),
@@ -131,7 +131,7 @@ def test_chains_follow_flow_both_ways_until_it_ends():
     steps = np.arange(-2, 2)[:, None]
     expected = [10, 12] + steps * [1.25, -0.5]
     np.testing.assert_allclose(chained.pixel[0, :4], expected, atol=1e-5)
-    # The other left the picture on its right.
+    # The other left the image on its right.
     assert chained.seen[1].tolist() == [True] * 3 + [False] * 2
 
 
@@ -139,12 +139,12 @@ def test_wide_steps_are_found_from_where_a_still_scene_would_be():
     # 18 px of 96 from frame to frame
     capture = films.film(camera=lambda t: (1.2 * t - 0.6, 0.0, 0.0), frames=4)
     views = view_set.in_time_order(capture)
-    pictures = dense_flow.leveled(views)
+    images = dense_flow.leveled(views)
     height, width = views.gray.shape[1:]
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     shares = []
     for span in (None, view_set.depth_span(capture, views)):
-        flow = dense_flow.between_neighbors(views, pictures, span)
+        flow = dense_flow.between_neighbors(views, images, span)
         far_off = []
         for frame, depth in enumerate(capture.depths[:-1]):
             step = (views.position[frame] - views.position[frame + 1])[:2]
@@ -159,16 +159,16 @@ def test_wide_steps_are_found_from_where_a_still_scene_would_be():
 
 
 def test_points_are_aligned_with_where_they_began():
-    picture = 255 * films.texture(3).mean(-1)
-    pictures = np.stack([nd.shift(picture, (0.0, k))[:80, 20:140] for k in (0, 3.3)])
-    pictures = np.rint(np.clip(pictures, 0, 255)).astype(np.uint8)
+    image = 255 * films.texture(3).mean(-1)
+    images = np.stack([nd.shift(image, (0.0, k))[:80, 20:140] for k in (0, 3.3)])
+    images = np.rint(np.clip(images, 0, 255)).astype(np.uint8)
     pixel = np.float32([[[30, 40], [34, 40]], [[60, 20], [62.8, 20.3]]])
     drifted = Tracks(np.zeros(2, int), pixel, np.ones((2, 2), bool))
-    aligned = tracks.realigned(drifted, pictures, (120, 80))
+    aligned = tracks.realigned(drifted, images, (120, 80))
     assert aligned.seen.all()
     np.testing.assert_allclose(aligned.pixel[:, 1], [[33.3, 40], [63.3, 20]], atol=0.05)
     lost = drifted._replace(pixel=pixel + np.float32([[0, 0], [9, 9]]))
-    assert not tracks.realigned(lost, pictures, (120, 80)).seen[:, 1].any()
+    assert not tracks.realigned(lost, images, (120, 80)).seen[:, 1].any()
 
 
 def test_points_at_rest_are_found_and_what_moves_misses(monkeypatch):
@@ -211,7 +211,7 @@ def test_what_moves_is_marked_and_little_else():
 def test_what_moves_looks_unlike_the_wall_behind_it_and_the_wall_like_itself(light):
     capture = films.film(**MOVES, gain=light, frames=24)
     views = view_set.in_time_order(capture)
-    odds = still_pictures.log_odds(views, capture.points)
+    odds = photo_consistency.log_odds(views, capture.points)
     inner = np.zeros_like(capture.moving)
     inner[:, 4:-4, 4:-4] = True
     card, wall = (
@@ -223,7 +223,7 @@ def test_what_moves_looks_unlike_the_wall_behind_it_and_the_wall_like_itself(lig
     beside = wall & nd.binary_dilation(capture.moving, np.ones((1, 9, 9)))
     assert (odds[beside] < 0).mean() > 0.9  # next to the edge colors mix
     none = PointCloud(capture.points.position[:0], capture.points.color[:0])
-    assert not still_pictures.log_odds(views, none).any()
+    assert not photo_consistency.log_odds(views, none).any()
 
 
 def test_smaller_views_show_the_same_points_in_larger_pixels():

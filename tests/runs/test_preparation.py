@@ -31,19 +31,19 @@ from tests.capture import test_colmap as models
 def mapper(monkeypatch):
     """COLMAP, which here writes a model by hand; its `calls`, each with its masks.
 
-    Where it `fails`, the second call places three pictures fewer.
+    Where it `fails`, the second call places three photographs fewer.
     """
     calls, kept = [], []
 
-    def run_sfm(pictures, out, masks, spec, *, groups, features):
+    def run_sfm(photographs, out, masks, spec, *, groups, features):
         kept.append((groups, features))
-        names = sorted(path.name for path in pictures.iterdir())
+        names = sorted(path.name for path in photographs.iterdir())
         models.make(out, count=len(names))
         text = (out / "sparse/0/images.txt").read_text()
         for row, name in enumerate(names):
             text = text.replace(f"f_{row:03d}.png", name)
             (out / f"images/f_{row:03d}.png").unlink()
-            (out / "images" / name).write_bytes((pictures / name).read_bytes())
+            (out / "images" / name).write_bytes((photographs / name).read_bytes())
         (out / "sparse/0/images.txt").write_text(text)
         black = None
         if masks is not None:
@@ -60,7 +60,7 @@ def mapper(monkeypatch):
 
 @pytest.fixture
 def moving(monkeypatch):
-    """What is taken to move: a corner in the third picture."""
+    """What is taken to move: a corner in the third image."""
     moving = np.zeros((9, 16, 24), bool)
     moving[2, 10:, 15:] = True
     monkeypatch.setattr(movers, "masks_of", lambda capture: moving)
@@ -68,19 +68,19 @@ def moving(monkeypatch):
 
 
 @pytest.fixture
-def pictures(tmp_path):
+def photographs(tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()
     for row in range(9):
-        images.write_png(folder / f"p{row}.png", models.picture(row))
+        images.write_png(folder / f"p{row}.png", models.image(row))
     return folder
 
 
 def test_the_second_pass_goes_without_what_the_first_saw_move(
-    pictures, tmp_path, mapper, moving
+    photographs, tmp_path, mapper, moving
 ):
     how = Preparation(camera_model="RADIAL", matcher="exhaustive", threads=1)
-    capture = preparation.prepare(pictures, tmp_path / "out", how)
+    capture = preparation.prepare(photographs, tmp_path / "out", how)
     (spec, black), (second, masked) = mapper.calls
     assert black is None
     assert (spec.least_scale, second.least_scale) == (COARSE_PX, 0)
@@ -128,31 +128,31 @@ def test_masks_are_of_every_frame_and_of_its_size(monkeypatch):
     assert movers.masks_of(capture) is None
 
 
-def test_a_second_pass_that_loses_pictures_is_not_taken(
-    pictures, tmp_path, mapper, moving
+def test_a_second_pass_that_loses_images_is_not_taken(
+    photographs, tmp_path, mapper, moving
 ):
     del moving
     mapper.fails, log = True, []
-    preparation.prepare(pictures, tmp_path / "out", tell=log.append)
+    preparation.prepare(photographs, tmp_path / "out", tell=log.append)
     assert any("registered only 6 of the 9 images" in line for line in log)
     assert not (tmp_path / "out/masks_found").exists()
 
 
 def test_where_too_few_are_placed_what_moves_is_masked_before(
-    pictures, tmp_path, mapper, monkeypatch
+    photographs, tmp_path, mapper, monkeypatch
 ):
     moves = {f"p{row}.png": np.zeros((16, 24), bool) for row in range(9)}
     moves["p2.png"][10:, 15:] = True
     monkeypatch.setattr(masks_without_cameras, "moving_in", lambda folder: moves)
 
-    def too_few_unmasked(pictures, out, masks, spec, **rest):
+    def too_few_unmasked(photographs, out, masks, spec, **rest):
         if masks is None and spec.at_least > 0:
-            raise FewPlaced(f"{pictures}: only 1 of 9 images could be registered", 1)
-        return mapper(pictures, out, masks, spec, **rest)
+            raise FewPlaced(f"{photographs}: only 1 of 9 images could be registered", 1)
+        return mapper(photographs, out, masks, spec, **rest)
 
     monkeypatch.setattr(preparation, "run_sfm", too_few_unmasked)
     log = []
-    preparation.prepare(pictures, tmp_path / "out", tell=log.append)
+    preparation.prepare(photographs, tmp_path / "out", tell=log.append)
     ((_, black),) = mapper.calls
     assert [mask.any() for mask in black] == [row == 2 for row in range(9)]
     shown = mask_files.read_mask(tmp_path / "out/masks_found/p2.png")
@@ -161,11 +161,11 @@ def test_where_too_few_are_placed_what_moves_is_masked_before(
     moves["p2.png"][:] = False  # nothing to leave out: the first reason is told
     for how in (Preparation(), Preparation(passes=1)):
         with pytest.raises(CaptureError, match="only 1 of 9"):
-            preparation.prepare(pictures, tmp_path / "again", how)
+            preparation.prepare(photographs, tmp_path / "again", how)
     # A piece of the images is used on request.
     for row, passes in enumerate((1, 2)):
         how = Preparation(passes=passes, piece=True)
-        preparation.prepare(pictures, tmp_path / f"piece{row}", how)
+        preparation.prepare(photographs, tmp_path / f"piece{row}", how)
     assert [black is None for _, black in mapper.calls] == [False, True, True]
 
 
@@ -182,8 +182,8 @@ def test_photographs_of_several_cameras_have_a_camera_each(
         if name:
             exif[0x0110] = name
             exif.get_ifd(0x8769)[0xA405] = focal
-        picture = PIL.Image.fromarray(models.picture(row))
-        picture.save(folder / f"p{row}.png", exif=exif)
+        image = PIL.Image.fromarray(models.image(row))
+        image.save(folder / f"p{row}.png", exif=exif)
     preparation.prepare(folder, tmp_path / "auto")
     groups, _ = mapper.kept[0]
     assert [(group.names[0], group.focal) for group in groups] == [
@@ -200,53 +200,53 @@ def test_photographs_of_several_cameras_have_a_camera_each(
     assert len(mapper.kept[-1][0]) == 1
 
 
-def test_given_masks_take_one_pass_and_are_kept(pictures, tmp_path, mapper):
+def test_given_masks_take_one_pass_and_are_kept(photographs, tmp_path, mapper):
     (tmp_path / "masks").mkdir()
     for row in range(9):
         mask = np.ones((16, 24), bool)
         mask[:, : row + 1] = False
         images.write_png(tmp_path / f"masks/p{row}.png", mask)
     how = Preparation(masks=tmp_path / "masks")
-    preparation.prepare(pictures, tmp_path / "out", how)
+    preparation.prepare(photographs, tmp_path / "out", how)
     ((_, black),) = mapper.calls
     assert [mask[0].sum() for mask in black] == list(range(1, 10))
     np.testing.assert_array_equal(room.load(tmp_path / "out").moving, black)
 
 
-def test_other_masks_make_another_capture_and_what_is_no_picture_does_not(
-    pictures, tmp_path, mapper
+def test_other_masks_make_another_capture_and_what_is_no_image_does_not(
+    photographs, tmp_path, mapper
 ):
     (tmp_path / "masks").mkdir()
     mask = np.ones((16, 24), bool)
     for row in range(9):
         images.write_png(tmp_path / f"masks/p{row}.png", mask)
     how = Preparation(masks=tmp_path / "masks")
-    preparation.prepared(pictures, tmp_path / "out", how)
-    for folder in (pictures, tmp_path / "masks"):
+    preparation.prepared(photographs, tmp_path / "out", how)
+    for folder in (photographs, tmp_path / "masks"):
         for name in (".DS_Store", "Thumbs.db", "._p0.png"):
             (folder / name).write_bytes(b"of a file manager")
     log = []
-    preparation.prepared(pictures, tmp_path / "out", how, log.append)
+    preparation.prepared(photographs, tmp_path / "out", how, log.append)
     assert "has already been converted" in log[0]
     assert len(mapper.calls) == 1
     mask[3:5] = False
     images.write_png(tmp_path / "masks/p4.png", mask)
     with pytest.raises(ValueError, match=r"\(masks differ\)"):
-        preparation.prepared(pictures, tmp_path / "out", how)
+        preparation.prepared(photographs, tmp_path / "out", how)
     gone = Preparation(masks=tmp_path / "gone")
     with pytest.raises(CaptureError, match="gone: no such folder of masks"):
-        preparation.prepared(pictures, tmp_path / "out", gone)
+        preparation.prepared(photographs, tmp_path / "out", gone)
     # One made before masks were looked at has had none.
-    preparation.prepared(pictures, tmp_path / "without")
+    preparation.prepared(photographs, tmp_path / "without")
     record = json.loads((tmp_path / "without/prepared.json").read_text())
     del record["masks"]
     (tmp_path / "without/prepared.json").write_text(json.dumps(record))
-    preparation.prepared(pictures, tmp_path / "without")
+    preparation.prepared(photographs, tmp_path / "without")
 
 
 def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monkeypatch):
     monkeypatch.setattr(movers, "masks_of", lambda capture: None)
-    frames = [models.picture(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
+    frames = [models.image(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
     video.write_video(tmp_path / "clip.mp4", frames, 30)
     config = RunConfig(source=CaptureSource(tmp_path / "clip.mp4", heldout="4"))
     how = Preparation(frames=9, max_side=24)
@@ -273,16 +273,16 @@ def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monke
         reconstruction._with_cameras(config, tmp_path / "run", other)
 
 
-def test_what_cannot_be_prepared_is_refused_and_leaves_nothing(pictures, tmp_path):
+def test_what_cannot_be_prepared_is_refused_and_leaves_nothing(photographs, tmp_path):
     with pytest.raises(CaptureError, match=r"nothing\.mp4: no such video"):
         preparation.prepare(tmp_path / "nothing.mp4", tmp_path / "out")
     with pytest.raises(CaptureError, match="neither a video"):
-        preparation.prepare(pictures / "p0.png", tmp_path / "out")
+        preparation.prepare(photographs / "p0.png", tmp_path / "out")
     with pytest.raises(ValueError, match="select frames of a video"):
-        preparation.prepare(pictures, tmp_path / "out", Preparation(frames=5))
+        preparation.prepare(photographs, tmp_path / "out", Preparation(frames=5))
     with pytest.raises(CaptureError, match="maskz: no such folder of masks"):
         preparation.prepare(
-            pictures, tmp_path / "out", Preparation(masks=tmp_path / "maskz")
+            photographs, tmp_path / "out", Preparation(masks=tmp_path / "maskz")
         )
     assert [path.name for path in tmp_path.iterdir()] == ["photographs"]
 
@@ -301,7 +301,7 @@ def test_wrong_settings_are_refused_before_a_film_is_read(wrong, words):
 
 
 def test_wrong_words_are_refused_before_cameras_are_looked_for(tmp_path, mapper):
-    frames = [models.picture(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
+    frames = [models.image(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
     video.write_video(tmp_path / "clip.mp4", frames, 30)
     source = CaptureSource(tmp_path / "clip.mp4")
     wrong = [RunConfig("nerf-smal", source), RunConfig("nerf", source, steps=0)]

@@ -54,13 +54,13 @@ class Page(html.parser.HTMLParser):
 
 
 @pytest.fixture
-def picture(tmp_path, rng):
+def image(tmp_path, rng):
     path = tmp_path / "heldout.png"
     panels.save(rng.integers(0, 256, (8, 9, 3), dtype=np.uint8), path)
     return path
 
 
-def test_the_page_holds_everything_and_fetches_nothing(tmp_path, picture):
+def test_the_page_holds_everything_and_fetches_nothing(tmp_path, image):
     film = tmp_path / "orbit.mp4"
     film.write_bytes(b"not really a film")
     video = report.Video(film, "The scene.", np.zeros((6, 8, 3), np.uint8))
@@ -69,7 +69,7 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path, picture):
         "a run",
         MEASURED,
         {"seed": 3, "spec": {"motion": {"width": 128}, "extras": {}}},
-        [report.Figure(picture, "held-out frames", "player.html")],
+        [report.Figure(image, "held-out frames", "player.html")],
         video,
         {"field": 30.0, "rasterizer": 10.0},
         ["LPIPS is not computed, because there are no weights"],
@@ -79,7 +79,7 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path, picture):
     shown, still = page.find("img")
     assert shown["alt"] == "held-out frames"
     assert (shown["width"], shown["height"]) == ("9", "8")
-    assert base64.b64decode(shown["src"].split(",")[1]) == picture.read_bytes()
+    assert base64.b64decode(shown["src"].split(",")[1]) == image.read_bytes()
     (played,) = page.find("video")
     assert base64.b64decode(played["src"].split(",")[1]) == film.read_bytes()
     # A printed page shows the poster in its place, and the name of the file.
@@ -124,14 +124,14 @@ def test_the_first_number_of_a_model_with_codes_is_of_fitted_ones(tmp_path):
     assert "PSNR, without fitting" in page.text[first:unfitted]
 
 
-def test_what_was_written_by_others_cannot_become_markup(tmp_path, picture):
+def test_what_was_written_by_others_cannot_become_markup(tmp_path, image):
     evil = '"><script>alert(1)</script>&'
     path = report.write(
         tmp_path,
         evil,
         [Metric(evil, 1.0, evil, "equal", 0.0)],
         {evil: evil},
-        [report.Figure(picture, evil)],
+        [report.Figure(image, evil)],
         notes=[evil],
         step_ms={evil: 1.0},
         commands=[report.Command(evil, evil)],
@@ -157,7 +157,7 @@ def test_an_empty_run_still_makes_a_page(tmp_path):
     assert page.text.split() == ["nothing", *report.STYLE.split(), "nothing"]
 
 
-def test_a_missing_picture_is_named_and_nothing_is_left(tmp_path):
+def test_a_missing_image_is_named_and_nothing_is_left(tmp_path):
     figure = report.Figure(tmp_path / "gone.png", "gone")
     with pytest.raises(CaptureError, match=r"gone\.png"):
         report.write(tmp_path, "a run", MEASURED, {}, [figure])
@@ -191,7 +191,7 @@ def test_values_read_as_a_person_writes_them(value, unit, words):
 
 @pytest.mark.parametrize("inside", [True, False])
 def test_no_path_of_the_machine_is_on_the_page(
-    inside, tmp_path, picture, monkeypatch, rng
+    inside, tmp_path, image, monkeypatch, rng
 ):
     """Settings, commands and notes name files by paths that can be followed."""
     folder = tmp_path / "runs" / "first run"
@@ -210,7 +210,7 @@ def test_no_path_of_the_machine_is_on_the_page(
         "a run",
         MEASURED,
         config,
-        [report.Figure(picture, f"From {picture}.")],
+        [report.Figure(image, f"From {image}.")],
         notes=[f"saved in {folder}/checkpoints", "OSError: '/usr/lib/libx.so'; 3 dB/s"],
         commands=[report.Command("Go on:", line) for line in lines],
     )

@@ -24,8 +24,8 @@ def address(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     (folder / "scene.mp4").write_bytes(b"not really a video")
     broad = np.zeros((90, report.WIDE_PX + 1, 3), np.uint8)
-    for name, picture in (("broad", broad), ("small", broad[:, :100])):
-        panels.save(picture, folder / f"{name}.png")
+    for name, image in (("broad", broad), ("small", broad[:, :100])):
+        panels.save(image, folder / f"{name}.png")
     path = report.write(
         folder,
         "a run with a name that is longer than a phone is wide",

@@ -19,7 +19,7 @@ from tests import scenes
 CAPTURE = scenes.tiny_capture()
 
 
-def with_pictures(change):
+def with_images(change):
     images = CAPTURE.images.copy()
     change(images)
     return dataclasses.replace(CAPTURE, images=images)
@@ -52,8 +52,8 @@ FOURTH = CAPTURE.ids[3]
 FOCAL = CAPTURE.cameras.focal_px * np.where(np.arange(len(CAPTURE.ids)) == 3, 1.01, 1)
 OTHERS = {
     f"images have changed (first at frame {FOURTH})": [
-        with_pictures(_of_another_frame),
-        with_pictures(_retouched),
+        with_images(_of_another_frame),
+        with_images(_retouched),
     ],
     f"camera focal_px have changed (first at frame {FOURTH})": [
         with_cameras(focal_px=FOCAL.astype(np.float32))
@@ -129,7 +129,7 @@ def test_a_capture_may_be_moved(begun):
 def test_another_capture_is_not_taken_for_a_moved_one(begun):
     source, folder = begun
     there = source.with_name("elsewhere")
-    nerfies_format.write(with_pictures(_retouched), there)
+    nerfies_format.write(with_images(_retouched), there)
     before = (folder / run_folder.CONFIG).read_bytes()
     with pytest.raises(runs.Refused, match="capture: saved"):  # the old one is there
         runs.resume(folder, expected={"capture": there})

@@ -90,10 +90,10 @@ def test_a_screen_draws_what_the_renderer_draws_and_without_effects(kind, monkey
     row = int(CAPTURE.train[0])
     first = Look(float(CAPTURE.times[row]), appearance=int(CAPTURE.appearance_ids[row]))
     eye = eye_of(row)
-    picture = whole(shown, state, eye, first, 1)
+    image = whole(shown, state, eye, first, 1)
     renderer = evaluation.Renderer(run.model, CAPTURE.size)
     expected = renderer(state, evaluation.view_of(CAPTURE, row)).color
-    difference = picture - 255.0 * expected.clip(0, 1)
+    difference = image - 255.0 * expected.clip(0, 1)
     # 8 bits round by half; the pose went through a quaternion
     assert np.abs(difference).mean() < 0.6
     assert shown.tile_seconds(first) > 0
@@ -105,7 +105,7 @@ def test_a_screen_draws_what_the_renderer_draws_and_without_effects(kind, monkey
         for look in (first, later)
     ]
     np.testing.assert_array_equal(*frozen)
-    assert (whole(shown, state, eye, later, 1) != picture).any()
+    assert (whole(shown, state, eye, later, 1) != image).any()
     # How far things moved since time 0: nothing at 0, something later. Tiles are
     # colored over the range of the coarse image before them.
     dark, bright = (
@@ -117,7 +117,7 @@ def test_a_screen_draws_what_the_renderer_draws_and_without_effects(kind, monkey
     fine = whole(shown, state, eye, Look(0.9, "motion"), 1)
     assert np.abs(fine[::2, ::2].astype(float) - bright).mean() < 40
     varied = whole(shown, state, eye, first._replace(appearance=1), 1)
-    assert (varied != picture).any() == (kind == "radiance")
+    assert (varied != image).any() == (kind == "radiance")
 
 
 class Browser:
@@ -131,7 +131,7 @@ class Browser:
             subprotocols=[f"viser-v{viser.__version__}"],
             max_size=None,
         )
-        self.picture, self.splats, self.visible = None, None, False
+        self.image, self.splats, self.visible = None, None, False
 
     def close(self):
         self._socket.close()
@@ -181,8 +181,8 @@ class Browser:
 
     def _take(self, message, buffers):
         if message.get("rgb_data"):
-            picture = PIL.Image.open(io.BytesIO(message["rgb_data"]))
-            self.picture = np.asarray(picture)
+            image = PIL.Image.open(io.BytesIO(message["rgb_data"]))
+            self.image = np.asarray(image)
         updates = message.get("props") or message.get("updates") or {}
         buffer = updates.get("buffer")
         if isinstance(buffer, dict):
@@ -238,7 +238,7 @@ def test_a_browser_gets_gaussians_that_follow_time_effects_and_the_channel(tmp_p
         np.testing.assert_allclose(first * unit, cloud.centers, rtol=1e-5, atol=1e-6)
         assert len(first) == len(cloud.centers)
         # What is behind them is one color.
-        assert browser.picture.shape == (8, 8, 3)
+        assert browser.image.shape == (8, 8, 3)
         browser.press(page, "time", 0.9)
         until(lambda: (browser.positions() != first).any())
         browser.press(page, "motion", False)
@@ -254,12 +254,12 @@ def test_a_browser_gets_gaussians_that_follow_time_effects_and_the_channel(tmp_p
         told, tell = [], page._windows[0]._show_text
         page._windows[0]._show_text = lambda text: told.append(text) or tell(text)
         browser.press(page, "show", "depth")
-        until(lambda: browser.picture is not None and browser.picture.shape[1] == 160)
+        until(lambda: browser.image is not None and browser.image.shape[1] == 160)
         assert told[0].startswith("Compiling")
         assert told[-1].startswith("160x120")
         assert not page._windows[0]._splats.visible
         browser.press(page, "show", "color")
-        until(lambda: browser.picture.shape == (8, 8, 3))
+        until(lambda: browser.image.shape == (8, 8, 3))
         assert page._windows[0]._splats.visible
 
 
@@ -300,9 +300,9 @@ def test_images_of_a_field_reach_full_size_however_slow_they_are(tmp_path, monke
     with opened(tmp_path, "radiance") as (page, browser, until, run, state):
         assert run.representation.products.splatting is None
         browser.look(eye_of(row))
-        until(lambda: browser.picture is not None)
-        assert browser.picture.shape[1] < 160
-        until(lambda: browser.picture.shape[1] == 160)
+        until(lambda: browser.image is not None)
+        assert browser.image.shape[1] < 160
+        until(lambda: browser.image.shape[1] == 160)
         until(lambda: not page._update(state, 0))
         browser.receive(0.2)
         view = evaluation.resized(
@@ -310,7 +310,7 @@ def test_images_of_a_field_reach_full_size_however_slow_they_are(tmp_path, monke
         )
         expected = evaluation.Renderer(run.model, (160, 120))(state, view).color
         # JPEG of quality 90
-        assert np.abs(browser.picture - 255.0 * expected.clip(0, 1)).mean() < 4
+        assert np.abs(browser.image - 255.0 * expected.clip(0, 1)).mean() < 4
 
 
 @pytest.mark.slow

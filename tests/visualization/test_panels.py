@@ -1,4 +1,4 @@
-"""Pictures that mean what they show: colors decoded by hand, sizes, hard inputs."""
+"""Images that mean what they show: colors decoded by hand, sizes, hard inputs."""
 
 import sys
 
@@ -27,16 +27,16 @@ def test_depth_is_bright_near_and_dark_far_over_one_range():
         ((1, 0, 0), 128),
         ((1, 0, 1), 0),
     ):
-        np.testing.assert_array_equal(colored.picture[at], mapped("viridis", index))
+        np.testing.assert_array_equal(colored.image[at], mapped("viridis", index))
 
 
 @pytest.mark.hard_cases
-def test_one_stray_depth_does_not_flatten_the_picture(rng):
+def test_one_stray_depth_does_not_flatten_the_image(rng):
     depth = rng.uniform(2, 4, (3, 40, 40))
     depth[0, 0, 0] = 1e6
     colored = panels.color_depth(depth)
     assert 2 <= colored.low < colored.high <= 4
-    np.testing.assert_array_equal(colored.picture[0, 0, 0], mapped("viridis", 0))
+    np.testing.assert_array_equal(colored.image[0, 0, 0], mapped("viridis", 0))
 
 
 @pytest.mark.hard_cases
@@ -46,31 +46,31 @@ def test_unknown_depth_is_gray_and_a_flat_one_has_one_color(unknown):
     depth[1, 2] = unknown
     known = np.ones((4, 5), bool)
     known[3, 3] = False
-    picture = panels.color_depth(depth, known).picture
-    assert tuple(picture[1, 2]) == tuple(picture[3, 3]) == GRAY
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 2
-    nothing = panels.color_depth(np.full((4, 5), unknown)).picture
+    image = panels.color_depth(depth, known).image
+    assert tuple(image[1, 2]) == tuple(image[3, 3]) == GRAY
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) == 2
+    nothing = panels.color_depth(np.full((4, 5), unknown)).image
     assert np.all(nothing == 128)
 
 
 def test_error_is_linear_up_to_its_largest():
     truth = np.zeros((1, 4, 3), np.uint8)
     render = np.array([[[0, 0, 0], [0.3, 0, 0], [0.2, 0.2, 0.2], [1, np.nan, 0]]])
-    picture = panels.color_error(render, truth, largest=0.2).picture[0]
+    image = panels.color_error(render, truth, largest=0.2).image[0]
     for column, index in ((0, 0), (1, 128), (2, 255)):
-        np.testing.assert_array_equal(picture[column], mapped("inferno", index))
-    assert tuple(picture[3]) == GRAY
+        np.testing.assert_array_equal(image[column], mapped("inferno", index))
+    assert tuple(image[3]) == GRAY
     with pytest.raises(ValueError, match="largest=0 must be positive"):
         panels.color_error(render, truth, 0)
 
 
 def test_flow_is_white_at_rest_and_hue_tells_the_direction():
     flow = np.array([[[0, 0], [4, 0], [-9, 0], [2, 0], [np.nan, 0]]], float)
-    picture = panels.color_flow(flow, largest=4.0).picture[0]
+    image = panels.color_flow(flow, largest=4.0).image[0]
     expected = [(255, 255, 255), (255, 0, 0), (0, 255, 255), (255, 128, 128), GRAY]
-    np.testing.assert_array_equal(picture, expected)
+    np.testing.assert_array_equal(image, expected)
     still = panels.color_flow(np.zeros((2, 3, 2)))
-    assert np.all(still.picture == 255)
+    assert np.all(still.image == 255)
     assert panels.color_flow(np.full((2, 3, 2), np.nan)).high == 1
 
 
@@ -78,26 +78,26 @@ def test_a_comparison_holds_every_panel_unchanged(rng):
     truth = rng.integers(0, 256, (2, 30, 240, 3), dtype=np.uint8)
     render = rng.random((2, 30, 240, 3))
     depth = rng.uniform(1, 2, (2, 30, 240))
-    picture = panels.comparison(truth, render, depth, ["frame 3", "frame 9"])
+    image = panels.comparison(truth, render, depth, ["frame 3", "frame 9"])
     gap, text = panels.GAP, panels.TEXT_HEIGHT
     top = gap + 2 * (text + gap)
     for row in range(2):
-        panel = picture[top : top + 30]
+        panel = image[top : top + 30]
         np.testing.assert_array_equal(panel[:, gap : gap + 240], truth[row])
         second = panel[:, 2 * gap + 240 : 2 * gap + 480]
         np.testing.assert_array_equal(second, panels.as_bytes(render[row]))
         top += 30 + gap + text + gap
     # Titles and captions are written, and differ.
-    strips = [picture[gap + i * (text + gap) :][:text, :300] for i in range(2)]
+    strips = [image[gap + i * (text + gap) :][:text, :300] for i in range(2)]
     assert all(strip.min() < 128 for strip in strips)
     assert not np.array_equal(*strips)
 
 
 def test_small_frames_are_enlarged_by_whole_pixels(rng):
     truth = rng.integers(0, 256, (1, 5, 100, 3), dtype=np.uint8)
-    picture = panels.comparison(truth, truth, np.ones((1, 5, 100)), ["one"])
+    image = panels.comparison(truth, truth, np.ones((1, 5, 100)), ["one"])
     gap, text = panels.GAP, panels.TEXT_HEIGHT
-    panel = picture[gap + 2 * (text + gap) :][: 3 * 5, gap : gap + 3 * 100]
+    panel = image[gap + 2 * (text + gap) :][: 3 * 5, gap : gap + 3 * 100]
     np.testing.assert_array_equal(panel, truth[0].repeat(3, 0).repeat(3, 1))
 
 
@@ -121,7 +121,7 @@ def test_a_contact_sheet_fills_rows_and_leaves_paper(rng):
         panels.contact_sheet(cells, ["a"])
 
 
-def test_the_curve_is_a_picture_with_a_line_for_each_history(tmp_path):
+def test_the_curve_is_an_image_with_a_line_for_each_history(tmp_path):
     path = tmp_path / "psnr.png"
     one = panels.History([0, 1, 2], [20, np.nan, 25])
     panels.curve({"one": one}, path)
@@ -149,9 +149,9 @@ def test_drawing_leaves_no_figure_behind(tmp_path):
 def test_colors_are_matplotlibs_and_only_the_curve_needs_it(tmp_path, monkeypatch):
     ramp = np.linspace(0, 1, 256)[None]
     truth = np.zeros((1, 256, 3))
-    error = panels.color_error(truth + ramp[..., None], truth, 1.0).picture
+    error = panels.color_error(truth + ramp[..., None], truth, 1.0).image
     np.testing.assert_array_equal(error[0], [mapped("inferno", i) for i in range(256)])
-    depth = panels.color_depth(2 - ramp, limits=(1.0, 2.0)).picture
+    depth = panels.color_depth(2 - ramp, limits=(1.0, 2.0)).image
     np.testing.assert_array_equal(depth[0], [mapped("viridis", i) for i in range(256)])
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(extras.MissingExtra, match=r"matplotlib.*nerfies-jax\[report\]"):
@@ -159,6 +159,6 @@ def test_colors_are_matplotlibs_and_only_the_curve_needs_it(tmp_path, monkeypatc
 
 
 def test_saving_keeps_the_pixels(tmp_path, rng):
-    picture = rng.integers(0, 256, (7, 9, 3), dtype=np.uint8)
-    panels.save(picture, tmp_path / "p.png")
-    np.testing.assert_array_equal(skimage.io.imread(tmp_path / "p.png"), picture)
+    image = rng.integers(0, 256, (7, 9, 3), dtype=np.uint8)
+    panels.save(image, tmp_path / "p.png")
+    np.testing.assert_array_equal(skimage.io.imread(tmp_path / "p.png"), image)

@@ -36,11 +36,11 @@ MEASURES = {
 
 
 def pair(kind, height=37, width=29):
-    """Pictures of that type, their float32 copies, a mask of over 256 pixels."""
+    """Images of that type, their float32 copies, a mask of over 256 pixels."""
     rng = np.random.default_rng(0)
     image = rng.random((height, width, 3))
     target = np.clip(image + 0.1 * rng.normal(size=image.shape), 0, 1)
-    half = tuple(picture.astype(jnp.dtype(kind)) for picture in (image, target))
+    half = tuple(x.astype(jnp.dtype(kind)) for x in (image, target))
     wide = tuple(x.astype(np.float32) for x in half)
     return half, wide, rng.random((height, width)) < 0.6
 
@@ -59,7 +59,7 @@ def every_measure(image, target, mask):
 
 
 @pytest.mark.full
-def test_losses_of_bfloat16_pictures_are_those_of_their_float32_copies():
+def test_losses_of_bfloat16_images_are_those_of_their_float32_copies():
     """Counted and summed as they are, a masked mean was 1.7 times too large."""
     half, wide, mask = pair("bfloat16")
     exact = every_slope(*wide, mask)
@@ -75,8 +75,8 @@ def test_losses_of_bfloat16_pictures_are_those_of_their_float32_copies():
 
 
 @pytest.mark.full
-def test_measures_of_half_precision_pictures_are_those_of_float32():
-    """In bfloat16, and of a float32 render beside a bfloat16 picture."""
+def test_measures_of_half_precision_images_are_those_of_float32():
+    """In bfloat16, and of a float32 render beside a bfloat16 image."""
     half, wide, mask = pair("bfloat16")
     exact = every_measure(*wide, mask)
     for both in (half, (wide[0], half[1])):
@@ -85,7 +85,7 @@ def test_measures_of_half_precision_pictures_are_those_of_float32():
             assert abs(value - exact[name]) <= 1e-6 * abs(exact[name]), name
 
 
-def test_a_float16_picture_may_have_more_pixels_than_float16_counts():
+def test_a_float16_image_may_have_more_pixels_than_float16_counts():
     """70 000 pixels were infinitely many: a mean of 0, and 100 dB."""
     half = np.zeros((700, 100, 1), np.float16), np.ones((700, 100, 1), np.float16)
     mask = np.ones((700, 100), bool)

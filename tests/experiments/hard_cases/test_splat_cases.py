@@ -104,7 +104,7 @@ def test_the_clamped_tangent_is_continuous_and_its_slope_is_the_clamped_one(
 
 
 def pixel(alphas, values, spec):
-    """Composite at the only pixel of a picture, Gaussians too wide to fall off."""
+    """Composite at the only pixel of an image, Gaussians too wide to fall off."""
     count, dtype = alphas.shape[0], alphas.dtype
     footprints = Footprints(
         mean_px=jnp.full((count, 2), 0.5, dtype),

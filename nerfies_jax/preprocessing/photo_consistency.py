@@ -84,7 +84,7 @@ def _depth(views, frame, position):
     width, height = views.size
     columns, rows = -(-width // CELL), -(-height // CELL)
     pixel, depth = view_set.project(views, frame, position)
-    inside = view_set.in_picture(views, pixel, depth, 0.0)
+    inside = view_set.in_image(views, pixel, depth, 0.0)
     if not inside.any():
         return None
     column, row = (pixel[inside] / CELL).astype(int).T
