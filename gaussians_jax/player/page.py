@@ -190,7 +190,7 @@ def _about(instants, packed, capture):
     return (
         f"{count:,} Gaussians, {packing.moving_rows(packed):,} of them moving, at "
         f"{len(instants.mean)} times. {instants.left_out:,} that no camera saw are "
-        f"left out. One unit is {1 / capture.scale:.3g} world units of the capture."
+        f"left out. One scene unit is {1 / capture.scale:.3g} of the capture's."
     )
 
 

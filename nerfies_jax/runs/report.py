@@ -198,8 +198,15 @@ def _headlines(metrics):
 
 
 def _notes(notes):
-    items = "".join(f"<li>{_safe(note[:1].upper() + note[1:])}</li>" for note in notes)
+    items = "".join(f"<li>{_safe(_sentence(note))}</li>" for note in notes)
     return f'<ul class="notes">{items}</ul>' if items else ""
+
+
+def _sentence(note):
+    """Capitalize a note, unless it begins with a path or a setting."""
+    word = note.partition(" ")[0].rstrip(".,:")
+    is_name = any(mark in word for mark in "./=_")
+    return note if is_name else note[:1].upper() + note[1:]
 
 
 def _figure(figure):

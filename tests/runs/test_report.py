@@ -273,3 +273,16 @@ def test_every_metric_has_a_name_and_a_sentence():
     assert metric("train.steps", 7).direction == "equal"
     with pytest.raises(ValueError, match=r"tracks\.size: not in metric_table"):
         metric("tracks.size", 1)
+
+
+@pytest.mark.parametrize(
+    ("note", "expected"),
+    [
+        ("completed 20 steps", "Completed 20 steps"),
+        ("gaussians.ply holds the Gaussians", "gaussians.ply holds the Gaussians"),
+        ("./checkpoints: full", "./checkpoints: full"),
+    ],
+)
+def test_a_note_begins_in_upper_case_unless_with_a_name(note, expected, tmp_path):
+    path = report.write(tmp_path, "title", (), {}, notes=(note,))
+    assert expected in Page(path).words
