@@ -39,7 +39,7 @@ BOX_SCALE, BOX_CENTER = 0.5, (0.2, -0.1, 2.0)
 def frames_and_batch(rng, dtype):
     """Four frames of one camera that moves, with depth and flow, and six rays."""
     width, height = SIZE
-    filmed = cameras.stack(
+    poses = cameras.stack(
         [
             cameras.look_at([0.1 * k, 0, -2.0], [0, 0, 2.0], [0, 1, 0], 9.0, SIZE)
             for k in range(MOMENTS)
@@ -57,8 +57,8 @@ def frames_and_batch(rng, dtype):
     depths = rng.uniform(2, 5, shape).astype(np.float32)
     frames = Frames(
         images=None,
-        cameras=jax.tree.map(lambda leaf: leaf.astype(dtype), filmed),
-        # the third is filmed a little late: moments are not even
+        cameras=jax.tree.map(lambda leaf: leaf.astype(dtype), poses),
+        # the third is observed a little late: moments are not even
         times=np.array(TIMES, dtype),
         appearance=np.arange(MOMENTS, dtype=np.int32),
         valid=None,
@@ -70,12 +70,12 @@ def frames_and_batch(rng, dtype):
     offset = (pixel - np.array(SIZE) / 2) / 9.0
     inside = np.concatenate([offset, np.ones((RAYS, 1))], 1)
     cosine = 1 / np.linalg.norm(inside, axis=1)
-    turn = filmed.camera_from_world[row]
+    turn = poses.camera_from_world[row]
     direction = np.einsum("rki,rk->ri", turn, inside) * cosine[:, None]
     batch = Batch(
         row=row,
         pixel=pixel.astype(dtype),
-        origin=filmed.position[row].astype(dtype),
+        origin=poses.position[row].astype(dtype),
         direction=direction.astype(dtype),
         cosine=cosine.astype(dtype),
         color=rng.uniform(size=(RAYS, 3)).astype(dtype),

@@ -26,7 +26,7 @@ from nerfies_jax.fields.template import TemplateSpec
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.scene import scene as nerf_scene
 
-TINY_FILM = dataclasses.replace(
+TINY_SCENE = dataclasses.replace(
     synthetic.DEFAULT, size=(40, 30), frames=6, supersampling=1, points=200, tracks=8
 )
 TINY_MOTION = MotionSpec(
@@ -95,7 +95,7 @@ TINY_FIELD = RadianceScene(
 @functools.cache
 def tiny_scene():
     """`tiny_capture`, and what only the scene knows."""
-    return synthetic.make(TINY_FILM)
+    return synthetic.make(TINY_SCENE)
 
 
 def tiny_capture():
@@ -123,7 +123,7 @@ def tiny_field():
 
 @functools.cache
 def tiny_tracks():
-    """A film of which half is held out, its truth and five tracks through it."""
-    film = dataclasses.replace(TINY_FILM, heldout_every=2)
-    capture, truth = synthetic.make(film)
+    """A capture of which half is held out, its truth and five tracks through it."""
+    spec = dataclasses.replace(TINY_SCENE, heldout_every=2)
+    capture, truth = synthetic.make(spec)
     return capture, truth, protocol.ground_truth(capture, truth, 2, 5)

@@ -34,7 +34,7 @@ def page(tmp_path, monkeypatch):
     names = ("Drift", "SlowMotion", "PruneUnseen", "Translation", "Phase", "Fog")
     source = (block for block in BLOCKS if any(f"class {n}:" in block for n in names))
     classes = (block[: re.search(r"^\w+ =", block, re.M).start()] for block in source)
-    text = "\n".join([BLOCKS[0].partition("\nfilm = ")[0], *classes])
+    text = "\n".join([BLOCKS[0].partition("\nscene = ")[0], *classes])
     (tmp_path / f"{MODULE}.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     return MODULE

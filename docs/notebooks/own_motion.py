@@ -70,11 +70,11 @@ class Swing:
 # %% [markdown]
 # ## A scene that moves
 #
-# A built-in scene, filmed small. Its truth is known, but nothing here needs that.
+# A built-in scene, at a small size. Its truth is known, but nothing here needs that.
 
 # %%
-film = dataclasses.replace(synthetic.PRESETS["default"], size=SIZE, frames=FRAMES)
-capture, _ = synthetic.make(film)
+scene = dataclasses.replace(synthetic.PRESETS["default"], size=SIZE, frames=FRAMES)
+capture, _ = synthetic.make(scene)
 frames = nj.frames_of(capture)
 spec = gj.with_steps(gj.PRESETS["splats-static-small"], STEPS)
 metadata = gj.metadata_of(capture)
@@ -176,7 +176,7 @@ plt.show()
 params = states["with swing"].params
 reach = np.linalg.norm(params.rows["swing"], axis=1)
 reach = reach[np.asarray(params.rows["splats"].opacity_logit) > -500]  # those in use
-print(f"{params.nets['swing']:.3f} cycles over the film")
+print(f"{params.nets['swing']:.3f} cycles over the video")
 print(f"reach: median {np.median(reach):.4f}, largest {reach.max():.4f} scene units")
 assert 0 < reach.max() < np.inf
 

@@ -36,13 +36,13 @@ from nerfies_jax.capture import synthetic, video
 from nerfies_jax.runs import preparation
 from nerfies_jax.runs.config import CaptureSource, Preparation, RunConfig
 
-CLIP = None  # a film of yours; None films the built-in scene
+CLIP = None  # a video of yours; None renders the built-in scene
 FRAMES = 24
 STEPS = 600
 PASSES = 2
 PRESET = "splats-deformable-small"
 MAX_SIDE = None  # of the images to learn from, pixels; None takes the capture's
-OUT = pathlib.Path(tempfile.mkdtemp(prefix="film-to-page-"))
+OUT = pathlib.Path(tempfile.mkdtemp(prefix="video-to-page-"))
 
 # %% [markdown]
 # ## A video
@@ -51,19 +51,19 @@ OUT = pathlib.Path(tempfile.mkdtemp(prefix="film-to-page-"))
 # of your own. The ground truth is only used to measure the error of the poses.
 
 # %%
-clip, filmed = CLIP, None
+clip, rendered = CLIP, None
 if clip is None:
-    film = dataclasses.replace(
+    scene = dataclasses.replace(
         synthetic.PRESETS["default"],
         size=(320, 240),
         frames=FRAMES,
         supersampling=1,
     )
-    filmed, _ = synthetic.make(film)
-    order = np.argsort(filmed.times, kind="stable")
-    order = order[filmed.camera_ids[order] == 0]
+    rendered, _ = synthetic.make(scene)
+    order = np.argsort(rendered.times, kind="stable")
+    order = order[rendered.camera_ids[order] == 0]
     clip = OUT / "clip.mp4"
-    video.write_video(clip, (filmed.images[row] for row in order), 12)
+    video.write_video(clip, (rendered.images[row] for row in order), 12)
 print(clip)
 
 # %% [markdown]
@@ -95,13 +95,13 @@ def path_error(found, true):
     return np.sqrt((off**2).sum() / (true**2).sum())
 
 
-if filmed is not None:
+if rendered is not None:
     placed = np.argsort(capture.times, kind="stable")
-    # Frames are named by their place in the film: those that were kept and placed.
+    # Frames are named by their place in the video: selected and registered ones.
     kept = order[np.round(capture.times[placed] * (len(order) - 1)).astype(int)]
     error = path_error(
         np.asarray(capture.cameras.position, float)[placed],
-        np.asarray(filmed.cameras.position, float)[kept],
+        np.asarray(rendered.cameras.position, float)[kept],
     )
     print(f"the path is off by {error:.1%} of its extent")
     assert error < 0.2

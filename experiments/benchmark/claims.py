@@ -117,7 +117,7 @@ def comparisons(league: Mapping[str, Any], notes: Mapping[str, str]) -> list[Row
     Returns:
       A row for each margin, with gains from tracks and from rest.
     """
-    contests = {one["film"]: one["rows"] for one in league["contests"]}
+    contests = {one["capture"]: one["rows"] for one in league["contests"]}
     contests = {capture: contests[capture] for capture in CAPTURES}
     rows = []
     for table in published.TABLES:
@@ -330,7 +330,7 @@ def _cost(league):
     """Format the published costs next to those of the small preset from tracks."""
     columns = []
     for capture in CAPTURES:
-        (contest,) = (one for one in league["contests"] if one["film"] == capture)
+        (contest,) = (one for one in league["contests"] if one["capture"] == capture)
         ours, others = (
             {
                 seed: cell["numbers"]

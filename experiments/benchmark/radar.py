@@ -75,7 +75,7 @@ def _known(scores: Mapping[str, Score]) -> Scores:
 
 def _measured(league, preset):
     """Mean scores of a preset over captures and seeds."""
-    contests = (one for one in league["contests"] if one["film"] in claims.CAPTURES)
+    contests = (one for one in league["contests"] if one["capture"] in claims.CAPTURES)
     cells = [
         cell["numbers"]
         for contest in contests

@@ -52,10 +52,10 @@ def kind_of(path: pathlib.Path) -> str | None:
       path: A file or folder.
 
     Returns:
-      "film" for a video, "images" for a folder with at least two images, or None.
+      "video" for a video, "images" for a folder with at least two images, or None.
     """
     if path.is_file() and path.suffix.lower() in VIDEOS:
-        return "film"
+        return "video"
     if path.is_dir() and len(images_in(path)) >= 2:
         return "images"
     return None
@@ -75,8 +75,8 @@ def images_in(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 @decoder.session()
-def from_film(
-    film: pathlib.Path,
+def from_video(
+    video: pathlib.Path,
     out: pathlib.Path,
     count: int | None = None,
     per_second: float | None = None,
@@ -88,7 +88,7 @@ def from_film(
     Names contain the time in milliseconds.
 
     Args:
-      film: The video.
+      video: The video.
       out: The folder to write to.
       count: Number of frames.
       per_second: Frames per second of video. At most one of the two can be given.
@@ -104,7 +104,7 @@ def from_film(
     """
     stored_times, sharpnesses = [], []
     with events.stage("decoding the video to find sharp frames") as stage:
-        for seconds, gray in read_video(film, gray=True, damaged="skip"):
+        for seconds, gray in read_video(video, gray=True, damaged="skip"):
             stored_times.append(seconds)
             sharpnesses.append(sharpness(gray))
             stage.advance(text=f"{len(stored_times):,} frames")
@@ -115,8 +115,8 @@ def from_film(
     # In a phone's video, one or two frames may share a time. In a video without times
     # all do.
     if len(np.unique(milliseconds)) < OWN_TIMES * len(milliseconds):
-        raise CaptureError(f"{film}: its frames have no times; encode it again")
-    count = _frame_count(film, times, count, per_second)
+        raise CaptureError(f"{video}: its frames have no times; encode it again")
+    count = _frame_count(video, times, count, per_second)
     selected, blurred = sharp_rows(scores, times, count)
     selected = selected[np.unique(milliseconds[selected], return_index=True)[1]]
     sources = None if masks is None else _masks_of_video(masks, len(times))
@@ -124,7 +124,7 @@ def from_film(
     if sources is not None:
         sources = {row: sources[row] for row in rows}
         encoding = mask_files.find_encoding([*sources.values()], "upright")
-    colors = read_video(film, rows=set(rows), damaged="skip")
+    colors = read_video(video, rows=set(rows), damaged="skip")
     with events.stage("writing frames of the video", len(rows)) as stage:
         for row, (_, frame) in zip(rows, colors, strict=True):
             factor = _factor(frame.shape[1::-1], max_side)
@@ -137,8 +137,8 @@ def from_film(
                 _write_mask(out, names[-1], mask, frame.shape, factor, source)
             stage.advance()
     notes = [f"{len(selected)} of {len(scores)} frames selected, {blurred} too blurred"]
-    notes += notes_of(film, len(scores), float(times[-1]))
-    transfer = transfer_of(film)
+    notes += notes_of(video, len(scores), float(times[-1]))
+    transfer = transfer_of(video)
     if transfer is not None:
         notes.append(f"video in high dynamic range ({transfer}), tone-mapped to sRGB")
     if sources is not None:

@@ -194,7 +194,7 @@ def canvas(capture: Capture) -> Canvas:
     return Canvas((width + left + right, height + top + bottom), left, top)
 
 
-def as_filmed(
+def as_observed(
     image: np.ndarray, camera: Camera, wide: Canvas, size: tuple[int, int]
 ) -> np.ndarray:
     """Distort a mask of undistorted pixels to those of a captured image.
@@ -217,41 +217,42 @@ def as_filmed(
     return inside & resampling.nearest(image, place)
 
 
-def scorable(filmed: Capture) -> Capture:
+def scorable(observed: Capture) -> Capture:
     """Mark the pixels of a distorted capture for which its lens model has a ray.
 
     The other pixels are no longer `valid`, and their depth is unknown.
 
     Args:
-      filmed: The capture.
+      observed: The capture.
 
     Returns:
       The capture with its masks and depth restricted, or the same one if the lens model
       has a ray for every pixel.
     """
-    if not has_lens(filmed.cameras):
-        return filmed
-    maps = Maps(_straight_pixels, filmed.size)
+    if not has_lens(observed.cameras):
+        return observed
+    maps = Maps(_straight_pixels, observed.size)
     each = [
-        maps.of(cameras.take(filmed.cameras, row))[1] for row in range(len(filmed.ids))
+        maps.of(cameras.take(observed.cameras, row))[1]
+        for row in range(len(observed.ids))
     ]
     if all(pixels.all() for pixels in each):
-        return filmed
-    scorable_pixels = frame_memory.allocate(filmed.images.shape[:3], np.bool_)
+        return observed
+    scorable_pixels = frame_memory.allocate(observed.images.shape[:3], np.bool_)
     np.stack(each, out=scorable_pixels)
     valid = scorable_pixels
-    if filmed.valid is not None:
+    if observed.valid is not None:
         valid = frame_memory.allocate(scorable_pixels.shape, np.bool_)
-        np.logical_and(filmed.valid, scorable_pixels, out=valid)
-    depths = filmed.depths
-    before = 1.0 if filmed.valid is None else filmed.valid.mean()
+        np.logical_and(observed.valid, scorable_pixels, out=valid)
+    depths = observed.depths
+    before = 1.0 if observed.valid is None else observed.valid.mean()
     if valid.mean() == before:
-        return filmed
+        return observed
     note = f"{before - valid.mean():.2%} of the pixels have no ray, and are not scored"
     return dataclasses.replace(
-        filmed,
+        observed,
         valid=valid,
-        notes=(*filmed.notes, note),
+        notes=(*observed.notes, note),
         depths=None
         if depths is None
         else np.where(scorable_pixels, depths, np.float32(0)),

@@ -34,8 +34,8 @@ def with_flow(capture: Capture) -> Capture:
             continue
         views = view_set.in_time_order(capture, mine)
         # Images with one timestamp are not a video and need no second search.
-        film = np.ptp(views.time) > 0
-        span = view_set.depth_span(capture, views) if film else None
+        is_video = np.ptp(views.time) > 0
+        span = view_set.depth_span(capture, views) if is_video else None
         images = dense_flow.leveled(views)
         neighbors = dense_flow.between_neighbors(views, images, span)
         flow.forward[views.row] = neighbors.forward

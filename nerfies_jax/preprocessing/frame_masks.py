@@ -52,7 +52,7 @@ def of_frames(evidence: Any, capture: Capture) -> np.ndarray:
     for row, mask in zip(evidence.row, evidence.moving, strict=True):
         full = enlarged(mask, evidence.factor, canvas.size)
         camera = cameras.take(capture.cameras, row)
-        moving[row] = pinholes.as_filmed(full, camera, canvas, capture.size)
+        moving[row] = pinholes.as_observed(full, camera, canvas, capture.size)
     return moving
 
 

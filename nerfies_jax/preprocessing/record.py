@@ -48,7 +48,7 @@ from nerfies_jax.preprocessing.watch import (
 )
 from nerfies_jax.runtime import console
 
-SHORTEST_FILM = 6  # minimum number of frames of a video
+SHORTEST_VIDEO = 6  # minimum number of frames of a video
 MOVES = 0.5  # score above which a track is considered as moving
 MOST_PATHS = 1500
 MOST_PIXELS = 16_000_000  # of all frames together, at 17 bytes each for their flow
@@ -101,8 +101,8 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     images = dense_flow.leveled(views)
     flow = taken.flow(given, views)
     # Images of one moment are no video: there is nothing to search twice for.
-    film = np.ptp(views.time) > 0
-    span = view_set.depth_span(capture, views) if film else None
+    is_video = np.ptp(views.time) > 0
+    span = view_set.depth_span(capture, views) if is_video else None
     is_computed = flow is None
     if flow is None:
         flow = _flow(views, images, span, watch)
@@ -271,7 +271,7 @@ def _factor(capture):
 
 def _unusable(views, flow):
     frames = len(views.row)
-    if frames < SHORTEST_FILM:
+    if frames < SHORTEST_VIDEO:
         return f"{frames} frames are too few for tracking"
     if np.ptp(views.time) == 0:
         return "all frames have the same time"

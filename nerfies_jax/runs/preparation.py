@@ -105,7 +105,7 @@ def prepare(
         )
     _check_masks(how)
     with scratch_folder(out) as scratch, _renaming_paths(scratch, source, out):
-        if kind == "film":
+        if kind == "video":
             tell(f"selecting sharp frames of {source}")
         source_images = _source_images(kind, source, scratch, how)
         for line in source_images.notes:
@@ -155,8 +155,8 @@ def _renaming_paths(scratch, source, out):
 
 
 def _source_images(kind, source, scratch, how) -> Taken:
-    if kind == "film":
-        return footage.from_film(
+    if kind == "video":
+        return footage.from_video(
             source, scratch, how.frames, how.fps, how.max_side, how.masks
         )
     return footage.from_images(source, scratch, how.max_side, how.masks)

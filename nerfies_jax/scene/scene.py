@@ -112,7 +112,7 @@ def _model(radiance, more):
         params = radiance.init(start_key)
         evidence = usable_paths.evidence_to_start_from(capture, spec.start)
         if evidence is not None:
-            paths = warp_fit.film_paths(radiance, capture, evidence)
+            paths = warp_fit.point_paths(radiance, capture, evidence)
             fit = warp_fit.fit_flow if spec.warp is None else warp_fit.fit
             params = fit(radiance, params, paths, start_key, spec.start).params
         return first_state(params, run_key)

@@ -38,7 +38,7 @@ STRETCH = 0.3
 LEAST_STRETCH = 1e-6  # squared; bounds the logarithm of collapsed directions
 
 
-class FilmPaths(NamedTuple):
+class PointPaths(NamedTuple):
     """Tracked points of a video, in units of the field."""
 
     time: Float[np.ndarray, " frames"]
@@ -65,7 +65,7 @@ class FlowFit(NamedTuple):
     last: float
 
 
-def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
+def point_paths(field: Field, capture, evidence: Evidence) -> PointPaths:
     """Convert paths and static points of preprocessing to units of the field.
 
     Args:
@@ -84,7 +84,7 @@ def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
         )
 
     position, valid, _ = usable_paths.known_paths(evidence)
-    return FilmPaths(
+    return PointPaths(
         capture.times[evidence.row].astype(np.float32),
         capture.appearance_ids[evidence.row],
         inside(np.where(valid[..., None], position, 0)),
@@ -96,7 +96,7 @@ def film_paths(field: Field, capture, evidence: Evidence) -> FilmPaths:
 def fit(
     field: Field,
     params: PyTree,
-    paths: FilmPaths,
+    paths: PointPaths,
     key: Key[Array, ""],
     start: TrackStartSpec,
 ) -> WarpFit:
@@ -149,7 +149,7 @@ def fit(
 def fit_flow(
     field: Field,
     params: PyTree,
-    paths: FilmPaths,
+    paths: PointPaths,
     key: Key[Array, ""],
     start: TrackStartSpec,
 ) -> FlowFit:

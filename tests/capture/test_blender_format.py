@@ -126,9 +126,9 @@ def test_times_that_are_missing(tmp_path):
     still = blender_format.read(make(tmp_path / "still", times=False))
     assert not still.times.any()
     assert any("static scene" in note for note in still.notes)
-    film = blender_format.read(make(tmp_path / "film", {"": 12}, times=False))
-    order = np.argsort([int(name.split("_")[-1]) for name in film.ids])
-    np.testing.assert_allclose(film.times[order], np.linspace(0, 1, 12), atol=1e-7)
+    video = blender_format.read(make(tmp_path / "video", {"": 12}, times=False))
+    order = np.argsort([int(name.split("_")[-1]) for name in video.ids])
+    np.testing.assert_allclose(video.times[order], np.linspace(0, 1, 12), atol=1e-7)
     make(tmp_path / "some")
     file = tmp_path / "some/transforms_train.json"
     table = json.loads(file.read_text())

@@ -20,7 +20,7 @@ SIZE = (24, 16)
 CENTER, SCALE = (100.0, -20.0, 3.0), 0.25
 
 
-def filmed(bent=True, frames=9):
+def hand_made(bent=True, frames=9):
     """A capture whose every number matters, off the origin of its world."""
     rng = np.random.default_rng(0)
     places = rng.normal(size=(frames, 3)) * 0.1 + [0.0, 0.0, -2.0]
@@ -85,7 +85,7 @@ def same_cameras(read, written, rows):
 
 @pytest.mark.parametrize("units", ["scene", "world"])
 def test_transforms_come_back_with_times_splits_masks_and_points(units, tmp_path):
-    capture = filmed("fisheye" if units == "world" else True)
+    capture = hand_made("fisheye" if units == "world" else True)
     transforms_writer.write(capture, tmp_path / "out", units)
     read = blender_format.read(tmp_path / "out")
     rows = np.concatenate([capture.train, capture.heldout])
@@ -114,7 +114,7 @@ def test_transforms_come_back_with_times_splits_masks_and_points(units, tmp_path
 @pytest.mark.parametrize("bent", [True, False, "fisheye"])
 def test_transforms_have_what_the_parser_of_nerfstudio_requires(bent, tmp_path):
     """Its rules as of 1.1, `nerfstudio/data/dataparsers/nerfstudio_dataparser.py`."""
-    capture = filmed(bent)
+    capture = hand_made(bent)
     transforms_writer.write(capture, tmp_path / "out")
     meta = json.loads((tmp_path / "out/transforms.json").read_text())
     model = {True: "OPENCV", False: "PINHOLE", "fisheye": "OPENCV_FISHEYE"}[bent]
@@ -135,7 +135,7 @@ def test_transforms_have_what_the_parser_of_nerfstudio_requires(bent, tmp_path):
 
 @pytest.mark.parametrize("bent", [True, False, "fisheye"])
 def test_a_colmap_model_comes_back_through_colmap(bent, tmp_path):
-    capture = filmed(bent, frames=20)
+    capture = hand_made(bent, frames=20)
     moving = np.zeros(capture.images.shape[:3], bool)
     moving[:, 5:9, 5:9] = True
     capture = dataclasses.replace(capture, moving=moving)
@@ -160,7 +160,7 @@ def test_a_colmap_model_comes_back_through_colmap(bent, tmp_path):
 
 def test_the_pixels_of_a_colmap_model_are_where_its_points_are_seen(tmp_path):
     """By hand, from the text: every pixel is the projection of the point it names."""
-    capture = filmed(False)
+    capture = hand_made(False)
     colmap_writer.write(capture, tmp_path / "out")
     model = tmp_path / "out" / "sparse" / "0"
     rows = {
@@ -209,5 +209,5 @@ def skewed(capture):
 )
 def test_what_a_format_has_no_place_for_is_refused(change, module, words, tmp_path):
     with pytest.raises(CaptureError, match=words):
-        module.write(change(filmed(frames=3)), tmp_path / "out")
+        module.write(change(hand_made(frames=3)), tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

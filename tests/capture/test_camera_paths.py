@@ -1,4 +1,4 @@
-"""Where the camera goes in a film."""
+"""Where the camera goes in a video."""
 
 import dataclasses
 
@@ -60,8 +60,8 @@ def test_every_path_looks_at_the_scene_with_proper_rotations(kind):
     assert path.position.shape == (5, 3)
     cameras.validate(path, capture.size)
     if kind != "captured":
-        filmed = cameras.take(capture.cameras, capture.train)
-        target = camera_paths.focus_point(filmed, capture.near, capture.far)
+        poses = cameras.take(capture.cameras, capture.train)
+        target = camera_paths.focus_point(poses, capture.near, capture.far)
         offset = target - path.position
         ahead = np.einsum("ni,ni->n", offset, path.camera_from_world[:, 2, :])
         np.testing.assert_allclose(ahead, np.linalg.norm(offset, axis=1), rtol=1e-4)
@@ -73,11 +73,11 @@ def test_a_camera_overhead_keeps_what_its_images_call_up(kind, tilt):
     """What is up lies along the view: no image may be undefined, or turn over."""
     place = np.array([0.0, -2 * np.sin(tilt), 2 * np.cos(tilt)])
     one = cameras.look_at(place, np.zeros(3), (0.0, 1.0, 0.0), 40.0, (40, 30))
-    filmed = cameras.stack([one] * 10)
+    poses = cameras.stack([one] * 10)
     capture = scenes.tiny_capture()
     capture = dataclasses.replace(
         capture,
-        cameras=cameras.take(filmed, np.zeros(len(capture.ids), int)),
+        cameras=cameras.take(poses, np.zeros(len(capture.ids), int)),
         up=(0.0, 0.0, 1.0),
     )
     path = camera_paths.path(kind, capture, 9)
@@ -87,15 +87,15 @@ def test_a_camera_overhead_keeps_what_its_images_call_up(kind, tilt):
         assert upward.min() > 0.9
 
 
-def test_sway_stays_within_the_filmed_span():
+def test_sway_stays_within_the_span_of_the_capture():
     capture = scenes.tiny_capture()
-    filmed = capture.cameras.position[capture.train]
+    places = capture.cameras.position[capture.train]
     swaying = camera_paths.path("sway", capture, 16).position
-    reach = np.abs(filmed - np.median(filmed, axis=0)).max() + 0.05
-    assert np.abs(swaying - np.median(filmed, axis=0)).max() < reach
+    reach = np.abs(places - np.median(places, axis=0)).max() + 0.05
+    assert np.abs(swaying - np.median(places, axis=0)).max() < reach
 
 
-def test_a_single_filming_position_still_sways_a_little():
+def test_a_single_camera_position_still_sways_a_little():
     capture = scenes.tiny_capture()
     still = np.broadcast_to(capture.cameras.position[:1], (len(capture.ids), 3)).copy()
     capture = dataclasses.replace(
@@ -122,7 +122,7 @@ def test_a_stabilized_path_keeps_a_walk_and_loses_its_shake():
     turn = scipy.spatial.transform.Rotation.from_rotvec(
         np.stack([0 * angle, angle, 0 * angle], axis=1)
     )
-    filmed = cameras.stack(
+    shaky = cameras.stack(
         [
             cameras.pinhole(rotation, place, 40.0, (40, 30))
             for rotation, place in zip(
@@ -132,7 +132,7 @@ def test_a_stabilized_path_keeps_a_walk_and_loses_its_shake():
             )
         ]
     )
-    path = camera_paths.smoothed(filmed, times, times)
+    path = camera_paths.smoothed(shaky, times, times)
     cameras.validate(path, (40, 30))
     # Ends included: a mean of what is around them would cut the walk short there.
     off = np.linalg.norm(path.position - walk, axis=1)
@@ -141,17 +141,17 @@ def test_a_stabilized_path_keeps_a_walk_and_loses_its_shake():
     smooth = scipy.spatial.transform.Rotation.from_matrix(path.camera_from_world)
     assert (smooth * turn.inv()).magnitude().mean() < 0.012
     steps = np.linalg.norm(np.diff(path.position, n=2, axis=0), axis=1)
-    shaken = np.linalg.norm(np.diff(filmed.position, n=2, axis=0), axis=1)
+    shaken = np.linalg.norm(np.diff(shaky.position, n=2, axis=0), axis=1)
     assert steps.mean() < 0.05 * shaken.mean()
 
 
-def test_a_path_along_the_film_is_there_when_the_film_was():
+def test_a_path_along_the_capture_is_there_when_the_capture_was():
     capture = scenes.tiny_capture()
-    filmed = np.sort(capture.times[capture.train])
-    captured = camera_paths.planned("captured", capture, len(filmed))
-    np.testing.assert_array_equal(captured.times, filmed)
+    times = np.sort(capture.times[capture.train])
+    captured = camera_paths.planned("captured", capture, len(times))
+    np.testing.assert_array_equal(captured.times, times)
     stabilized = camera_paths.planned("stabilized", capture, 7).times
-    np.testing.assert_allclose(stabilized, np.linspace(filmed[0], filmed[-1], 7), 1e-6)
+    np.testing.assert_allclose(stabilized, np.linspace(times[0], times[-1], 7), 1e-6)
     assert camera_paths.planned("sway", capture, 7).times is None
 
 

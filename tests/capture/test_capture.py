@@ -178,7 +178,7 @@ def test_describe_says_what_was_found():
     assert len(capturing.describe(bare)) == 2
 
 
-def test_depths_of_points_are_those_of_a_loop_over_the_filmed_views():
+def test_depths_of_points_are_those_of_a_loop_over_the_captured_views():
     capture = scenes.tiny_capture()
     expected = []
     for row in capture.train:

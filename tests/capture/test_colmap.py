@@ -278,7 +278,7 @@ def test_a_lens_for_each_image_is_no_physical_camera(
     assert len(told) == (len(set(lenses)) == 9)
 
 
-def test_black_wedges_at_the_rim_are_not_filmed():
+def test_black_wedges_at_the_rim_are_not_observed():
     images = np.full((4, 40, 50, 3), 90, np.uint8)
     images[1, :6, 10:40] = 0  # touches the rim
     images[1, 20:24, 20:24] = 0  # a dark thing inside

@@ -1,4 +1,4 @@
-"""Films and photographs become images of one size, upright and in order."""
+"""Videos and photographs become images of one size, upright and in order."""
 
 import os
 import struct
@@ -32,7 +32,7 @@ def one_child():
 def test_the_sharpest_of_each_stretch_is_kept():
     rng = np.random.default_rng(0)
     scores = rng.uniform(80, 120, 60)
-    scores[30:] *= 20  # a part of the film with much more texture
+    scores[30:] *= 20  # a part of the video with much more texture
     scores[12:18] = 5  # one whole stretch is blurred
     kept, blurred = footage.sharp_rows(scores, np.arange(60) / 30, 10)
     assert blurred == 1
@@ -61,8 +61,8 @@ def test_sharpness_falls_with_blur():
     assert values[3] < 0.01 * values[0]
 
 
-def film(path, milliseconds, shape=(32, 48)):
-    """A film whose frame k, shown at its own time, is gray 10 k."""
+def write_video(path, milliseconds, shape=(32, 48)):
+    """A video whose frame k, shown at its own time, is gray 10 k."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("h264", rate=30, options={"crf": "0"})
         stream.height, stream.width = shape
@@ -75,15 +75,15 @@ def film(path, milliseconds, shape=(32, 48)):
         container.mux(stream.encode())
 
 
-def test_a_film_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
+def test_a_video_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
     moments = [0, 40, 80, 500, 510, 520, 1000]
-    film(tmp_path / "a.mp4", moments)
+    write_video(tmp_path / "a.mp4", moments)
     (tmp_path / "given").mkdir()
     for number in range(7):
         mask = np.arange(48) >= 6 * number
         mask = np.repeat(mask[None], 32, 0)
         images.write_png(tmp_path / f"given/{number}.png", mask)
-    taken = footage.from_film(
+    taken = footage.from_video(
         tmp_path / "a.mp4", tmp_path, 3, max_side=16, masks=tmp_path / "given"
     )
     times = [int(name[2:10]) for name in taken.names]
@@ -100,16 +100,16 @@ def test_a_film_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
         assert mask[0].sum() == 16 - 2 * number
     (tmp_path / "given/6.png").unlink()
     with pytest.raises(CaptureError, match="7 frames"):
-        footage.from_film(tmp_path / "a.mp4", tmp_path, 3, masks=tmp_path / "given")
-    assert len(footage.from_film(tmp_path / "a.mp4", tmp_path / "b").names) == 7
-    half = footage.from_film(tmp_path / "a.mp4", tmp_path / "c", per_second=2.0)
+        footage.from_video(tmp_path / "a.mp4", tmp_path, 3, masks=tmp_path / "given")
+    assert len(footage.from_video(tmp_path / "a.mp4", tmp_path / "b").names) == 7
+    half = footage.from_video(tmp_path / "a.mp4", tmp_path / "c", per_second=2.0)
     assert len(half.names) == 3
     with pytest.raises(ValueError, match="1 frames to select"):
-        footage.from_film(tmp_path / "a.mp4", tmp_path / "d", 1)
+        footage.from_video(tmp_path / "a.mp4", tmp_path / "d", 1)
 
 
 def test_colors_are_made_of_the_frames_that_are_kept_alone(tmp_path, monkeypatch):
-    film(tmp_path / "a.mp4", range(0, 1000, 40))
+    write_video(tmp_path / "a.mp4", range(0, 1000, 40))
     made, pixels = [], video_decoding._pixels
     monkeypatch.setattr(
         video_decoding, "_pixels", lambda one: made.append(one) or pixels(one)
@@ -134,7 +134,7 @@ def test_frames_stay_in_order_where_times_are_those_of_decoding(tmp_path):
         container.mux(stream.encode())
     times = [seconds for seconds, _ in video.read_video(tmp_path / "a.avi")]
     assert min(np.diff(times)) < 0
-    taken = footage.from_film(tmp_path / "a.avi", tmp_path / "out", 12)
+    taken = footage.from_video(tmp_path / "a.avi", tmp_path / "out", 12)
     shown = [
         images.read_pixels(tmp_path / "out/images" / name).mean()
         for name in sorted(taken.names)
@@ -221,7 +221,7 @@ def test_photographs_come_upright_of_one_size_whatever_their_ending(
 def test_a_folder_is_told_by_what_is_in_it(tmp_path):
     assert footage.kind_of(tmp_path) is None
     (tmp_path / "a.MOV").touch()
-    assert footage.kind_of(tmp_path / "a.MOV") == "film"
+    assert footage.kind_of(tmp_path / "a.MOV") == "video"
     for name in ("a.jpg", "b.JPG"):
         (tmp_path / name).write_bytes(b"broken")
     assert footage.kind_of(tmp_path) == "images"
@@ -280,10 +280,10 @@ def test_two_frames_of_one_time_cost_one_of_them(tmp_path, monkeypatch):
             yield seconds, np.full((32, 48) if gray else (32, 48, 3), row, np.uint8)
 
     monkeypatch.setattr(footage, "read_video", read)
-    monkeypatch.setattr(footage, "transfer_of", lambda film: None)
+    monkeypatch.setattr(footage, "transfer_of", lambda video: None)
     monkeypatch.setattr(footage, "notes_of", lambda *_: ())
-    taken = footage.from_film(tmp_path / "a.mp4", tmp_path, 30)
+    taken = footage.from_video(tmp_path / "a.mp4", tmp_path, 30)
     assert len(taken.names) == len(set(taken.names)) == 29
     monkeypatch.setattr(footage, "OWN_TIMES", 0.99)
     with pytest.raises(CaptureError, match="its frames have no times"):
-        footage.from_film(tmp_path / "a.mp4", tmp_path / "b", 30)
+        footage.from_video(tmp_path / "a.mp4", tmp_path / "b", 30)

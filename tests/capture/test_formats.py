@@ -37,9 +37,9 @@ def test_a_folder_that_is_no_capture_lists_what_was_looked_for(tmp_path):
 def test_what_is_no_capture_yet_is_refused_with_the_way_out(tmp_path):
     with pytest.raises(CaptureError, match="no such file or folder"):
         room.load(tmp_path / "nowhere")
-    (tmp_path / "film.mp4").write_bytes(b"")
+    (tmp_path / "video.mp4").write_bytes(b"")
     with pytest.raises(CaptureError, match="a file, not a capture"):
-        room.load(tmp_path / "film.mp4")
+        room.load(tmp_path / "video.mp4")
     assert issubclass(CaptureError, ValueError)
     for name in ("a.jpg", "b.HEIC"):
         (tmp_path / name).touch()

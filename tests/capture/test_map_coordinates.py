@@ -13,7 +13,7 @@ from nerfies_jax.capture import (
     transforms_writer,
     world_points,
 )
-from tests.capture.test_camera_files import SIZE, filmed
+from tests.capture.test_camera_files import SIZE, hand_made
 
 UTM = (500_000.123, 4_649_776.456, 120.789)
 WRITERS = {
@@ -35,7 +35,7 @@ def pixels(capture, world):
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_an_export_comes_back_within_a_thousandth_of_a_pixel(kind, tmp_path):
-    capture = dataclasses.replace(filmed(False, frames=20), center=UTM)
+    capture = dataclasses.replace(hand_made(False, frames=20), center=UTM)
     WRITERS[kind](capture, tmp_path / "out")
     read = formats.load(tmp_path / "out")
     points = np.float64(capture.points.position)

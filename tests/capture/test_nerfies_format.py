@@ -242,7 +242,7 @@ def test_nerf_ds_masks_are_black_where_it_moves(tmp_path, ending):
     )
 
 
-def test_dycheck_alpha_marks_pixels_that_were_filmed(tmp_path):
+def test_dycheck_alpha_marks_pixels_that_were_observed(tmp_path):
     make(tmp_path, channels=4)
     capture = nerfies_format.read(tmp_path)
     np.testing.assert_array_equal(capture.valid[2], image(2, channels=4)[..., 3] == 255)

@@ -12,7 +12,7 @@ from nerfies_jax.capture.camera_paths import CameraPath
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.keyframes import Keyframe
 from nerfies_jax.geometry import camera
-from tests.capture.test_camera_files import filmed
+from tests.capture.test_camera_files import hand_made
 
 SIZE = (64, 36)
 TIMES = np.float32([0, 0.25, 1])
@@ -34,7 +34,7 @@ def test_a_nerfstudio_path_is_drawn_by_nerfstudio_as_by_us(tmp_path):
     assert (table["render_width"], table["render_height"]) == SIZE
     assert table["seconds"] * table["fps"] == pytest.approx(3)
     point = np.array([0.2, -0.1, 0.3])
-    read = path_files.read(tmp_path / "a.json", filmed(frames=3))
+    read = path_files.read(tmp_path / "a.json", hand_made(frames=3))
     np.testing.assert_array_equal(read.times, TIMES)
     assert read.size == SIZE
     for row, entry in enumerate(table["camera_path"]):
@@ -58,7 +58,7 @@ def test_a_nerfies_path_keeps_the_whole_camera_and_the_world(tmp_path):
         "radial": np.float32([[0.1, 0.01, 0.001]] * 3),
         "skew_px": np.float32([0.5, 0.25, 0]),
     }
-    capture, planned = filmed(frames=3), a_path(**lens)
+    capture, planned = hand_made(frames=3), a_path(**lens)
     path_files.write_nerfies(tmp_path / "path", planned, capture)
     read = path_files.read(tmp_path / "path", capture)
     for field, exact in planned.cameras._asdict().items():
@@ -75,7 +75,7 @@ def test_a_nerfies_path_keeps_the_whole_camera_and_the_world(tmp_path):
 
 def test_a_nerfies_path_keeps_a_fisheye_and_refuses_half_of_one(tmp_path):
     lens = np.float32([[0.1, 0.01, 0.001, -0.002]] * 3)
-    capture, planned = filmed(frames=3), a_path(fisheye=lens)
+    capture, planned = hand_made(frames=3), a_path(fisheye=lens)
     path_files.write_nerfies(tmp_path / "path", planned, capture)
     read = path_files.read(tmp_path / "path", capture)
     np.testing.assert_allclose(read.cameras.fisheye, lens, rtol=1e-6)
@@ -90,7 +90,7 @@ def test_a_nerfies_path_keeps_a_fisheye_and_refuses_half_of_one(tmp_path):
 def test_a_path_without_times_leaves_them_to_whoever_renders_it(tmp_path):
     planned = a_path()._replace(times=None)
     path_files.write_nerfstudio(tmp_path / "a.json", planned, 24.0)
-    assert path_files.read(tmp_path / "a.json", filmed(frames=3)).times is None
+    assert path_files.read(tmp_path / "a.json", hand_made(frames=3)).times is None
 
 
 def change(table, **first):
@@ -117,12 +117,12 @@ def test_a_path_that_cannot_be_rendered_is_refused(spoil, words, tmp_path):
     spoil(table)
     (tmp_path / "a.json").write_text(json.dumps(table))
     with pytest.raises(CaptureError, match=words) as caught:
-        path_files.read(tmp_path / "a.json", filmed(frames=3))
+        path_files.read(tmp_path / "a.json", hand_made(frames=3))
     assert str(caught.value).startswith(str(tmp_path / "a.json"))
 
 
 def test_folders_of_no_cameras_or_of_several_sizes_are_refused(tmp_path):
-    capture = filmed(frames=3)
+    capture = hand_made(frames=3)
     with pytest.raises(CaptureError, match="no camera files"):
         path_files.read(tmp_path, capture)
     path_files.write_nerfies(tmp_path / "path", a_path(), capture)
@@ -138,7 +138,7 @@ def test_folders_of_no_cameras_or_of_several_sizes_are_refused(tmp_path):
 
 
 def test_keyframes_are_read_back_and_come_of_the_cameras_where_there_are_none(tmp_path):
-    capture, planned, file = filmed(frames=3), a_path(), tmp_path / "a.json"
+    capture, planned, file = hand_made(frames=3), a_path(), tmp_path / "a.json"
     chosen = [
         Keyframe(camera.take(planned.cameras, row), moment)
         for row, moment in ((2, 0.75), (0, 0.25))

@@ -13,7 +13,7 @@ from tests import scenes
 
 
 def through_a_lens(capture, radial, tangential=(0.0, 0.0)):
-    """The same directions, filmed through a lens: sampled from a smooth pattern."""
+    """The same directions, seen through a lens: sampled from a smooth pattern."""
     count = len(capture.ids)
     lens = capture.cameras._replace(
         radial=np.tile(np.float32(radial), (count, 1)),
@@ -67,7 +67,7 @@ def test_resampling_there_and_back_keeps_fine_texture(rng):
     assert 10 * np.log10(255**2 / np.mean(error**2)) > 44
 
 
-def test_pixels_the_lens_did_not_film_are_marked():
+def test_pixels_outside_of_the_lens_are_marked():
     capture = scenes.tiny_capture()
     # Barrel distortion: the pinhole's corners lie outside the round image.
     flat = pinholes.as_pinholes(through_a_lens(capture, (0.4, 0.0, 0.0)))
@@ -89,7 +89,7 @@ def test_masks_and_depth_move_with_the_image():
     np.testing.assert_array_equal(center, capture.depths[:, 15, 20])
 
 
-def test_an_undistorted_image_contains_all_filmed_pixels_and_leads_back_to_them():
+def test_an_undistorted_image_contains_all_observed_pixels_and_leads_back_to_them():
     bent = through_a_lens(scenes.tiny_capture(), (-0.3, 0.0, 0.0))
     flat, wide = pinholes.as_pinholes(bent), pinholes.canvas(bent)
     assert pinholes.as_pinholes(bent).images is flat.images  # kept
@@ -100,10 +100,10 @@ def test_an_undistorted_image_contains_all_filmed_pixels_and_leads_back_to_them(
     assert height < wide.size[1] < 1.5 * height
     camera = cameras.take(bent.cameras, 0)
     everywhere = np.ones(wide.size[::-1], bool)
-    assert pinholes.as_filmed(everywhere, camera, wide, bent.size).all()
+    assert pinholes.as_observed(everywhere, camera, wide, bent.size).all()
     left = np.zeros(wide.size[::-1], bool)
     left[:, : round(float(flat.cameras.principal_point_px[0, 0]))] = True
-    back = pinholes.as_filmed(left, camera, wide, bent.size)
+    back = pinholes.as_observed(left, camera, wide, bent.size)
     expected = np.arange(width) + 0.5 < float(camera.principal_point_px[0])
     np.testing.assert_array_equal(back, np.tile(expected, (height, 1)))
 

@@ -43,7 +43,7 @@ def walk(count):
     ]
 
 
-def film(folder, count, plain=False, views=walk):
+def photograph(folder, count, plain=False, views=walk):
     """Write images, and return their cameras."""
     rng = np.random.default_rng(0)
     textures = [
@@ -73,7 +73,7 @@ def aligned(guess, true):
 
 @pytest.mark.slow
 def test_cameras_of_a_textured_room_are_found(tmp_path, monkeypatch):
-    cameras = film(tmp_path / "images", 8)
+    cameras = photograph(tmp_path / "images", 8)
     masks = tmp_path / "masks"
     masks.mkdir()
     for row in range(8):
@@ -147,7 +147,7 @@ def pan(count):
     ],
 )
 def test_cameras_that_zoom_or_turn_are_found(views, count, error, tmp_path):
-    cameras = film(tmp_path / "images", count, views=views)
+    cameras = photograph(tmp_path / "images", count, views=views)
     spec = mapping.MappingSpec(threads=2, features=1500)
     poses = mapping.run_sfm(tmp_path / "images", tmp_path / "out", spec=spec)
     assert poses.placed == count
@@ -162,7 +162,7 @@ def test_cameras_that_zoom_or_turn_are_found(views, count, error, tmp_path):
 
 @pytest.mark.slow
 def test_images_without_texture_are_refused_and_leave_nothing(tmp_path):
-    film(tmp_path / "images", 3, plain=True)
+    photograph(tmp_path / "images", 3, plain=True)
     with pytest.raises(CaptureError, match="only 0 of 3 images"):
         mapping.run_sfm(tmp_path / "images", tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["images"]
@@ -172,10 +172,10 @@ def test_what_cannot_work_is_said_before_it_starts(tmp_path):
     lost = [mapping.CameraGroup(("f00.png", "f01.png"), 1.0)]
     with pytest.raises(CaptureError, match="no such folder"):
         mapping.run_sfm(tmp_path / "images", tmp_path / "out")
-    film(tmp_path / "images", 2)
+    photograph(tmp_path / "images", 2)
     with pytest.raises(CaptureError, match="2 images"):
         mapping.run_sfm(tmp_path / "images", tmp_path / "out")
-    film(tmp_path / "more", 3)
+    photograph(tmp_path / "more", 3)
     with pytest.raises(ValueError, match="each image of the folder once"):
         mapping.run_sfm(tmp_path / "more", tmp_path / "out", groups=lost)
     (tmp_path / "masks").mkdir()
@@ -197,7 +197,7 @@ def test_doubtful_cameras_say_what_to_do():
 
 
 def test_a_child_that_dies_is_an_error_not_our_end(tmp_path, monkeypatch):
-    film(tmp_path / "images", 3)
+    photograph(tmp_path / "images", 3)
     monkeypatch.setattr(mapping.sys, "executable", "/bin/false")
     with pytest.raises(CaptureError, match="ended with code 1"):
         mapping.run_sfm(tmp_path / "images", tmp_path / "out")

@@ -259,7 +259,7 @@ def test_exposure_changes_the_light_alone(small):
     assert np.array_equal(gain[7:], gain[[1, 3, 5]])  # an instant has one exposure
     before, after = linear(capture.images), linear(lit.images)
     expected = before * gain[:, None, None]
-    # Brighter than filmed without it, single samples of a pixel may be clipped.
+    # Brighter than rendered without it, single samples of a pixel may be clipped.
     clean = (gain[:, None, None] <= 1) & (expected > 0.05)
     assert clean.mean() > 0.2
     # 8 bits: half a count in either image is 2% of light 0.05.
@@ -315,21 +315,21 @@ def test_lumps_merge_and_part_and_a_shutter_opens_and_shuts():
         presets.TOPOLOGY, size=(88, 66), frames=9, heldout_every=8, supersampling=1
     )
     capture, truth = synthetic.make(spec)
-    film = capture.camera_ids == 0
+    first = capture.camera_ids == 0
 
     def parts(*names):
         """Connected parts of these things in each image of the first camera."""
-        shown = np.isin(truth.things[film], [spec.id_of(name) for name in names])
+        shown = np.isin(truth.things[first], [spec.id_of(name) for name in names])
         return [scipy.ndimage.label(image)[1] for image in shown]
 
-    # At eighths of the film: the lumps are one twice, the shutter at its middle and
+    # At eighths of the video: the lumps are one twice, the shutter at its middle and
     # both ends.
     assert parts("left lump", "right lump") == [2, 1, 2, 2, 2, 1, 2, 2, 2]
     assert parts("left shutter", "right shutter") == [1, 2, 2, 2, 1, 2, 2, 2, 1]
     # What one ball has inside the other is a surface before and after, not then.
     lumps = [spec.id_of(name) for name in ("left lump", "right lump")]
     radius = [spec.things[lump].shape.radius for lump in lumps]
-    time = capture.times[film]
+    time = capture.times[first]
     vanished = 0
     for lump, other, reach in zip(lumps, lumps[::-1], radius[::-1], strict=True):
         center = np.stack(
@@ -337,7 +337,7 @@ def test_lumps_merge_and_part_and_a_shutter_opens_and_shuts():
         )
         mine = truth.track_thing == lump
         apart = np.linalg.norm(truth.track_world[mine] - center, axis=-1) - reach
-        seen = truth.track_seen[mine][:, film]
+        seen = truth.track_seen[mine][:, first]
         assert not seen[apart < -1e-3].any()
         vanished += ((apart < -1e-3).any(1) & seen[:, [0, 4, 8]].any(1)).sum()
     assert vanished > 20
@@ -360,10 +360,10 @@ def test_the_written_directory_reads_back_row_for_row(small, tmp_path, monkeypat
     capture, answers = small
     first = synthetic.cached(SMALL, tmp_path)
 
-    def no_film(*_):
-        raise AssertionError("filmed again although cached")
+    def no_scene(*_):
+        raise AssertionError("rendered again although cached")
 
-    monkeypatch.setattr(record, "make", no_film)
+    monkeypatch.setattr(record, "make", no_scene)
     second, stored = synthetic.cached(SMALL, tmp_path)
     for read in (first[0], second):
         assert read.ids == capture.ids

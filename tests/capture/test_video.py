@@ -1,4 +1,4 @@
-"""Film: round trips, odd sizes, times, and broken files."""
+"""Video: round trips, odd sizes, times, and broken files."""
 
 import os
 import struct
@@ -19,14 +19,14 @@ def one_child():
         yield
 
 
-def film(count=8, size=(31, 45)):
+def make_frames(count=8, size=(31, 45)):
     y, x = np.mgrid[: size[0], : size[1]]
     frames = [np.stack([x * 5, y * 8, x * 0 + 25 * k], -1) for k in range(count)]
     return [np.clip(frame, 0, 255).astype(np.uint8) for frame in frames]
 
 
 def test_colors_and_times_survive_odd_sizes(tmp_path):
-    frames = film()
+    frames = make_frames()
     video.write_video(tmp_path / "a.mp4", iter(frames), 12.5, quality=2)
     decoded = list(video.read_video(tmp_path / "a.mp4"))
     assert len(decoded) == 8
@@ -47,25 +47,25 @@ from nerfies_jax.capture import video
 y, x, k = np.ogrid[:48, :64, :14]
 waves = np.sin((x + 4 * k)[..., None] / [7, 9, 11])
 waves = waves + np.cos((y - 3 * k)[..., None] / [5, 8, 13])
-film = (127 + 60 * waves).astype(np.uint8)
-video.write_video(sys.argv[1], np.moveaxis(film, 2, 0), 12)
+frames = (127 + 60 * waves).astype(np.uint8)
+video.write_video(sys.argv[1], np.moveaxis(frames, 2, 0), 12)
 """
 
 
 @pytest.mark.full
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc fills new memory if asked")
-def test_equal_frames_make_equal_films_whatever_was_in_memory(tmp_path):
-    films = []
+def test_equal_frames_make_equal_videos_whatever_was_in_memory(tmp_path):
+    contents = []
     for fill in ("1", "85"):
         path = tmp_path / f"{fill}.mp4"
         told = os.environ | {"MALLOC_PERTURB_": fill}
         subprocess.run([sys.executable, "-c", WRITES, path], env=told, check=True)
-        films.append(path.read_bytes())
-    assert films[0] == films[1]
+        contents.append(path.read_bytes())
+    assert contents[0] == contents[1]
 
 
 def test_the_file_says_which_colors_it_holds(tmp_path):
-    video.write_video(tmp_path / "a.mp4", film())
+    video.write_video(tmp_path / "a.mp4", make_frames())
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0].codec_context
         assert (stream.color_primaries, stream.colorspace, stream.color_range) == (
@@ -77,7 +77,7 @@ def test_the_file_says_which_colors_it_holds(tmp_path):
 
 
 def test_every_other_frame_and_at_most_so_many(tmp_path):
-    video.write_video(tmp_path / "a.mp4", film(), 10)
+    video.write_video(tmp_path / "a.mp4", make_frames(), 10)
     times = [seconds for seconds, _ in video.read_video(tmp_path / "a.mp4", stride=3)]
     assert times == pytest.approx([0, 0.3, 0.6], abs=1e-4)
     assert len(list(video.read_video(tmp_path / "a.mp4", most=2))) == 2
@@ -143,7 +143,7 @@ def test_a_mirror_is_no_turn(tmp_path, across, down, expected):
 @pytest.mark.parametrize(
     ("height", "space"), [(718, "ITU601"), (720, "ITU709")], ids=["small", "hd"]
 )
-def test_a_film_without_color_tags_has_those_of_its_size(tmp_path, height, space):
+def test_a_video_without_color_tags_has_those_of_its_size(tmp_path, height, space):
     color = np.array([200, 30, 40])
     image = np.zeros((height, 64, 3), np.uint8) + color.astype(np.uint8)
     with av.open(str(tmp_path / "a.mp4"), "w") as container:
@@ -165,7 +165,7 @@ def test_of_rows_alone_nothing_behind_the_last_is_decoded(tmp_path):
     with av.open(str(tmp_path / "a.mov"), "w") as container:
         stream = container.add_stream("png", rate=10)
         stream.width, stream.height, stream.pix_fmt = 45, 31, "rgb24"
-        for image in film(60):
+        for image in make_frames(60):
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
@@ -179,7 +179,7 @@ def test_of_rows_alone_nothing_behind_the_last_is_decoded(tmp_path):
         list(video.read_video(tmp_path / "a.mov"))
     shown = list(video.read_video(tmp_path / "a.mov", rows=(1, 6)))
     for (_, image), number in zip(shown, (1, 6), strict=True):
-        np.testing.assert_array_equal(image, film()[number])
+        np.testing.assert_array_equal(image, make_frames()[number])
 
 
 def pq_code(nits):
@@ -226,7 +226,7 @@ def test_high_dynamic_range_keeps_what_is_no_brighter_than_half_of_white():
     assert 215 < paper[0].min() < 240
 
 
-def test_a_film_of_high_dynamic_range_is_told_and_tone_mapped(tmp_path):
+def test_a_video_of_high_dynamic_range_is_told_and_tone_mapped(tmp_path):
     luma = np.full((32, 48), 64, np.uint16)  # 10 bits: black, and a code of 0.75
     luma[:, 24:] = 64 + 0.75 * 876
     with av.open(str(tmp_path / "a.mp4"), "w") as container:
@@ -248,19 +248,19 @@ def test_a_film_of_high_dynamic_range_is_told_and_tone_mapped(tmp_path):
     paper = high_dynamic_range.tone_mapped(code, "HLG")
     assert np.abs(decoded[16, 40].astype(int) - paper).max() <= 1
     assert decoded[16, 8].max() <= 1
-    taken = footage.from_film(tmp_path / "a.mp4", tmp_path / "out")
+    taken = footage.from_video(tmp_path / "a.mp4", tmp_path / "out")
     assert "high dynamic range (HLG), tone-mapped" in taken.notes[-1]
-    video.write_video(tmp_path / "b.mp4", film())
+    video.write_video(tmp_path / "b.mp4", make_frames())
     assert video.transfer_of(tmp_path / "b.mp4") is None
 
 
-def test_what_is_no_film_is_refused(tmp_path):
+def test_what_is_no_video_is_refused(tmp_path):
     with pytest.raises(CaptureError, match="no such video"):
         list(video.read_video(tmp_path / "a.mp4"))
     (tmp_path / "b.mp4").write_bytes(b"hello")
     with pytest.raises(CaptureError, match=r"b\.mp4: not a readable video"):
         list(video.read_video(tmp_path / "b.mp4"))
-    video.write_video(tmp_path / "c.mp4", film())
+    video.write_video(tmp_path / "c.mp4", make_frames())
     data = (tmp_path / "c.mp4").read_bytes()
     (tmp_path / "c.mp4").write_bytes(data[: len(data) // 2])
     with pytest.raises(CaptureError, match=r"c\.mp4: "):
@@ -300,10 +300,10 @@ def write(path, shapes, count=30, **options):
 def test_a_file_cut_short_says_how_much_of_it_was_read(ending, tmp_path):
     path = tmp_path / f"a.{ending}"
     write(path, [(64, 48)], movflags="faststart" if ending == "mp4" else "")
-    whole = footage.from_film(path, tmp_path / "whole", 5)
+    whole = footage.from_video(path, tmp_path / "whole", 5)
     assert not any("cut short" in note for note in whole.notes)
     path.write_bytes(path.read_bytes()[: int(0.6 * path.stat().st_size)])
-    part = footage.from_film(path, tmp_path / "part", 5)
+    part = footage.from_video(path, tmp_path / "part", 5)
     (note,) = [note for note in part.notes if "cut short" in note]
     count = int(note.split(": ")[1].split(" of ")[0])
     assert 12 < count < 20
@@ -320,7 +320,7 @@ def test_damaged_frames_are_left_out_with_a_note_and_refused_by_default(tmp_path
         data[start + len(data[start:]) // 2 :]
     )
     path.write_bytes(data)
-    taken = footage.from_film(path, tmp_path / "out", 5)
+    taken = footage.from_video(path, tmp_path / "out", 5)
     assert any("cut short or broken" in note for note in taken.notes)
     with pytest.raises(CaptureError, match="not a readable video"):
         list(video.read_video(path))
@@ -330,7 +330,7 @@ def test_the_largest_of_several_videos_is_read(tmp_path):
     write(tmp_path / "a.mkv", [(32, 16), (64, 48)], 5)
     shapes = {frame.shape for _, frame in video.read_video(tmp_path / "a.mkv")}
     assert shapes == {(48, 64, 3)}
-    taken = footage.from_film(tmp_path / "a.mkv", tmp_path / "out", 3)
+    taken = footage.from_video(tmp_path / "a.mkv", tmp_path / "out", 3)
     assert any("1 other video streams" in note for note in taken.notes)
 
 
@@ -354,7 +354,7 @@ def test_a_cover_is_no_video(tmp_path):
 
 def test_a_cover_stored_as_an_ordinary_stream_is_no_video(tmp_path):
     """Larger than the video, and first in the file."""
-    video.write_video(tmp_path / "a.mp4", film(6), 10)
+    video.write_video(tmp_path / "a.mp4", make_frames(6), 10)
     with (
         av.open(str(tmp_path / "a.mp4")) as source,
         av.open(str(tmp_path / "b.mkv"), "w") as target,
@@ -395,7 +395,7 @@ def coded(path, size, **params):
         options = {"x264-params": ":".join(f"{k}={v}" for k, v in params.items())}
         stream = container.add_stream("h264", rate=10, options=options)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        for frame in film(3, size[::-1]):
+        for frame in make_frames(3, size[::-1]):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
         container.mux(stream.encode())
     return path.read_bytes()

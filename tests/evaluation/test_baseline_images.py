@@ -14,18 +14,18 @@ from nerfies_jax.geometry.rays import pixel_rays
 from nerfies_jax.preprocessing import findings, motion, record
 from nerfies_jax.runs import baselines_text
 from nerfies_jax.training.model import Rendering, TrainState
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 SIZE = (24, 18)
 NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), None)
 
 
-def film(frames=12, **changes):
-    """A small film in which every frame has its own level, every third held out."""
+def small_capture(frames=12, **changes):
+    """A small capture in which every frame has its own level, every third held out."""
     rows = np.arange(frames)
     images = np.zeros((frames, *SIZE[::-1], 3), np.uint8)
     images += (10 * rows[:, None, None, None]).astype(np.uint8)
-    bare = films.film(frames=frames, points=0)
+    bare = two_planes.make(frames=frames, points=0)
     return dataclasses.replace(
         bare,
         images=images,
@@ -39,7 +39,7 @@ def film(frames=12, **changes):
 
 
 def test_neighbors_are_the_nearest_in_time_of_the_same_camera():
-    capture = film()
+    capture = small_capture()
     assert sorted(baseline_images.neighbor_rows(capture, 4)) == [3, 5]
     assert list(baseline_images.neighbor_rows(capture, 10)) == [9, 11]
     # Of the camera's own frames, however far, if it has two; else of all.
@@ -56,11 +56,11 @@ def test_neighbors_are_the_nearest_in_time_of_the_same_camera():
     assert list(baseline_images.neighbor_rows(still, 4)) == [0, 2]
 
 
-def test_a_mean_of_neighbors_is_of_those_that_filmed_a_pixel():
+def test_a_mean_of_neighbors_is_of_those_that_observe_a_pixel():
     valid = np.ones((12, *SIZE[::-1]), bool)
     valid[3, :, :5] = False
     valid[[3, 5], 0] = False
-    capture = film(valid=valid)
+    capture = small_capture(valid=valid)
     means = baseline_images.neighbor_means(capture, np.array([4, 7]))
     expected = np.full((*SIZE[::-1], 3), 40 / 255)
     expected[:, :5] = 50 / 255
@@ -76,7 +76,7 @@ def test_a_mean_of_neighbors_is_of_those_that_filmed_a_pixel():
 
 
 def test_an_average_over_time_leaves_the_rest_of_a_view():
-    capture, order = film(), []
+    capture, order = small_capture(), []
 
     def draw(state, view):
         level = float(view.time) + float(view.camera.position[0])
@@ -138,7 +138,7 @@ def test_a_run_below_a_baseline_is_told_what_to_do():
 
 
 def test_rays_through_a_lens_are_scored_but_where_it_has_none():
-    capture = films.film(frames=3)
+    capture = two_planes.make(frames=3)
     assert pinholes.scorable(capture) is capture
     lens = np.tile(np.float32([-0.2, 0.03, 0.0]), (3, 1))
     bent = dataclasses.replace(capture, cameras=capture.cameras._replace(radial=lens))
@@ -155,22 +155,22 @@ def test_rays_through_a_lens_are_scored_but_where_it_has_none():
 
 @pytest.fixture
 def looked(tmp_path, monkeypatch):
-    """Films that are looked at: the upper left quarter moves from 5/11 of the time on.
+    """Captures that are looked at: the upper left quarter moves from time 5/11 on.
 
-    Where there are two cameras the film is of no use.
+    Where there are two cameras the capture is of no use.
     """
     looked_at = []
 
-    def cached(film, folder):
-        looked_at.append(film)
+    def cached(capture, folder):
+        looked_at.append(capture)
         assert folder == tmp_path
-        order = film.train[np.argsort(film.times[film.train], kind="stable")]
-        wide = pinholes.canvas(film)
+        order = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+        wide = pinholes.canvas(capture)
         mask = np.zeros((len(order), *wide.size[::-1]), bool)
-        quarter = wide.top + film.size[1] // 2, wide.left + film.size[0] // 2
+        quarter = wide.top + capture.size[1] // 2, wide.left + capture.size[0] // 2
         mask[:, : quarter[0], : quarter[1]] = True
-        mask[film.times[order] < np.float32(4.5 / 11)] = False
-        jumps = len(np.unique(film.camera_ids)) > 1
+        mask[capture.times[order] < np.float32(4.5 / 11)] = False
+        jumps = len(np.unique(capture.camera_ids)) > 1
         return record.Evidence(
             **dict.fromkeys(record.Evidence._fields)
             | {"row": order, "moving": mask, "factor": 1}
@@ -180,15 +180,15 @@ def looked(tmp_path, monkeypatch):
     monkeypatch.setattr(record, "cached", cached)
     moves = findings.Finding(findings.MOTION, "", "", True, findings.CERTAIN)
     monkeypatch.setattr(motion, "motion", lambda *_: moves)
-    width, height = films.SIZE
+    width, height = two_planes.SIZE
     monkeypatch.setattr(moving_masks, "MAX_PIXELS", 12 * width * height // 4)
     return looked_at
 
 
 def without_masks(**changes):
-    """A film of which one frame is held out."""
-    film = films.film(frames=12, train=np.r_[0:5, 6:12], heldout=np.r_[5:6])
-    return dataclasses.replace(film, moving=None, **changes)
+    """A capture of which one frame is held out."""
+    capture = two_planes.make(frames=12, train=np.r_[0:5, 6:12], heldout=np.r_[5:6])
+    return dataclasses.replace(capture, moving=None, **changes)
 
 
 @pytest.mark.parametrize("lens", [False, True])
@@ -233,7 +233,7 @@ def test_images_that_jump_between_cameras_are_followed_in_one(looked, tmp_path):
     ids = np.repeat(np.int32([1, 0]), 6)
     rig = without_masks(camera_ids=ids)
     masked, _ = moving_masks.with_masks(rig, tmp_path)
-    assert [film.ids for film in looked] == [rig.ids, rig.ids[:6]]
+    assert [capture.ids for capture in looked] == [rig.ids, rig.ids[:6]]
     assert masked.moving[5].any()
     looked.clear()
     both = dataclasses.replace(rig, train=np.r_[0:5, 7:12], heldout=np.r_[5:7])

@@ -51,12 +51,12 @@ MODEL = Model("blobs", None, None, blobs, (), lambda state: {})
 @pytest.fixture(scope="module")
 def capture():
     """Six frames of blobs as their cameras see them, all held out but one."""
-    film = scenes.tiny_capture()
-    params = in_default_precision((CLOUD + film_center(film), COLORS))
-    draw = jax.jit(lambda view: blobs(params, view, film.size, None).color)
-    images = [draw(evaluation.view_of(film, row)) for row in range(len(film.ids))]
+    video = scenes.tiny_capture()
+    params = in_default_precision((CLOUD + scene_center(video), COLORS))
+    draw = jax.jit(lambda view: blobs(params, view, video.size, None).color)
+    images = [draw(evaluation.view_of(video, row)) for row in range(len(video.ids))]
     return dataclasses.replace(
-        film,
+        video,
         images=evaluation.to_uint8(np.stack(images)),
         train=np.array([0]),
         heldout=np.arange(1, 6),
@@ -66,30 +66,30 @@ def capture():
     )
 
 
-def film_center(film):
+def scene_center(video):
     """What the first camera looks at."""
-    depth = 2 / (1 / film.near + 1 / film.far)
-    forward = film.cameras.camera_from_world[:, 2]
-    return np.mean(film.cameras.position + depth * forward, axis=0)
+    depth = 2 / (1 / video.near + 1 / video.far)
+    forward = video.cameras.camera_from_world[:, 2]
+    return np.mean(video.cameras.position + depth * forward, axis=0)
 
 
-def state_of(film):
-    params = in_default_precision((CLOUD + film_center(film), COLORS))
+def state_of(video):
+    params = in_default_precision((CLOUD + scene_center(video), COLORS))
     return TrainState(params, (), (), jnp.zeros((), jnp.int32), jax.random.key(0))
 
 
-def displaced(film, rng, turn, shift):
+def displaced(video, rng, turn, shift):
     """The capture with its held-out cameras turned (rad) and shifted (scene units)."""
-    position = film.cameras.position.copy()
-    rotation = film.cameras.camera_from_world.copy()
-    for row in film.heldout:
+    position = video.cameras.position.copy()
+    rotation = video.cameras.camera_from_world.copy()
+    for row in video.heldout:
         way = rng.normal(size=(2, 3))
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         spin = Rotation.from_rotvec(turn * way[0]).as_matrix()
         rotation[row] = spin @ rotation[row]
         position[row] += shift * way[1]
-    moved = film.cameras._replace(camera_from_world=rotation, position=position)
-    return dataclasses.replace(film, cameras=moved)
+    moved = video.cameras._replace(camera_from_world=rotation, position=position)
+    return dataclasses.replace(video, cameras=moved)
 
 
 @pytest.mark.full
@@ -97,14 +97,14 @@ def displaced(film, rng, turn, shift):
     ("turn", "shift", "most_pixels"), [(0.02, 0.01, 400), (0.02, 0.0, 5000)]
 )
 def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixels):
-    film = displaced(capture, rng, turn, shift)
+    video = displaced(capture, rng, turn, shift)
     state = state_of(capture)
-    renderer = evaluation.Renderer(MODEL, film.size)
-    rows = film.heldout[:3]
-    before = evaluation.score(renderer, state, film, rows)
+    renderer = evaluation.Renderer(MODEL, video.size)
+    rows = video.heldout[:3]
+    before = evaluation.score(renderer, state, video, rows)
     spec = CameraFitSpec(max_steps=200, tolerance=3e-3, most_pixels=most_pixels)
-    # Scored through the lens that filmed, with the poses that were fitted without.
-    lens = film.cameras._replace(radial=film.cameras.radial + np.float32(0.1))
+    # Scored through the lens of the capture, with the poses that were fitted without.
+    lens = video.cameras._replace(radial=video.cameras.radial + np.float32(0.1))
     scored = []
 
     def draw(state, view):
@@ -115,10 +115,10 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
         MODEL,
         draw,
         state,
-        film,
+        video,
         rows,
         spec,
-        observed=dataclasses.replace(film, cameras=lens),
+        observed=dataclasses.replace(video, cameras=lens),
     )
     assert [float(camera.radial[0]) for camera in scored] == [np.float32(0.1)] * 3
     for camera, position in zip(scored, fitted.cameras.position, strict=True):
@@ -151,16 +151,16 @@ def test_a_displaced_camera_is_found_again(capture, rng, turn, shift, most_pixel
 
 
 @pytest.mark.full
-def test_what_is_not_filmed_does_not_count(capture, rng):
-    film = displaced(capture, rng, 0.02, 0.01)
-    valid = np.ones(film.images.shape[:3], bool)
+def test_what_is_not_observed_does_not_count(capture, rng):
+    video = displaced(capture, rng, 0.02, 0.01)
+    valid = np.ones(video.images.shape[:3], bool)
     valid[:, :6] = False
-    spoilt = film.images.copy()
+    spoilt = video.images.copy()
     spoilt[:, :6] = 255
-    film = dataclasses.replace(film, valid=valid, images=spoilt)
-    renderer, state = evaluation.Renderer(MODEL, film.size), state_of(capture)
-    rows = film.heldout[:2]
-    fitted = fitted_cameras.fit_cameras(MODEL, renderer, state, film, rows)
+    video = dataclasses.replace(video, valid=valid, images=spoilt)
+    renderer, state = evaluation.Renderer(MODEL, video.size), state_of(capture)
+    rows = video.heldout[:2]
+    fitted = fitted_cameras.fit_cameras(MODEL, renderer, state, video, rows)
     assert fitted.converged.all()
     apart = fitted.cameras.position - capture.cameras.position[rows]
     assert np.abs(apart).max() < 2e-3
@@ -198,17 +198,17 @@ KINDS = {
 def test_the_slope_of_the_error_is_that_of_both_representations(kind, float64):
     """Through rendering, posing and the block by block map of a field."""
     module, spec = KINDS[kind]
-    film = scenes.tiny_capture()
+    video = scenes.tiny_capture()
     metadata = (
-        module.metadata_of(film)
+        module.metadata_of(video)
         if kind == "gaussians"
-        else module.metadata_of(film, spec)
+        else module.metadata_of(video, spec)
     )
     model = module.build(spec, metadata)
-    state = model.init(film, jax.random.key(1))
+    state = model.init(video, jax.random.key(1))
     small = (12, 9)
-    view = evaluation.resized(evaluation.view_of(film, 2), film.size, small)
-    image = jnp.asarray(film.images[2, 1::3, 1::3][: small[1], : small[0]])
+    view = evaluation.resized(evaluation.view_of(video, 2), video.size, small)
+    image = jnp.asarray(video.images[2, 1::3, 1::3][: small[1], : small[0]])
     valid = jnp.ones(small[::-1], bool).at[2:4].set(False)
     depth = jnp.asarray(0.6, float64)
     loss = fitted_cameras.photometric_loss(model, state, view, image, valid, depth)

@@ -29,7 +29,7 @@ from tests import scene_oracle, scenes
 from tests.metrics.test_perceptual import TINY, state_dict
 
 # Two frames of the second camera: one has a next one, so a flow.
-FILM = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
+SCENE = dataclasses.replace(scenes.TINY_SCENE, heldout_every=2)
 NOBODY = TrainState((), (), (), jnp.zeros((), jnp.int32), jax.random.key(0))
 ALWAYS = {"heldout.psnr", "heldout.ssim"}
 MASKED = {f"heldout.{name}" for name in ("moving_psnr", "moving_ssim", "static_psnr")}
@@ -72,7 +72,7 @@ def psnr(image, truth, mask):
     return -10 * np.log10(np.mean((image - truth)[mask] ** 2))
 
 
-def test_a_frame_of_which_nothing_was_filmed_spoils_no_mean(rng):
+def test_a_frame_of_which_nothing_was_observed_spoils_no_mean(rng):
     capture = scenes.tiny_capture()
     scored = drawn(capture, rng)
     twice = Scored(*(np.concatenate([leaf, leaf]) for leaf in scored))
@@ -84,27 +84,27 @@ def test_a_frame_of_which_nothing_was_filmed_spoils_no_mean(rng):
     assert np.isnan(heldout_metrics(nothing, capture)["heldout.psnr"])
 
 
-@pytest.mark.parametrize("filmed", [True, pytest.param(False, marks=pytest.mark.full)])
-def test_every_number_is_that_of_a_direct_computation(rng, filmed):
+@pytest.mark.parametrize("masked", [True, pytest.param(False, marks=pytest.mark.full)])
+def test_every_number_is_that_of_a_direct_computation(rng, masked):
     capture = scenes.tiny_capture()
     valid = rng.random(capture.moving.shape) > 0.2
-    if filmed:
+    if masked:
         capture = dataclasses.replace(capture, valid=valid)
     scored = drawn(capture, rng)
     places = np.array([len(scored.rows) - 1])
     gray = Averages(places, np.full_like(scored.color[places], 0.4), None)
     baselines = Baselines(gray._replace(known=~valid[scored.rows[places]]), gray)
     numbers = heldout_metrics(scored, capture, baselines=baselines)
-    unscored = {"heldout.unscored"} if filmed else set()
+    unscored = {"heldout.unscored"} if masked else set()
     lost = (
-        {"baseline.neighbor_mean"} if filmed else set()
-    )  # what is known was not filmed
+        {"baseline.neighbor_mean"} if masked else set()
+    )  # what is known was not observed
     assert set(numbers) == (ALWAYS | MASKED | DEPTHS | BASELINES | unscored) - lost
     assert numbers["heldout.psnr"] == pytest.approx(scored.psnr.mean())
     rows = capture.heldout
     image = np.round(scored.color.astype(float) * 255) / 255
     truth = capture.images[rows] / 255
-    known = valid[rows] if filmed else np.ones_like(valid[rows])
+    known = valid[rows] if masked else np.ones_like(valid[rows])
     moving = capture.moving[rows]
     for name, mask in (("moving", moving & known), ("static", ~moving & known)):
         frames = zip(image, truth, mask, strict=True)
@@ -114,7 +114,7 @@ def test_every_number_is_that_of_a_direct_computation(rng, filmed):
         own = psnr(image[-1], truth[-1], mask)
         gain = own - psnr(np.full_like(truth[-1], 102 / 255), truth[-1], mask)
         assert numbers[f"motion.{key}"] == pytest.approx(gain, abs=1e-4)
-    if filmed:
+    if masked:
         share = 1 - valid[rows].mean()
         assert numbers["heldout.unscored"] == pytest.approx(share)
     ssim = [
@@ -177,13 +177,13 @@ def test_large_images_get_ms_ssim_and_weights_lpips(rng, tmp_path):
     )
     assert numbers["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
 
-    filmed = np.ones(capture.images.shape[:3], bool)
-    filmed[:, :, 100:] = False
-    capture = dataclasses.replace(capture, valid=filmed)
+    valid = np.ones(capture.images.shape[:3], bool)
+    valid[:, :, 100:] = False
+    capture = dataclasses.replace(capture, valid=valid)
     numbers = heldout_metrics(scored, capture, lpips=lpips)
     assert "heldout.ms_ssim" not in numbers  # it has no masked form
     exact = jax.jit(perceptual.masked_lpips, static_argnums=1)(
-        lpips.params, TINY, image, truth, filmed[rows[0]]
+        lpips.params, TINY, image, truth, valid[rows[0]]
     )
     assert numbers["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
     with pytest.raises(ValueError, match="9 pixels on the shorter side"):
@@ -195,7 +195,7 @@ def test_flow_is_scored_where_there_is_an_answer(double):
     truth = np.zeros((5, 2))
     predicted = np.array([[3, 4], [0, 1], [np.nan, 0], [0, 0], [0, 2.0]])
     moving = np.array([True, False, True, False, True])
-    kinds = np.float64 if double else np.float32, np.float32  # of a run; of a film
+    kinds = np.float64 if double else np.float32, np.float32  # of a run; of a capture
     with jax.enable_x64(double):
         predicted, truth = map(np.asarray, (predicted, truth), kinds)
         scored = heldout._flow(Flow(predicted, truth, moving))
@@ -208,7 +208,7 @@ def test_flow_is_scored_where_there_is_an_answer(double):
 @pytest.mark.full
 def test_the_flow_of_a_known_motion_is_the_true_one():
     """Points moved as the scene moves them, at the true depths: the true flow."""
-    capture, truth = synthetic.make(FILM)
+    capture, truth = synthetic.make(SCENE)
     lost = 7
 
     def move(state, points, here, there):
@@ -223,7 +223,7 @@ def test_the_flow_of_a_known_motion_is_the_true_one():
         things = truth.things[row, line, column]
         moved = points.copy()
         for one in np.unique(things):
-            thing, here_too = FILM.things[one], things == one
+            thing, here_too = SCENE.things[one], things == one
             then = scene_oracle.canonical(thing, points[here_too], float(here.time))
             moved[here_too] = scene_oracle.observe(thing, then, float(there.time))
         known = np.ones(len(points), bool)
@@ -256,10 +256,10 @@ KINDS = {"gaussians": scenes.TINY_DEFORMABLE, "radiance": FIELD}
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory):
+def scene_folder(tmp_path_factory):
     """A folder with a tiny scene and its truth."""
-    folder = tmp_path_factory.mktemp("film") / "tiny"
-    synthetic.write(FILM, folder)
+    folder = tmp_path_factory.mktemp("scene") / "tiny"
+    synthetic.write(SCENE, folder)
     return folder
 
 
@@ -278,8 +278,8 @@ def started(kind, folder):
 
 @pytest.mark.full
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
-    run, state = started(kind, filmed)
+def test_a_run_is_held_against_the_truth_of_its_scene(kind, scene_folder, rng):
+    run, state = started(kind, scene_folder)
     capture = run.capture
     scored = drawn(capture, rng)
     renderer = evaluation.Renderer(run.model, run.capture.size)
@@ -320,8 +320,10 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, filmed, rng):
 
 
 @pytest.mark.full
-def test_a_scene_without_motion_or_truth_has_no_points_to_follow(filmed, rng, tmp_path):
-    run, state = started("gaussians", filmed)
+def test_a_scene_without_motion_or_truth_has_no_points_to_follow(
+    scene_folder, rng, tmp_path
+):
+    run, state = started("gaussians", scene_folder)
     static = dataclasses.replace(KINDS["gaussians"], motion=None)
     kind = run.representation
     assert kind.scoring.mover(static, splat_scene.metadata_of(run.capture)) is None

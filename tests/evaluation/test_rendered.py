@@ -277,8 +277,8 @@ def test_the_code_sees_the_left_half_and_the_score_the_right(masked):
     capture = dataclasses.replace(capture, valid=valid if masked else None)
     seen = []
 
-    def fit_code(view, left, filmed):
-        seen.append((float(view.time), left, filmed))
+    def fit_code(view, left, mask):
+        seen.append((float(view.time), left, mask))
         return left.mean() / 255
 
     def render(view, code):
@@ -289,10 +289,10 @@ def test_the_code_sees_the_left_half_and_the_score_the_right(masked):
     scored = evaluation.score_halves(fit_code, render, capture, capture.heldout)
     np.testing.assert_array_equal(scored.rows, capture.heldout)
     for place, row in enumerate(capture.heldout):
-        time, left, filmed = seen[place]
+        time, left, mask = seen[place]
         assert time == capture.times[row]
         np.testing.assert_array_equal(left, capture.images[row, :, :20])
-        assert filmed.shape == (30, 20) if masked else filmed is None
+        assert mask.shape == (30, 20) if masked else mask is None
         level = np.round(left.mean()) / 255
         right = capture.images[row, :, 20 : 36 if masked else 40] / 255
         exact = -10 * np.log10(np.mean((right - level) ** 2))

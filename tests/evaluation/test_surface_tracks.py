@@ -16,10 +16,10 @@ DEPTH, SPEED = 2.0, 0.6  # scene units, and scene units over the whole time
 
 @pytest.fixture(scope="module")
 def capture():
-    """The tiny capture, filmed from one place."""
-    filmed = scenes.tiny_capture()
-    rows = np.zeros(len(filmed.ids), int)
-    return dataclasses.replace(filmed, cameras=cameras.take(filmed.cameras, rows))
+    """The tiny capture, recorded from one place."""
+    tiny = scenes.tiny_capture()
+    rows = np.zeros(len(tiny.ids), int)
+    return dataclasses.replace(tiny, cameras=cameras.take(tiny.cameras, rows))
 
 
 def state_of(late):
@@ -29,7 +29,7 @@ def state_of(late):
 
 def drawn(state, view):
     """A wall; late, something stands before the left half of it."""
-    width, height = scenes.TINY_FILM.size
+    width, height = scenes.TINY_SCENE.size
     depth = np.full((height, width), DEPTH, np.float32)
     if float(view.time) > state.step:
         depth[:, : width // 2] = DEPTH / 2
@@ -50,16 +50,16 @@ def moved(state, points, here, there):
 def test_points_are_followed_until_they_leave_or_are_hidden(capture):
     late = 0.5
     tracks = surface_tracks.follow(moved, drawn, state_of(late), capture, 40, time=0.3)
-    filmed = np.sort(capture.times[capture.train])
-    np.testing.assert_array_equal(tracks.times, filmed)
-    start = np.argmin(np.abs(filmed - 0.3))
+    times = np.sort(capture.times[capture.train])
+    np.testing.assert_array_equal(tracks.times, times)
+    start = np.argmin(np.abs(times - 0.3))
     pixels = tracks.pixels[:, start]
     np.testing.assert_allclose(pixels % 1, 0.5, atol=1e-4)  # centers of pixels
     assert (pixels[:, 1] > 5).all()
     one = cameras.take(capture.cameras, 0)
     depth = (tracks.positions - one.position) @ one.camera_from_world[2]
     np.testing.assert_allclose(depth, DEPTH, rtol=1e-5)
-    way = SPEED * (filmed - filmed[start])
+    way = SPEED * (times - times[start])
     right = (tracks.positions - tracks.positions[:, [start]]) @ one.camera_from_world[0]
     np.testing.assert_allclose(right[1:], np.tile(way, (39, 1)), atol=1e-5)
     np.testing.assert_allclose(right[0], 0, atol=1e-6)
@@ -67,9 +67,9 @@ def test_points_are_followed_until_they_leave_or_are_hidden(capture):
     across = pixels[:, :1] + float(one.focal_px) * way / DEPTH
     np.testing.assert_allclose(tracks.pixels[1:, :, 0], across[1:], atol=1e-3)
     inside = (across >= 0) & (across < capture.size[0])
-    hidden = (filmed > late) & (across < capture.size[0] // 2)
+    hidden = (times > late) & (across < capture.size[0] // 2)
     seen = inside & ~hidden
-    seen[0] = filmed == filmed[start]
+    seen[0] = times == times[start]
     np.testing.assert_array_equal(tracks.visible, seen)
     assert not inside.all()
     assert hidden.any()

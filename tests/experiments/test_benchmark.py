@@ -44,13 +44,13 @@ def run(*words):
 
 
 def test_a_benchmark_is_named_without_where_it_lies(tmp_path):
-    words = [str(tmp_path / "film"), "--max-side", "256", "--steps", "20"]
+    words = [str(tmp_path / "capture"), "--max-side", "256", "--steps", "20"]
     args = cli.parse(benchmark.Benchmark, words)
-    assert args.label == "film --max-side 256 --steps 20"
+    assert args.label == "capture --max-side 256 --steps 20"
     planned = benchmark.planned(args)
     folders = [run.task.folder for run in planned]
     assert [folder.name for folder in folders] == [f"default-{k}" for k in range(3)]
-    assert folders[0].parent.name == "film-max-side-256-steps-20"
+    assert folders[0].parent.name == "capture-max-side-256-steps-20"
 
 
 def test_a_run_is_one_of_reconstruct():

@@ -28,9 +28,9 @@ FIELD = (
 
 def reconstruct_at(tmp_path, preset, *settings):
     """The run folder, whose newest checkpoint is finite, and its steps."""
-    filmed, folder = tmp_path / "filmed", tmp_path / "run"
-    nerfies_format.write(scenes.tiny_capture(), filmed)
-    words = f"{filmed} --preset {preset} --steps 6 --out {folder} --set".split()
+    captured, folder = tmp_path / "capture", tmp_path / "run"
+    nerfies_format.write(scenes.tiny_capture(), captured)
+    words = f"{captured} --preset {preset} --steps 6 --out {folder} --set".split()
     with pytest.raises(SystemExit) as stop:
         reconstruct.main([*words, *settings])
     assert stop.value.code == 1

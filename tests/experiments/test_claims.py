@@ -84,7 +84,7 @@ def test_the_radar_charts_show_the_kept_numbers():
         rows = [
             claims.row_of(contest["rows"], name, "tracks")["cells"].values()
             for contest in stored["contests"]
-            if contest["film"] in claims.CAPTURES
+            if contest["capture"] in claims.CAPTURES
         ]
         means = [np.mean([cell["numbers"]["psnr"] for cell in row]) for row in rows]
         psnr[name] = np.mean(means)

@@ -62,7 +62,7 @@ def test_errors_of_some_kinds_are_shown_with_their_option(tmp_path, capsys):
             refuse()
         assert words in capsys.readouterr().err
     with pytest.raises(SystemExit), cli.user_errors():
-        raise CaptureNotFound(tmp_path, "filmed")
+        raise CaptureNotFound(tmp_path, "capture")
     assert f"CAPTURE --out {tmp_path} --resume" in capsys.readouterr().err
 
 

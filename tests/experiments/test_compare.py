@@ -12,9 +12,9 @@ from nerfies_jax.training import specs
 from nerfies_jax.training.loop import History
 
 
-def stored(film):
-    """What a run of a film has in its config.json, as far as it is compared."""
-    config = RunConfig("nerf", CaptureSource(f"/films/{film}"))
+def stored(capture):
+    """What a run of a capture has in its config.json, as far as it is compared."""
+    config = RunConfig("nerf", CaptureSource(f"/captures/{capture}"))
     return json.dumps({"config": specs.as_json(config), "representation": "radiance"})
 
 
@@ -125,7 +125,7 @@ def test_other_machines_and_frames_are_remarked(tmp_path):
         (lambda folder: (folder / "config.json").write_text("{}"), "not a run"),
         (
             lambda folder: (folder / "config.json").write_text(stored("dog")),
-            "capture is /films/dog and /films/cat",
+            "capture is /captures/dog and /captures/cat",
         ),
     ],
 )

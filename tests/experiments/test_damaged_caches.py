@@ -41,7 +41,7 @@ def evidence(folder):
 
 
 def scene(folder):
-    return synthetic.cached(scenes.TINY_FILM, folder)
+    return synthetic.cached(scenes.TINY_SCENE, folder)
 
 
 def rows(folder):
@@ -81,7 +81,7 @@ def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("written") / "scene"
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(scenes_record, "make", lambda *_: scenes.tiny_scene())
-        synthetic.write(scenes.TINY_FILM, folder)
+        synthetic.write(scenes.TINY_SCENE, folder)
     return folder
 
 

@@ -34,8 +34,8 @@ def saved(folder, preset, overrides, shaken):
     `shaken` are the networks whose numbers are drawn anew, so that something moves.
     """
     capture = dataclasses.replace(scenes.tiny_capture(), scale=0.5, center=CENTER)
-    nerfies_format.write(capture, folder / "filmed")
-    source = CaptureSource(capture=folder / "filmed")
+    nerfies_format.write(capture, folder / "capture")
+    source = CaptureSource(capture=folder / "capture")
     run = runs.new_run(RunConfig(preset, source, steps=12, overrides=overrides))
     state, rng = runs.initial_state(run), np.random.default_rng(0)
 
@@ -93,8 +93,10 @@ def test_a_path_leaves_with_its_times(splats, capsys):
     times = [
         each["render_time"] for each in json.loads(path.read_text())["camera_path"]
     ]
-    filmed = scenes.tiny_capture().times[scenes.tiny_capture().train]
-    np.testing.assert_allclose(times, np.linspace(filmed.min(), filmed.max(), 5), 1e-6)
+    times_of_capture = scenes.tiny_capture().times[scenes.tiny_capture().train]
+    np.testing.assert_allclose(
+        times, np.linspace(times_of_capture.min(), times_of_capture.max(), 5), 1e-6
+    )
     # In the one form and out in the other; and the times of a path that has none.
     assert main(splats, "nerfies-path", "--path", path) == 0
     (folder,) = (splats / "exports").glob("nerfies-path-path-stabilized-????????")

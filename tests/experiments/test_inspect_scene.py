@@ -7,7 +7,7 @@ import pytest
 from experiments import inspect_scene
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.runs import platform
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 
 @pytest.mark.full
@@ -16,11 +16,11 @@ def test_the_command_line_prints_the_table_and_writes_both_files(
 ):
     monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
-    nerfies_format.write(films.film(), tmp_path / "film")
+    nerfies_format.write(two_planes.make(), tmp_path / "capture")
     names = ("sheet.png", "findings.json")
     sheet, findings = (tmp_path / name for name in names)
     inspect_scene.main(
-        [str(tmp_path / "film"), "--image", str(sheet), "--findings", str(findings)]
+        [str(tmp_path / "capture"), "--image", str(sheet), "--findings", str(findings)]
     )
     printed = capsys.readouterr().out
     assert "splats-static-small" in printed

@@ -29,13 +29,13 @@ def test_every_preset_has_its_name_on_the_command_line():
     assert tuple(synthetic.PRESETS) == cli.SCENES
 
 
-def test_a_folder_in_use_is_refused_before_anything_is_filmed(tmp_path, monkeypatch):
+def test_a_folder_in_use_is_refused_before_anything_is_rendered(tmp_path, monkeypatch):
     (tmp_path / "mine").write_text("kept")
 
-    def no_film(*_):
-        raise AssertionError("filmed for a folder that cannot be used")
+    def no_scene(*_):
+        raise AssertionError("rendered for a folder that cannot be used")
 
-    monkeypatch.setattr("nerfies_jax.capture.synthetic.record.make", no_film)
+    monkeypatch.setattr("nerfies_jax.capture.synthetic.record.make", no_scene)
     with pytest.raises(SystemExit):
         make_scene.main([str(tmp_path)])
     assert (tmp_path / "mine").read_text() == "kept"

@@ -72,8 +72,8 @@ def check_whole(folder, undisturbed):
 def undisturbed(tmp_path_factory):
     """A run on a terminal, and what the terminal shows."""
     folder = tmp_path_factory.mktemp("output")
-    nerfies_format.write(scenes.tiny_capture(), folder / "filmed")
-    words = ("reconstruct", folder / "filmed", *RECONSTRUCT, "--out", folder / "run")
+    nerfies_format.write(scenes.tiny_capture(), folder / "capture")
+    words = ("reconstruct", folder / "capture", *RECONSTRUCT, "--out", folder / "run")
     return folder / "run", on_terminal(*words)
 
 
@@ -128,7 +128,7 @@ def test_a_terminal_shows_each_stage_that_lasts_by_name(undisturbed):
 def test_a_reconstruction_completes_whatever_reads_it(undisturbed, tmp_path):
     """A reader that goes away is no failure; a full disk, below, is one."""
     whole, _ = undisturbed
-    words = (whole.parent / "filmed", *RECONSTRUCT, "--out", tmp_path / "run")
+    words = (whole.parent / "capture", *RECONSTRUCT, "--out", tmp_path / "run")
     assert command("reconstruct", *words, output="2>&1 | head -1") == 0
     check_whole(tmp_path / "run", whole)
 

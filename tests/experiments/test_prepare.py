@@ -1,4 +1,4 @@
-"""Captures from archives and films."""
+"""Captures from archives and videos."""
 
 import numpy as np
 import pytest
@@ -116,7 +116,7 @@ def test_an_archive_cut_short_and_a_place_in_use(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_film_without_texture_is_refused_and_leaves_nothing(tmp_path, capsys):
+def test_a_video_without_texture_is_refused_and_leaves_nothing(tmp_path, capsys):
     frames = [np.full((64, 64, 3), 100 + k, np.uint8) for k in range(6)]
     video.write_video(tmp_path / "a.mp4", frames)
     with pytest.raises(SystemExit) as caught:
@@ -127,7 +127,7 @@ def test_a_film_without_texture_is_refused_and_leaves_nothing(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_real_film_becomes_a_capture(data_dir, tmp_path):
+def test_a_real_video_becomes_a_capture(data_dir, tmp_path):
     from nerfies_jax.capture import images
 
     files = sorted((data_dir / "nrnerf_bookshelf/rgb/1x").glob("*.png"))
@@ -145,7 +145,7 @@ def test_a_real_film_becomes_a_capture(data_dir, tmp_path):
     u, values, v = np.linalg.svd(other.T @ one)
     turned = values.sum() / (one**2).sum() * one @ (u @ v).T
     error = np.linalg.norm(turned - other, axis=1)
-    # 2 % of the path's extent: two reconstructions of the same hand-held film
+    # 2 % of the path's extent: two reconstructions of the same hand-held video
     assert np.median(error) < 0.02 * np.linalg.norm(np.ptp(other, axis=0))
 
 

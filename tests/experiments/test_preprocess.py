@@ -8,7 +8,7 @@ from experiments import preprocess
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.preprocessing import record
 from nerfies_jax.runs import platform
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 from tests.preprocessing.test_tracks import MOVES
 
 
@@ -18,8 +18,8 @@ def test_the_command_line_says_draws_and_keeps_what_it_finds(
 ):
     monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
-    nerfies_format.write(films.film(**MOVES), tmp_path / "film")
-    words = [str(tmp_path / "film"), "--out", str(tmp_path / "out")]
+    nerfies_format.write(two_planes.make(**MOVES), tmp_path / "capture")
+    words = [str(tmp_path / "capture"), "--out", str(tmp_path / "out")]
     preprocess.main(words)
     printed = capsys.readouterr().out
     assert "masks of moving objects ..." in printed

@@ -37,20 +37,20 @@ def main(job, *arguments):
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory):
+def captured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("radiance")
-    nerfies_format.write(scenes.tiny_capture(), folder / "filmed")
-    return folder / "filmed"
+    nerfies_format.write(scenes.tiny_capture(), folder / "capture")
+    return folder / "capture"
 
 
 @pytest.fixture(scope="module")
-def run(filmed):
+def run(captured):
     """A short run of a field with appearance codes and a warp."""
-    out = filmed.parent / "run"
+    out = captured.parent / "run"
     common = ("--preset", "nerfies", "--steps", "12", "--step-profile", "--out", out)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(budget, "MAX_VIDEO_FRAMES", budget.MIN_VIDEO_FRAMES)
-        assert main(reconstruct, filmed, *common, "--set", *TINY) == 0
+        assert main(reconstruct, captured, *common, "--set", *TINY) == 0
     return out
 
 

@@ -55,8 +55,8 @@ def ended(*arguments):
 def run(tmp_path_factory):
     """A short run on a tiny capture, from the command line to its files."""
     folder = tmp_path_factory.mktemp("main job")
-    nerfies_format.write(scenes.tiny_capture(), folder / "filmed")
-    words = (folder / "filmed", "--preset", "splats-deformable-small")
+    nerfies_format.write(scenes.tiny_capture(), folder / "capture")
+    words = (folder / "capture", "--preset", "splats-deformable-small")
     words = (*words, "--steps", 12, "--out", folder / "run")
     assert ended(*words, "--set", *QUICK) == 0
     return folder / "run"
@@ -82,7 +82,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(step_time, "part", jax.eval_shape)
     monkeypatch.setattr(part_time, "parts_ms", lambda parts: dict.fromkeys(parts, 1.0))
     monkeypatch.setattr(quality, "CACHE", tmp_path / "cache")
-    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "capture")
     out = tmp_path / "run"
     # Two steps are what the seconds allow.
     monkeypatch.setattr(rate, "step_time", lambda *_: rate.StepTime(100.0, 0.0))
@@ -94,7 +94,7 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
         return states[-1]
 
     monkeypatch.setattr(reconstruction, "initial_state", counted)
-    words = (tmp_path / "filmed", "--preset", "splats-static-small", "--seconds", 250)
+    words = (tmp_path / "capture", "--preset", "splats-static-small", "--seconds", 250)
     quick = ("strategy=none", "sh_degree=0", "init.extra_random=0")
     words = (*words, "--step-profile", "--out", out, "--json")
     assert ended(*words, "--set", *quick) == 0
@@ -231,7 +231,7 @@ def test_a_run_is_rendered_at_other_times_and_places(run, tmp_path):
     words = ["path", "--path", "orbit", "--frames", "3", "--out", str(path)]
     export.main([str(run), *words])
     table = json.loads(path.read_text())
-    table |= {"render_width": 64, "render_height": 32}  # not as it was filmed
+    table |= {"render_width": 64, "render_height": 32}  # not the size of the capture
     path.write_text(json.dumps(table))
     arguments = [str(run), "--path", str(path), "--freeze", "0.5"]
     formats = ["--formats", "png", "mp4", "exr", "--max-side", "32"]

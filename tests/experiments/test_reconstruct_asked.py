@@ -19,14 +19,14 @@ from nerfies_jax.runs import (
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
 from tests.metrics.test_perceptual import state_dict
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 
 @pytest.fixture
-def filmed(tmp_path):
+def captured(tmp_path):
     """A Nerfies directory that a test may damage."""
-    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
-    return tmp_path / "filmed"
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "capture")
+    return tmp_path / "capture"
 
 
 def refused(capsys, *arguments):
@@ -42,21 +42,23 @@ def refused(capsys, *arguments):
     return line
 
 
-def test_a_broken_capture_is_refused_by_name(filmed, tmp_path, capsys):
-    camera = min((filmed / "camera").iterdir())
+def test_a_broken_capture_is_refused_by_name(captured, tmp_path, capsys):
+    camera = min((captured / "camera").iterdir())
     camera.write_text(camera.read_text().replace("focal_length", "focal_lenght"))
-    line = refused(capsys, filmed, "--out", tmp_path / "run")
+    line = refused(capsys, captured, "--out", tmp_path / "run")
     assert str(camera) in line
     assert not (tmp_path / "run").exists()
 
 
-def test_frames_without_their_image_are_left_out_where_asked(filmed, tmp_path, capsys):
-    lost = min((filmed / "rgb/1x").iterdir())
+def test_frames_without_their_image_are_left_out_where_asked(
+    captured, tmp_path, capsys
+):
+    lost = min((captured / "rgb/1x").iterdir())
     lost.unlink()
-    assert "--missing skip" in refused(capsys, filmed, "--out", tmp_path / "run")
-    source = CaptureSource(filmed, missing="skip")
+    assert "--missing skip" in refused(capsys, captured, "--out", tmp_path / "run")
+    source = CaptureSource(captured, missing="skip")
     assert lost.stem not in runs.stored_capture(source).ids
-    assert source.arguments == (str(filmed), "--missing", "skip")
+    assert source.arguments == (str(captured), "--missing", "skip")
 
 
 @pytest.mark.parametrize(
@@ -73,22 +75,24 @@ def test_frames_without_their_image_are_left_out_where_asked(filmed, tmp_path, c
         (("--lpips-weights", "a.npz", "--lpips-network", "vgg"), "a.npz: No such file"),
     ],
 )
-def test_wrong_settings_are_refused(arguments, words, filmed, capsys, tmp_path):
-    assert words in refused(capsys, filmed, "--out", tmp_path / "run", *arguments)
+def test_wrong_settings_are_refused(arguments, words, captured, capsys, tmp_path):
+    assert words in refused(capsys, captured, "--out", tmp_path / "run", *arguments)
     assert not (tmp_path / "run").exists()
 
 
-def test_images_that_are_too_small_for_lpips_are_refused(filmed, capsys, tmp_path, rng):
+def test_images_that_are_too_small_for_lpips_are_refused(
+    captured, capsys, tmp_path, rng
+):
     weights = tmp_path / "alex.npz"
     np.savez(weights, **state_dict("alex", rng))
     asked = "--out", tmp_path / "run", "--lpips-weights", weights
-    assert "31 pixels on the shorter side" in refused(capsys, filmed, *asked)
+    assert "31 pixels on the shorter side" in refused(capsys, captured, *asked)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_folder_that_cannot_be_written_is_refused(filmed, tmp_path, capsys):
+def test_a_run_folder_that_cannot_be_written_is_refused(captured, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    assert "--out" in refused(capsys, filmed, "--out", tmp_path / "file" / "run")
+    assert "--out" in refused(capsys, captured, "--out", tmp_path / "file" / "run")
 
 
 def started(folder, config):
@@ -116,14 +120,14 @@ def started(folder, config):
     ],
 )
 def test_a_run_is_not_continued_as_another_one(arguments, words, tmp_path, capsys):
-    source = CaptureSource(tmp_path / "filmed", factor=4, heldout="8")
+    source = CaptureSource(tmp_path / "capture", factor=4, heldout="8")
     config = RunConfig("splats-static", source, 60, ("sh_degree=1",), seed=3)
     started(tmp_path, config)
     line = refused(capsys, *arguments, "--resume", "--out", tmp_path)
     assert words in line
 
 
-def test_a_run_is_found_by_what_was_filmed(tmp_path, monkeypatch, capsys):
+def test_a_run_is_found_by_its_capture(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     clip = tmp_path / "clip.mp4"
     record = {"source": str(clip.resolve())}
@@ -175,7 +179,7 @@ def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
-    nerfies_format.write(films.film(), tmp_path / "film")
+    nerfies_format.write(two_planes.make(), tmp_path / "capture")
     taken = {}
 
     def caught(config, stored):
@@ -186,7 +190,7 @@ def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
     with pytest.raises(SystemExit):
         reconstruct.main(
             [
-                *(str(tmp_path / "film"), "--preset", "splats-deformable-small"),
+                *(str(tmp_path / "capture"), "--preset", "splats-deformable-small"),
                 *("--effects", "auto", "--set", "sh_degree=0"),
             ]
         )

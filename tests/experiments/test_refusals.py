@@ -69,7 +69,7 @@ ROOM = pathlib.Path(__file__).resolve().parents[2] / "experiments"
 def test_what_cannot_be_is_refused(name, words, refusal, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     monkeypatch.setattr(platform, "CACHE", tmp_path / "cache")
-    monkeypatch.setitem(synthetic.PRESETS, "tiny", scenes.TINY_FILM)
+    monkeypatch.setitem(synthetic.PRESETS, "tiny", scenes.TINY_SCENE)
     monkeypatch.chdir(tmp_path)
     module = f"experiments.{name}{'.__main__' * (ROOM / name).is_dir()}"
     out = str(tmp_path / "out")

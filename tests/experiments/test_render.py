@@ -44,8 +44,8 @@ class Drawn:
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rendered")
-    nerfies_format.write(scenes.tiny_capture(), folder / "filmed")
-    source = CaptureSource(capture=folder / "filmed")
+    nerfies_format.write(scenes.tiny_capture(), folder / "capture")
+    source = CaptureSource(capture=folder / "capture")
     return runs.new_run(RunConfig("splats-static-small", source))
 
 
@@ -114,7 +114,7 @@ def test_a_render_that_fails_leaves_the_earlier_one_as_it_was(run, monkeypatch, 
             fail_at(failure[0], patch, *failure[1:])
             assert main(run, *SWAY) in (2, 130), failure
         assert contents(renders) == before, failure
-    # The film cannot be written where the images of a sequence have two sizes.
+    # The video cannot be written where the images of a sequence have two sizes.
     with monkeypatch.context() as patch:
         to_uint8 = evaluation.to_uint8
         sizes = iter((24, 24, 8))

@@ -129,8 +129,8 @@ MOMENTS = (
 
 @pytest.mark.slow
 def test_a_run_goes_on_after_a_signal_at_any_moment_and_is_viewed(tmp_path):
-    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
-    words = ("reconstruct", tmp_path / "filmed", *QUICK, "--out", tmp_path / "run")
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "capture")
+    words = ("reconstruct", tmp_path / "capture", *QUICK, "--out", tmp_path / "run")
     goes_on = ("reconstruct", "--out", tmp_path / "run", "--resume")
     for moment, number in zip(MOMENTS, SIGNALS, strict=True):
         command = Command(tmp_path, *words)

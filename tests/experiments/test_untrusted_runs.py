@@ -66,8 +66,8 @@ OPENING = {
 def finished(tmp_path_factory):
     """Two runs of a tiny capture, saved before they learned anything."""
     folder = tmp_path_factory.mktemp("finished")
-    nerfies_format.write(scenes.tiny_capture(), folder / "filmed")
-    source = CaptureSource(capture=folder / "filmed")
+    nerfies_format.write(scenes.tiny_capture(), folder / "capture")
+    source = CaptureSource(capture=folder / "capture")
     config = RunConfig("splats-static-small", source, steps=2, overrides=SMALL)
     run = runs.new_run(config)
     state = runs.initial_state(run)

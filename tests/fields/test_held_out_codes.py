@@ -18,7 +18,7 @@ from tests.scenes import TINY_FIELD
 
 
 def repainted(rows):
-    """The capture as the field would film it, in appearances it never learned."""
+    """The capture as the field would render it, in appearances it never learned."""
     capture, (metadata, params, _) = scenes.tiny_capture(), scenes.tiny_field()
     field = nerf_scene.field(TINY_FIELD, metadata)
     draw = jax.jit(field.render, static_argnums=4)
@@ -33,14 +33,14 @@ def repainted(rows):
 
 
 @pytest.mark.slow
-def test_a_code_is_found_again_from_half_an_image_if_that_was_filmed():
+def test_a_code_is_found_again_from_half_an_image_if_that_was_observed():
     metadata, params, _ = scenes.tiny_field()
     rows = scenes.tiny_capture().heldout[:1]
-    filmed = repainted(rows)
+    painted = repainted(rows)
     state = TrainState(params, (), (), jnp.asarray(10, jnp.int32), jax.random.key(0))
-    renderer = evaluation.Renderer(nerf_scene.build(TINY_FIELD, metadata), filmed.size)
+    renderer = evaluation.Renderer(nerf_scene.build(TINY_FIELD, metadata), painted.size)
 
-    score = held_out_codes.scorer(TINY_FIELD, metadata, filmed.size)
+    score = held_out_codes.scorer(TINY_FIELD, metadata, painted.size)
 
     def before_and_after(capture):
         color = evaluation.score(renderer, state, capture, rows).color
@@ -49,13 +49,13 @@ def test_a_code_is_found_again_from_half_an_image_if_that_was_filmed():
             score(state, capture, rows),
         )
 
-    before, after = before_and_after(filmed)
+    before, after = before_and_after(painted)
     assert before.psnr[0] < 35
     assert after.psnr[0] > 48  # the truth has 8 bits: 59 dB is all there is
     assert after.ssim[0] > 0.99
-    valid = np.ones(filmed.images.shape[:3], bool)
+    valid = np.ones(painted.images.shape[:3], bool)
     valid[:, :, :20] = False
-    before, after = before_and_after(dataclasses.replace(filmed, valid=valid))
+    before, after = before_and_after(dataclasses.replace(painted, valid=valid))
     np.testing.assert_allclose(after.psnr, before.psnr, atol=1e-3)
 
 

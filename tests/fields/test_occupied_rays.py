@@ -54,7 +54,7 @@ def test_a_ray_meets_what_it_goes_through(rng, dtype):
         corner = rng.integers(4, CELLS - 6, 3)
         occupied = np.zeros((CELLS,) * 3, bool)
         occupied[tuple(slice(c, c + 2) for c in corner)] = True
-        # Within the filmed volume contraction changes nothing.
+        # Within the observed volume contraction changes nothing.
         size = half_side * 3 / CELLS
         middle = ((corner + 1) / CELLS - 0.5) * half_side * 3
         if np.abs(middle).max() + size > half_side:

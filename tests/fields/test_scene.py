@@ -302,7 +302,7 @@ def test_facts_place_held_out_exposures_by_time():
     assert metadata.times == tuple(sorted(set(capture.times[capture.train].tolist())))
 
 
-def test_the_filmed_volume_fills_the_box():
+def test_the_observed_volume_fills_the_box():
     capture = scenes.tiny_capture()
     metadata = scene.metadata_of(capture, STATIC)
     inside = (capture.points.position - np.asarray(metadata.center)) * metadata.scale
@@ -451,7 +451,7 @@ def test_shared_and_single_levels(levels):
 
 
 @pytest.mark.full
-def test_an_unfilmed_pixel_teaches_nothing():
+def test_an_unobserved_pixel_teaches_nothing():
     model, state, frames = started(STATIC)
     nothing = frames._replace(valid=np.zeros(frames.images.shape[:3], bool))
     _, metrics = jax.jit(model.step)(state, nothing)

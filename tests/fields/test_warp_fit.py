@@ -14,7 +14,7 @@ from nerfies_jax.fields.effects.appearance import AppearanceSpec
 from nerfies_jax.fields.effects.records import FieldRecord
 from nerfies_jax.scene import presets, scene, warp_fit
 from nerfies_jax.scene import steps as field_steps
-from nerfies_jax.scene.warp_fit import FilmPaths
+from nerfies_jax.scene.warp_fit import PointPaths
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
 from nerfies_jax.training.track_start import FieldStartSpec
@@ -40,13 +40,13 @@ def turning_body(points=40):
     return path.astype(np.float32), time
 
 
-def film(known=None, still=200):
+def some_paths(known=None, still=200):
     path, time = turning_body()
     if known is None:
         known = np.random.default_rng(1).uniform(size=path.shape[:2]) < 0.6
     rest = np.random.default_rng(2).uniform(-1, 1, (still, 3)).astype(np.float32)
     rest[:, 2] = 1
-    return FilmPaths(time, np.zeros(FRAMES, int), path, known, rest)
+    return PointPaths(time, np.zeros(FRAMES, int), path, known, rest)
 
 
 def narrow(network):
@@ -88,7 +88,7 @@ def canonical_places(field, params):
 @pytest.mark.full
 @pytest.mark.parametrize("name", ["nerfies-small", "d-nerf-small"])
 def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
-    field, paths = field_of(name), film()
+    field, paths = field_of(name), some_paths()
     params = field.init(jax.random.key(0))
     fitted = warp_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
     assert fitted.first > 0.1
@@ -113,7 +113,7 @@ def test_a_warp_into_one_point_has_finite_slopes(dtype):
     path, time = turning_body()
     rest = np.zeros((1, 3), dtype)
     ids = np.zeros(FRAMES, int)
-    paths = FilmPaths(time, ids, path.astype(dtype), path[..., 0] < 9, rest)
+    paths = PointPaths(time, ids, path.astype(dtype), path[..., 0] < 9, rest)
     field = types.SimpleNamespace(
         spec=types.SimpleNamespace(steps=1),
         codes_at=lambda *_: {},
@@ -165,7 +165,7 @@ def test_a_motion_of_one_s_own_may_have_no_parameters():
     rates = field_steps.learning_rates(field.spec, field.effects, params, jnp.int32(0))
     assert rates.keys() == params.keys()
     start = dataclasses.replace(TRACKS, fit_steps=2)
-    fitted = warp_fit.fit(field, params, film(), jax.random.key(0), start)
+    fitted = warp_fit.fit(field, params, some_paths(), jax.random.key(0), start)
     assert fitted.params.keys() == params.keys()
 
 
@@ -222,7 +222,7 @@ def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
 
     Or none: two cameras saw the tenth.
     """
-    field, paths = field_of("nsff-small"), film()
+    field, paths = field_of("nsff-small"), some_paths()
     kept = np.array([*range(0, 8), 9, *range(9, FRAMES)])
     paths = paths._replace(
         time=paths.time[kept],
@@ -241,7 +241,7 @@ def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
         return scene_flow.dynamic(spec, medium, point, toward, time).flow
 
     ask = jax.jit(jax.vmap(flow, (0, None)))
-    for frame in (3, 8, 12):  # the ninth was never filmed
+    for frame in (3, 8, 12):  # the ninth was never observed
         ahead, back = np.moveaxis(np.asarray(ask(path[:, frame], time[frame])), 1, 0)
         true = path[:, frame + 1] - path[:, frame]
         size = np.linalg.norm(true, axis=-1).mean()
@@ -257,7 +257,7 @@ def test_points_seen_once_leave_everything_where_it_is():
     """Each has one place: there is no motion to find, and no wall that holds it."""
     known = np.zeros((40, FRAMES), bool)
     known[np.arange(40), np.arange(40) % FRAMES] = True
-    field, paths = field_of("nerfies-small"), film(known, still=0)
+    field, paths = field_of("nerfies-small"), some_paths(known, still=0)
     params = field.init(jax.random.key(0))
     fitted = warp_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
     assert fitted.last < 5e-3
@@ -271,13 +271,17 @@ def test_what_cannot_be_fitted_is_refused_by_name():
     params = field.init(jax.random.key(0))
     with pytest.raises(ValueError, match="no path is known"):
         warp_fit.fit(
-            field, params, film(np.zeros((40, FRAMES), bool)), jax.random.key(0), TRACKS
+            field,
+            params,
+            some_paths(np.zeros((40, FRAMES), bool)),
+            jax.random.key(0),
+            TRACKS,
         )
     alone = np.zeros((40, FRAMES), bool)
     alone[:, 4] = True
     with pytest.raises(ValueError, match="in two frames that follow each other"):
         warp_fit.fit_flow(
-            field_of("nsff-small"), params, film(alone), jax.random.key(0), TRACKS
+            field_of("nsff-small"), params, some_paths(alone), jax.random.key(0), TRACKS
         )
     with pytest.raises(ValueError, match=r'start\.motion="tracks" fits a warp'):
         dataclasses.replace(presets.PRESETS["nerf-small"], start=TRACKS)

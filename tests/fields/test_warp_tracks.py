@@ -19,18 +19,18 @@ from tests import scenes
 
 
 @pytest.fixture(scope="module")
-def filmed():
-    film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
-    capture, truth = synthetic.make(film)
+def known_scene():
+    spec = dataclasses.replace(scenes.TINY_SCENE, heldout_every=2)
+    capture, truth = synthetic.make(spec)
     return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
 
 
 @pytest.mark.parametrize("lost_at", [None, pytest.param(2, marks=pytest.mark.full)])
 def test_points_are_followed_through_a_warp_in_closed_form(
-    filmed, monkeypatch, lost_at
+    known_scene, monkeypatch, lost_at
 ):
     """x + d(x) = x / s(t) - v t: a point is scaled by s and moved, in field units."""
-    capture, _, known = filmed
+    capture, _, known = known_scene
     metadata = types.SimpleNamespace(center=(0.1, -0.2, 0.3), scale=4.0)
     times = capture.times[known.moments]
     velocity = jnp.asarray([0.3, 0.1, -0.2])
@@ -73,13 +73,13 @@ def test_points_are_followed_through_a_warp_in_closed_form(
 
 @pytest.mark.parametrize(("moving", "every"), [(0.75, 1), (1.0, 2)])
 def test_points_are_followed_along_a_flow_in_closed_form(
-    filmed, moving, every, monkeypatch
+    known_scene, moving, every, monkeypatch
 ):
     """A turn about an axis, by so much in each interval, of a share of what is there.
 
     With `every` second moment known, the flow is followed over two intervals at once.
     """
-    capture, _, known = filmed
+    capture, _, known = known_scene
     chosen = np.arange(known.start % every, len(known.moments), every)
     known = known._replace(
         moments=known.moments[chosen],
@@ -124,8 +124,8 @@ def test_points_are_followed_along_a_flow_in_closed_form(
     assert 0 < errors["track_error"] != protocol.static_error(known)
 
 
-def test_a_field_without_a_motion_follows_nothing(filmed):
-    capture, _, known = filmed
+def test_a_field_without_a_motion_follows_nothing(known_scene):
+    capture, _, known = known_scene
     spec = presets.PRESETS["t-nerf-small"]
     metadata = scene.metadata_of(capture, spec)
     assert warp_tracks.follow(spec, metadata, None, capture, known) is None

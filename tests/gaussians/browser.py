@@ -92,7 +92,7 @@ def capture():
     )
     # The first view is the middle one.
     positions = np.roll(positions, 5, axis=0)
-    filmed = [
+    poses = [
         cameras.look_at(place, (0, 0, 0), (0, 1, 0), FOCAL_PX, SIZE)
         for place in positions
     ]
@@ -102,7 +102,7 @@ def capture():
         source="test",
         ids=tuple(f"{i}" for i in count),
         images=np.zeros((9, SIZE[1], SIZE[0], 3), np.uint8),
-        cameras=cameras.stack(filmed),
+        cameras=cameras.stack(poses),
         times=np.linspace(0, 1, 9, dtype=np.float32),
         train=count,
         heldout=count[:0],

@@ -106,7 +106,7 @@ def test_the_reference_values_of_e_d3dgs_are_met(dtype, oracle_dir):
     """Codes and offsets of its networks at three times and lengths of its table.
 
     It fades offsets in over a thousand steps, of sizes twice. Its times are those of a
-    camera that is 0.01 late, reflected at the end of the film.
+    camera that is 0.01 late, reflected at the end of the video.
     """
     path = oracle_dir / "splatting" / "ed3dgs_deform.npz"
     stored = np.load(path, allow_pickle=False)
@@ -149,7 +149,7 @@ HARD = {
     "equal codes": same_codes,
     "zero embeddings": lambda params, embedding: (params, np.zeros_like(embedding)),
 }
-# The film's ends, a code of the table and one of the coarse network's three.
+# The video's ends, a code of the table and one of the coarse network's three.
 MOMENTS = (0.0, 1.0, 1 / 3, 0.5)
 
 
@@ -215,7 +215,7 @@ def test_the_fine_network_reads_ever_more_rows():
     at_once = dataclasses.replace(SPEC, grow_until=0)
     assert motion_codes.fine_rows(at_once, 10, 0) == 10
     assert motion_codes.growth_steps(at_once, 10) == ()
-    # A film of one moment has one code, and nothing grows.
+    # A video of one timestamp has one code, and nothing grows.
     assert motion_codes.coarse_rows(SPEC, 1) == 1
     assert motion_codes.growth_steps(SPEC, 1) == ()
 

@@ -87,13 +87,13 @@ def test_half_a_frame_tells_the_light_of_the_other_half(built):
     lit = plain * 0.7 + 0.2 + plain @ CHANGE[:, :3].T
     images = CAPTURE.images.copy()
     images[CAPTURE.heldout] = np.round(255 * lit.clip(0, 1))
-    filmed = dataclasses.replace(CAPTURE, images=images)
-    score = held_out_exposure.scorer(SPEC, metadata, filmed.size)
-    halves = score(state, filmed, filmed.heldout)
+    capture = dataclasses.replace(CAPTURE, images=images)
+    score = held_out_exposure.scorer(SPEC, metadata, capture.size)
+    halves = score(state, capture, capture.heldout)
     # 8 bits of both images leave 56 dB; nothing else is between them
     assert halves.psnr.min() > 50
     still = dataclasses.replace(SPEC, exposure=None)
-    assert held_out_exposure.scorer(still, metadata, filmed.size) is None
+    assert held_out_exposure.scorer(still, metadata, capture.size) is None
     # Of a black image nothing can be told but the offset.
     black = np.zeros((4, 5, 3))
     change = exposure.fit(black, black + 0.25, None)

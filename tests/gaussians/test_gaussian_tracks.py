@@ -20,9 +20,9 @@ from tests.gaussians.shared import put, rows_of
 
 
 @pytest.fixture(scope="module")
-def filmed():
-    film = dataclasses.replace(scenes.TINY_FILM, heldout_every=2)
-    capture, truth = synthetic.make(film)
+def known_scene():
+    spec = dataclasses.replace(scenes.TINY_SCENE, heldout_every=2)
+    capture, truth = synthetic.make(spec)
     return capture, truth, protocol.ground_truth(capture, truth, 2, 5)
 
 
@@ -32,9 +32,9 @@ def splat_rows(mean, logit):
     return rows_of(Gaussians(np.float32(mean), *unit), logit)
 
 
-def follow_moved(monkeypatch, filmed, rows, moved):
+def follow_moved(monkeypatch, known_scene, rows, moved):
     """Follow through Gaussians that `moved(mean, time)` poses in closed form."""
-    capture, _, known = filmed
+    capture, _, known = known_scene
 
     def deform(params, prepared, time):
         splats = params.rows["splats"]
@@ -52,21 +52,21 @@ def follow_moved(monkeypatch, filmed, rows, moved):
 
 
 @pytest.fixture
-def cloud(filmed, rng):
+def cloud(known_scene, rng):
     """Gaussians all around the known points and the static ones."""
-    capture, _, known = filmed
+    capture, _, known = known_scene
     near = np.concatenate([known.start_points, capture.points.position])
     return near.repeat(20, 0) + rng.normal(scale=0.01, size=(20 * len(near), 3))
 
 
 def test_points_are_carried_by_gaussians_that_all_move_alike(
-    filmed, monkeypatch, cloud
+    known_scene, monkeypatch, cloud
 ):
-    capture, _, known = filmed
+    capture, _, known = known_scene
     velocity = np.float32([0.3, 0.1, -0.2])
     rows = splat_rows(cloud, np.zeros(len(cloud)))
     followed = follow_moved(
-        monkeypatch, filmed, rows, lambda mean, time: mean + velocity * time
+        monkeypatch, known_scene, rows, lambda mean, time: mean + velocity * time
     )
     since = capture.times[known.moments] - capture.times[known.moments][known.start]
     expected = known.start_points[:, None] + since[:, None] * velocity
@@ -80,10 +80,10 @@ def test_points_are_carried_by_gaussians_that_all_move_alike(
 
 
 def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbors_mean(
-    filmed, monkeypatch, cloud
+    known_scene, monkeypatch, cloud
 ):
     """x(t) = R(t) x with a turn of t radians about an axis through the origin."""
-    capture, _, known = filmed
+    capture, _, known = known_scene
     axis = np.float32([0.6, 0.0, 0.8])
 
     def turned(points, time):
@@ -97,7 +97,7 @@ def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbors_mean
     times = capture.times[known.moments]
     # Turned back, so that they are around the points when these are given.
     rows = splat_rows(turned(cloud, -times[known.start]), np.zeros(len(cloud)))
-    followed = follow_moved(monkeypatch, filmed, rows, moved)
+    followed = follow_moved(monkeypatch, known_scene, rows, moved)
     body = turned(known.start_points, -times[known.start])
     right = np.stack([turned(body, time) for time in times], axis=1)
     error = np.linalg.norm(followed.path - right, axis=-1)
@@ -109,9 +109,9 @@ def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbors_mean
     assert error[:, -1].mean() < 0.05 * still[:, -1].mean()
 
 
-def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
+def test_what_cannot_be_seen_carries_nothing(known_scene, monkeypatch, cloud):
     """Faint and dead Gaussians fly off; those that can be seen stay."""
-    known = filmed[2]
+    known = known_scene[2]
     mean = np.concatenate([cloud, cloud + 1e-4, cloud - 1e-4])
     logit = np.repeat([0.0, -4.0, 5.0], len(cloud))
     rows = splat_rows(mean, logit)
@@ -121,11 +121,13 @@ def test_what_cannot_be_seen_carries_nothing(filmed, monkeypatch, cloud):
     def moved(mean, time):
         return jnp.where(hidden[:, None], mean + time, mean)
 
-    followed = follow_moved(monkeypatch, filmed, rows, moved)
+    followed = follow_moved(monkeypatch, known_scene, rows, moved)
     still = np.repeat(known.start_points[:, None], known.path.shape[1], 1)
     np.testing.assert_allclose(followed.path, still, atol=1e-6)
     none = splat_rows(cloud, np.full(len(cloud), -4.0))
-    followed = follow_moved(monkeypatch, filmed, none, lambda mean, time: mean + time)
+    followed = follow_moved(
+        monkeypatch, known_scene, none, lambda mean, time: mean + time
+    )
     np.testing.assert_allclose(followed.path, still, atol=1e-6)
 
 
@@ -147,8 +149,8 @@ def test_the_weights_of_neighbors_are_a_slow_sum(rng):
 
 
 @pytest.mark.full
-def test_splats_without_motion_follow_nothing_and_untrained_motion_stays(filmed):
-    capture, _, known = filmed
+def test_splats_without_motion_follow_nothing_and_untrained_motion_stays(known_scene):
+    capture, _, known = known_scene
     metadata, spec = splat_scene.metadata_of(capture), scenes.TINY_DEFORMABLE
     still = gaussian_tracks.follow(scenes.TINY_SPLATS, metadata, None, capture, known)
     assert still is None

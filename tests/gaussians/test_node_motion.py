@@ -280,7 +280,7 @@ def test_rigid_bodies_do_not_bend_and_others_do_by_what_is_left(dtype):
     np.testing.assert_allclose(value, total / len(before), rtol=1e-5)
 
 
-def test_links_are_to_what_stays_near_over_the_film(dtype):
+def test_links_are_to_what_stays_near_over_the_video(dtype):
     """The third node passes the first closely and is gone afterwards."""
     time = np.linspace(0, 1, 5)
     paths = np.zeros((4, 5, 3))

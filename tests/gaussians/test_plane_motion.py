@@ -127,7 +127,7 @@ def test_what_is_kept_smooth_is_what_the_weights_say(float64):
     assert {float(term.weight) for term in early.values()} == {0.0}
 
 
-def test_the_box_holds_what_was_filmed():
+def test_the_box_holds_what_was_observed():
     capture = scenes.tiny_capture()
     low, high = np.array(initialization.observed_box(capture))
     inside = (capture.points.position > low) & (capture.points.position < high)

@@ -87,15 +87,15 @@ def test_views_turn_about_their_target():
 
 def on_sphere(azimuths, elevations, distance=3.0, target=(0.5, -1.0, 2.0)):
     """Cameras around a target, y up; the azimuth is counted from z toward x."""
-    filmed = []
+    poses = []
     for azimuth, elevation in zip(azimuths, elevations, strict=True):
         level = np.cos(elevation)
         away = [np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level]
         place = np.add(target, np.multiply(distance, away))
         up = (0, 1, 0) if abs(elevation) < 1.5 else (0, 0, -1)
-        filmed.append(cameras.look_at(place, target, up, 50.0, (64, 48)))
+        poses.append(cameras.look_at(place, target, up, 50.0, (64, 48)))
     up = np.array([0.0, 1.0, 0.0])
-    return camera_limits(cameras.stack(filmed), np.array(target), up, 0.8)
+    return camera_limits(cameras.stack(poses), np.array(target), up, 0.8)
 
 
 def test_limits_are_those_of_the_capture_with_a_margin():

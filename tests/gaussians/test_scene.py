@@ -168,7 +168,7 @@ def test_facts_take_a_depth_for_the_extent_of_a_camera_that_stands_still():
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("unit", [1.0, 1e-3])
-def test_what_was_filmed_is_drawn_however_small_its_units_are(unit):
+def test_what_was_observed_is_rendered_however_small_its_units_are(unit):
     """Where far points span the box, 0.01 of it is meters before the camera."""
     capture = scenes.tiny_capture()
     small = dataclasses.replace(

@@ -42,7 +42,7 @@ def test_what_moves_on_cubics_and_fades_by_bells_comes_back():
     for row, time in enumerate(TIMES):
         drawn = splatv.at(curves, float(time))
         seen = instants.opacity[row] > 0.02
-        # Half floats of coefficients up to 2 over half a film, 8 bits of opacity
+        # Half floats of coefficients up to 2 over half a video, 8 bits of opacity
         off = np.abs(np.asarray(drawn.mean) - instants.mean[row])
         assert off[seen].max() < 2e-3
         np.testing.assert_allclose(drawn.opacity, instants.opacity[row], atol=4e-3)

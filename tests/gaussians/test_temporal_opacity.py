@@ -76,7 +76,7 @@ def test_the_lifted_ones_start_around_their_images():
     )
     fading = track_start.put_in(params, (motion, EFFECT), tracked).rows[NAME]
     np.testing.assert_allclose(fading.time, [0.5, 0.5, 0.5, 0.25, 0.75])
-    # 0.5 of 0.4 films, and what was never followed as short as widths get.
+    # 0.5 times 0.4 of the video, and what was never followed as short as widths get.
     always, (least, _) = temporal_opacity.ALWAYS, temporal_opacity.LOG_WIDTH_RANGE
     widths = [always, always, always, math.log(0.2), least]
     np.testing.assert_allclose(fading.log_width, widths, rtol=1e-6)

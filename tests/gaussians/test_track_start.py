@@ -22,7 +22,7 @@ from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import hidden_points, record, usable_paths
 from tests import compilations
 from tests.gradients import directional_error
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 from tests.preprocessing.test_tracks import MOVES, gathered
 
 FRAMES = 24
@@ -184,7 +184,7 @@ def test_slopes_of_carried_points_are_those_of_differences(float64):
 @pytest.mark.full
 @pytest.mark.parametrize("deviation", [0.02, 1.0])
 def test_a_thing_tells_its_depth_better_than_each_of_its_tracks(deviation):
-    """Where the film tells depth; where it does not, tracks count as they are."""
+    """Where the video tells depth; where it does not, tracks count as they are."""
     position, time = turning_body()
     ray = position / np.linalg.norm(position, axis=-1, keepdims=True)
     noise = np.random.default_rng(3).normal(0, 0.06, (30, 1, 1))
@@ -226,9 +226,9 @@ def test_gaussians_start_on_the_card_and_move_with_it():
     for time, place in zip(times, places_of(effect, points, times), strict=True):
         across, down = MOVES["card"](time)
         on_card = (
-            np.abs(place[:, :2] - np.array([across, down])) < films.CARD + 0.05
+            np.abs(place[:, :2] - np.array([across, down])) < two_planes.CARD + 0.05
         ).all(-1)
-        near = np.abs(place[:, 2] - films.NEAR) < 0.15
+        near = np.abs(place[:, 2] - two_planes.NEAR) < 0.15
         assert (on_card & near).mean() > 0.8  # the mask has a rim
 
 
@@ -277,7 +277,7 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     assert (still[active] < 0.5).sum() >= 100
     assert (still[active] > 0.99).sum() == active.sum() - 150
     wall = np.asarray(rows["splats"].mean)[active & (still > 0.99)]
-    assert abs(np.median(wall[:, 2]) - films.FAR) < 0.05
+    assert abs(np.median(wall[:, 2]) - two_planes.FAR) < 0.05
     # What stands hidden begins opaque, in the color that was guessed.
     opaque = np.asarray(jax.nn.sigmoid(rows["splats"].opacity_logit)) > 0.8
     np.testing.assert_array_equal(rows["splats"].mean[opaque], places[::2])
@@ -295,9 +295,9 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     assert jax.tree.structure(once) == jax.tree.structure(state)
 
 
-def test_a_film_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypatch):
+def test_a_video_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypatch):
     monkeypatch.setattr(usable_paths, "CACHE", tmp_path)
-    capture = films.film(card=lambda time: (0.1, 0.0), frames=8)
+    capture = two_planes.make(card=lambda time: (0.1, 0.0), frames=8)
     drawn = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 3), (300, 3))
     points = PointCloud(drawn.astype("f4"), np.zeros((300, 3), "u1"))
     capture = dataclasses.replace(capture, points=points)
@@ -325,13 +325,15 @@ def test_starts_that_cannot_be_are_refused(changes, words):
 
 
 @pytest.mark.full
-def test_large_films_are_looked_at_smaller(monkeypatch):
+def test_large_videos_are_looked_at_smaller(monkeypatch):
     monkeypatch.setattr(record, "MOST_PIXELS", FRAMES * 96 * 72 // 3)
-    capture = films.film(**MOVES, frames=FRAMES)
+    capture = two_planes.make(**MOVES, frames=FRAMES)
     evidence = record.gather(capture)
     assert evidence.factor == 2
     assert evidence.moving.shape[1:] == (36, 48)
     effect = effect_of(MOTIONS["bases"])
     start = StartSpec(motion="tracks", moving_points=50, fit_steps=100)
     started = track_start.start(start, effect, evidence, capture, jax.random.key(0))
-    assert abs(np.median(started.position[:, 2]) - films.NEAR) < 0.3  # the wall: 0.7
+    assert (
+        abs(np.median(started.position[:, 2]) - two_planes.NEAR) < 0.3
+    )  # the wall: 0.7

@@ -26,9 +26,9 @@ def as_is(x: Any) -> Any:
 
 
 class Start(NamedTuple):
-    """What is unusual, on the way from the film to the first step."""
+    """What is unusual, on the way from the capture to the first step."""
 
-    film: Callable[[Capture], Capture] = as_is
+    capture: Callable[[Capture], Capture] = as_is
     frames: Callable[[Frames], Frames] = as_is
     params: Callable[[PyTree], PyTree] = as_is
     speed: float = 1.0  # times the learning rate
@@ -37,9 +37,9 @@ class Start(NamedTuple):
 
 
 def scaled(factor: float) -> Callable[[Capture], Capture]:
-    """The same film in other units."""
+    """The same capture in other units."""
 
-    def film(capture):
+    def change(capture):
         cameras = capture.cameras
         position = (cameras.position * factor).astype(np.float32)
         points = (capture.points.position * factor).astype(np.float32)
@@ -52,7 +52,7 @@ def scaled(factor: float) -> Callable[[Capture], Capture]:
             far=capture.far * factor,
         )
 
-    return film
+    return change
 
 
 def inside(capture: Capture) -> Capture:
@@ -82,14 +82,14 @@ def rounded(frames: Frames) -> Frames:
     return frames._replace(images=255 * shares.astype(np.float32))
 
 
-def unfilmed_nan(frames: Frames) -> Frames:
-    """`hostile.unfilmed`, where nothing is but NaN."""
-    frames = hostile.unfilmed(frames)
+def unobserved_nan(frames: Frames) -> Frames:
+    """`hostile.unobserved`, where nothing is but NaN."""
+    frames = hostile.unobserved(frames)
     images = np.where(frames.valid[..., None], frames.images, np.float32(np.nan))
     return frames._replace(images=images)
 
 
-def nothing_filmed(frames: Frames) -> Frames:
+def nothing_observed(frames: Frames) -> Frames:
     """No pixel at all, and NaN everywhere."""
     images = np.full_like(frames.images, np.nan)
     return frames._replace(images=images, valid=np.zeros_like(frames.valid))
@@ -184,27 +184,27 @@ SEEN = ("forward_seen", "backward_seen")
 NEEDS = {
     "no depth known": FLOW,
     "constant depth": FLOW,
-    "unfilmed depth not a number": FLOW,
+    "unobserved depth not a number": FLOW,
 }
 OF_FRAMES = {
     name: Start(frames=change, needs=NEEDS.get(name, ()))
     for name, change in hostile.CAPTURES.items()
 }
-OF_FILMS = {
+OF_CAPTURES = {
     "bfloat16 images": Start(frames=rounded),
-    "unfilmed not a number": Start(frames=unfilmed_nan),
-    "nothing filmed": Start(frames=nothing_filmed),
+    "unobserved not a number": Start(frames=unobserved_nan),
+    "nothing observed": Start(frames=nothing_observed),
     "one exposure": Start(frames=one_exposure, needs=("appearance",)),
     "no flow known": Start(frames=flow_times(0, *SEEN), needs=FLOW),
     "wild flow": Start(frames=flow_times(1e4, "forward", "backward"), needs=FLOW),
     "points in one place": Start(frames=points_at(0.0), needs=("background",)),
     "points at 1e20": Start(frames=points_at(1e20), needs=("background",)),
-    "cameras inside": Start(film=inside),
-    "near 1e-6 before far": Start(film=thin(1e-6)),
-    "near as far as far": Start(film=thin(1e-9)),
-    "near at the lens": Start(film=from_the_lens),
-    "box of 1e-5 units": Start(film=scaled(1e-5)),
-    "box of 1e5 units": Start(film=scaled(1e5)),
+    "cameras inside": Start(capture=inside),
+    "near 1e-6 before far": Start(capture=thin(1e-6)),
+    "near as far as far": Start(capture=thin(1e-9)),
+    "near at the lens": Start(capture=from_the_lens),
+    "box of 1e-5 units": Start(capture=scaled(1e-5)),
+    "box of 1e5 units": Start(capture=scaled(1e5)),
 }
 OF_PARAMETERS = {
     "opaque": Start(params=denser(100.0)),

@@ -60,8 +60,8 @@ def two_views(frames):
     return taken._replace(points=frames.points, flow=frames.flow)
 
 
-def unfilmed(frames):
-    """A frame without a valid pixel, and one of which the left half was not filmed."""
+def unobserved(frames):
+    """A frame without a valid pixel, and one whose left half was not observed."""
     half = frames.images.shape[2] // 2
     valid = frames.valid.copy()
     valid[0], valid[1, :, :half] = False, False
@@ -79,8 +79,8 @@ def with_depths(value):
     return change
 
 
-def unfilmed_depth_nan(frames):
-    """The left half of one frame not filmed, its depth not a number."""
+def unobserved_depth_nan(frames):
+    """The left half of one frame not observed, its depth not a number."""
     half = frames.images.shape[2] // 2
     valid = frames.valid.copy()
     valid[1, :, :half] = False
@@ -92,15 +92,15 @@ def unfilmed_depth_nan(frames):
 
 
 CAPTURES = {
-    "as filmed": lambda frames: frames,
+    "as recorded": lambda frames: frames,
     "black images": lambda frames: frames._replace(images=0 * frames.images),
     "one instant": lambda frames: _first(frames, "times"),
     "duplicated frames": duplicated,
     "two views": two_views,
-    "unfilmed frames": unfilmed,
+    "unobserved frames": unobserved,
     "no depth known": with_depths(0.0),
     "constant depth": with_depths(2.0),
-    "unfilmed depth not a number": unfilmed_depth_nan,
+    "unobserved depth not a number": unobserved_depth_nan,
 }
 
 

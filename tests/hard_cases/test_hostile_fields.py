@@ -14,7 +14,7 @@ from tests.hard_cases import field_starts, hostile, linear_warps, tiny_fields
 from tests.hard_cases.field_starts import Start
 from tests.hard_cases.linear_warps import DISPLACEMENTS
 
-STARTS = field_starts.OF_FRAMES | field_starts.OF_FILMS | field_starts.OF_PARAMETERS
+STARTS = field_starts.OF_FRAMES | field_starts.OF_CAPTURES | field_starts.OF_PARAMETERS
 # A field compiles in 15 to 45 s.
 QUICK = ("nerf-w",)
 
@@ -27,7 +27,7 @@ def marked(name, *others):
 
 FIELDS = [marked(name) for name in tiny_fields.PAPERS]
 # Starts of the other fields: those that reach what they have and NeRF-W has not.
-FEW_STARTS = ("as filmed", "one instant", "nothing filmed", "cameras inside")
+FEW_STARTS = ("as recorded", "one instant", "nothing observed", "cameras inside")
 FEW_STARTS += ("opaque by far", "shattered warp", "all a hundredfold")
 
 
@@ -54,11 +54,11 @@ RUNS += [marked(name, start) for name in tiny_fields.SYSTEMS for start in FEW_ST
 def trained(name, start, folder=None):
     """A run that ended as every run must, and what it would show then."""
     run = tiny_fields.started(name)
-    film = start.film(run.capture)
-    place = tiny_fields.place_of(scene.metadata_of(film, run.spec), start.speed)
-    if film.points is None:  # they are told the field's planes alone
-        film = dataclasses.replace(film, points=run.capture.points)
-    frames = start.frames(tiny_fields.frames_of(film, run.model.required_data))
+    capture = start.capture(run.capture)
+    place = tiny_fields.place_of(scene.metadata_of(capture, run.spec), start.speed)
+    if capture.points is None:  # they are told the field's planes alone
+        capture = dataclasses.replace(capture, points=run.capture.points)
+    frames = start.frames(tiny_fields.frames_of(capture, run.model.required_data))
     params = start.params(jax.tree.map(np.asarray, run.state.params))
     state = run.state._replace(params=params, aux_state=place)
     ended = hostile.train(run.model, state, frames, folder, steps=tiny_fields.STEPS)
@@ -73,7 +73,7 @@ def image_of(run, state, frames, row):
 
 @pytest.mark.parametrize(("name", "start"), RUNS)
 def test_a_field_stays_finite_from(name, start, tmp_path):
-    folder = tmp_path if start == "as filmed" else None
+    folder = tmp_path if start == "as recorded" else None
     ended, image = trained(name, STARTS[start], folder)
     # The loop may stop with a word; none of these starts gives it a reason.
     assert ended.result.stopped_by == "steps", ended.result.message
@@ -81,7 +81,7 @@ def test_a_field_stays_finite_from(name, start, tmp_path):
     assert np.all((image.color > -1e-5) & (image.color < 2 + 1e-5))
     assert np.all((image.alpha > -1e-5) & (image.alpha < 1 + 1e-5))
     assert np.all(image.depth >= 0)
-    if start == "as filmed":
+    if start == "as recorded":
         assert ended.last["mse"] < 0.9 * ended.first["mse"]
 
 

@@ -45,9 +45,9 @@ SYSTEMS = ("moba", "4dgs", "e-d3dgs", "sc-gs", "spacetime")
 DIE = ("huge", "needles", "transparent")
 # |dL/dq| is 1e30 times that of a unit quaternion; its square is beyond float32.
 STOPS = {"quaternions of nearly nothing": "optimizer.second.rows.splats.quaternion"}
-# Captures that change nothing a preset reads: they would be "as filmed" once more. Of
-# these, "unfilmed depth not a number" is half of "unfilmed frames".
-NO_DEPTHS = ("no depth known", "constant depth", "unfilmed depth not a number")
+# Captures that change nothing a preset reads: they would be "as recorded" once more. Of
+# these, "unobserved depth not a number" is half of "unobserved frames".
+NO_DEPTHS = ("no depth known", "constant depth", "unobserved depth not a number")
 UNREAD = {"splats-static": (*NO_DEPTHS, "one instant")}
 # Starts that only a motion, its network or its growth could spoil: the static preset
 # shows what becomes of the others.
@@ -56,14 +56,14 @@ ROWS_OF = {
 }
 CAPTURES_OF = {
     "sonata": (
-        *("as filmed", "one instant", "two views", "no depth known"),
-        "unfilmed depth not a number",
+        *("as recorded", "one instant", "two views", "no depth known"),
+        "unobserved depth not a number",
     ),
 }
 SILENT = {"kan_motion", "motion_growth"}  # add nothing to the loss
 # The last frame's error over that of the start; 0.15 to 0.63 where Adam trains. RAdam's
 # steps are 0.03 to 0.15 of Adam's in so few updates, too short to make good what the
-# reset of the opacities at half time took: 1.12 to 1.24, as filmed, too.
+# reset of the opacities at half time took: 1.12 to 1.24, as recorded, too.
 FALLS = {"sonata": 1.5}
 
 
@@ -261,11 +261,11 @@ def test_splats_train_from_hostile_rows(name, case, tmp_path):
 def test_splats_train_on_hostile_captures(name, case, tmp_path):
     prepared = ready(name)
     frames = hostile.CAPTURES[case](prepared.frames)
-    folder = tmp_path if case == "as filmed" else None
+    folder = tmp_path if case == "as recorded" else None
     trained = run(prepared, prepared.start, frames, folder)
     assert trained.result.stopped_by == "steps", trained.result.message
     assert falls(prepared, frames, trained) < FALLS.get(name, 0.95)
-    if case == "as filmed":
+    if case == "as recorded":
         check_every_part(prepared, trained.result)
 
 

@@ -11,16 +11,16 @@ import pytest
 from nerfies_jax.preprocessing import dense_flow, record, watch
 from nerfies_jax.runs import products, representations, run
 from nerfies_jax.runs.config import CaptureSource, RunConfig
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 pytestmark = pytest.mark.slow
 
 LITTLE = 1e-9  # of the default budget: nothing that can be left out is within it
 
 
-def moving_film(**changes):
-    film = films.film(card=lambda time: (0.5 * (time - 0.5), 0.0), frames=12)
-    return dataclasses.replace(film, **changes)
+def moving_capture(**changes):
+    capture = two_planes.make(card=lambda time: (0.5 * (time - 0.5), 0.0), frames=12)
+    return dataclasses.replace(capture, **changes)
 
 
 def same(one, other):
@@ -51,7 +51,7 @@ def once(monkeypatch, forgetful):
 
 def test_a_busy_machine_finds_the_same(monkeypatch):
     """With a budget that is used up in the middle of the work."""
-    capture = moving_film(preprocessing=0.002)
+    capture = moving_capture(preprocessing=0.002)
     quick = record.gather(capture)
     assert quick.left_out
     hours = itertools.count(step=3600.0)
@@ -63,7 +63,7 @@ def test_a_busy_machine_finds_the_same(monkeypatch):
 
 
 def test_what_is_beyond_the_budget_is_kept_and_stated(tmp_path, once, capsys):
-    capture, log = moving_film(preprocessing=LITTLE), []
+    capture, log = moving_capture(preprocessing=LITTLE), []
     hasty = record.cached(capture, tmp_path, tell=log.append)
     assert "skipped, beyond the budget of work: dense static points" in log
     assert not len(hasty.still.position)
@@ -81,15 +81,15 @@ def test_what_is_beyond_the_budget_is_kept_and_stated(tmp_path, once, capsys):
     assert "Preprocessing skipped" in capsys.readouterr().err
     assert len(once) == 1
     # A larger budget is another record, from which nothing is missing.
-    whole = record.cached(moving_film(), tmp_path)
+    whole = record.cached(moving_capture(), tmp_path)
     assert not whole.left_out
-    assert not record.notes_on(moving_film(), tmp_path)
+    assert not record.notes_on(moving_capture(), tmp_path)
     assert 0.3 < len(hasty.score) / len(whole.score) < 0.7
 
 
 def test_a_run_records_what_was_left_out(tmp_path):
     """In its config.json, from which the report has it, also after `--resume`."""
-    capture = moving_film(notes=("of the reader",))
+    capture = moving_capture(notes=("of the reader",))
     kind = representations.named("gaussians")
     spec = kind.presets["splats-static"]
     opened = run.Run(RunConfig(), capture, capture, kind, spec, None, None)
@@ -101,7 +101,7 @@ def test_a_run_records_what_was_left_out(tmp_path):
 
 
 def test_a_folder_that_cannot_be_written_costs_the_next_command_alone(tmp_path, once):
-    capture, log = moving_film(), []
+    capture, log = moving_capture(), []
     (tmp_path / "file").touch()
     first = record.cached(capture, tmp_path / "file", tell=log.append)
     assert "could not be cached" in log[-1]
@@ -119,7 +119,7 @@ def test_as_many_wide_steps_as_there_is_room_for_are_searched_again(monkeypatch)
 
     monkeypatch.setattr(dense_flow.wide_steps, "improved", improved)
     monkeypatch.setattr(dense_flow.wide_steps, "is_wide", lambda *_: True)
-    views = record.view_set.in_time_order(films.film(frames=6))
+    views = record.view_set.in_time_order(two_planes.make(frames=6))
     images = dense_flow.leveled(views)
     asked = []
 

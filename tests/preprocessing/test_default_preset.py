@@ -18,7 +18,7 @@ from nerfies_jax.preprocessing.findings import (
     cannot_tell,
 )
 from nerfies_jax.training import specs
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 from tests.preprocessing.test_tracks import MOVES
 
 UNTRACKED = "spacetime-small"
@@ -26,7 +26,7 @@ UNTRACKED = "spacetime-small"
 
 @pytest.fixture(scope="module", autouse=True)
 def one_cache(tmp_path_factory):
-    """What a film shows is found once for all tests of it, and nowhere else."""
+    """What a capture shows is found once for all tests of it, and nowhere else."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(representation, "CACHE", tmp_path_factory.mktemp("cache"))
         yield
@@ -34,16 +34,16 @@ def one_cache(tmp_path_factory):
 
 def noisy():
     """Every image of its own: there is nothing to carry from one to the next."""
-    film = films.film(frames=12)
-    noise = np.random.default_rng(0).integers(0, 255, film.images.shape, np.uint8)
-    return dataclasses.replace(film, images=noise)
+    capture = two_planes.make(frames=12)
+    noise = np.random.default_rng(0).integers(0, 255, capture.images.shape, np.uint8)
+    return dataclasses.replace(capture, images=noise)
 
 
 @pytest.mark.parametrize(
     ("make", "preset", "words"),
     [
-        (lambda: films.film(**MOVES, frames=24), "splats-tracked-small", ""),
-        (lambda: films.film(frames=24), "splats-static-small", "nothing moves: "),
+        (lambda: two_planes.make(**MOVES, frames=24), "splats-tracked-small", ""),
+        (lambda: two_planes.make(frames=24), "splats-static-small", "nothing moves: "),
         (noisy, UNTRACKED, "only 0% of the moving pixels are near a track"),
     ],
 )
@@ -58,7 +58,7 @@ def test_motion_is_chosen_by_what_tracks_say(make, preset, words):
 
 def test_what_moves_and_cannot_be_followed_is_no_still_scene(monkeypatch):
     monkeypatch.setattr(usable_paths, "LEAST_COVERAGE", 1.01)
-    choice = representation.default_preset(films.film(**MOVES, frames=24))
+    choice = representation.default_preset(two_planes.make(**MOVES, frames=24))
     assert choice.preset == UNTRACKED
     assert "of the moving pixels are near a track" in "".join(choice.notes)
 
@@ -72,9 +72,9 @@ def test_the_preset_is_the_best_curve_in_the_planned_time(monkeypatch):
     scenes = {"static": curves, "default": curves}
     monkeypatch.setattr(method_curves, "curves", lambda: scenes)
     for moves in (MOVES, {}):
-        film = films.film(**moves, frames=24)
+        capture = two_planes.make(**moves, frames=24)
         for seconds, expected in ((20, early), (100, late)):
-            choice = representation.default_preset(film, seconds)
+            choice = representation.default_preset(capture, seconds)
             preset, *overrides = expected.split()
             assert choice.preset == preset
             assert choice.overrides[: len(overrides)] == tuple(overrides)
@@ -83,8 +83,8 @@ def test_the_preset_is_the_best_curve_in_the_planned_time(monkeypatch):
 
 @pytest.mark.parametrize("stops", [1.0, 0.2])
 def test_photographs_in_changing_light_get_an_appearance_of_each(stops, monkeypatch):
-    film = films.film(frames=24)
-    evidence = record.cached(film, representation.CACHE / "evidence")
+    capture = two_planes.make(frames=24)
+    evidence = record.cached(capture, representation.CACHE / "evidence")
     apart = evidence._replace(unusable="the camera motion is discontinuous")
     found = (
         cannot_tell(MOTION, ""),
@@ -93,20 +93,20 @@ def test_photographs_in_changing_light_get_an_appearance_of_each(stops, monkeypa
     )
     monkeypatch.setattr(representation.record, "cached", lambda *_: apart)
     monkeypatch.setattr(representation.inspection, "find", lambda *_: found)
-    choice = representation.default_preset(film)
+    choice = representation.default_preset(capture)
     preset = "splats-collection-small" if stops == 1 else UNTRACKED
     assert choice.preset == preset
 
 
 @pytest.mark.parametrize("wanted", [False, True])
 def test_photographs_are_static_if_the_inspection_is_certain(wanted, monkeypatch):
-    film = films.film(frames=24)
-    evidence = record.cached(film, representation.CACHE / "evidence")
+    capture = two_planes.make(frames=24)
+    evidence = record.cached(capture, representation.CACHE / "evidence")
     apart = evidence._replace(unusable="the camera motion is discontinuous")
     found = (Finding(MOTION, "none of 400 points moves", "", wanted, CERTAIN),)
     monkeypatch.setattr(representation.record, "cached", lambda *_: apart)
     monkeypatch.setattr(representation.inspection, "find", lambda *_: found)
-    choice = representation.default_preset(film)
+    choice = representation.default_preset(capture)
     assert choice.preset == (UNTRACKED if wanted else "splats-static-small")
     said = "nothing moves: none of 400 points moves" in choice.notes
     assert said is not wanted
@@ -114,7 +114,7 @@ def test_photographs_are_static_if_the_inspection_is_certain(wanted, monkeypatch
 
 def test_coverage_is_the_share_of_moving_pixels_near_known_paths():
     folder = representation.CACHE / "evidence"
-    evidence = record.cached(films.film(**MOVES, frames=24), folder)
+    evidence = record.cached(two_planes.make(**MOVES, frames=24), folder)
     assert 0.5 < usable_paths.coverage(evidence) <= 1
     # Pixel by pixel, with one path that is known in a single frame too few.
     known = np.zeros_like(evidence.paths.known)
@@ -134,8 +134,8 @@ def test_coverage_is_the_share_of_moving_pixels_near_known_paths():
 
 @pytest.mark.full
 def test_a_scene_of_which_no_track_moves_is_static():
-    film = films.film(frames=24)
-    evidence = record.gather(film)
+    capture = two_planes.make(frames=24)
+    evidence = record.gather(capture)
     assert len(evidence.score) >= usable_paths.LEAST_TRACKS
     moving = np.zeros_like(evidence.moving)
     moving[:, :3] = True  # marked where flow fails, as at occlusions
@@ -143,7 +143,7 @@ def test_a_scene_of_which_no_track_moves_is_static():
     score = np.zeros_like(evidence.score)
     static = evidence._replace(moving=moving, score=score)
     assert usable_paths.unusable(static)
-    assert usable_paths.stands_still(static, film.times)
+    assert usable_paths.stands_still(static, capture.times)
     score[: 1 + len(score) // 200] = 1
     for change in (
         {"score": score},
@@ -151,22 +151,22 @@ def test_a_scene_of_which_no_track_moves_is_static():
         {"score": score[:9] * 0},
         {"unusable": "too little texture"},
     ):
-        assert not usable_paths.stands_still(static._replace(**change), film.times)
+        assert not usable_paths.stands_still(static._replace(**change), capture.times)
 
 
 @pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (8, ())])
 def test_paths_of_many_things_get_more_bases(asked, overrides, monkeypatch):
     monkeypatch.setattr(rigid_groups, "enough", lambda *_: asked)
-    choice = representation.default_preset(films.film(**MOVES, frames=24))
+    choice = representation.default_preset(two_planes.make(**MOVES, frames=24))
     assert choice.overrides == overrides
     spec = specs.override(PRESETS[choice.preset], choice.overrides)
     assert spec.motion.bases == asked
 
 
 @pytest.mark.parametrize(("a_knot", "knots"), [(3, 20), (0.8, 30), (0.1, 60)])
-def test_long_films_get_more_knots(a_knot, knots, monkeypatch):
+def test_long_videos_get_more_knots(a_knot, knots, monkeypatch):
     monkeypatch.setattr(representation, "FRAMES_A_KNOT", a_knot)
-    choice = representation.default_preset(films.film(**MOVES, frames=24))
+    choice = representation.default_preset(two_planes.make(**MOVES, frames=24))
     spec = specs.override(PRESETS[choice.preset], choice.overrides)
     assert spec.motion.knots == knots
     assert ("for 24 frames" in choice.notes) == (knots > 20)

@@ -9,7 +9,7 @@ import pytest
 from nerfies_jax.preprocessing import feature_matches, motion, view_set
 from nerfies_jax.preprocessing.findings import CANNOT_TELL, CERTAIN
 from nerfies_jax.preprocessing.record import Evidence
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 PHOTOGRAPHS = 20
 
@@ -28,10 +28,10 @@ def _elsewhere(time):
 
 @pytest.fixture
 def sharp(monkeypatch):
-    monkeypatch.setattr(films, "SIZE", (192, 144))
-    monkeypatch.setattr(films, "FOCAL", 180.0)
+    monkeypatch.setattr(two_planes, "SIZE", (192, 144))
+    monkeypatch.setattr(two_planes, "FOCAL", 180.0)
     monkeypatch.setattr(feature_matches, "MOST_FEATURES", 400)
-    return functools.partial(films.film, camera=_place, frames=PHOTOGRAPHS)
+    return functools.partial(two_planes.make, camera=_place, frames=PHOTOGRAPHS)
 
 
 def _finding(capture):

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 
 from nerfies_jax.preprocessing import frame_flow
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 
 def test_flow_leads_to_the_next_frame_of_the_same_camera_and_past_held_out_ones():
     # 18 px of 96 a frame, and 36 past one held out: the latter are found only by a
     # search from where a still scene would be.
-    capture = films.film(camera=lambda t: (2.8 * t - 1.4, 0.0, 0.0), frames=8)
+    capture = two_planes.make(camera=lambda t: (2.8 * t - 1.4, 0.0, 0.0), frames=8)
     capture = dataclasses.replace(
         capture,
         train=np.array([0, 1, 2, 4, 5, 7]),
@@ -29,12 +29,12 @@ def test_flow_leads_to_the_next_frame_of_the_same_camera_and_past_held_out_ones(
         step = position[row] - position[flow.next_row[row]]
         wall = flow.forward_seen[row] & ~capture.moving[row]
         assert wall.mean() > 0.5
-        off = flow.forward[row][wall] - films.FOCAL * step[:2] / films.FAR
+        off = flow.forward[row][wall] - two_planes.FOCAL * step[:2] / two_planes.FAR
         assert np.median(np.linalg.norm(off, axis=-1)) < 0.2
 
 
 def test_cameras_of_one_frame_have_no_flow_and_a_note_says_so():
-    capture = films.film(frames=3)
+    capture = two_planes.make(frames=3)
     capture = dataclasses.replace(capture, camera_ids=np.arange(3, dtype=np.int32))
     found = frame_flow.with_flow(capture)
     assert not found.flow.forward_seen.any()

@@ -44,10 +44,10 @@ def test_masks_are_the_evidence_s_at_the_size_of_the_images(factor, monkeypatch)
     assert "masks of moving objects were computed from" in capture.notes[-1]
 
 
-def test_a_film_that_cannot_be_followed_stays_without_masks(monkeypatch):
+def test_a_video_that_cannot_be_tracked_stays_without_masks(monkeypatch):
     bare = dataclasses.replace(scenes.tiny_capture(), moving=None)
-    evidence = found(bare, 1, "one image is no film")
+    evidence = found(bare, 1, "one image is no video")
     monkeypatch.setattr(frame_masks.record, "cached", lambda *_: evidence)
     capture = frame_masks.with_masks(bare)
     assert capture.moving is None
-    assert "one image is no film" in capture.notes[-1]
+    assert "one image is no video" in capture.notes[-1]

@@ -16,13 +16,13 @@ from nerfies_jax.preprocessing import (
     record,
     usable_paths,
 )
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 from tests.preprocessing.test_summary import card_points
 from tests.preprocessing.test_tracks import MOVES, gathered
 
 
 def with_files(capture=None, **files):
-    capture = films.film(**MOVES, frames=24) if capture is None else capture
+    capture = two_planes.make(**MOVES, frames=24) if capture is None else capture
     return given_files.attached(capture, GivenFiles(**files))
 
 
@@ -79,7 +79,7 @@ def test_tracks_are_read_in_each_layout(tmp_path, layout):
 
 def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     path, points = tapir(tmp_path / "t.npz")
-    capture = films.film(**MOVES, frames=24)
+    capture = two_planes.make(**MOVES, frames=24)
     for row, name in enumerate(capture.ids):
         large = capture.moving[row].repeat(2, 0).repeat(2, 1)
         cut_out = np.where(large, 255, 0)[..., None] * [0, 0, 0, 1] + [255, 255, 255, 0]
@@ -98,7 +98,7 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     np.testing.assert_allclose(pixel[points.seen], points.pixel[points.seen], atol=1e-4)
     off = np.linalg.norm(evidence.paths.position - points.position, axis=-1)
     known = evidence.paths.known
-    assert np.median(off[known]) < 0.1 * films.NEAR  # drawn toward the wall
+    assert np.median(off[known]) < 0.1 * two_planes.NEAR  # drawn toward the wall
     # Our own tracks still say where the wall is.
     assert len(evidence.still.position) > 2000
 
@@ -118,7 +118,7 @@ def test_a_mover_that_was_marked_is_no_noise_however_small():
 
 def test_tracks_of_larger_images_are_brought_to_those_that_are_read(tmp_path):
     _, points = tapir(tmp_path / "t.npz")
-    size = 4 * np.array(films.SIZE)
+    size = 4 * np.array(two_planes.SIZE)
     path, _ = tapir(tmp_path / "t.npz", tracks=4 * points.pixel, size=size)
     given = with_files(tracks=path).given
     place = np.moveaxis(given.track_pixel, 0, 1)[points.seen]
@@ -138,9 +138,9 @@ def pixels(camera, point):
 @pytest.mark.full
 def test_results_for_distorted_images_are_mapped_to_undistorted_ones():
     """The geometry is that of a wall, by projection alone."""
-    film = films.film(frames=3, blank=True)
-    lens = film.cameras._replace(radial=np.tile(np.float32([-0.2, 0.05, 0]), (3, 1)))
-    bent = dataclasses.replace(film, cameras=lens)
+    capture = two_planes.make(frames=3, blank=True)
+    lens = capture.cameras._replace(radial=np.tile(np.float32([-0.2, 0.05, 0]), (3, 1)))
+    bent = dataclasses.replace(capture, cameras=lens)
     wide = pinholes.canvas(bent)
     flat_cameras = cameras.crop(pinholes.pinhole(lens), -wide.left, -wide.top)
 
@@ -149,7 +149,7 @@ def test_results_for_distorted_images_are_mapped_to_undistorted_ones():
         camera = cameras.take(all_cameras, frame)
         centers = rays.pixel_centers(size).reshape(-1, 2)
         ray = np.asarray(directions(camera, centers), float).reshape(*size[::-1], 3)
-        return camera.position + ray * (films.FAR / ray[..., 2:])
+        return camera.position + ray * (two_planes.FAR / ray[..., 2:])
 
     def flow(all_cameras, frame, other, size):
         camera = cameras.take(all_cameras, other)
@@ -173,16 +173,21 @@ def test_results_for_distorted_images_are_mapped_to_undistorted_ones():
             "backward": backward,
         }
 
-    point = np.float32([[-0.3, 0.2, films.FAR], [0.4, -0.3, films.FAR], [9, 9, 2]])
+    point = np.float32(
+        [[-0.3, 0.2, two_planes.FAR], [0.4, -0.3, two_planes.FAR], [9, 9, 2]]
+    )
 
     def tracks(all_cameras):
         every = (cameras.take(all_cameras, frame) for frame in range(3))
         return np.stack([np.asarray(pixels(camera, point)) for camera in every])
 
     seen = np.tile([True, True, False], (3, 1))
-    filmed = fields(lens, film.size) | {"track_pixel": tracks(lens), "track_seen": seen}
+    external = fields(lens, capture.size) | {
+        "track_pixel": tracks(lens),
+        "track_seen": seen,
+    }
     given = pinholes.as_pinholes(
-        dataclasses.replace(bent, given=Given(film.size, **filmed))
+        dataclasses.replace(bent, given=Given(capture.size, **external))
     ).given
     assert given.size == wide.size
     np.testing.assert_array_equal(given.track_seen, seen)

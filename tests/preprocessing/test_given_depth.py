@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing import (
 )
 from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 from tests.preprocessing.test_given import with_files
 from tests.preprocessing.test_summary import card_points
 from tests.preprocessing.test_tracks import MOVES, gathered
@@ -96,17 +96,17 @@ def test_a_body_is_in_front_of_what_it_hides():
     alone = exact._replace(depth_deviation=np.full(len(card.seen), np.inf))
     measured = np.where(card.seen, 2.5 * exact.depth, np.nan)  # behind the wall
     bodies = given_bodies.scaled(views, card, measured, alone, *static, 0.05)
-    assert np.nanmedian(bodies.depth) < 1.05 * films.FAR
+    assert np.nanmedian(bodies.depth) < 1.05 * two_planes.FAR
 
 
 @pytest.mark.full
 def test_depth_that_hardly_fits_is_used_with_a_warning(tmp_path, capsys):
-    film = films.film(**MOVES, frames=24)
+    video = two_planes.make(**MOVES, frames=24)
     rng = np.random.default_rng(0)
     # Errors that are independent from pixel to pixel, as no correction can remove.
-    noise = np.exp(rng.normal(0, 0.25, film.depths.shape))
-    np.savez(tmp_path / "d.npz", depths=film.depths * noise)
-    capture = with_files(film, depths=tmp_path / "d.npz")
+    noise = np.exp(rng.normal(0, 0.25, video.depths.shape))
+    np.savez(tmp_path / "d.npz", depths=video.depths * noise)
+    capture = with_files(video, depths=tmp_path / "d.npz")
     for _ in range(2):  # from the cache too
         record._told_of.clear()
         evidence = record.cached(capture, tmp_path / "cache")
@@ -119,25 +119,25 @@ def test_depth_that_hardly_fits_is_used_with_a_warning(tmp_path, capsys):
 
 @pytest.mark.full
 def test_paths_lean_on_depths_given(tmp_path):
-    film, folders = films.film(**MOVES, frames=24), {}
+    capture, folders = two_planes.make(**MOVES, frames=24), {}
     for kind in ("exr", "png"):
         folders[kind] = tmp_path / kind
         folders[kind].mkdir()
-        for row, name in enumerate(film.ids):
-            depth = (7 + 0.1 * row) * film.depths[row]
+        for row, name in enumerate(capture.ids):
+            depth = (7 + 0.1 * row) * capture.depths[row]
             path = folders[kind] / f"{name}.{kind}"
             if kind == "exr":
                 OpenEXR.File({}, {"Z": depth}).write(str(path))
             else:  # as depth cameras write it: millimeters, far below 16 bits
                 stored = np.round(100 * depth).astype(np.uint16)
                 PIL.Image.fromarray(stored).save(path)
-    captures_of = {kind: with_files(film, depths=folders[kind]) for kind in folders}
+    captures_of = {kind: with_files(capture, depths=folders[kind]) for kind in folders}
     exr, png = (captures_of[kind].given.depth for kind in folders)
     np.testing.assert_allclose(png / png.max(), exr / exr.max(), atol=1e-3)
     evidence = record.gather(captures_of["png"])
     own = gathered()[1]
     off, without = (
-        np.abs(one.paths.depth[one.paths.known] - films.NEAR).mean()
+        np.abs(one.paths.depth[one.paths.known] - two_planes.NEAR).mean()
         for one in (evidence, own)
     )
     assert off < 0.5 * without

@@ -5,7 +5,7 @@ import pytest
 
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import hidden_points, view_set
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 HOLE = 0.3  # half the side of what nothing shows, on the wall
 SLOPE = 0.4  # of the wall's z, per unit to the right
@@ -15,9 +15,9 @@ def wall(x, y):
     return np.stack([x, y, 2 + SLOPE * x], -1)
 
 
-def film_before(hole=HOLE, front=False):
+def capture_before(hole=HOLE, front=False):
     """Views, points of a tilted wall around a hole, and a mask that hides the hole."""
-    capture = films.film(frames=12)
+    capture = two_planes.make(frames=12)
     views = view_set.in_time_order(capture)
     x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-1.6, 1.6, 200)]))
     shown = np.maximum(np.abs(x), np.abs(y)) > hole
@@ -42,7 +42,7 @@ def film_before(hole=HOLE, front=False):
 @pytest.mark.parametrize("front", [False, True])
 def test_a_wall_goes_on_behind_what_moves(front):
     """Its plane and colors; an edge before it takes no part."""
-    views, still, moving = film_before(front=front)
+    views, still, moving = capture_before(front=front)
     found = hidden_points.behind(views, still, moving)
     x, y, z = found.position.astype(float).T
     assert np.abs(z - wall(x, y)[:, 2]).max() < 0.03
@@ -59,12 +59,12 @@ def test_a_wall_goes_on_behind_what_moves(front):
 
 
 def test_nothing_is_guessed_where_points_are():
-    views, still, moving = film_before(hole=0.0)
+    views, still, moving = capture_before(hole=0.0)
     assert len(hidden_points.behind(views, still, moving).position) == 0
 
 
 @pytest.mark.parametrize("points", [0, 5])
 def test_few_points_tell_of_nothing(points):
-    views, still, moving = film_before()
+    views, still, moving = capture_before()
     few = PointCloud(still.position[:points], still.color[:points])
     assert len(hidden_points.behind(views, few, moving).position) == 0

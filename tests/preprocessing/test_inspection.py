@@ -1,4 +1,4 @@
-"""What an inspection says of small films whose truth is known."""
+"""What an inspection says of small captures whose truth is known."""
 
 import dataclasses
 import functools
@@ -10,29 +10,29 @@ from nerfies_jax.preprocessing import exposure, findings, motion, texture
 from nerfies_jax.preprocessing import inspection as inspect_job
 from nerfies_jax.preprocessing import stored as inspect_stored
 from nerfies_jax.preprocessing.findings import CANNOT_TELL, CERTAIN, LIKELY
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 
 @functools.cache
 def still():
-    return inspect_job.inspect(films.film())
+    return inspect_job.inspect(two_planes.make())
 
 
 @functools.cache
-def swaying_film():
-    return films.film(card=films.swaying)
+def swaying_capture():
+    return two_planes.make(card=two_planes.swaying)
 
 
 @functools.cache
 def swaying():
-    return inspect_job.inspect(dataclasses.replace(swaying_film(), moving=None))
+    return inspect_job.inspect(dataclasses.replace(swaying_capture(), moving=None))
 
 
 def swaying_with(masks):
     """The findings about masks alone; what moves is already known."""
     inspected = swaying()
-    film = dataclasses.replace(swaying_film(), moving=masks)
-    finding = inspect_stored.masks(film, inspected.evidence)
+    capture = dataclasses.replace(swaying_capture(), moving=masks)
+    finding = inspect_stored.masks(capture, inspected.evidence)
     return dataclasses.replace(inspected, findings=(finding,))
 
 
@@ -51,9 +51,9 @@ def test_a_swaying_card_moves():
 
 @pytest.mark.full
 def test_cameras_that_take_turns_see_what_one_camera_sees():
-    ids = np.arange(films.FRAMES, dtype=np.int32)
-    film = dataclasses.replace(swaying_film(), camera_ids=ids)
-    assert inspect_job.inspect(film).findings[0] == swaying().findings[0]
+    ids = np.arange(two_planes.FRAMES, dtype=np.int32)
+    capture = dataclasses.replace(swaying_capture(), camera_ids=ids)
+    assert inspect_job.inspect(capture).findings[0] == swaying().findings[0]
 
 
 @pytest.mark.parametrize(
@@ -83,22 +83,22 @@ def test_a_static_camera_sees_motion_and_stillness():
     def fixed(time):
         return (0.0, 0.0, 0.0)
 
-    moving = films.film(card=films.swaying, camera=fixed)
+    moving = two_planes.make(card=two_planes.swaying, camera=fixed)
     assert verdict(inspect_job.inspect(moving), "motion") == (True, CERTAIN)
-    quiet = films.film(camera=fixed)
+    quiet = two_planes.make(camera=fixed)
     assert verdict(inspect_job.inspect(quiet), "motion") == (False, CERTAIN)
 
 
 @pytest.mark.full
 def test_a_drifting_exposure_is_told_from_motion():
-    film = films.film(gain=lambda time: 2 ** (0.5 * np.sin(7 * time)) / 1.5)
-    inspected = inspect_job.inspect(film)
+    capture = two_planes.make(gain=lambda time: 2 ** (0.5 * np.sin(7 * time)) / 1.5)
+    inspected = inspect_job.inspect(capture)
     assert verdict(inspected, "appearance codes") == (True, CERTAIN)
     assert verdict(inspected, "motion") == (False, CERTAIN)
-    times = np.linspace(0, 1, films.FRAMES)
+    times = np.linspace(0, 1, two_planes.FRAMES)
     truth = np.std(0.5 * np.sin(7 * times))
     stops = inspected.finding("appearance codes").numbers["drift_stops"]
-    # The film is coded by a power of 1/2.2 and read as sRGB: some 3 % apart.
+    # The images are coded by a power of 1/2.2 and read as sRGB: some 3 % apart.
     assert stops == pytest.approx(truth, rel=0.06)
 
 
@@ -122,7 +122,7 @@ def test_exposure_drift_is_separated_from_errors_of_single_groups(drift, noise, 
 @pytest.mark.full
 def test_an_even_exposure_is_seen_with_motion_and_without_points():
     assert verdict(swaying(), "appearance codes") == (False, CERTAIN)
-    bare = inspect_job.inspect(films.film(points=0))
+    bare = inspect_job.inspect(two_planes.make(points=0))
     assert verdict(bare, "appearance codes") == (False, CERTAIN)
     assert verdict(bare, "start from points") == (False, CERTAIN)
     assert verdict(bare, "background points") == (False, CERTAIN)
@@ -135,46 +135,49 @@ def test_points_of_the_wall_are_fit_for_both_their_uses():
 
 @pytest.mark.full
 def test_points_on_what_moves_are_no_background():
-    film = films.film(card=films.swaying)
+    capture = two_planes.make(card=two_planes.swaying)
     rng = np.random.default_rng(3)
-    on_card = rng.uniform(-films.CARD, films.CARD, (1500, 3))
-    on_card[:, 2] = films.NEAR
-    film.points.position[:] = on_card
-    assert verdict(inspect_job.inspect(film), "background points") == (False, CERTAIN)
+    on_card = rng.uniform(-two_planes.CARD, two_planes.CARD, (1500, 3))
+    on_card[:, 2] = two_planes.NEAR
+    capture.points.position[:] = on_card
+    assert verdict(inspect_job.inspect(capture), "background points") == (
+        False,
+        CERTAIN,
+    )
 
 
 @pytest.mark.parametrize(
-    "film",
+    "capture",
     [
         {"frames": 2},
         # too fast to be followed
-        pytest.param({"frames": 5, "card": films.swaying}, marks=pytest.mark.full),
+        pytest.param({"frames": 5, "card": two_planes.swaying}, marks=pytest.mark.full),
         pytest.param({"blank": True}, marks=pytest.mark.full),
     ],
     ids=["two frames", "five frames", "nothing to see"],
 )
-def test_what_cannot_be_seen_decides_nothing_and_says_why(film):
-    finding = inspect_job.inspect(films.film(**film)).finding("motion")
+def test_what_cannot_be_seen_decides_nothing_and_says_why(capture):
+    finding = inspect_job.inspect(two_planes.make(**capture)).finding("motion")
     assert (finding.wanted, finding.confidence) == (None, CANNOT_TELL)
     assert len(finding.evidence) > 20
 
 
 def test_frames_of_one_moment_ask_for_no_motion():
-    times = np.zeros(films.FRAMES, np.float32)
-    film = films.film(card=films.swaying, times=times)
-    inspected = inspect_job.inspect(film)
+    times = np.zeros(two_planes.FRAMES, np.float32)
+    capture = two_planes.make(card=two_planes.swaying, times=times)
+    inspected = inspect_job.inspect(capture)
     assert verdict(inspected, "motion") == (False, CERTAIN)
     assert "same time" in inspected.finding("motion").evidence
 
 
 @pytest.mark.full
 def test_a_card_that_comes_and_goes_is_transient_and_one_that_sways_is_not():
-    film = films.film(
+    capture = two_planes.make(
         card=lambda time: (0.2 * (time - 0.5), 0.0),
         shown=lambda time: 0.2 < time < 0.45 or 0.6 < time < 0.85,
         half=0.26,
     )
-    inspected = inspect_job.inspect(film)
+    inspected = inspect_job.inspect(capture)
     assert verdict(inspected, "transient objects")[0] is True
     assert inspected.finding("transient objects").numbers["times"] == 4
     assert verdict(swaying(), "transient objects")[0] is False
@@ -183,20 +186,22 @@ def test_a_card_that_comes_and_goes_is_transient_and_one_that_sways_is_not():
 
 @pytest.mark.full
 def test_depth_is_held_against_parallax():
-    film = films.film()
-    scene = np.full(film.images.shape[:3], films.FAR, np.float32)
-    wall = inspect_job.inspect(films.film(shown=lambda time: False, depths=3.0 * scene))
+    capture = two_planes.make()
+    scene = np.full(capture.images.shape[:3], two_planes.FAR, np.float32)
+    wall = inspect_job.inspect(
+        two_planes.make(shown=lambda time: False, depths=3.0 * scene)
+    )
     finding = wall.finding("depth")
     assert (finding.wanted, finding.confidence) == (True, CERTAIN)
     assert finding.numbers["scale"] == pytest.approx(1 / 3, rel=0.02)
     x = np.linspace(0.5, 2, scene.shape[2], dtype=np.float32)
-    bent = films.film(shown=lambda time: False, depths=scene * x)
+    bent = two_planes.make(shown=lambda time: False, depths=scene * x)
     wrong = inspect_stored.depth(bent, wall.views, wall.evidence)
     assert (wrong.wanted, wrong.confidence) == (False, CERTAIN)
 
 
 def test_masks_are_held_against_what_moves():
-    truth = swaying_film().moving
+    truth = swaying_capture().moving
     assert verdict(swaying_with(truth), "masks of what moves")[0] is True
     elsewhere = np.zeros_like(truth)
     elsewhere[:, :10] = True
@@ -205,29 +210,29 @@ def test_masks_are_held_against_what_moves():
 
 
 def test_a_lens_is_measured_in_pixels():
-    film = films.film()
-    width, height = films.SIZE
-    corner = np.hypot(width / 2, height / 2) / films.FOCAL
-    film.cameras.radial[:, 0] = 0.1
-    finding = inspect_stored.lens(film)
-    expected = 0.1 * corner**3 * films.FOCAL
+    capture = two_planes.make()
+    width, height = two_planes.SIZE
+    corner = np.hypot(width / 2, height / 2) / two_planes.FOCAL
+    capture.cameras.radial[:, 0] = 0.1
+    finding = inspect_stored.lens(capture)
+    expected = 0.1 * corner**3 * two_planes.FOCAL
     assert finding.numbers["most_px"] == pytest.approx(expected, rel=1e-4)
     assert finding.wanted
-    film.cameras.radial[:, 0] = 0
-    assert inspect_stored.lens(film).wanted is False
+    capture.cameras.radial[:, 0] = 0
+    assert inspect_stored.lens(capture).wanted is False
 
 
 @pytest.mark.parametrize("period_px", [4.0, 12.0])
 def test_the_finest_detail_is_that_of_the_image(period_px):
-    film = films.film()
-    width, height = films.SIZE
+    capture = two_planes.make()
+    width, height = two_planes.SIZE
     wave = 0.5 + 0.3 * np.sin(2 * np.pi * np.arange(width) / period_px)
-    gray = np.tile(wave, (films.FRAMES, height, 1)).astype(np.float32)
-    finding = texture.texture(film, still().views._replace(gray=gray), 1)
+    gray = np.tile(wave, (two_planes.FRAMES, height, 1)).astype(np.float32)
+    finding = texture.texture(capture, still().views._replace(gray=gray), 1)
     # A Hann window of 96 pixels smears a frequency by two lines of its spectrum.
     slack = 2 * period_px / width
     assert finding.numbers["finest_px"] == pytest.approx(period_px, rel=slack)
-    halved = texture.texture(film, still().views._replace(gray=gray), 2)
+    halved = texture.texture(capture, still().views._replace(gray=gray), 2)
     assert halved.numbers["finest_px"] == 2 * finding.numbers["finest_px"]
 
 
@@ -245,8 +250,8 @@ def test_the_last_band_is_fast_enough_and_the_one_before_is_not(cycles):
     ids=["at rest", "turning"],
 )
 def test_outlines_tell_motion_where_no_flow_can(turn, answer):
-    film = films.rod(turn)
-    finding = inspect_job.inspect(film).finding("motion")
+    capture = two_planes.rod(turn)
+    finding = inspect_job.inspect(capture).finding("motion")
     assert (finding.wanted, finding.confidence) == answer
     assert "outlines" in finding.evidence
 

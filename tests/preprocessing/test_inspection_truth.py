@@ -1,4 +1,4 @@
-"""The decisions on built-in scenes, filmed smaller; each has its own effects."""
+"""The decisions on built-in scenes, at a smaller size; each has its own effects."""
 
 import dataclasses
 

@@ -16,11 +16,11 @@ def test_what_moves_is_found_in_a_folder_of_images(tmp_path):
     )
     capture, _ = synthetic.make(small, seed=5)
     rows = capture.train
-    film = tmp_path / "film"
-    film.mkdir()
+    folder = tmp_path / "images"
+    folder.mkdir()
     for row in rows:
-        images.write_png(film / f"{row:03d}.png", capture.images[row])
-    found = masks_without_cameras.moving_in(film)
+        images.write_png(folder / f"{row:03d}.png", capture.images[row])
+    found = masks_without_cameras.moving_in(folder)
     assert list(found) == [f"{row:03d}.png" for row in rows]
     masked, true = np.stack(list(found.values())), capture.moving[rows]
     assert true.mean() > 0.15

@@ -14,12 +14,12 @@ from nerfies_jax.capture.extras import MissingExtra
 from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.preprocessing import given_files, networks
 from nerfies_jax.preprocessing.networks import NetworkSettings
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 helper, numpy_helper, TensorProto = onnx.helper, onnx.numpy_helper, onnx.TensorProto
-WIDTH, HEIGHT = films.SIZE
+WIDTH, HEIGHT = two_planes.SIZE
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
 
@@ -32,8 +32,8 @@ def children():
 
 @pytest.fixture(scope="module")
 def capture():
-    film = films.film(frames=4, points=0)
-    return dataclasses.replace(film, train=np.arange(3), heldout=np.array([3]))
+    capture = two_planes.make(frames=4, points=0)
+    return dataclasses.replace(capture, train=np.arange(3), heldout=np.array([3]))
 
 
 def save(path, nodes, initializers=(), shape=(1, 3, HEIGHT, WIDTH), **options):

@@ -90,7 +90,7 @@ def test_a_thing_that_swings_faster_than_the_camera_is_placed_by_its_own_size():
 
 
 @pytest.mark.full
-def test_of_a_long_film_a_thing_is_adjusted_in_some_frames_and_posed_in_all(
+def test_of_a_long_video_a_thing_is_adjusted_in_some_frames_and_posed_in_all(
     monkeypatch,
 ):
     seen_from, world = views(), turning_body()

@@ -28,7 +28,7 @@ def two_bodies():
 def test_two_bodies_are_told_apart_and_their_motions_found():
     position, angle = two_bodies()
     known = np.ones(position.shape[:2], bool)
-    # No point of the first body lives through the film.
+    # No point of the first body lives through the video.
     for row in range(20):
         known[row, (row % 10) + 8 :] = False
         known[row, : max(0, row % 10 - 2)] = False

@@ -15,7 +15,7 @@ from nerfies_jax.preprocessing import (
 )
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 FRAMES, POINTS, FOCAL = 24, 500, 200.0
 SPAN = (0.4, 1.5)
@@ -112,7 +112,7 @@ def test_short_tracks_are_for_cameras_far_apart_with_flow_between_them():
 
 def test_a_region_that_jumps_is_found_again():
     # The card jumps by 20 px, nearly its width, and the wall moves by 4 px.
-    capture = films.film(
+    capture = two_planes.make(
         frames=3,
         camera=lambda time: (0.18 * time, 0.0, 0.0),
         card=lambda time: (0.6 * time - 0.25, 0.04 * np.sin(9 * time)),
@@ -130,9 +130,9 @@ def test_a_region_that_jumps_is_found_again():
         for frame in range(2):
             time = views.time[frame : frame + 2]
             card = np.diff([(0.6 * t, 0.04 * np.sin(9 * t)) for t in time], axis=0)[0]
-            depth = films.NEAR if on_card else films.FAR
+            depth = two_planes.NEAR if on_card else two_planes.FAR
             step = np.diff(views.position[frame : frame + 2, :2], axis=0)[0]
-            true = films.FOCAL * (on_card * card - step) / depth
+            true = two_planes.FOCAL * (on_card * card - step) / depth
             pixels = capture.moving[frame] == on_card
             pixels &= flow.forward_seen[frame]
             error = np.linalg.norm(flow.forward[frame] - true, axis=-1)

@@ -13,7 +13,7 @@ from nerfies_jax.preprocessing import (
     view_set,
 )
 from nerfies_jax.preprocessing.against_truth import TruePoints
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 from tests.preprocessing.test_tracks import MOVES, card_path, gathered
 
 
@@ -24,10 +24,10 @@ def views_of(capture):
 def card_points(capture, rows):
     """The truth of a few points of the card, seen wherever they are in the image."""
     views = views_of(capture)
-    inner = np.linspace(-0.6, 0.6, 4) * films.CARD
+    inner = np.linspace(-0.6, 0.6, 4) * two_planes.CARD
     offset = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 1, 2)
     flat = card_path(capture, rows)[None] + offset
-    place = np.concatenate([flat, np.full((*flat.shape[:2], 1), films.NEAR)], -1)
+    place = np.concatenate([flat, np.full((*flat.shape[:2], 1), two_planes.NEAR)], -1)
     pixel, seen = [], []
     for frame in range(len(rows)):
         at, depth = view_set.project(views, frame, place[:, frame])
@@ -67,7 +67,9 @@ def test_words_say_what_there_is_and_what_cannot_be_told():
     assert counted.groups == 1
     assert "their depth is accurate" in text
     assert "motion is unknown" not in text
-    held = films.film(card=MOVES["card"], camera=lambda t: (0.0, 0.0, 0.0), frames=24)
+    held = two_planes.make(
+        card=MOVES["card"], camera=lambda t: (0.0, 0.0, 0.0), frames=24
+    )
     evidence = record.gather(held)
     counted = summary.of(views_of(held), evidence)
     text = "\n".join(summary.lines(counted, evidence))

@@ -1,4 +1,4 @@
-"""Flow, tracks, what moves, and paths in space, on films of two planes."""
+"""Flow, tracks, what moves, and paths in space, on captures of two planes."""
 
 import dataclasses
 import functools
@@ -23,7 +23,7 @@ from nerfies_jax.preprocessing import (
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
 from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 
 def shaking(t):
@@ -35,7 +35,7 @@ MOVES = {"card": lambda time: (0.4 * time - 0.2, 0.1 * time), "camera": shaking}
 
 @functools.cache
 def gathered(**changes):
-    capture = films.film(**(changes or MOVES), frames=24)
+    capture = two_planes.make(**(changes or MOVES), frames=24)
     return capture, record.gather(capture)
 
 
@@ -47,7 +47,7 @@ def card_path(capture, rows):
 @functools.cache
 def hand_held(frames=24):
     """Views of a camera that shakes, in scene units; images are of no matter."""
-    capture = films.film(camera=shaking, frames=frames, blank=True)
+    capture = two_planes.make(camera=shaking, frames=frames, blank=True)
     return view_set.in_time_order(capture)
 
 
@@ -66,11 +66,11 @@ def tracks_of(views, position):
 
 @pytest.mark.parametrize("light", [lambda time: 1.0, lambda time: 1 - 0.6 * time])
 def test_flow_of_a_wall_is_that_of_its_homography_in_any_light(light):
-    capture = films.film(shown=lambda time: False, gain=light, frames=4)
+    capture = two_planes.make(shown=lambda time: False, gain=light, frames=4)
     views = view_set.in_time_order(capture)
     flow = dense_flow.between_neighbors(views, dense_flow.leveled(views))
     ray = view_set.rays(views, 1)
-    point = views.position[1] + films.FAR * ray
+    point = views.position[1] + two_planes.FAR * ray
     there, _ = view_set.project(views, 2, point.reshape(-1, 3))
     height, width = flow.forward.shape[1:3]
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -92,7 +92,7 @@ def test_flow_that_does_not_lead_back_is_not_trusted():
 
 
 def test_flow_that_a_thing_lost_is_found_from_how_it_came():
-    capture = films.film(shown=lambda time: False, frames=6)
+    capture = two_planes.make(shown=lambda time: False, frames=6)
     views = view_set.in_time_order(capture)
     images = dense_flow.leveled(views)
     true = dense_flow.between_neighbors(views, images)
@@ -137,7 +137,7 @@ def test_chains_follow_flow_both_ways_until_it_ends():
 
 def test_wide_steps_are_found_from_where_a_still_scene_would_be():
     # 18 px of 96 from frame to frame
-    capture = films.film(camera=lambda t: (1.2 * t - 0.6, 0.0, 0.0), frames=4)
+    capture = two_planes.make(camera=lambda t: (1.2 * t - 0.6, 0.0, 0.0), frames=4)
     views = view_set.in_time_order(capture)
     images = dense_flow.leveled(views)
     height, width = views.gray.shape[1:]
@@ -148,7 +148,7 @@ def test_wide_steps_are_found_from_where_a_still_scene_would_be():
         far_off = []
         for frame, depth in enumerate(capture.depths[:-1]):
             step = (views.position[frame] - views.position[frame + 1])[:2]
-            true = films.FOCAL * step / depth[..., None]
+            true = two_planes.FOCAL * step / depth[..., None]
             at = np.stack([x, y], -1) + true
             inside = ((at > 3) & (at < np.array(views.size) - 4)).all(-1)
             error = np.linalg.norm(flow.forward[frame] - true, axis=-1)
@@ -159,7 +159,7 @@ def test_wide_steps_are_found_from_where_a_still_scene_would_be():
 
 
 def test_points_are_aligned_with_where_they_began():
-    image = 255 * films.texture(3).mean(-1)
+    image = 255 * two_planes.texture(3).mean(-1)
     images = np.stack([nd.shift(image, (0.0, k))[:80, 20:140] for k in (0, 3.3)])
     images = np.rint(np.clip(images, 0, 255)).astype(np.uint8)
     pixel = np.float32([[[30, 40], [34, 40]], [[60, 20], [62.8, 20.3]]])
@@ -185,7 +185,7 @@ def test_points_at_rest_are_found_and_what_moves_misses(monkeypatch):
 
 
 def test_a_camera_in_place_gives_finite_points_at_rest():
-    capture = films.film(camera=lambda t: (0.0, 0.0, 0.0), frames=6, blank=True)
+    capture = two_planes.make(camera=lambda t: (0.0, 0.0, 0.0), frames=6, blank=True)
     views = view_set.in_time_order(capture)
     position = np.repeat(np.array([[[0.1, 0.0, 1.5]]]), 6, axis=1)
     one = tracks_of(views, position)
@@ -209,7 +209,7 @@ def test_what_moves_is_marked_and_little_else():
 
 @pytest.mark.parametrize("light", [lambda time: 1.0, lambda time: 1 - 0.6 * time])
 def test_what_moves_looks_unlike_the_wall_behind_it_and_the_wall_like_itself(light):
-    capture = films.film(**MOVES, gain=light, frames=24)
+    capture = two_planes.make(**MOVES, gain=light, frames=24)
     views = view_set.in_time_order(capture)
     odds = photo_consistency.log_odds(views, capture.points)
     inner = np.zeros_like(capture.moving)
@@ -238,7 +238,7 @@ def test_smaller_views_show_the_same_points_in_larger_pixels():
     assert means[0] == pytest.approx(means[1], abs=1)
 
 
-def test_nothing_moves_in_a_still_film():
+def test_nothing_moves_in_a_static_capture():
     _, evidence = gathered(card=lambda time: (0.1, 0.0))
     assert evidence.moving.mean() < 0.01
     assert len(evidence.moved) < 0.01 * len(evidence.score)
@@ -246,8 +246,10 @@ def test_nothing_moves_in_a_still_film():
 
 @pytest.mark.full
 def test_cameras_that_are_off_by_a_pixel_set_no_wall_in_motion():
-    capture = films.film(**MOVES, frames=24)
-    noise = np.random.default_rng(0).normal(0, 0.7 * films.FAR / films.FOCAL, (24, 3))
+    capture = two_planes.make(**MOVES, frames=24)
+    noise = np.random.default_rng(0).normal(
+        0, 0.7 * two_planes.FAR / two_planes.FOCAL, (24, 3)
+    )
     position = capture.cameras.position + (noise * [1, 1, 0]).astype(np.float32)
     cameras = capture.cameras._replace(position=position)
     evidence = record.gather(dataclasses.replace(capture, cameras=cameras))
@@ -275,8 +277,8 @@ def test_still_points_lie_on_the_wall_and_have_its_colors():
     cloud = evidence.still
     assert len(cloud.position) > 2000
     depth = cloud.position[:, 2]
-    assert abs(np.median(depth) - films.FAR) < 0.01 * films.FAR
-    assert (abs(depth - films.FAR) < 0.1 * films.FAR).mean() > 0.95
+    assert abs(np.median(depth) - two_planes.FAR) < 0.01 * two_planes.FAR
+    assert (abs(depth - two_planes.FAR) < 0.1 * two_planes.FAR).mean() > 0.95
     views = view_set.in_time_order(capture)
     pixel, _ = view_set.project(views, 12, cloud.position.astype(float))
     inside = ((pixel > 8) & (pixel < np.array(views.size) - 8)).all(-1)
@@ -299,7 +301,7 @@ def test_a_smooth_path_before_a_shaking_camera_has_its_depth():
 
 
 @pytest.mark.parametrize("frames", [24, 120])
-def test_a_film_of_more_frames_has_the_same_depths(frames):
+def test_a_video_of_more_frames_has_the_same_depths(frames):
     views = hand_held(frames)
     time = np.linspace(0, 1, frames)[:, None]
     turn = np.concatenate([np.sin(2 * time), np.cos(3 * time), 0 * time], -1)
@@ -363,7 +365,7 @@ def test_a_path_of_few_frames_lies_at_the_depth_around(seen):
 
 @pytest.mark.hard_cases
 def test_before_a_camera_in_place_depth_is_that_around_and_said_to_be_unknown():
-    capture = films.film(camera=lambda t: (0.0, 0.0, 0.0), frames=12, blank=True)
+    capture = two_planes.make(camera=lambda t: (0.0, 0.0, 0.0), frames=12, blank=True)
     views = view_set.in_time_order(capture)
     path = np.array([0, 0, 1.5]) + np.linspace(0, 0.3, 12)[:, None] * [1, 0, 0]
     one = tracks_of(views, path[None])
@@ -381,20 +383,22 @@ def test_the_card_is_where_it_is():
         np.where(evidence.paths.known[..., None], evidence.paths.position, np.nan), 0
     )
     inner = slice(4, -4)
-    assert np.abs(middle[inner, 2] - films.NEAR).max() < 0.1 * films.NEAR
+    assert np.abs(middle[inner, 2] - two_planes.NEAR).max() < 0.1 * two_planes.NEAR
     assert np.abs(middle[inner, :2] - true[inner]).max() < 0.06
     speed = motion.speeds(view_set.in_time_order(capture), evidence)
     step = np.median(np.linalg.norm(np.diff(true, axis=0), axis=1))
     assert speed["speed_units"] == pytest.approx(step, rel=0.1)
-    assert speed["speed_px"] == pytest.approx(step / films.NEAR * films.FOCAL, rel=0.1)
+    assert speed["speed_px"] == pytest.approx(
+        step / two_planes.NEAR * two_planes.FOCAL, rel=0.1
+    )
 
 
 @pytest.mark.full
 def test_what_moves_before_the_near_plane_of_the_wall_is_known():
     """Structure from motion gives the plane, and no point of what moves."""
-    near = 0.8 * films.FAR
-    assert near > films.NEAR
-    evidence = record.gather(films.film(**MOVES, frames=12, near=near))
+    near = 0.8 * two_planes.FAR
+    assert near > two_planes.NEAR
+    evidence = record.gather(two_planes.make(**MOVES, frames=12, near=near))
     assert len(evidence.moved) > 20
     seen = evidence.tracks.seen[evidence.moved]
     assert (evidence.paths.known & seen).sum() > 0.9 * seen.sum()
@@ -410,8 +414,8 @@ def test_detail_everywhere_is_texture_and_no_noise(coarse, rng):
     assert view_set._textured(plain).mean() < 0.05
 
 
-def test_a_long_film_has_no_more_places_than_memory_holds(monkeypatch):
-    views = view_set.in_time_order(films.film(frames=24))
+def test_a_long_video_has_no_more_places_than_memory_holds(monkeypatch):
+    views = view_set.in_time_order(two_planes.make(frames=24))
     every = tracks.grid(views)
     places = len(every) * len(views.row)
     monkeypatch.setattr(tracks, "MOST_PLACES", places // 2)
@@ -428,8 +432,8 @@ def test_what_was_gathered_is_read_again(tmp_path):
     np.testing.assert_array_equal(again.paths.position, evidence.paths.position)
     np.testing.assert_allclose(again.flow.forward, evidence.flow.forward, atol=2e-3)
     assert again.unusable == evidence.unusable
-    assert record.digest(capture) == record.digest(films.film(**MOVES, frames=24))
-    assert record.digest(capture) != record.digest(films.film(frames=24))
+    assert record.digest(capture) == record.digest(two_planes.make(**MOVES, frames=24))
+    assert record.digest(capture) != record.digest(two_planes.make(frames=24))
     # The span of depths, which steers the search for flow, is of these as well.
     assert record.digest(capture) != record.digest(
         dataclasses.replace(capture, far=2 * capture.far)
@@ -440,9 +444,9 @@ def test_what_was_gathered_is_read_again(tmp_path):
     )
 
 
-def test_jumping_views_and_short_films_say_why_they_are_of_no_use():
-    jumps = films.film(
+def test_jumping_views_and_short_videos_say_why_they_are_of_no_use():
+    jumps = two_planes.make(
         card=MOVES["card"], camera=lambda t: (3 * np.sin(400 * t), 0.0, 0.0), frames=12
     )
     assert "the camera motion is discontinuous" in record.gather(jumps).unusable
-    assert "too few" in record.gather(films.film(**MOVES, frames=4)).unusable
+    assert "too few" in record.gather(two_planes.make(**MOVES, frames=4)).unusable

@@ -20,7 +20,7 @@ from nerfies_jax.runs.effect_choice import Trial
 from nerfies_jax.runs.run import scene_spec
 from nerfies_jax.training import specs
 from tests import scenes
-from tests.preprocessing import films
+from tests.preprocessing import two_planes
 
 EFFECTS = ("motion", "appearance_codes", "transient_objects")
 EFFECTS += ("start_from_points", "background_points", "depth")
@@ -285,7 +285,7 @@ def test_a_doubtful_motion_is_compared_with_a_static_scene(gain, preset, monkeyp
     choice = Choice(TRACKED, ("motion.bases=12",), ("a reason",), other)
     kinds = [(None, lambda capture, seconds: choice)]
     monkeypatch.setattr(adviser.representations, "choosing", lambda: kinds)
-    tried, capture = [], films.film(frames=2)
+    tried, capture = [], two_planes.make(frames=2)
 
     def try_out(config, changed, capture, name):
         tried.append((config.preset, changed.preset, name))

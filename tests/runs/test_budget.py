@@ -33,21 +33,21 @@ def test_all_frames_are_scored_where_time_allows_and_eight_otherwise():
 
 
 @pytest.mark.parametrize("frame_seconds", [0.01, 0.47, 1.0, 1.8, 1.9, 5.0, 20.0])
-def test_a_film_fits_its_time_and_plays_four_seconds(frame_seconds):
-    film = budget.video(frame_seconds, (176, 132))
-    assert 24 <= film.frames <= 96
-    smaller = 176 // film.size[0]
-    assert film.size == (176 // smaller, 132 // smaller)
-    assert film.frames * frame_seconds / smaller**2 <= 45.0
-    assert film.frames / film.rate == pytest.approx(4.0)
+def test_a_video_fits_its_time_and_plays_four_seconds(frame_seconds):
+    video = budget.video(frame_seconds, (176, 132))
+    assert 24 <= video.frames <= 96
+    smaller = 176 // video.size[0]
+    assert video.size == (176 // smaller, 132 // smaller)
+    assert video.frames * frame_seconds / smaller**2 <= 45.0
+    assert video.frames / video.rate == pytest.approx(4.0)
     if frame_seconds * 24 <= 45:
         assert smaller == 1  # fewer frames before smaller ones
 
 
-def test_a_film_is_not_made_too_small_to_see():
-    film = budget.video(1e4, (100, 80))
-    assert film.size == (50, 40)
-    assert film.frames == 24
+def test_a_video_is_not_made_too_small_to_see():
+    video = budget.video(1e4, (100, 80))
+    assert video.size == (50, 40)
+    assert video.frames == 24
 
 
 @pytest.mark.parametrize("frame_seconds", [0.0, 0.01, 0.1, 0.5, 1.0, 30.0])

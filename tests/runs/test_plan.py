@@ -33,12 +33,12 @@ def test_schedules_stretch_with_steps_however_these_are_given():
 
 @pytest.mark.parametrize("growing", [True, False])
 def test_seconds_are_the_steps_that_they_allow(growing, tmp_path, monkeypatch):
-    nerfies_format.write(scenes.tiny_capture(), tmp_path / "filmed")
+    nerfies_format.write(scenes.tiny_capture(), tmp_path / "capture")
     overrides = ("sh_degree=1", "strategy.cap_max=400", "init.extra_random=0")
     if not growing:
         overrides = ("strategy=none",)
     config = RunConfig(
-        "splats-static-small", CaptureSource(tmp_path / "filmed"), None, overrides
+        "splats-static-small", CaptureSource(tmp_path / "capture"), None, overrides
     )
     run = runs.new_run(config)
     state = run.model.init(run.capture, jax.random.key(0))

@@ -244,7 +244,9 @@ def test_other_masks_make_another_capture_and_what_is_no_image_does_not(
     preparation.prepared(photographs, tmp_path / "without")
 
 
-def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monkeypatch):
+def test_a_run_of_a_video_prepares_it_once_beside_the_run(
+    tmp_path, mapper, monkeypatch
+):
     monkeypatch.setattr(movers, "masks_of", lambda capture: None)
     frames = [models.image(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
     video.write_video(tmp_path / "clip.mp4", frames, 30)
@@ -260,7 +262,7 @@ def test_a_run_of_a_film_prepares_it_once_beside_the_run(tmp_path, mapper, monke
     capture = room.load(tmp_path / "run-capture")
     assert capture.frames_per_second == pytest.approx(30, abs=0.2)
     assert reconstruction._with_cameras(moving, None, Preparation()) is moving
-    # As many threads as there are cores change nothing; another film does.
+    # As many threads as there are cores change nothing; another video does.
     threads = dataclasses.replace(how, threads=3)
     reconstruction._with_cameras(config, tmp_path / "run", threads)
     clip = (tmp_path / "clip.mp4").read_bytes()
@@ -295,7 +297,7 @@ def test_what_cannot_be_prepared_is_refused_and_leaves_nothing(photographs, tmp_
         ({"frames": 9, "fps": 2.0}, "mutually exclusive"),
     ],
 )
-def test_wrong_settings_are_refused_before_a_film_is_read(wrong, words):
+def test_wrong_settings_are_refused_before_a_video_is_read(wrong, words):
     with pytest.raises(ValueError, match=words):
         Preparation(**wrong)
 

@@ -61,9 +61,9 @@ def image(tmp_path, rng):
 
 
 def test_the_page_holds_everything_and_fetches_nothing(tmp_path, image):
-    film = tmp_path / "orbit.mp4"
-    film.write_bytes(b"not really a film")
-    video = report.Video(film, "The scene.", np.zeros((6, 8, 3), np.uint8))
+    file = tmp_path / "orbit.mp4"
+    file.write_bytes(b"not really a video")
+    video = report.Video(file, "The scene.", np.zeros((6, 8, 3), np.uint8))
     path = report.write(
         tmp_path,
         "a run",
@@ -81,7 +81,7 @@ def test_the_page_holds_everything_and_fetches_nothing(tmp_path, image):
     assert (shown["width"], shown["height"]) == ("9", "8")
     assert base64.b64decode(shown["src"].split(",")[1]) == image.read_bytes()
     (played,) = page.find("video")
-    assert base64.b64decode(played["src"].split(",")[1]) == film.read_bytes()
+    assert base64.b64decode(played["src"].split(",")[1]) == file.read_bytes()
     # A printed page shows the poster in its place, and the name of the file.
     assert still["src"] == played["poster"]
     assert still["class"] == "print"
@@ -141,12 +141,12 @@ def test_what_was_written_by_others_cannot_become_markup(tmp_path, image):
     assert page.text.count("<script>alert(1)</script>&") == 11
 
 
-def test_a_long_film_stays_beside_the_page(tmp_path, monkeypatch):
+def test_a_long_video_stays_beside_the_page(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "EMBEDDED_VIDEO_BYTES", 3)
-    film = tmp_path / "renders" / "orbit.mp4"
-    film.parent.mkdir()
-    film.write_bytes(b"long")
-    video = report.Video(film, "The scene.", np.zeros((6, 8, 3), np.uint8))
+    file = tmp_path / "renders" / "orbit.mp4"
+    file.parent.mkdir()
+    file.write_bytes(b"long")
+    video = report.Video(file, "The scene.", np.zeros((6, 8, 3), np.uint8))
     page = Page(report.write(tmp_path, "a run", MEASURED, {}, video=video))
     (played,) = page.find("video")
     assert played["src"] == "renders/orbit.mp4"

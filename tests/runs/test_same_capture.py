@@ -104,7 +104,7 @@ def test_a_damaged_record_is_named(content, tmp_path):
 @pytest.fixture
 def begun(tmp_path):
     """The folders of a capture and of a run that was begun with it."""
-    source, folder = tmp_path / "filmed", tmp_path / "run"
+    source, folder = tmp_path / "capture", tmp_path / "run"
     nerfies_format.write(CAPTURE, source)
     folder.mkdir()
     run = runs.new_run(RunConfig("splats-static", CaptureSource(source), 60))

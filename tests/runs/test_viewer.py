@@ -55,7 +55,7 @@ def a_run(kind, shaken=0.1):
 
 
 def eye_of(row):
-    """Where a frame was filmed from, as viser tells it."""
+    """Where a frame was taken from, as viser tells it."""
     one = jax.tree.map(lambda leaf: leaf[row], CAPTURE.cameras)
     turn = Rotation.from_matrix(one.camera_from_world.T)
     return Eye(

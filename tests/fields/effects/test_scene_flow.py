@@ -192,10 +192,10 @@ def test_a_single_moment_has_no_neighbors_and_no_flow_to_learn(dtype):
 
 
 @pytest.mark.parametrize("held_out", [2, 3, 8])
-def test_neighbors_are_moments_that_were_filmed(held_out, dtype):
+def test_neighbors_are_times_that_were_observed(held_out, dtype):
     """And not those that lie an interval away, where no image says what is seen."""
-    filmed = np.arange(40) / 39
-    learned = np.delete(filmed, np.arange(0, 40, held_out)).astype(np.float32)
+    every_time = np.arange(40) / 39
+    learned = np.delete(every_time, np.arange(0, 40, held_out)).astype(np.float32)
     times = tuple(float(time) for time in learned)
     beside = jax.jit(timestamps.neighbor, static_argnums=(0, 2))
     now = jnp.asarray(learned, dtype)

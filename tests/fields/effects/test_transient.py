@@ -180,7 +180,7 @@ def test_photometric_holds_from_no_residual_to_a_huge_one(offset, power, dtype):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("hole", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("power", [0.0, 1.0])
-def test_unfilmed_pixels_teach_nothing_whatever_they_hold(power, hole, dtype, rng):
+def test_unobserved_pixels_teach_nothing_whatever_they_hold(power, hole, dtype, rng):
     color, truth, beta = whole = rays_of(dtype, rng, 3)[:3]
     valid = np.array([True, False, True])
     broken = [leaf.copy() for leaf in whole]
@@ -227,7 +227,7 @@ def test_the_penalty_is_the_mean_density_of_the_fine_samples(dtype):
     density = np.array([[0.0, 1.0, 2.0], [5.0, 4.0, 0.0], [1e6, 1.0, 1.0]], dtype)
     terms = penalty(density)
     assert set(terms) == {"density", "share"}
-    # 12 over six samples; the third ray was not filmed
+    # 12 over six samples; the third ray was not observed
     assert terms["density"].value == 2.0
     assert terms["density"].value.dtype == dtype
     np.testing.assert_allclose(terms["density"].weight, 0.01)

@@ -1,4 +1,4 @@
-"""Small films of two textured planes, drawn by homographies alone (no ray tracer)."""
+"""Small captures of two textured planes, warped by homographies (no ray tracer)."""
 
 import functools
 
@@ -33,7 +33,7 @@ def paint(seed, x, y):
     )
 
 
-def film(
+def make(
     card=lambda time: (0.0, 0.0),
     gain=lambda time: 1.0,
     camera=lambda time: (0.35 * (time - 0.5), 0.08 * np.sin(5 * time), 0.0),
@@ -112,7 +112,7 @@ def swaying(time):
 def rod(turn: float, frames: int = 12, side: int = 56) -> Capture:
     """A dark rod across a ball before white, seen from all around, one view a moment.
 
-    The rod turns by `turn` rad over the film; the ball is at rest. Points of both are
+    The rod turns by `turn` rad over the video; the ball is at rest. Points of both are
     drawn as discs, so the outlines share no code with what reads them.
     """
     rng = np.random.default_rng(4)
@@ -142,7 +142,7 @@ def rod(turn: float, frames: int = 12, side: int = 56) -> Capture:
         turns.append(turned)
         places.append(eye)
     one = np.ones(frames, np.float32)
-    return film(
+    return make(
         frames=frames,
         points=0,
         images=images,
