@@ -151,7 +151,9 @@ def tiny_splats(name):
         few = {"count": 2, "reference": 3, "residual": 2, "time_code": 3}
         motion = shrunk(motion, width=6, make_width=6, **few)
     elif isinstance(motion, PlaneMotionSpec):
-        few = shrunk(motion.planes, vertices=4, multiples=(1, 2), moments=3, features=2)
+        few = shrunk(
+            motion.planes, vertices=4, multiples=(1, 2), timestamps=3, features=2
+        )
         motion = shrunk(motion, planes=few, width=8)
     elif isinstance(motion, TimeBasisSpec):
         motion = shrunk(motion, count=2, time=FEW, depth=1, width=8)

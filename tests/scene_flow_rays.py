@@ -28,9 +28,9 @@ TINY = SceneFlowSpec(
     flow_bound=0.3,
     decay_steps=100,
 )
-MOMENTS, RAYS, SAMPLES, FEATURES = 4, 6, 5, 7
+TIMESTAMPS, RAYS, SAMPLES, FEATURES = 4, 6, 5, 7
 SIZE = (8, 6)
-ROWS = [0, 3, 1, 2, 2, 1]  # of the rays; rows are moments here
+ROWS = [0, 3, 1, 2, 2, 1]  # of the rays; rows are timestamps here
 TIMES = (0.0, 1 / 3, 0.7, 1.0)
 FAR = 3.2  # behind all samples, where a background is known
 BOX_SCALE, BOX_CENTER = 0.5, (0.2, -0.1, 2.0)
@@ -42,25 +42,25 @@ def frames_and_batch(rng, dtype):
     poses = cameras.stack(
         [
             cameras.look_at([0.1 * k, 0, -2.0], [0, 0, 2.0], [0, 1, 0], 9.0, SIZE)
-            for k in range(MOMENTS)
+            for k in range(TIMESTAMPS)
         ]
     )
-    shape = (MOMENTS, height, width)
+    shape = (TIMESTAMPS, height, width)
     flow = FrameFlow(
         forward=rng.normal(size=(*shape, 2)).astype(np.float32),
         forward_seen=rng.uniform(size=shape) < 0.8,
-        next_row=np.minimum(np.arange(MOMENTS) + 1, MOMENTS - 1).astype(np.int32),
+        next_row=np.minimum(np.arange(TIMESTAMPS) + 1, TIMESTAMPS - 1).astype(np.int32),
         backward=rng.normal(size=(*shape, 2)).astype(np.float32),
         backward_seen=rng.uniform(size=shape) < 0.8,
-        previous_row=np.maximum(np.arange(MOMENTS) - 1, 0).astype(np.int32),
+        previous_row=np.maximum(np.arange(TIMESTAMPS) - 1, 0).astype(np.int32),
     )
     depths = rng.uniform(2, 5, shape).astype(np.float32)
     frames = Frames(
         images=None,
         cameras=jax.tree.map(lambda leaf: leaf.astype(dtype), poses),
-        # the third is observed a little late: moments are not even
+        # the third is observed a little late: timestamps are not even
         times=np.array(TIMES, dtype),
-        appearance=np.arange(MOMENTS, dtype=np.int32),
+        appearance=np.arange(TIMESTAMPS, dtype=np.int32),
         valid=None,
         depths=np.where(depths < 2.3, 0, depths),
         flow=flow,
@@ -230,7 +230,7 @@ def oracle(params, frames, batch, arrays, step, behind=None):
         flows = np.array([h[2] for h in here])  # samples, sides, axes
         for side in (0, 1):
             beside = row + (1, -1)[side]
-            if not 0 <= beside < MOMENTS:
+            if not 0 <= beside < TIMESTAMPS:
                 continue
             later = frames.times[beside]
             stretch = abs(later - time) * 3
@@ -254,7 +254,7 @@ def oracle(params, frames, batch, arrays, step, behind=None):
             rendered = np.abs(weight @ flows[:, side]).mean()
             lists[f"magnitude{side}"].append((rendered, 1))
             _flow_pixel(lists, frames, batch, r, side, points, flows, weight)
-        if 0 < row < MOMENTS - 1:
+        if 0 < row < TIMESTAMPS - 1:
             for s in range(SAMPLES):
                 acceleration = np.mean((flows[s, 0] + flows[s, 1]) ** 2) / 2
                 lists["kinetic"].append((acceleration, 1))

@@ -99,7 +99,7 @@ def _network(make):
 
 
 _GRID = HashGridSpec(levels=2, coarsest=1, finest=2, rows=20)
-_PLANES = PlanesSpec(vertices=3, multiples=(1, 2), moments=3, features=2)
+_PLANES = PlanesSpec(vertices=3, multiples=(1, 2), timestamps=3, features=2)
 
 
 def _levels(dtype):

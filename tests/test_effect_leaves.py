@@ -51,14 +51,14 @@ from nerfies_jax.scene import presets as field_presets
 from tests import bare_scenes, scenes
 
 QUICK = ("nerf-w", "hypernerf")
-MOMENTS, EXPOSURES = 5, 3
+TIMESTAMPS, EXPOSURES = 5, 3
 METADATA = SceneMetadata(
     near=1.0,
     far=3.0,
     center=(0.0, 0.0, 0.0),
     scale=1.0,
     background=None,
-    times=tuple(t / (MOMENTS - 1) for t in range(MOMENTS)),
+    times=tuple(t / (TIMESTAMPS - 1) for t in range(TIMESTAMPS)),
     exposures=tuple((row, row, 0.0) for row in range(EXPOSURES)),
 )
 
@@ -97,11 +97,11 @@ def counted_out(spec):
         bent = dataclasses.replace(spec.warp, guides=guides)
         own["warp"] = warp.init(bent, key)
         if spec.warp.condition == "code":
-            tables["motion"] = (MOMENTS, spec.warp.code_width)
+            tables["motion"] = (TIMESTAMPS, spec.warp.code_width)
     if spec.ambient is not None:
         bent = dataclasses.replace(spec.ambient, guides=guides)
         own["ambient"] = ambient.init(bent, key)
-        tables["motion"] = (MOMENTS, spec.ambient.code_width)
+        tables["motion"] = (TIMESTAMPS, spec.ambient.code_width)
         lifted += 2 * spec.ambient.encoding.bands * spec.ambient.dims
     if spec.scene_flow is not None:
         own["scene_flow"] = scene_flow.init(spec.scene_flow, key, width)
@@ -110,7 +110,7 @@ def counted_out(spec):
         nets["coarse"] = spec.coarse or spec.template
     if spec.mask is not None:
         own["mask"] = moving_mask.init(spec.mask, key)
-        tables[spec.mask.table] = (MOMENTS, spec.mask.code_width)
+        tables[spec.mask.table] = (TIMESTAMPS, spec.mask.code_width)
     if spec.surface is not None:
         own["surface"] = surface.init({n: one.width for n, one in nets.items()}, key)
         for one in (spec.surface.position, spec.surface.normal):

@@ -43,7 +43,7 @@ class SceneMetadata:
     distorted: bool = False
 
     @property
-    def moments(self) -> int:
+    def timestamps(self) -> int:
         """Number of distinct training times, which several cameras may share."""
         return self.frames if self.times is None else self.times
 

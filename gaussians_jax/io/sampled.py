@@ -112,8 +112,8 @@ def count_for(capture: Capture) -> int:
     Returns:
       Number of distinct timestamps, from 24 to 48.
     """
-    moments = len(np.unique(capture.times[capture.train]))
-    return int(np.clip(moments, LEAST_INSTANTS, MOST_INSTANTS))
+    times = len(np.unique(capture.times[capture.train]))
+    return int(np.clip(times, LEAST_INSTANTS, MOST_INSTANTS))
 
 
 @events.stage("finding the Gaussians that are seen")

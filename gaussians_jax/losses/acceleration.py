@@ -59,7 +59,7 @@ class AccelerationSpec:
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
         """Return the regularizer for this capture."""
-        return Bound(self, metadata.extent, metadata.moments)
+        return Bound(self, metadata.extent, metadata.timestamps)
 
 
 def instants(time: Float[Array, ""], interval: float) -> Float[Array, "3"]:

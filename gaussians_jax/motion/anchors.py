@@ -105,7 +105,7 @@ class AnchorMotionSpec:
         """Return the motion for a run of `run_steps` on this capture."""
         from gaussians_jax.motion import anchor_motion  # imports this module
 
-        return anchor_motion.Bound(self, run_steps, metadata.moments)
+        return anchor_motion.Bound(self, run_steps, metadata.timestamps)
 
 
 class Features(NamedTuple):
@@ -128,7 +128,7 @@ class Law(NamedTuple):
 class Anchors(NamedTuple):
     """Shared parameters."""
 
-    times: Float[Array, "moments code"] | None  # evenly spaced over [0, 1]
+    times: Float[Array, "times code"] | None  # evenly spaced over [0, 1]
     make: MLP
     coarse: MLP | None  # None without motion, like `times` and `fine`
     fine: MLP | None

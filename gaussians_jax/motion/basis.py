@@ -96,7 +96,7 @@ class BasisMotionSpec:
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
         """Return the motion for a run of `run_steps` on this capture."""
-        return Bound(self, run_steps, metadata.moments)
+        return Bound(self, run_steps, metadata.timestamps)
 
 
 class BasisMotion(NamedTuple):

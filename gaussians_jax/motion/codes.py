@@ -69,7 +69,7 @@ class Codes(Protocol):
         """Number of steps without motion."""
 
 
-def moments(spec: Codes, frames: int) -> int:
+def code_count(spec: Codes, frames: int) -> int:
     """Return the number of time codes for a number of training frames.
 
     Args:
@@ -125,7 +125,7 @@ def _random_waves(key, spec, positions, width):
 
 def init_times(
     key: Key[Array, ""], spec: Codes, frames: int, dtype: DTypeLike = jnp.float32
-) -> Float[Array, "moments code"]:
+) -> Float[Array, "times code"]:
     """Initialize the table of time codes like the embeddings.
 
     Args:
@@ -139,7 +139,7 @@ def init_times(
     """
     if frames < 1:
         raise ValueError(f"frames={frames}: a motion needs at least one training frame")
-    count = moments(spec, frames)
+    count = code_count(spec, frames)
     if spec.waves is None:
         scale = math.sqrt(3) * spec.spread  # bound of a uniform distribution
         return codes.init(key, count, spec.time_code, scale, dtype)
@@ -209,7 +209,7 @@ def revised(spec: Codes, shared: Any, step: int) -> Any:
 
 def read(
     spec: Codes,
-    times: Float[Array, "moments code"],
+    times: Float[Array, "times code"],
     rows: Float[Array, "1"],
     time: Float[Array, ""],
 ) -> tuple[Float[Array, " code"], Float[Array, " code"]]:
@@ -231,7 +231,7 @@ def read(
     return coarse, fine
 
 
-def second_differences(times: Float[Array, "moments code"]) -> Float[Array, ""]:
+def second_differences(times: Float[Array, "times code"]) -> Float[Array, ""]:
     """Compute the mean square of second differences between consecutive codes.
 
     Args:
@@ -261,7 +261,7 @@ def mean_opacity(params: Params) -> Float[Array, ""]:
 
 
 def penalty(
-    spec: Codes, times: Float[Array, "moments code"], context: PenaltyContext
+    spec: Codes, times: Float[Array, "times code"], context: PenaltyContext
 ) -> dict[str, Term]:
     """Compute the losses of the codes: `smoothness` after the warm-up, and `opacity`.
 
@@ -307,7 +307,7 @@ class BoundCodes(BoundMotion):
         """Steps after which the fine network reads more time codes."""
         if self.spec.coarser is None:
             return ()
-        return growth_steps(self.spec, moments(self.spec, self.frames))
+        return growth_steps(self.spec, code_count(self.spec, self.frames))
 
     def project(self, shared: Any, step: int) -> Any:
         """Return the shared parameters with the number of codes from a step on."""

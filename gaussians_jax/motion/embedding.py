@@ -81,7 +81,7 @@ class EmbeddingMotionSpec:
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
         """Return the motion for a run of `run_steps` on this capture."""
-        return Bound(self, run_steps, metadata.moments)
+        return Bound(self, run_steps, metadata.timestamps)
 
 
 class Decoder(NamedTuple):
@@ -94,7 +94,7 @@ class Decoder(NamedTuple):
 class EmbeddingMotion(NamedTuple):
     """Shared parameters. The embeddings are per-Gaussian parameters."""
 
-    times: Float[Array, "moments code"]  # evenly spaced over [0, 1]
+    times: Float[Array, "times code"]  # evenly spaced over [0, 1]
     # Number of codes to which the fine network resamples the table. Projection steps
     # set it, and it gets no gradient.
     rows: Float[Array, "1"]

@@ -130,13 +130,13 @@ class KanMotionSpec:
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
         """Return the motion for a run of `run_steps` on this capture."""
-        return Bound(self, run_steps, metadata.moments)
+        return Bound(self, run_steps, metadata.timestamps)
 
 
 class KanMotion(NamedTuple):
     """Shared parameters. The embeddings are per-Gaussian parameters."""
 
-    times: Float[Array, "moments code"]  # evenly spaced over [0, 1]
+    times: Float[Array, "times code"]  # evenly spaced over [0, 1]
     field: KAN | MLP  # the fine network, if there are two
     # Number of codes to which the fine network resamples the table. Projection steps
     # set it, and it gets no gradient.

@@ -89,7 +89,7 @@ class MotionSpec:
 
     def bind(self, run_steps: int, metadata: SceneMetadata) -> "Bound":
         """Return the motion for a run of `run_steps` on this capture."""
-        return Bound(self, run_steps, metadata.moments)
+        return Bound(self, run_steps, metadata.timestamps)
 
 
 class Motion(NamedTuple):

@@ -70,7 +70,7 @@ from nerfies_jax.training.effects import (
 from nerfies_jax.training.step_counts import steps
 
 NAME = "node_motion"
-MOMENTS = 8  # frame times at which the paths of nodes are compared
+TIMES = 8  # frame times at which the paths of nodes are compared
 STRETCH = 1.2  # of a mask, see `openness`
 ROWS_AT_ONCE, NODES_AT_ONCE = 512, 32  # blocks that are skipped if nothing moves
 
@@ -295,8 +295,8 @@ def _find(
         moving = jnp.any((openness(nodes.mask) > 0)[near], axis=1)
     if spec.rigidity is None or not linked:
         return Neighborhoods(near, None, moving)
-    moments = jnp.linspace(0, 1, MOMENTS, dtype=mean.dtype)
-    shifts = jax.vmap(lambda time: moves(nodes, spec, extent, time).shift)(moments)
+    times = jnp.linspace(0, 1, TIMES, dtype=mean.dtype)
+    shifts = jax.vmap(lambda time: moves(nodes, spec, extent, time).shift)(times)
     paths = jnp.swapaxes(nodes.position + shifts, 0, 1)
     return Neighborhoods(
         near, skinning.links(paths, nodes.log_radius, spec.links), moving

@@ -56,7 +56,7 @@ class PlaneMotionSpec:
     Weights are of sums over planes and levels. Zero disables a loss.
     """
 
-    planes: PlanesSpec = PlanesSpec(moments=150)
+    planes: PlanesSpec = PlanesSpec(timestamps=150)
     depth: int = 1
     width: int = 128
     variation: float = 2e-4  # weight of the total variation of spatial planes
@@ -69,10 +69,10 @@ class PlaneMotionSpec:
     learning_rate_end: float = 1.6e-5
 
     def __post_init__(self):
-        if self.planes.moments is None or self.planes.combination != "product":
+        if self.planes.timestamps is None or self.planes.combination != "product":
             raise ValueError(
-                "the planes of a motion need moments and a product, got moments="
-                f"{self.planes.moments} and combination={self.planes.combination!r}"
+                "the planes of a motion need timestamps and a product, got timestamps="
+                f"{self.planes.timestamps} and combination={self.planes.combination!r}"
             )
         for name in ("variation", "bend", "unrest"):
             if not 0 <= getattr(self, name) < math.inf:
@@ -114,7 +114,7 @@ def network_spec(spec: PlaneMotionSpec) -> MLPSpec:
 # Forward and backward of 10,000 Gaussians on one core: 10 ms for the planes and 5 for
 # the network. The paper's size takes 120 ms, and its regularization 12.
 SMALL_PLANE_MOTION = PlaneMotionSpec(
-    planes=PlanesSpec(vertices=32, multiples=(1, 2), moments=24, features=8),
+    planes=PlanesSpec(vertices=32, multiples=(1, 2), timestamps=24, features=8),
     width=64,
     plane_rate_end=1.6e-5,
     learning_rate_end=1.6e-6,

@@ -192,7 +192,7 @@ def _rotation_offset(turn, vector):
 
 
 def links(
-    paths: Float[Array, "nodes moments 3"],
+    paths: Float[Array, "nodes times 3"],
     log_radius: Float[Array, " nodes"],
     count: int,
 ) -> Links:

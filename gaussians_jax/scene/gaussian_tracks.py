@@ -46,7 +46,7 @@ def follow(
     if all(effect.deform is None for effect in effects) or not len(known.path):
         return None
     deform = programs.deformer(scene.build(spec, metadata))(state.params)
-    times = np.asarray(in_default_precision(capture.times[known.moments]))
+    times = np.asarray(in_default_precision(capture.times[known.track_rows]))
     # [times, gaussians, 3]
     means = np.stack([np.asarray(deform(time).mean) for time in times])
     first = deform(times[known.start])

@@ -23,12 +23,12 @@ class GroundTruth(NamedTuple):
     """Ground truth of a built-in scene, in NumPy."""
 
     rows: np.ndarray  # held-out frames to render
-    moments: np.ndarray  # training frames in temporal order, at which tracks are known
-    path: np.ndarray  # [tracks, moments, 3] positions in scene units
-    seen: np.ndarray  # [tracks, moments] True if visible to the training camera
-    # Index into `moments` from which points are tracked, the middle one. It is not the
-    # first, because the template of D-NeRF is the scene at time 0, where its warp is
-    # discontinuous.
+    track_rows: np.ndarray  # training frames, by time, at which tracks are known
+    path: np.ndarray  # [tracks, times, 3] positions in scene units
+    seen: np.ndarray  # [tracks, times] True if visible to the training camera
+    # Index into `track_rows` from which points are tracked, the middle one. It is not
+    # the first, because the template of D-NeRF is the scene at time 0, where its warp
+    # is discontinuous.
     start: int
 
     @property
@@ -40,8 +40,8 @@ class GroundTruth(NamedTuple):
 class PointTracks(NamedTuple):
     """Points moved by a learned deformation."""
 
-    path: np.ndarray  # [tracks, moments, 3] scene units, the start if not found
-    found: np.ndarray  # [tracks, moments] bool
+    path: np.ndarray  # [tracks, times, 3] scene units, the start if not found
+    found: np.ndarray  # [tracks, times] bool
     # Mean distance, in scene units, of static points from their mean over time. Points
     # are mapped to the template, whose own position is arbitrary. Gaussians have no
     # template, so the distance is that of the points themselves.
@@ -84,16 +84,16 @@ def ground_truth(
     Raises:
       ValueError: If the ground truth belongs to another capture.
     """
-    moments = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-    path = truths.track_places(capture, truth, moments)
-    start = len(moments) // 2
-    visible = np.flatnonzero(truth.track_seen[:, moments[start]])
+    track_rows = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    path = truths.track_places(capture, truth, track_rows)
+    start = len(track_rows) // 2
+    visible = np.flatnonzero(truth.track_seen[:, track_rows[start]])
     points = evaluation.spread(visible, tracks) if len(visible) else visible
     return GroundTruth(
         rows=evaluation.spread(capture.heldout, frames),
-        moments=moments,
+        track_rows=track_rows,
         path=path[points],
-        seen=truth.track_seen[points][:, moments],
+        seen=truth.track_seen[points][:, track_rows],
         start=start,
     )
 

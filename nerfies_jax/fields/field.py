@@ -21,7 +21,7 @@ from nerfies_jax.geometry import rays
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.nn import codes
 from nerfies_jax.training.effects import (
-    MOMENT,
+    TIMESTAMP,
     FrameCondition,
     Table,
     joined,
@@ -239,7 +239,7 @@ def _init(spec, metadata, effects, key):
             one.encoded_width + ambient_width,
             condition + extras,
         )
-    rows = {MOMENT: len(metadata.times)}
+    rows = {TIMESTAMP: len(metadata.times)}
     learned = 1 + max((max(left, right) for left, right, _ in metadata.exposures))
     params = {"template": nets, "codes": {}}
     for table in specs.tables_of(effects):
@@ -267,7 +267,7 @@ def _look_up(
         rows = params["codes"][table.name]
         place = (
             _place_in_time(metadata, time)
-            if table.by == MOMENT
+            if table.by == TIMESTAMP
             else codes.place_of(metadata.exposures, appearance, rows.dtype)
         )
         frame_codes[table.name] = codes.blend(rows, *place)

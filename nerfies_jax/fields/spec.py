@@ -177,7 +177,7 @@ class RadianceScene:
         if any(getattr(one, "reads_time", False) for one in templates):
             raise ValueError(
                 "a template is read at a point, at whatever time, and its planes have "
-                "none: set position.moments=none (scene_flow.network may have them)"
+                "none: set position.timestamps=none (scene_flow.network may have them)"
             )
         if self.extent is not None and not 0 < self.extent < math.inf:
             raise ValueError(

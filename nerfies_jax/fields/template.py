@@ -58,8 +58,8 @@ class TemplateSpec:
     as for the warp of Nerfies. None opens all from the start.
 
     The position may be encoded by a grid or by planes, which span the cube [-1, 1]^3 of
-    the field and, contracted, all space around it. Planes with `moments` also read the
-    time. They are for the medium of a scene flow and not for templates.
+    the field and, contracted, all space around it. Planes with `timestamps` also read
+    the time. They are for the medium of a scene flow and not for templates.
     """
 
     position: EncodingSpec | HashGridSpec | VoxelGridSpec | PlanesSpec = EncodingSpec(
@@ -102,7 +102,7 @@ class TemplateSpec:
     @property
     def reads_time(self) -> bool:
         """True if its tables depend on time."""
-        return isinstance(self.position, PlanesSpec) and bool(self.position.moments)
+        return isinstance(self.position, PlanesSpec) and bool(self.position.timestamps)
 
     @property
     def encoded_width(self) -> int:

@@ -34,10 +34,10 @@ FIRST = {"product": (0.1, 0.5), "sum": (-0.1, 0.1)}
 
 @dataclasses.dataclass(frozen=True)
 class PlanesSpec:
-    """Settings of feature planes over [0, 1]^3, or [0, 1]^4 if there are `moments`.
+    """Settings of feature planes over [0, 1]^3, or [0, 1]^4 if there are `timestamps`.
 
     Each level has `vertices` times one of `multiples` vertices along an axis of space.
-    All levels have `moments` vertices along time. The `combination` "product"
+    All levels have `timestamps` vertices along time. The `combination` "product"
     multiplies the planes of a level, so that one plane can switch off the features of
     another. "sum" adds them. A point `outside` the box has the features of the nearest
     point of the box ("clamp") or NaN ("refuse"), which ends a run with an error that
@@ -46,7 +46,7 @@ class PlanesSpec:
 
     vertices: int = 64
     multiples: tuple[int, ...] = (1, 2, 4)
-    moments: int | None = None  # vertices along time; None for planes of space only
+    timestamps: int | None = None  # vertices along time; None for planes of space only
     features: int = 16  # of each level
     combination: str = "product"
     outside: str = "clamp"
@@ -62,10 +62,10 @@ class PlanesSpec:
                 f"vertices={self.vertices} times {max(self.multiples)} must lie "
                 f"between 2 and {MAX_VERTICES}"
             )
-        if self.moments is not None and not 2 <= self.moments <= MAX_VERTICES:
+        if self.timestamps is not None and not 2 <= self.timestamps <= MAX_VERTICES:
             raise ValueError(
-                f"moments={self.moments} must lie between 2 and {MAX_VERTICES}, or be "
-                "None for planes without time"
+                f"timestamps={self.timestamps} must lie between 2 and {MAX_VERTICES}, "
+                "or be None for planes without time"
             )
         for name, options in (("combination", COMBINATIONS), ("outside", OUTSIDE)):
             if getattr(self, name) not in options:
@@ -90,11 +90,11 @@ class PlanesSpec:
         Raises:
           ValueError: If the planes have another number of dimensions.
         """
-        axes = 3 if self.moments is None else 4
+        axes = 3 if self.timestamps is None else 4
         if dimensions != axes:
             raise ValueError(
-                f"planes with moments={self.moments} have {axes} dimensions, but the "
-                f"points have {dimensions}"
+                f"planes with timestamps={self.timestamps} have {axes} dimensions, but "
+                f"the points have {dimensions}"
             )
         return len(self.multiples) * self.features
 
@@ -103,7 +103,7 @@ class Level(NamedTuple):
     """The planes of one level."""
 
     space: tuple[Float[Array, "vertices vertices features"], ...]  # as `PAIRS`
-    time: tuple[Float[Array, "moments vertices features"], ...]  # of x, y, z; or none
+    time: tuple[Float[Array, "times vertices features"], ...]  # of x, y, z; or none
 
 
 # The three lines of each level at one time.
@@ -135,9 +135,9 @@ def init(
             for plane_key in jax.random.split(level_key, len(PAIRS))
         )
         time: tuple[jax.Array, ...] = ()
-        if spec.moments is not None:
+        if spec.timestamps is not None:
             neutral = 1 if spec.combination == "product" else 0
-            plane = jnp.full((spec.moments, side, spec.features), neutral, dtype)
+            plane = jnp.full((spec.timestamps, side, spec.features), neutral, dtype)
             time = (plane,) * 3
         levels.append(Level(space, time))
     return tuple(levels)
@@ -160,7 +160,7 @@ def encode(
     """
     spec.width(len(place))
     encoded = space_features(spec, levels, place[:3])
-    if spec.moments is not None:
+    if spec.timestamps is not None:
         time, *axes = place[3], *place[:3]
         by_level = [
             [
@@ -200,17 +200,17 @@ def space_features(
     return _refuse_outside(spec, encoded, inside)
 
 
-def at_time(levels: tuple[Level, ...], moment: Float[Array, ""]) -> Lines:
+def at_time(levels: tuple[Level, ...], time: Float[Array, ""]) -> Lines:
     """Interpolate the planes of time to lines at one time, which points can share.
 
     Args:
       levels: The planes.
-      moment: Time in [0, 1].
+      time: Time in [0, 1].
 
     Returns:
       Three lines [vertices, features] of each level.
     """
-    return tuple(tuple(linear(p, moment) for p in level.time) for level in levels)
+    return tuple(tuple(linear(p, time) for p in level.time) for level in levels)
 
 
 def time_features(
@@ -316,12 +316,12 @@ def total_variation(plane: Float[Array, "first second features"]) -> Float[Array
 
 
 def time_smoothness(
-    plane: Float[Array, "moments vertices features"],
+    plane: Float[Array, "times vertices features"],
 ) -> Float[Array, ""]:
     """Compute the mean squared second difference along time.
 
     Args:
-      plane: A plane of time, [moments, vertices, features].
+      plane: A plane of time, [times, vertices, features].
 
     Returns:
       A scalar, zero for features that change linearly and for fewer than three rows.
@@ -336,14 +336,14 @@ def time_smoothness(
 
 
 def l1_time_planes(
-    plane: Float[Array, "moments vertices features"],
+    plane: Float[Array, "times vertices features"],
 ) -> Float[Array, ""]:
     """Compute the mean absolute distance from one, the neutral element of a product.
 
     This encourages static features to be explained by the planes of space.
 
     Args:
-      plane: A plane of time, [moments, vertices, features].
+      plane: A plane of time, [times, vertices, features].
 
     Returns:
       A scalar.

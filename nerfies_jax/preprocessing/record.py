@@ -100,7 +100,7 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     views = view_set.in_time_order(capture)
     images = dense_flow.leveled(views)
     flow = taken.flow(given, views)
-    # Images of one moment are no video: there is nothing to search twice for.
+    # Images of one timestamp are no video: there is nothing to search twice for.
     is_video = np.ptp(views.time) > 0
     span = view_set.depth_span(capture, views) if is_video else None
     is_computed = flow is None

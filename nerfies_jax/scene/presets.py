@@ -339,7 +339,7 @@ def _on_grid(preset: RadianceScene) -> RadianceScene:
 #   planes, exponential, template's rate    690    23.57 18.26   1.2
 PLANES_MEDIUM = dataclasses.replace(
     GRID_TEMPLATE,
-    position=PlanesSpec(vertices=64, multiples=(1, 2), moments=30, features=8),
+    position=PlanesSpec(vertices=64, multiples=(1, 2), timestamps=30, features=8),
     width=48,
 )
 

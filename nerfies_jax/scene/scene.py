@@ -226,7 +226,7 @@ def _width_of(one: object) -> int:
     width, position = one.depth * one.width + one.color_width, one.position
     if not isinstance(position, PlanesSpec):
         return width  # grids add little: 0.77 to 1.02 times the estimate
-    corners = 4 * (3 if position.moments is None else 6)
+    corners = 4 * (3 if position.timestamps is None else 6)
     return width + corners * position.levels * position.features
 
 

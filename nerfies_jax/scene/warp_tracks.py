@@ -46,7 +46,7 @@ def follow(
         return None
     if all(effect.displace is None for effect in field.effects):
         return _follow_flow(field, state, capture, known)
-    views = [evaluation.view_of(capture, int(row)) for row in known.moments]
+    views = [evaluation.view_of(capture, int(row)) for row in known.track_rows]
     views = jax.tree.map(lambda *leaves: np.stack(leaves), *views)
     center = np.asarray(metadata.center, np.float32)
 
@@ -104,7 +104,7 @@ def _follow_flow(field, state, capture, truth):
     move = _flow_mover(field)
     if move is None:
         return None
-    views = [evaluation.view_of(capture, int(row)) for row in truth.moments]
+    views = [evaluation.view_of(capture, int(row)) for row in truth.track_rows]
     static = _static_points(capture)
     begin = np.concatenate([truth.start_points, static])
     places = {truth.start: Moved(begin, np.ones(len(begin), bool))}

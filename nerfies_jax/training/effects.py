@@ -28,7 +28,7 @@ Features = Float[Array, " features"]
 
 # A table of codes has one row for each distinct training timestamp, or one for each
 # exposure ("appearance id") of the capture.
-MOMENT, APPEARANCE = "moment", "appearance"
+TIMESTAMP, APPEARANCE = "timestamp", "appearance"
 
 
 class Table(NamedTuple):
@@ -36,8 +36,8 @@ class Table(NamedTuple):
 
     Attributes:
       name: Name of the table, the key of `FrameCondition.codes`.
-      by: `MOMENT` ("moment", a row for each frame time) or `APPEARANCE` ("appearance",
-        a row for each exposure).
+      by: `TIMESTAMP` ("timestamp", a row for each frame time) or `APPEARANCE`
+        ("appearance", a row for each exposure).
       width: Number of entries of a code.
     """
 

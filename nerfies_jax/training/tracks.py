@@ -101,15 +101,15 @@ def inverse_warp(
 class Tracks(NamedTuple):
     """Positions of points through time, in the coordinates of the warp."""
 
-    points: Float[Array, "points moments 3"]
-    converged: Bool[Array, "points moments"]
+    points: Float[Array, "points times 3"]
+    converged: Bool[Array, "points times"]
 
 
 def point_tracks(
     displace: Callable[[PyTree, Vector, PyTree], Vector],
     params: PyTree,
     points: Float[Array, "points 3"],
-    moments: PyTree,
+    conditions: PyTree,
     row: int | None = None,
     spec: InverseSpec = InverseSpec(),
 ) -> Tracks:
@@ -124,27 +124,27 @@ def point_tracks(
         at one time.
       params: Parameters of the displacement.
       points: Points in units of the field, [points, 3].
-      moments: Conditioning at all times, a pytree with times along the first axis.
+      conditions: Conditioning at all times, a pytree with times along the first axis.
       row: Index of the time at which the points were observed. None for canonical
         points.
       spec: Solver settings and convergence criteria.
 
     Returns:
-      Positions [points, moments, 3] and convergence flags [points, moments].
+      Positions [points, times, 3] and convergence flags [points, times].
 
     Raises:
       ValueError: If `row` is out of range.
     """
-    count = jax.tree.leaves(moments)[0].shape[0]
+    count = jax.tree.leaves(conditions)[0].shape[0]
     if row is not None and not 0 <= row < count:
         raise ValueError(
             f"row={row} is not in 0 .. {count - 1}; it is the index of the time at "
             "which the points were observed, or None for canonical points"
         )
     first = row or 0
-    reference = jax.tree.map(lambda leaf: leaf[first], moments)
-    before = jax.tree.map(lambda leaf: leaf[:first][::-1], moments)
-    after = jax.tree.map(lambda leaf: leaf[first + 1 :], moments)
+    reference = jax.tree.map(lambda leaf: leaf[first], conditions)
+    before = jax.tree.map(lambda leaf: leaf[:first][::-1], conditions)
+    after = jax.tree.map(lambda leaf: leaf[first + 1 :], conditions)
 
     def displace_at(inputs, point):
         return displace(inputs[0], point, inputs[1])

@@ -65,7 +65,7 @@ def test_everything_in_the_files_arrives(tmp_path):
     np.testing.assert_allclose(
         capture.times, [0, 1 / 3, 2 / 3, 1, 0, 0.5, 1], atol=1e-7
     )
-    assert capture.warp_ids.tolist() == [0, 1, 3, 4, 0, 2, 4]  # equal times, one moment
+    assert capture.warp_ids.tolist() == [0, 1, 3, 4, 0, 2, 4]  # equal times, one id
     pixels = image(2).astype(float)
     cover = pixels[..., 3:] / 255
     white = pixels[..., :3] * cover + 255 * (1 - cover)

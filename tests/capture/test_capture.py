@@ -127,8 +127,8 @@ def test_names_tell_times_and_cameras(names, times, cameras):
     ],
 )
 def test_phones_name_images_by_date_and_time_of_day(stems, gaps):
-    moments, _, notes = name_times.clock(stems)
-    assert np.diff(moments).tolist() == gaps
+    times, _, notes = name_times.clock(stems)
+    assert np.diff(times).tolist() == gaps
     assert notes == ()
 
 

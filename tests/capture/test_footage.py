@@ -67,17 +67,17 @@ def write_video(path, milliseconds, shape=(32, 48)):
         stream = container.add_stream("h264", rate=30, options={"crf": "0"})
         stream.height, stream.width = shape
         stream.pix_fmt, stream.codec_context.time_base = "yuv444p", Fraction(1, 1000)
-        for number, moment in enumerate(milliseconds):
+        for number, time in enumerate(milliseconds):
             gray = np.full((*shape, 3), 10 * number, np.uint8)
             frame = av.VideoFrame.from_ndarray(gray, format="rgb24")
-            frame.pts, frame.time_base = moment, Fraction(1, 1000)
+            frame.pts, frame.time_base = time, Fraction(1, 1000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
 
 def test_a_video_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path):
-    moments = [0, 40, 80, 500, 510, 520, 1000]
-    write_video(tmp_path / "a.mp4", moments)
+    milliseconds = [0, 40, 80, 500, 510, 520, 1000]
+    write_video(tmp_path / "a.mp4", milliseconds)
     (tmp_path / "given").mkdir()
     for number in range(7):
         mask = np.arange(48) >= 6 * number
@@ -87,11 +87,11 @@ def test_a_video_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path)
         tmp_path / "a.mp4", tmp_path, 3, max_side=16, masks=tmp_path / "given"
     )
     times = [int(name[2:10]) for name in taken.names]
-    assert set(times) <= set(moments)
+    assert set(times) <= set(milliseconds)
     assert [time // 400 for time in times] == [0, 1, 2]
     assert taken.seconds == pytest.approx((times[-1] - times[0]) / 1000)
     for name, time in zip(taken.names, times, strict=True):
-        number = moments.index(time)
+        number = milliseconds.index(time)
         image = images.read_pixels(tmp_path / "images" / name)
         assert image.shape == (10, 16, 3)
         assert abs(image.astype(int) - 10 * number).max() <= 3

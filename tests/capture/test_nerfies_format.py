@@ -45,11 +45,11 @@ def make(folder, count=6, factors=(1,), channels=3):
         folder / "dataset.json",
         {"count": count, "ids": ids, "train_ids": ids[::2], "val_ids": ids[1::2]},
     )
-    moments = {
+    entries = {
         name: {"warp_id": 10 + 2 * row, "appearance_id": row, "camera_id": row % 2}
         for row, name in enumerate(ids)
     }
-    dump(folder / "metadata.json", moments)
+    dump(folder / "metadata.json", entries)
     for row, name in enumerate(ids):
         entry = {
             "orientation": orientation(0.1 * row),
@@ -323,7 +323,7 @@ def one_camera(**changes):
     return changed("camera/002.json", **changes)
 
 
-def one_moment(row, **entry):
+def one_entry(row, **entry):
     return changed("metadata.json", **{row: entry})
 
 
@@ -386,8 +386,8 @@ BAD = {
         written("metadata.json", {"000": {"warp_id": 0}}),
         "no entry for frame '001'",
     ),
-    "id negative": (one_moment("003", warp_id=-1), "frame '003' has warp_id -1"),
-    "id huge": (one_moment("003", camera_id=2**40), "frame '003' has camera_id"),
+    "id negative": (one_entry("003", warp_id=-1), "frame '003' has warp_id -1"),
+    "id huge": (one_entry("003", camera_id=2**40), "frame '003' has camera_id"),
     "time outside": (written("metadata.json", LATE), "frame '003' has time 1.5"),
     "id that climbs": (written("dataset.json", CLIMBS), "leads outside"),
     "absolute id": (
@@ -558,9 +558,9 @@ def test_keys_that_are_not_read_are_named(tmp_path):
     ):
         file = tmp_path / name
         dump(file, (json.loads(file.read_text()) if file.exists() else {}) | keys)
-    moments = json.loads((tmp_path / "metadata.json").read_text())
-    moments["003"]["exposure"] = 2.0
-    dump(tmp_path / "metadata.json", moments)
+    entries = json.loads((tmp_path / "metadata.json").read_text())
+    entries["003"]["exposure"] = 2.0
+    dump(tmp_path / "metadata.json", entries)
     notes = nerfies_format.read(tmp_path).notes
     for file, key in (
         ("scene.json", "rotation"),

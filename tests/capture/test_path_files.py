@@ -140,8 +140,8 @@ def test_folders_of_no_cameras_or_of_several_sizes_are_refused(tmp_path):
 def test_keyframes_are_read_back_and_come_of_the_cameras_where_there_are_none(tmp_path):
     capture, planned, file = hand_made(frames=3), a_path(), tmp_path / "a.json"
     chosen = [
-        Keyframe(camera.take(planned.cameras, row), moment)
-        for row, moment in ((2, 0.75), (0, 0.25))
+        Keyframe(camera.take(planned.cameras, row), time)
+        for row, time in ((2, 0.75), (0, 0.25))
     ]
     path_files.write_nerfstudio(file, planned, 24.0, keyframes=chosen)
     for read, written in zip(

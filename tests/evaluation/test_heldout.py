@@ -302,10 +302,10 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, scene_folder, rng):
     ):
         away = np.linalg.norm(path - known.path, axis=-1)[seen]
         assert numbers[key] == pytest.approx(away.mean(), rel=1e-4)
-    # The flow is that of the same motion: points of the start at the last moment.
+    # The flow is that of the same motion: points of the start at the last time.
     move = run.representation.scoring.mover(run.spec, run.metadata)
     here, there = (
-        evaluation.view_of(capture, int(known.moments[place]))
+        evaluation.view_of(capture, int(known.track_rows[place]))
         for place in (known.start, -1)
     )
     moved = move(state, known.start_points, here, there)

@@ -17,13 +17,13 @@ def test_the_known_paths_are_those_of_points_seen_at_the_start():
     assert known.path.shape == (5, len(capture.train), 3)
     assert len(known.rows) == 2
     assert set(known.rows) <= set(capture.heldout)
-    assert np.all(np.diff(capture.times[known.moments]) > 0)
-    assert known.start == len(known.moments) // 2
+    assert np.all(np.diff(capture.times[known.track_rows]) > 0)
+    assert known.start == len(known.track_rows) // 2
     assert known.seen[:, known.start].all()
     for point, seen in zip(known.path, known.seen, strict=True):
         (track,) = np.flatnonzero((truth.track_canonical == point[0]).all(axis=1))
         np.testing.assert_array_equal(point, truth.track_world[track])
-        np.testing.assert_array_equal(seen, truth.track_seen[track][known.moments])
+        np.testing.assert_array_equal(seen, truth.track_seen[track][known.track_rows])
 
 
 def test_a_scaled_capture_has_its_paths_in_scene_units():

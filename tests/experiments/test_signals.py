@@ -52,7 +52,7 @@ class Command:
         return self.log.read_text(errors="replace")
 
     def wait_until(self, is_reached):
-        """Until a moment of progress, or the end of the process; returns whether it is
+        """Until a stage of progress, or the end of the process; returns whether it is
         still running.
         """
         until = time.monotonic() + 300
@@ -114,13 +114,13 @@ def product(name):
     return lambda folder: (folder / "run" / name).exists()
 
 
-def is_at(moment, command, folder):
-    """Whether a run that may have been there before has begun and is at a moment."""
-    return "for training" in command.said() and moment(folder)
+def is_at(stage, command, folder):
+    """Whether a run that may have been there before has begun and is at a stage."""
+    return "for training" in command.said() and stage(folder)
 
 
 # In the order of a run: each is waited for where the run was left at the one before.
-MOMENTS = (
+STAGES = (
     product("config.json"),
     checkpoint_after(STEPS // 2),
     product("player.html"),
@@ -128,13 +128,13 @@ MOMENTS = (
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_after_a_signal_at_any_moment_and_is_viewed(tmp_path):
+def test_a_run_goes_on_after_a_signal_at_any_time_and_is_viewed(tmp_path):
     nerfies_format.write(scenes.tiny_capture(), tmp_path / "capture")
     words = ("reconstruct", tmp_path / "capture", *QUICK, "--out", tmp_path / "run")
     goes_on = ("reconstruct", "--out", tmp_path / "run", "--resume")
-    for moment, number in zip(MOMENTS, SIGNALS, strict=True):
+    for stage, number in zip(STAGES, SIGNALS, strict=True):
         command = Command(tmp_path, *words)
-        assert command.wait_until(functools.partial(is_at, moment, command, tmp_path))
+        assert command.wait_until(functools.partial(is_at, stage, command, tmp_path))
         command.check_ends(number)
         assert "--resume" in command.said()
         words = goes_on

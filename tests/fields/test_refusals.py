@@ -45,7 +45,7 @@ ON_POINTS = dataclasses.replace(BENT, background=BackgroundSpec())
 TWO_WIDTHS = dataclasses.replace(
     BENT, warp=WarpSpec(code_width=5), time=TimeSpec(condition="code")
 )
-ON_MOMENTS = TemplateSpec(PlanesSpec(moments=4))
+WITH_TIME = TemplateSpec(PlanesSpec(timestamps=4))
 LINE = np.linspace(0.1, 1, 5, dtype=np.float32)
 
 
@@ -100,8 +100,8 @@ def sample_pdf(edges, weights, count):
         (lambda: RadianceScene(1, template_rate=np.inf), "template_rate=inf.*finite"),
         (lambda: RadianceScene(1, table_rate=np.inf), "table_rate=inf.*finite"),
         (lambda: RadianceScene(1, code_rate=0.0), "code_rate=0.0.*positive"),
-        (lambda: RadianceScene(1, ON_MOMENTS), "position.moments=none"),
-        (lambda: RadianceScene(1, coarse=ON_MOMENTS), "position.moments=none"),
+        (lambda: RadianceScene(1, WITH_TIME), "position.timestamps=none"),
+        (lambda: RadianceScene(1, coarse=WITH_TIME), "position.timestamps=none"),
         (
             lambda: RadianceScene(1, learning_rate=1e-4, learning_rate_end=1e-3),
             "learning_rate_end",

@@ -189,7 +189,7 @@ def test_blocks_of_rays_do_not_show_in_an_image():
 
 
 def test_the_estimate_of_memory_counts_each_sample_of_each_network():
-    """A medium at three moments, and no sample of a single level twice."""
+    """A medium at three times, and no sample of a single level twice."""
     capture = scenes.tiny_capture()
 
     def floats(**changes):
@@ -211,7 +211,7 @@ def test_the_estimate_of_memory_counts_each_sample_of_each_network():
     assert floats(transient=transient) == (8 + 16) * net + 16 * 8
     flow = SceneFlowSpec(TINY_TEMPLATE, flow_trunk=True)
     assert floats(sampling=one, scene_flow=flow) == 8 * net + 3 * 8 * (net + 2 * 16)
-    planes = PlanesSpec(multiples=(1, 2), moments=3, features=4)
+    planes = PlanesSpec(multiples=(1, 2), timestamps=3, features=4)
     flow = SceneFlowSpec(dataclasses.replace(TINY_TEMPLATE, position=planes))
     corners = 2 * 6 * 4 * 4
     assert floats(sampling=one, scene_flow=flow) == 8 * net + 24 * (net + corners)

@@ -110,7 +110,7 @@ occupied_at = jax.jit(occupancy.at, static_argnums=2)
 def test_skipping_changes_a_frame_by_no_more_than_it_may(spec, background, row):
     model, params = full_of_holes(spec, background)
     view = evaluation.view_of(scenes.tiny_capture(), row)
-    if spec.warp is not None:  # in another place at every moment, and between two
+    if spec.warp is not None:  # in another place at every time, and between two
         view = view._replace(time=view.time + jnp.float32(0.03))
     occupied = jax.jit(model.surveyed.survey)(params, STEP)
     assert all(0.02 < cells.mean() < 0.8 for cells in occupied.values())

@@ -96,7 +96,7 @@ PLANES = dataclasses.replace(
     anneal_steps=40,
 )
 TIMED = dataclasses.replace(
-    PLANES, position=dataclasses.replace(PLANES.position, moments=4)
+    PLANES, position=dataclasses.replace(PLANES.position, timestamps=4)
 )
 
 
@@ -144,7 +144,7 @@ def test_gradients_of_planes(float64):
     assert gradients.directional_error(total, params, point) < 1e-7
 
 
-def test_planes_of_moments_say_when_as_well(dtype):
+def test_planes_with_time_depend_on_it(dtype):
     params, place = planes_drawn(dtype, TIMED), np.array([0.575, 0.45, 0.725, 0.4])
     levels = [product_of_planes(level, place) for level in params.tables]
     point, time = np.asarray([0.3, -0.2, 0.9], dtype), np.asarray(0.4, dtype)
@@ -157,7 +157,7 @@ def test_planes_of_moments_say_when_as_well(dtype):
 
 
 @pytest.mark.full
-def test_gradients_of_planes_of_moments(float64):
+def test_gradients_of_planes_with_time(float64):
     params = planes_drawn("float64", TIMED)
     point, time = np.array([0.31, -0.23, 1.7]), np.asarray(0.41)
 

@@ -218,7 +218,7 @@ def test_codes_learn_at_a_rate_of_their_own():
 
 @pytest.mark.full
 def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
-    """Against the body's own velocity; also where frames are two moments apart.
+    """Against the body's own velocity; also where frames are two times apart.
 
     Or none: two cameras saw the tenth.
     """

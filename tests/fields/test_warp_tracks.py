@@ -32,14 +32,14 @@ def test_points_are_followed_through_a_warp_in_closed_form(
     """x + d(x) = x / s(t) - v t: a point is scaled by s and moved, in field units."""
     capture, _, known = known_scene
     metadata = types.SimpleNamespace(center=(0.1, -0.2, 0.3), scale=4.0)
-    times = capture.times[known.moments]
+    times = capture.times[known.track_rows]
     velocity = jnp.asarray([0.3, 0.1, -0.2])
 
-    def displace(params, point, moment):
-        moved = point / (1 + moment.time) - params * moment.time - point
+    def displace(params, point, condition):
+        moved = point / (1 + condition.time) - params * condition.time - point
         if lost_at is None:
             return moved
-        return jnp.where(abs(moment.time - times[lost_at]) < 1e-3, jnp.nan, moved)
+        return jnp.where(abs(condition.time - times[lost_at]) < 1e-3, jnp.nan, moved)
 
     stub = types.SimpleNamespace(
         effects=(FieldRecord("warp", displace=displace),),
@@ -77,12 +77,12 @@ def test_points_are_followed_along_a_flow_in_closed_form(
 ):
     """A turn about an axis, by so much in each interval, of a share of what is there.
 
-    With `every` second moment known, the flow is followed over two intervals at once.
+    With `every` second time known, the flow is followed over two intervals at once.
     """
     capture, _, known = known_scene
-    chosen = np.arange(known.start % every, len(known.moments), every)
+    chosen = np.arange(known.start % every, len(known.track_rows), every)
     known = known._replace(
-        moments=known.moments[chosen],
+        track_rows=known.track_rows[chosen],
         path=known.path[:, chosen],
         seen=known.seen[:, chosen],
         start=known.start // every,

@@ -150,7 +150,7 @@ HARD = {
     "zero embeddings": lambda params, embedding: (params, np.zeros_like(embedding)),
 }
 # The video's ends, a code of the table and one of the coarse network's three.
-MOMENTS = (0.0, 1.0, 1 / 3, 0.5)
+TIMES = (0.0, 1.0, 1 / 3, 0.5)
 
 
 @jax.jit
@@ -176,7 +176,7 @@ def test_codes_at_their_edges_have_the_values_and_slopes_of_the_network(
         offsets = by_hand(*tree.unflatten(ahead), time)
         return sum(np.sin(value).sum() for value in offsets.values())
 
-    for time in np.asarray(MOMENTS, dtype):
+    for time in np.asarray(TIMES, dtype):
         total, slopes = total_and_slopes(*given, time)
         bound = {"float32": 5e-5, "float64": 1e-12}[dtype]
         np.testing.assert_allclose(total, total_along(0, time), rtol=bound, atol=bound)

@@ -68,7 +68,9 @@ def test_points_are_carried_by_gaussians_that_all_move_alike(
     followed = follow_moved(
         monkeypatch, known_scene, rows, lambda mean, time: mean + velocity * time
     )
-    since = capture.times[known.moments] - capture.times[known.moments][known.start]
+    since = (
+        capture.times[known.track_rows] - capture.times[known.track_rows][known.start]
+    )
     expected = known.start_points[:, None] + since[:, None] * velocity
     np.testing.assert_allclose(followed.path, expected, atol=1e-6)
     assert followed.found.all()
@@ -94,7 +96,7 @@ def test_a_turning_body_carries_its_points_but_for_the_way_to_the_neighbors_mean
         shape = jax.ShapeDtypeStruct(mean.shape, mean.dtype)
         return jax.pure_callback(turned, shape, mean, time)
 
-    times = capture.times[known.moments]
+    times = capture.times[known.track_rows]
     # Turned back, so that they are around the points when these are given.
     rows = splat_rows(turned(cloud, -times[known.start]), np.zeros(len(cloud)))
     followed = follow_moved(monkeypatch, known_scene, rows, moved)

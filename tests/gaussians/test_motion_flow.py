@@ -37,7 +37,7 @@ def pair(dtype, turned=0.1):
 
 
 def scattered(dtype, count=7, seed=0):
-    """Gaussians before the cameras, and the same a moment later."""
+    """Gaussians before the cameras, and the same a little later."""
     rng = np.random.default_rng(seed)
     here = Gaussians(
         rng.uniform(-1, 1, (count, 3)),

@@ -25,7 +25,8 @@ from tests.nn.test_planes import expected
 ROWS, EXTENT, NAME = 7, 2.0, plane_motion.NAME
 BOX = ((-1.0, -2.0, -0.5), (1.5, 1.0, 2.0))
 MOTION = PlaneMotionSpec(
-    planes=PlanesSpec(vertices=3, multiples=(1, 2), moments=4, features=2), width=4
+    planes=PlanesSpec(vertices=3, multiples=(1, 2), timestamps=4, features=2),
+    width=4,
 )
 
 
@@ -139,8 +140,11 @@ def test_the_box_holds_what_was_observed():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"planes": PlanesSpec()}, "need moments and a product, got moments=None"),
-        ({"planes": PlanesSpec(moments=3, combination="sum")}, "combination='sum'"),
+        ({"planes": PlanesSpec()}, "need timestamps and a product"),
+        (
+            {"planes": PlanesSpec(timestamps=3, combination="sum")},
+            "combination='sum'",
+        ),
         ({"bend": -1.0}, "finite and not negative"),
         ({"warm_up": -1}, "must not be negative"),
         ({"plane_rate": 1e-9}, "the rate falls"),

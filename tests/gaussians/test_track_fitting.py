@@ -17,7 +17,7 @@ TIMES = np.linspace(0, 1, 10)
 EXTENTS = (
     TimeBasisSpec(count=2, depth=1, width=4),
     PlaneMotionSpec(
-        planes=PlanesSpec(vertices=4, multiples=(1,), moments=4, features=2),
+        planes=PlanesSpec(vertices=4, multiples=(1,), timestamps=4, features=2),
         width=4,
     ),
     NodeMotionSpec(nodes=5, depth=1, width=4, skips=(), links=3),

@@ -13,7 +13,7 @@ from nerfies_jax.nn.planes import Level, PlanesSpec
 from tests import gradients
 
 SPECS = {
-    "hexplane": PlanesSpec(vertices=3, multiples=(1, 2), moments=4, features=2),
+    "hexplane": PlanesSpec(vertices=3, multiples=(1, 2), timestamps=4, features=2),
     "triplane": PlanesSpec(
         vertices=4, multiples=(1,), features=3, combination="sum", outside="refuse"
     ),
@@ -23,11 +23,11 @@ encode = jax.jit(planes.encode, static_argnums=0)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def encode_at_time(spec, levels, place, moment):
+def encode_at_time(spec, levels, place, time):
     """As a motion does, for which all points share one time."""
     space = planes.space_features(spec, levels, place)
-    time = planes.time_features(spec, planes.at_time(levels, moment), place)
-    return planes.features(spec, space, time)
+    of_time = planes.time_features(spec, planes.at_time(levels, time), place)
+    return planes.features(spec, space, of_time)
 
 
 def filled(spec, dtype, seed=0):
@@ -55,7 +55,7 @@ def expected(spec, levels, places):
 @by_name
 def test_planes_are_bilinear_between_their_vertices(name, dtype, rng):
     spec = SPECS[name]
-    dimensions = 3 if spec.moments is None else 4
+    dimensions = 3 if spec.timestamps is None else 4
     places = rng.uniform(size=(20, dimensions)).astype(dtype)
     levels = filled(spec, dtype)
     exact = expected(spec, levels, places)
@@ -90,7 +90,7 @@ def test_cells_agree_where_they_meet(vertex, dtype, rng):
 @pytest.mark.parametrize("beyond", [-1e30, -0.1, 1.1, 1e30])
 def test_what_is_outside_is_clamped_or_refused_as_the_spec_says(name, beyond, dtype):
     spec = SPECS[name]
-    place = np.full(3 if spec.moments is None else 4, 0.3, dtype)
+    place = np.full(3 if spec.timestamps is None else 4, 0.3, dtype)
     for axis in range(len(place)):
         outside, nearest = place.copy(), place.copy()
         outside[axis], nearest[axis] = beyond, np.clip(beyond, 0, 1)
@@ -107,7 +107,7 @@ def test_what_is_outside_is_clamped_or_refused_as_the_spec_says(name, beyond, dt
 @by_name
 def test_slopes_are_those_of_differences(name, float64):
     spec = SPECS[name]
-    place = np.array([0.21, 0.44, 0.83, 0.55])[: 3 if spec.moments is None else 4]
+    place = np.array([0.21, 0.44, 0.83, 0.55])[: 3 if spec.timestamps is None else 4]
     weights = np.random.default_rng(0).normal(size=spec.width(len(place)))
 
     def value(levels, place):
@@ -162,14 +162,16 @@ def test_the_reference_values_of_4dgs_are_met(dtype, oracle_dir):
         )
         for level in range(2)
     )
-    spec = PlanesSpec(vertices=8, multiples=(1, 2), moments=5, features=8)
+    spec = PlanesSpec(vertices=8, multiples=(1, 2), timestamps=5, features=8)
     high, low = stored["aabb"].astype(dtype)
     # Theirs runs from the high corner to the low one, and reads time in [-1, 1].
-    moment = (stored["t"][:, 0].astype(dtype) + 1) / 2
+    timestamp = (stored["t"][:, 0].astype(dtype) + 1) / 2
 
     @jax.jit
     def field(x):
-        places = jnp.concatenate([(high - x) / (high - low), moment[:, None]], axis=1)
+        places = jnp.concatenate(
+            [(high - x) / (high - low), timestamp[:, None]], axis=1
+        )
         return jax.vmap(lambda place: planes.encode(spec, levels, place))(places)
 
     x = stored["x"].astype(dtype)
@@ -190,7 +192,7 @@ def test_the_reference_values_of_4dgs_are_met(dtype, oracle_dir):
         assert abs(ours - stored[theirs]) < 1e-6
 
 
-def test_two_moments_change_evenly():
+def test_two_timestamps_change_evenly():
     assert planes.time_smoothness(jnp.arange(12.0).reshape(2, 3, 2)) == 0
 
 
@@ -200,7 +202,7 @@ def test_two_moments_change_evenly():
         ({"features": 0}, "features >= 1"),
         ({"multiples": ()}, "a positive multiple"),
         ({"vertices": 1}, "must lie between 2"),
-        ({"moments": 1}, "None for planes without time"),
+        ({"timestamps": 1}, "None for planes without time"),
         ({"combination": "mean"}, "unknown combination"),
         ({"outside": "wrap"}, "unknown outside"),
     ],

@@ -162,7 +162,7 @@ def test_what_cannot_be_seen_decides_nothing_and_says_why(capture):
     assert len(finding.evidence) > 20
 
 
-def test_frames_of_one_moment_ask_for_no_motion():
+def test_frames_of_one_time_ask_for_no_motion():
     times = np.zeros(two_planes.FRAMES, np.float32)
     capture = two_planes.make(card=two_planes.swaying, times=times)
     inspected = inspect_job.inspect(capture)

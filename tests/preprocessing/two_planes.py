@@ -110,7 +110,7 @@ def swaying(time):
 
 
 def rod(turn: float, frames: int = 12, side: int = 56) -> Capture:
-    """A dark rod across a ball before white, seen from all around, one view a moment.
+    """A dark rod across a ball before white, seen from all around, one view a time.
 
     The rod turns by `turn` rad over the video; the ball is at rest. Points of both are
     drawn as discs, so the outlines share no code with what reads them.
@@ -119,7 +119,7 @@ def rod(turn: float, frames: int = 12, side: int = 56) -> Capture:
     ball = rng.normal(size=(4000, 3))
     ball *= 0.4 / np.linalg.norm(ball, axis=1, keepdims=True)
     times = np.linspace(0, 1, frames)
-    # Neighboring moments lie far apart: no flow between them.
+    # Neighboring times lie far apart: no flow between them.
     angles = 2.4 * np.arange(frames)
     images = np.full((frames, side, side, 3), 255, np.uint8)
     turns, places = [], []

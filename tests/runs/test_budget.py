@@ -53,12 +53,12 @@ def test_a_video_is_not_made_too_small_to_see():
 @pytest.mark.parametrize("frame_seconds", [0.0, 0.01, 0.1, 0.5, 1.0, 30.0])
 @pytest.mark.parametrize("size", [(176, 132), (4000, 3000)])
 def test_averages_over_time_keep_to_their_time_and_memory(frame_seconds, size):
-    frames, moments = budget.static_renders(frame_seconds, 15, size)
+    frames, times = budget.static_renders(frame_seconds, 15, size)
     assert 2 <= frames <= 15
-    assert 4 <= moments <= 16
+    assert 4 <= times <= 16
     assert frames * size[0] * size[1] <= max(10_000_000, 2 * size[0] * size[1])
-    # Two frames at four moments are drawn, whatever they take.
-    assert frames * moments * frame_seconds <= max(30.0, 8 * frame_seconds)
+    # Two frames at four times are drawn, whatever they take.
+    assert frames * times * frame_seconds <= max(30.0, 8 * frame_seconds)
     if frame_seconds <= 0.1 and size == (176, 132):
-        assert (frames, moments) == (15, 16)
+        assert (frames, times) == (15, 16)
     assert budget.static_renders(frame_seconds, 1, size)[0] == 1

@@ -319,19 +319,19 @@ def test_a_path_is_edited_saved_loaded_and_rendered(tmp_path, capsys):
     with opened(tmp_path) as (page, browser, until, _, _):
         frames = page.path.keyframes
 
-        def add(row, moment, count):
+        def add(row, time, count):
             browser.look(eye_of(row))
-            browser.press(page, "time", moment)
+            browser.press(page, "time", time)
             browser.press(page, "add keyframe")
             # What is clicked counts, however the camera moves before it is dealt with.
             browser.look(eye_of(int(CAPTURE.train[-1])))
             browser.press(page, "time", 0.77)
             until(lambda: len(frames) == count)
 
-        for count, (row, moment) in enumerate(
+        for count, (row, time) in enumerate(
             zip(rows, (0.0, 0.5, 0.25), strict=True), 1
         ):
-            add(row, moment, count)
+            add(row, time, count)
         positions = [keyframe.camera.position for keyframe in frames]
         np.testing.assert_allclose(positions, CAPTURE.cameras.position[rows], atol=1e-5)
         assert [keyframe.time for keyframe in frames] == [0.0, 0.5, 0.25]

@@ -110,12 +110,12 @@ def served(browser, tmp_path):
         page.close()
 
 
-def rendered(each, moment, without=()):
+def rendered(each, time, without=()):
     """What our renderer shows in the browser's window."""
     size = WINDOW["width"] // 2, WINDOW["height"] // 2
     model = each.page.screen.model(without)
     camera = interactive.camera_of(each.still_eye(), size)
-    view = View(camera, np.float32(moment), np.int32(0))
+    view = View(camera, np.float32(time), np.int32(0))
     renderer = evaluation.Renderer(model, size)
     return renderer(each.state, in_default_precision(view)).color.clip(0, 1)
 
@@ -125,9 +125,9 @@ def test_the_browser_renders_the_gaussians_at_every_time_and_without_effects(
 ):
     with served(browser, tmp_path) as each:
 
-        def difference(moment, without=()):
+        def difference(time, without=()):
             shown = each.settled()[::2, ::2]
-            expected = rendered(each, moment, without)[:, : SCENE_PX // 2]
+            expected = rendered(each, time, without)[:, : SCENE_PX // 2]
             behind = np.asarray(each.page.screen.run.capture.background)
             covered = np.abs(expected - behind).max(axis=-1) > 0.05
             assert covered.mean() > 0.02

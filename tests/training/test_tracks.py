@@ -231,13 +231,13 @@ def test_gradients_are_those_of_the_implicit_function(float64, rng):
     np.testing.assert_allclose(by_target, inverse, rtol=1e-10, atol=1e-12)
 
 
-def moving(params, point, moment):
+def moving(params, point, condition):
     """Turns by `rate` rad per time about an axis through `center`, and swells."""
     rate, swell = params
-    center = moment["center"]
+    center = condition["center"]
     offset = point - center
-    turned = lie.displacement(rate * moment["time"], 0 * rate, offset)
-    return turned + swell * jnp.sin(3 * moment["time"]) * offset
+    turned = lie.displacement(rate * condition["time"], 0 * rate, offset)
+    return turned + swell * jnp.sin(3 * condition["time"]) * offset
 
 
 def moving_truth(params, canonical, times, center):
@@ -258,7 +258,7 @@ def test_tracks_follow_points_through_a_known_motion(row, dtype, rng):
     params = (np.asarray([0.0, 2.5, 0.4], dtype), np.asarray(0.2, dtype))
     times = np.linspace(0, 1, 9)
     center = np.array([0.2, 0.0, -0.1])
-    moments = {
+    conditions = {
         "time": times.astype(dtype),
         "center": np.tile(center.astype(dtype), (9, 1)),
     }
@@ -266,7 +266,7 @@ def test_tracks_follow_points_through_a_known_motion(row, dtype, rng):
     truth = moving_truth(params, canonical, times, center)
     given = canonical if row is None else truth[:, row]
     tracks = jax.jit(lambda p, x, m: point_tracks(moving, p, x, m, row))(
-        params, given.astype(dtype), moments
+        params, given.astype(dtype), conditions
     )
     assert tracks.converged.all()
     error = np.abs(np.asarray(tracks.points) - truth).max()
@@ -274,8 +274,8 @@ def test_tracks_follow_points_through_a_known_motion(row, dtype, rng):
 
 
 @pytest.mark.full
-def test_a_track_survives_a_moment_at_which_it_is_lost(dtype):
-    """At two moments the image of the warp ends before the point."""
+def test_a_track_survives_a_time_at_which_it_is_lost(dtype):
+    """At two times the image of the warp ends before the point."""
     widths = np.asarray([2, 2, 0.5, 0.5, 2, 1.9], dtype)
 
     def field(params, point, width):
@@ -292,10 +292,10 @@ def test_a_track_survives_a_moment_at_which_it_is_lost(dtype):
 @pytest.mark.full
 def test_gradients_of_tracks_equal_central_differences(float64):
     params = (np.array([0.0, 2.5, 0.4]), np.array(0.2))
-    moments = {"time": np.linspace(0, 1, 5), "center": np.full((5, 3), 0.1)}
+    conditions = {"time": np.linspace(0, 1, 5), "center": np.full((5, 3), 0.1)}
 
     def total(params, points):
-        tracks = point_tracks(moving, params, points, moments, 2)
+        tracks = point_tracks(moving, params, points, conditions, 2)
         return jnp.sum(tracks.points * jnp.arange(15.0).reshape(5, 3))
 
     assert gradients.directional_error(total, params, np.ones((2, 3)) / 3) < 1e-7

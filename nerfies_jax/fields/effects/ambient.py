@@ -20,7 +20,7 @@ from nerfies_jax.nn import encoding, mlp
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.nn.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
+from nerfies_jax.training.effects import TIMESTAMP, FrameCondition, Table
 from nerfies_jax.training.step_counts import steps
 
 KINDS = ("bent", "plane")
@@ -123,7 +123,7 @@ class Bound:
     @property
     def tables(self) -> tuple[Table, ...]:
         """Table of the codes that it reads."""
-        return (Table(PLANE_TABLE, MOMENT, self.spec.dims),)
+        return (Table(PLANE_TABLE, TIMESTAMP, self.spec.dims),)
 
     def apply(
         self, params: MLP | None, point: Vector, frame: FrameCondition
@@ -139,7 +139,7 @@ class BentBound(Bound):
     @property
     def tables(self) -> tuple[Table, ...]:
         """Table of the codes that it reads."""
-        return (Table(self.spec.table, MOMENT, self.spec.code_width),)
+        return (Table(self.spec.table, TIMESTAMP, self.spec.code_width),)
 
     def init(self, key: Key[Array, ""]) -> MLP:
         """Initialize the network."""

@@ -22,7 +22,7 @@ from nerfies_jax.nn import encoding, mlp
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.nn.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training.effects import (
-    MOMENT,
+    TIMESTAMP,
     FrameCondition,
     PenaltyContext,
     Table,
@@ -73,7 +73,7 @@ class MovingMaskSpec:
     @property
     def tables(self) -> tuple[Table, ...]:
         """Table of the codes that it reads."""
-        return (Table(self.table, MOMENT, self.code_width),)
+        return (Table(self.table, TIMESTAMP, self.code_width),)
 
     def init(self, key: Key[Array, ""]) -> MLP:
         """Initialize the network."""

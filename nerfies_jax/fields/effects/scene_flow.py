@@ -69,7 +69,7 @@ class SceneFlowSpec:
     image, afterwards only its part of the blend. With `flow_trunk` the flow has its own
     trunk of the same size, which preserves a flow that was initialized from tracks
     during the first steps of the medium. In the public code flow shares the trunk of
-    the medium. A network on planes with `moments` (HexPlane) reads features of point
+    the medium. A network on planes with `timestamps` (HexPlane) reads features of point
     and time instead of a positional encoding.
 
     `moving_rays` is the share of the rays of a step that are of moving objects up to

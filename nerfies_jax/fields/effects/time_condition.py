@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from nerfies_jax.nn import encoding
 from nerfies_jax.nn.encoding import EncodingSpec
-from nerfies_jax.training.effects import MOMENT, FrameCondition, Table, Vector
+from nerfies_jax.training.effects import TIMESTAMP, FrameCondition, Table, Vector
 
 CONDITIONS = ("time", "code")
 
@@ -56,7 +56,7 @@ class TimeSpec:
         """Tables of the codes that it reads."""
         if self.condition != "code":
             return ()
-        return (Table(self.table, MOMENT, self.code_width),)
+        return (Table(self.table, TIMESTAMP, self.code_width),)
 
     def apply(
         self, params: None, point: Vector | None, frame: FrameCondition

@@ -4,11 +4,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 
-def interval(moments: int) -> float:
+def interval(count: int) -> float:
     """Return the time between two of evenly spaced timestamps in [0, 1].
 
     Args:
-      moments: Number of timestamps.
+      count: Number of timestamps.
 
     Returns:
       The interval, 2 for a single timestamp, which has no neighbors.
@@ -16,9 +16,9 @@ def interval(moments: int) -> float:
     Raises:
       ValueError: If there are none.
     """
-    if moments < 1:
-        raise ValueError(f"moments={moments} must be at least 1 timestamp")
-    return 1 / (moments - 1) if moments > 1 else 2.0
+    if count < 1:
+        raise ValueError(f"count={count} must be at least 1 timestamp")
+    return 1 / (count - 1) if count > 1 else 2.0
 
 
 def neighbor(

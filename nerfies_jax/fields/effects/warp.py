@@ -19,7 +19,7 @@ from nerfies_jax.nn import dense, encoding, mlp
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.nn.mlp import MLP, HeadSpec, MLPSpec
 from nerfies_jax.training import schedules
-from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
+from nerfies_jax.training.effects import TIMESTAMP, FrameCondition, Table
 from nerfies_jax.training.step_counts import steps
 
 KINDS = ("se3", "translation")
@@ -76,7 +76,7 @@ class WarpSpec:
         """Tables of the codes that the warp reads."""
         if self.condition != "code":
             return ()
-        return (Table(self.table, MOMENT, self.code_width),)
+        return (Table(self.table, TIMESTAMP, self.code_width),)
 
     @property
     def shortest_wave(self) -> float | None:

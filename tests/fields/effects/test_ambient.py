@@ -8,7 +8,7 @@ import pytest
 from nerfies_jax.fields.effects import ambient
 from nerfies_jax.fields.effects.ambient import AmbientSpec
 from nerfies_jax.nn.encoding import EncodingSpec
-from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
+from nerfies_jax.training.effects import TIMESTAMP, FrameCondition, Table
 from tests import drawn, gradients
 from tests.oracles import networks
 
@@ -112,7 +112,7 @@ def test_while_shut_the_template_reads_zeros_and_nothing_learns(spec, dtype, rng
 def test_a_plane_has_one_ambient_point_for_all_points(dtype, rng):
     effect = PLANE.bind(1, None)
     assert not hasattr(effect, "init")
-    assert effect.tables == (Table("ambient", MOMENT, 3),)
+    assert effect.tables == (Table("ambient", TIMESTAMP, 3),)
     when = condition(dtype)
 
     @jax.jit
@@ -132,7 +132,7 @@ def test_a_plane_has_one_ambient_point_for_all_points(dtype, rng):
 def test_a_bent_slice_shares_the_code_of_the_warp_and_starts_flat(rng):
     spec = AmbientSpec()
     effect = spec.bind(1, None)
-    assert effect.tables == (Table("motion", MOMENT, 8),)
+    assert effect.tables == (Table("motion", TIMESTAMP, 8),)
     points = rng.uniform(-1, 1, (200, 3)).astype(np.float32)
     codes = {"motion": jnp.asarray(np.full(8, 0.05, np.float32))}
     when = FrameCondition(jnp.float32(0), codes, jnp.int32(0))

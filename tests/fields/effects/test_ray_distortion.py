@@ -29,8 +29,11 @@ def of_pairs(weights, edges, points=4000):
         ]
     )
     # For sorted places: Σ_ij s_i s_j |x_i - x_j| = 2 Σ_j s_j (x_j S_j - M_j).
-    before, moment = np.cumsum(share) - share, np.cumsum(share * place) - share * place
-    return 2 * np.sum(share * (place * before - moment))
+    before, weighted = (
+        np.cumsum(share) - share,
+        np.cumsum(share * place) - share * place,
+    )
+    return 2 * np.sum(share * (place * before - weighted))
 
 
 def test_distortion_is_the_mean_distance_between_points(dtype, rng):

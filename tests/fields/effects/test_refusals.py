@@ -21,7 +21,7 @@ from nerfies_jax.fields.effects.warp import WarpSpec
 from nerfies_jax.fields.template import TemplateSpec
 from nerfies_jax.nn.planes import PlanesSpec
 
-STRICT = TemplateSpec(PlanesSpec(moments=4, outside="refuse"))
+STRICT = TemplateSpec(PlanesSpec(timestamps=4, outside="refuse"))
 REFUSED = [
     (AmbientSpec, {"kind": "curved"}, "unknown kind of slicing surface 'curved'.*bent"),
     (AmbientSpec, {"dims": 0}, "dims=0 must be at least 1.*none"),
@@ -59,7 +59,7 @@ REFUSED = [
     (SceneFlowSpec, {"network": STRICT}, "before the first.*clamp"),
     (FlowWeights, {"cycle": -1.0}, "cycle=-1"),
     (FlowWeights, {"depth": math.inf}, "depth=inf"),
-    (timestamps.interval, {"moments": 0}, "moments=0"),
+    (timestamps.interval, {"count": 0}, "count=0"),
     (SmoothnessSpec, {"weight": -1.0}, "weight=-1.0"),
     (DistortionSpec, {"weight": math.inf}, "weight=inf"),
     (SmoothnessSpec, {"until": 0}, "until=0.*none"),

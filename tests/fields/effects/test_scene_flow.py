@@ -18,9 +18,9 @@ from tests import drawn, gradients, scene_flow_rays
 from tests.scene_flow_rays import (
     BOX_SCALE,
     FEATURES,
-    MOMENTS,
     ROWS,
     TIMES,
+    TIMESTAMPS,
     TINY,
     context_of,
     oracle,
@@ -121,10 +121,10 @@ def test_a_flow_with_a_trunk_of_its_own_reads_nothing_of_the_medium_s(dtype):
 
 
 @pytest.mark.full
-def test_a_medium_on_planes_is_finite_where_there_is_no_moment(dtype):
+def test_a_medium_on_planes_is_finite_outside_of_its_times(dtype):
     """As neighbors of the first and the last are, at any distance."""
     network = dataclasses.replace(
-        TINY.network, position=PlanesSpec(3, (1, 2), moments=4, features=2)
+        TINY.network, position=PlanesSpec(3, (1, 2), timestamps=4, features=2)
     )
     spec = dataclasses.replace(TINY, network=network)
     params = drawn.params(
@@ -165,22 +165,22 @@ def slopes_of(params, frames, batch, arrays, times):
 
 
 @pytest.mark.full
-def test_the_first_and_the_last_moment_have_one_neighbor(float64):
+def test_the_first_and_the_last_time_have_one_neighbor(float64):
     (_, grad), _ = slopes_of(*scenario("float64"), TIMES)
     strength = {name: np.abs(np.asarray(x)).sum((1, -1)) for name, x in grad.items()}
     rows = np.array(ROWS)
-    for name, missing in (("flow_forward", MOMENTS - 1), ("flow_backward", 0)):
+    for name, missing in (("flow_forward", TIMESTAMPS - 1), ("flow_backward", 0)):
         assert (strength[name][rows == missing] == 0).all()
         assert (strength[name][rows != missing] > 0).all()
     hidden = np.abs(np.asarray(grad["disocclusion"])).sum(1)  # rays, sides
-    assert (hidden[rows == MOMENTS - 1, 0] == 0).all()
+    assert (hidden[rows == TIMESTAMPS - 1, 0] == 0).all()
     assert (hidden[rows == 0, 1] == 0).all()
 
 
 @pytest.mark.full
-def test_a_single_moment_has_no_neighbors_and_no_flow_to_learn(dtype):
+def test_a_single_time_has_no_neighbors_and_no_flow_to_learn(dtype):
     params, frames, batch, arrays = scenario(dtype)
-    still = frames._replace(times=np.zeros(MOMENTS, dtype))
+    still = frames._replace(times=np.zeros(TIMESTAMPS, dtype))
     slopes_and_terms = slopes_of(params, still, batch, arrays, (0.0,))
     (grad, _), terms = jax.tree.map(np.asarray, slopes_and_terms)
     for name in ("warped", "cycle", "disocclusion", "magnitude", "kinetic", "flow"):
@@ -281,12 +281,12 @@ def chain_by_hand(params, frames, batch, arrays, step):
     side, sign = step % 2, (1, -1)[step % 2]
     errors = []
     for r, row in enumerate(ROWS):
-        if not (0 <= row + 2 * sign < MOMENTS and batch.valid[r]):
+        if not (0 <= row + 2 * sign < TIMESTAMPS and batch.valid[r]):
             continue
         origin = (batch.origin[r] - scene_flow_rays.BOX_CENTER) * BOX_SCALE
         points = [origin + d * batch.direction[r] for d in distances[r]]
         for k in (row, row + sign):
-            gap = abs(TIMES[k + sign] - TIMES[k]) * (MOMENTS - 1)
+            gap = abs(TIMES[k + sign] - TIMES[k]) * (TIMESTAMPS - 1)
             flows = [
                 scene_flow_rays.dynamic(params, x, batch.direction[r], TIMES[k])[2]
                 for x in points

@@ -54,7 +54,7 @@ def params_of(dtype, size=0.3):
 
 
 def seen(params, dtype):
-    """The levels of one ray at one moment."""
+    """The levels of one ray at one time."""
     rng = np.random.default_rng(4)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)

@@ -8,7 +8,7 @@ import pytest
 from nerfies_jax.fields.effects import time_condition
 from nerfies_jax.fields.effects.time_condition import TimeSpec
 from nerfies_jax.nn.encoding import EncodingSpec
-from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
+from nerfies_jax.training.effects import TIMESTAMP, FrameCondition, Table
 from tests import gradients
 from tests.oracles import networks
 
@@ -45,7 +45,7 @@ def test_the_template_reads_the_encoded_time(encoding, dtype):
 
 def test_by_code_it_is_the_frame_s_code(dtype, rng):
     code = jnp.asarray(rng.normal(size=5), dtype)
-    assert BY_CODE.tables == (Table("motion", MOMENT, 5),)
+    assert BY_CODE.tables == (Table("motion", TIMESTAMP, 5),)
     assert BY_CODE.features == 5
     lifted = BY_CODE.apply(None, None, condition(dtype, 0.2, code))
     assert lifted.dtype == dtype

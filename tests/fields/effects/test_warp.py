@@ -12,7 +12,7 @@ import scipy.linalg
 from nerfies_jax.fields.effects import warp
 from nerfies_jax.fields.effects.warp import WarpSpec
 from nerfies_jax.nn.encoding import EncodingSpec
-from nerfies_jax.training.effects import MOMENT, FrameCondition, Table
+from nerfies_jax.training.effects import TIMESTAMP, FrameCondition, Table
 from tests import drawn, gradients
 from tests.oracles import networks
 
@@ -78,7 +78,7 @@ def compiled(spec):
 @pytest.mark.parametrize("step", [0, 7, 100])
 def test_points_move_as_the_matrix_exponential_says(kind, condition, step, dtype, rng):
     spec = dataclasses.replace(SMALL, kind=kind, condition=condition, anneal_steps=20)
-    tables = (Table("motion", MOMENT, 4),) if condition == "code" else ()
+    tables = (Table("motion", TIMESTAMP, 4),) if condition == "code" else ()
     assert spec.tables == tables
     params, when = bent(spec, dtype), frame(dtype, step=step)
     points = rng.uniform(-1, 1, (4, 3)).astype(dtype)
