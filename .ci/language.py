@@ -2,7 +2,8 @@
 
 The rules: a docstring begins with an imperative or a noun phrase, its first paragraph
 has no semicolons, public functions document their arguments and results (Google style),
-and all text is in American spelling.
+all text is in American spelling, and words that the field has another name for do not
+come back in code: `image`, `video` and `timestamp`, not picture, film and moment.
 
     python .ci/language.py            # check
     python .ci/language.py --list     # also list every violation
@@ -21,6 +22,7 @@ BAD_OPENINGS = dict.fromkeys(PACKAGES, 2.0)
 SEMICOLONS = dict.fromkeys(PACKAGES, 3.0)
 UNDOCUMENTED = 0  # public functions without Args or Returns
 BRITISH = 0  # words
+OLD = 0  # words
 
 OPENING = re.compile(r"(What|Which|Whether|How|Of|As|Those)\b")
 # Searched in single lower-case words.
@@ -34,6 +36,35 @@ SPELLING = re.compile(
 )
 # optimistix.minimise, and the former name of Capture.center
 ALLOWED = {"minimise", "centre"}
+
+OLD_WORDS = re.compile(r"pictures?|(un)?film(s|ed|ing)?|moments?", re.I)
+# Moments of gradients, of distributions and of shapes.
+MOMENTS = (
+    "experiments/hard_cases/networks.py",
+    "gaussians_jax/core/protocols.py",
+    "gaussians_jax/io/splatv.py",
+    "gaussians_jax/optim/",
+    "gaussians_jax/scene/first_state.py",
+    "gaussians_jax/scene/growth.py",
+    "gaussians_jax/scene/presets.py",
+    "gaussians_jax/splatting/blending.py",
+    "gaussians_jax/strategy.py",
+    "nerfies_jax/metrics/image_quality.py",
+    "nerfies_jax/scene/steps.py",
+    "nerfies_jax/training/chunk.py",
+    "nerfies_jax/training/updates.py",
+    "tests/bare_scenes.py",
+    "tests/fields/test_scene.py",
+    "tests/gaussians/test_densification.py",
+    "tests/gaussians/test_lens.py",
+    "tests/gaussians/test_mcmc.py",
+    "tests/gaussians/test_motion_growth.py",
+    "tests/gaussians/test_optimizer.py",
+    "tests/gaussians/test_phases.py",
+    "tests/test_effect_leaves.py",
+    "tests/test_extending.py",
+    "tests/training/",
+)
 
 
 def docstrings(path):
@@ -92,10 +123,10 @@ def missing_sections(function):
     return missing
 
 
-def british_words():
-    """Yield (place, word) for British spellings in all tracked text files."""
+def tracked(*patterns):
+    """Yield (name, text) for all tracked files but this one."""
     listed = subprocess.run(
-        ["git", "ls-files", "*.py", "*.pyi", "*.md", "*.js", "*.html", "*.toml"],
+        ["git", "ls-files", *patterns],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -103,13 +134,32 @@ def british_words():
     ).stdout.split()
     for name in listed:
         path = ROOT / name
-        if path == pathlib.Path(__file__) or not path.exists():
-            continue
-        text = path.read_text().lower()
+        if path != pathlib.Path(__file__) and path.exists():
+            yield name, path.read_text()
+
+
+def british_words():
+    """Yield (place, word) for British spellings in all tracked text files."""
+    files = tracked("*.py", "*.pyi", "*.md", "*.js", "*.html", "*.toml")
+    for name, text in files:
+        text = text.lower()
         for word in set(re.findall("[a-z]+", text)) - ALLOWED:
             if SPELLING.search(word):
                 line = text.count("\n", 0, text.index(word)) + 1
                 yield f"{name}:{line}", word
+
+
+def old_words():
+    """Yield (place, identifier or word) for `OLD_WORDS` in code and its text."""
+    for name, text in tracked("*.py", "*.pyi"):
+        for number, line in enumerate(text.splitlines(), 1):
+            for word in re.findall("[A-Za-z_]+", line):
+                parts = re.findall("[A-Z]?[a-z]+|[A-Z]+", word)
+                old = [part for part in parts if OLD_WORDS.fullmatch(part)]
+                if name.startswith(MOMENTS):
+                    old = [part for part in old if "moment" not in part.lower()]
+                if old:
+                    yield f"{name}:{number}", word
 
 
 def main():
@@ -150,6 +200,8 @@ def main():
     report(name, len(undocumented), UNDOCUMENTED, "", undocumented)
     words = [f"{place} {word}" for place, word in british_words()]
     report("British spellings", len(words), BRITISH, "", words)
+    words = [f"{place} {word}" for place, word in old_words()]
+    report("pictures, films and moments", len(words), OLD, "", words)
     return 1 if failures else 0
 
 
