@@ -118,10 +118,10 @@ More = Annotated[(MoreMetrics, *_heading("scoring"))]
 
 def plain(source: CaptureSource) -> CaptureSource:
     """Return the source as a run stores it, however its folder was named."""
-    return CaptureSource(**given(source))
+    return CaptureSource(**set_options(source))
 
 
-def given(source: CaptureSource) -> dict[str, Any]:
+def set_options(source: CaptureSource) -> dict[str, Any]:
     """Collect the options of the source that the command line sets.
 
     Args:

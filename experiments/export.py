@@ -175,7 +175,7 @@ class Export:
         return self.up or self._of_program("up") or default
 
     @property
-    def kept(self) -> str:
+    def selection(self) -> str:
         """Gaussians to write."""
         return self.keep or self._of_program("keep") or "all"
 
@@ -223,7 +223,7 @@ def main(args):
         sweep(args.place.resolve().parent)
         refuse_existing(args.place, args.overwrite)
         run = runs.saved_run(args.run, trusted=args.trust)
-        if run.model.found is not None:
+        if run.model.apply_to_capture is not None:
             # What is written is in the cameras that training found.
             run = runs.with_found_cameras(run, runs.restore(args.run, run).state)
         args.place.parent.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ def _gaussians(args: Any, run: Any) -> str:
     in_scene = instants.splats_at(run.model, state)
     rotation = None if args.axis is None else axes.rotation_to(run.capture, args.axis)
     visible = None
-    if args.kept == "seen":
+    if args.selection == "seen":
         visible = sampled.visible(_visible_statistics(run, state))
         left_out = splats.active_count(run.model.stages.rows(state.params))
         left_out -= int(visible.sum())

@@ -57,7 +57,7 @@ def main(args):
         if path.exists():
             console.say("already preprocessed; the stored result is read")
         evidence = record.cached(capture, cache, tell=_PartLog())
-        views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
+        views = view_set.in_time_order(record.downscale(capture, evidence.factor))
         numbers = summary.of(views, evidence)
         console.say("\n".join(summary.lines(numbers, evidence)))
         document = {"capture": capture.name, "found": _as_json(numbers._asdict())}

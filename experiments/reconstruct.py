@@ -292,7 +292,7 @@ def _expected_options(args):
     """Collect the options that must agree with the run that is continued."""
     options = {"preset": args.preset, "seed": args.seed}
     options = {name: value for name, value in options.items() if value is not None}
-    return {**cli.given(args.source), **options}
+    return {**cli.set_options(args.source), **options}
 
 
 if __name__ == "__main__":

@@ -199,7 +199,7 @@ def main(args):
     with cli.user_errors():
         if args.measured is not None:
             keep(args.pages[0], args.measured)
-        pages = {name: PAGES / f"{name}.md" for name in args.pages or kept()}
+        pages = {name: PAGES / f"{name}.md" for name in args.pages or stored_pages()}
         for name, path in pages.items():
             _draw(name)
             _advise(name)
@@ -257,7 +257,7 @@ def path_of(name: str) -> pathlib.Path:
     return ROOT / (STUDIES[name].measured or f"experiments/measured/{name}.json")
 
 
-def kept() -> list[str]:
+def stored_pages() -> list[str]:
     """List the pages with stored numbers.
 
     Returns:
@@ -361,8 +361,9 @@ def index() -> str:
         for name, study in STUDIES.items()
         if path_of(name).exists()
     ]
+    stored = stored_pages()
     absent = [
-        f"`{study.line}`" for name, study in STUDIES.items() if name not in kept()
+        f"`{study.line}`" for name, study in STUDIES.items() if name not in stored
     ]
     return INDEX.format(
         summaries=markdown.bullets(

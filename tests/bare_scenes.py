@@ -321,7 +321,7 @@ def splat_step(spec, metadata, shuffled_row):
         if spec.strategy is not None:
             radius_px = jnp.max(seen.extent_px, axis=1)
             stats = densification.observe(
-                aux_state.stats, grads[1], seen.seen(size), radius_px, size
+                aux_state.stats, grads[1], seen.overlaps_image(size), radius_px, size
             )
             aux_state = aux_state._replace(stats=stats)
         state = TrainState(params, moments, aux_state, state.step + 1, state.key)

@@ -19,7 +19,7 @@ import subprocess
 import tempfile
 
 from experiments import cli, records
-from experiments.mutants.faults import ROOT, drawn
+from experiments.mutants.faults import ROOT, sample_faults
 from experiments.mutants.page import page
 from experiments.mutants.witnesses import default_tests, reached_by, tried
 from nerfies_jax.runtime import console
@@ -54,7 +54,7 @@ class Mutants:
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        faults = drawn(args.count, args.seed, args.only)
+        faults = sample_faults(args.count, args.seed, args.only)
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.metrics import clock
 

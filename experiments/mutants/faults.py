@@ -38,7 +38,7 @@ class Fault(NamedTuple):
     text: str
 
 
-def drawn(count: int, seed: int, only: str = "") -> list[Fault]:
+def sample_faults(count: int, seed: int, only: str = "") -> list[Fault]:
     """Sample faults, one in each module before any module has two."""
     chance = random.Random(seed)
     by_module = []

@@ -185,7 +185,7 @@ def compile_camera_optimizer(optimizer: CameraOptimizer) -> SplatRecord:
     """
     apply_to_capture = getattr(optimizer, "apply_to_capture", None)
     return SplatRecord(
-        **_hooks(optimizer), pose=optimizer.apply, found=apply_to_capture
+        **_hooks(optimizer), pose=optimizer.apply, apply_to_capture=apply_to_capture
     )
 
 

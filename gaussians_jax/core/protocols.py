@@ -238,7 +238,7 @@ class StepInfo(NamedTuple):
       radius_px: Radius of the footprint in pixels.
       size: (width, height) of the image in pixels.
       canonical: The Gaussians in their canonical state.
-      moved: The Gaussians at the time of the frame.
+      deformed: The Gaussians at the time of the frame.
       significance: Weight of each rendered Gaussian in the statistics of its parent.
         None if Gaussians have no children.
     """
@@ -248,7 +248,7 @@ class StepInfo(NamedTuple):
     radius_px: Float[Array, " rendered"]
     size: tuple[int, int]
     canonical: Gaussians
-    moved: Gaussians
+    deformed: Gaussians
     significance: Float[Array, " rendered"] | None = None
 
 

@@ -57,7 +57,7 @@ class SplatRecord(Record):
     # training step's frames get these.
     pose: Callable[[PyTree, Camera], Camera] | None = None
     # (params, capture) -> the capture with refined cameras of all frames. Host side.
-    found: Callable[[PyTree, Any], Any] | None = None
+    apply_to_capture: Callable[[PyTree, Any], Any] | None = None
     # (`motion_fit.Paths`, key) -> `motion_fit.Guess`, from which the fit to tracks
     # starts. Host side. None: the fit starts from `init`.
     fit_to_paths: Callable[[Any, Key[Array, ""]], Any] | None = None

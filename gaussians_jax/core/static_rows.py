@@ -185,24 +185,24 @@ def deform(
     return merge(parts.static, deform_rows(parts.dynamic, time), parts.row_index)
 
 
-def merge(static: Gaussians, moved: Gaussians, table: RowIndex) -> Gaussians:
-    """Combine moved and static Gaussians.
+def merge(static: Gaussians, dynamic: Gaussians, table: RowIndex) -> Gaussians:
+    """Combine moving and static Gaussians.
 
     Args:
       static: All Gaussians at the reference time.
-      moved: The moving Gaussians.
+      dynamic: The moving Gaussians.
       table: Index of the moving Gaussians.
 
     Returns:
       All Gaussians.
     """
 
-    def leaf(static, moved):
+    def leaf(static, dynamic):
         # A gather, because XLA on CPUs executes a scatter row by row.
         moves = table.moves.reshape(-1, *[1] * (static.ndim - 1))
-        return jnp.where(moves, moved[table.place], static)
+        return jnp.where(moves, dynamic[table.place], static)
 
-    return jax.tree.map(leaf, static, moved)
+    return jax.tree.map(leaf, static, dynamic)
 
 
 _max_displacement = jax.jit(max_displacement)

@@ -75,7 +75,7 @@ def start(
     times = capture.times[evidence.row].astype(np.float32)
     unit = usable_paths.scene_unit(evidence)
     static_points = np.asarray(evidence.still.position, np.float32)
-    views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
+    views = view_set.in_time_order(record.downscale(capture, evidence.factor))
     ray = position - views.position
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     depth = Depth(ray, deviation)

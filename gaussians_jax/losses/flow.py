@@ -280,7 +280,7 @@ def camera_flow(
 def error(
     rendered: Float[Array, "height width 2"],
     object_flow: Float[Array, "height width 2"],
-    seen: Bool[Array, "height width"],
+    visible: Bool[Array, "height width"],
 ) -> Float[Array, ""]:
     """Compute the mean absolute difference of two flows.
 
@@ -290,16 +290,17 @@ def error(
     Args:
       rendered: Flow of the Gaussians in pixels.
       object_flow: Motion flow of the capture in pixels.
-      seen: Pixels to compare.
+      visible: Pixels to compare.
 
     Returns:
       The mean, zero without pixels.
     """
-    height, width = seen.shape
+    height, width = visible.shape
     side = jnp.asarray((width, height), rendered.dtype)
     # Selected first, because other pixels may have arbitrary values.
     flows = (
-        jnp.where(seen[..., None], flow, 0) / side for flow in (rendered, object_flow)
+        jnp.where(visible[..., None], flow, 0) / side
+        for flow in (rendered, object_flow)
     )
     rendered, object_flow = (jnp.clip(flow, -1, 1) for flow in flows)
-    return losses.l1(rendered, object_flow, seen)
+    return losses.l1(rendered, object_flow, visible)

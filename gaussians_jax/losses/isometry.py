@@ -93,14 +93,14 @@ class Bound:
 
 def change_of_distances(
     canonical: Float[Array, "samples points 3"],
-    moved: Float[Array, "samples points 3"],
+    deformed: Float[Array, "samples points 3"],
     weight: Float[Array, "samples neighbors"],
 ) -> Float[Array, ""]:
     """Compute the weighted mean change of distances from a point to its neighbors.
 
     Args:
       canonical: Positions of each sample (first) and of its neighbors.
-      moved: The same points at another time.
+      deformed: The same points at another time.
       weight: Weights of the neighbors, in [0, 1].
 
     Returns:
@@ -112,6 +112,6 @@ def change_of_distances(
         return jnp.sqrt(jnp.sum(difference**2, axis=-1) + FLOOR)
 
     before = jax.lax.stop_gradient(distances(canonical))
-    change = jnp.abs(distances(moved) - before)
+    change = jnp.abs(distances(deformed) - before)
     total = jnp.sum(weight)
     return jnp.sum(weight * change) / jnp.where(total > 0, total, 1)

@@ -145,14 +145,14 @@ def rendered_rows(effects: Effects, params: Params) -> Splats:
 
 
 def rendered(
-    effects: Effects, params: Params, moved: Gaussians, condition: FrameCondition
+    effects: Effects, params: Params, deformed: Gaussians, condition: FrameCondition
 ) -> tuple[Splats, Gaussians]:
     """Return the rendered Gaussians in training: canonical parameters, and deformed.
 
     Args:
       effects: Components of the scene.
       params: Trained parameters.
-      moved: Deformed Gaussians, without their children.
+      deformed: Deformed Gaussians, without their children.
       condition: Frame time, step and key.
 
     Returns:
@@ -160,10 +160,10 @@ def rendered(
     """
     derivation = _derivation(effects)
     if derivation is None:
-        return params.rows["splats"], moved
+        return params.rows["splats"], deformed
     derive_rows, derive = derivation
     derived = derive_rows(params, condition)
-    return derived[0], derive(params, derived, moved, condition)
+    return derived[0], derive(params, derived, deformed, condition)
 
 
 def significance(

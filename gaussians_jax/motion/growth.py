@@ -86,7 +86,7 @@ def no_travel(gaussians: Splats | Gaussians) -> Travel:
     return Travel(jnp.full_like(mean, most), jnp.full_like(mean, -most))
 
 
-def traveled(state: Travel, canonical: Gaussians, moved: Gaussians) -> Travel:
+def traveled(state: Travel, canonical: Gaussians, deformed: Gaussians) -> Travel:
     """Add the positions at one time to the bounding boxes.
 
     Displacements are relative to the median displacement of the active Gaussians at
@@ -97,12 +97,12 @@ def traveled(state: Travel, canonical: Gaussians, moved: Gaussians) -> Travel:
     Args:
       state: Bounding boxes.
       canonical: Gaussians in their canonical state.
-      moved: The Gaussians at the time.
+      deformed: The Gaussians at the time.
 
     Returns:
       The bounding boxes with the added positions.
     """
-    displacement = moved.mean - canonical.mean
+    displacement = deformed.mean - canonical.mean
     finite = jnp.all(jnp.isfinite(displacement), axis=1)
     # The opacity of an inactive Gaussian is exactly zero.
     common = common_motion(displacement, finite & (canonical.opacity > 0))
@@ -241,7 +241,7 @@ class MotionGuided:
 
     def update(self, state: Guided, info: StepInfo) -> Guided:
         """Return the state after one more view."""
-        travel = traveled(state.travel, info.canonical, info.moved)
+        travel = traveled(state.travel, info.canonical, info.deformed)
         return Guided(self.base.update(state.stats, info), travel)
 
     def events(self, steps: int) -> tuple[StrategyEvent, ...]:

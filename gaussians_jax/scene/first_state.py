@@ -134,7 +134,7 @@ def _from_tracks(spec, effects, capture, key):
         capture = dataclasses.replace(capture, points=tracking.still)
     hidden = None
     if spec.start.fill_hidden and initialization.point_count(capture):
-        views = view_set.in_time_order(record.looked_at(capture, tracking.factor))
+        views = view_set.in_time_order(record.downscale(capture, tracking.factor))
         hidden = hidden_points.behind(views, capture.points, tracking.moving)
     return seeds, hidden, capture
 

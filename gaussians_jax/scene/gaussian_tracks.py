@@ -60,7 +60,7 @@ def follow(
         drift = float(np.linalg.norm(offset, axis=-1).mean())
     return PointTracks(
         path=path.astype(np.float32),
-        found=np.ones(path.shape[:2], bool),
+        converged=np.ones(path.shape[:2], bool),
         drift=drift,
         strain=float("nan"),
     )

@@ -171,21 +171,21 @@ def _model(spec, metadata, effects):
         stages=stages,
         example=example,
         devices=devices,
-        found=_finder(effects),
+        apply_to_capture=_camera_refiner(effects),
         compiler_options=compiler.UNDIVIDED,
     )
 
 
-def _finder(effects):
-    """Return `Model.found` for these components."""
-    finding = [effect for effect in effects if effect.found is not None]
+def _camera_refiner(effects):
+    """Return `Model.apply_to_capture` for these components."""
+    refining = [effect for effect in effects if effect.apply_to_capture is not None]
 
     def refine(params, capture):
-        for effect in finding:
-            capture = effect.found(params.nets.get(effect.name), capture)
+        for effect in refining:
+            capture = effect.apply_to_capture(params.nets.get(effect.name), capture)
         return capture
 
-    return refine if finding else None
+    return refine if refining else None
 
 
 def _stages(spec, metadata, effects):

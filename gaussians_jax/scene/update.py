@@ -26,7 +26,7 @@ class ViewStatistics(NamedTuple):
     mean2d_grad: Float[Array, "rendered 2"]  # of the loss, per pixel
     footprints: Footprints
     canonical: Gaussians  # before the deformation
-    moved: Gaussians  # at the time of the frame
+    deformed: Gaussians  # at the time of the frame
     # Weight of each child in the statistics of its parent. None: all weights are equal.
     significance: Float[Array, " rendered"] | None = None
 
@@ -90,11 +90,11 @@ def observe(
     footprints = statistics.footprints
     info = StepInfo(
         statistics.mean2d_grad,
-        footprints.seen(size),
+        footprints.overlaps_image(size),
         jnp.max(footprints.extent_px, axis=1),
         size,
         statistics.canonical,
-        statistics.moved,
+        statistics.deformed,
         statistics.significance,
     )
     return aux_state._replace(stats=strategy.update(aux_state.stats, info))

@@ -54,7 +54,7 @@ class Footprints(NamedTuple):
         """True for Gaussians that are rendered if their box overlaps the image."""
         return self.extent_px[:, 0] > 0
 
-    def seen(self, size: tuple[int, int]) -> Bool[Array, " gaussians"]:
+    def overlaps_image(self, size: tuple[int, int]) -> Bool[Array, " gaussians"]:
         """Select visible Gaussians whose box overlaps an image.
 
         Args:

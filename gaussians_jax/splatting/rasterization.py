@@ -459,7 +459,7 @@ def _radii(footprints, size):
     reach = jnp.ceil(jnp.minimum(footprints.extent_px, MAX_RADIUS_PX))
     # Visibility by the box of whole pixels, as in gsplat.
     whole = lax.stop_gradient(footprints)._replace(extent_px=reach)
-    return jnp.where(whole.seen(size)[:, None], reach, 0).astype(jnp.int32)
+    return jnp.where(whole.overlaps_image(size)[:, None], reach, 0).astype(jnp.int32)
 
 
 def _conics(whitening):

@@ -143,25 +143,25 @@ def shrink(flow: FrameFlow, factor: int) -> FrameFlow:
 
 
 def shrink_one(
-    shift: np.ndarray, seen: np.ndarray, factor: int
+    shift: np.ndarray, valid: np.ndarray, factor: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Downscale the flow of one frame by an integer factor.
 
     Args:
       shift: Flow in pixels, [height, width, 2].
-      seen: True where the flow is valid, [height, width].
+      valid: True where the flow is valid, [height, width].
       factor: Integer factor.
 
     Returns:
       The mean of each block in pixels of the smaller image, and True where the whole
       block is valid.
     """
-    rows, columns = seen.shape[0] // factor, seen.shape[1] // factor
+    rows, columns = valid.shape[0] // factor, valid.shape[1] // factor
     cropped = np.s_[: rows * factor, : columns * factor]
     blocks = (rows, factor, columns, factor)
     mean = shift[cropped].reshape(*blocks, 2).mean((1, 3), dtype=np.float64)
-    valid = np.all(seen[cropped].reshape(blocks), axis=(1, 3))
-    return (mean / factor).astype(np.float32), valid
+    whole = np.all(valid[cropped].reshape(blocks), axis=(1, 3))
+    return (mean / factor).astype(np.float32), whole
 
 
 def training_flow(capture) -> FrameFlow | None:

@@ -1,12 +1,12 @@
 """Frames of a capture, the renderer, and metrics of rendered images."""
 
 from nerfies_jax.evaluation.frames import (
-    as_found,
     frames_of,
     path_views,
     resized,
     spread,
     view_of,
+    with_refined_cameras,
 )
 from nerfies_jax.evaluation.renderer import Renderer, to_uint8
 from nerfies_jax.evaluation.scores import (
@@ -22,7 +22,6 @@ __all__ = [
     "Halves",
     "Renderer",
     "Scored",
-    "as_found",
     "frames_of",
     "known_mean",
     "path_views",
@@ -33,4 +32,5 @@ __all__ = [
     "spread",
     "to_uint8",
     "view_of",
+    "with_refined_cameras",
 ]

@@ -61,7 +61,7 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
     return in_default_precision(frames)
 
 
-def as_found(model: Model, state: TrainState, capture: Capture) -> Capture:
+def with_refined_cameras(model: Model, state: TrainState, capture: Capture) -> Capture:
     """Replace the cameras of a capture by the refined cameras of a model.
 
     Args:
@@ -72,9 +72,9 @@ def as_found(model: Model, state: TrainState, capture: Capture) -> Capture:
     Returns:
       The capture, unchanged if the model does not refine cameras.
     """
-    if model.found is None:
+    if model.apply_to_capture is None:
         return capture
-    return model.found(state.params, capture)
+    return model.apply_to_capture(state.params, capture)
 
 
 def view_of(capture: Capture, row: int | np.integer) -> View:

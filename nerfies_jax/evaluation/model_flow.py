@@ -28,7 +28,7 @@ class Moved(NamedTuple):
     """Positions of points at another time, in NumPy."""
 
     points: np.ndarray  # [points, 3] scene units, the original ones if not found
-    found: np.ndarray  # [points] bool, False if the inverse warp did not converge
+    converged: np.ndarray  # [points] bool, False if the inverse warp did not converge
 
 
 # (state, points [points, 3] in scene units, their view, target view) -> new positions
@@ -63,7 +63,7 @@ def _pixel_flow(
     points = surface(here.camera, pixels, np.where(valid, depth, 1))
     end = move(state, points, here, there)
     target, in_front = _project(there.camera, in_default_precision(end.points))
-    valid = valid & end.found & np.asarray(in_front)
+    valid = valid & end.converged & np.asarray(in_front)
     return np.where(valid[:, None], np.asarray(target) - pixels, np.nan)
 
 
@@ -111,7 +111,7 @@ def image_distance(
     points = surface(here.camera, _pixels(rendering), np.where(valid, depth, 1))
     end = move(state, points, here, there)
     distance = np.linalg.norm(end.points - points, axis=1)
-    distance = np.where(valid & end.found, distance, np.nan)
+    distance = np.where(valid & end.converged, distance, np.nan)
     return distance.reshape(rendering.alpha.shape)
 
 

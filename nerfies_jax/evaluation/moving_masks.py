@@ -44,7 +44,7 @@ def with_masks(capture: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
             f"Dynamic regions are not evaluated separately, because the capture has no "
             f"masks and tracking failed: {unusable}."
         )
-    views = view_set.in_time_order(record.looked_at(video, evidence.factor))
+    views = view_set.in_time_order(record.downscale(video, evidence.factor))
     finding = motion.motion(views, evidence)
     if finding.wanted is False:
         return capture, (

@@ -25,7 +25,7 @@ class GroundTruth(NamedTuple):
     rows: np.ndarray  # held-out frames to render
     track_rows: np.ndarray  # training frames, by time, at which tracks are known
     path: np.ndarray  # [tracks, times, 3] positions in scene units
-    seen: np.ndarray  # [tracks, times] True if visible to the training camera
+    visible: np.ndarray  # [tracks, times] True if visible to the training camera
     # Index into `track_rows` from which points are tracked, the middle one. It is not
     # the first, because the template of D-NeRF is the scene at time 0, where its warp
     # is discontinuous.
@@ -41,7 +41,7 @@ class PointTracks(NamedTuple):
     """Points moved by a learned deformation."""
 
     path: np.ndarray  # [tracks, times, 3] scene units, the start if not found
-    found: np.ndarray  # [tracks, times] bool
+    converged: np.ndarray  # [tracks, times] bool
     # Mean distance, in scene units, of static points from their mean over time. Points
     # are mapped to the template, whose own position is arbitrary. Gaussians have no
     # template, so the distance is that of the points themselves.
@@ -93,7 +93,7 @@ def ground_truth(
         rows=evaluation.spread(capture.heldout, frames),
         track_rows=track_rows,
         path=path[points],
-        seen=truth.track_seen[points][:, track_rows],
+        visible=truth.track_seen[points][:, track_rows],
         start=start,
     )
 
@@ -112,7 +112,7 @@ def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, 
     if followed is None or not len(known.path):
         return dict.fromkeys(names, float("nan"))
     errors = _endpoints(followed.path, known)
-    lost = 1 - followed.found[_scored_mask(known)].mean()
+    lost = 1 - followed.converged[_scored_mask(known)].mean()
     values = (errors.endpoint, errors.correct, lost, followed.drift, followed.strain)
     return {name: float(value) for name, value in zip(names, values, strict=True)}
 
@@ -134,7 +134,7 @@ def static_error(known: GroundTruth) -> float:
 
 def _scored_mask(truth):
     """Return a mask of the visible points, except at the start."""
-    scored = truth.seen.copy()
+    scored = truth.visible.copy()
     scored[:, truth.start] = False
     return scored
 

@@ -87,7 +87,7 @@ def follow(
         in_front = depth <= surface_depth[line, column] * (1 + DEPTH_TOLERANCE)
         solid = rendering.alpha[line, column] > MIN_ALPHA
         positions.append(end.points)
-        visible.append(end.found & inside & solid & in_front)
+        visible.append(end.converged & inside & solid & in_front)
         projected.append(pixel)
     return SurfaceTracks(
         positions=np.stack(positions, axis=1).astype(np.float32),

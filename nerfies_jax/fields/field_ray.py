@@ -130,7 +130,7 @@ def fine_distances(
     spec: RadianceScene,
     metadata: SceneMetadata,
     coarse: Float[Array, " coarse"],
-    drawn: Float[Array, " fine"],
+    new: Float[Array, " fine"],
 ) -> Float[Array, " samples"]:
     """Combine the distances of the fine level.
 
@@ -142,13 +142,13 @@ def fine_distances(
       spec: The scene.
       metadata: Scene metadata.
       coarse: Sorted distances of the coarse level, [coarse].
-      drawn: Sorted new distances, [fine].
+      new: Sorted new distances, [fine].
 
     Returns:
       Sorted distances, [samples].
     """
     if spec.sampling.union:
-        return sampling.union(coarse, drawn)
+        return sampling.union(coarse, new)
     if metadata.background is None:
-        return jnp.concatenate([drawn, coarse[-1:]])
-    return drawn
+        return jnp.concatenate([new, coarse[-1:]])
+    return new

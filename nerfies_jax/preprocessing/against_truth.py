@@ -72,7 +72,7 @@ def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
     Returns:
       The errors.
     """
-    small = record.looked_at(capture, evidence.factor)
+    small = record.downscale(capture, evidence.factor)
     assert small.moving is not None
     true = small.moving[evidence.row]
     either = (evidence.moving | true).sum()

@@ -94,7 +94,7 @@ def common_drift(gain: np.ndarray) -> tuple[float, float]:
             products[first, second] = np.nanmean(product)
     variance = np.nanmedian(products)
     others = [np.delete(np.arange(count), index) for index in range(count)]
-    without = [np.nanmedian(products[np.ix_(kept, kept)]) for kept in others]
+    without = [np.nanmedian(products[np.ix_(rows, rows)]) for rows in others]
     error = np.sqrt((count - 1) * np.var(without))
     drift = np.sqrt(max(variance, 0))
     sign = -1 if drift > DRIFT_STOPS else 1

@@ -110,7 +110,7 @@ class _Read(NamedTuple):
     """Data of an inspection."""
 
     capture: Capture
-    looked: Capture  # at the size of preprocessing
+    small: Capture  # at the size of preprocessing
     views: Views
     evidence: Evidence
     points: np.ndarray  # of the capture, [points, 3]
@@ -122,13 +122,13 @@ def _read(capture, folder):
         evidence = record.gather(capture)
     else:
         evidence = record.cached(capture, folder)
-    looked = record.looked_at(capture, evidence.factor)
-    points = view_set.own_points(looked)
+    small = record.downscale(capture, evidence.factor)
+    points = view_set.own_points(small)
     static = points
     if not len(points) and not evidence.unusable:
         static = view_set.some(evidence.still.position)
-    views = view_set.in_time_order(looked)
-    return _Read(capture, looked, views, evidence, points, static)
+    views = view_set.in_time_order(small)
+    return _Read(capture, small, views, evidence, points, static)
 
 
 EFFECTS: Mapping[str, Callable[[_Read], Finding]] = MappingProxyType(
@@ -136,12 +136,12 @@ EFFECTS: Mapping[str, Callable[[_Read], Finding]] = MappingProxyType(
         MOTION: lambda x: motion.motion(x.views, x.evidence),
         LIGHT: lambda x: exposure.exposure(x.views, x.static),
         TRANSIENT: lambda x: transient.transient(x.views, x.evidence),
-        START: lambda x: scene_points.start(x.looked, x.views, x.evidence, x.points),
+        START: lambda x: scene_points.start(x.small, x.views, x.evidence, x.points),
         BACKGROUND: lambda x: scene_points.background(x.views, x.evidence, x.points),
-        DEPTH: lambda x: stored.depth(x.looked, x.views, x.evidence),
-        MASKS: lambda x: stored.masks(x.looked, x.evidence),
+        DEPTH: lambda x: stored.depth(x.small, x.views, x.evidence),
+        MASKS: lambda x: stored.masks(x.small, x.evidence),
         LENS: lambda x: stored.lens(x.capture),
-        TEXTURE: lambda x: texture.texture(x.looked, x.views, x.evidence.factor),
+        TEXTURE: lambda x: texture.texture(x.small, x.views, x.evidence.factor),
     }
 )
 

@@ -191,23 +191,23 @@ def _block_matches(views, pair, source, target):
 def _feature_matches(views, pair, source, target):
     times = pair.images[0].shape[1] // views.size[0]
     sift = cv2.SIFT_create(contrastThreshold=FEATURE_CONTRAST)
-    found = [sift.detectAndCompute(pair.images[at], None) for at in (source, target)]
+    features = [sift.detectAndCompute(pair.images[at], None) for at in (source, target)]
     place = [
         (np.array([point.pt for point in points], float).reshape(-1, 2) + 0.5) / times
-        for points, _ in found
+        for points, _ in features
     ]
     none = np.zeros((0, 2))
     if min(map(len, place)) < 2:
         return none, none
-    near = cv2.BFMatcher().knnMatch(found[0][1], found[1][1], k=2)
-    kept = [
+    near = cv2.BFMatcher().knnMatch(features[0][1], features[1][1], k=2)
+    matches = [
         (best.queryIdx, best.trainIdx)
         for best, second in near
         if best.distance < FEATURE_RATIO * second.distance
     ]
-    if not kept:
+    if not matches:
         return none, none
-    first, second = np.array(kept).T
+    first, second = np.array(matches).T
     one, other = place[0][first], place[1][second]
     region = pair.lost[source]
     is_lost = region[pixel_of(one, region.shape)]

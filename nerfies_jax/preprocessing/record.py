@@ -96,7 +96,7 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     watch.begin("flow")
     capture = pinholes.as_pinholes(capture)
     factor, given = _factor(capture), capture.given or Given(capture.size)
-    capture = looked_at(capture, factor)
+    capture = downscale(capture, factor)
     views = view_set.in_time_order(capture)
     images = dense_flow.leveled(views)
     flow = taken.flow(given, views)
@@ -138,9 +138,9 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     still = np.flatnonzero(score < paths.AT_REST)
     static = tracks.take(still), rest.take(still)
     depths = path_depths.known(capture, given, views, static, use_depths)
-    moved = tracks.take(which)
+    moving_tracks = tracks.take(which)
     moved_paths = path_depths.fitted(
-        capture, views, moved, static, depths, watch, least.known
+        capture, views, moving_tracks, static, depths, watch, least.known
     )
     watch.begin("still")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
@@ -251,7 +251,7 @@ def _depth_note(evidence: Evidence) -> str:
     )
 
 
-def looked_at(capture: Capture, factor: int) -> Capture:
+def downscale(capture: Capture, factor: int) -> Capture:
     """Return the undistorted, reduced capture that preprocessing results refer to.
 
     Args:

@@ -60,7 +60,7 @@ def _moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> fl
     width, height = views.size
     size = height // down, width // across
     held = shown = 0
-    for index in _looked_from(views):
+    for index in _sampled_frames(views):
         moving = evidence.moving[index]
         if moving.mean() < LEAST_MOVING:
             continue
@@ -78,7 +78,7 @@ def _moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> fl
     return held / shown if shown else np.nan
 
 
-def _looked_from(views):
+def _sampled_frames(views):
     last = len(views.row) - 1
     frames = np.linspace(0, last, min(CENTERS, last + 1)).round().astype(int)
     return np.unique(frames).tolist()
@@ -136,13 +136,13 @@ def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
     if not len(points):
         measurement = "the capture has no points"
         return Finding(BACKGROUND, measurement, threshold, False, CERTAIN)
-    seen, agree = np.zeros(len(points)), np.zeros(len(points))
+    checks, agree = np.zeros(len(points)), np.zeros(len(points))
     if not evidence.unusable:
-        for frame in _looked_from(views):
+        for frame in _sampled_frames(views):
             which, stays = _stays(views, evidence, frame, points)
-            seen[which] += 1
+            checks[which] += 1
             agree[which] += stays
-    count = int((seen > 0).sum())
+    count = int((checks > 0).sum())
     if count < MIN_POINTS:
         return cannot_tell(
             BACKGROUND,
@@ -150,12 +150,12 @@ def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
             threshold,
         )
     # A point is static if most frames agree, because single frames may err at edges.
-    share = float((agree[seen > 0] > 0.5 * seen[seen > 0]).mean())
+    share = float((agree[checks > 0] > 0.5 * checks[checks > 0]).mean())
     # Judged by the moving share, whose values 1 % and 2 % differ by a factor of two.
-    moved, confidence = judge(
+    moves, confidence = judge(
         1 - share, 1 - STILL_SHARE, np.sqrt(share * (1 - share) / count)
     )
-    wanted = None if moved is None else not moved
+    wanted = None if moves is None else not moves
     measurement = f"{share:.1%} of {count} points agree with the tracks"
     numbers = {"still_share": share}
     return Finding(BACKGROUND, measurement, threshold, wanted, confidence, numbers)

@@ -59,9 +59,9 @@ def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
         if not len(tracks.seen):
             continue
         rest = rest_points.fit(near, tracks)
-        kept = _placed(near, tracks, rest)
-        places.append(rest.position[kept])
-        pixel = starts[enough][kept, 1:].astype(int)
+        valid = _placed(near, tracks, rest)
+        places.append(rest.position[valid])
+        pixel = starts[enough][valid, 1:].astype(int)
         colors.append(views.image[center][pixel[:, 1], pixel[:, 0]])
     if not places:
         return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))

@@ -101,8 +101,8 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
     if share in (0.0, 1.0):
         return Finding(MASKS, measurement, threshold, False, CERTAIN, numbers)
     tracks = evidence.tracks.take((evidence.score > MOVES) & (not evidence.unusable))
-    seen, frames = int(tracks.seen.sum()), int(tracks.seen.any(0).sum())
-    if seen < MIN_MOVING:
+    count, frames = int(tracks.seen.sum()), int(tracks.seen.any(0).sum())
+    if count < MIN_MOVING:
         return cannot_tell(
             MASKS,
             f"{measurement}, but too few moving tracks to check them",
@@ -110,7 +110,7 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
         )
     row, column = pixel_of(tracks.pixel, moving.shape[1:])
     inside = moving[np.arange(len(moving)), row, column] & tracks.seen
-    part = 1 - float(inside.sum() / seen)
+    part = 1 - float(inside.sum() / count)
     # Whole regions are in or out: one region a frame.
     error = np.sqrt(part * (1 - part) / frames)
     wrong, confidence = judge(part, MISSED_SHARE, float(error))

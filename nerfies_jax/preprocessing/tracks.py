@@ -146,8 +146,8 @@ def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
                 continue
             # Only tracks that began earlier in this direction.
             goes = np.flatnonzero(seen[:, here] & (sign * (here - start) >= 0))
-            moved, kept = _step(pixel[goes, here], shift[here], usable[here])
-            pixel[goes[kept], there], seen[goes[kept], there] = moved[kept], True
+            target, valid = _step(pixel[goes, here], shift[here], usable[here])
+            pixel[goes[valid], there], seen[goes[valid], there] = target[valid], True
     return Tracks(start, pixel, seen)
 
 
@@ -155,7 +155,7 @@ def _step(pixel, shift, usable):
     """Move pixels by bilinearly interpolated flow, and return their validity."""
     height, width = usable.shape
     bound = np.array([width, height])
-    kept = usable[pixel_of(pixel, usable.shape)]
+    valid = usable[pixel_of(pixel, usable.shape)]
     corner = np.clip(np.floor(pixel - 0.5).astype(int), 0, bound - 2)
     part = np.clip(pixel - 0.5 - corner, 0, 1)
     total, sum_of_weights = 0.0, 0.0
@@ -168,9 +168,9 @@ def _step(pixel, shift, usable):
                 total + weight * shift[y, x],
                 sum_of_weights + weight,
             )
-    moved = pixel + total / np.maximum(sum_of_weights, 1e-6)
-    kept &= ((moved > 0.5) & (moved < bound - 0.5)).all(-1)
-    return moved, kept
+    target = pixel + total / np.maximum(sum_of_weights, 1e-6)
+    valid &= ((target > 0.5) & (target < bound - 0.5)).all(-1)
+    return target, valid
 
 
 def long_enough(tracks: Tracks, frames: int = SHORTEST) -> Tracks:

@@ -135,11 +135,11 @@ class _Way(NamedTuple):
     reach: int  # px around it
 
 
-def _way(flow, seen, part):
+def _way(flow, valid, part):
     """Return the flow and search range in pixels of reduced images."""
     flow = dense_flow.reduced(flow, part)
-    seen = cv2.resize(np.uint8(seen), flow.shape[1::-1]) > 0
-    usual = flow[seen] if seen.any() else flow.reshape(-1, 2)
+    valid = cv2.resize(np.uint8(valid), flow.shape[1::-1]) > 0
+    usual = flow[valid] if valid.any() else flow.reshape(-1, 2)
     shift = np.median(usual, axis=0)
     off = np.linalg.norm(usual - shift, axis=-1)
     low, high = (share * flow.shape[1] for share in REACH_SHARES)

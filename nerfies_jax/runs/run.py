@@ -14,7 +14,7 @@ from nerfies_jax.capture import frame_memory, pinholes
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.errors import FileError
 from nerfies_jax.capture.json_files import read_json, write_json
-from nerfies_jax.evaluation import as_found
+from nerfies_jax.evaluation import with_refined_cameras
 from nerfies_jax.evaluation.representation import Representation
 from nerfies_jax.preprocessing import frame_flow, frame_masks
 from nerfies_jax.runs import representations, same_capture, trust
@@ -168,10 +168,10 @@ def with_found_cameras(run: Run, state: TrainState) -> Run:
     Returns:
       The run, unchanged if its cameras are not trained.
     """
-    capture = as_found(run.model, state, run.capture)
+    capture = with_refined_cameras(run.model, state, run.capture)
     if run.observed is run.capture:
         return run._replace(capture=capture, observed=capture)
-    observed = as_found(run.model, state, run.observed)
+    observed = with_refined_cameras(run.model, state, run.observed)
     return run._replace(capture=capture, observed=observed)
 
 
@@ -217,7 +217,7 @@ def save_config(folder: pathlib.Path, run: Run, notes: Sequence[str] = ()) -> No
 def saved_run(
     folder: pathlib.Path,
     overrides: tuple[str, ...] = (),
-    moved: Mapping[str, Any] = {},
+    new_source: Mapping[str, Any] = {},
     trusted: Collection[str] = (),
 ) -> Run:
     """Open the run in a folder with the settings and the capture it was started with.
@@ -229,8 +229,8 @@ def saved_run(
       folder: The run folder. Settings come from its `config.json`, not from the preset,
         which may have changed since.
       overrides: Settings that the run must have, as PATH=VALUE.
-      moved: New values of fields of its source whose files have been moved. They are
-        stored in the run.
+      new_source: New values of fields of its source whose files have been moved. They
+        are stored in the run.
       trusted: Names MODULE:NAME of code from other packages that the caller trusts. It
         is loaded if the run needs it.
 
@@ -254,12 +254,12 @@ def saved_run(
             "leave them out to continue it, or start a new run in another folder, "
             "out=..."
         )
-    source = dataclasses.replace(config.source, **moved)
+    source = dataclasses.replace(config.source, **new_source)
     if source.capture is not None and not pathlib.Path(source.capture).exists():
         raise CaptureNotFound(folder, source.capture)
     run = open_run(dataclasses.replace(config, source=source), kind, spec)
     same_capture.check(folder, run.capture)
-    if moved:
+    if new_source:
         content = json.loads((folder / CONFIG).read_text())
         write_json(folder / CONFIG, content | {"config": specs.as_json(run.config)})
     return run

@@ -118,7 +118,7 @@ def train(
 
     def held_out(state, step, metrics):
         del step, metrics
-        capture = evaluation.as_found(run.model, state, run.observed)
+        capture = evaluation.with_refined_cameras(run.model, state, run.observed)
         scored = evaluation.score(renderer, state, capture, rows)
         numbers = {
             "psnr": evaluation.known_mean(scored.psnr),
@@ -126,7 +126,7 @@ def train(
         }
         if scorer is None:
             return numbers
-        observed = evaluation.as_found(run.model, state, run.capture)
+        observed = evaluation.with_refined_cameras(run.model, state, run.capture)
         halves = scorer(state, observed, rows)
         return {
             "psnr": evaluation.known_mean(halves.psnr),

@@ -158,24 +158,26 @@ def _check_guides(spec, effects):
                 )
 
 
-def drawing(radiance: Field, seen: Callable[..., tuple[View, Codes]]) -> dict[str, Any]:
+def drawing(
+    radiance: Field, observe: Callable[..., tuple[View, Codes]]
+) -> dict[str, Any]:
     """Return the `render` and `surveyed` functions of a field's model.
 
     Args:
       radiance: The field.
-      seen: Function `seen(params, given)` that returns a view and the codes of its
-        frame, given the input of `render`.
+      observe: Function `observe(params, inputs)` that returns a view and the codes of
+        its frame, given the input of `render`.
 
     Returns:
       The fields of `Model` by name.
     """
 
     def render(params, inputs, size, step):
-        view, frame_codes = seen(params, inputs)
+        view, frame_codes = observe(params, inputs)
         return radiance.render(params, view.camera, view.time, frame_codes, size, step)
 
     def draw(params, occupied, inputs, size, step):
-        view, frame_codes = seen(params, inputs)
+        view, frame_codes = observe(params, inputs)
         return radiance.render_occupied(
             params, occupied, view.camera, view.time, frame_codes, size, step
         )

@@ -87,7 +87,7 @@ def follow(
     strain = np.log(np.maximum(stretch, LEAST_STRETCH))
     return PointTracks(
         path=path.astype(np.float32),
-        found=result.converged,
+        converged=result.converged,
         drift=float(apart.mean() / metadata.scale) if apart.size else float("nan"),
         strain=float(np.sqrt(np.mean(np.sum(strain**2, axis=-1)))),
     )
@@ -114,7 +114,7 @@ def _follow_flow(field, state, capture, truth):
             before, following = places[frame], frame + step
             step_result = move(state, before.points, views[frame], views[following])
             places[following] = Moved(
-                step_result.points, before.found & step_result.found
+                step_result.points, before.converged & step_result.converged
             )
     count = len(truth.path)
     path, valid = (
@@ -128,7 +128,7 @@ def _follow_flow(field, state, capture, truth):
     lost = ~valid[:count, :, None]
     return PointTracks(
         path=np.where(lost, truth.start_points[:, None], path[:count]).astype("f4"),
-        found=valid[:count],
+        converged=valid[:count],
         drift=float(apart.mean()) if apart.size else float("nan"),
         strain=float("nan"),
     )

@@ -156,7 +156,7 @@ class Model(NamedTuple):
     devices: int = 1  # that `step` uses (`data_parallel`)
     # (params, capture) -> the capture with refined cameras. None if cameras are not
     # trained.
-    found: Callable[[PyTree, Any], Any] | None = None
+    apply_to_capture: Callable[[PyTree, Any], Any] | None = None
     # Compiler options of steps and renders (`nerfies_jax.runtime.compiler`).
     compiler_options: Mapping[str, str] | None = None
     # Numbers of the capture that the functions above read, a pytree of floats and

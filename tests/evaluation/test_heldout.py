@@ -294,7 +294,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, scene_folder, rng):
         run.spec, run.metadata, state, capture, known
     )
     assert np.abs(followed.path - known.start_points[:, None]).max() > 1e-3
-    seen = known.seen.copy()
+    seen = known.visible.copy()
     seen[:, known.start] = False
     for key, path in (
         ("tracks.epe", followed.path),
@@ -309,7 +309,7 @@ def test_a_run_is_held_against_the_truth_of_its_scene(kind, scene_folder, rng):
         for place in (known.start, -1)
     )
     moved = move(state, known.start_points, here, there)
-    both = moved.found & followed.found[:, -1]
+    both = moved.converged & followed.converged[:, -1]
     assert both.any()
     np.testing.assert_allclose(moved.points[both], followed.path[both, -1], atol=1e-5)
     flow = model_flow.heldout_flow(move, state, capture, scored)

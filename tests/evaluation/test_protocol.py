@@ -19,8 +19,8 @@ def test_the_known_paths_are_those_of_points_seen_at_the_start():
     assert set(known.rows) <= set(capture.heldout)
     assert np.all(np.diff(capture.times[known.track_rows]) > 0)
     assert known.start == len(known.track_rows) // 2
-    assert known.seen[:, known.start].all()
-    for point, seen in zip(known.path, known.seen, strict=True):
+    assert known.visible[:, known.start].all()
+    for point, seen in zip(known.path, known.visible, strict=True):
         (track,) = np.flatnonzero((truth.track_canonical == point[0]).all(axis=1))
         np.testing.assert_array_equal(point, truth.track_world[track])
         np.testing.assert_array_equal(seen, truth.track_seen[track][known.track_rows])
@@ -42,8 +42,8 @@ def test_the_truth_of_another_capture_is_refused():
 
 def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start():
     known = scenes.tiny_tracks()[2]
-    known = known._replace(seen=np.ones_like(known.seen))
-    answered = np.ones(known.seen.shape, bool)
+    known = known._replace(visible=np.ones_like(known.visible))
+    answered = np.ones(known.visible.shape, bool)
     answered[0, 4:6] = False
     right = PointTracks(known.path, answered, 0.1, 0.2)
     later = answered[:, 1:].size  # all but one column
@@ -57,10 +57,10 @@ def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start():
     assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
     assert numbers["track_correct"] == 0
     # What cannot be seen is not scored.
-    half = known.seen.copy()
+    half = known.visible.copy()
     half[:, ::2] = False
     wrong.path[:, ::2] = 9.0
-    numbers = protocol.score_tracks(known._replace(seen=half), wrong)
+    numbers = protocol.score_tracks(known._replace(visible=half), wrong)
     assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
     away = np.linalg.norm(known.path - known.path[:, 3:4], axis=-1)
     away = np.delete(away, 3, axis=1)

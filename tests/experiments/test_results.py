@@ -12,7 +12,7 @@ from experiments.results import PAGES, REVISIONS, ROOT, STUDIES, SUMMARIES
 from nerfies_jax.visualization import figures
 
 
-@pytest.mark.parametrize("name", results.kept())
+@pytest.mark.parametrize("name", results.stored_pages())
 def test_a_page_is_what_its_kept_numbers_make(name):
     assert (PAGES / f"{name}.md").read_text() == results.page(name)
 
@@ -38,7 +38,7 @@ def test_presets_are_ranked_by_the_kept_curves():
     assert set(advice) == {"static", "default", "fast"}
 
 
-@pytest.mark.skipif("growth" not in results.kept(), reason="no stored numbers")
+@pytest.mark.skipif("growth" not in results.stored_pages(), reason="no stored numbers")
 def test_the_figure_of_growth_shows_the_kept_numbers():
     stored = json.loads(results.path_of("growth").read_text())
     with PIL.Image.open(PAGES / "growth.png") as image:
@@ -48,7 +48,7 @@ def test_the_figure_of_growth_shows_the_kept_numbers():
 def test_the_index_lists_every_page_there_is():
     assert (PAGES / "README.md").read_text() == results.index()
     there = {path.stem for path in PAGES.glob("*.md")} - {"README"}
-    assert there == {*results.kept(), *REVISIONS, *SUMMARIES}
+    assert there == {*results.stored_pages(), *REVISIONS, *SUMMARIES}
     measured = {path.name for path in (ROOT / "experiments/measured").iterdir()}
     known = {results.path_of(name).name for name in STUDIES}
     assert measured <= known

@@ -60,7 +60,7 @@ def test_points_are_followed_through_a_warp_in_closed_form(
         if column == lost_at:
             place = known.path[:, 3]
         np.testing.assert_allclose(followed.path[:, column], place, atol=3e-6)
-        assert followed.found[:, column].all() == (column != lost_at)
+        assert followed.converged[:, column].all() == (column != lost_at)
     if lost_at is None:
         stretch = np.sqrt(np.mean(3 * np.log(1 / (1 + times)) ** 2))
         assert followed.strain == pytest.approx(stretch, rel=1e-4)
@@ -84,7 +84,7 @@ def test_points_are_followed_along_a_flow_in_closed_form(
     known = known._replace(
         track_rows=known.track_rows[chosen],
         path=known.path[:, chosen],
-        seen=known.seen[:, chosen],
+        visible=known.visible[:, chosen],
         start=known.start // every,
     )
     spec = dataclasses.replace(presets.PRESETS["nsff-small"], scene_flow=None)
@@ -118,7 +118,7 @@ def test_points_are_followed_along_a_flow_in_closed_form(
         step = np.linalg.matrix_power(each, abs(hops))
         expected = (known.start_points - center) @ step.T + center
         np.testing.assert_allclose(followed.path[:, column], expected, atol=2e-6)
-    assert followed.found.all()
+    assert followed.converged.all()
     assert followed.drift > 0.01
     errors = protocol.score_tracks(known, followed)
     assert 0 < errors["track_error"] != protocol.static_error(known)

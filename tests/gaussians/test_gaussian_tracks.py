@@ -73,8 +73,8 @@ def test_points_are_carried_by_gaussians_that_all_move_alike(
     )
     expected = known.start_points[:, None] + since[:, None] * velocity
     np.testing.assert_allclose(followed.path, expected, atol=1e-6)
-    assert followed.found.all()
-    assert followed.found.shape == followed.path.shape[:2]
+    assert followed.converged.all()
+    assert followed.converged.shape == followed.path.shape[:2]
     assert np.isnan(followed.strain)
     away = since - since.mean()  # how far a static point is from its mean
     drift = np.abs(away).mean() * np.linalg.norm(velocity)

@@ -181,9 +181,9 @@ def test_frames_between_lie_between_and_other_cameras_stay():
 
 def test_without_refinement_a_capture_is_as_it_was():
     model = scene.build(scenes.TINY_SPLATS, scene.metadata_of(EVEN))
-    assert model.found is None
+    assert model.apply_to_capture is None
     state = model.init(EVEN, jax.random.key(0))
-    assert evaluation.as_found(model, state, EVEN) is EVEN
+    assert evaluation.with_refined_cameras(model, state, EVEN) is EVEN
 
 
 def test_rates_that_rise_are_refused():

@@ -204,7 +204,7 @@ def test_what_lies_beside_the_image_is_visible_and_not_seen(rng):
 @jitted
 def footprints_seen(gaussians, camera):
     drawn = projection.project(gaussians, camera, SIZE, GSPLAT)
-    return drawn, drawn.visible, drawn.seen(SIZE)
+    return drawn, drawn.visible, drawn.overlaps_image(SIZE)
 
 
 @pytest.mark.hard_cases

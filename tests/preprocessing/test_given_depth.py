@@ -67,7 +67,7 @@ def test_depth_that_tilts_over_the_image_is_straightened():
 def card_and_wall():
     """Tracks of a card and of a wall, from truth, with the exact paths of the card."""
     capture, evidence = gathered()
-    views = view_set.in_time_order(record.looked_at(capture, evidence.factor))
+    views = view_set.in_time_order(record.downscale(capture, evidence.factor))
     points = card_points(capture, evidence.row)
     start = points.seen.argmax(1)
     card = Tracks(start, np.float32(points.pixel), points.seen)

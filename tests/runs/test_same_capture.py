@@ -120,7 +120,7 @@ def test_a_capture_may_be_moved(begun):
     there = source.rename(source.with_name("elsewhere"))
     with pytest.raises(ValueError, match="was moved, pass its new path"):
         runs.saved_run(folder)
-    runs.saved_run(folder, moved={"capture": there})
+    runs.saved_run(folder, new_source={"capture": there})
     assert runs.saved_run(folder).capture.path == there
     before["config"]["source"]["capture"] = str(there)
     assert json.loads(path.read_text()) == before
