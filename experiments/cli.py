@@ -22,8 +22,8 @@ import tyro
 from tyro.conf import Positional
 
 from experiments import names, options
+from nerfies_jax.capture.external import ExternalFiles
 from nerfies_jax.capture.extras import MissingExtra
-from nerfies_jax.capture.given import GivenFiles
 from nerfies_jax.capture.nearest import known_names
 from nerfies_jax.runs import platform, representations, trust
 from nerfies_jax.runs.config import (
@@ -96,7 +96,7 @@ class NamedSource(CaptureSource):
     """Built-in scene to use if no capture is given (default: default)."""
     missing: Literal["refuse", "skip"] | None = None  # type: ignore[assignment]
     """Handling of frames whose image is missing (default: refuse)."""
-    files: Annotated[GivenFiles, tyro.conf.arg(name="")] = GivenFiles()
+    files: Annotated[ExternalFiles, tyro.conf.arg(name="")] = ExternalFiles()
 
     def __post_init__(self):
         if None not in (self.capture, self.scene):
@@ -130,7 +130,7 @@ def set_options(source: CaptureSource) -> dict[str, Any]:
     Returns:
       Values by field.
     """
-    unsaid = (None, GivenFiles())
+    unsaid = (None, ExternalFiles())
     return {name: value for name, value in vars(source).items() if value not in unsaid}
 
 

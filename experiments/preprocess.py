@@ -81,7 +81,7 @@ def _errors(capture, evidence):
     truth = protocol.stored_truth(capture)
     # With a lens, the tracks are of undistorted pixels and the truth is not.
     lens = pinholes.has_lens(capture.cameras)
-    if truth is None or capture.given is not None or lens:
+    if truth is None or capture.external is not None or lens:
         return None
     points = against_truth.true_points(capture, truth, evidence)
     return against_truth.errors(capture, evidence, points)

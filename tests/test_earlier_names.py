@@ -9,7 +9,7 @@ from nerfies_jax.runtime import earlier_names
 
 
 @pytest.mark.parametrize(
-    "name", [*earlier_names.CURRENT, "nerfies_jax.evidence.given_files"]
+    "name", [*earlier_names.CURRENT, "nerfies_jax.evidence.external_files"]
 )
 def test_an_earlier_name_is_the_module_of_today(name, monkeypatch):
     monkeypatch.delitem(sys.modules, name, raising=False)

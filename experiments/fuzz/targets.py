@@ -385,11 +385,13 @@ def _external(folder):
 
 
 def _read_external(folder):
-    from nerfies_jax.capture.given import GivenFiles
-    from nerfies_jax.preprocessing import given_files
+    from nerfies_jax.capture.external import ExternalFiles
+    from nerfies_jax.preprocessing import external_files
 
-    files = GivenFiles(*(folder / n for n in ("tracks.npz", "masks", "depths", "flow")))
-    given_files.attached(_capture(), files)
+    files = ExternalFiles(
+        *(folder / n for n in ("tracks.npz", "masks", "depths", "flow"))
+    )
+    external_files.attached(_capture(), files)
 
 
 def _video(folder):

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from nerfies_jax.capture import external as external_results
 from nerfies_jax.capture import flow as flows
-from nerfies_jax.capture import given as givens
 from nerfies_jax.capture.errors import CaptureError as CaptureError
+from nerfies_jax.capture.external import ExternalResults
 from nerfies_jax.capture.flow import FrameFlow
-from nerfies_jax.capture.given import Given
 from nerfies_jax.geometry import camera
 from nerfies_jax.geometry.camera import Camera
 
@@ -57,7 +57,7 @@ class Capture:
     # [frames, height, width] float32 z-depth, 0 where unknown
     depths: np.ndarray | None = None
     flow: FrameFlow | None = None  # to the next and previous frame, in pixels
-    given: Given | None = None  # external preprocessing that replaces our own
+    external: ExternalResults | None = None  # results that replace our preprocessing
     points: PointCloud | None = None
     background: tuple[float, float, float] | None = None  # sRGB in [0, 1], if known
     scale: float = 1.0
@@ -330,7 +330,9 @@ def select(capture: Capture, rows: np.ndarray) -> Capture:
         moving=take(capture.moving),
         depths=take(capture.depths),
         flow=None if capture.flow is None else flows.take(capture.flow, rows),
-        given=None if capture.given is None else givens.take(capture.given, rows),
+        external=None
+        if capture.external is None
+        else external_results.take(capture.external, rows),
     )
 
 

@@ -32,7 +32,7 @@ _BROKEN = "not readable, so copy them again"
 _LARGE = f"of more than {MAX_PIXELS:,} pixels, so make them smaller first"
 
 
-class Taken(NamedTuple):
+class SourceImages(NamedTuple):
     """Images taken from a video or from a folder of photographs."""
 
     names: tuple[str, ...]  # of the written files, in order
@@ -82,7 +82,7 @@ def from_video(
     per_second: float | None = None,
     max_side: int = 960,
     masks: pathlib.Path | None = None,
-) -> Taken:
+) -> SourceImages:
     """Write the sharpest frames of a video, evenly spread in time, into `out/images`.
 
     Names contain the time in milliseconds.
@@ -146,7 +146,7 @@ def from_video(
         notes.append(
             mask_files.describe(used, len(used), encoding, np.mean(white), "moving")
         )
-    return Taken(tuple(names), tuple(notes), float(np.ptp(times[selected])))
+    return SourceImages(tuple(names), tuple(notes), float(np.ptp(times[selected])))
 
 
 def _frame_count(path, times, count, per_second):
@@ -182,7 +182,7 @@ def from_images(
     out: pathlib.Path,
     max_side: int = 960,
     masks: pathlib.Path | None = None,
-) -> Taken:
+) -> SourceImages:
     """Write the images of a folder, upright and of one size, into `out/images`.
 
     Images that cannot be read or differ in size from the majority are left out with a
@@ -245,7 +245,7 @@ def from_images(
         by_camera[headers[file].camera, headers[file].focal].append(name)
     groups = tuple((tuple(group), focal) for (_, focal), group in by_camera.items())
     focal = float(np.median(stated)) if stated else None
-    return Taken(names, notes, focal=focal, groups=groups)
+    return SourceImages(names, notes, focal=focal, groups=groups)
 
 
 def _readable(folder):

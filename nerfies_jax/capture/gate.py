@@ -100,7 +100,7 @@ def check_observed(capture: Capture) -> None:
                     "the masks (white is observed) and the alpha channel of the images "
                     "(255 is observed)"
                 )
-    external = None if capture.given is None else capture.given.moving
+    external = None if capture.external is None else capture.external.moving
     for moving in (capture.moving, external):
         if moving is None:
             continue

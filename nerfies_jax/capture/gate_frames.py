@@ -66,7 +66,7 @@ def _find_unobserved(capture):
 
 
 def _moving(capture):
-    external = None if capture.given is None else capture.given.moving
+    external = None if capture.external is None else capture.external.moving
     moving = capture.moving if external is None else external
     if moving is None:
         return []

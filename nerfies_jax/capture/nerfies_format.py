@@ -142,7 +142,7 @@ def write(capture: Capture, path: AnyPath, factors: tuple[int, ...] = (1,)):
     Images go to `rgb/<factor>x`, downscaled by averaging. In addition to the layout of
     Nerfies, exact times, depth (as in DyCheck), masks of moving pixels (as in NeRF-DS),
     masks of observed pixels, optical flow and colors of the points are stored in files
-    and keys that other readers ignore. External preprocessing (`given`) is not stored.
+    and keys that other readers ignore. External results (`external`) are not stored.
     When the directory is read again, frames in neither split are missing, and every
     eighth frame is held out if none was.
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from nerfies_jax.capture import frame_memory, given_lens, resampling
+from nerfies_jax.capture import external_lens, frame_memory, resampling
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import lens, rays
@@ -37,7 +37,7 @@ def as_pinholes(capture: Capture) -> Capture:
     most by `MOST_GROWTH` of their sides. Pixels that the lens did not observe are
     marked in `valid`. Color is sampled with a Lanczos filter, masks and depth at the
     nearest pixel. z-depth needs no change, since a ray keeps its points. External
-    preprocessing results (`given`) are mapped too. Flow of the capture is dropped,
+    preprocessing results (`external`) are mapped too. Flow of the capture is dropped,
     since both of its ends would move.
 
     Args:
@@ -63,7 +63,7 @@ def as_pinholes(capture: Capture) -> Capture:
         **arrays | {"valid": None if observed.all() else observed},
         cameras=cameras.crop(pinhole(capture.cameras), -wide.left, -wide.top),
         flow=None,
-        given=None if capture.given is None else _last.given(capture, wide),
+        external=None if capture.external is None else _last.external(capture, wide),
         notes=(*capture.notes, note),
     )
 
@@ -80,7 +80,10 @@ class _Last:
     def _forget(self, _=None):
         self._images: Any = lambda: None
         self._others, self._arrays = (), None
-        self._given: tuple[Any, Any] = (None, None)  # external results, and undistorted
+        self._external: tuple[Any, Any] = (
+            None,
+            None,
+        )  # external results, and undistorted
 
     def arrays(self, capture):
         others = _others(capture)
@@ -94,13 +97,13 @@ class _Last:
         self._images = weakref.ref(capture.images, self._forget)
         self._others, self._arrays = _others(capture), arrays
 
-    def given(self, capture, wide):
+    def external(self, capture, wide):
         if self.arrays(capture) is None:  # too large to be kept
-            return _undistort_external(capture, capture.given, wide)
-        if self._given[0] is not capture.given:
-            undistorted = _undistort_external(capture, capture.given, wide)
-            self._given = capture.given, undistorted
-        return self._given[1]
+            return _undistort_external(capture, capture.external, wide)
+        if self._external[0] is not capture.external:
+            undistorted = _undistort_external(capture, capture.external, wide)
+            self._external = capture.external, undistorted
+        return self._external[1]
 
 
 def _others(capture):
@@ -149,7 +152,7 @@ def _undistort_external(capture, external, wide):
     def straight(row, pixel):
         return _straight_points(camera_of[row], pixel, wide)
 
-    return given_lens.undistorted(
+    return external_lens.undistorted(
         external,
         wide.size,
         capture.train[order],

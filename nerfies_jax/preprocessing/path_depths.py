@@ -4,17 +4,17 @@ import numpy as np
 import scipy.ndimage as nd
 
 from nerfies_jax.capture.capture import Capture, CaptureError
-from nerfies_jax.capture.given import Given
+from nerfies_jax.capture.external import ExternalResults
 from nerfies_jax.preprocessing import (
-    given_bodies,
-    given_depth,
+    external_bodies,
+    external_depth,
+    external_resampling,
     paths,
     rigid_bodies,
     still_points,
-    taken,
 )
 from nerfies_jax.preprocessing import tracks as tracking
-from nerfies_jax.preprocessing.given_depth import AlignedDepth
+from nerfies_jax.preprocessing.external_depth import AlignedDepth
 from nerfies_jax.preprocessing.paths import Paths
 from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
@@ -32,7 +32,7 @@ SURE_DEPTH, MOST_FRAMES_SURE = 0.1, 0.8
 
 def known(
     capture: Capture,
-    given: Given,
+    external: ExternalResults,
     views: Views,
     static: tuple[Tracks, RestPoints],
     use_depths: bool,
@@ -41,7 +41,7 @@ def known(
 
     Args:
       capture: The capture.
-      given: External results.
+      external: External results.
       views: The frames.
       static: Static tracks and their points.
       use_depths: True to use the depth maps of the capture, if there are no external
@@ -53,14 +53,14 @@ def known(
     Raises:
       CaptureError: If external depth maps do not fit the static points.
     """
-    depth = taken.depth(given, views)
+    depth = external_resampling.depth(external, views)
     if depth is None:
         if not use_depths or capture.depths is None:
             return None
         exact = np.zeros(len(views.row))
         return AlignedDepth(capture.depths[views.row], exact, 0.0)
     tracks, rest = _well_placed(views, *static)
-    aligned = given_depth.aligned(depth, tracks, rest, given.inverse)
+    aligned = external_depth.aligned(depth, tracks, rest, external.inverse)
     miss, name = aligned.total_miss, capture.path or capture.name
     if not np.isfinite(miss):
         kinds = {
@@ -69,14 +69,14 @@ def known(
         }
         raise CaptureError(
             f"{name}: the external depth maps fit the static points in no frame, "
-            f"{kinds.get(given.inverse, 'as depth')}; remove them, or check that "
+            f"{kinds.get(external.inverse, 'as depth')}; remove them, or check that "
             "enough of the scene is static and has texture"
         )
-    if miss > given_depth.USABLE:
+    if miss > external_depth.USABLE:
         raise CaptureError(
             f"{name}: the external depth maps differ from the static points by "
-            f"{miss:.0%} (median), more than {given_depth.USABLE:.0%}; check that they "
-            "belong to these frames, or remove them"
+            f"{miss:.0%} (median), more than {external_depth.USABLE:.0%}; check that "
+            "they belong to these frames, or remove them"
         )
     return aligned
 
@@ -84,7 +84,7 @@ def known(
 def _well_placed(views, tracks, rest):
     """Return the static points whose depth is certain, or all if they are few."""
     sure = still_points.depth_deviation(views, tracks, rest) < SURE_DEPTH
-    if (tracks.seen[sure].sum(0) >= given_depth.FEWEST).mean() < MOST_FRAMES_SURE:
+    if (tracks.seen[sure].sum(0) >= external_depth.FEWEST).mean() < MOST_FRAMES_SURE:
         return tracks, rest
     return tracks.take(sure), rest.take(sure)
 
@@ -128,14 +128,14 @@ def fitted(
         return rigid_bodies.refined(views, moved, alone, has_room)
     measured = _measured(depths.depth, moved)
     deviation = depths.deviation(paths.MEASURED_DEVIATION)
-    if capture.given is None or capture.given.depth is None:
+    if capture.external is None or capture.external.depth is None:
         return paths.least_acceleration(
             views, moved, least, around, measured, deviation
         )
     watch.spend(1e-6 * A_PATH_FRAME * moved.seen.size)
-    miss = given_depth.PER_MEDIAN * depths.total_miss
+    miss = external_depth.PER_MEDIAN * depths.total_miss
     near, rest = _well_placed(views, *static)
-    bodies = given_bodies.scaled(views, moved, measured, alone, near, rest, miss)
+    bodies = external_bodies.scaled(views, moved, measured, alone, near, rest, miss)
     smooth = paths.least_acceleration(
         views, moved, least, around, bodies.depth, deviation
     )

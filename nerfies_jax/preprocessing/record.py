@@ -18,10 +18,11 @@ import numpy as np
 from nerfies_jax.capture import cache, cache_files, pinholes
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
-from nerfies_jax.capture.given import Given
+from nerfies_jax.capture.external import ExternalResults
 from nerfies_jax.preprocessing import (
     dense_flow,
-    given_depth,
+    external_depth,
+    external_resampling,
     lost_regions,
     moving,
     path_depths,
@@ -30,7 +31,6 @@ from nerfies_jax.preprocessing import (
     rest_points,
     short_tracks,
     still_points,
-    taken,
     view_set,
 )
 from nerfies_jax.preprocessing import tracks as tracking
@@ -78,7 +78,7 @@ def gather(
     counts work instead of time, so that the result does not depend on the machine.
 
     Args:
-      capture: The capture. External results (`capture.given`) replace those computed
+      capture: The capture. External results (`capture.external`) replace those computed
         here.
       use_depths: True to constrain paths by the depth maps of the capture, if any.
       tell: Called with the name of each part when it begins, and with skipped parts.
@@ -95,11 +95,14 @@ def gather(
 def _gathered(capture, use_depths, rough_cameras, watch):
     watch.begin("flow")
     capture = pinholes.as_pinholes(capture)
-    factor, given = _factor(capture), capture.given or Given(capture.size)
+    factor, external = (
+        _factor(capture),
+        capture.external or ExternalResults(capture.size),
+    )
     capture = downscale(capture, factor)
     views = view_set.in_time_order(capture)
     images = dense_flow.leveled(views)
-    flow = taken.flow(given, views)
+    flow = external_resampling.flow(external, views)
     # Images of one timestamp are no video: there is nothing to search twice for.
     is_video = np.ptp(views.time) > 0
     span = view_set.depth_span(capture, views) if is_video else None
@@ -116,10 +119,10 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     few = not watch.has_room(FOR_TRACKS, "half of the tracks", every)
     watch.spend(every / 2 if few else 0.0)
     starts = tracking.grid(views, 2 if few else 1)
-    tracks, first = _tracks(given, views, flow, images, starts, least)
+    tracks, first = _tracks(external, views, flow, images, starts, least)
     rest = rest_points.fit(views, tracks)
     watch.begin("moving")
-    mask = taken.moving(given, views)
+    mask = external_resampling.moving(external, views)
     if mask is None:
         score = moving.track_scores(tracks, rest)
         mask = _mask(views, flow, tracks, score, watch)
@@ -137,7 +140,7 @@ def _gathered(capture, use_depths, rough_cameras, watch):
         which = _moved(tracks, score, first, least.path)
     still = np.flatnonzero(score < paths.AT_REST)
     static = tracks.take(still), rest.take(still)
-    depths = path_depths.known(capture, given, views, static, use_depths)
+    depths = path_depths.known(capture, external, views, static, use_depths)
     moving_tracks = tracks.take(which)
     moved_paths = path_depths.fitted(
         capture, views, moving_tracks, static, depths, watch, least.known
@@ -159,10 +162,10 @@ def _gathered(capture, use_depths, rough_cameras, watch):
         least_known=least.known,
         still=dense,
         unusable=unusable,
-        told=given.moving is not None or given.track_pixel is not None,
+        told=external.moving is not None or external.track_pixel is not None,
         factor=factor,
         left_out=watch.left_out,
-        depth_miss=0.0 if given.depth is None else depths.total_miss,
+        depth_miss=0.0 if external.depth is None else depths.total_miss,
         seconds=watch.seconds(),
     )
 
@@ -200,14 +203,14 @@ def _rounded(flow):
     return flow._replace(forward=forward, backward=backward)
 
 
-def _tracks(given, views, flow, images, starts, least):
+def _tracks(external, views, flow, images, starts, least):
     """Return all tracks, and the index of the first one whose path is computed.
 
     External tracks follow the computed ones, which are still needed for static points:
     other tools may have tracked only moving objects.
     """
     own = tracking.from_flow(views, flow, images, starts, least.track)
-    others = taken.tracks(given, views)
+    others = external_resampling.tracks(external, views)
     if others is None:
         return own, 0
     both = zip(own, others, strict=True)
@@ -242,12 +245,12 @@ def _enlarged(masks, height, width):
 
 def _depth_note(evidence: Evidence) -> str:
     """Describe a doubtful agreement of external depth with static points."""
-    if evidence.depth_miss <= given_depth.DOUBTFUL:
+    if evidence.depth_miss <= external_depth.DOUBTFUL:
         return ""
     return (
         f"the external depth maps differ from the static points by "
         f"{evidence.depth_miss:.0%} (median). They are used with a low weight; up to "
-        f"{given_depth.DOUBTFUL:.0%} is usual"
+        f"{external_depth.DOUBTFUL:.0%} is usual"
     )
 
 

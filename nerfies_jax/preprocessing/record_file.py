@@ -9,7 +9,7 @@ import numpy as np
 
 from nerfies_jax.capture import cache_files
 from nerfies_jax.capture.capture import Capture, PointCloud
-from nerfies_jax.capture.given import Given
+from nerfies_jax.capture.external import ExternalResults
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
 from nerfies_jax.preprocessing.paths import Paths
 from nerfies_jax.preprocessing.rest_points import RestPoints
@@ -75,8 +75,8 @@ def digest(capture: Capture, use_depths: bool = False) -> str:
     if capture.points is not None:
         parts.append(capture.points.position)
     depths = capture.depths if use_depths else None
-    external = () if capture.given is None else capture.given
-    for name, part in zip(Given._fields, external, strict=False):
+    external = () if capture.external is None else capture.external
+    for name, part in zip(ExternalResults._fields, external, strict=False):
         checksum.update(f"{name} {part is None}".encode())
     parts += [part for part in (capture.valid, depths, *external) if part is not None]
     for part in parts:

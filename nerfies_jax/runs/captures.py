@@ -9,7 +9,7 @@ from nerfies_jax.capture import gate, pinholes, synthetic
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.nearest import known_names
-from nerfies_jax.preprocessing import given_files
+from nerfies_jax.preprocessing import external_files
 from nerfies_jax.runs.config import CaptureSource
 
 
@@ -87,7 +87,7 @@ def stored_capture(source: CaptureSource, seed: int = 0) -> Capture:
     Raises:
       ValueError: If it cannot be read as requested.
     """
-    capture = given_files.attached(_load(source, seed), source.files)
+    capture = external_files.attached(_load(source, seed), source.files)
     gate.check_observed(capture)
     if source.preprocessing is None:
         return capture

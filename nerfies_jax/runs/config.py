@@ -8,7 +8,7 @@ import math
 import pathlib
 from typing import Literal
 
-from nerfies_jax.capture.given import GivenFiles
+from nerfies_jax.capture.external import ExternalFiles
 
 
 class CaptureNotFound(ValueError):
@@ -62,7 +62,7 @@ class CaptureSource:
     preprocessing: float | None = None
     """Work to spend on optical flow, tracks and masks, as a multiple of the default
     budget. Work beyond it is skipped (default: 1)."""
-    files: GivenFiles = GivenFiles()
+    files: ExternalFiles = ExternalFiles()
     """Results of other tools."""
 
     def __post_init__(self):

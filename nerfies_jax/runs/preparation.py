@@ -29,7 +29,7 @@ import numpy as np
 
 from nerfies_jax.capture import colmap, footage, formats, nerfies_format
 from nerfies_jax.capture.capture import Capture, CaptureError, describe
-from nerfies_jax.capture.footage import Taken
+from nerfies_jax.capture.footage import SourceImages
 from nerfies_jax.capture.images import write_png
 from nerfies_jax.capture.json_files import AnyPath, scratch_folder, write_json
 from nerfies_jax.capture.sfm_features import COARSE_PX, CameraGroup
@@ -154,7 +154,7 @@ def _renaming_paths(scratch, source, out):
         raise CaptureError(message) from error
 
 
-def _source_images(kind, source, scratch, how) -> Taken:
+def _source_images(kind, source, scratch, how) -> SourceImages:
     if kind == "video":
         return footage.from_video(
             source, scratch, how.frames, how.fps, how.max_side, how.masks

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 from nerfies_jax.capture.cache import CACHE
 from nerfies_jax.capture.capture import CaptureError, describe
-from nerfies_jax.capture.given import GivenFiles
+from nerfies_jax.capture.external import ExternalFiles
 from nerfies_jax.preprocessing import inspection, record
 from nerfies_jax.runs import (
     adviser,
@@ -321,7 +321,7 @@ def _check_expected(folder, expected):
 
 def _has_moved(old, new):
     """Test if a file that is missing may be the one at a new path."""
-    if isinstance(old, GivenFiles):
+    if isinstance(old, ExternalFiles):
         pairs = [(x, getattr(new, name)) for name, x in vars(old).items()]
         different = [(x, y) for x, y in pairs if x != y]
         return bool(different) and all(_has_moved(x, y) for x, y in different)

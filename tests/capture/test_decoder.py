@@ -141,11 +141,11 @@ def test_heic_and_large_photographs_are_decoded_in_the_child(
         PIL.Image.new("RGB", (64, 48), (40 * row, 99, 9)).save(path, exif=exif)
     content = path.read_bytes()
     path.write_bytes(content[: len(content) - 60])  # its header is whole
-    taken = footage.from_images(tmp_path, tmp_path / "out")
-    assert taken.names == ("0.png", "1.png", "2.png")
-    assert taken.focal == 0.5
+    source_images = footage.from_images(tmp_path, tmp_path / "out")
+    assert source_images.names == ("0.png", "1.png", "2.png")
+    assert source_images.focal == 0.5
     assert f"1 images left out, not readable, so copy them again: 3.{ending}" in (
-        taken.notes
+        source_images.notes
     )
     shown = images.read_pixels(tmp_path / "out/images/2.png")
     np.testing.assert_allclose(shown.mean((0, 1)), (80, 99, 9), atol=3)

@@ -83,14 +83,14 @@ def test_a_video_keeps_its_own_times_and_the_masks_of_the_frames_taken(tmp_path)
         mask = np.arange(48) >= 6 * number
         mask = np.repeat(mask[None], 32, 0)
         images.write_png(tmp_path / f"given/{number}.png", mask)
-    taken = footage.from_video(
+    source_images = footage.from_video(
         tmp_path / "a.mp4", tmp_path, 3, max_side=16, masks=tmp_path / "given"
     )
-    times = [int(name[2:10]) for name in taken.names]
+    times = [int(name[2:10]) for name in source_images.names]
     assert set(times) <= set(milliseconds)
     assert [time // 400 for time in times] == [0, 1, 2]
-    assert taken.seconds == pytest.approx((times[-1] - times[0]) / 1000)
-    for name, time in zip(taken.names, times, strict=True):
+    assert source_images.seconds == pytest.approx((times[-1] - times[0]) / 1000)
+    for name, time in zip(source_images.names, times, strict=True):
         number = milliseconds.index(time)
         image = images.read_pixels(tmp_path / "images" / name)
         assert image.shape == (10, 16, 3)
@@ -134,10 +134,10 @@ def test_frames_stay_in_order_where_times_are_those_of_decoding(tmp_path):
         container.mux(stream.encode())
     times = [seconds for seconds, _ in video.read_video(tmp_path / "a.avi")]
     assert min(np.diff(times)) < 0
-    taken = footage.from_video(tmp_path / "a.avi", tmp_path / "out", 12)
+    source_images = footage.from_video(tmp_path / "a.avi", tmp_path / "out", 12)
     shown = [
         images.read_pixels(tmp_path / "out/images" / name).mean()
-        for name in sorted(taken.names)
+        for name in sorted(source_images.names)
     ]
     assert len(shown) == 12
     assert min(np.diff(shown)) > 10
@@ -163,10 +163,12 @@ def test_masks_of_zero_and_one_are_written_as_meant(tmp_path):
         image = np.full((32, 32, 3), 90, np.uint8)
         PIL.Image.fromarray(image).save(tmp_path / name)
         PIL.Image.fromarray(mask).save(tmp_path / "masks" / name)
-    taken = footage.from_images(tmp_path, tmp_path / "out", masks=tmp_path / "masks")
+    source_images = footage.from_images(
+        tmp_path, tmp_path / "out", masks=tmp_path / "masks"
+    )
     written = images.read_pixels(tmp_path / "out/masks/1.png.png")[..., 0]
     np.testing.assert_array_equal(written, 255 * mask)
-    assert "3 masks of values 0 and 1 (white); 25.0%" in taken.notes[-1]
+    assert "3 masks of values 0 and 1 (white); 25.0%" in source_images.notes[-1]
 
 
 def test_what_is_cut_out_of_an_image_is_black(tmp_path):
@@ -204,14 +206,14 @@ def test_photographs_come_upright_of_one_size_whatever_their_ending(
     PIL.Image.fromarray(upright[0, :, :16]).save(folder / "small.png")
     (folder / "4.HEIC").write_bytes(b"")
     (folder / "notes.txt").touch()
-    taken = footage.from_images(folder, tmp_path / "out", max_side=32)
-    assert taken.names == ("0.png", "1.png", "2.png", "3.png", "10.png")
-    assert taken.focal == 27 / 36
-    left_out = " ".join(taken.notes)
+    source_images = footage.from_images(folder, tmp_path / "out", max_side=32)
+    assert source_images.names == ("0.png", "1.png", "2.png", "3.png", "10.png")
+    assert source_images.focal == 27 / 36
+    left_out = " ".join(source_images.notes)
     assert "4.HEIC" in left_out
     assert "small.png" in left_out
     assert "notes.txt" not in left_out
-    for name, row in zip(taken.names, (0, 1, 2, 4, 3), strict=True):
+    for name, row in zip(source_images.names, (0, 1, 2, 4, 3), strict=True):
         pixels = images.read_pixels(tmp_path / "out/images" / name)
         exact = upright[row].reshape(16, 2, 32, 2, 3).mean((1, 3))
         assert pixels.shape == (16, 32, 3)
@@ -249,9 +251,9 @@ def test_what_cannot_be_read_is_left_out_and_what_is_hidden_is_no_image(tmp_path
         (folder / name).write_bytes(header)
     assert len(footage.images_in(folder)) == 7
     assert len(frames.images_in(folder, footage.PLAIN)) == 7
-    taken = footage.from_images(folder, tmp_path / "out")
-    assert taken.names == ("0.png", "3.png", "für.png")
-    left_out = [note.rpartition(": ")[2] for note in taken.notes]
+    source_images = footage.from_images(folder, tmp_path / "out")
+    assert source_images.names == ("0.png", "3.png", "für.png")
+    left_out = [note.rpartition(": ")[2] for note in source_images.notes]
     assert left_out == ["1.jpg", "5.bmp, 6.bmp", "2.jpg"]
     written = sorted(path.name for path in (tmp_path / "out/images").iterdir())
     assert written == ["0.png", "3.png", "für.png"]
@@ -267,9 +269,9 @@ def test_what_files_say_of_a_lens_may_be_anything(tmp_path):
         told[0x0112] = 9  # no orientation that there is
         told.get_ifd(0x8769)[0xA405] = value
         PIL.Image.new("RGB", (48, 32)).save(tmp_path / name, exif=told)
-    taken = footage.from_images(tmp_path, tmp_path / "out")
-    assert taken.names == ("0.png", "1.png", "2.png", "3.png")
-    assert taken.focal == 18 / 36
+    source_images = footage.from_images(tmp_path, tmp_path / "out")
+    assert source_images.names == ("0.png", "1.png", "2.png", "3.png")
+    assert source_images.focal == 18 / 36
 
 
 def test_two_frames_of_one_time_cost_one_of_them(tmp_path, monkeypatch):
@@ -282,8 +284,8 @@ def test_two_frames_of_one_time_cost_one_of_them(tmp_path, monkeypatch):
     monkeypatch.setattr(footage, "read_video", read)
     monkeypatch.setattr(footage, "transfer_of", lambda video: None)
     monkeypatch.setattr(footage, "notes_of", lambda *_: ())
-    taken = footage.from_video(tmp_path / "a.mp4", tmp_path, 30)
-    assert len(taken.names) == len(set(taken.names)) == 29
+    source_images = footage.from_video(tmp_path / "a.mp4", tmp_path, 30)
+    assert len(source_images.names) == len(set(source_images.names)) == 29
     monkeypatch.setattr(footage, "OWN_TIMES", 0.99)
     with pytest.raises(CaptureError, match="its frames have no times"):
         footage.from_video(tmp_path / "a.mp4", tmp_path / "b", 30)

@@ -8,7 +8,7 @@ import pytest
 
 from nerfies_jax.capture import formats, gate, images, nerfies_format
 from nerfies_jax.capture.capture import CaptureError
-from nerfies_jax.capture.given import Given
+from nerfies_jax.capture.external import ExternalResults
 from tests.scenes import tiny_capture
 
 
@@ -138,8 +138,8 @@ def test_nothing_observed_or_nothing_static_is_refused():
     valid[capture.heldout] = False
     refused(changed(valid=valid), "no pixel of the .* held-out frames")
     refused(changed(moving=filled(True)), "leaves no static scene.* inverted")
-    given = Given(capture.size, moving=filled(True))
-    refused(changed(given=given), "leaves no static scene")
+    external = ExternalResults(capture.size, moving=filled(True))
+    refused(changed(external=external), "leaves no static scene")
     moving = filled(True)
     moving[capture.train[0], 0, 0] = False
     assert gate.checked(changed(moving=moving)).moving.any()

@@ -248,8 +248,8 @@ def test_a_video_of_high_dynamic_range_is_told_and_tone_mapped(tmp_path):
     paper = high_dynamic_range.tone_mapped(code, "HLG")
     assert np.abs(decoded[16, 40].astype(int) - paper).max() <= 1
     assert decoded[16, 8].max() <= 1
-    taken = footage.from_video(tmp_path / "a.mp4", tmp_path / "out")
-    assert "high dynamic range (HLG), tone-mapped" in taken.notes[-1]
+    source_images = footage.from_video(tmp_path / "a.mp4", tmp_path / "out")
+    assert "high dynamic range (HLG), tone-mapped" in source_images.notes[-1]
     video.write_video(tmp_path / "b.mp4", make_frames())
     assert video.transfer_of(tmp_path / "b.mp4") is None
 
@@ -320,8 +320,8 @@ def test_damaged_frames_are_left_out_with_a_note_and_refused_by_default(tmp_path
         data[start + len(data[start:]) // 2 :]
     )
     path.write_bytes(data)
-    taken = footage.from_video(path, tmp_path / "out", 5)
-    assert any("cut short or broken" in note for note in taken.notes)
+    source_images = footage.from_video(path, tmp_path / "out", 5)
+    assert any("cut short or broken" in note for note in source_images.notes)
     with pytest.raises(CaptureError, match="not a readable video"):
         list(video.read_video(path))
 
@@ -330,8 +330,8 @@ def test_the_largest_of_several_videos_is_read(tmp_path):
     write(tmp_path / "a.mkv", [(32, 16), (64, 48)], 5)
     shapes = {frame.shape for _, frame in video.read_video(tmp_path / "a.mkv")}
     assert shapes == {(48, 64, 3)}
-    taken = footage.from_video(tmp_path / "a.mkv", tmp_path / "out", 3)
-    assert any("1 other video streams" in note for note in taken.notes)
+    source_images = footage.from_video(tmp_path / "a.mkv", tmp_path / "out", 3)
+    assert any("1 other video streams" in note for note in source_images.notes)
 
 
 def test_a_cover_is_no_video(tmp_path):

@@ -10,9 +10,9 @@ import pytest
 
 from nerfies_jax.capture import decoder
 from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.external import ExternalFiles
 from nerfies_jax.capture.extras import MissingExtra
-from nerfies_jax.capture.given import GivenFiles
-from nerfies_jax.preprocessing import given_files, networks
+from nerfies_jax.preprocessing import external_files, networks
 from nerfies_jax.preprocessing.networks import NetworkSettings
 from tests.preprocessing import two_planes
 
@@ -119,17 +119,17 @@ def test_results_are_cached_and_attached_with_their_kind(
     tmp_path, capture, monkeypatch
 ):
     path = mixes(tmp_path / "n.onnx", [[1, 1, 1]], kind="inverse depth")
-    files = GivenFiles(depth_model=path)
-    first = given_files.attached(capture, files, tmp_path / "cache").given
+    files = ExternalFiles(depth_model=path)
+    first = external_files.attached(capture, files, tmp_path / "cache").external
     assert first.inverse is True
     monkeypatch.setattr(networks, "_results", None)
-    again = given_files.attached(capture, files, tmp_path / "cache").given
+    again = external_files.attached(capture, files, tmp_path / "cache").external
     np.testing.assert_array_equal(first.depth, again.depth)
     brighter = dataclasses.replace(capture, images=capture.images // 2)
     with pytest.raises(TypeError):  # computed again
-        given_files.attached(brighter, files, tmp_path / "cache")
+        external_files.attached(brighter, files, tmp_path / "cache")
     with pytest.raises(ValueError, match=r"depths=.* and depth_model=.*: both provide"):
-        GivenFiles(depths=path, depth_model=path)
+        ExternalFiles(depths=path, depth_model=path)
 
 
 @pytest.mark.parametrize("output", ["logits", "probability", "two", "classes"])
@@ -155,10 +155,10 @@ def test_segmentation_is_read_from_any_kind_of_output(tmp_path, capture, output)
     np.testing.assert_array_equal(found[:3][clear], expected[clear])
     assert not found[3].any()
     if output == "logits":
-        files = GivenFiles(segmentation_model=path)
-        given = given_files.attached(capture, files, tmp_path / "cache")
-        np.testing.assert_array_equal(given.given.moving, found)
-        assert "segmented by a network" in given.notes[-1]
+        files = ExternalFiles(segmentation_model=path)
+        attached = external_files.attached(capture, files, tmp_path / "cache")
+        np.testing.assert_array_equal(attached.external.moving, found)
+        assert "segmented by a network" in attached.notes[-1]
 
 
 def outside(path, location):
@@ -231,7 +231,7 @@ def test_what_is_no_network_of_an_image_is_refused(tmp_path, capture, monkeypatc
 
 def test_a_network_that_finds_nothing_leaves_the_masks_to_the_tracks(tmp_path, capture):
     path = mixes(tmp_path / "n.onnx", [[0, 0, 0]], [-5])
-    files = GivenFiles(segmentation_model=path)
-    result = given_files.attached(capture, files, tmp_path / "cache")
-    assert result.given.moving is None
+    files = ExternalFiles(segmentation_model=path)
+    result = external_files.attached(capture, files, tmp_path / "cache")
+    assert result.external.moving is None
     assert "marks none of the pixels, and is not used" in result.notes[-1]

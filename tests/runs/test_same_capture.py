@@ -11,7 +11,7 @@ from nerfies_jax import runs
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import nerfies_format
 from nerfies_jax.capture.capture import CaptureError
-from nerfies_jax.capture.given import GivenFiles
+from nerfies_jax.capture.external import ExternalFiles
 from nerfies_jax.runs import run_folder, same_capture
 from nerfies_jax.runs.config import CaptureSource, RunConfig
 from tests import scenes
@@ -144,12 +144,12 @@ def test_files_of_other_tools_may_be_moved(begun):
     source, folder = begun
     masks = source.with_name("masks")
     run = runs.saved_run(folder)
-    named = CaptureSource(source, files=GivenFiles(masks=masks))
+    named = CaptureSource(source, files=ExternalFiles(masks=masks))
     runs.save_config(
         folder, run._replace(config=dataclasses.replace(run.config, source=named))
     )
     there = source.with_name("other_masks")
-    wanted = {"files": GivenFiles(masks=there)}
+    wanted = {"files": ExternalFiles(masks=there)}
     with pytest.raises(runs.Refused, match="files: saved"):  # not there either
         runs.resume(folder, expected=wanted)
     there.mkdir()
@@ -162,9 +162,9 @@ def test_times_of_a_file_are_of_captures_and_of_no_built_in_scene(tmp_path):
     file = tmp_path / "times.txt"
     rows = zip(CAPTURE.ids, CAPTURE.times.tolist(), strict=True)
     file.write_text("".join(f"{name} {7 * time**2}\n" for name, time in rows))
-    source = CaptureSource(capture=tmp_path / "a", files=GivenFiles(times=file))
+    source = CaptureSource(capture=tmp_path / "a", files=ExternalFiles(times=file))
     read = runs.stored_capture(source)
     np.testing.assert_allclose(read.times, CAPTURE.times**2, atol=1e-6)
-    assert read.given is None
+    assert read.external is None
     with pytest.raises(ValueError, match="a built-in scene defines its own"):
-        runs.stored_capture(CaptureSource(files=GivenFiles(times=file)))
+        runs.stored_capture(CaptureSource(files=ExternalFiles(times=file)))

@@ -8,7 +8,7 @@ import numpy as np
 
 
 @dataclasses.dataclass(frozen=True)
-class GivenFiles:
+class ExternalFiles:
     """Preprocessing files of other tools (docs/formats.md), as absolute paths."""
 
     tracks: pathlib.Path | str | None = None
@@ -40,7 +40,7 @@ class GivenFiles:
                 object.__setattr__(self, name, pathlib.Path(path).absolute())
 
 
-class Given(NamedTuple):
+class ExternalResults(NamedTuple):
     """External preprocessing results by frame, in pixels of `size`, None where absent.
 
     Pixels are those of the images of the capture, with their lens distortion. Frames
@@ -61,20 +61,20 @@ class Given(NamedTuple):
     backward: np.ndarray | None = None
 
 
-def take(given: Given, rows: np.ndarray) -> Given:
+def take(external: ExternalResults, rows: np.ndarray) -> ExternalResults:
     """Select frames. Flow is dropped, since its target frames may not be selected.
 
     Args:
-      given: External preprocessing results.
+      external: External preprocessing results.
       rows: Indices of the frames, in the order of the result.
 
     Returns:
       The results of these frames.
     """
-    arrays = given._asdict()
+    arrays = external._asdict()
     for name in ("size", "inverse", "forward", "backward"):
         del arrays[name]
     selection = {
         name: None if array is None else array[rows] for name, array in arrays.items()
     }
-    return Given(given.size, inverse=given.inverse, **selection)
+    return ExternalResults(external.size, inverse=external.inverse, **selection)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from nerfies_jax.capture import resampling
-from nerfies_jax.capture.given import Given
+from nerfies_jax.capture.external import ExternalResults
 
 NOWHERE = 1e5  # px, flow of pixels that the lens did not observe
 
@@ -20,19 +20,19 @@ Straight = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def undistorted(
-    given: Given,
+    external: ExternalResults,
     size: tuple[int, int],
     in_time: np.ndarray,
     sources: Sources,
     straight: Straight,
-) -> Given:
+) -> ExternalResults:
     """Map external results from images as they were captured to undistorted images.
 
     Masks, depth and flow are sampled at the nearest pixel, because they have edges.
     z-depth needs no change, since a ray keeps its points.
 
     Args:
-      given: External results in pixels of the captured images.
+      external: External results in pixels of the captured images.
       size: Width and height of the undistorted images in pixels.
       in_time: Indices of the training frames in temporal order, between which flow is.
       sources: Positions of undistorted pixels in the captured image of a frame.
@@ -43,16 +43,19 @@ def undistorted(
       have unknown depth, and inconsistent flow.
     """
     parts: dict[str, Any] = {}
-    if given.track_pixel is not None and given.track_seen is not None:
-        pixel, is_visible = np.zeros_like(given.track_pixel), given.track_seen.copy()
+    if external.track_pixel is not None and external.track_seen is not None:
+        pixel, is_visible = (
+            np.zeros_like(external.track_pixel),
+            external.track_seen.copy(),
+        )
         for frame, visible in enumerate(is_visible):
-            place, exists = straight(frame, given.track_pixel[frame])
+            place, exists = straight(frame, external.track_pixel[frame])
             visible &= exists & ((place > 0) & (place < size)).all(-1)
             pixel[frame] = np.where(visible[:, None], place, 0)
         parts |= {"track_pixel": pixel, "track_seen": is_visible}
     unknown = {"moving": False, "depth": np.nan}
     for name, outside in unknown.items():
-        array = getattr(given, name)
+        array = getattr(external, name)
         if array is None:
             continue
         parts[name] = np.empty((len(array), *size[::-1]), array.dtype)
@@ -65,13 +68,13 @@ def undistorted(
         "backward": itertools.pairwise(in_time[::-1]),
     }
     for name, frames in pairs.items():
-        array = getattr(given, name)
+        array = getattr(external, name)
         if array is None:
             continue
         parts[name] = np.full((len(array), *size[::-1], 2), NOWHERE, np.float32)
         for one, other in frames:
             parts[name][one] = _flow(array[one], sources(one), other, straight)
-    return given._replace(size=size, **parts)
+    return external._replace(size=size, **parts)
 
 
 def _flow(flow, sources, other, straight):

@@ -21,8 +21,8 @@ from nerfies_jax.capture import (
     safe_files,
 )
 from nerfies_jax.capture.capture import Capture, CaptureError
-from nerfies_jax.capture.given import Given, GivenFiles
-from nerfies_jax.preprocessing import given_arrays, given_tracks, networks
+from nerfies_jax.capture.external import ExternalFiles, ExternalResults
+from nerfies_jax.preprocessing import external_arrays, external_tracks, networks
 
 FLO_MAGIC = 202021.25  # of Middlebury's .flo
 IMAGES, DEPTHS = (".png",), (".exr", ".png", ".npy")
@@ -30,7 +30,7 @@ IMAGES, DEPTHS = (".png",), (".exr", ".png", ".npy")
 
 @decoder.session()
 def attached(
-    capture: Capture, files: GivenFiles, folder: pathlib.Path = networks.FOLDER
+    capture: Capture, files: ExternalFiles, folder: pathlib.Path = networks.FOLDER
 ) -> Capture:
     """Read external files, except for times, and attach them to a capture.
 
@@ -42,18 +42,18 @@ def attached(
       folder: Cache folder for results of networks.
 
     Returns:
-      The capture with `given` set.
+      The capture with `external` set.
 
     Raises:
       CaptureError: If a file does not fit, or a network cannot be run.
       MissingExtra: If a network needs a package that is not installed.
     """
-    if files == GivenFiles(times=files.times):  # times are read with the capture
+    if files == ExternalFiles(times=files.times):  # times are read with the capture
         return capture
     parts: dict[str, Any] = {}
     notes = capture.notes
     if files.tracks is not None:
-        parts |= given_tracks.read(pathlib.Path(files.tracks), capture)
+        parts |= external_tracks.read(pathlib.Path(files.tracks), capture)
     if files.masks is not None:
         parts["moving"], more = _masks(files.masks, capture)
         notes += more
@@ -76,7 +76,9 @@ def attached(
                 "pixels, and is not used"
             )
         notes += (note,)
-    return dataclasses.replace(capture, given=Given(capture.size, **parts), notes=notes)
+    return dataclasses.replace(
+        capture, external=ExternalResults(capture.size, **parts), notes=notes
+    )
 
 
 def _files(folder, suffixes, capture, what):
@@ -93,7 +95,7 @@ def _files(folder, suffixes, capture, what):
         raise CaptureError(
             f"{folder}: contains no {what} ({' or '.join(suffixes)} files)"
         )
-    return paths, given_arrays.frames_of(len(paths), capture, folder, what)
+    return paths, external_arrays.frames_of(len(paths), capture, folder, what)
 
 
 def _masks(folder, capture):
@@ -137,7 +139,7 @@ def _depths(path, capture):
         maps = [_depth_map(one) for one in paths]
     else:
         paths, maps = [path], _stack(path)
-        rows = given_arrays.frames_of(len(maps), capture, path, "depths")
+        rows = external_arrays.frames_of(len(maps), capture, path, "depths")
         paths = paths * len(rows)
     depths = np.full(capture.images.shape[:3], np.nan, np.float32)
     for where, depth_map, row in zip(paths, maps, rows, strict=True):
@@ -170,7 +172,7 @@ def _depth_map(path):
 def _stack(path):
     if path.suffix == ".npy":
         return _checked_stack(
-            npz_files.load_array(path, given_arrays.MOST_NUMBERS), path, "it"
+            npz_files.load_array(path, external_arrays.MOST_NUMBERS), path, "it"
         )
     arrays = npz_files.load_arrays(path)
     name = "depths" if "depths" in arrays else next(iter(arrays), "depths")

@@ -8,11 +8,11 @@ import pytest
 
 from nerfies_jax.capture import capture as captures
 from nerfies_jax.capture import images, pinholes
-from nerfies_jax.capture.given import Given, GivenFiles
+from nerfies_jax.capture.external import ExternalFiles, ExternalResults
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry import rays
 from nerfies_jax.preprocessing import (
-    given_files,
+    external_files,
     record,
     usable_paths,
 )
@@ -23,7 +23,7 @@ from tests.preprocessing.test_tracks import MOVES, gathered
 
 def with_files(capture=None, **files):
     capture = two_planes.make(**MOVES, frames=24) if capture is None else capture
-    return given_files.attached(capture, GivenFiles(**files))
+    return external_files.attached(capture, ExternalFiles(**files))
 
 
 def tapir(path, **changes):
@@ -71,9 +71,9 @@ def test_tracks_are_read_in_each_layout(tmp_path, layout):
                 table = [points.pixel[part, frame], flag, -5 + 0 * flag]
                 np.save(path / f"{query}_{frame:03d}.npy", np.concatenate(table, 1))
     capture = with_files(tracks=path)
-    place = np.moveaxis(capture.given.track_pixel, 0, 1)[points.seen]
+    place = np.moveaxis(capture.external.track_pixel, 0, 1)[points.seen]
     np.testing.assert_allclose(place, points.pixel[points.seen], atol=1e-4)
-    np.testing.assert_array_equal(capture.given.track_seen.T, points.seen)
+    np.testing.assert_array_equal(capture.external.track_seen.T, points.seen)
     assert record.digest(capture) != record.digest(gathered()[0])
 
 
@@ -120,8 +120,8 @@ def test_tracks_of_larger_images_are_brought_to_those_that_are_read(tmp_path):
     _, points = tapir(tmp_path / "t.npz")
     size = 4 * np.array(two_planes.SIZE)
     path, _ = tapir(tmp_path / "t.npz", tracks=4 * points.pixel, size=size)
-    given = with_files(tracks=path).given
-    place = np.moveaxis(given.track_pixel, 0, 1)[points.seen]
+    external = with_files(tracks=path).external
+    place = np.moveaxis(external.track_pixel, 0, 1)[points.seen]
     np.testing.assert_allclose(place, points.pixel[points.seen], atol=1e-3)
 
 
@@ -186,22 +186,24 @@ def test_results_for_distorted_images_are_mapped_to_undistorted_ones():
         "track_pixel": tracks(lens),
         "track_seen": seen,
     }
-    given = pinholes.as_pinholes(
-        dataclasses.replace(bent, given=Given(capture.size, **external))
-    ).given
-    assert given.size == wide.size
-    np.testing.assert_array_equal(given.track_seen, seen)
+    straight = pinholes.as_pinholes(
+        dataclasses.replace(bent, external=ExternalResults(capture.size, **external))
+    ).external
+    assert straight.size == wide.size
+    np.testing.assert_array_equal(straight.track_seen, seen)
     expected = tracks(flat_cameras)[:, :2]
-    np.testing.assert_allclose(given.track_pixel[:, :2], expected, atol=0.01)
+    np.testing.assert_allclose(straight.track_pixel[:, :2], expected, atol=0.01)
     expected = fields(flat_cameras, wide.size)
-    known = np.isfinite(given.depth)
+    known = np.isfinite(straight.depth)
     assert 0.7 < known.mean() < 1
     # Half a pixel of the sampling is 0.011 units.
-    assert np.abs(given.depth - expected["depth"])[known].max() < 0.02
-    wrong = (given.moving != expected["moving"])[known].mean()
+    assert np.abs(straight.depth - expected["depth"])[known].max() < 0.02
+    wrong = (straight.moving != expected["moving"])[known].mean()
     assert wrong < 0.02
     for side, frames in (("forward", np.s_[:2]), ("backward", np.s_[1:])):
-        error = np.linalg.norm(getattr(given, side) - expected[side], axis=-1)[frames]
+        error = np.linalg.norm(getattr(straight, side) - expected[side], axis=-1)[
+            frames
+        ]
         # Within the image of the other frame too.
         assert np.quantile(error[known[frames]], 0.9) < 0.1
         assert (error[~known[frames]] > 1000).all()
@@ -284,7 +286,8 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
         (tmp_path / "flow" / side).mkdir(parents=True)
         for number, size in enumerate(sizes):
             head = (
-                np.float32(given_files.FLO_MAGIC).tobytes() + np.int32(size).tobytes()
+                np.float32(external_files.FLO_MAGIC).tobytes()
+                + np.int32(size).tobytes()
             )
             pixels = np.zeros(2 * size[0] * size[1], np.float32).tobytes()
             (tmp_path / "flow" / side / f"{number}.flo").write_bytes(head + pixels)
@@ -300,6 +303,6 @@ def test_a_capture_cut_to_some_frames_keeps_what_was_given_for_them(tmp_path):
     capture = with_files(tracks=path)
     part = captures.select(capture, np.arange(3, 9))
     np.testing.assert_array_equal(
-        part.given.track_pixel, capture.given.track_pixel[3:9]
+        part.external.track_pixel, capture.external.track_pixel[3:9]
     )
-    assert dataclasses.replace(part, given=None).given is None
+    assert dataclasses.replace(part, external=None).external is None

@@ -8,7 +8,7 @@ import scipy.special
 
 from nerfies_jax.capture import frames, npz_files
 from nerfies_jax.capture.capture import Capture, CaptureError
-from nerfies_jax.preprocessing import given_arrays
+from nerfies_jax.preprocessing import external_arrays
 
 # Names of positions, the axis of the frames if the shape is ambiguous, and the
 # coordinate of the center of the first pixel: images of TAPIR and LocoTrack begin at 0,
@@ -63,7 +63,7 @@ def read(path: pathlib.Path, capture: Capture) -> dict[str, np.ndarray]:
     if len(fits) != 1:
         fits = [pairs.frames_axis]
     pixel, visible = np.moveaxis(pixel, fits[0], 0), np.moveaxis(visible, fits[0], 0)
-    rows = given_arrays.frames_of(len(pixel), capture, path, "tracks")
+    rows = external_arrays.frames_of(len(pixel), capture, path, "tracks")
     stride = -(-pixel[..., 0].size // MOST_PLACES) or 1
     pixel, visible = pixel[:, ::stride], visible[:, ::stride]
     pixel = pixel.astype(np.float32) + np.float32(0.5 - pairs.center)
@@ -113,7 +113,7 @@ def _arrays(path):
             name = next((n for n in names if stem == n or stem.endswith(f"_{n}")), None)
             if name is not None:
                 arrays[name] = npz_files.load_array(
-                    file, given_arrays.MOST_NUMBERS, "fiub"
+                    file, external_arrays.MOST_NUMBERS, "fiub"
                 )
         return arrays
     if path.suffix.lower() not in (".npz", ""):
@@ -220,7 +220,7 @@ def _pairs(folder):
 
 
 def _pair(file):
-    table = npz_files.load_array(file, given_arrays.MOST_NUMBERS)
+    table = npz_files.load_array(file, external_arrays.MOST_NUMBERS)
     if table.ndim != 2 or table.shape[1] != PAIR_COLUMNS:
         raise CaptureError(
             f"{file}: an array of shape {table.shape}; expected [points, "
