@@ -231,12 +231,12 @@ def field_loss(spec, metadata, params, batch, key):
             return (level("fine", origin, direction, far, distance)[1],)
         name = "fine" if plan.shared else "coarse"
         weights, coarse = level(name, origin, direction, far, distance)
-        drawn = sampling.refine(second, distance, weights, plan.fine)
+        fine = sampling.refine(second, distance, weights, plan.fine)
         if plan.union:
-            distance = sampling.union(distance, drawn)
+            distance = sampling.union(distance, fine)
         else:
             last = () if metadata.background is not None else (distance[-1:],)
-            distance = jnp.concatenate([drawn, *last])
+            distance = jnp.concatenate([fine, *last])
         return coarse, level("fine", origin, direction, far, distance)[1]
 
     keys = jax.random.split(jax.random.split(key)[0], len(batch.origin))
@@ -277,7 +277,7 @@ def splat_step(spec, metadata, shuffled_row):
     if spec.optimizer == "radam":
         update = optimizer.scale_by_row_radam().update
 
-    def drawn(rows, offset, camera, size, degree):
+    def render_rows(rows, offset, camera, size, degree):
         gaussians = splats.activate(rows)
         shown = splats.active_harmonics(rows, degree)
         color = harmonics.color_toward(shown, gaussians.mean, camera.position)
@@ -298,7 +298,9 @@ def splat_step(spec, metadata, shuffled_row):
         degree = jnp.minimum(state.step // spec.sh_every, spec.sh_degree)
 
         def loss(params, offset):
-            image, seen = drawn(params.rows["splats"], offset, camera, size, degree)
+            image, seen = render_rows(
+                params.rows["splats"], offset, camera, size, degree
+            )
             value = losses.photometric(
                 image, truth, valid, dssim_weight=spec.dssim_weight
             )

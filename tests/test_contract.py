@@ -125,8 +125,8 @@ def test_a_shape_that_passed_does_not_excuse_another():
 def test_leading_axes_broadcast_as_those_of_numpy(rng):
     vector, weight = rng.normal(size=(4, 1, 3)), rng.normal(size=(1, 5))
     vector, weight = vector.astype(np.float32), weight.astype(np.float32)
-    found = weighted(vector, weight=weight)
-    np.testing.assert_array_equal(found, vector * weight[..., None])
+    actual = weighted(vector, weight=weight)
+    np.testing.assert_array_equal(actual, vector * weight[..., None])
     assert weighted(vector[:0], weight).shape == (0, 5, 3)
     cameras = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), ONE)
     moved = weighted(vector, 2.0, cameras)  # [4, 1], [], [2]
@@ -137,9 +137,9 @@ def test_leading_axes_broadcast_as_those_of_numpy(rng):
 def test_integer_and_gray_images_are_converted_as_documented():
     full = np.full((4, 5), 255, np.uint8)
     deep = np.full((4, 5, 1), 65535 // 2, np.uint16)
-    found = difference(full, deep)
-    assert found.dtype == jnp.float32
-    np.testing.assert_allclose(found, np.full((4, 5, 1), 1 - 32767 / 65535), rtol=1e-6)
+    actual = difference(full, deep)
+    assert actual.dtype == jnp.float32
+    np.testing.assert_allclose(actual, np.full((4, 5, 1), 1 - 32767 / 65535), rtol=1e-6)
     with jax.enable_x64(True):
         exact = difference(full, jnp.zeros((4, 5), jnp.float64))
         assert exact.dtype == jnp.float64

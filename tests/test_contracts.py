@@ -90,12 +90,12 @@ _TEMPLATE = TemplateSpec(
 def _network(make):
     """Parameters of its shapes, in the precision asked for."""
 
-    def drawn(dtype):
+    def random_params(dtype):
         shapes = jax.eval_shape(lambda key: make(key, dtype), jax.random.key(0))
         rng = np.random.default_rng(0)
         return jax.tree.map(lambda x: 0.3 * rng.normal(size=x.shape), shapes)
 
-    return lambda dtype: jax.tree.map(lambda x: x.astype(dtype), drawn(dtype))
+    return lambda dtype: jax.tree.map(lambda x: x.astype(dtype), random_params(dtype))
 
 
 _GRID = HashGridSpec(levels=2, coarsest=1, finest=2, rows=20)
@@ -104,8 +104,8 @@ _PLANES = PlanesSpec(vertices=3, multiples=(1, 2), timestamps=3, features=2)
 
 def _levels(dtype):
     """Planes, each leaf an array of JAX, as the check of tuples wants it."""
-    drawn = _network(functools.partial(planes.init, _PLANES))(dtype)
-    return jax.tree.map(jnp.asarray, drawn)
+    levels = _network(functools.partial(planes.init, _PLANES))(dtype)
+    return jax.tree.map(jnp.asarray, levels)
 
 
 SETTINGS = {
@@ -212,8 +212,8 @@ def _rotation(rng, shape):
 
 
 def _unit(rng, shape):
-    drawn = rng.normal(size=shape)
-    return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
+    vectors = rng.normal(size=shape)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _positive(rng, shape):
@@ -363,14 +363,14 @@ def _rows(function, dtype):
     sizes = SIZES | SIZES_OF.get(function.name, {})
     arguments = {}
     for key, annotation in function.annotations.items():
-        drawn = []
+        parts = []
         for row, factor in enumerate(factors):
             seed = zlib.crc32(f"{function.name} {key} {min(row, USUAL)}".encode())
             rng = np.random.default_rng(seed)
             leaves, free = _draw(function.name, key, annotation, rng, sizes)
-            drawn.append(jax.tree.map(functools.partial(_scaled, factor), leaves, free))
+            parts.append(jax.tree.map(functools.partial(_scaled, factor), leaves, free))
         arguments[key] = jax.tree.map(
-            lambda *leaves: _typed(np.stack(leaves), dtype), *drawn
+            lambda *leaves: _typed(np.stack(leaves), dtype), *parts
         )
     return arguments
 
@@ -474,8 +474,8 @@ def test_rotations_and_strains_of_half_precision_are_rounded_once(kind):
     """Computed in float32 from the same inputs; in bfloat16 a screw is 3e-2 off."""
     rooms = {"lie", "quaternion", "stumpff", "matrix3"}
     names = [name for name in FUNCTIONS if name.split(".")[0] in rooms]
-    drawn = {name: _rows(FUNCTIONS[name], "float32") for name in names}
-    half = jax.tree.map(lambda rows: rows[0].astype(jnp.dtype(kind)), drawn)
+    inputs = {name: _rows(FUNCTIONS[name], "float32") for name in names}
+    half = jax.tree.map(lambda rows: rows[0].astype(jnp.dtype(kind)), inputs)
     rounded = _every_rotation_and_strain(half)
     exact = _every_rotation_and_strain(jax.tree.map(np.float32, half))
     half_ulp = float(jnp.finfo(kind).eps) / 2

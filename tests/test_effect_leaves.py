@@ -71,7 +71,7 @@ def shapes(tree):
     }
 
 
-def drawn(init, *args):
+def random_params(init, *args):
     """What an `init` would return, without drawing it."""
     return jax.eval_shape(lambda key: init(key, *args), jax.random.key(0))
 

@@ -34,12 +34,12 @@ def one_step(name):
     frames = evaluation.frames_of(capture, model.required_data)
     second, logged = jax.eval_shape(model.step, first, frames)
     view = evaluation.view_of(capture, int(capture.heldout[0]))
-    drawn = jax.eval_shape(
+    rendering = jax.eval_shape(
         lambda state, view: model.render(state.params, view, capture.size, state.step),
         second,
         view,
     )
-    return jax.device_get(first.params), (first, second, logged, drawn)
+    return jax.device_get(first.params), (first, second, logged, rendering)
 
 
 def floats(tree):

@@ -113,23 +113,23 @@ def test_an_image_is_the_same_under_every_default():
     gaussians = some_gaussians(400, "float32")
     camera = cameras.pinhole(np.eye(3), np.array([0, 0, -4.0]), 40.0, (32, 24))
 
-    def drawn(gaussians):
+    def render(gaussians):
         seen = projection.project(gaussians, camera, (32, 24), GSPLAT)
         return raster.rasterize(seen, gaussians.scale, (32, 24), GSPLAT)
 
     images = []
     for default in (None, "BF16_BF16_F32"):
         with jax.default_matmul_precision(default):
-            images.append(jax.jit(drawn)(gaussians))
+            images.append(jax.jit(render)(gaussians))
     same_bits(*images)
 
 
 def moved_by_bases(dtype):
     """Where points some four units from the origin go with turns of half a radian."""
     rng = np.random.default_rng(0)
-    drawn = [size * rng.normal(size=(4, 5, 3)) for size in (0.5, 0.2)]
+    render = [size * rng.normal(size=(4, 5, 3)) for size in (0.5, 0.2)]
     none = np.zeros((4, 0, 3))
-    bases = Bases(Poses(*drawn), Poses(none, none), 2 + rng.normal(size=(4, 3)))
+    bases = Bases(Poses(*render), Poses(none, none), 2 + rng.normal(size=(4, 3)))
     logits = 8 * np.eye(5)[rng.integers(1, 5, 500)]
     gaussians = some_gaussians(500, dtype)
     gaussians = put(gaussians._replace(mean=np.asarray(gaussians.mean) + 2), dtype)

@@ -58,7 +58,7 @@ class Still:
         return gaussians._replace(mean=gaussians.mean + params.per_gaussian)
 
 
-def drawn(gaussians: gj.Gaussians, colors: jax.Array) -> jax.Array:
+def render(gaussians: gj.Gaussians, colors: jax.Array) -> jax.Array:
     camera = nj.look_at((0, 0, -5), (0, 0, 0), (0, 1, 0), focal_px=150, size=(160, 120))
     return gj.render(gaussians, colors, camera, (160, 120)).rendering.color
 

@@ -103,11 +103,11 @@ def test_intrinsics_of_larger_images_are_named(with_points):
             focal_px=times * cameras.focal_px,
             principal_point_px=times * cameras.principal_point_px,
         )
-        found = [
+        findings = [
             one for one in gate.findings(larger) if f"{times} times as" in one.problem
         ]
-        assert found
-        assert any(one.refused for one in found) == refused
+        assert findings
+        assert any(one.refused for one in findings) == refused
 
 
 def test_intrinsics_of_smaller_images_are_named():

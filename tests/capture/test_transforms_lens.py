@@ -72,8 +72,8 @@ LEVELS = {
 @pytest.mark.parametrize("case", LEVELS)
 def test_intrinsics_are_of_the_frame_or_of_the_file_as_units(case, tmp_path):
     top, frame, expected = LEVELS[case]
-    found, notes = in_frame(top, frame)(tmp_path)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    actual, notes = in_frame(top, frame)(tmp_path)
+    np.testing.assert_allclose(actual, expected, rtol=1e-5)
     assert any("principal point" in note for note in notes) == (case == "larger images")
 
 

@@ -128,8 +128,8 @@ def test_a_run_below_a_baseline_is_told_what_to_do():
     (lost,) = baselines_text.warnings(numbers | {"motion.gain": -2.0}, 0.07)
     assert "only 7% of the moving pixels" in lost
     assert "was not followed" in lost
-    (found,) = baselines_text.warnings(numbers | {"motion.gain": -2.0}, 0.7)
-    assert "not followed" not in found
+    (actual,) = baselines_text.warnings(numbers | {"motion.gain": -2.0}, 0.7)
+    assert "not followed" not in actual
     assert baselines_text.lines({"heldout.psnr": 20.0}) == []
     assert baselines_text.warnings({"heldout.psnr": 20.0}) == []
     coded = numbers | {"heldout.psnr": 18.0}  # and 20 dB with fitted codes

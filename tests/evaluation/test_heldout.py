@@ -47,7 +47,7 @@ TRUTH = {
 }
 
 
-def drawn(capture, rng):
+def random_renders(capture, rng):
     """Held-out frames as a poor scene might draw them."""
     rows = capture.heldout
     truth = capture.images[rows] / 255
@@ -74,7 +74,7 @@ def psnr(image, truth, mask):
 
 def test_a_frame_of_which_nothing_was_observed_spoils_no_mean(rng):
     capture = scenes.tiny_capture()
-    scored = drawn(capture, rng)
+    scored = random_renders(capture, rng)
     twice = Scored(*(np.concatenate([leaf, leaf]) for leaf in scored))
     twice = twice._replace(psnr=np.array([np.nan, 21.0]), ssim=np.array([np.nan, 0.5]))
     numbers = heldout_metrics(twice, capture)
@@ -90,7 +90,7 @@ def test_every_number_is_that_of_a_direct_computation(rng, masked):
     valid = rng.random(capture.moving.shape) > 0.2
     if masked:
         capture = dataclasses.replace(capture, valid=valid)
-    scored = drawn(capture, rng)
+    scored = random_renders(capture, rng)
     places = np.array([len(scored.rows) - 1])
     gray = Averages(places, np.full_like(scored.color[places], 0.4), None)
     baselines = Baselines(gray._replace(known=~valid[scored.rows[places]]), gray)
@@ -141,9 +141,9 @@ def test_every_number_is_that_of_a_direct_computation(rng, masked):
 def test_what_a_capture_has_not_is_not_among_the_numbers(rng):
     capture = scenes.tiny_capture()
     bare = dataclasses.replace(capture, moving=None, depths=None)
-    assert set(heldout_metrics(drawn(bare, rng), bare)) == ALWAYS
+    assert set(heldout_metrics(random_renders(bare, rng), bare)) == ALWAYS
     still = dataclasses.replace(capture, moving=np.zeros_like(capture.moving))
-    numbers = heldout_metrics(drawn(still, rng), still)
+    numbers = heldout_metrics(random_renders(still, rng), still)
     assert "heldout.static_psnr" in numbers
     assert not [key for key in numbers if "moving" in key]
     listed = {metric.key: metric.value for metric in heldout.metrics(numbers)}
@@ -165,7 +165,7 @@ def test_large_images_get_ms_ssim_and_weights_lpips(rng, tmp_path):
     )
     np.savez(tmp_path / "tiny.npz", **state_dict("tiny", rng))
     lpips = heldout.Lpips(TINY, perceptual.load(TINY, [tmp_path / "tiny.npz"]))
-    scored = drawn(capture, rng)
+    scored = random_renders(capture, rng)
     numbers = heldout_metrics(scored, capture, lpips=lpips)
     assert set(numbers) == ALWAYS | {"heldout.ms_ssim", "heldout.lpips"}
     image = np.round(scored.color[0] * 255) / np.float32(255)
@@ -230,7 +230,7 @@ def test_the_flow_of_a_known_motion_is_the_true_one():
         known[lost] = False
         return Moved(moved, known)
 
-    scored = drawn(capture, np.random.default_rng(0))
+    scored = random_renders(capture, np.random.default_rng(0))
     scored = scored._replace(depth=capture.depths[capture.heldout])
     flow = model_flow.heldout_flow(move, NOBODY, capture, scored)
     assert np.isnan(flow.predicted[lost]).all()
@@ -281,7 +281,7 @@ def started(kind, folder):
 def test_a_run_is_held_against_the_truth_of_its_scene(kind, scene_folder, rng):
     run, state = started(kind, scene_folder)
     capture = run.capture
-    scored = drawn(capture, rng)
+    scored = random_renders(capture, rng)
     renderer = evaluation.Renderer(run.model, run.capture.size)
     numbers, notes = quality.measure(run, state, renderer, scored)
     assert notes == []
@@ -335,7 +335,7 @@ def test_a_scene_without_motion_or_truth_has_no_points_to_follow(
         is None
     )
     renderer = evaluation.Renderer(run.model, run.capture.size)
-    scored = drawn(run.capture, rng)
+    scored = random_renders(run.capture, rng)
     elsewhere = dataclasses.replace(run.capture, path=None)
     numbers, notes = quality.measure(
         run._replace(observed=elsewhere), state, renderer, scored

@@ -57,7 +57,7 @@ def test_tiles_show_their_part_of_the_image():
 
 
 def test_images_are_coarse_while_the_view_moves_and_reach_full_size_at_rest():
-    def drawn(tile_seconds, moving, complete, levels=4):
+    def rendered_levels(tile_seconds, moving, complete, levels=4):
         """Levels rendered one after another until there is nothing to do."""
         order = []
         while True:
@@ -67,13 +67,19 @@ def test_images_are_coarse_while_the_view_moves_and_reach_full_size_at_rest():
             order.append(level)
             complete = level
 
-    assert drawn(None, False, None) == [0, 3]
-    assert drawn(0.01, True, None) == [1]  # 4 tiles; 16 would take longer than 0.1 s
-    assert drawn(0.01, False, None) == [1, 2, 3]  # 64 tiles are not waited for
-    assert drawn(0.001, False, None) == [3]
+    assert rendered_levels(None, False, None) == [0, 3]
+    assert rendered_levels(0.01, True, None) == [
+        1
+    ]  # 4 tiles; 16 would take longer than 0.1 s
+    assert rendered_levels(0.01, False, None) == [
+        1,
+        2,
+        3,
+    ]  # 64 tiles are not waited for
+    assert rendered_levels(0.001, False, None) == [3]
     # However long a tile takes, the finest image comes.
-    assert drawn(100.0, True, None) == [0]
-    assert drawn(100.0, False, 0) == [1, 2, 3]
+    assert rendered_levels(100.0, True, None) == [0]
+    assert rendered_levels(100.0, False, 0) == [1, 2, 3]
 
 
 def test_channels_show_what_they_are_called():

@@ -127,7 +127,7 @@ def test_a_renderer_keeps_what_stays_and_drops_what_changes():
     assert here.time != later.time
     params = {"mean": jnp.asarray(0.1), "weight": jnp.asarray(0.2)}
 
-    def drawn(params, view):
+    def stages_run(params, view):
         state = TrainState(params, (), (), jnp.zeros((), jnp.int32), None)
         ran, gray = counted.since(lambda: renderer(state, view))
         time = float(view.time)
@@ -135,17 +135,17 @@ def test_a_renderer_keeps_what_stays_and_drops_what_changes():
         np.testing.assert_allclose(gray, exact, atol=1e-6)
         return ran
 
-    assert drawn(params, here) == (1, 1, 1)
-    assert drawn(params, here) == (0, 0, 1)
-    assert drawn(dict(params), aside) == (0, 0, 1)  # another dict, the same arrays
-    assert drawn(params, later) == (0, 1, 1)
-    assert drawn(params, here) == (0, 1, 1)
+    assert stages_run(params, here) == (1, 1, 1)
+    assert stages_run(params, here) == (0, 0, 1)
+    assert stages_run(dict(params), aside) == (0, 0, 1)  # another dict, the same arrays
+    assert stages_run(params, later) == (0, 1, 1)
+    assert stages_run(params, here) == (0, 1, 1)
     for name in params:
         params = params | {name: params[name] + 0.3}
-        assert drawn(params, here) == (1, 1, 1)
+        assert stages_run(params, here) == (1, 1, 1)
         equal = params | {name: params[name] + 0.0}  # of equal value, but another array
-        assert drawn(equal, here) == (1, 1, 1)
-        assert drawn(params, later) == (1, 1, 1)
+        assert stages_run(equal, here) == (1, 1, 1)
+        assert stages_run(params, later) == (1, 1, 1)
     assert renderer.newly_deformed == [True, False, False, *[True] * 8]
 
 

@@ -27,7 +27,7 @@ def state_of(late):
     return TrainState((), (), (), late, None)
 
 
-def drawn(state, view):
+def render(state, view):
     """A wall; late, something stands before the left half of it."""
     width, height = scenes.TINY_SCENE.size
     depth = np.full((height, width), DEPTH, np.float32)
@@ -49,7 +49,7 @@ def moved(state, points, here, there):
 
 def test_points_are_followed_until_they_leave_or_are_hidden(capture):
     late = 0.5
-    tracks = surface_tracks.follow(moved, drawn, state_of(late), capture, 40, time=0.3)
+    tracks = surface_tracks.follow(moved, render, state_of(late), capture, 40, time=0.3)
     times = np.sort(capture.times[capture.train])
     np.testing.assert_array_equal(tracks.times, times)
     start = np.argmin(np.abs(times - 0.3))
@@ -77,7 +77,7 @@ def test_points_are_followed_until_they_leave_or_are_hidden(capture):
 
 def test_an_image_that_shows_nothing_has_no_points(capture):
     def empty(state, view):
-        rendering = drawn(state, view)
+        rendering = render(state, view)
         return rendering._replace(alpha=0 * rendering.alpha)
 
     with pytest.raises(

@@ -60,7 +60,7 @@ def test_a_field_that_draws_no_numbers_leaves_no_report(tmp_path, capsys):
     rate = "learning_rate=1e38"
     folder, step = reconstruct_at(tmp_path, "nerf-small", rate, *FIELD)
     assert step == 1
-    *_, drawn, last = capsys.readouterr().err.splitlines()
-    assert drawn.startswith("error: no report: the images rendered at step 1 are not")
+    *_, error, last = capsys.readouterr().err.splitlines()
+    assert error.startswith("error: no report: the images rendered at step 1 are not")
     assert last.startswith("error: stopped at step 1 of 6: step 2 is not finite: ")
     assert not (folder / "report.html").exists()

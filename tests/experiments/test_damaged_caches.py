@@ -36,8 +36,8 @@ class Kind(NamedTuple):
 
 
 def evidence(folder):
-    found = record.cached(scenes.tiny_capture(), folder)
-    return found._replace(seconds=None)
+    evidence = record.cached(scenes.tiny_capture(), folder)
+    return evidence._replace(seconds=None)
 
 
 def scene(folder):
@@ -46,11 +46,11 @@ def scene(folder):
 
 def rows(folder):
     path = folder / "rows.json"
-    found = records.rows(path, rows=list)
-    if not found:
+    stored = records.rows(path, rows=list)
+    if not stored:
         path.write_text(json.dumps({"machine": {}, "rows": [{"psnr": 20.5}] * 9}))
-        found = records.rows(path, rows=list)
-    return found
+        stored = records.rows(path, rows=list)
+    return stored
 
 
 def finished(folder):

@@ -115,7 +115,7 @@ def test_a_path_leaves_with_its_times(splats, capsys):
 
 
 def test_a_path_leaves_as_training_found_the_cameras(splats, tmp_path, monkeypatch):
-    def found(params, capture):
+    def refine(params, capture):
         cameras = capture.cameras
         moved = cameras._replace(position=cameras.position + np.float32([0.25, 0, 0]))
         return dataclasses.replace(capture, cameras=moved)
@@ -127,7 +127,7 @@ def test_a_path_leaves_as_training_found_the_cameras(splats, tmp_path, monkeypat
         return np.array([each["camera_to_world"] for each in table])[:, 3:12:4]
 
     before, run = positions("before"), runs.saved_run(splats)
-    refined = run._replace(model=run.model._replace(apply_to_capture=found))
+    refined = run._replace(model=run.model._replace(apply_to_capture=refine))
     monkeypatch.setattr(runs, "saved_run", lambda folder, **_: refined)
     moved = positions("after") - before
     np.testing.assert_allclose(np.abs(moved).max(axis=1), 0.25, rtol=1e-5)

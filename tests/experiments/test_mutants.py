@@ -30,6 +30,6 @@ def test_faults_stand_in_bodies_and_neither_in_words_nor_in_settings():
 
 
 def test_the_modules_take_turns():
-    drawn = faults.sample_faults(8, seed=1, only="nerfies_jax/geometry")
-    assert len({fault.path for fault in drawn}) == 8
-    assert drawn == faults.sample_faults(8, seed=1, only="nerfies_jax/geometry")
+    sample = faults.sample_faults(8, seed=1, only="nerfies_jax/geometry")
+    assert len({fault.path for fault in sample}) == 8
+    assert sample == faults.sample_faults(8, seed=1, only="nerfies_jax/geometry")

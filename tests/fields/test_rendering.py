@@ -28,7 +28,7 @@ def reference(density, color, t, background, last):
     return rendered + (1 - alpha) * background, depth, np.array(weights), alpha
 
 
-def drawn(rng, dtype="float64"):
+def random_samples(rng, dtype="float64"):
     density = rng.uniform(0, 2, (2, 3, 6))
     color = rng.uniform(size=(2, 3, 6, 4))
     t = np.sort(rng.uniform(1, 4, (3, 6)), axis=-1)
@@ -37,15 +37,15 @@ def drawn(rng, dtype="float64"):
 
 
 def test_composite_is_a_loop_over_samples_for_any_leading_axes(dtype, rng):
-    density, color, t, background = drawn(rng, dtype)
-    found = composite(density, color, t, background, last_interval=0.5)
-    assert found.color.shape == (2, 3, 4)
-    assert found.weights.shape == (2, 3, 6)
+    density, color, t, background = random_samples(rng, dtype)
+    actual = composite(density, color, t, background, last_interval=0.5)
+    assert actual.color.shape == (2, 3, 4)
+    assert actual.weights.shape == (2, 3, 6)
     bound = {"float32": 2e-6, "float64": 1e-14}[dtype]
     for place in np.ndindex(2, 3):
         given = (density[place], color[place], t[place[1]], background)
         loop = reference(*(x.astype(np.float64) for x in given), 0.5)
-        for one, other in zip(found, loop, strict=True):
+        for one, other in zip(actual, loop, strict=True):
             assert one.dtype == dtype
             assert np.max(np.abs(one[place] - other)) < bound
 
@@ -71,23 +71,23 @@ def test_empty_and_opaque_rays_have_exact_weights_and_finite_gradients(
     arguments = (np.asarray(density, dtype), np.eye(3, dtype=dtype), t)
 
     def total(*arguments):
-        found = rendering.composite(*arguments)
-        return jnp.sum(found.color) + found.depth, found
+        actual = rendering.composite(*arguments)
+        return jnp.sum(actual.color) + actual.depth, actual
 
-    grads, found = jax.jit(jax.grad(total, (0, 1, 2), has_aux=True))(*arguments)
-    np.testing.assert_array_equal(found.weights, np.asarray(weights, dtype))
+    grads, actual = jax.jit(jax.grad(total, (0, 1, 2), has_aux=True))(*arguments)
+    np.testing.assert_array_equal(actual.weights, np.asarray(weights, dtype))
     hit = float(t @ np.asarray(weights, dtype)) if any(weights) else float(t[-1])
-    assert abs(float(found.depth) - hit) < 1e-6
+    assert abs(float(actual.depth) - hit) < 1e-6
     assert all(np.isfinite(leaf).all() for leaf in grads)
 
 
 def test_gradients_are_those_of_central_differences(float64, rng):
-    density, color, t, background = drawn(rng)
+    density, color, t, background = random_samples(rng)
     weight = rng.normal(size=(2, 3, 4))
 
     def total(density, color, t, background):
-        found = rendering.composite(density, color, t, background, last_interval=0.5)
-        return jnp.sum(weight * found.color) + jnp.sum(jnp.sin(found.depth))
+        actual = rendering.composite(density, color, t, background, last_interval=0.5)
+        return jnp.sum(weight * actual.color) + jnp.sum(jnp.sin(actual.depth))
 
     error = gradients.directional_error(total, density, color, t, background)
     assert error < 1e-8
@@ -129,19 +129,19 @@ def test_samples_lie_one_in_each_bin_on_their_rays(spacing, dtype, rng):
 @pytest.mark.parametrize("far", [1e7, np.inf])
 def test_disparity_reaches_far_and_infinity_with_all_digits(far, dtype):
     one = np.asarray([0, 0, 1], dtype)
-    found = rendering.sample_along_rays(
+    actual = rendering.sample_along_rays(
         None, 0 * one, one, 1.0, far, 4, spacing="disparity"
     )
     share = (np.arange(4) + 0.5) / 4
     exact = 1 / ((1 - share) + share / far)
     bound = {"float32": 1e-6, "float64": 1e-14}[dtype]
-    assert np.max(np.abs(found.t / exact - 1)) < bound
+    assert np.max(np.abs(actual.t / exact - 1)) < bound
 
 
 def test_a_ray_that_ends_before_it_begins_has_its_samples_at_its_end(dtype):
     one = np.asarray([0, 0, 1], dtype)
-    found = rendering.sample_along_rays(jax.random.key(0), 0 * one, one, 3.0, 2.0, 4)
-    np.testing.assert_array_equal(found.t, np.full(4, 2, dtype))
+    actual = rendering.sample_along_rays(jax.random.key(0), 0 * one, one, 3.0, 2.0, 4)
+    np.testing.assert_array_equal(actual.t, np.full(4, 2, dtype))
 
 
 @pytest.mark.parametrize(

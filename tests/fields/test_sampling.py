@@ -183,13 +183,13 @@ def test_weights_of_any_size_share_alike_and_peaks_draw_all(dtype):
     """But the ends u = 0 and 1 of the even shares, which are the ends of the range."""
     weights = np.stack(list(HARD.values())).astype(dtype)
     draws = [
-        np.asarray(sample_many_pdfs(drawn, EDGES.astype(dtype), weights, 34))
-        for drawn in (None, key(1))
+        np.asarray(sample_many_pdfs(random, EDGES.astype(dtype), weights, 34))
+        for random in (None, key(1))
     ]
     # 16 floors of one rounding unit on a sum of one, on bins of 1/8
     tolerance = {"float32": 3e-6, "float64": 1e-13}[dtype]
-    for case, given, even, drawn in zip(HARD, HARD.values(), *draws, strict=True):
-        for got in (even, drawn):
+    for case, given, even, random in zip(HARD, HARD.values(), *draws, strict=True):
+        for got in (even, random):
             assert got.dtype == dtype
             assert np.all((got >= 2) & (got <= 4)), case  # and so finite
             assert np.all(np.diff(got) >= 0), case
@@ -199,7 +199,7 @@ def test_weights_of_any_size_share_alike_and_peaks_draw_all(dtype):
         elif case != "1e-37 and less":
             wanted = bisect_inverse(EDGES, given, np.linspace(0, 1, 34))
             np.testing.assert_allclose(even[1:-1], wanted[1:-1], atol=tolerance)
-            bins = np.clip(np.searchsorted(EDGES, drawn, side="right") - 1, 0, 15)
+            bins = np.clip(np.searchsorted(EDGES, random, side="right") - 1, 0, 15)
             assert np.all(given[bins] > 0), case
 
 
@@ -260,8 +260,8 @@ def test_no_gradient_passes_through_the_samples(dtype, rng):
     along = jnp.asarray(np.linspace(1, 2, 8), dtype)
 
     def total(edges, weights):
-        drawn = sampling.sample_pdf(jax.random.key(0), edges, weights, 7)
-        return jnp.sum(drawn) + jnp.sum(sampling.refine(None, along, weights, 6))
+        distances = sampling.sample_pdf(jax.random.key(0), edges, weights, 7)
+        return jnp.sum(distances) + jnp.sum(sampling.refine(None, along, weights, 6))
 
     for grad in jax.jit(jax.grad(total, argnums=(0, 1)))(edges, weights):
         np.testing.assert_array_equal(grad, 0)
@@ -302,8 +302,8 @@ def test_narrow_rays_keep_their_order_and_their_peaks(narrow):
     edges = np.linspace(2, 4, 65).astype(narrow)
     peak = (np.arange(64) == 40).astype(narrow)
     # A rounding unit of bfloat16 in each of 64 bins would be a third of the weight.
-    drawn = sample_pdf(key(0), edges, peak, 64)
-    for samples in (even, drawn):
+    random = sample_pdf(key(0), edges, peak, 64)
+    for samples in (even, random):
         assert samples.dtype == narrow
         samples = np.asarray(samples, np.float64)
         assert np.all(np.diff(samples) >= 0)

@@ -32,7 +32,7 @@ from nerfies_jax.scene.scene import RadianceScene
 from nerfies_jax.training import loop
 from nerfies_jax.training.effects import FrameCondition, weighted_sum
 from nerfies_jax.training.model import View
-from tests import drawn, gradients, scenes
+from tests import gradients, random_params, scenes
 from tests.oracles import networks
 
 TINY_TEMPLATE = TemplateSpec(
@@ -120,7 +120,7 @@ def test_a_static_level_is_the_plain_nerf(union, behind, asked, dtype):
     metadata = dataclasses.replace(METADATA, background=behind)
     field = scene.field(dataclasses.replace(STATIC, sampling=plan), metadata)
     ray = ray_of(dtype)
-    params = drawn.params(field.init, dtype)
+    params = random_params.like(field.init, dtype)
     levels = jax.jit(field.render_ray)(params, ray, condition_of(dtype))
     coarse, fine = jax.tree.map(np.asarray, levels)
     assert fine.color.dtype == dtype
@@ -147,7 +147,7 @@ def test_a_transient_medium_ends_at_the_far_plane(dtype):
     thin = TransientSpec(code_width=2, depth=1, width=8, density_bias=-12.0)
     spec = dataclasses.replace(STATIC, transient=thin)
     field = scene.field(spec, dataclasses.replace(METADATA, background=None))
-    params = drawn.params(field.init, dtype)
+    params = random_params.like(field.init, dtype)
     ray, condition = ray_of(dtype), condition_of(dtype, transient=np.zeros(2))
     output = jax.jit(field.render_ray)(params, ray, condition)[-1]
     share = np.asarray(output.media_weight["transient"], float)
@@ -262,7 +262,7 @@ def test_depth_is_along_the_viewing_axis_in_scene_units():
 
 def codes_by(field, dtype):
     """Tables, and codes at times and for exposures, in one program a field."""
-    params = drawn.params(field.init, dtype)
+    params = random_params.like(field.init, dtype)
     at = jax.jit(
         jax.vmap(lambda p, *seen: field.codes_at(p, View(None, *seen)), (None, 0, 0))
     )
@@ -374,7 +374,7 @@ def test_gradient_of_a_whole_step(float64):
         return weighted_sum(terms)
 
     # Not the first state: zero displacements would leave terms without slope.
-    params = drawn.params(field.init, "float64", 0.05)
+    params = random_params.like(field.init, "float64", 0.05)
     assert gradients.directional_error(loss, params) < 1e-5
 
 
@@ -517,6 +517,8 @@ def test_micro_batches_go_down_the_mean_of_all_rays():
     moment, loss = mean_slope(2)
     (one, first), (other, second) = part(0), part(1)
     np.testing.assert_allclose(loss, (one + other) / 2, rtol=1e-5)
-    for found, a, b in zip(*map(jax.tree.leaves, (moment, first, second)), strict=True):
+    for actual, a, b in zip(
+        *map(jax.tree.leaves, (moment, first, second)), strict=True
+    ):
         # Adam's first moment after one step is a tenth of the slope.
-        np.testing.assert_allclose(found, 0.05 * (a + b), rtol=1e-4, atol=1e-7)
+        np.testing.assert_allclose(actual, 0.05 * (a + b), rtol=1e-4, atol=1e-7)

@@ -163,11 +163,13 @@ def test_where_nothing_is_skipped_a_frame_is_the_full_quadrature(monkeypatch):
     monkeypatch.setattr(skipping, "OPAQUE_DEPTH", np.inf)
     model, params = full_of_holes(TAKEN_OVER, ORANGE)
     view = evaluation.view_of(scenes.tiny_capture(), 1)
-    drawn = jax.jit(model.surveyed.draw, static_argnums=3)(params, {}, view, SIZE, STEP)
+    rendering = jax.jit(model.surveyed.draw, static_argnums=3)(
+        params, {}, view, SIZE, STEP
+    )
     whole = jax.jit(model.render, static_argnums=2)(params, view, SIZE, STEP)
     assert 0.1 < whole.alpha.mean() < 0.98
-    np.testing.assert_allclose(drawn.color, whole.color, atol=1e-5)
-    np.testing.assert_allclose(drawn.depth, whole.depth, atol=1e-4)
+    np.testing.assert_allclose(rendering.color, whole.color, atol=1e-5)
+    np.testing.assert_allclose(rendering.depth, whole.depth, atol=1e-4)
 
 
 @pytest.mark.full
@@ -246,9 +248,9 @@ def test_a_survey_of_what_is_shown_is_that_of_everything_there(bend):
     around = np.asarray(jax.jit(occupancy.dilated)(shown))
     shown = np.asarray(shown)
     for name, cells in whole.items():
-        found = np.asarray(part[name])
-        np.testing.assert_array_equal(found & shown, np.asarray(cells) & shown)
-        assert found[~around].all()
+        actual = np.asarray(part[name])
+        np.testing.assert_array_equal(actual & shown, np.asarray(cells) & shown)
+        assert actual[~around].all()
 
 
 @pytest.mark.parametrize(

@@ -13,17 +13,17 @@ import scipy.interpolate
 from nerfies_jax.fields import template
 from nerfies_jax.fields.template import TemplateSpec
 from nerfies_jax.nn.planes import PlanesSpec
-from tests import drawn as values
 from tests import gradients
+from tests import random_params as values
 from tests.oracles import networks
 
 SMALL = TemplateSpec(depth=4, width=16, skips=(2,), color_width=8)
 INPUTS, CONDITION = 7, 5
 
 
-def drawn(dtype, spec=SMALL, condition=CONDITION):
+def random_template(dtype, spec=SMALL, condition=CONDITION):
     """Parameters with biases that are not zero, and inputs."""
-    params = values.params(
+    params = values.like(
         lambda key: template.init(spec, key, INPUTS, condition), dtype, 0.1
     )
     rng, kind = np.random.default_rng(1), jnp.dtype(dtype)
@@ -54,7 +54,7 @@ apply = jax.jit(template.apply, static_argnums=0)
 )
 def test_density_color_and_features_layer_by_layer(density, condition, noise, dtype):
     spec = dataclasses.replace(SMALL, density=density, density_bias=2.0)
-    params, *inputs = drawn(dtype, condition=condition)
+    params, *inputs = random_template(dtype, condition=condition)
     added = None if noise is None else np.asarray(noise, dtype)
     answer = apply(spec, params, *inputs, added)
     truth = by_hand(spec, params, *inputs, noise or 0.0)
@@ -69,7 +69,7 @@ def test_density_color_and_features_layer_by_layer(density, condition, noise, dt
 
 
 def test_gradients(float64):
-    params, features, condition = drawn("float64")
+    params, features, condition = random_template("float64")
 
     def total(params, features, condition):
         answer = template.apply(SMALL, params, features, condition)
@@ -81,7 +81,7 @@ def test_gradients(float64):
 
 def test_density_does_not_depend_on_where_it_is_seen_from(dtype):
     """Nor, therefore, do depth, opacity and the samples of the fine level."""
-    params, features, condition = drawn(dtype)
+    params, features, condition = random_template(dtype)
     views = np.stack([condition, -condition, 9 * condition])
     seen = jax.jit(jax.vmap(functools.partial(template.apply, SMALL), (None, None, 0)))
     answer = jax.tree.map(np.asarray, seen(params, features, views))
@@ -101,7 +101,7 @@ TIMED = dataclasses.replace(
 
 
 def planes_drawn(dtype, spec=PLANES):
-    return values.params(
+    return values.like(
         lambda key: template.init(spec, key, spec.encoded_width, 1), dtype, 0.1
     )
 
@@ -109,12 +109,12 @@ def planes_drawn(dtype, spec=PLANES):
 def product_of_planes(level, place):
     """Of one place by SciPy's interpolation of the three or six planes of a level."""
     sides = ((0, 1), (0, 2), (1, 2), (3, 0), (3, 1), (3, 2))[: 3 * (len(place) - 2)]
-    found = 1
+    product = 1
     for pair, plane in zip(sides, level.space + level.time, strict=True):
         axes = [np.linspace(0, 1, side) for side in plane.shape[:2]]
         oracle = scipy.interpolate.RegularGridInterpolator(axes, np.asarray(plane))
-        found = found * oracle(place[list(pair)])[0]
-    return found
+        product = product * oracle(place[list(pair)])[0]
+    return product
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def density_and_slope(spec, params, features, condition, noise):
 @pytest.mark.parametrize("raw", [-1e4, -100.0, 0.0, 100.0, 1e4])
 @pytest.mark.parametrize("density", template.DENSITIES)
 def test_any_raw_density_has_a_finite_value_and_slope(raw, density, dtype):
-    params, *inputs = drawn(dtype)
+    params, *inputs = random_template(dtype)
     spec = dataclasses.replace(SMALL, density=density)
     noise = np.asarray(raw, dtype)
     value, grad = map(float, density_and_slope(spec, params, *inputs, noise))
@@ -202,7 +202,7 @@ def test_parameters_have_the_sizes_of_the_paper():
 @pytest.mark.full
 @pytest.mark.hard_cases
 def test_bfloat16_is_finite_and_near():
-    params, features, condition = drawn("bfloat16")
+    params, features, condition = random_template("bfloat16")
     spec = dataclasses.replace(SMALL, density="softplus")
 
     def seen(params, *inputs):

@@ -26,7 +26,7 @@ def test_an_appearance_is_named_by_its_frame_or_its_number():
             variants.appearance_id(capture, wrong)
 
 
-def drawn(seen, without=(), blended=False):
+def render(seen, without=(), blended=False):
     metadata, params, _ = scenes.tiny_field()
     draw = variants.without_effects(TINY_FIELD, metadata, without, blended)
     step = jnp.asarray(10, jnp.int32)
@@ -37,7 +37,7 @@ def drawn(seen, without=(), blended=False):
 @pytest.mark.full
 def test_a_field_without_its_warp_is_the_template():
     metadata, params, view = scenes.tiny_field()
-    image = drawn(view, without=("warp",))
+    image = render(view, without=("warp",))
     still = dataclasses.replace(TINY_FIELD, warp=None)
     codes = {"appearance": params["codes"]["appearance"]}
     model = nerf_scene.build(still, metadata)
@@ -45,7 +45,7 @@ def test_a_field_without_its_warp_is_the_template():
         {"template": params["template"], "codes": codes}, view, SIZE, jnp.int32(10)
     ).color
     np.testing.assert_allclose(image, expected, atol=1e-6)
-    assert np.abs(image - drawn(view)).max() > 1e-3
+    assert np.abs(image - render(view)).max() > 1e-3
 
 
 @pytest.mark.full
@@ -54,12 +54,12 @@ def test_a_blend_starts_at_one_appearance_and_ends_at_the_other():
     first, last = (
         view._replace(appearance=jnp.asarray(row, jnp.int32)) for row in (0, 5)
     )
-    ends = [drawn(end) for end in (first, last)]
+    ends = [render(end) for end in (first, last)]
     assert np.abs(ends[0] - ends[1]).max() > 0.02
 
     def at(share):
         between = variants.Between(first, last.appearance, jnp.float32(share))
-        return drawn(between, blended=True)
+        return render(between, blended=True)
 
     np.testing.assert_allclose(at(0.0), ends[0], atol=1e-6)
     np.testing.assert_allclose(at(1.0), ends[1], atol=1e-6)

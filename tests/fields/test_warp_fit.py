@@ -120,12 +120,12 @@ def test_a_warp_into_one_point_has_finite_slopes(dtype):
         displace=lambda params, point, _: -params["share"] * point,
     )
     distances = warp_fit._distances(field, {}, paths)
-    drawn = jnp.arange(4), jnp.arange(40), jnp.asarray(rest), jax.random.key(0)
+    batch = jnp.arange(4), jnp.arange(40), jnp.asarray(rest), jax.random.key(0)
 
     @jax.jit
     def stretch(share):
         places = jnp.asarray(path[:, 0], dtype)
-        return distances({"share": share}, places, *drawn)[2]
+        return distances({"share": share}, places, *batch)[2]
 
     value, slope = jax.jit(jax.value_and_grad(stretch))(jnp.asarray(1.0, dtype))
     expected = warp_fit.STRETCH * (np.log(warp_fit.LEAST_STRETCH) / 2) ** 2

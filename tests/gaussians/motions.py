@@ -108,8 +108,8 @@ def strong(name, spec=None, dtype="float64"):
 def read_by(name, count, dtype="float64"):
     """What the network reads of each Gaussian: its place, or a code of its own."""
     if name == "kan":
-        drawn = np.random.default_rng(1).normal(size=(count, KAN.embedding))
-        return put(drawn, dtype)
+        embedding = np.random.default_rng(1).normal(size=(count, KAN.embedding))
+        return put(embedding, dtype)
     return some_gaussians(count, dtype).mean
 
 

@@ -32,13 +32,13 @@ def jitted(function, **options):
 
 def some_gaussians(count, dtype="float64", seed=0):
     rng = np.random.default_rng(seed)
-    drawn = (
+    fields = (
         rng.normal(size=(count, 3)),
         rng.normal(size=(count, 4)),
         rng.uniform(0.1, 1, (count, 3)),
         rng.uniform(0.1, 1, count),
     )
-    return put(Gaussians(*drawn), dtype)
+    return put(Gaussians(*fields), dtype)
 
 
 def rows_of(gaussians, opacity_logit=0.0, rest=0):

@@ -132,8 +132,8 @@ def test_the_three_times_stay_within_the_capture(interval, dtype):
 @pytest.mark.parametrize("places", [[1, 2, 5, 8, 9], *full([3], [0, 11])])
 def test_rows_are_drawn_evenly_from_the_active(places):
     active = np.isin(np.arange(12), places)
-    drawn = draw_active(jax.random.key(0), active, 6000)
-    counts = np.bincount(drawn, minlength=12)
+    sample = draw_active(jax.random.key(0), active, 6000)
+    counts = np.bincount(sample, minlength=12)
     assert set(np.flatnonzero(counts)) == set(places)
     share = 6000 / len(places)
     assert np.abs(counts[places] - share).max() < 5 * np.sqrt(share)
@@ -164,11 +164,11 @@ def test_the_effect_is_the_mean_over_the_rows_it_draws(time, dtype):
     before, terms = (ask(spec, params, time, step, extent=3.0) for step in (8, 9))
     assert before["unrest"].value == 0
     key = jax.random.fold_in(jax.random.key(0), acceleration._STREAM)
-    drawn = draw_active(key, active, 12)
+    sample = draw_active(key, active, 12)
     middle = np.clip(time, 0.2, 0.8)
     expected = slow_unrest(
-        np.asarray(params.rows["splats"].mean, np.float64)[drawn],
-        *(places(params, t)[drawn] for t in (middle - 0.2, middle, middle + 0.2)),
+        np.asarray(params.rows["splats"].mean, np.float64)[sample],
+        *(places(params, t)[sample] for t in (middle - 0.2, middle, middle + 0.2)),
         0.06,
         0.5,
     )

@@ -105,7 +105,7 @@ def drawn_by_hand(params, time):
     """Mean, rotation, scale, opacity and color of each, in float64."""
     rows, net = params.rows["splats"], params.nets[NAME]
     reference, residual, _ = kept_by_hand(params.rows[NAME], net.law)
-    code, drawn = code_at(net.times, time), []
+    code, children = code_at(net.times, time), []
     for n in range(ROWS):
         moved = network(net.coarse, np.concatenate([reference[n], code]))
         core = Rotation.from_rotvec(moved["turn"]) * turn_of(rows.quaternion[n])
@@ -119,7 +119,7 @@ def drawn_by_hand(params, time):
             away = scale * (made["offset"] + fine["position"])
             logit = rows.opacity_logit[n] + made["opacity_logit"][0]
             grown = made["log_scale"] + fine["log_scale"] + np.log(SPEC.first_scale)
-            drawn.append(
+            children.append(
                 (
                     mean + core.apply(away),
                     functools.reduce(Rotation.__mul__, turns, core),
@@ -128,7 +128,7 @@ def drawn_by_hand(params, time):
                     rows.sh_dc[n, 0] + made["sh_dc"],
                 )
             )
-    return [*zip(*drawn, strict=True)]
+    return [*zip(*children, strict=True)]
 
 
 @pytest.mark.parametrize("time", [0.0, 0.7])
@@ -142,17 +142,17 @@ def test_all_is_made_of_features_as_they_are_kept(time, dtype):
         rows = effect().deform(params, still, condition, None)
         return derived[0].sh_dc[:, 0], effect().derive(params, derived, rows, condition)
 
-    color, found = jitted(run)(params, put(time, dtype))
+    color, actual = jitted(run)(params, put(time, dtype))
     *expected, colors = drawn_by_hand(host(params), time)
     for leaf, by_hand in zip(
-        (found.mean, found.scale, found.opacity, color),
+        (actual.mean, actual.scale, actual.opacity, color),
         (expected[0], *expected[2:], colors),
         strict=True,
     ):
         np.testing.assert_allclose(leaf, by_hand, rtol=EXACT[dtype], atol=EXACT[dtype])
-    apart = rotations(found.quaternion) * Rotation.concatenate(expected[1]).inv()
+    apart = rotations(actual.quaternion) * Rotation.concatenate(expected[1]).inv()
     np.testing.assert_allclose(apart.magnitude(), 0, atol=10 * EXACT[dtype])
-    assert {leaf.dtype for leaf in found} == {np.dtype(dtype)}
+    assert {leaf.dtype for leaf in actual} == {np.dtype(dtype)}
 
 
 @pytest.mark.full
@@ -185,8 +185,12 @@ def test_slopes_are_those_of_differences(float64):
         derived = effect().derive_rows(params, now)
         still = splats.activate(params.rows["splats"])
         rows = effect().deform(params, still, now, None)
-        drawn = effect().derive(params, derived, rows, now)
-        leaves = [*drawn[:3], drawn.opacity[:, None], derived[0].sh_dc[:, 0]]
+        child_gaussians = effect().derive(params, derived, rows, now)
+        leaves = [
+            *child_gaussians[:3],
+            child_gaussians.opacity[:, None],
+            derived[0].sh_dc[:, 0],
+        ]
         context = PenaltyContext(now, now.step, jax.random.key(4), params)
         (term,) = effect().penalty(params.nets[NAME], context).values()
         return jnp.sum(weights * jnp.concatenate(leaves, axis=1)) + term.value
@@ -230,8 +234,8 @@ def test_what_is_hardly_to_be_seen_counts_less(dtype):
     gaussians = put(
         Gaussians(np.zeros((20, 3)), np.ones((20, 4)), scale, opacity), dtype
     )
-    found = jitted(anchor_motion.significance)(gaussians)
-    np.testing.assert_allclose(found, opacity * share, rtol=1e-5)
+    actual = jitted(anchor_motion.significance)(gaussians)
+    np.testing.assert_allclose(actual, opacity * share, rtol=1e-5)
     nothing = gaussians._replace(scale=0 * gaussians.scale)
     assert np.isfinite(jitted(anchor_motion.significance)(nothing)).all()
 

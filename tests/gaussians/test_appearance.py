@@ -150,8 +150,8 @@ def test_directions_are_those_of_pixel_rays_at_any_aspect_and_skew(radial):
 
     @jitted
     def both(camera):
-        found = drawing.directions(camera, (16, 12), distorted=radial != 0)
-        return found, rays.pixel_rays(camera, (16, 12)).direction
+        actual = drawing.directions(camera, (16, 12), distorted=radial != 0)
+        return actual, rays.pixel_rays(camera, (16, 12)).direction
 
     np.testing.assert_allclose(*both(camera), atol=1e-6)
 

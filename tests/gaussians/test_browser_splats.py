@@ -60,10 +60,10 @@ def composited(cloud, camera, spec):
         jnp.asarray(np.sqrt(np.maximum(variance, 0)), jnp.float32),
         jnp.asarray(cloud.opacity),
     )
-    drawn = dense_splats.render(
+    rendering = dense_splats.render(
         gaussians, jnp.asarray(cloud.rgb), camera, CAPTURE.size, spec
     )
-    return drawn.color + (1 - drawn.alpha[..., None]) * cloud.background
+    return rendering.color + (1 - rendering.alpha[..., None]) * cloud.background
 
 
 @pytest.mark.parametrize("without", [(), ("motion",)])

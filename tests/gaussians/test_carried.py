@@ -63,7 +63,7 @@ def turn_of(wxyz):
 def by_hand(params, moved, time):
     """Mean, rotation, scale and opacity of each, one after the other, in float64."""
     own, layer = params.rows[NAME], params.nets[NAME].heads["turn"]
-    rows, drawn = params.rows["splats"], []
+    rows, children = params.rows["splats"], []
     for n in range(ROWS):
         core = turn_of(moved.quaternion[n])
         for k in range(EACH):
@@ -71,7 +71,7 @@ def by_hand(params, moved, time):
             reads = np.concatenate([quaternion, [time, np.sin(time), np.cos(time)]])
             turn = Rotation.from_rotvec(reads @ layer.weight + layer.bias)
             logit = rows.opacity_logit[n] + own.opacity_logit[n, k]
-            drawn.append(
+            children.append(
                 (
                     moved.mean[n] + core.apply(moved.scale[n] * own.offset[n, k]),
                     core * turn * turn_of(quaternion),
@@ -79,11 +79,11 @@ def by_hand(params, moved, time):
                     1 / (1 + np.exp(-logit)),
                 )
             )
-    return [*zip(*drawn, strict=True)]
+    return [*zip(*children, strict=True)]
 
 
-def same_turn(found, expected, atol):
-    apart = (rotations(found) * Rotation.concatenate(expected).inv()).magnitude()
+def same_turn(actual, expected, atol):
+    apart = (rotations(actual) * Rotation.concatenate(expected).inv()).magnitude()
     # A quaternion keeps an angle to the root of what it keeps of its cosine.
     np.testing.assert_allclose(apart, 0, atol=atol)
 
@@ -98,22 +98,22 @@ def test_what_is_carried_follows_its_row_and_turns_by_itself(time, dtype):
         derived = effect.derive_rows(params, None)
         return effect.derive(params, derived, moved, condition)
 
-    found = jitted(run)(params, moved, put(time, dtype))
+    actual = jitted(run)(params, moved, put(time, dtype))
     mean, turn, scale, opacity = by_hand(host(params), host(moved), time)
-    np.testing.assert_allclose(found.mean, mean, atol=EXACT[dtype])
-    np.testing.assert_allclose(found.scale, scale, rtol=EXACT[dtype])
-    np.testing.assert_allclose(found.opacity, opacity, rtol=EXACT[dtype])
-    same_turn(found.quaternion, turn, atol=10 * EXACT[dtype])
-    assert {leaf.dtype for leaf in found} == {np.dtype(dtype)}
+    np.testing.assert_allclose(actual.mean, mean, atol=EXACT[dtype])
+    np.testing.assert_allclose(actual.scale, scale, rtol=EXACT[dtype])
+    np.testing.assert_allclose(actual.opacity, opacity, rtol=EXACT[dtype])
+    same_turn(actual.quaternion, turn, atol=10 * EXACT[dtype])
+    assert {leaf.dtype for leaf in actual} == {np.dtype(dtype)}
 
 
 def test_rows_of_what_is_carried_are_what_is_drawn_at_rest(dtype):
     params = params_of(dtype)
     rows, own = params.rows["splats"], params.rows[NAME]
     still = jitted(carried.canonical_children)(rows, own)
-    drawn = jitted(splats.activate)(still)
+    static = jitted(splats.activate)(still)
     stood = jitted(carried.pose_children)(own, None, still, splats.activate(rows))
-    for one, other in zip(drawn, stood, strict=True):
+    for one, other in zip(static, stood, strict=True):
         np.testing.assert_allclose(one, other, rtol=EXACT[dtype], atol=EXACT[dtype])
     looks = np.asarray(rows.sh_rest)[:, None] + np.asarray(own.sh_rest)
     np.testing.assert_array_equal(still.sh_rest, looks.reshape(-1, 3, 3))
@@ -125,8 +125,13 @@ def test_slopes_of_what_is_carried_are_those_of_differences(float64):
     weights = np.random.default_rng(1).normal(size=(ROWS * EACH, 11))
 
     def value(params, moved, time):
-        drawn = carried.follow(params, SPEC, moved, time)
-        leaves = [drawn.mean, drawn.quaternion, drawn.scale, drawn.opacity[:, None]]
+        children = carried.follow(params, SPEC, moved, time)
+        leaves = [
+            children.mean,
+            children.quaternion,
+            children.scale,
+            children.opacity[:, None],
+        ]
         return jnp.sum(weights * jnp.concatenate(leaves, axis=1))
 
     assert directional_error(value, params, moved, put(0.4, "float64")) < 1e-7
@@ -167,19 +172,19 @@ def finite_slopes(own, rows, cores):
         return sum(jnp.sum(leaf) for leaf in run(*args))
 
     slopes = jitted(jax.grad(total, argnums=(0, 1, 2)))(own, rows, cores)
-    found = jitted(run)(own, rows, cores)
-    for leaf in jax.tree.leaves((found, slopes)):
+    actual = jitted(run)(own, rows, cores)
+    for leaf in jax.tree.leaves((actual, slopes)):
         assert np.isfinite(leaf).all()
-    return found, slopes
+    return actual, slopes
 
 
 @pytest.mark.hard_cases
 def test_a_core_of_no_size_has_all_in_its_middle(dtype):
     rows, own = rows_and_own(dtype)
     cores = some_gaussians(ROWS, dtype)._replace(scale=put(np.zeros((ROWS, 3)), dtype))
-    found, _ = finite_slopes(own, rows, cores)
-    np.testing.assert_array_equal(found.mean, np.repeat(cores.mean, EACH, axis=0))
-    np.testing.assert_array_equal(found.scale, 0)
+    actual, _ = finite_slopes(own, rows, cores)
+    np.testing.assert_array_equal(actual.mean, np.repeat(cores.mean, EACH, axis=0))
+    np.testing.assert_array_equal(actual.scale, 0)
 
 
 @pytest.mark.hard_cases
@@ -187,9 +192,9 @@ def test_a_core_without_a_direction_has_the_axes_of_the_world(dtype):
     rows, own = rows_and_own(dtype)
     cores = some_gaussians(ROWS, dtype)
     cores = cores._replace(quaternion=put(np.zeros((ROWS, 4)), dtype))
-    found, _ = finite_slopes(own, rows, cores)
+    actual, _ = finite_slopes(own, rows, cores)
     places = np.asarray(cores.mean)[:, None] + np.asarray(cores.scale)[:, None] * own[0]
-    np.testing.assert_allclose(found.mean, places.reshape(-1, 3), atol=EXACT[dtype])
+    np.testing.assert_allclose(actual.mean, places.reshape(-1, 3), atol=EXACT[dtype])
 
 
 @pytest.mark.hard_cases
@@ -197,11 +202,11 @@ def test_one_in_the_middle_with_nothing_of_its_own_is_the_row(dtype):
     rows, own = rows_and_own(dtype, count=1)
     own = jax.tree.map(jnp.zeros_like, own)  # a turn of zero is the identity
     cores = splats.activate(rows)
-    found, slopes = finite_slopes(own, rows, cores)
-    np.testing.assert_array_equal(found.mean, cores.mean)
-    np.testing.assert_array_equal(found.scale, cores.scale)
-    np.testing.assert_array_equal(found.opacity, cores.opacity)
-    same_turn(found.quaternion, rotations(cores.quaternion), atol=10 * EXACT[dtype])
+    actual, slopes = finite_slopes(own, rows, cores)
+    np.testing.assert_array_equal(actual.mean, cores.mean)
+    np.testing.assert_array_equal(actual.scale, cores.scale)
+    np.testing.assert_array_equal(actual.opacity, cores.opacity)
+    same_turn(actual.quaternion, rotations(cores.quaternion), atol=10 * EXACT[dtype])
     assert np.abs(slopes[0].offset).max() > 0  # it leaves the middle where it is asked
 
 
@@ -213,8 +218,8 @@ def test_an_inactive_row_carries_inactive_ones_without_a_slope(dtype):
     still = jax.jit(carried.canonical_children)(rows, own)
     active = splats.active_mask(still).reshape(ROWS, EACH)
     np.testing.assert_array_equal(active.all(axis=1), np.arange(ROWS) != 1)
-    found, slopes = finite_slopes(own, rows, splats.activate(rows))
-    np.testing.assert_array_equal(found.opacity.reshape(ROWS, EACH)[1], 0)
+    actual, slopes = finite_slopes(own, rows, splats.activate(rows))
+    np.testing.assert_array_equal(actual.opacity.reshape(ROWS, EACH)[1], 0)
     np.testing.assert_array_equal(slopes[0].opacity_logit[1], 0)
 
 
@@ -236,12 +241,12 @@ def games(corners):
 def test_a_triangle_is_the_gaussian_of_games(dtype):
     corners = np.random.default_rng(3).normal(size=(9, 3, 3)).astype(dtype)
     flat, opaque = put(np.full(9, 1e-3), dtype), put(np.full(9, 0.5), dtype)
-    found = jitted(faces.gaussians)(put(corners), flat, opaque)
+    actual = jitted(faces.gaussians)(put(corners), flat, opaque)
     turn, long, wide = zip(*map(games, corners.astype(float)), strict=True)
     scale = np.stack([np.full(9, 1e-3), long, wide], axis=1)
-    np.testing.assert_allclose(found.scale, scale, rtol=EXACT[dtype])
-    np.testing.assert_array_equal(found.mean, corners[:, 0])
-    same_turn(found.quaternion, turn, atol=10 * EXACT[dtype])
+    np.testing.assert_allclose(actual.scale, scale, rtol=EXACT[dtype])
+    np.testing.assert_array_equal(actual.mean, corners[:, 0])
+    same_turn(actual.quaternion, turn, atol=10 * EXACT[dtype])
 
 
 def test_corners_of_gaussians_give_the_gaussians_again(float64):
@@ -250,17 +255,17 @@ def test_corners_of_gaussians_give_the_gaussians_again(float64):
     def there_and_back(cores):
         return faces.gaussians(faces.corners(cores), cores.scale[:, 0], cores.opacity)
 
-    found = jitted(there_and_back)(cores)
-    np.testing.assert_allclose(found.scale, cores.scale, rtol=1e-12)
-    same_turn(found.quaternion, rotations(cores.quaternion), atol=1e-7)
+    actual = jitted(there_and_back)(cores)
+    np.testing.assert_allclose(actual.scale, cores.scale, rtol=1e-12)
+    same_turn(actual.quaternion, rotations(cores.quaternion), atol=1e-7)
     weights = np.random.default_rng(1).normal(size=(6, 7))
 
     def value(corners):
         made = faces.gaussians(corners, cores.scale[:, 0], cores.opacity)
         return jnp.sum(weights * jnp.concatenate([made.quaternion, made.scale], -1))
 
-    drawn = np.random.default_rng(5).normal(size=(6, 3, 3))
-    assert directional_error(value, drawn, step=1e-6) < 1e-6
+    gaussians = np.random.default_rng(5).normal(size=(6, 3, 3))
+    assert directional_error(value, gaussians, step=1e-6) < 1e-6
 
 
 ALONG = np.array([1.0, 2.0, -2.0]) / 3
@@ -329,8 +334,8 @@ def test_rows_that_carry_grow_train_and_are_drawn_by_what_they_carry(tmp_path):
     # What a file holds is what is drawn.
     rows = instants.splats_at(model, state)(0.5)
     assert files.save(tmp_path / "scene.ply", rows) == after["gaussians"]
-    drawn = instants.gaussians_at(model, state)(0.5)
-    np.testing.assert_allclose(rows.mean, drawn.mean, atol=1e-6)
+    gaussians = instants.gaussians_at(model, state)(0.5)
+    np.testing.assert_allclose(rows.mean, gaussians.mean, atol=1e-6)
 
 
 @pytest.mark.slow

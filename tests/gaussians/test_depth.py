@@ -33,18 +33,18 @@ def two_depths(dtype, seed=0):
     return *depths, known
 
 
-def expected_loss(kind, drawn, truth):
+def expected_loss(kind, rendered, truth):
     """From the known pixels alone, in NumPy and SciPy."""
     if kind == "metric":
-        return np.abs(drawn - truth).mean() / truth.mean()
+        return np.abs(rendered - truth).mean() / truth.mean()
     if kind == "correlation":
-        return 1 - scipy.stats.pearsonr(drawn, truth).statistic
+        return 1 - scipy.stats.pearsonr(rendered, truth).statistic
 
     def normalized(x):
         middle = np.sort(x)[(len(x) - 1) // 2]
         return (x - middle) / np.abs(x - middle).mean()
 
-    return np.abs(normalized(drawn) - normalized(truth)).mean()
+    return np.abs(normalized(rendered) - normalized(truth)).mean()
 
 
 @pytest.mark.parametrize(
@@ -52,11 +52,11 @@ def expected_loss(kind, drawn, truth):
 )  # even and odd numbers of known pixels
 @pytest.mark.parametrize("kind", depth.KINDS)
 def test_losses_are_those_of_the_known_pixels(kind, seed, dtype):
-    drawn, truth, known = two_depths(dtype, seed)
-    value = FORMS[kind](drawn, truth, known)
+    rendered, truth, known = two_depths(dtype, seed)
+    value = FORMS[kind](rendered, truth, known)
     chosen = np.asarray(known)
     expected = expected_loss(
-        kind, *(np.asarray(x, np.float64)[chosen] for x in (drawn, truth))
+        kind, *(np.asarray(x, np.float64)[chosen] for x in (rendered, truth))
     )
     assert value.dtype.name == dtype
     tolerance = {"float32": 1e-5, "float64": 1e-12}[dtype]
@@ -65,22 +65,22 @@ def test_losses_are_those_of_the_known_pixels(kind, seed, dtype):
 
 @pytest.mark.parametrize("kind", depth.KINDS)
 def test_gradients(kind, float64):
-    drawn, truth, known = map(put, two_depths("float64"))
+    rendered, truth, known = map(put, two_depths("float64"))
 
-    def total(drawn):
-        return depth.FORMS[kind](drawn, truth, known)
+    def total(rendered):
+        return depth.FORMS[kind](rendered, truth, known)
 
-    assert gradients.directional_error(total, drawn, step=1e-6) < 1e-6
-    assert not SLOPES[kind](drawn, truth, known)[1][~np.asarray(known)].any()
+    assert gradients.directional_error(total, rendered, step=1e-6) < 1e-6
+    assert not SLOPES[kind](rendered, truth, known)[1][~np.asarray(known)].any()
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("kind", ["affine", "correlation"])
 @pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (50.0, 20.0)])
 def test_scale_and_offset_are_not_seen(kind, scale, offset, dtype):
-    drawn, truth, known = two_depths(dtype)
-    value, _ = SLOPES[kind](drawn, truth, known)
-    moved, _ = SLOPES[kind](drawn * scale + offset, truth, known)
+    rendered, truth, known = two_depths(dtype)
+    value, _ = SLOPES[kind](rendered, truth, known)
+    moved, _ = SLOPES[kind](rendered * scale + offset, truth, known)
     tolerance = {"float32": 2e-5, "float64": 1e-11}[dtype]
     np.testing.assert_allclose(moved, value, rtol=tolerance)
     same, _ = SLOPES[kind](truth * 3 + 1, truth, known)
@@ -127,12 +127,12 @@ def hard_images():
 @pytest.mark.parametrize("kind", depth.KINDS)
 @pytest.mark.parametrize("name", hard_images())
 def test_images_that_say_little_stay_finite(kind, name, dtype):
-    drawn, truth, known = hard_images()[name]
-    value, grad = SLOPES[kind](drawn.astype(dtype), truth.astype(dtype), known)
+    rendered, truth, known = hard_images()[name]
+    value, grad = SLOPES[kind](rendered.astype(dtype), truth.astype(dtype), known)
     assert np.isfinite(value)
     assert np.isfinite(grad).all()
     # Slopes are at most a thousand over the depth of the image.
-    assert np.abs(grad).max() * np.median(drawn) < 1100
+    assert np.abs(grad).max() * np.median(rendered) < 1100
     if known.sum() < 2 and kind != "metric":
         assert value == 0
         assert not np.asarray(grad).any()
@@ -161,17 +161,17 @@ def test_the_nth_smallest_is_that_of_a_sort(count, dtype):
 
 def some_shot(dtype="float32", size=(5, 6)):
     rng = np.random.default_rng(0)
-    drawn, truth = rng.uniform(1, 4, (2, *size)).astype(dtype)
+    rendered, truth = rng.uniform(1, 4, (2, *size)).astype(dtype)
     color = np.zeros((*size, 3), dtype)
     return Observation(
-        Rendering(color, np.ones(size, dtype), drawn), color, None, truth
+        Rendering(color, np.ones(size, dtype), rendered), color, None, truth
     )
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def loss_and_slope(spec, shot):
-    def value(drawn, alpha):
-        rendering = shot.rendering._replace(depth=drawn, alpha=alpha)
+    def value(rendered, alpha):
+        rendering = shot.rendering._replace(depth=rendered, alpha=alpha)
         terms = depth.terms(spec, shot._replace(rendering=rendering))
         return weighted_sum(terms), values(terms)
 
@@ -193,13 +193,13 @@ def test_what_is_unknown_or_see_through_teaches_nothing(kind, space, dtype):
     valid = np.ones((5, 6), bool)
     valid[4] = False
     shot.depth[0] = [0.0, np.nan, np.inf, -1.0, 2.0, 2.0]
-    drawn = shot.rendering.depth
+    rendered = shot.rendering.depth
     shot.rendering.alpha[0, 4:] = 0.4, 0.0
-    drawn[4, 0], drawn[0, 5] = np.nan, 0.0
+    rendered[4, 0], rendered[0, 5] = np.nan, 0.0
     masked = shot._replace(valid=valid)
     (value, metrics), grads = loss_and_slope(spec, masked)
     ours, truth = (
-        np.asarray(x, np.float64)[1:4].ravel() for x in (drawn, masked.depth)
+        np.asarray(x, np.float64)[1:4].ravel() for x in (rendered, masked.depth)
     )
     if space == "disparity":
         ours, truth = 1 / ours, 1 / truth

@@ -50,9 +50,9 @@ def test_a_frame_is_drawn_in_its_light_and_one_never_seen_between_its_neighbors(
     neutral = variants.without_effects(SPEC, metadata, ("exposure",), False)
     plain = rendered(neutral, state, [*rows, between])
     assert plain.max() > 0.1
-    drawn = rendered(model, state, [*rows, between])
+    exposed = rendered(model, state, [*rows, between])
     shares = np.array([*range(6), 2.5]) - 2.5  # beside the mean
-    for image, shown, share in zip(plain, drawn, shares, strict=True):
+    for image, shown, share in zip(plain, exposed, shares, strict=True):
         expected = image + share * (image @ CHANGE[:, :3].T + CHANGE[:, 3])
         np.testing.assert_allclose(shown, expected, atol=2e-6)
     assert variants.parts(SPEC, metadata).appearance
@@ -75,9 +75,9 @@ def test_what_all_exposures_have_in_common_changes_no_image(dtype):
         left, right, share = places[one]
         expected = (1 - share) * table[left] + share * table[right] - table.mean(axis=0)
         for common in (0.0, 0.5):
-            found = change(table + np.asarray(common, dtype), places, np.int32(one))
-            assert found.dtype == dtype
-            np.testing.assert_allclose(found, expected, atol=1e-6)
+            actual = change(table + np.asarray(common, dtype), places, np.int32(one))
+            assert actual.dtype == dtype
+            np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 def test_half_a_frame_tells_the_light_of_the_other_half(built):

@@ -71,24 +71,24 @@ def slowly(spec, rows, views):
 )
 def test_floaters_are_those_of_the_definition(spec, rng):
     rows, views = scene(rng)
-    found = floaters.find(spec, rows, views, SIZE)
+    actual = floaters.find(spec, rows, views, SIZE)
     expected = slowly(spec, rows, views)
     assert 0 < expected.sum() < 250
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(actual, expected)
 
 
 @pytest.mark.hard_cases
 def test_behind_all_cameras_or_in_one_nothing_is_near(rng):
     rows, views = scene(rng, 12)
     at_camera = jnp.broadcast_to(jnp.asarray(views.position[0]), (12, 3))
-    found = floaters.find(
+    actual = floaters.find(
         FloaterSpec(0.5, 0), rows._replace(mean=at_camera), views, SIZE
     )
     # At the center of a camera there is no direction, and no division by zero.
-    assert not found.any()
+    assert not actual.any()
     behind = rows._replace(mean=rows.mean + 1000)
-    found = floaters.find(FloaterSpec(0.5, 1), behind, views, SIZE)
-    np.testing.assert_array_equal(found, [False] * 10 + [True] * 2)
+    actual = floaters.find(FloaterSpec(0.5, 1), behind, views, SIZE)
+    np.testing.assert_array_equal(actual, [False] * 10 + [True] * 2)
 
 
 def test_an_event_prunes_a_floater(rng):

@@ -28,7 +28,7 @@ def own_points(spec, capture):
 
 
 @pytest.mark.parametrize(
-    ("source", "points", "own", "drawn"),
+    ("source", "points", "own", "random"),
     [
         ("auto", 150, 150, 30),
         ("auto", 99, 0, 70),
@@ -37,10 +37,10 @@ def own_points(spec, capture):
         ("random", 150, 0, 70),
     ],
 )
-def test_the_source_decides_whose_points_they_are(source, points, own, drawn):
+def test_the_source_decides_whose_points_they_are(source, points, own, random):
     spec, capture = dataclasses.replace(SPEC, source=source), capture_with(points)
     assert own_points(spec, capture) == own
-    assert initialization.initial_count(spec, capture) == own + drawn
+    assert initialization.initial_count(spec, capture) == own + random
 
 
 def test_a_start_is_never_empty():

@@ -39,14 +39,16 @@ def test_the_file_of_an_instant_is_drawn_as_the_scene_is_then(swaying):
     view = view._replace(time=put(0.4, "float32"))
     still = scene.build(scenes.TINY_SPLATS, model.spec[1])
     size = (20, 15)
-    drawn = jitted(model.render, static_argnums=2)(state.params, view, size, state.step)
+    rendering = jitted(model.render, static_argnums=2)(
+        state.params, view, size, state.step
+    )
     params = state.params._replace(rows={"splats": rows}, nets={})
     posed = jitted(still.render, static_argnums=2)(params, view, size, state.step)
-    np.testing.assert_allclose(posed.color, drawn.color, atol=1e-5)
+    np.testing.assert_allclose(posed.color, rendering.color, atol=1e-5)
     canonical = jitted(still.render, static_argnums=2)(
         state.params._replace(nets={}), view, size, state.step
     )
-    assert np.abs(canonical.color - drawn.color).max() > 0.05
+    assert np.abs(canonical.color - rendering.color).max() > 0.05
 
 
 def test_a_sequence_is_numbered_files_of_the_same_rows(swaying, tmp_path):

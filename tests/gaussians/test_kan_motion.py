@@ -253,8 +253,8 @@ def test_equal_and_wild_embeddings_have_finite_slopes(dtype):
 def test_the_effect_tells_its_rows_networks_and_rates():
     filled = bound.motion(SMALL, frames=FRAMES)
     first = rows.from_points(np.zeros((12, 3)), np.zeros((12, 3)))
-    drawn, nets = jitted(filled.init)(jax.random.key(0), first)
-    assert drawn.shape == (12, 6)
+    embedding, nets = jitted(filled.init)(jax.random.key(0), first)
+    assert embedding.shape == (12, 6)
     assert isinstance(nets, KanMotion)
     assert not any_nonzero(nets.field.heads)  # no motion yet
     assert nets.times.any()

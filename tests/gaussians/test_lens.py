@@ -82,17 +82,17 @@ def test_footprints_equal_the_moments_of_what_opencv_projects(name, dtype, rng):
         np.full(count, 0.5),
     )
     camera = camera_at(model, coefficients, dtype)
-    drawn = project(put(gaussians, dtype), camera, SIZE, LENS)
-    assert (drawn.extent_px > 0).all()
+    footprints = project(put(gaussians, dtype), camera, SIZE, LENS)
+    assert (footprints.extent_px > 0).all()
     exact = camera_at(model, coefficients, "float64")
     means, covariances = moments(model, coefficients, exact, gaussians)
     on_screen = ((means > 0) & (means < SIZE)).all(axis=1)
     assert on_screen.sum() > 20
-    found = covariance_of(drawn.whitening) - GSPLAT.eps2d * np.eye(2)
+    actual = covariance_of(footprints.whitening) - GSPLAT.eps2d * np.eye(2)
     size = np.trace(covariances, axis1=1, axis2=2)
-    error = np.linalg.norm(found - covariances, axis=(1, 2)) / (size + 0.01)
+    error = np.linalg.norm(actual - covariances, axis=(1, 2)) / (size + 0.01)
     assert error[on_screen].max() < 0.02
-    shift = np.linalg.norm(drawn.mean_px - means, axis=1)
+    shift = np.linalg.norm(footprints.mean_px - means, axis=1)
     assert (shift / np.sqrt(size))[on_screen].max() < 0.03
 
 
@@ -134,9 +134,11 @@ def test_projection_gradient_equals_central_differences(name, float64, rng):
     sharp = dataclasses.replace(LENS, antialiased=True)
 
     def loss(gaussians, camera):
-        drawn = projection.project(gaussians, camera, SIZE, sharp)
-        fields = (drawn.mean_px, drawn.whitening, drawn.opacity[:, None])
-        return jnp.sum(jnp.concatenate([*fields, drawn.depth[:, None]], 1) * weights)
+        footprints = projection.project(gaussians, camera, SIZE, sharp)
+        fields = (footprints.mean_px, footprints.whitening, footprints.opacity[:, None])
+        return jnp.sum(
+            jnp.concatenate([*fields, footprints.depth[:, None]], 1) * weights
+        )
 
     assert gradients.directional_error(loss, gaussians, camera) < 1e-6
 
@@ -164,12 +166,12 @@ HARD = {
 @jitted
 def footprint_and_gradient(gaussians, camera):
     def loss(gaussians):
-        drawn = projection.project(gaussians, camera, SIZE, LENS)
-        total = jnp.sum(drawn.mean_px) + jnp.sum(drawn.whitening)
-        return total + jnp.sum(drawn.opacity + drawn.depth), drawn
+        footprints = projection.project(gaussians, camera, SIZE, LENS)
+        total = jnp.sum(footprints.mean_px) + jnp.sum(footprints.whitening)
+        return total + jnp.sum(footprints.opacity + footprints.depth), footprints
 
-    gradient, drawn = jax.grad(loss, has_aux=True)(gaussians)
-    return drawn, gradient
+    gradient, footprints = jax.grad(loss, has_aux=True)(gaussians)
+    return footprints, gradient
 
 
 def drawn_one(lens, dtype, mean=(0, 0, 2), scale=(0.1,) * 3):
@@ -184,9 +186,9 @@ def drawn_one(lens, dtype, mean=(0, 0, 2), scale=(0.1,) * 3):
 @pytest.mark.parametrize("name", HARD)
 def test_hard_gaussians_are_drawn_or_left_out_and_finite(name, lens, dtype):
     changes, shown = HARD[name]
-    drawn, gradient = drawn_one(LENSES[lens], dtype, **changes)
-    assert finite((drawn, gradient))
-    assert (drawn.extent_px > 0).all() == shown
+    footprints, gradient = drawn_one(LENSES[lens], dtype, **changes)
+    assert finite((footprints, gradient))
+    assert (footprints.extent_px > 0).all() == shown
     if not shown:
         assert not any(leaf.any() for leaf in gradient)
 
@@ -210,19 +212,19 @@ def test_what_the_lens_folds_back_into_the_image_is_left_out(dtype):
 @pytest.mark.parametrize("degrees", [60, 80, 88, 89.9])
 def test_a_strong_fisheye_draws_up_to_the_rim(degrees, dtype):
     lens = LENSES["fisheye"][0], (0.0, 0.0, 0.0, 0.0)
-    drawn, gradient = drawn_one(lens, dtype, at_degrees(degrees, 0.5), (1e-3,) * 3)
-    assert finite((drawn, gradient))
+    footprints, gradient = drawn_one(lens, dtype, at_degrees(degrees, 0.5), (1e-3,) * 3)
+    assert finite((footprints, gradient))
     expected = K[0, 2] + K[0, 0] * np.radians(degrees)
     bound = {"float32": 1e-4, "float64": 1e-9}[dtype]
-    np.testing.assert_allclose(drawn.mean_px[0, 0], expected, atol=bound)
+    np.testing.assert_allclose(footprints.mean_px[0, 0], expected, atol=bound)
 
 
 @pytest.mark.hard_cases
 def test_a_large_gaussian_beside_the_image_keeps_a_bounded_footprint(dtype):
     """The Jacobian is taken inside the widened image: 12 px here, not 100."""
     lens = LENSES["tangential"][0], (0.3, 0.2, 0.0, 0.0)
-    drawn, _ = drawn_one(lens, dtype, mean=(4.0, 0.0, 2.0), scale=(0.1,) * 3)
-    assert 0 < drawn.extent_px[0, 0] < 60
+    footprints, _ = drawn_one(lens, dtype, mean=(4.0, 0.0, 2.0), scale=(0.1,) * 3)
+    assert 0 < footprints.extent_px[0, 0] < 60
 
 
 def arguments(rng, dtype, count=60):

@@ -219,8 +219,8 @@ def test_noise_has_the_covariance_squared_and_spares_the_opaque(dtype):
     strength = 0.5 / (1 + math.exp(100 * (0.001 - 0.005)))
     # R S² Rᵀ of a standard normal draw: through R for Rᵀ it would be distributed alike.
     covariance = turn * variance @ turn.T
-    drawn = np.asarray(jax.random.normal(KEY, noise.shape, dtype), np.float64)
-    np.testing.assert_allclose(noise, strength * drawn @ covariance, atol=1e-6)
+    normal = np.asarray(jax.random.normal(KEY, noise.shape, dtype), np.float64)
+    np.testing.assert_allclose(noise, strength * normal @ covariance, atol=1e-6)
 
     logit = np.repeat([0.0, -6.0, rows.INACTIVE_LOGIT], [400, 200, 200]).astype(dtype)
     noise = np.abs(shake(KEY, splats._replace(opacity_logit=logit), 1e-6, SPEC))

@@ -96,11 +96,13 @@ camera_flow = jitted(motion_flow.camera_flow)
 
 def test_the_gaussians_flow_is_that_of_a_loop(dtype):
     here, there = scattered(dtype)
-    drawn = drawn_flow(here, there, pair(dtype), SIZE, GSPLAT)
-    assert drawn.flow.dtype == dtype
+    rendered = drawn_flow(here, there, pair(dtype), SIZE, GSPLAT)
+    assert rendered.flow.dtype == dtype
     atol = {"float32": 2e-4, "float64": 1e-9}[dtype]  # px
-    for found, expected in zip(drawn, by_hand(here, there, pair(dtype)), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=atol)
+    for actual, expected in zip(
+        rendered, by_hand(here, there, pair(dtype)), strict=True
+    ):
+        np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=atol)
 
 
 @pytest.mark.parametrize("depth", [0.5, 3.0, 80.0])
@@ -108,8 +110,8 @@ def test_a_still_scene_goes_as_its_points_project(depth, dtype):
     """A pixel's point by SciPy's rotations, through both pinholes."""
     both = pair(dtype)
     width, height = SIZE
-    found = camera_flow(both, np.full((height, width), depth, dtype))
-    assert found.dtype == dtype
+    actual = camera_flow(both, np.full((height, width), depth, dtype))
+    assert actual.dtype == dtype
     first, second = jax.tree.map(lambda x: np.asarray(x, np.float64), both)
     turn = scipy.spatial.transform.Rotation.from_matrix(first.camera_from_world)
     for line, column in np.ndindex(height, width):
@@ -120,37 +122,37 @@ def test_a_still_scene_goes_as_its_points_project(depth, dtype):
         goes = second.focal_px * seen[:2] / seen[2] + second.principal_point_px
         rtol = {"float32": 2e-5, "float64": 1e-12}[dtype]
         np.testing.assert_allclose(
-            found[line, column], goes - pixel, rtol=rtol, atol=20 * rtol
+            actual[line, column], goes - pixel, rtol=rtol, atol=20 * rtol
         )
 
 
 def test_what_stands_still_has_no_flow_of_its_own(dtype):
     """Whatever the cameras do; so all of its optical flow is the camera's."""
     here, _ = scattered(dtype)
-    drawn = drawn_flow(here, here, pair(dtype), SIZE, GSPLAT)
+    rendered = drawn_flow(here, here, pair(dtype), SIZE, GSPLAT)
     # Both ends are projected, each in an order of its own.
-    assert np.abs(drawn.flow).max() < {"float32": 2e-5, "float64": 1e-13}[dtype]
-    assert drawn.share.max() > 0.5
+    assert np.abs(rendered.flow).max() < {"float32": 2e-5, "float64": 1e-13}[dtype]
+    assert rendered.share.max() > 0.5
 
 
 def test_the_error_is_that_of_a_loop(dtype, rng):
-    drawn, things = rng.normal(size=(2, 9, 13, 2)).astype(dtype) * 4
-    drawn[2, 3, 0], things[2, 3, 0] = 100, 1  # held to one width of 13
+    rendered, things = rng.normal(size=(2, 9, 13, 2)).astype(dtype) * 4
+    rendered[2, 3, 0], things[2, 3, 0] = 100, 1  # held to one width of 13
     seen = rng.uniform(size=(9, 13)) < 0.6
     seen[2, 3] = True
     things[~seen] = np.nan
-    found = jitted(motion_flow.error)(drawn, things, seen)
+    actual = jitted(motion_flow.error)(rendered, things, seen)
     terms = []
     for line, column in np.argwhere(seen):
         for axis, side in enumerate(SIZE):
             one, other = (
                 np.clip(flow[line, column, axis] / side, -1, 1)
-                for flow in (np.float64(drawn), np.float64(things))
+                for flow in (np.float64(rendered), np.float64(things))
             )
             terms.append(abs(one - other))
     rtol = {"float32": 1e-6, "float64": 1e-14}[dtype]
-    np.testing.assert_allclose(found, np.mean(terms), rtol=rtol)
-    for slope in jitted(jax.grad(motion_flow.error, (0, 1)))(drawn, things, seen):
+    np.testing.assert_allclose(actual, np.mean(terms), rtol=rtol)
+    for slope in jitted(jax.grad(motion_flow.error, (0, 1)))(rendered, things, seen):
         assert np.isfinite(slope).all()
         assert slope.any()
         np.testing.assert_array_equal(slope[~seen], 0)
@@ -170,9 +172,9 @@ HARD = {
 @jitted
 def error_and_slopes(here, there, both):
     def total(here, there):
-        drawn = motion_flow.render_flow(here, there, both, SIZE, GSPLAT)
-        things = motion_flow.camera_flow(both, drawn.depth)
-        return motion_flow.error(drawn.flow, things, drawn.share > 0.01)
+        rendered = motion_flow.render_flow(here, there, both, SIZE, GSPLAT)
+        things = motion_flow.camera_flow(both, rendered.depth)
+        return motion_flow.error(rendered.flow, things, rendered.share > 0.01)
 
     return jax.value_and_grad(total, (0, 1))(here, there)
 
@@ -212,8 +214,8 @@ def test_gradients_go_through_both_ends_and_no_weight(float64):
     assert gradients.directional_error(total, here, there) < 1e-5
 
     def blended(here, there):
-        drawn = motion_flow.render_flow(here, there, both, SIZE, GSPLAT)
-        return jnp.sum(drawn.flow * weight)
+        rendered = motion_flow.render_flow(here, there, both, SIZE, GSPLAT)
+        return jnp.sum(rendered.flow * weight)
 
     slopes = jitted(jax.grad(blended, (0, 1)))(here, there)
     assert all(one.mean.any() and one.scale.any() for one in slopes)
@@ -260,9 +262,9 @@ def test_flow_pulls_both_cameras_by_how_they_move_and_no_weight(float64):
     @jax.jit
     def held(screws):
         first, second = (cameras.take(refined(screws), row) for row in (0, 1))
-        drawn = motion_flow.render_flow(here, there, (still, second), SIZE, GSPLAT)
-        things = shift[0] - motion_flow.camera_flow((first, second), drawn.depth)
-        return motion_flow.error(drawn.flow, things, drawn.share >= 0.5)
+        rendered = motion_flow.render_flow(here, there, (still, second), SIZE, GSPLAT)
+        things = shift[0] - motion_flow.camera_flow((first, second), rendered.depth)
+        return motion_flow.error(rendered.flow, things, rendered.share >= 0.5)
 
     slopes, known = jitted(jax.grad(term, has_aux=True))(screws)
     assert 0.3 < known < 1

@@ -126,12 +126,12 @@ def test_a_trained_scene_is_drawn_from_what_was_prepared_without_noise(name, flo
     motion, (params, effects) = MOTIONS[name], scene_and_effect(name)
 
     @jitted
-    def drawn(params, time):
+    def render(params, time):
         ready = deformation.prepare(effects, params)
         canonical = splats.activate(params.rows["splats"])
         return deformation.deform(effects, params, ready, time), canonical
 
-    rows, canonical = drawn(params, np.asarray(0.5))
+    rows, canonical = render(params, np.asarray(0.5))
     reads = params.rows.get(kan_motion.NAME, canonical.mean)
     network = params.nets[motion.module.NAME]
     offsets = deformed[name](network, motion.spec, reads, np.asarray(0.5))
@@ -174,9 +174,9 @@ def test_a_scene_in_training_moves_with_noise_after_its_warm_up(name, float64):
 def test_moving_gaussians(name, float64):
     """Places and logarithms of scales add; rotation vectors turn as SciPy's do."""
     module, gaussians = MOTIONS[name].module, some_gaussians(6)
-    drawn = np.random.default_rng(1).normal(size=(3, 6, 3))
+    samples = np.random.default_rng(1).normal(size=(3, 6, 3))
     fields = module.Offsets._fields
-    move, log_scale, turn = drawn
+    move, log_scale, turn = samples
     named = {"log_scale": log_scale, "turn": turn}
     offsets = put(module.Offsets(*(named.get(field, move) for field in fields)))
     moved = jitted(module.apply)(gaussians, offsets)

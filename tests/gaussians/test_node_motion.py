@@ -129,18 +129,20 @@ def test_slopes_are_those_of_differences(name, float64):
     gaussians = some_gaussians(ROWS, "float64")
     params = params_of(gaussians, "float64", name=name)
     weights = np.random.default_rng(1).normal(size=(ROWS, 7))
-    found = effect(name).state(params)
+    actual = effect(name).state(params)
     seen, begun = FrameCondition(put(0.3, "float64")), jnp.int32(OF[name].warm_up)
-    context = PenaltyContext(seen, begun, jax.random.key(0), None, state=found)
+    context = PenaltyContext(seen, begun, jax.random.key(0), None, state=actual)
 
     def value(nodes, mean, time):
         rows = params.rows["splats"]._replace(mean=mean)
         scene = Params({"splats": rows}, {NAME: nodes})
         there = moved(scene, gaussians._replace(mean=mean), time, name)
-        drawn = jnp.sum(weights * jnp.concatenate([there.mean, there.quaternion], -1))
+        weighted = jnp.sum(
+            weights * jnp.concatenate([there.mean, there.quaternion], -1)
+        )
         terms = motion_of(name).loss(MotionParams(shared=nodes), context)
         assert set(terms) == {{"nodes": "unrigidity", "masked": "moving"}[name]}
-        return drawn + sum(term.value for term in terms.values())
+        return weighted + sum(term.value for term in terms.values())
 
     args = params.nets[NAME], gaussians.mean, put(0.47, "float64")
     assert directional_error(value, *args, step=1e-6) < 1e-6
@@ -295,12 +297,12 @@ def test_links_are_to_what_stays_near_over_the_video(dtype):
 def test_what_is_found_when_rows_change_is_what_is_found_when_drawn():
     gaussians = some_gaussians(ROWS, "float32")
     params = params_of(gaussians, "float32")
-    found, ready = effect().state(params), effect().prepare(params)
-    np.testing.assert_array_equal(found.near, ready.near)
+    actual, ready = effect().state(params), effect().prepare(params)
+    np.testing.assert_array_equal(actual.near, ready.near)
     distance = np.linalg.norm(
         np.asarray(gaussians.mean)[:, None] - params.nets[NAME].position, axis=2
     )
-    np.testing.assert_array_equal(found.near, np.argsort(distance, axis=1)[:, :3])
+    np.testing.assert_array_equal(actual.near, np.argsort(distance, axis=1)[:, :3])
 
 
 def test_training_searches_only_when_rows_change():
@@ -309,8 +311,8 @@ def test_training_searches_only_when_rows_change():
     params = params_of(gaussians, "float32")
     condition = FrameCondition(put(0.4, "float32"), jnp.int32(50), jax.random.key(0))
     effects = (effect(),)
-    found = effect().state(params)
-    other = found._replace(near=(found.near + 1) % NODES)
+    actual = effect().state(params)
+    other = actual._replace(near=(actual.near + 1) % NODES)
 
     def run(states):
         return deformation.deform_in_training(
@@ -318,7 +320,7 @@ def test_training_searches_only_when_rows_change():
         )
 
     fresh = run(None).mean
-    np.testing.assert_array_equal(run({NAME: found}).mean, fresh)
+    np.testing.assert_array_equal(run({NAME: actual}).mean, fresh)
     assert np.abs(run({NAME: other}).mean - fresh).max() > 1e-2
 
 

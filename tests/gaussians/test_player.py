@@ -71,7 +71,7 @@ def moving_scene():
 
 
 @functools.cache
-def drawn(row, time):
+def render(row, time):
     """The model's image from a camera of the capture."""
     _, state, capture = moving_scene()
     view = evaluation.view_of(capture, row)._replace(time=jnp.asarray(time, "float32"))
@@ -88,7 +88,7 @@ def renderer():
 def page(tmp_path_factory):
     path = tmp_path_factory.mktemp("player") / "player.html"
     model, state, capture = moving_scene()
-    poster = evaluation.to_uint8(drawn(0, 0.0))
+    poster = evaluation.to_uint8(render(0, 0.0))
     title = "</script>{{data}}"
     written = representation.player(path, title, SPEC, model, state, capture, poster)
     assert written.path == path
@@ -148,7 +148,7 @@ def test_what_is_in_the_page_draws_as_the_model_does(page, time):
         view = evaluation.view_of(capture, row)
         image = compiled_render()(gaussians, colors, view.camera)
         # 73 dB at an instant; halfway between two, 64: a straight line for an arc.
-        assert psnr(image, drawn(int(row), time)) > 60
+        assert psnr(image, render(int(row), time)) > 60
     active = int(splats.active_mask(state.params.rows["splats"]).sum())
     assert len(colors) <= active - BEHIND
 
@@ -313,8 +313,8 @@ def test_a_browser_draws_what_the_model_does(opened, time):
     opened.wait_for_function("(time) => player.ready && player.time === time", arg=time)
     image = image_of(opened)
     assert image.shape == (30, 40, 3)
-    assert psnr(image, drawn(0, time)) > 50  # 8 bits alone leave 59
-    assert psnr(image, drawn(0, 1.0 - time)) < 30
+    assert psnr(image, render(0, time)) > 50  # 8 bits alone leave 59
+    assert psnr(image, render(0, 1.0 - time)) < 30
 
 
 @pytest.mark.full

@@ -96,8 +96,8 @@ def test_slopes_of_the_loss_are_those_of_differences():
             own = screws - jnp.mean(screws, axis=0)  # the rest has no slope
             moved = refined(own, frames.cameras, metadata.depth)
             seen = view._replace(camera=cameras.take(moved, 0))
-            drawn = model.render(state.params, seen, EVEN.size, state.step)
-            return jnp.mean((drawn.color - truth) ** 2)
+            rendering = model.render(state.params, seen, EVEN.size, state.step)
+            return jnp.mean((rendering.color - truth) ** 2)
 
         screws = 1e-3 * np.random.default_rng(1).normal(size=(6, 6))
         assert gradients.directional_error(loss, screws, directions=2) < 1e-4
@@ -122,7 +122,7 @@ def test_cameras_that_are_off_are_found():
     whole = scene.build(dataclasses.replace(plain, poses=None), metadata)
     state = whole.init(EVEN, jax.random.key(0))
     trained = loop.fit(whole, state, evaluation.frames_of(EVEN), steps=150).state
-    drawn = drawn_from(whole, trained, EVEN)
+    rendering = drawn_from(whole, trained, EVEN)
     rng = np.random.default_rng(0)
     error = 0.02 * rng.normal(size=(len(EVEN.train), 6)).astype(np.float32)
     error -= error.mean(axis=0)
@@ -140,10 +140,10 @@ def test_cameras_that_are_off_are_found():
     began = model.init(EVEN, jax.random.key(0))
     nets = {**trained.params.nets, **began.params.nets}
     began = began._replace(params=trained.params._replace(nets=nets))
-    frames = evaluation.frames_of(EVEN)._replace(cameras=off, images=drawn)
+    frames = evaluation.frames_of(EVEN)._replace(cameras=off, images=rendering)
     ended = loop.fit(model, began, frames, steps=120).state
-    found = refined(ended.params.nets["poses"], off, metadata.depth)
-    assert misplaced_px(found, true) < misplaced_px(off, true) / 5
+    actual = refined(ended.params.nets["poses"], off, metadata.depth)
+    assert misplaced_px(actual, true) < misplaced_px(off, true) / 5
 
 
 @jax.jit
@@ -168,15 +168,15 @@ def test_frames_between_lie_between_and_other_cameras_stay():
     rng = np.random.default_rng(2)
     screws = (1e-2 * rng.normal(size=(5, 6))).astype(np.float32)
     screws = screws - screws.mean(axis=0)
-    found = pose_refinement.refine_capture(jnp.asarray(screws), one, DEPTH).cameras
+    actual = pose_refinement.refine_capture(jnp.asarray(screws), one, DEPTH).cameras
     learned = refined(screws, cameras.take(EVEN.cameras, rows), DEPTH)
-    np.testing.assert_allclose(found.position[rows], learned.position, atol=1e-6)
+    np.testing.assert_allclose(actual.position[rows], learned.position, atol=1e-6)
     between = (screws[2] + screws[3]) / 2  # times are even
     turn, place = by_scipy(between, cameras.take(EVEN.cameras, held))
-    np.testing.assert_allclose(found.position[held], place, atol=1e-6)
-    np.testing.assert_allclose(found.camera_from_world[held], turn, atol=1e-6)
+    np.testing.assert_allclose(actual.position[held], place, atol=1e-6)
+    np.testing.assert_allclose(actual.camera_from_world[held], turn, atol=1e-6)
     # The second camera, of which nothing was learned.
-    np.testing.assert_array_equal(found.position[6], EVEN.cameras.position[6])
+    np.testing.assert_array_equal(actual.position[6], EVEN.cameras.position[6])
 
 
 def test_without_refinement_a_capture_is_as_it_was():

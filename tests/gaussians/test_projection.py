@@ -73,21 +73,23 @@ def test_footprints_equal_the_textbook_with_skew_aspect_and_offset(spec, dtype, 
     with jax.enable_x64(True):
         exact, exact_camera = put((gaussians, camera), "float64")
         mean_px, covariance, depth, opacity = textbook(exact, exact_camera, spec)
-    drawn = (depth > 0.02) & (opacity > 1.01 / 255)
-    assert np.asarray(footprint.extent_px)[drawn].all()
+    rendered = (depth > 0.02) & (opacity > 1.01 / 255)
+    assert np.asarray(footprint.extent_px)[rendered].all()
     dilated = covariance + spec.eps2d * np.eye(2)
     size = np.trace(dilated, axis1=1, axis2=2)[:, None, None]
     # Relative: depths down to 0.02 magnify the rounding of x - c in float32.
     tolerance = {"float32": 2e-4, "float64": 1e-12}[dtype]
     error = np.abs(covariance_of(footprint.whitening) - dilated) / size
-    assert error[drawn].max() < tolerance
+    assert error[rendered].max() < tolerance
     shift = np.abs(footprint.mean_px - mean_px) / (np.abs(mean_px) + 1)
-    assert shift[drawn].max() < tolerance
-    np.testing.assert_allclose(footprint.opacity[drawn], opacity[drawn], rtol=tolerance)
+    assert shift[rendered].max() < tolerance
+    np.testing.assert_allclose(
+        footprint.opacity[rendered], opacity[rendered], rtol=tolerance
+    )
     ln = 2 * np.log(opacity * 255)[:, None]
     box = np.sqrt(np.maximum(ln, 0) * np.stack([dilated[:, 0, 0], dilated[:, 1, 1]], 1))
     np.testing.assert_allclose(
-        footprint.extent_px[drawn], box[drawn], rtol=50 * tolerance
+        footprint.extent_px[rendered], box[rendered], rtol=50 * tolerance
     )
 
 
@@ -189,10 +191,10 @@ def footprint_and_slopes(gaussians, camera):
 def test_what_lies_beside_the_image_is_visible_and_not_seen(rng):
     """Density control divides by the views in which a Gaussian was."""
     gaussians = some_gaussians(rng, 300, "float32")
-    drawn, visible, seen = footprints_seen(
+    footprints, visible, seen = footprints_seen(
         gaussians, camera_at([0.0, 0.0, -3.0], "float32")
     )
-    places, reaches = np.asarray(drawn.mean_px), np.asarray(drawn.extent_px)
+    places, reaches = np.asarray(footprints.mean_px), np.asarray(footprints.extent_px)
     expected = [
         x + right > 0 and x - right < 64 and y + down > 0 and y - down < 48
         for (x, y), (right, down) in zip(places, reaches, strict=True)
@@ -203,8 +205,8 @@ def test_what_lies_beside_the_image_is_visible_and_not_seen(rng):
 
 @jitted
 def footprints_seen(gaussians, camera):
-    drawn = projection.project(gaussians, camera, SIZE, GSPLAT)
-    return drawn, drawn.visible, drawn.overlaps_image(SIZE)
+    footprints = projection.project(gaussians, camera, SIZE, GSPLAT)
+    return footprints, footprints.visible, footprints.overlaps_image(SIZE)
 
 
 @pytest.mark.hard_cases

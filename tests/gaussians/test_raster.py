@@ -136,7 +136,7 @@ def test_summed_weights_are_the_sums_of_the_dense_images_of_one_gaussian_each(
     assert np.count_nonzero(result) > COUNT / 2
 
 
-def drawn(mean_px, sigma_px, opacity, depth, values, dtype):
+def rendered(mean_px, sigma_px, opacity, depth, values, dtype):
     """Image and what is left behind a few round Gaussians of one size.
 
     With rows that are not drawn they are `COUNT`, and go through the shared program.
@@ -155,7 +155,7 @@ def drawn(mean_px, sigma_px, opacity, depth, values, dtype):
 
 @pytest.mark.hard_cases
 def test_equal_depths_are_drawn_in_order_of_index(dtype):
-    image, _ = drawn([[4.0, 4.0]] * 3, 3.0, 0.9, [2.0] * 3, np.eye(3), dtype)
+    image, _ = rendered([[4.0, 4.0]] * 3, 3.0, 0.9, [2.0] * 3, np.eye(3), dtype)
     front, middle, back = image[4, 4]
     assert front > 5 * middle > 20 * back > 0
 
@@ -163,7 +163,9 @@ def test_equal_depths_are_drawn_in_order_of_index(dtype):
 @pytest.mark.hard_cases
 def test_two_opaque_gaussians_stop_a_pixel(dtype):
     """0.99 twice leaves 1e-4: float32 rounds it below the threshold, float64 above."""
-    image, left = drawn([[4.5, 4.5]] * 3, 100.0, 1.0, [1.0, 2.0, 3.0], np.eye(3), dtype)
+    image, left = rendered(
+        [[4.5, 4.5]] * 3, 100.0, 1.0, [1.0, 2.0, 3.0], np.eye(3), dtype
+    )
     expected = {"float32": [0.99, 0, 0], "float64": [0.99, 0.0099, 0]}[dtype]
     np.testing.assert_allclose(image[4, 4], expected, atol=1e-6)
     np.testing.assert_allclose(image.sum(-1) + left, np.ones(SIZE[::-1]), atol=1e-6)
@@ -187,7 +189,7 @@ def test_nothing_to_draw_leaves_the_background(count, dtype, rng):
 
 @pytest.mark.hard_cases
 def test_a_nan_value_shows_where_its_gaussian_is(dtype):
-    image, left = drawn([[4.0, 4.0]], 0.8, 1.0, [1.0], [[np.nan, 1, 1]], dtype)
+    image, left = rendered([[4.0, 4.0]], 0.8, 1.0, [1.0], [[np.nan, 1, 1]], dtype)
     assert np.isnan(image[4, 4, 0])
     assert not np.isnan(image[:, 8:]).any()
     assert not np.isnan(left).any()
@@ -217,14 +219,14 @@ depth_order = jitted(binning.depth_order)
 @pytest.mark.parametrize("count", [1000, *full(1, 70_000)])
 def test_depth_order_is_a_stable_sort(count, dtype, rng):
     """70000 rows leave 15 bits a pass, so wide ranges take three."""
-    drawn = rng.random(count) < 0.8
+    rendered = rng.random(count) < 0.8
     for depth in (
         np.exp(rng.normal(0, 15, count)),
         rng.integers(-3, 3, count),
     ):
         depth = depth.astype(dtype)
-        order = depth_order(depth, drawn.astype(np.int32))
-        expected = np.argsort(np.where(drawn, depth, np.inf), kind="stable")
+        order = depth_order(depth, rendered.astype(np.int32))
+        expected = np.argsort(np.where(rendered, depth, np.inf), kind="stable")
         np.testing.assert_array_equal(order, expected)
 
 

@@ -34,13 +34,13 @@ def make_camera(dtype, size=(53, 37), skew=3.0, turn=0.2):
 def make_gaussians(rng, count, dtype):
     opacity = rng.uniform(0.05, 0.9, count)
     opacity[::3] = 0.9999  # above the clamp
-    drawn = Gaussians(
+    cloud = Gaussians(
         rng.normal(size=(count, 3)) * [1.5, 1.2, 1.5],
         rng.normal(size=(count, 4)),
         np.exp(rng.normal(-2.0, 0.7, (count, 3))),
         opacity,
     )
-    return put(drawn, dtype)
+    return put(cloud, dtype)
 
 
 def weights_for(rng, size, channels):

@@ -128,10 +128,10 @@ def test_a_frame_has_the_harmonics_of_its_step():
     render = jitted(model.render, static_argnums=2)
 
     def color(params, step):
-        drawn = render(params, view, (20, 15), np.int32(step))
-        assert drawn.depth.shape == drawn.alpha.shape == (15, 20)
-        assert finite(drawn)
-        return drawn.color
+        rendering = render(params, view, (20, 15), np.int32(step))
+        assert rendering.depth.shape == rendering.alpha.shape == (15, 20)
+        assert finite(rendering)
+        return rendering.color
 
     every = scenes.TINY_SPLATS.sh_every  # below it no band but the first has trained
     np.testing.assert_array_equal(color(shaded, every - 1), color(plain, every))
@@ -185,10 +185,10 @@ def test_what_was_observed_is_rendered_however_small_its_units_are(unit):
     model = scene.build(scenes.TINY_SPLATS, scene.metadata_of(small))
     state = model.init(small, jax.random.key(KEY))
     view = evaluation.view_of(small, 0)
-    drawn = jax.jit(model.render, static_argnums=2)(
+    rendering = jax.jit(model.render, static_argnums=2)(
         state.params, view, small.size, state.step
     )
-    assert np.asarray(drawn.alpha).mean() > 0.1
+    assert np.asarray(rendering.alpha).mean() > 0.1
 
 
 # Fields of the parts that count steps.

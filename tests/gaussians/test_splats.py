@@ -31,13 +31,13 @@ def some_splats(rng, count=7, dtype="float64", degree=3):
 
 def test_activation_is_exp_and_logistic(rng, dtype):
     splats = some_splats(rng, dtype=dtype)
-    drawn = jitted(rows.activate)(splats)
+    activated = jitted(rows.activate)(splats)
     scale = np.exp(np.asarray(splats.log_scale, np.float64))
     opacity = 1 / (1 + np.exp(-np.asarray(splats.opacity_logit, np.float64)))
     tolerance = {"float32": 3e-7, "float64": 1e-15}[dtype]
-    np.testing.assert_allclose(drawn.scale, scale, rtol=tolerance)
-    np.testing.assert_allclose(drawn.opacity, opacity, rtol=tolerance)
-    assert {leaf.dtype.name for leaf in drawn} == {dtype}
+    np.testing.assert_allclose(activated.scale, scale, rtol=tolerance)
+    np.testing.assert_allclose(activated.opacity, opacity, rtol=tolerance)
+    assert {leaf.dtype.name for leaf in activated} == {dtype}
 
 
 def test_activation_gradient(rng, float64):
@@ -45,8 +45,8 @@ def test_activation_gradient(rng, float64):
 
     def total(log_scale, logit):
         moved = splats._replace(log_scale=log_scale, opacity_logit=logit)
-        drawn = rows.activate(moved)
-        return jnp.sum(drawn.scale**2) + jnp.sum(drawn.opacity**3)
+        activated = rows.activate(moved)
+        return jnp.sum(activated.scale**2) + jnp.sum(activated.opacity**3)
 
     error = gradients.directional_error(total, splats.log_scale, splats.opacity_logit)
     assert error < 1e-8

@@ -40,13 +40,13 @@ def test_what_moves_on_cubics_and_fades_by_bells_comes_back():
     instants, capture = learned(), scenes.tiny_capture()
     curves = splatv.decode(splatv.encode(splatv.fit(instants), capture))
     for row, time in enumerate(TIMES):
-        drawn = splatv.at(curves, float(time))
+        gaussians = splatv.at(curves, float(time))
         seen = instants.opacity[row] > 0.02
         # Half floats of coefficients up to 2 over half a video, 8 bits of opacity
-        off = np.abs(np.asarray(drawn.mean) - instants.mean[row])
+        off = np.abs(np.asarray(gaussians.mean) - instants.mean[row])
         assert off[seen].max() < 2e-3
-        np.testing.assert_allclose(drawn.opacity, instants.opacity[row], atol=4e-3)
-        turn = np.asarray(drawn.quaternion)
+        np.testing.assert_allclose(gaussians.opacity, instants.opacity[row], atol=4e-3)
+        turn = np.asarray(gaussians.quaternion)
         turn = turn / np.linalg.norm(turn, axis=1, keepdims=True)
         # 9 degrees to either side: the unit quaternion is off a line by 1e-3 at most
         np.testing.assert_allclose(turn, instants.quaternion[row], atol=2e-3)
@@ -75,15 +75,15 @@ def test_a_row_of_the_file_is_what_its_shader_unpacks():
     since = time - center
     first, second, third = (np.array(halves[16 + 3 * k : 19 + 3 * k]) for k in range(3))
     mean = np.array([x, y, z]) + since * (first + since * (second + since * third))
-    drawn = splatv.at(curves, time)
-    np.testing.assert_allclose(mean, drawn.mean[index], atol=1e-3)
+    gaussians = splatv.at(curves, time)
+    np.testing.assert_allclose(mean, gaussians.mean[index], atol=1e-3)
     turning = np.array(halves[26:30]) * since
     np.testing.assert_allclose(
-        np.array(halves[6:10]) + turning, drawn.quaternion[index], atol=1e-3
+        np.array(halves[6:10]) + turning, gaussians.quaternion[index], atol=1e-3
     )
     np.testing.assert_allclose(halves[10:13], 0.05, rtol=1e-3)
     alpha = words[31] / 255 * math.exp(-((since / width) ** 2))
-    assert alpha == pytest.approx(float(drawn.opacity[index]), abs=4e-3)
+    assert alpha == pytest.approx(float(gaussians.opacity[index]), abs=4e-3)
     # The rest of the texture draws nothing: a bell of no width.
     assert texture[64 * 3 :].count(0) == len(texture) - 64 * 3
 

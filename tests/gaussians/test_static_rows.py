@@ -130,8 +130,8 @@ def test_what_comes_and_goes_is_drawn_while_it_is_there(rng):
     parts = static_rows.split(params, fading, TIMES, 0.01)
     assert parts.row_index.moves[:4].tolist() == [True, True, False, False]
     early = np.float32(TIMES[1])
-    drawn = jax.jit(static_rows.deform, static_argnums=1)(parts, fading, early)
-    np.testing.assert_allclose(drawn.opacity, fading(params, early).opacity, rtol=1e-6)
+    there = jax.jit(static_rows.deform, static_argnums=1)(parts, fading, early)
+    np.testing.assert_allclose(there.opacity, fading(params, early).opacity, rtol=1e-6)
     # To be hidden, a row must move: one at rest stays, however short it is there.
     parts = static_rows.split(params, fading, TIMES, 0.01, fading=False)
     assert parts.row_index.moves[:4].tolist() == [True, False, False, False]

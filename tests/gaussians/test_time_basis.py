@@ -60,7 +60,7 @@ def moving(name):
     return run
 
 
-def drawn(name, dtype, size=0.5):
+def random_basis(name, dtype, size=0.5):
     """Rows and networks that move things, and the Gaussians."""
     effect, rng = effect_of(name), np.random.default_rng(0)
     key, gaussians = jax.random.key(0), some_gaussians(ROWS, dtype)
@@ -105,7 +105,7 @@ def expected(name, rows, nets, time):
 @by_name
 @pytest.mark.parametrize("time", [0.0, 0.37, 0.4, 1.0])
 def test_gaussians_move_as_their_rows_say(name, time, dtype):
-    (rows, nets), gaussians = drawn(name, dtype)
+    (rows, nets), gaussians = random_basis(name, dtype)
     there = moving(name)(rows, nets, gaussians, put(time, dtype))
     host = jax.tree.map(np.asarray, (rows, nets, gaussians))
     shift, turn, share = expected(name, *host[:2], float(np.dtype(dtype).type(time)))
@@ -123,7 +123,7 @@ def test_gaussians_move_as_their_rows_say(name, time, dtype):
 
 @by_name
 def test_slopes_are_those_of_differences(name, float64):
-    (rows, nets), gaussians = drawn(name, "float64")
+    (rows, nets), gaussians = random_basis(name, "float64")
     weights = np.random.default_rng(1).normal(size=(ROWS, 8))
 
     def value(rows, nets, mean, opacity, time):

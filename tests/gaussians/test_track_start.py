@@ -298,8 +298,8 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
 def test_a_video_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypatch):
     monkeypatch.setattr(usable_paths, "CACHE", tmp_path)
     capture = two_planes.make(card=lambda time: (0.1, 0.0), frames=8)
-    drawn = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 3), (300, 3))
-    points = PointCloud(drawn.astype("f4"), np.zeros((300, 3), "u1"))
+    positions = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 3), (300, 3))
+    points = PointCloud(positions.astype("f4"), np.zeros((300, 3), "u1"))
     capture = dataclasses.replace(capture, points=points)
     spec = small_scene(start=StartSpec(motion="tracks"))
     model = scene.build(spec, scene.metadata_of(capture))

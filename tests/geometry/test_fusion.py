@@ -57,8 +57,8 @@ def test_derivatives_of_every_kind_are_those_of_plain_indices(float64, rng):
         yield jax.jit(jax.vmap(jax.hessian(value)))(vectors)
         yield jax.jit(jax.vmap(jax.jacrev(jax.jacrev(value))))(vectors)
 
-    for found, expected in zip(each(ours), each(plain), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+    for actual, expected in zip(each(ours), each(plain), strict=True):
+        np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-14)
     assert gradients.directional_error(lambda x: ours(x) @ toward, vectors[0]) < 1e-7
 
 

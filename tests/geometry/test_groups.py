@@ -52,7 +52,7 @@ def everything(twists, points):
 
 
 def test_exponentials_logarithms_and_products_are_those_of_scipy(dtype):
-    found = everything(jnp.asarray(TWISTS, dtype), jnp.asarray(POINTS, dtype))
+    actual = everything(jnp.asarray(TWISTS, dtype), jnp.asarray(POINTS, dtype))
     rotation = EXACT[:, :3, :3]
     moved = np.einsum("tij,pnj->pti", EXACT[:, :3, :3], POINTS) + EXACT[:, :3, 3]
     scipys = {
@@ -70,13 +70,13 @@ def test_exponentials_logarithms_and_products_are_those_of_scipy(dtype):
     # A few ulps of entries up to 2; the angle itself is rounded, to 2e-7 at pi.
     bound = {"float32": 2e-6, "float64": 4e-15}[dtype]
     for name, value in scipys.items():
-        assert found[name].dtype == dtype
-        assert np.max(np.abs(found[name] - value)) < bound, name
+        assert actual[name].dtype == dtype
+        assert np.max(np.abs(actual[name] - value)) < bound, name
     # Below a half turn the logarithm inverts; at it the axis may have either sign.
     below = TWISTS[:, 0] < 2
-    assert np.max(np.abs(found["twists"] - TWISTS)[below]) < 4 * bound
+    assert np.max(np.abs(actual["twists"] - TWISTS)[below]) < 4 * bound
     again = scipy.spatial.transform.Rotation.from_rotvec(
-        np.array(found["vectors"], np.float64)
+        np.array(actual["vectors"], np.float64)
     ).as_matrix()
     bound = {"float32": 2e-6, "float64": 1e-14}[dtype]
     assert np.max(np.abs(again - rotation)) < bound
@@ -146,13 +146,13 @@ def together(every):
 def test_leading_axes_give_what_a_loop_over_them_gives(float64, rng):
     """Of three items: a batch as long as a point was once taken for one."""
     batch = (3,)
-    drawn = {
+    cases = {
         function: tuple(rng.normal(size=batch + shape) for shape in shapes)
         for function, shapes in SHAPES.items()
     }
-    many = together(list(drawn.values()))
+    many = together(list(cases.values()))
     for place in np.ndindex(*batch):
-        single = together([tuple(x[place] for x in a) for a in drawn.values()])
+        single = together([tuple(x[place] for x in a) for a in cases.values()])
         for function, one, all_ in zip(SHAPES, single, many, strict=True):
             for a, b in zip(*map(jax.tree.leaves, (one, all_)), strict=True):
                 np.testing.assert_allclose(

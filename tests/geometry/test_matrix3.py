@@ -65,12 +65,12 @@ def exact(matrix, signed):
 
 def matrices(rng):
     """Near rigid, moderate, wild, thin and mirrored; 20 each."""
-    drawn = rng.normal(size=(5, 20, 3, 3))
-    drawn[0] = np.eye(3) + 1e-2 * drawn[0]
-    drawn[1] = np.eye(3) + 0.3 * drawn[1]
-    drawn[3] = drawn[3] @ np.diag([1, 1, 1e-1])
-    drawn[4] = -(np.abs(np.linalg.det(drawn[4]))[:, None, None] ** -1) * drawn[4]
-    return drawn.reshape(-1, 3, 3)
+    samples = rng.normal(size=(5, 20, 3, 3))
+    samples[0] = np.eye(3) + 1e-2 * samples[0]
+    samples[1] = np.eye(3) + 0.3 * samples[1]
+    samples[3] = samples[3] @ np.diag([1, 1, 1e-1])
+    samples[4] = -(np.abs(np.linalg.det(samples[4]))[:, None, None] ** -1) * samples[4]
+    return samples.reshape(-1, 3, 3)
 
 
 @pytest.mark.hard_cases
@@ -220,9 +220,9 @@ def test_stretches_far_apart_keep_their_slopes_and_curvature(signed, dtype):
     log1p from the larger stretch down flips the sign of a curvature at a ratio of 5e6
     and is NaN at 5e7; a second stretch taken for rounding flips that of a slope.
     """
-    drawn = np.asarray(STRETCHED, dtype)
-    drawn = drawn if signed else abs(drawn)
-    cases = [(stretches, i, j) for stretches in drawn for i, j in SIDES]
+    samples = np.asarray(STRETCHED, dtype)
+    samples = samples if signed else abs(samples)
+    cases = [(stretches, i, j) for stretches in samples for i, j in SIDES]
     ways = np.zeros((len(cases), 3, 3), dtype)
     for way, (_, i, j) in zip(ways, cases, strict=True):
         way[i, j] = way[j, i] = 1

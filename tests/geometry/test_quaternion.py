@@ -41,7 +41,7 @@ def round_trip(w):
     return unit, quaternion.log(unit), quaternion.log(-unit), grad(w)
 
 
-def drawn(rng, count=50):
+def random_quaternions(rng, count=50):
     """Random unit quaternions, wxyz, with w of both signs."""
     values = rng.normal(size=(count, 4))
     return values / np.linalg.norm(values, axis=-1, keepdims=True)
@@ -52,7 +52,11 @@ def scipy_of(wxyz):
 
 
 def test_matrices_products_and_rotated_vectors_match_scipy(dtype, rng):
-    second, first, vectors = drawn(rng), drawn(rng), rng.normal(size=(50, 3))
+    second, first, vectors = (
+        random_quaternions(rng),
+        random_quaternions(rng),
+        rng.normal(size=(50, 3)),
+    )
     given = (np.asarray(x, dtype) for x in (second, first, vectors))
     product, undone, rotated = composed(*given)
     truth = (scipy_of(second) * scipy_of(first)).as_matrix()
@@ -112,7 +116,7 @@ def test_log_inverts_exp_below_pi_for_both_signs(angle, dtype, rng):
 
 
 def test_slerp_matches_scipy(dtype, rng):
-    ends = drawn(rng, 2)
+    ends = random_quaternions(rng, 2)
     line = scipy.spatial.transform.Slerp([0, 1], scipy_of(ends))
     shares = np.repeat([0.0, 0.2, 0.7, 1.0], 2)
     start, end = (np.tile(x, (8, 1)).astype(dtype) for x in ends)
@@ -124,7 +128,7 @@ def test_slerp_matches_scipy(dtype, rng):
 
 @pytest.mark.full
 def test_gradients(float64, rng):
-    one, other = drawn(rng, 2)
+    one, other = random_quaternions(rng, 2)
     weight, vector = (jnp.asarray(rng.normal(size=size)) for size in ((3, 3), 3))
 
     def everything(one, other):

@@ -195,13 +195,13 @@ def of_every_kind(rows):
 def run(prepared, start, frames, folder=None, steps=STEPS):
     """Train, hold the run to its promises and look at its image."""
     trained = hostile.train(prepared.model, start, frames, folder, steps=steps)
-    image = drawn(prepared, trained.result.state, frames, 0)
+    image = rendered_frame(prepared, trained.result.state, frames, 0)
     for name, leaf in image._asdict().items():
         assert np.isfinite(np.asarray(leaf)).all(), name
     return trained
 
 
-def drawn(prepared, state, frames, row):
+def rendered_frame(prepared, state, frames, row):
     """The view of that frame."""
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     view = View(camera, frames.times[row], frames.appearance[row])
@@ -212,7 +212,9 @@ def falls(prepared, frames, trained):
     """The last frame's mean squared error after training, over that before it."""
     truth = np.float32(frames.images[-1]) / 255
     before, after = (
-        np.mean((np.asarray(drawn(prepared, state, frames, -1).color) - truth) ** 2)
+        np.mean(
+            (np.asarray(rendered_frame(prepared, state, frames, -1).color) - truth) ** 2
+        )
         for state in (prepared.start, trained.result.state)
     )
     return after / before

@@ -39,16 +39,16 @@ def test_an_equinox_module_is_a_network():
         return eqx.nn.MLP(3, 2, 8, 1, key=key)
 
     expected = jax.vmap(eqx.filter_jit(make)(jax.random.key(3)))(X)
-    found = trained(adapters.equinox(make), one_by_one=True)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    actual = trained(adapters.equinox(make), one_by_one=True)
+    np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_linen_module_is_a_network():
     linen = pytest.importorskip("flax.linen")
     module = linen.Dense(2)
     expected, _ = module.init_with_output(jax.random.key(3), X)
-    found = trained(adapters.linen(module, X), one_by_one=False)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    actual = trained(adapters.linen(module, X), one_by_one=False)
+    np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-6)
     with pytest.raises(
         TypeError, match=r"`module` must be a flax\.linen\.Module, got a"
     ):
@@ -62,8 +62,8 @@ def test_an_nnx_module_is_a_network():
         return nnx.Linear(3, 2, rngs=rngs)
 
     expected = make(nnx.Rngs(jax.random.key(3)))(X)
-    found = trained(adapters.nnx(make), one_by_one=False)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    actual = trained(adapters.nnx(make), one_by_one=False)
+    np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_library_that_is_missing_is_named(monkeypatch):

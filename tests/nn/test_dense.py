@@ -17,10 +17,10 @@ def plain(inputs, weight):
 def test_it_is_the_product_of_rows(shape, dtype, rng):
     inputs = rng.normal(size=shape).astype(dtype)
     weight = rng.normal(size=(shape[-1], 2)).astype(dtype)
-    found = dense.product(inputs, weight)
-    assert found.dtype == dtype
+    actual = dense.product(inputs, weight)
+    assert actual.dtype == dtype
     np.testing.assert_allclose(
-        found, inputs @ weight, rtol={"float32": 1e-5, "float64": 1e-13}[dtype]
+        actual, inputs @ weight, rtol={"float32": 1e-5, "float64": 1e-13}[dtype]
     )
 
 
@@ -38,8 +38,8 @@ def test_slopes_under_vmaps_are_those_of_plain_products(rows, float64, rng):
 
         return jax.jit(jax.grad(value, (0, 1)))(inputs, weight)
 
-    for found, expected in zip(slopes(dense.product), slopes(plain), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+    for actual, expected in zip(slopes(dense.product), slopes(plain), strict=True):
+        np.testing.assert_allclose(actual, expected, rtol=1e-10, atol=1e-12)
 
 
 def test_a_matrix_for_each_example_and_slopes_of_slopes(float64, rng):
@@ -56,8 +56,8 @@ def test_a_matrix_for_each_example_and_slopes_of_slopes(float64, rng):
         several = jax.vmap(both, (None, 0))(inputs[0], weights)
         return shared, several, jax.vmap(both)(inputs, weights)
 
-    found, expected = each(dense.product), each(plain)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, 1e-10), found, expected)
+    actual, expected = each(dense.product), each(plain)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, 1e-10), actual, expected)
     error = gradients.directional_error(
         lambda x, weight: strain(dense.product, x, weight), inputs[0], weights[0]
     )

@@ -36,17 +36,17 @@ def test_a_level_is_trilinear_between_its_vertices(dtype, rng):
     values = table.reshape(5, 5, 5, 2).transpose(2, 1, 0, 3)  # x runs fastest
     oracle = scipy.interpolate.RegularGridInterpolator(axes, values)
     places = rng.uniform(size=(40, 3))
-    found = [level(table, place.astype(dtype), cells) for place in places]
+    actual = [level(table, place.astype(dtype), cells) for place in places]
     atol = 2e-6 if dtype == "float32" else 1e-14
-    np.testing.assert_allclose(found, oracle(places), rtol=0, atol=atol)
+    np.testing.assert_allclose(actual, oracle(places), rtol=0, atol=atol)
 
 
 def test_vertices_without_a_row_of_their_own_share_by_the_hash(rng):
     vertices = rng.integers(0, 4096, (50, 3))
-    found = jax.jit(grids.vertex_row, static_argnums=(1, 2))(
+    actual = jax.jit(grids.vertex_row, static_argnums=(1, 2))(
         vertices.astype(np.int32), 4096, 1000
     )
-    assert found.tolist() == [hashed(vertex, 1000) for vertex in vertices]
+    assert actual.tolist() == [hashed(vertex, 1000) for vertex in vertices]
 
 
 @pytest.mark.parametrize("edge", [0.0, 0.25, 0.5, 1.0])
@@ -54,10 +54,10 @@ def test_cells_agree_where_they_meet(edge, dtype, rng):
     table = rng.normal(size=(125, 2)).astype(dtype)
     tiny = np.finfo(dtype).eps
     sides = [np.clip(edge * (1 + k * tiny), 0, 1) for k in (-1, 0, 1)]
-    found = np.array(
+    actual = np.array(
         [level(table, np.array([s, 0.4, 0.9], dtype), 4) for s in sides], np.float64
     )
-    assert np.abs(np.diff(found, axis=0)).max() < 20 * tiny
+    assert np.abs(np.diff(actual, axis=0)).max() < 20 * tiny
     at_vertex = level(table, np.full(3, edge, dtype), 4)
     number = round(4 * edge)
     np.testing.assert_array_equal(at_vertex, table[number * (1 + 5 + 25)])
@@ -68,8 +68,8 @@ def test_space_is_contracted_into_twice_the_box(dtype):
         [[0, 0, 0], [1, -1, 0.5], [2, 0, 1], [-4, 4, 1], [1e30, -3, 0]], dtype
     )
     wanted = [[0, 0, 0], [1, -1, 0.5], [1.5, 0, 0.75], [-1.75, 1.75, 0.4375], [2, 0, 0]]
-    found = jax.vmap(grids.contract)(points)
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-6)
+    actual = jax.vmap(grids.contract)(points)
+    np.testing.assert_allclose(actual, wanted, rtol=0, atol=1e-6)
     slopes = jax.vmap(jax.jacfwd(grids.contract))(points)
     assert np.isfinite(slopes).all()
     assert np.abs(np.asarray(slopes[0]) - np.eye(3)).max() == 0
@@ -128,8 +128,8 @@ def test_total_variation_is_the_mean_over_neighbors(float64, rng):
         np.mean((np.delete(grid, 0, axis) - np.delete(grid, -1, axis)) ** 2)
         for axis in range(3)
     ]
-    found = jax.jit(grids.total_variation, static_argnums=1)(table, 2)
-    np.testing.assert_allclose(found, np.mean(pairs), rtol=1e-14)
+    actual = jax.jit(grids.total_variation, static_argnums=1)(table, 2)
+    np.testing.assert_allclose(actual, np.mean(pairs), rtol=1e-14)
     with pytest.raises(ValueError, match="use variation_at_random for hashed levels"):
         grids.total_variation(jnp.asarray(table[:20]), 2)
 
@@ -154,8 +154,8 @@ def test_variation_at_random_is_that_of_every_level_hashed_or_not(float64):
                     level.append((table[row(*vertex)] - table[row(*beyond)]) ** 2)
         pairs.append(np.mean(level))
     vary = jax.jit(grids.variation_at_random, static_argnums=(0, 3))
-    found = vary(SPEC, tables, key, 20_000)
-    assert abs(found / np.mean(pairs) - 1) < 0.02  # six sigmas
+    actual = vary(SPEC, tables, key, 20_000)
+    assert abs(actual / np.mean(pairs) - 1) < 0.02  # six sigmas
 
     def few(tables):
         return grids.variation_at_random(SPEC, tables, key, 5)

@@ -11,7 +11,7 @@ import pytest
 
 from nerfies_jax.nn import mlp
 from nerfies_jax.nn.mlp import HeadSpec, MLPSpec
-from tests import drawn, gradients
+from tests import gradients, random_params
 from tests.oracles import networks
 
 SPEC = MLPSpec(
@@ -43,7 +43,7 @@ apply = jax.jit(mlp.apply, static_argnums=0)
 
 def drawn_net(spec, dtype):
     """With biases that are not zero, so that a lost one shows."""
-    return drawn.params(lambda key: mlp.init(spec, key), dtype, 0.1)
+    return random_params.like(lambda key: mlp.init(spec, key), dtype, 0.1)
 
 
 @pytest.mark.parametrize(

@@ -46,8 +46,8 @@ def expected(spec, levels, places):
         for pair, plane in zip(pairs, (*level.space, *level.time), strict=True):
             axes = [np.linspace(0, 1, side) for side in plane.shape[:2]]
             oracle = scipy.interpolate.RegularGridInterpolator(axes, plane)
-            found = oracle(np.clip(places[:, pair], 0, 1))
-            total = found if total is None else together(total, found)
+            actual = oracle(np.clip(places[:, pair], 0, 1))
+            total = actual if total is None else together(total, actual)
         every.append(total)
     return np.concatenate(every, axis=1)
 
@@ -62,9 +62,9 @@ def test_planes_are_bilinear_between_their_vertices(name, dtype, rng):
     atol = {"float32": 5e-5, "float64": 1e-12}[
         dtype
     ]  # cells of products of six normals
-    found = np.array([encode(spec, levels, place) for place in places])
-    assert found.shape == (20, spec.width(dimensions))
-    np.testing.assert_allclose(found, exact, rtol=0, atol=atol)
+    actual = np.array([encode(spec, levels, place) for place in places])
+    assert actual.shape == (20, spec.width(dimensions))
+    np.testing.assert_allclose(actual, exact, rtol=0, atol=atol)
     if dimensions == 4:
         shared = [encode_at_time(spec, levels, p[:3], p[3]) for p in places]
         np.testing.assert_allclose(shared, exact, rtol=0, atol=atol)
@@ -78,8 +78,8 @@ def test_cells_agree_where_they_meet(vertex, dtype, rng):
     tiny, edge = np.finfo(dtype).eps, vertex / 6
     sides = [np.asarray(edge * (1 + k * tiny), dtype) for k in (-1, 0, 1)]
     read, other = jax.jit(planes.bilinear), np.asarray(0.4, dtype)
-    found = np.array([read(plane, side, other) for side in sides], np.float64)
-    assert np.abs(np.diff(found, axis=0)).max() < 100 * tiny
+    actual = np.array([read(plane, side, other) for side in sides], np.float64)
+    assert np.abs(np.diff(actual, axis=0)).max() < 100 * tiny
     # In float32 a third is not the place of a vertex; 0, 1/2 and 1 are.
     if vertex % 3 == 0:
         here = np.asarray(edge, dtype)
@@ -94,14 +94,14 @@ def test_what_is_outside_is_clamped_or_refused_as_the_spec_says(name, beyond, dt
     for axis in range(len(place)):
         outside, nearest = place.copy(), place.copy()
         outside[axis], nearest[axis] = beyond, np.clip(beyond, 0, 1)
-        found = encode(spec, filled(spec, dtype), outside)
+        actual = encode(spec, filled(spec, dtype), outside)
         if spec.outside == "refuse":
-            assert np.isnan(found).all()
-            found = encode(spec, filled(spec, dtype), nearest)
-            assert np.isfinite(found).all()
+            assert np.isnan(actual).all()
+            actual = encode(spec, filled(spec, dtype), nearest)
+            assert np.isfinite(actual).all()
             continue
         same = encode(spec, filled(spec, dtype), nearest)
-        np.testing.assert_array_equal(found, same)
+        np.testing.assert_array_equal(actual, same)
 
 
 @by_name

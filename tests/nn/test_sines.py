@@ -12,8 +12,8 @@ from nerfies_jax.nn import sines
 @pytest.mark.parametrize("far", [12_801.0, 1e30, np.nan, -np.inf])
 def test_one_number_out_of_reach_leaves_the_others_right(far):
     angles = np.asarray([[0.3, -12_800], [far, 7000.25]], np.float32)
-    found = jax.vmap(sines.sincos)(angles)
-    for ours, exact in zip(found, (mpmath.sin, mpmath.cos), strict=True):
+    actual = jax.vmap(sines.sincos)(angles)
+    for ours, exact in zip(actual, (mpmath.sin, mpmath.cos), strict=True):
         finite = np.isfinite(angles)
         truth = np.full_like(angles, np.nan)
         with mpmath.workdps(60):

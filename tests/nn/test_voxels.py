@@ -34,28 +34,28 @@ def by_hand(table, point):
 def test_features_are_those_of_three_grids_in_one(dtype, rng):
     (table,) = tables = filled(dtype)
     for point in rng.uniform(-1, 1, (20, 3)):
-        found = encode(SPEC, tables, point.astype(dtype))
-        assert found.dtype == dtype
-        assert found.shape == (SPEC.width(3),)
+        actual = encode(SPEC, tables, point.astype(dtype))
+        assert actual.dtype == dtype
+        assert actual.shape == (SPEC.width(3),)
         atol = 2e-5 if dtype == "float32" else 1e-13
-        np.testing.assert_allclose(found, by_hand(table, point), rtol=0, atol=atol)
+        np.testing.assert_allclose(actual, by_hand(table, point), rtol=0, atol=atol)
 
 
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("corner", [-1.0, 0.0, 1.0, 9.0])
 def test_all_distances_meet_at_a_vertex_of_all(corner, dtype):
     (table,) = tables = filled(dtype)
-    found = encode(SPEC, tables, np.full(3, corner, dtype))
+    actual = encode(SPEC, tables, np.full(3, corner, dtype))
     vertex = {-1.0: 0, 0.0: 4}.get(corner, 8) * (1 + 9 + 81)
-    np.testing.assert_array_equal(found[:6], np.tile(table[vertex], 3))
+    np.testing.assert_array_equal(actual[:6], np.tile(table[vertex], 3))
 
 
 def test_before_the_last_stride_opens_only_the_vertices_of_wider_ones_learn(rng):
     point = rng.uniform(-1, 1, (64, 3)).astype(np.float32)
 
     def total(table, window):
-        found = jax.vmap(lambda p: voxels.encode(SPEC, (table,), p, window))(point)
-        return jnp.sum(found[:, :6])
+        actual = jax.vmap(lambda p: voxels.encode(SPEC, (table,), p, window))(point)
+        return jnp.sum(actual[:, :6])
 
     slopes = jax.jit(jax.grad(total))
     window = jnp.asarray([1.0, 0.5, 0.0])

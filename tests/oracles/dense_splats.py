@@ -85,9 +85,9 @@ def composite(mean_px, conic, opacity, depth, values, size, spec):
     alpha = jnp.where((raw >= spec.alpha_threshold) & (opacity[order] > 0), alpha, 0)
     passed = jnp.cumprod(1 - alpha, axis=1)
     before = jnp.concatenate([jnp.ones_like(passed[:, :1]), passed[:, :-1]], axis=1)
-    drawn = passed > spec.transmittance_threshold
-    weight = jnp.where(drawn, alpha * before, 0)
-    left = jnp.prod(jnp.where(drawn, 1 - alpha, 1), axis=1)
+    blended = passed > spec.transmittance_threshold
+    weight = jnp.where(blended, alpha * before, 0)
+    left = jnp.prod(jnp.where(blended, 1 - alpha, 1), axis=1)
     return weight @ values[order], left
 
 

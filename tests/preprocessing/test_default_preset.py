@@ -86,13 +86,13 @@ def test_photographs_in_changing_light_get_an_appearance_of_each(stops, monkeypa
     capture = two_planes.make(frames=24)
     evidence = record.cached(capture, representation.CACHE / "evidence")
     apart = evidence._replace(unusable="the camera motion is discontinuous")
-    found = (
+    findings = (
         cannot_tell(MOTION, ""),
         cannot_tell(TRANSIENT, ""),
         Finding(LIGHT, "", "", True, CERTAIN, {"drift_stops": stops}),
     )
     monkeypatch.setattr(representation.record, "cached", lambda *_: apart)
-    monkeypatch.setattr(representation.inspection, "find", lambda *_: found)
+    monkeypatch.setattr(representation.inspection, "find", lambda *_: findings)
     choice = representation.default_preset(capture)
     preset = "splats-collection-small" if stops == 1 else UNTRACKED
     assert choice.preset == preset
@@ -103,9 +103,9 @@ def test_photographs_are_static_if_the_inspection_is_certain(wanted, monkeypatch
     capture = two_planes.make(frames=24)
     evidence = record.cached(capture, representation.CACHE / "evidence")
     apart = evidence._replace(unusable="the camera motion is discontinuous")
-    found = (Finding(MOTION, "none of 400 points moves", "", wanted, CERTAIN),)
+    findings = (Finding(MOTION, "none of 400 points moves", "", wanted, CERTAIN),)
     monkeypatch.setattr(representation.record, "cached", lambda *_: apart)
-    monkeypatch.setattr(representation.inspection, "find", lambda *_: found)
+    monkeypatch.setattr(representation.inspection, "find", lambda *_: findings)
     choice = representation.default_preset(capture)
     assert choice.preset == (UNTRACKED if wanted else "splats-static-small")
     said = "nothing moves: none of 400 points moves" in choice.notes

@@ -104,8 +104,8 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
 
 
 def test_a_mover_that_was_marked_is_no_noise_however_small():
-    _, found = gathered()
-    small = found._replace(moving=np.zeros_like(found.moving))
+    _, evidence = gathered()
+    small = evidence._replace(moving=np.zeros_like(evidence.moving))
     small.moving[:, :2, :5] = True
     assert small.moving.mean() < usable_paths.LEAST_MOVING
     assert "of the pixels show moving" in usable_paths.unusable(small)

@@ -36,6 +36,6 @@ def test_flow_leads_to_the_next_frame_of_the_same_camera_and_past_held_out_ones(
 def test_cameras_of_one_frame_have_no_flow_and_a_note_says_so():
     capture = two_planes.make(frames=3)
     capture = dataclasses.replace(capture, camera_ids=np.arange(3, dtype=np.int32))
-    found = frame_flow.with_flow(capture)
-    assert not found.flow.forward_seen.any()
-    assert found.notes[-1].startswith("no optical flow: no camera has two training")
+    actual = frame_flow.with_flow(capture)
+    assert not actual.flow.forward_seen.any()
+    assert actual.notes[-1].startswith("no optical flow: no camera has two training")

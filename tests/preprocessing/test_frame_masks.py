@@ -10,7 +10,7 @@ from nerfies_jax.preprocessing import frame_masks
 from tests import scenes
 
 
-def found(capture, factor, unusable=""):
+def evidence_of(capture, factor, unusable=""):
     """Evidence of a capture, at images so many times smaller: its first pixel moves
     in every frame, the others as they are drawn.
     """
@@ -26,7 +26,7 @@ def found(capture, factor, unusable=""):
 @pytest.mark.parametrize("factor", [1, 5])
 def test_masks_are_the_evidence_s_at_the_size_of_the_images(factor, monkeypatch):
     bare = dataclasses.replace(scenes.tiny_capture(), moving=None)
-    evidence = found(bare, factor)
+    evidence = evidence_of(bare, factor)
     monkeypatch.setattr(frame_masks.record, "cached", lambda *_: evidence)
     capture = frame_masks.with_masks(bare)
     height, width = bare.images.shape[1:3]
@@ -46,7 +46,7 @@ def test_masks_are_the_evidence_s_at_the_size_of_the_images(factor, monkeypatch)
 
 def test_a_video_that_cannot_be_tracked_stays_without_masks(monkeypatch):
     bare = dataclasses.replace(scenes.tiny_capture(), moving=None)
-    evidence = found(bare, 1, "one image is no video")
+    evidence = evidence_of(bare, 1, "one image is no video")
     monkeypatch.setattr(frame_masks.record, "cached", lambda *_: evidence)
     capture = frame_masks.with_masks(bare)
     assert capture.moving is None

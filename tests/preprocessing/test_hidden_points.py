@@ -43,15 +43,15 @@ def capture_before(hole=HOLE, front=False):
 def test_a_wall_goes_on_behind_what_moves(front):
     """Its plane and colors; an edge before it takes no part."""
     views, still, moving = capture_before(front=front)
-    found = hidden_points.behind(views, still, moving)
-    x, y, z = found.position.astype(float).T
+    actual = hidden_points.behind(views, still, moving)
+    x, y, z = actual.position.astype(float).T
     assert np.abs(z - wall(x, y)[:, 2]).max() < 0.03
     assert np.maximum(np.abs(x), np.abs(y)).max() < HOLE + 0.05
     true = np.round(128 + 70 * x)
-    assert np.abs(found.color[:, 0] - true).mean() < 3
+    assert np.abs(actual.color[:, 0] - true).mean() < 3
     # Wherever the hole is looked at there is a point near; pixels by the edge show it.
     for frame in () if front else (0, 6, 11):
-        pixel, _ = view_set.project(views, frame, found.position)
+        pixel, _ = view_set.project(views, frame, actual.position)
         row, column = np.nonzero(moving[frame])
         hole = np.stack([column, row], -1) + 0.5
         apart = np.linalg.norm(hole[:, None] - pixel, axis=-1).min(1)

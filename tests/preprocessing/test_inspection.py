@@ -113,9 +113,9 @@ def test_exposure_drift_is_separated_from_errors_of_single_groups(drift, noise, 
     errors = noise * rng.normal(size=(exposure.GROUPS, 87, 3))
     errors[2, 20:] += 1.0  # an object hides this group for most of the video
     errors[4, :10] = np.nan
-    found, error = exposure.common_drift(common[None, :, None] + errors)
-    assert abs(found**2 - drift**2) < 0.02**2 + 3 * error * (found + drift)
-    decision, _ = findings.judge(found, exposure.DRIFT_STOPS, error)
+    actual, error = exposure.common_drift(common[None, :, None] + errors)
+    assert abs(actual**2 - drift**2) < 0.02**2 + 3 * error * (actual + drift)
+    decision, _ = findings.judge(actual, exposure.DRIFT_STOPS, error)
     assert decision is wanted
 
 

@@ -20,9 +20,9 @@ def test_what_moves_is_found_in_a_folder_of_images(tmp_path):
     folder.mkdir()
     for row in rows:
         images.write_png(folder / f"{row:03d}.png", capture.images[row])
-    found = masks_without_cameras.moving_in(folder)
-    assert list(found) == [f"{row:03d}.png" for row in rows]
-    masked, true = np.stack(list(found.values())), capture.moving[rows]
+    actual = masks_without_cameras.moving_in(folder)
+    assert list(actual) == [f"{row:03d}.png" for row in rows]
+    masked, true = np.stack(list(actual.values())), capture.moving[rows]
     assert true.mean() > 0.15
     assert masked[true].mean() > 0.5
     assert (~masked[~true]).mean() > 0.85

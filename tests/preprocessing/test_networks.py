@@ -109,10 +109,10 @@ def test_an_image_is_normalized_as_the_files_say(tmp_path, capture, layout):
         ]
         save(path, nodes, shape=last, in_kind=TensorProto.UINT8)
         expected = capture.images[:3].max(-1).astype(float)
-    found = networks.depths(capture, path, folder=tmp_path / "cache")
-    np.testing.assert_allclose(found.depth[:3], shifted(expected), atol=atol)
-    assert np.isnan(found.depth[3]).all()  # held out
-    assert found.inverse is None
+    depths = networks.depths(capture, path, folder=tmp_path / "cache")
+    np.testing.assert_allclose(depths.depth[:3], shifted(expected), atol=atol)
+    assert np.isnan(depths.depth[3]).all()  # held out
+    assert depths.inverse is None
 
 
 def test_results_are_cached_and_attached_with_their_kind(
@@ -148,16 +148,16 @@ def test_segmentation_is_read_from_any_kind_of_output(tmp_path, capture, output)
         with pytest.raises(CaptureError, match=r"3 classes; name those that move"):
             networks.segments(capture, path, folder=tmp_path)
         settings = NetworkSettings(mean=(0.0,) * 3, std=(1.0,) * 3, classes=(1,))
-    found = networks.segments(capture, path, settings, tmp_path / "cache")
+    masks = networks.segments(capture, path, settings, tmp_path / "cache")
     red = capture.images[:3, ..., 0] / 255
     expected = red > middle
     clear = abs(red - middle) > 0.01
-    np.testing.assert_array_equal(found[:3][clear], expected[clear])
-    assert not found[3].any()
+    np.testing.assert_array_equal(masks[:3][clear], expected[clear])
+    assert not masks[3].any()
     if output == "logits":
         files = ExternalFiles(segmentation_model=path)
         attached = external_files.attached(capture, files, tmp_path / "cache")
-        np.testing.assert_array_equal(attached.external.moving, found)
+        np.testing.assert_array_equal(attached.external.moving, masks)
         assert "segmented by a network" in attached.notes[-1]
 
 
@@ -178,9 +178,9 @@ def test_weights_are_read_from_the_folder_of_the_network_only(tmp_path, capture)
         np.float32([1, 0, 0]).tofile(place / "w.bin")
     os.symlink("../w.bin", folder / "link.bin")
     path = outside(folder / "n.onnx", "w.bin")
-    found = networks.depths(capture, path, folder=tmp_path / "cache")
+    depths = networks.depths(capture, path, folder=tmp_path / "cache")
     expected = shifted(normalized(capture, 0))
-    np.testing.assert_allclose(found.depth[:3], expected, atol=1e-5)
+    np.testing.assert_allclose(depths.depth[:3], expected, atol=1e-5)
     for location in ("../w.bin", str(tmp_path / "w.bin"), "link.bin", "none.bin"):
         outside(path, location)
         with pytest.raises(CaptureError, match=r"n\.onnx: ONNX Runtime cannot use it"):

@@ -186,12 +186,12 @@ def test_a_body_is_adjusted_to_what_was_seen_of_it(flat):
         point=body.point + rng.normal(0, 0.01, body.point.shape),
         shift=body.shift + rng.normal(0, 0.01, body.shift.shape),
     )
-    found = bundle.adjusted(seen_from, seen, off)
-    assert np.median(bundle.misses(seen_from, seen, found)) < 0.02
-    factor = np.median(world[known][:, 2] / found.world()[known][:, 2])
-    whole = bundle.scaled(seen_from, found, factor)
+    actual = bundle.adjusted(seen_from, seen, off)
+    assert np.median(bundle.misses(seen_from, seen, actual)) < 0.02
+    factor = np.median(world[known][:, 2] / actual.world()[known][:, 2])
+    whole = bundle.scaled(seen_from, actual, factor)
     assert np.median(np.linalg.norm(whole.world() - world, axis=-1)[known]) < 2e-3
-    assert np.isfinite(found.world()).all()
+    assert np.isfinite(actual.world()).all()
 
 
 def _motion(world):

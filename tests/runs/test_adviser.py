@@ -256,19 +256,19 @@ def photographs(**numbers):
 
 
 def test_photographs_in_changing_light_get_an_appearance_of_each():
-    found = photographs(drift_stops=1.0)
+    actual = photographs(drift_stops=1.0)
     for preset in ("splats-static-small", "splats-tracked-small"):
-        advice = adviser.advise_for(found, preset)
+        advice = adviser.advise_for(actual, preset)
         assert advice.preset == "splats-collection-small"
         assert advice.overrides == ()
-    assert adviser.advise_for(found, "moba-small").preset == "moba-small"
+    assert adviser.advise_for(actual, "moba-small").preset == "moba-small"
     moving = Finding("motion", "", "", True, CERTAIN, {"moving_share": 0.1})
     still = findings(transient_objects=False)
     for other in (
         photographs(drift_stops=0.3),  # as automatic exposure
-        (*found, moving),
-        (*found, *still),
-        found[1:],
+        (*actual, moving),
+        (*actual, *still),
+        actual[1:],
     ):
         assert adviser.advise_for(other, "splats-static-small").preset != advice.preset
 

@@ -20,12 +20,12 @@ def chosen(monkeypatch):
     """Choose effects for given findings; returns the overrides, lines and trials."""
 
     def choose(light, depth, gain=0.0, user=()):
-        found = []
+        findings = []
         for effect, answer in (("appearance codes", light), ("depth", depth)):
             wanted = None if answer == CANNOT_TELL else True
-            found.append(Finding(effect, "numbers", "bound", wanted, answer))
+            findings.append(Finding(effect, "numbers", "bound", wanted, answer))
         monkeypatch.setattr(
-            effect_choice.inspection, "find", lambda *args: tuple(found)
+            effect_choice.inspection, "find", lambda *args: tuple(findings)
         )
         tried = []
 

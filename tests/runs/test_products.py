@@ -132,8 +132,8 @@ def test_a_profile_that_fails_loses_nothing_but_itself():
 
 def test_the_curve_and_the_headline_agree_visibly(tmp_path, monkeypatch):
     """The curve is of a few frames; its figure and caption have the score as well."""
-    drawn = []
-    monkeypatch.setattr(panels, "curve", lambda *parts: drawn.append(parts))
+    curves = []
+    monkeypatch.setattr(panels, "curve", lambda *parts: curves.append(parts))
     capture = scenes.tiny_capture()
     config = RunConfig("splats-static-small")
     run = Run(config, capture, capture, None, None, None, None)
@@ -145,7 +145,7 @@ def test_the_curve_and_the_headline_agree_visibly(tmp_path, monkeypatch):
         trained = Trained(result, None, None, watched)
         path = tmp_path / "curve.png"
         assert curve_figure.save(path, run, trained, score) == path
-        (history, _, mark) = drawn.pop()
+        (history, _, mark) = curves.pop()
         assert history["splats-static-small"].psnr == [20.0, 30.61]
         assert mark == final
         caption = curve_figure.caption(run, trained, score)

@@ -58,15 +58,15 @@ def seen_and_slopes(gaussians, view):
 
 
 @pytest.mark.parametrize(
-    ("what", "edge", "drawn"),
+    ("what", "edge", "rendered"),
     [
         ("near", NEARBY.near, [False, True, True]),
         ("far", NEARBY.far, [True, True, False]),
         ("opacity", NEARBY.alpha_threshold, [False, True, True]),
     ],
 )
-def test_what_is_drawn_ends_within_one_step_of_its_edge(what, edge, drawn, dtype):
-    for value, expected in zip(neighbors(edge, dtype), drawn, strict=True):
+def test_what_is_drawn_ends_within_one_step_of_its_edge(what, edge, rendered, dtype):
+    for value, expected in zip(neighbors(edge, dtype), rendered, strict=True):
         place = {"opacity": value} if what == "opacity" else {"mean": (0, 0, value)}
         footprint, slopes = seen_and_slopes(one(dtype, **place), camera(dtype))
         assert bool(footprint.visible[0]) is expected
@@ -120,10 +120,10 @@ def pixel(alphas, values, spec):
 def pixel_and_slopes(alphas, values, spec):
     """Color and what is left, and slopes in `alphas` and `values`; one or two rows."""
     hidden = (0, max(0, 2 - len(alphas)))  # what is not drawn behind a single one
-    drawn, slopes = _pixel_and_slopes(
+    rendered, slopes = _pixel_and_slopes(
         np.pad(alphas, hidden), np.pad(values, hidden), spec
     )
-    return drawn, [np.asarray(slope)[: len(alphas)] for slope in slopes]
+    return rendered, [np.asarray(slope)[: len(alphas)] for slope in slopes]
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -132,21 +132,21 @@ def _pixel_and_slopes(alphas, values, spec):
         color, left = pixel(alphas, values, spec)
         return color + left / 2, (color, left)
 
-    slopes, drawn = jax.grad(loss, (0, 1), has_aux=True)(alphas, values)
-    return drawn, slopes
+    slopes, rendered = jax.grad(loss, (0, 1), has_aux=True)(alphas, values)
+    return rendered, slopes
 
 
 def test_an_alpha_jumps_at_the_cut_and_nowhere_else(dtype):
     """exp(log o) is an ulp or two off, so the cut is approached to eight ulps."""
     ulps = 8 * float(jnp.finfo(dtype).eps)
     values = np.asarray([1.0], dtype)
-    for share, drawn in ((1 - ulps, False), (1 + ulps, True)):
+    for share, rendered in ((1 - ulps, False), (1 + ulps, True)):
         alpha = np.asarray([share / 255], dtype)
         (color, left), (slope, _) = pixel_and_slopes(alpha, values, ONE_PIXEL)
-        expected = float(alpha[0]) if drawn else 0
+        expected = float(alpha[0]) if rendered else 0
         assert abs(color - expected) <= ulps / 255
         assert abs(left - (1 - expected)) <= ulps
-        assert abs(slope[0] - (0.5 if drawn else 0)) < 4 * ulps
+        assert abs(slope[0] - (0.5 if rendered else 0)) < 4 * ulps
 
 
 @pytest.mark.parametrize(
@@ -163,9 +163,9 @@ def test_an_alpha_stays_at_its_clamp_and_one_is_finite(spec, dtype):
     for alpha in (0.99 * (1 - ulps), 0.99 * (1 + ulps), 1 - ulps, 1.0):
         alphas = np.asarray([alpha, 0.5], dtype)
         (color, left), slopes = pixel_and_slopes(alphas, values, spec)
-        drawn = min(alpha, 0.99)
-        assert abs(color - (drawn + (1 - drawn) / 8)) < 4 * ulps
-        assert abs(left - (1 - drawn) / 2) < 4 * ulps
+        rendered = min(alpha, 0.99)
+        assert abs(color - (rendered + (1 - rendered) / 8)) < 4 * ulps
+        assert abs(left - (1 - rendered) / 2) < 4 * ulps
         # 1 - 0.25/2 - 1/4 of what lies behind
         expected = 0.625 if through or alpha < 0.99 else 0
         # What lies behind is divided by 1 - alpha = 0.01.
@@ -177,14 +177,14 @@ def test_a_pixel_is_done_on_the_side_of_the_stop_its_transmittance_is_on(dtype):
     """T = 0.01 (1 - a): the Gaussian that would take it to the stop is left out."""
     ulps = 64 * float(jnp.finfo(dtype).eps)
     values = np.asarray([0.0, 1.0], dtype)
-    for share, drawn in ((1 + ulps, True), (1 - ulps, False)):
+    for share, rendered in ((1 + ulps, True), (1 - ulps, False)):
         # 0.98 * 0.98 stay clear of the clamp: (1 - 0.98) (1 - a) = stop * share.
         alpha = 1 - ONE_PIXEL.transmittance_threshold * share / 0.02
         alphas = np.asarray([0.98, alpha], dtype)
         (color, left), slopes = pixel_and_slopes(alphas, values, ONE_PIXEL)
-        assert abs(color - (0.02 * alpha if drawn else 0)) < ulps
-        assert abs(left - (1e-3 if drawn else 0.02)) < ulps
-        assert bool(slopes[0][1] != 0) is drawn
+        assert abs(color - (0.02 * alpha if rendered else 0)) < ulps
+        assert abs(left - (1e-3 if rendered else 0.02)) < ulps
+        assert bool(slopes[0][1] != 0) is rendered
 
 
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])

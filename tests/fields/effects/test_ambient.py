@@ -9,7 +9,7 @@ from nerfies_jax.fields.effects import ambient
 from nerfies_jax.fields.effects.ambient import AmbientSpec
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.training.effects import TIMESTAMP, FrameCondition, Table
-from tests import drawn, gradients
+from tests import gradients, random_params
 from tests.oracles import networks
 
 BENT = AmbientSpec(
@@ -34,7 +34,7 @@ def condition(dtype, step=OPEN, seed=3):
 
 def bent_params(dtype):
     """A surface far from the plane it starts as."""
-    return drawn.params(lambda key: ambient.init(BENT, key), dtype)
+    return random_params.like(lambda key: ambient.init(BENT, key), dtype)
 
 
 def window_by_hand(spec, step):

@@ -19,7 +19,7 @@ from nerfies_jax.scene import presets, scene
 from nerfies_jax.scene import steps as field_steps
 from nerfies_jax.scene.scene import RadianceScene
 from nerfies_jax.training.effects import APPEARANCE, FrameCondition, Table, weighted_sum
-from tests import drawn, gradients, scenes
+from tests import gradients, random_params, scenes
 
 TINY = RadianceScene(
     steps=10,
@@ -69,7 +69,7 @@ def tracer():
 
 
 def params_of(dtype):
-    return drawn.params(scene.field(TINY, METADATA).init, dtype)
+    return random_params.like(scene.field(TINY, METADATA).init, dtype)
 
 
 @pytest.mark.parametrize("table", ["appearance", "exposure"])

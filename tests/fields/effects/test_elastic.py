@@ -365,8 +365,8 @@ def test_a_lazy_penalty_counts_for_the_steps_that_skip_it(setting):
     assert np.any(each[1] != 0)
     for step in range(5):
         times = 0 if step % 3 else 3
-        found = jax.tree.leaves(lazy(setting.params, jnp.int32(step)))
-        for one, full in zip(found, jax.tree.leaves(each), strict=True):
+        actual = jax.tree.leaves(lazy(setting.params, jnp.int32(step)))
+        for one, full in zip(actual, jax.tree.leaves(each), strict=True):
             np.testing.assert_allclose(one, times * full, rtol=1e-12)
 
 

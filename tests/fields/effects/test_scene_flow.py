@@ -14,7 +14,7 @@ from nerfies_jax.fields.effects.effect import Sample
 from nerfies_jax.fields.effects.scene_flow import FlowWeights
 from nerfies_jax.nn.planes import PlanesSpec
 from nerfies_jax.training.effects import FrameCondition
-from tests import drawn, gradients, scene_flow_rays
+from tests import gradients, random_params, scene_flow_rays
 from tests.scene_flow_rays import (
     BOX_SCALE,
     FEATURES,
@@ -127,7 +127,7 @@ def test_a_medium_on_planes_is_finite_outside_of_its_times(dtype):
         TINY.network, position=PlanesSpec(3, (1, 2), timestamps=4, features=2)
     )
     spec = dataclasses.replace(TINY, network=network)
-    params = drawn.params(
+    params = random_params.like(
         lambda key: scene_flow.init(spec, key, FEATURES, jnp.dtype(dtype)), dtype, 0.1
     )
 
@@ -138,9 +138,9 @@ def test_a_medium_on_planes_is_finite_outside_of_its_times(dtype):
         return sum(jnp.sum(leaf) for leaf in one)
 
     for place, time in itertools.product((0.3, 1e6), (-1 / 3, 0.0, 1.0, 4 / 3)):
-        found = total(params, np.full(3, place, dtype), np.asarray(time, dtype))
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
-        tables = found[1][0].network.tables
+        actual = total(params, np.full(3, place, dtype), np.asarray(time, dtype))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(actual))
+        tables = actual[1][0].network.tables
         assert all(np.any(plane) for plane in jax.tree.leaves(tables))
 
 
@@ -200,12 +200,12 @@ def test_neighbors_are_times_that_were_observed(held_out, dtype):
     beside = jax.jit(timestamps.neighbor, static_argnums=(0, 2))
     now = jnp.asarray(learned, dtype)
     for sign in scene_flow.SIGNS:
-        found, present = beside(times, now, sign)
+        actual, present = beside(times, now, sign)
         places = np.arange(len(learned)) + sign
         inside = (places >= 0) & (places < len(learned))
         np.testing.assert_array_equal(present, inside)
         np.testing.assert_array_equal(
-            np.asarray(found)[inside], learned[places[inside]].astype(dtype)
+            np.asarray(actual)[inside], learned[places[inside]].astype(dtype)
         )
 
 

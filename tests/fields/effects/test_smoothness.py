@@ -13,7 +13,7 @@ from nerfies_jax.nn.grids import HashGridSpec
 from nerfies_jax.nn.planes import PlanesSpec
 from nerfies_jax.nn.voxels import VoxelGridSpec
 from nerfies_jax.training.effects import PenaltyContext
-from tests import drawn
+from tests import random_params
 
 PLANES = PlanesSpec(vertices=3, multiples=(1, 2), features=2)
 TEMPLATES = {
@@ -25,12 +25,12 @@ HASHED = {"fine": TemplateSpec(HashGridSpec(levels=2, coarsest=2, finest=4, rows
 
 def tables(dtype, rng):
     voxels = (jnp.asarray(rng.normal(size=(125, 3)), dtype),)
-    read = drawn.params(lambda key: planes.init(PLANES, key), dtype, 0.3)
+    read = random_params.like(lambda key: planes.init(PLANES, key), dtype, 0.3)
     return {"coarse": read, "fine": voxels}
 
 
-def roughness(effect, found, step, seed=0):
-    nets = {name: Template(None, None, one) for name, one in found.items()}
+def roughness(effect, random_tables, step, seed=0):
+    nets = {name: Template(None, None, one) for name, one in random_tables.items()}
     key, step = jax.random.key(seed), jnp.int32(step)
     context = PenaltyContext(None, step, key, {"template": nets})
     return effect.loss(context.params, context)["variation"]
@@ -43,14 +43,14 @@ def of(grid, axes):
 
 def test_smoothness_is_the_mean_square_between_neighbors(dtype, rng):
     effect = smoothness.Bound(SmoothnessSpec(2.0, until=5), TEMPLATES)
-    found = tables(dtype, rng)
-    term = roughness(effect, found, 4)
+    random_tables = tables(dtype, rng)
+    term = roughness(effect, random_tables, 4)
     assert term.value.dtype == dtype
-    read = [of(plane, 2) for level in found["coarse"] for plane in level.space]
-    expected = np.mean(read) + of(np.reshape(found["fine"][0], (5, 5, 5, 3)), 3)
+    read = [of(plane, 2) for level in random_tables["coarse"] for plane in level.space]
+    expected = np.mean(read) + of(np.reshape(random_tables["fine"][0], (5, 5, 5, 3)), 3)
     np.testing.assert_allclose(term.value, expected, rtol=3e-6)
     assert term.weight == 2
-    assert roughness(effect, found, 5).weight == 0
+    assert roughness(effect, random_tables, 5).weight == 0
 
 
 def test_of_hashed_grids_it_is_guessed(rng):

@@ -15,7 +15,7 @@ from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.scene import scene
 from nerfies_jax.scene.scene import RadianceScene
 from nerfies_jax.training.effects import FrameCondition
-from tests import drawn, scenes
+from tests import random_params, scenes
 
 TINY = RadianceScene(
     steps=10,
@@ -40,7 +40,7 @@ def tracer(*without):
 
 
 def params_of(dtype):
-    return drawn.params(scene.field(TINY, metadata()).init, dtype, 0.1, 2)
+    return random_params.like(scene.field(TINY, metadata()).init, dtype, 0.1, 2)
 
 
 def ray_and_condition(dtype):

@@ -23,7 +23,7 @@ from nerfies_jax.fields.template import TemplateSpec
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.scene import scene
 from nerfies_jax.training.effects import FrameCondition, PenaltyContext
-from tests import drawn, gradients, scenes
+from tests import gradients, random_params, scenes
 from tests.oracles import networks
 
 FEW = EncodingSpec(2)
@@ -50,7 +50,7 @@ def field_of(spec):
 
 
 def params_of(dtype, size=0.3):
-    return drawn.params(field_of(SPEC).init, dtype, size)
+    return random_params.like(field_of(SPEC).init, dtype, size)
 
 
 def seen(params, dtype):
@@ -144,13 +144,13 @@ def test_normals_and_colors_of_a_ray_are_those_written_out(number, float64):
     levels, direction, code = seen(params, "float64")
     level, name = levels[number], ("coarse", "fine")[number]
     by_hand = ByHand(params, code)
-    found = level.surfaces["surface"]
+    normals = level.surfaces["surface"]
     for row, x in enumerate(np.asarray(level.point)):
         np.testing.assert_allclose(level.warped[row], by_hand.warped(x), atol=1e-12)
         expected = by_hand.normals(name, x)
         for key, value in zip(("head", "observed", "slope"), expected, strict=True):
             # central differences in float64
-            np.testing.assert_allclose(found[key][row], value, atol=1e-7, err_msg=key)
+            np.testing.assert_allclose(normals[key][row], value, atol=1e-7, err_msg=key)
     weight = np.asarray(level.static_weight)
     colors = [by_hand.color(name, x, direction) for x in np.asarray(level.point)]
     behind = np.asarray(field_of(SPEC).metadata.background or (0, 0, 0))
@@ -166,9 +166,9 @@ def test_float32_normals_are_those_of_float64():
     for key, value in zip(
         ("head", "observed", "slope"), by_hand.normals("fine", x), strict=True
     ):
-        found = levels[-1].surfaces["surface"][key][2]
-        assert found.dtype == jnp.float32
-        np.testing.assert_allclose(found, value, rtol=0, atol=2e-4, err_msg=key)
+        actual = levels[-1].surfaces["surface"][key][2]
+        assert actual.dtype == jnp.float32
+        np.testing.assert_allclose(actual, value, rtol=0, atol=2e-4, err_msg=key)
 
 
 @pytest.mark.full
@@ -177,7 +177,7 @@ def test_a_rigid_warp_turns_normals_as_it_turns_back(float64, rng):
     angle = rng.normal(size=3)
     rotation = scipy.linalg.expm(np.cross(np.eye(3), angle))
     still = dataclasses.replace(SPEC, ambient=None, mask=None)
-    params = drawn.params(field_of(still).init, "float64", 0.3)
+    params = random_params.like(field_of(still).init, "float64", 0.3)
     heads = params["warp"].heads
     zero = {
         k: h._replace(weight=0 * h.weight, bias=0 * h.bias) for k, h in heads.items()
@@ -187,30 +187,30 @@ def test_a_rigid_warp_turns_normals_as_it_turns_back(float64, rng):
     when = FrameCondition(jnp.asarray(0.3), {"motion": jnp.zeros(3)}, jnp.int32(0))
     ray = field_ray.Ray(*map(jnp.asarray, (np.zeros(3), np.eye(3)[2], 0.1, 0.9)))
     level = jax.jit(field_of(still).render_ray)(params, ray, when)[-1]
-    found = level.surfaces["surface"]
-    unit = np.asarray(found["head"])
+    normals = level.surfaces["surface"]
+    unit = np.asarray(normals["head"])
     unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
     turned = level.warped[1] - level.warped[0]
     moved = level.point[1] - level.point[0]
     matrix = rotation if np.allclose(rotation @ moved, turned) else rotation.T
     np.testing.assert_allclose(matrix @ moved, turned, atol=1e-12)
-    np.testing.assert_allclose(found["observed"], unit @ matrix, atol=1e-10)
+    np.testing.assert_allclose(normals["observed"], unit @ matrix, atol=1e-10)
 
 
 def looked(dtype, rays=5, samples=4, seed=2):
     """A level of rays with normals, and their directions."""
     rng = np.random.default_rng(seed)
-    found = {k: rng.normal(size=(rays, samples, 3)) for k in ("head", "observed")}
+    normals = {k: rng.normal(size=(rays, samples, 3)) for k in ("head", "observed")}
     slope = rng.normal(size=(rays, samples, 3))
-    found["slope"] = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+    normals["slope"] = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
     weight = rng.uniform(size=(rays, samples))
-    level = level_of(weight, found, dtype)
+    level = level_of(weight, normals, dtype)
     return level, jnp.asarray(rng.normal(size=(rays, 3)), dtype)
 
 
-def level_of(weight, found, dtype):
+def level_of(weight, normals, dtype):
     zeros = jnp.zeros((*weight.shape, 3), dtype)
-    looks = {k: jnp.asarray(v, dtype) for k, v in found.items()}
+    looks = {k: jnp.asarray(v, dtype) for k, v in normals.items()}
     flat = jnp.zeros(len(weight), dtype)
     weight = jnp.asarray(weight, dtype)
     parts = (weight, zeros, zeros, weight, {}, {}, zeros[:, 0], flat, flat, flat)
@@ -226,15 +226,18 @@ def test_costs_of_normals_are_those_of_a_loop(dtype):
     valid = jnp.asarray([True, True, False, True, True])
     slope, facing = jax.jit(surface.costs_of)(level, direction, valid)
     expected = np.zeros(2)
-    found, weight = networks.exact(level.surfaces["surface"]), np.asarray(level.weight)
+    normals, weight = (
+        networks.exact(level.surfaces["surface"]),
+        np.asarray(level.weight),
+    )
     for r in range(5):
         for s in range(4):
             if not valid[r]:
                 continue
-            if found["slope"][r, s].any():
-                off = found["head"][r, s] - found["slope"][r, s]
+            if normals["slope"][r, s].any():
+                off = normals["head"][r, s] - normals["slope"][r, s]
                 expected[0] += weight[r, s] * (off @ off) / 20
-            facing_by = found["observed"][r, s] @ np.asarray(direction[r], np.float64)
+            facing_by = normals["observed"][r, s] @ np.asarray(direction[r], np.float64)
             expected[1] += weight[r, s] * max(facing_by, 0) ** 2 / 20
     rtol = {"float32": 1e-5, "float64": 1e-12}[dtype]
     np.testing.assert_allclose([slope, facing], expected, rtol=rtol)
@@ -286,11 +289,11 @@ def unit_and_slope(vector):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("vector", UNITS)
 def test_directions_of_any_length_and_of_none(vector, dtype):
-    found, slope = unit_and_slope(np.asarray(vector, dtype))
+    actual, slope = unit_and_slope(np.asarray(vector, dtype))
     exact = np.asarray(vector, np.float64)
     length = np.linalg.norm(exact)
     expected = exact / length if length else exact
-    np.testing.assert_allclose(found, expected, atol=3e-7)
+    np.testing.assert_allclose(actual, expected, atol=3e-7)
     assert np.isfinite(slope).all()
     across = (np.eye(3) - np.outer(expected, expected)) / (length or np.inf)
     np.testing.assert_allclose(slope, across, rtol=1e-5, atol=1e-6 / (length or 1))
@@ -341,12 +344,14 @@ def test_gradients(float64):
     assert gradients.directional_error(mask_error, params["mask"], point) < 1e-6
 
     def normal_costs(head, observed):
-        found = level.surfaces["surface"] | {"head": head, "observed": observed}
-        one = level._replace(surfaces={"surface": found})
+        normals = level.surfaces["surface"] | {"head": head, "observed": observed}
+        one = level._replace(surfaces={"surface": normals})
         return sum(surface.costs_of(one, direction, jnp.ones(5, bool)))
 
-    found = {k: np.asarray(v) for k, v in level.surfaces["surface"].items()}
-    error = gradients.directional_error(normal_costs, found["head"], found["observed"])
+    normals = {k: np.asarray(v) for k, v in level.surfaces["surface"].items()}
+    error = gradients.directional_error(
+        normal_costs, normals["head"], normals["observed"]
+    )
     assert error < 1e-6
 
 

@@ -11,7 +11,7 @@ from nerfies_jax.fields.effects import time_warp
 from nerfies_jax.fields.effects.time_warp import TimeWarpSpec
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.training.effects import FrameCondition
-from tests import drawn, gradients
+from tests import gradients, random_params
 from tests.oracles import networks
 
 SPEC = TimeWarpSpec(EncodingSpec(3), EncodingSpec(2), embedding=4, depth=3, width=7)
@@ -31,7 +31,7 @@ def by_hand(params, point, time):
 
 @pytest.mark.parametrize("time", [0.0, 0.37, 1.0])
 def test_shift_and_features_are_those_of_the_layers(time, dtype, rng):
-    params = drawn.params(lambda key: time_warp.init(SPEC, key), dtype, 0.3)
+    params = random_params.like(lambda key: time_warp.init(SPEC, key), dtype, 0.3)
     points = rng.uniform(-1, 1, (4, 3)).astype(dtype)
 
     @jax.jit
@@ -67,7 +67,7 @@ def test_it_starts_as_the_identity_and_does_not_stay_there(dtype, rng):
 
 
 def test_gradients(float64, rng):
-    params = drawn.params(lambda key: time_warp.init(SPEC, key), "float64", 0.3)
+    params = random_params.like(lambda key: time_warp.init(SPEC, key), "float64", 0.3)
     pull = rng.normal(size=SPEC.position.width(3) + SPEC.embedding)
 
     def total(params, point, time):

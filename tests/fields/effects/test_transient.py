@@ -15,7 +15,7 @@ from nerfies_jax.training.effects import (
     FrameCondition,
     PenaltyContext,
 )
-from tests import drawn, gradients
+from tests import gradients, random_params
 from tests.oracles import networks
 
 SPEC = TransientSpec(code_width=3, depth=2, width=8)
@@ -41,7 +41,9 @@ photometric = jax.jit(
 
 
 def params_of(dtype):
-    return drawn.params(lambda key: transient.init(SPEC, key, FEATURES), dtype, 0.1)
+    return random_params.like(
+        lambda key: transient.init(SPEC, key, FEATURES), dtype, 0.1
+    )
 
 
 def medium_by_hand(params, met, when):

@@ -13,7 +13,7 @@ from nerfies_jax.fields.effects import warp
 from nerfies_jax.fields.effects.warp import WarpSpec
 from nerfies_jax.nn.encoding import EncodingSpec
 from nerfies_jax.training.effects import TIMESTAMP, FrameCondition, Table
-from tests import drawn, gradients
+from tests import gradients, random_params
 from tests.oracles import networks
 
 SMALL = WarpSpec(
@@ -35,7 +35,7 @@ def frame(dtype, time=0.4, width=4, step=0, seed=3):
 
 def bent(spec, dtype):
     """A warp that is far from the identity."""
-    return drawn.params(lambda key: warp.init(spec, key), dtype, 0.3)
+    return random_params.like(lambda key: warp.init(spec, key), dtype, 0.3)
 
 
 started = jax.jit(warp.init, static_argnums=(0, 2))

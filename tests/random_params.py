@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 
-def params(init, dtype, size=0.2, seed=0):
+def like(init, dtype, size=0.2, seed=0):
     """Arrays of the shapes that `init` of a key returns: biases of `size`, no zeros."""
     rng, kind = np.random.default_rng(seed), jnp.dtype(dtype)
 
