@@ -70,6 +70,7 @@ ARGUMENTS = (
         "evaluate_at",
         "evaluate_every",
         "factor",
+        "frame_memory",
         "heldout",
         "max_side",
     ),

@@ -76,6 +76,10 @@ class Reconstruct:
     or bands of the image of one view, or the rays of a field (micro_batches). The
     result is that of one device up to rounding (default: all; of a CPU, as many as it
     has cores and the step has parts; one for the image of one view)."""
+    frame_memory: float | None = None
+    """GiB of device memory for training frames (default: all that training leaves, no
+    limit on a CPU). If they do not fit, those of the next steps are streamed to the
+    device, with the same result."""
     coordinator: str | None = None
     """Train on several hosts, on each of which this command is started: HOST:PORT at
     which the first process listens, with --processes and --process, or auto if Slurm
@@ -161,7 +165,12 @@ def _outcome(args):
         cores = _cores(args)
         cluster = _cluster(args)
         platform.start_jax(
-            args.device, *cores, devices=args.devices, cluster=cluster, wide=wide
+            args.device,
+            *cores,
+            devices=args.devices,
+            frame_memory=args.frame_memory,
+            cluster=cluster,
+            wide=wide,
         )
         watched = _open_viewer(args)
     from nerfies_jax import runs

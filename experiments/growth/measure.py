@@ -12,7 +12,7 @@ import numpy as np
 from experiments.growth.axes import AXES
 from gaussians_jax.core import splats
 from gaussians_jax.init.points import InitSpec, StartSpec
-from gaussians_jax.scene import scene as splat_scene
+from gaussians_jax.scene import view_order
 from gaussians_jax.scene.spec import raster_of
 from gaussians_jax.splatting import binning, projection
 from nerfies_jax import evaluation, runs
@@ -153,7 +153,7 @@ BUILDERS: dict[str, Callable[[int], Scene]] = {
 def _pairs(scene):
     """Count the pairs of Gaussians and tiles in the frame of the first step."""
     frames = scene.frames
-    row = splat_scene.shuffled_row(scene.state.key, scene.state.step, len(frames.times))
+    row = view_order.shuffled_row(scene.state.key, scene.state.step, len(frames.times))
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     size = frames.images.shape[2], frames.images.shape[1]
     raster = raster_of(scene.spec, scene.metadata)

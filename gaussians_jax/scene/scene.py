@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.records import SplatRecord
@@ -15,7 +15,7 @@ from gaussians_jax.init.points import StartSpec
 from gaussians_jax.losses import transients
 from gaussians_jax.motion import deformation
 from gaussians_jax.optim import phases
-from gaussians_jax.scene import drawing, growth, update
+from gaussians_jax.scene import drawing, growth, update, view_order
 from gaussians_jax.scene.first_state import count_rows, first_state
 from gaussians_jax.scene.spec import (
     SceneMetadata,
@@ -54,8 +54,6 @@ PyTree = Any
 # Near plane relative to the nearest point of structure from motion. Moving objects may
 # be nearer than that.
 NEAREST = 0.2
-
-ORDER = 2**32 - 1  # stream of the run's PRNG key, like those in `growth`
 
 
 def metadata_of(capture: Capture) -> SceneMetadata:
@@ -172,6 +170,7 @@ def _model(spec, metadata, effects):
         example=example,
         devices=devices,
         apply_to_capture=_camera_refiner(effects),
+        reads=view_order.reader(spec.batch_size),
         compiler_options=compiler.UNDIVIDED,
     )
 
@@ -256,7 +255,7 @@ def _stepper(spec, metadata, effects, optimizer, devices):
 def _condition(spec, state, frames, index):
     """Select a frame of a step's batch, and return its row and condition."""
     visit = state.step * spec.batch_size + index
-    row = shuffled_row(state.key, visit, len(frames.times))
+    row = view_order.shuffled_row(state.key, visit, len(frames.times))
     key = loop.step_key(state)
     if spec.batch_size > 1:
         key = jax.random.fold_in(key, index)
@@ -406,20 +405,3 @@ def observe(
 def _view(frames, row):
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     return View(camera, frames.times[row], frames.appearance[row])
-
-
-def shuffled_row(
-    key: Key[Array, ""], step: Int[Array, ""], frames: int
-) -> Int[Array, ""]:
-    """Choose the frame of a step. Each epoch visits all frames once, in a new order.
-
-    Args:
-      key: PRNG key of the run.
-      step: Number of frames visited so far.
-      frames: Number of frames.
-
-    Returns:
-      Index of the frame.
-    """
-    epoch = jax.random.fold_in(jax.random.fold_in(key, ORDER), step // frames)
-    return jax.random.permutation(epoch, frames)[step % frames]

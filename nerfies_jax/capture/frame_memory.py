@@ -38,6 +38,8 @@ READING_IMAGES = 8
 # frames alone.
 LEAST_SHARED_BYTES = 2**26
 
+_device_limit = math.inf  # bytes, of `limit_device`
+
 
 def allocate(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """Allocate an array of frames that JAX on the CPU uses without a copy.
@@ -128,6 +130,38 @@ def is_shared(capture: Capture) -> bool:
     )
 
 
+def limit_device(gibibytes: float | int | None) -> None:
+    """Limit the memory of each device for training frames.
+
+    Args:
+      gibibytes: Memory in GiB. None for what the device has.
+
+    Raises:
+      ValueError: If it is not positive and finite.
+    """
+    global _device_limit
+    if gibibytes is not None and not 0 < gibibytes < math.inf:
+        raise ValueError(
+            f"frame_memory={gibibytes} must be a positive, finite number of GiB"
+        )
+    _device_limit = math.inf if gibibytes is None else gibibytes * 2**30
+
+
+def device_limit(training: int = 0) -> float | int:
+    """Return the memory of a device that is available for training frames.
+
+    Args:
+      training: Bytes that training needs in addition to the frames.
+
+    Returns:
+      Bytes: the limit of `limit_device`, or what training leaves of the memory of the
+      device if it is less. The memory of a CPU device is not bounded.
+    """
+    statistics = jax.local_devices()[0].memory_stats() or {}
+    limit = statistics.get("bytes_limit", math.inf)
+    return min(_device_limit, max(limit - training, 0))
+
+
 def check_device(needed: int) -> None:
     """Check that training frames fit in the memory of the device.
 
@@ -135,15 +169,14 @@ def check_device(needed: int) -> None:
       needed: Bytes of their images, masks and depths.
 
     Raises:
-      ValueError: If they do not. The memory of a CPU device is not checked.
+      ValueError: If they do not fit in `device_limit`.
     """
-    statistics = jax.local_devices()[0].memory_stats() or {}
-    limit = statistics.get("bytes_limit", math.inf)
+    limit = device_limit()
     if needed > limit:
         raise ValueError(
             f"the training frames need {needed / 2**30:.1f} GiB of memory on the "
-            f"device, which has {limit / 2**30:.1f} GiB; read smaller images with "
-            "max_side=..., or select fewer frames"
+            f"device, which has {limit / 2**30:.1f} GiB for them; read smaller images "
+            "with max_side=..., or select fewer frames"
         )
 
 
@@ -157,11 +190,11 @@ def frame_bytes(capture: Capture, devices: int = 1) -> int:
     Returns:
       Bytes of the capture on the host, plus the larger of two: the images that are
       decoded at a time, or the copies of the training frames on the host and on each
-      device. CPU devices share one copy.
+      device. CPU devices share one copy, and frames above `device_limit` have none.
     """
     image = capture.images[:1].nbytes
     copies = 0
-    if not is_shared(capture):
+    if not is_shared(capture) and len(capture.train) * image <= device_limit():
         devices = 1 if jax.default_backend() == "cpu" else devices
         copies = len(capture.train) * (devices + 1)
     return capture_bytes(capture) + image * max(copies, READING_IMAGES)

@@ -5,6 +5,7 @@ from nerfies_jax.evaluation.frames import (
     path_views,
     resized,
     spread,
+    training_frames,
     view_of,
     with_refined_cameras,
 )
@@ -31,6 +32,7 @@ __all__ = [
     "score_right_halves",
     "spread",
     "to_uint8",
+    "training_frames",
     "view_of",
     "with_refined_cameras",
 ]

@@ -12,6 +12,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.flow import training_flow
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.training.frame_stream import FrameStream, TrainingFrames
 from nerfies_jax.training.model import (
     Frames,
     Model,
@@ -36,29 +37,70 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
       ValueError: If they do not fit in the memory of the device.
     """
     rows, shared = capture.train, frame_memory.is_shared(capture)
-    names = ("images", "valid", *sorted(required_data & {"depths", "moving"}))
-    arrays = {name: getattr(capture, name) for name in names}
-    data: dict[str, Any] = {
-        name: array if shared or array is None else array[rows]
-        for name, array in arrays.items()
-    }
-    pixels = [array for array in data.values() if array is not None]
-    frame_memory.check_device(sum(array.nbytes for array in pixels))
+    pixels = _pixels(capture, required_data)
+    if not shared:
+        pixels = {name: array[rows] for name, array in pixels.items()}
+    frame_memory.check_device(sum(array.nbytes for array in pixels.values()))
+    frames = _without_pixels(capture, required_data)
     if shared:
         # Unlike `jnp.asarray`, this does not copy the arrays.
-        data = jax.device_put(data)
-        data["image_rows"] = rows.astype(np.int32)
+        pixels = jax.device_put(pixels)
+        frames = frames._replace(image_rows=rows.astype(np.int32))
+    return in_default_precision(frames._replace(**pixels))
+
+
+def training_frames(
+    model: Model, capture: Capture, training: int = 0
+) -> TrainingFrames:
+    """Move the training frames of a capture to the device, or stream them to it.
+
+    They are streamed if they do not fit in `frame_memory.device_limit`.
+
+    Args:
+      model: The model that is trained.
+      capture: The capture.
+      training: Bytes that training needs on the device in addition to the frames.
+
+    Returns:
+      The frames, or their stream.
+
+    Raises:
+      ValueError: If they do not fit and `model` cannot be trained on a stream, or if
+        not even the frames of a few steps fit.
+    """
+    shared = frame_memory.is_shared(capture)
+    count = len(capture.images) if shared else len(capture.train)
+    pixels = _pixels(capture, model.required_data)
+    needed = sum(count * array[:1].nbytes for array in pixels.values())
+    limit = frame_memory.device_limit(training)
+    if needed <= limit or model.reads is None:
+        return frames_of(capture, model.required_data)
+    frames = _without_pixels(capture, model.required_data)
+    return FrameStream(model, frames, pixels, capture.train, limit)
+
+
+def _pixels(capture, required_data) -> dict[str, Any]:
+    """Return the images, masks and depths of all frames that a model reads."""
+    names = ("images", "valid", *sorted(required_data & {"depths", "moving"}))
+    arrays = {name: getattr(capture, name) for name in names}
+    return {name: array for name, array in arrays.items() if array is not None}
+
+
+def _without_pixels(capture, required_data) -> Frames:
+    """Return the training frames without images and masks, in NumPy."""
+    rows, data = capture.train, {}
     if "points" in required_data and capture.points is not None:
         data["points"] = capture.points.position
     if "flow" in required_data and capture.flow is not None:
         data["flow"] = training_flow(capture)
-    frames = Frames(
+    return Frames(
+        images=None,
         cameras=cameras.take(capture.cameras, rows),
         times=capture.times[rows],
         appearance=capture.appearance_ids[rows],
+        valid=None,
         **data,
     )
-    return in_default_precision(frames)
 
 
 def with_refined_cameras(model: Model, state: TrainState, capture: Capture) -> Capture:

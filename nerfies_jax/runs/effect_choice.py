@@ -174,7 +174,7 @@ def _train(run: Run, rows: np.ndarray):
     capture = dataclasses.replace(
         run.capture, train=np.setdiff1d(run.capture.train, rows), heldout=rows
     )
-    frames = evaluation.frames_of(capture, run.model.required_data)
+    frames = validation.frames_for(run, capture)
     silent = rich.console.Console(file=io.StringIO())
     result = loop.fit(
         run.model, initial_state(run), frames, steps=run.spec.steps, console=silent

@@ -40,6 +40,7 @@ def start_jax(
     shares: int = 1,
     *,
     devices: int | None = None,
+    frame_memory: float | int | None = None,
     cluster: Cluster | None = None,
     wide: bool = True,
 ) -> None:
@@ -58,6 +59,8 @@ def start_jax(
         of its own if there are enough cores (`data_parallel`).
       devices: Number of devices to compute on. None for all, and on a CPU for as many
         as there are shares and cores.
+      frame_memory: GiB of device memory for training frames. None for what the device
+        has.
       cluster: Other processes to train with. None for this process alone. Each uses
         as many devices as `devices` says.
       wide: False for processes that compile code of other packages. With vectors of 512
@@ -66,7 +69,7 @@ def start_jax(
 
     Raises:
       ValueError: If the devices are not available, the processes cannot be connected,
-        or the limit of the cache is wrong.
+        or a limit of memory or of the cache is wrong.
     """
     if threads == "one" and os.environ.setdefault("PJRT_NPROC", "1") == "1":
         # XLA has a thread for each device and would divide the loops of every device
@@ -81,6 +84,7 @@ def start_jax(
 
     # These load JAX.
     from nerfies_jax.capture import cache_files
+    from nerfies_jax.capture.frame_memory import limit_device
     from nerfies_jax.runtime import data_parallel, hosts
 
     count = min(shares, cores()) if devices is None else devices
@@ -104,6 +108,7 @@ def start_jax(
             "install a version of JAX for that device"
         ) from error
     data_parallel.limit_devices(devices)
+    limit_device(frame_memory)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         folder = CACHE / "compiled"

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from nerfies_jax.runs import validation
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runtime import events
+from nerfies_jax.training.frame_stream import FrameStream
 from nerfies_jax.training.model import TrainState
 
 
@@ -52,6 +53,8 @@ def profiling(
         yield lambda: Profile({}, [])
         return
     frames = validation.training_frames(run)
+    if isinstance(frames, FrameStream):
+        frames = frames.window(state, 1)
     try:
         parts = step_parts(run.spec, run.metadata, run.model, state, frames)
     except Exception as error:

@@ -17,6 +17,7 @@ from nerfies_jax.runs.run import Run
 from nerfies_jax.runtime import console, data_parallel, events
 from nerfies_jax.training import checkpoint, chunk, loop, losses
 from nerfies_jax.training.checkpoint import Checkpoints
+from nerfies_jax.training.frame_stream import FrameStream
 from nerfies_jax.training.loop import FitResult, History, Hook
 
 EVALUATED = 4  # held-out frames during training. All of them are scored at the end.
@@ -105,6 +106,11 @@ def train(
     renderer = Renderer(run.model, run.capture.size)
     rows, every_seconds = run.capture.heldout, pace.evaluate_every
     frames = validation.training_frames(run)
+    if isinstance(frames, FrameStream):
+        console.say(
+            "training frames do not fit in the memory of the device, so those of the "
+            "next steps are streamed to it"
+        )
     history = History() if record is None else _history(record)
     first = evaluation.view_of(run.capture, int(rows[0])) if len(rows) else None
     scorer = half_scorer(run)

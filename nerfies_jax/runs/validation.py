@@ -10,12 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from nerfies_jax import evaluation
+from nerfies_jax.capture import frame_memory
+from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import Renderer
 from nerfies_jax.runs.run import Run
 from nerfies_jax.training import chunk
 from nerfies_jax.training.best import VALIDATION, best_step, psnr_by_step
+from nerfies_jax.training.frame_stream import TrainingFrames
 from nerfies_jax.training.loop import FitResult, Hook
-from nerfies_jax.training.model import Frames
 
 # A run that is planned for fewer seconds has no time to overfit, and a capture with
 # fewer training frames needs all of them.
@@ -82,8 +84,8 @@ def spread_over_time(train: np.ndarray, times: np.ndarray, count: int) -> np.nda
     return np.sort(candidates[places.astype(int)])
 
 
-def training_frames(run: Run) -> Frames:
-    """Move the frames that a run trains on to the device.
+def training_frames(run: Run) -> TrainingFrames:
+    """Move the frames that a run trains on to the device, or stream them to it.
 
     Args:
       run: The run.
@@ -96,7 +98,24 @@ def training_frames(run: Run) -> Frames:
         train = capture.train
         remaining = train[~np.isin(train, left_out)]
         capture = dataclasses.replace(capture, train=remaining)
-    return evaluation.frames_of(capture, run.model.required_data)
+    return frames_for(run, capture)
+
+
+def frames_for(run: Run, capture: Capture) -> TrainingFrames:
+    """Move the training frames of a capture to the device, or stream them to it.
+
+    Args:
+      run: The run that they are for.
+      capture: Its capture, with any training frames.
+
+    Returns:
+      The training frames.
+    """
+    estimate, training = run.representation.resources.estimate_memory_bytes, 0
+    if estimate is not None:
+        frames = frame_memory.frame_bytes(capture, run.model.devices)
+        training = estimate(run.spec, capture) - frames
+    return evaluation.training_frames(run.model, capture, training)
 
 
 def hooks(run: Run, renderer: Renderer) -> tuple[Hook, ...]:

@@ -141,6 +141,7 @@ def _model(radiance, more):
         required_data=read,
         example=example,
         devices=devices,
+        reads=steps.reader(spec, read),
     )
 
 

@@ -37,7 +37,8 @@ def parts(
     batch_key, loss_key = jax.random.split(loop.step_key(state))
 
     def draw(state, frames, key):
-        return field_steps.micro_batch(field, state, frames, key)
+        own = frames.of_part(state.step, 0)
+        return field_steps.micro_batch(field, state, own, key)
 
     batch, guide = jax.jit(draw)(state, frames, batch_key)
 

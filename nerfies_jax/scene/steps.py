@@ -51,11 +51,9 @@ def stepper(
     """
 
     def part(index, state, frames):
-        key = loop.step_key(state)
-        if spec.micro_batches > 1:
-            key = jax.random.fold_in(key, index)
-        batch_key, field_key = jax.random.split(key)
-        batch, guide = micro_batch(radiance, state, frames, batch_key)
+        batch_key, field_key = _part_keys(spec, loop.step_key(state), index)
+        own = frames.of_part(state.step, index)
+        batch, guide = micro_batch(radiance, state, own, batch_key)
 
         def loss(params):
             terms = loss_terms(
@@ -81,6 +79,54 @@ def stepper(
     return step
 
 
+def _part_keys(spec, key, part):
+    """Return the keys of the rays and of the field, of a part of a step with a key."""
+    if spec.micro_batches > 1:
+        key = jax.random.fold_in(key, part)
+    return jax.random.split(key)
+
+
+def reader(
+    spec: RadianceScene, required_data: frozenset[str]
+) -> Callable[[Any, Any, Frames], tuple[Any, ...]] | None:
+    """Return the function `Model.reads` of a field.
+
+    Args:
+      spec: The scene.
+      required_data: Names of the data that the field reads.
+
+    Returns:
+      The function, of the key, the number of completed steps and the frames. None for
+      fields that read masks of motion or depths.
+    """
+    if required_data & {"moving", "depths"}:
+        return None
+
+    def read(key, step, frames):
+        step_key = jax.random.fold_in(key, step)
+        count, choice = _candidates(spec), _choice(spec, frames, step)
+
+        def one(part):
+            batch_key, _ = _part_keys(spec, step_key, part)
+            return random_pixels(frames, (count,), batch_key, choice)
+
+        return jax.vmap(one)(np.arange(spec.micro_batches, dtype=np.int32))
+
+    return read
+
+
+def _candidates(spec):
+    """Return the number of random rays of a micro-batch, before their selection."""
+    plan, count = spec.sampling.occupancy, spec.rays // spec.micro_batches
+    return count if plan is None else plan.candidates * count
+
+
+def _choice(spec, frames, step):
+    if spec.curriculum_steps is None:
+        return None
+    return curriculum(frames.times, step, spec.curriculum_steps)
+
+
 def micro_batch(
     radiance: Field, state: TrainState, frames: Frames, key: Key[Array, ""]
 ) -> tuple[Batch, Cells | None]:
@@ -98,16 +144,14 @@ def micro_batch(
     """
     spec = radiance.spec
     count, plan = spec.rays // spec.micro_batches, spec.sampling.occupancy
-    choice = on_moving = None
-    if spec.curriculum_steps is not None:
-        choice = curriculum(frames.times, state.step, spec.curriculum_steps)
+    choice, on_moving = _choice(spec, frames, state.step), None
     flow = spec.scene_flow
     if flow is not None and flow.moving_rays is not None and frames.moving is not None:
         first = jnp.arange(count) < round(flow.moving_rays * count)
         on_moving = first & (state.step < flow.decay_steps)
     if plan is None:
         return draw_batch(frames, count, key, choice, on_moving), None
-    batch = draw_batch(frames, plan.candidates * count, key, choice)
+    batch = draw_batch(frames, _candidates(spec), key, choice)
     cells = state.aux_state
     return occupied_rays.learned_from(radiance, cells, batch), cells
 
@@ -295,11 +339,9 @@ def draw_batch(
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     pixel = jnp.stack([column, line], axis=1).astype(camera.position.dtype) + 0.5
     ray = jax.vmap(rays.pixel_ray)(camera, pixel)
-    pixels = frames.image_row(row), line, column
-    color = frames.images[pixels].astype(pixel.dtype) / 255
-    valid = ray.valid
-    if frames.valid is not None:
-        valid = valid & frames.valid[pixels]
+    color, observed = frames.colors(row, line, column)
+    color = color.astype(pixel.dtype) / 255
+    valid = ray.valid if observed is None else ray.valid & observed
     # Masked here for all losses, because unobserved pixels may be NaN, which a weight
     # of zero does not remove.
     color = jnp.where(valid[:, None], color, 0)

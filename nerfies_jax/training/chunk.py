@@ -13,10 +13,11 @@ from jax import lax
 from jaxtyping import Array
 
 from nerfies_jax.runtime import compiler, data_parallel, events, hosts
-from nerfies_jax.training import matrix_flops, programs
+from nerfies_jax.training import frame_stream, matrix_flops, programs
+from nerfies_jax.training.frame_stream import FrameStream, TrainingFrames, abstract
 from nerfies_jax.training.model import Frames, Model, PyTree, TrainState
 
-LENGTH = 10  # steps per scan
+LENGTH = frame_stream.STEPS  # steps per scan
 # A scan cannot be interrupted, so it has less work than this (two seconds of a core),
 # or one step. Longer scans are faster, because each call allocates its memory from the
 # system page by page. With `d-nerf-small` that takes 24 of 110 ms for a single step,
@@ -134,8 +135,9 @@ class Program:
 
     Called with (state, frames, count) it returns the state and the `Outcome`. The state
     passed in is overwritten. If a step uses several devices, state and outcome are on
-    the first of them and `frames` on all (`data_parallel.replicate`). If it uses the
-    devices of several processes, process 0 sends each call to the others.
+    the first of them and `frames` on all (`frame_stream.replicate`). If it uses the
+    devices of several processes, process 0 sends each call to the others. Of a stream
+    of frames, each scan gets the window of its steps.
     """
 
     def __init__(self, model: Model, state: TrainState, frames: Frames, steps: int):
@@ -147,8 +149,8 @@ class Program:
         if self._spans:
             # Arrays of one device cannot be inputs beside those of several processes.
             self._numbers = jax.tree.map(_on_host, self._numbers)
-        shapes = jax.tree.map(_abstract, (self._replicate(state), frames))
-        self._inputs = (*shapes, self._numbers)
+        shapes = jax.tree.map(abstract, self._replicate(state))
+        self._inputs = shapes, jax.tree.map(abstract, frames), self._numbers
         self._lowered: dict[int, jax.stages.Lowered] = {}  # by the number of steps
         self._programs: dict[int, jax.stages.Compiled] = {}
         self.length = 1 if steps < FEW_STEPS else self._longest_scan()
@@ -210,17 +212,20 @@ class Program:
         scans, singles = divmod(count, self.length)
         return [self.length] * scans + [1] * singles
 
-    def __call__(self, state: TrainState, frames: Frames, count: int):
+    def __call__(self, state: TrainState, frames: TrainingFrames, count: int):
         """Run `count` steps, or fewer if one is not finite."""
         self.prepare(count)
-        self._tell(hosts.STEPS, state, frames, count)
+        self._tell(hosts.STEPS, state, self._inputs[1], count)
         state = self._replicate(state)
         if self._spans:
             hosts.meet()
         total: dict[str, float] = {}
         done, outcome = 0, None
         for length in self._lengths(count):
-            state, outcome = self._programs[length](state, frames, self._numbers)
+            # The window has no other name here, so that it is freed after its steps.
+            state, outcome = self._programs[length](
+                state, _window(frames, state, length, count - done), self._numbers
+            )
             outcome = jax.device_get(outcome)
             done += int(outcome.done)
             for name, mean in outcome.metrics.items():
@@ -242,12 +247,15 @@ def _on_host(leaf):
     return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
 
 
-def _abstract(leaf):
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
+def _window(frames, state, length, left):
+    """Return the frames of the next steps."""
+    if isinstance(frames, FrameStream):
+        return frames.window(state, length, left)
+    return frames
 
 
 def program(
-    model: Model, state: TrainState, frames: Frames, steps: int
+    model: Model, state: TrainState, frames: TrainingFrames, steps: int
 ) -> tuple[Program, float]:
     """Return the program for the shapes of a state and frames, traced but not compiled.
 
@@ -261,6 +269,7 @@ def program(
       The program, and the seconds of tracing, 0 if it was cached.
     """
     programs = _programs(model.step)
+    frames = frame_stream.layout_of(frames)
     leaves, structure = jax.tree.flatten((state, frames))
     shapes = tuple((x.shape, x.dtype, x.sharding) for x in leaves)
     key = structure, shapes, steps >= FEW_STEPS
@@ -273,8 +282,8 @@ def program(
 
 
 def compiled(
-    model: Model, state: TrainState, frames: Frames, steps: int
-) -> tuple[Program, Frames, float]:
+    model: Model, state: TrainState, frames: TrainingFrames, steps: int
+) -> tuple[Program, TrainingFrames, float]:
     """Return the program of a run with its scan compiled.
 
     Args:
@@ -291,7 +300,7 @@ def compiled(
 
 
 def compiling(
-    model: Model, state: TrainState, frames: Frames, steps: int
+    model: Model, state: TrainState, frames: TrainingFrames, steps: int
 ) -> Future[float]:
     """Compile the scan of a run in the background, for later use by `program`.
 
@@ -309,8 +318,7 @@ def compiling(
 
 
 def _lower_program(model, state, frames, steps):
-    frames = jax.tree.map(jnp.asarray, frames)
-    frames = data_parallel.shared(frames, model.devices)
+    _, frames = frame_stream.replicate(frames, model.devices)
     lowered, seconds = program(model, state, frames, steps)
     return lowered, frames, seconds
 

@@ -71,7 +71,7 @@ class Observation(NamedTuple):
       truth: Observed colors, sRGB in [0, 1].
       valid: Mask of the observed pixels. None for all.
       depth: Known z-depth in scene units, 0 where it is unknown. None without depths.
-      frames: All training frames.
+      frames: All training frames. If they are streamed, only this one has pixels.
       row: Row of this frame among them.
     """
 

@@ -1,15 +1,14 @@
 """The part of other processes in a training that process 0 leads (`runtime.hosts`)."""
 
-import jax
-import jax.numpy as jnp
-
-from nerfies_jax.runtime import data_parallel, hosts
+from nerfies_jax.runtime import hosts
 from nerfies_jax.runtime.stopping import StopRequests
-from nerfies_jax.training import chunk
-from nerfies_jax.training.model import Frames, Model, TrainState
+from nerfies_jax.training import chunk, frame_stream
+from nerfies_jax.training.model import Model, TrainState
 
 
-def follow(model: Model, example: TrainState, frames: Frames) -> str:
+def follow(
+    model: Model, example: TrainState, frames: frame_stream.TrainingFrames
+) -> str:
     """Compute the share of this process of each chunk, until process 0 ends.
 
     A signal does not end it, because the launcher sends it to process 0 as well, which
@@ -26,8 +25,7 @@ def follow(model: Model, example: TrainState, frames: Frames) -> str:
     Raises:
       ValueError: If the frames have other shapes than those of process 0.
     """
-    frames = jax.tree.map(jnp.asarray, frames)
-    frames = data_parallel.shared(frames, model.devices)
+    _, frames = frame_stream.replicate(frames, model.devices)
     state = example  # until the first is received
     with StopRequests() as requests:
         requests.protect()
@@ -35,7 +33,7 @@ def follow(model: Model, example: TrainState, frames: Frames) -> str:
             message = hosts.receive()
             if message["kind"] == hosts.END:
                 return message["error"]
-            hosts.check_frames(message, frames)
+            hosts.check_frames(message, frame_stream.layout_of(frames))
             compiles = message["kind"] == hosts.COMPILE
             if compiles or message["arrays"]:
                 received = hosts.received_state(message, example)

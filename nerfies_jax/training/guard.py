@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.training.chunk import Outcome
-from nerfies_jax.training.model import Frames, TrainState
+from nerfies_jax.training.frame_stream import TrainingFrames
+from nerfies_jax.training.model import TrainState
 
 RENEW_SECONDS = 0.5  # minimum time between copies
 RENEW_SHARE = 0.05  # maximum fraction of the time for copies
@@ -74,9 +75,9 @@ def _to_device(array, sharding, key_impl):
 
 
 def last_good(
-    program: Callable[[TrainState, Frames, int], tuple[TrainState, Outcome]],
+    program: Callable[[TrainState, TrainingFrames, int], tuple[TrainState, Outcome]],
     snapshot: Snapshot,
-    frames: Frames,
+    frames: TrainingFrames,
     good_step: int,
     bad_step: int,
 ) -> tuple[TrainState, int, str]:

@@ -11,14 +11,13 @@ import psutil
 import rich.console
 from jaxtyping import Array, Key
 
-from nerfies_jax.runtime import data_parallel
 from nerfies_jax.runtime import events as event_stream
 from nerfies_jax.runtime.progress import duration
 from nerfies_jax.runtime.stopping import StopRequests
-from nerfies_jax.training import best, chunk
+from nerfies_jax.training import best, chunk, frame_stream
 from nerfies_jax.training.checkpoint import Checkpoints
 from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
-from nerfies_jax.training.model import Event, Frames, Model, TrainState
+from nerfies_jax.training.model import Event, Model, TrainState
 
 CHUNK_STEPS = 100  # longer chunks are not faster
 CHUNK_SECONDS = 0.5  # a chunk cannot be interrupted, so this bounds the delay of Ctrl-C
@@ -90,7 +89,7 @@ def step_key(state: TrainState) -> Key[Array, ""]:
 def fit(
     model: Model,
     state: TrainState,
-    frames: Frames,
+    frames: frame_stream.TrainingFrames,
     *,
     steps: int,
     events: Sequence[Event] = (),
@@ -122,7 +121,7 @@ def fit(
     Args:
       model: The model.
       state: Initial or restored state. It is overwritten.
-      frames: Training frames on the device.
+      frames: Training frames on the device, or a stream of them.
       steps: Total number of steps of the run, including those of earlier sessions.
       events: Events in addition to those of the model.
       hooks: Callbacks that do not change the state.
@@ -170,8 +169,7 @@ class _Run:
                 "steps, or start a new run"
             )
         self.events = _by_step(events)
-        self.frames = jax.tree.map(jnp.asarray, frames)
-        self.device_frames = data_parallel.shared(self.frames, model.devices)
+        self.frames, self.device_frames = frame_stream.replicate(frames, model.devices)
         self.saved_at = time.monotonic()
         self.is_best = False  # the current state, by validation
         self.step_seconds = math.inf  # unknown

@@ -14,8 +14,20 @@ from nerfies_jax.geometry.camera import Camera
 PyTree = Any
 
 
+class StepPixels(NamedTuple):
+    """Pixels that steps read from training frames that are not on the device."""
+
+    first: Int[Array, ""]  # number of the first of the steps
+    color: Any  # [steps, parts, rays, 3] uint8
+    valid: Any  # [steps, parts, rays] bool, or None
+
+
 class Frames(NamedTuple):
-    """Training frames on the device, one row each."""
+    """Training frames on the device, one row each.
+
+    If they do not fit there (`frame_stream`), pixels are those that the current step
+    reads, and other rows are undefined.
+    """
 
     images: Any  # [frames, height, width, 3] uint8
     cameras: Camera
@@ -29,8 +41,11 @@ class Frames(NamedTuple):
     flow: FrameFlow | None = None  # its rows are training frames
     moving: Any = None  # [frames, height, width] bool, True for moving objects
     # Rows of the training frames in `images`, `valid`, `depths` and `moving` if these
-    # have all frames of the capture. None if they have only the training frames.
+    # have all frames of the capture, or those that the next steps read. None if they
+    # have only the training frames.
     image_rows: Any = None
+    # Single pixels in place of images, of which none are on the device.
+    step_pixels: StepPixels | None = None
 
     def image_row(self, row: Any) -> Any:
         """Return the row of the arrays of pixels that holds a training frame.
@@ -42,6 +57,39 @@ class Frames(NamedTuple):
           The row of its image, masks and depth.
         """
         return row if self.image_rows is None else self.image_rows[row]
+
+    def of_part(self, step: Int[Array, ""], part: Any) -> "Frames":
+        """Select the pixels that a part of a step reads, if single ones are here.
+
+        Args:
+          step: Number of completed steps.
+          part: Index of the part.
+
+        Returns:
+          The frames, for `colors` of this part.
+        """
+        if self.step_pixels is None:
+            return self
+        first, *arrays = self.step_pixels
+        own = [None if x is None else x[step - first, part] for x in arrays]
+        return self._replace(step_pixels=StepPixels(first, *own))
+
+    def colors(self, row: Any, line: Any, column: Any) -> tuple[Any, Any]:
+        """Return the colors of pixels, and their masks or None.
+
+        Args:
+          row: Training frame of each pixel.
+          line: Line of each pixel.
+          column: Column of each pixel.
+
+        Returns:
+          Colors, [..., 3] uint8, and True where a pixel is valid.
+        """
+        if self.step_pixels is not None:
+            return self.step_pixels.color, self.step_pixels.valid
+        pixels = self.image_row(row), line, column
+        valid = None if self.valid is None else self.valid[pixels]
+        return self.images[pixels], valid
 
 
 class View(NamedTuple):
@@ -103,7 +151,8 @@ def in_default_precision(tree: PyTree) -> PyTree:
 class Event(NamedTuple):
     """A change of the training state on the host between two chunks.
 
-    Only an event may change the shape of an array.
+    Only an event may change the shape of an array. Frames that are streamed to the
+    device have no pixels in an event.
     """
 
     name: str
@@ -164,3 +213,7 @@ class Model(NamedTuple):
     # be traced (`training.programs`). None: they are compiled into the programs.
     numbers: PyTree = None
     with_numbers: Callable[["Model", PyTree], "Model"] | None = None
+    # (key of the run, number of completed steps, frames) -> the pixels that a step
+    # reads, as indices of `Frames.images`: (rows,) of training frames, [views], or
+    # (rows, lines, columns), [parts, rays]. None: frames must fit on the device.
+    reads: Callable[[Any, Any, Frames], tuple[Any, ...]] | None = None

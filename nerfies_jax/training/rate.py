@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from nerfies_jax.training import chunk
-from nerfies_jax.training.model import Frames, Model, TrainState
+from nerfies_jax.training.frame_stream import TrainingFrames
+from nerfies_jax.training.model import Model, TrainState
 
 # Fractions of a run at which a step is timed. A motion may cost nothing during its
 # warm-up, and a penalty may start late.
@@ -25,7 +26,9 @@ class StepTime(NamedTuple):
     compile_seconds: float
 
 
-def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> StepTime:
+def step_time(
+    model: Model, state: TrainState, frames: TrainingFrames, steps: int
+) -> StepTime:
     """Measure the mean time of a step over a run, using the initial state.
 
     Steps are timed at several `PHASES` of the run, after a first scan that is not
@@ -62,7 +65,9 @@ def step_time(model: Model, state: TrainState, frames: Frames, steps: int) -> St
     return StepTime(float(np.mean(seconds)), compile_seconds)
 
 
-def step_ms(model: Model, state: TrainState, frames: Frames, steps: int) -> float:
+def step_ms(
+    model: Model, state: TrainState, frames: TrainingFrames, steps: int
+) -> float:
     """Measure the median time of a step, starting from a state.
 
     The program is that of a run of `steps` steps, so nothing is compiled if such a run

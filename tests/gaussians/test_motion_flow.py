@@ -14,7 +14,7 @@ from gaussians_jax.losses import flow as motion_flow
 from gaussians_jax.losses.flow import FlowSpec
 from gaussians_jax.per_frame import poses as pose_refinement
 from gaussians_jax.per_frame.poses import PoseRefinementSpec
-from gaussians_jax.scene import scene
+from gaussians_jax.scene import scene, view_order
 from gaussians_jax.splatting.raster_spec import GSPLAT
 from nerfies_jax.capture.flow import FrameFlow
 from nerfies_jax.evaluation import frames_of
@@ -340,7 +340,7 @@ def test_a_step_with_flow_moves_its_own_camera_and_the_next_one_alone():
     model = scene.build(spec, scene.metadata_of(capture))
     state = model.init(capture, jax.random.key(0))
     frames = frames_of(capture, model.required_data)
-    row = int(scene.shuffled_row(state.key, state.step, len(frames.times)))
+    row = int(view_order.shuffled_row(state.key, state.step, len(frames.times)))
     other = int(frames.flow.next_row[row])
     state, metrics = jax.jit(model.step)(state, frames)
     assert metrics["flow/known"] > 0

@@ -13,7 +13,7 @@ from gaussians_jax.init.points import InitSpec
 from gaussians_jax.optim import learning_rates
 from gaussians_jax.optim.densification import DefaultStrategySpec
 from gaussians_jax.optim.learning_rates import LearningRateSpec
-from gaussians_jax.scene import first_state, presets, scene
+from gaussians_jax.scene import first_state, presets, scene, view_order
 from gaussians_jax.scene.spec import SceneMetadata, raster_of
 from nerfies_jax import evaluation
 from nerfies_jax.runtime import compiler
@@ -76,7 +76,7 @@ def test_a_step_of_two_views_goes_down_the_mean_of_both():
 
 
 def test_every_epoch_shows_every_frame_once_in_its_own_order():
-    rows = jitted(jax.vmap(scene.shuffled_row, (None, 0, None)), static_argnums=2)
+    rows = jitted(jax.vmap(view_order.shuffled_row, (None, 0, None)), static_argnums=2)
     epochs = rows(jax.random.key(0), np.arange(21, dtype=np.int32), 7).reshape(3, 7)
     assert (np.sort(epochs, axis=1) == np.arange(7)).all()
     assert len({tuple(epoch) for epoch in epochs}) == 3
