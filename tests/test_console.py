@@ -159,8 +159,8 @@ def test_stages_are_nested_events_that_begin_and_end():
         pytest.raises(KeyError),
     ):
         work()
-    told = [(one["kind"], one.get("name"), one.get("status")) for one in received]
-    assert told == [
+    summary = [(one["kind"], one.get("name"), one.get("status")) for one in received]
+    assert summary == [
         ("stage", "outer", "begin"),
         ("stage", "inner", "begin"),
         ("train", None, None),

@@ -274,8 +274,8 @@ def test_a_lens_for_each_image_is_no_physical_camera(
     (model / "images.txt").write_text(text)
     capture = colmap.read(tmp_path)
     assert capture.camera_ids.tolist() == expected
-    told = [note for note in capture.notes if "a COLMAP camera of its own" in note]
-    assert len(told) == (len(set(lenses)) == 9)
+    notes = [note for note in capture.notes if "a COLMAP camera of its own" in note]
+    assert len(notes) == (len(set(lenses)) == 9)
 
 
 def test_black_wedges_at_the_rim_are_not_observed():

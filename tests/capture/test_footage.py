@@ -265,10 +265,10 @@ def test_what_cannot_be_read_is_left_out_and_what_is_hidden_is_no_image(tmp_path
 def test_what_files_say_of_a_lens_may_be_anything(tmp_path):
     values = {"0.jpg": (27, 35), "1.jpg": 0, "2.jpg": 18, "3.jpg": "wide"}
     for name, value in values.items():
-        told = PIL.Image.Exif()
-        told[0x0112] = 9  # no orientation that there is
-        told.get_ifd(0x8769)[0xA405] = value
-        PIL.Image.new("RGB", (48, 32)).save(tmp_path / name, exif=told)
+        exif = PIL.Image.Exif()
+        exif[0x0112] = 9  # no orientation that there is
+        exif.get_ifd(0x8769)[0xA405] = value
+        PIL.Image.new("RGB", (48, 32)).save(tmp_path / name, exif=exif)
     source_images = footage.from_images(tmp_path, tmp_path / "out")
     assert source_images.names == ("0.png", "1.png", "2.png", "3.png")
     assert source_images.focal == 18 / 36

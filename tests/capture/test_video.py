@@ -58,8 +58,10 @@ def test_equal_frames_make_equal_videos_whatever_was_in_memory(tmp_path):
     contents = []
     for fill in ("1", "85"):
         path = tmp_path / f"{fill}.mp4"
-        told = os.environ | {"MALLOC_PERTURB_": fill}
-        subprocess.run([sys.executable, "-c", WRITES, path], env=told, check=True)
+        environment = os.environ | {"MALLOC_PERTURB_": fill}
+        subprocess.run(
+            [sys.executable, "-c", WRITES, path], env=environment, check=True
+        )
         contents.append(path.read_bytes())
     assert contents[0] == contents[1]
 

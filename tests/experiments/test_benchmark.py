@@ -69,11 +69,11 @@ def test_methods_over_time_are_evaluated_at_halves_of_their_own_steps():
     words = ["--suite", "curves", "--methods", "static", "moba", "--seeds", "1"]
     for more, steps in ([], suites.CURVES.steps), (["--steps", "20"], {"static": 20}):
         args = cli.parse(benchmark.Benchmark, words + more)
-        told = " ".join(benchmark.planned(args)[0].task.words)
+        line = " ".join(benchmark.planned(args)[0].task.words)
         count = steps["static"]
         points = [count // 16, count // 8, count // 4, count // 2, count]
         shown = " ".join(map(str, points))
-        assert f"--steps {count} --evaluate-at {shown}" in told
+        assert f"--steps {count} --evaluate-at {shown}" in line
     timed = cli.parse(benchmark.Benchmark, [*words, "--seconds", "9"])
     assert "--evaluate-at" not in benchmark.planned(timed)[0].task.words
 

@@ -34,8 +34,10 @@ def rows_of_the_page():
 def test_the_page_has_a_row_of_every_case_and_no_other():
     rows = [row[:3] for row in rows_of_the_page()]
     cases = [case for cases, _ in TOPICS.values() for case in cases]
-    told = [(one.name, one.breaks, f"{one.formula}; {one.switch}") for one in cases]
-    assert rows == [[cell.replace("|", r"\|") for cell in row] for row in told]
+    described = [
+        (one.name, one.breaks, f"{one.formula}; {one.switch}") for one in cases
+    ]
+    assert rows == [[cell.replace("|", r"\|") for cell in row] for row in described]
 
 
 def test_textbook_forms_miss_a_bound_by_far():

@@ -107,15 +107,15 @@ def on_terminal(*words):
 
 def test_a_terminal_shows_each_stage_that_lasts_by_name(undisturbed):
     folder, shown = undisturbed
-    told = runs.read_events(folder)
-    names = event_checks.ended_stages(told)
+    events = runs.read_events(folder)
+    names = event_checks.ended_stages(events)
     expected = ["reading images", "building the model", "initializing the scene"]
     expected += ["compiling the renderer", "training", "scoring held-out frames"]
     expected += ["making the player", "rendering the video", "measuring quality"]
     assert [each for each in dict.fromkeys(names) if each in expected] == expected
     seconds = {
         one["name"]: one["seconds"]
-        for one in told
+        for one in events
         if one["kind"] == "stage" and "seconds" in one
     }
     # A shorter stage would only flicker, and how long each lasts is the machine's.

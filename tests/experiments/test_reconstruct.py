@@ -127,16 +127,16 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     assert "player could not be created" not in page
     assert "plan: 2 steps in 250 s of training" in printed
     assert "motion:     +0.00 dB compared with" in printed
-    told = runs.read_events(out)
-    names = event_checks.ended_stages(told)
+    events = runs.read_events(out)
+    names = event_checks.ended_stages(events)
     order = ["reading images", "initializing the scene", "training"]
     order += ["rendering the video", "measuring quality", "writing the report"]
     assert [name for name in dict.fromkeys(names) if name in order] == order
     # But for what is done between them, on a machine that does other things as well.
-    assert event_checks.share_in_stages(told) > 0.8
-    assert told[-1]["stopped_by"] == "steps"
+    assert event_checks.share_in_stages(events) > 0.8
+    assert events[-1]["stopped_by"] == "steps"
     curve = json.loads((out / "curve.json").read_text())
-    scores = [one["metrics"] for one in told if one["kind"] == "evaluation"]
+    scores = [one["metrics"] for one in events if one["kind"] == "evaluation"]
     assert [row["psnr"] for row in curve["evaluations"]] == [x["psnr"] for x in scores]
     assert curve["training"][-1]["step"] == 2
     # While another process is at work in it, it is not resumed.

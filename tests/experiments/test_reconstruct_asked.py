@@ -85,8 +85,8 @@ def test_images_that_are_too_small_for_lpips_are_refused(
 ):
     weights = tmp_path / "alex.npz"
     np.savez(weights, **state_dict("alex", rng))
-    asked = "--out", tmp_path / "run", "--lpips-weights", weights
-    assert "31 pixels on the shorter side" in refused(capsys, captured, *asked)
+    options = "--out", tmp_path / "run", "--lpips-weights", weights
+    assert "31 pixels on the shorter side" in refused(capsys, captured, *options)
     assert not (tmp_path / "run").exists()
 
 
@@ -180,10 +180,10 @@ def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
 ):
     monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     nerfies_format.write(two_planes.make(), tmp_path / "capture")
-    taken = {}
+    call = {}
 
     def caught(config, stored):
-        taken["config"] = config
+        call["config"] = config
         raise ValueError("caught")
 
     monkeypatch.setattr(reconstruction, "new_run", caught)
@@ -194,6 +194,6 @@ def test_effects_auto_takes_the_advice_and_the_users_word_comes_last(
                 *("--effects", "auto", "--set", "sh_degree=0"),
             ]
         )
-    assert taken["config"].preset == "splats-static-small"
-    assert taken["config"].overrides[-1] == "sh_degree=0"
+    assert call["config"].preset == "splats-static-small"
+    assert call["config"].overrides[-1] == "sh_degree=0"
     assert "effects: --preset splats-static-small" in capsys.readouterr().out

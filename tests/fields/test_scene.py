@@ -112,10 +112,10 @@ def test_training_a_static_field_lowers_the_loss():
 
 
 @pytest.mark.parametrize(
-    ("union", "behind", "asked"),
+    ("union", "behind", "samples"),
     [(True, (1.0, 1.0, 1.0), 16), (False, (0.0, 1.0, 0.5), 8), (False, None, 9)],
 )
-def test_a_static_level_is_the_plain_nerf(union, behind, asked, dtype):
+def test_a_static_level_is_the_plain_nerf(union, behind, samples, dtype):
     plan = dataclasses.replace(STATIC.sampling, union=union)
     metadata = dataclasses.replace(METADATA, background=behind)
     field = scene.field(dataclasses.replace(STATIC, sampling=plan), metadata)
@@ -130,7 +130,7 @@ def test_a_static_level_is_the_plain_nerf(union, behind, asked, dtype):
     np.testing.assert_allclose(coarse.color, expected, atol=tolerance)
     expected = plain_nerf(params["template"]["fine"], ray, fine.distances, behind)
     np.testing.assert_allclose(fine.color, expected, atol=tolerance)
-    assert len(fine.distances) == asked
+    assert len(fine.distances) == samples
     if behind is None:
         assert fine.distances[-1] == ray.far
         assert fine.spacing[-1] == compositing.AT_INFINITY
@@ -226,8 +226,8 @@ def test_a_step_takes_no_more_memory_than_the_estimate():
     frames = evaluation.frames_of(capture, model.required_data)
     state = jax.eval_shape(lambda key: model.example(capture, key), jax.random.key(0))
     program = jax.jit(model.step).lower(state, frames).compile()
-    taken = program.memory_analysis().temp_size_in_bytes
-    assert 0.5 < taken / scene.estimate_memory_bytes(spec, capture) < 1.1
+    temporary = program.memory_analysis().temp_size_in_bytes
+    assert 0.5 < temporary / scene.estimate_memory_bytes(spec, capture) < 1.1
 
 
 @pytest.mark.slow

@@ -52,7 +52,7 @@ def test_a_start_is_never_empty():
 
 def test_random_points_stand_in_where_no_tracks_bring_what_moves():
     spec = InitSpec(points=100, extra_random=None)
-    asked = dataclasses.replace(spec, extra_random=7)
+    larger = dataclasses.replace(spec, extra_random=7)
     for tracked, most, extra in (
         (True, None, 0),
         (False, None, 50),
@@ -61,7 +61,7 @@ def test_random_points_stand_in_where_no_tracks_bring_what_moves():
     ):
         settled = initialization.of_start(spec, tracked, most)
         assert settled.extra_random == extra
-        assert initialization.of_start(asked, tracked, most) == asked
+        assert initialization.of_start(larger, tracked, most) == larger
     assert own_points(spec, capture_with(150)) == 100
     assert initialization.initial_count(spec, capture_with(150)) == 150
 

@@ -261,11 +261,11 @@ def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
     moments = first_moments(tx, params, params)
     rows = np.asarray([5, 0, 0, 2, 1, 0, 0, 0])
     fresh, inactive = np.arange(8) == 2, np.arange(8) >= 5
-    taken, moved = gather(tx, params, moments, rows, fresh, inactive)
+    gathered, moved = gather(tx, params, moments, rows, fresh, inactive)
     expected = np.asarray(params.rows["code"])[rows]
-    np.testing.assert_array_equal(taken.rows["code"], expected)
-    assert (taken.rows["splats"].opacity_logit[5:] == INACTIVE_LOGIT).all()
-    np.testing.assert_array_equal(taken.nets["w"], params.nets["w"])
+    np.testing.assert_array_equal(gathered.rows["code"], expected)
+    assert (gathered.rows["splats"].opacity_logit[5:] == INACTIVE_LOGIT).all()
+    np.testing.assert_array_equal(gathered.nets["w"], params.nets["w"])
 
     by_kind = moved[1].inner_states
     before = moments[1].inner_states["mean"].inner_state[0]
@@ -279,4 +279,4 @@ def test_a_gather_moves_rows_with_their_moments_and_leaves_nets_alone(name):
     assert rest["splats"].sh_rest.shape == (8, 3, 3)
     same_bits(by_kind["nets"], moments[1].inner_states["nets"])
     with lenient("standard"):  # the state still fits the parameters
-        jax.eval_shape(tx.update, taken, moved, taken)
+        jax.eval_shape(tx.update, gathered, moved, gathered)

@@ -200,17 +200,17 @@ console.log(JSON.stringify({
 def test_the_page_sorts_what_is_ahead_from_the_farthest_on(page):
     capture = moving_scene()[2]
     views = [(2, 0.9), (0, 0.3), (2, 0.3)]  # and back: nothing of a time before stays
-    asked = []
+    requests = []
     for row, time in views:
         forward = capture.cameras.camera_from_world[row, 2].tolist()
         position = capture.cameras.position[row].tolist()
-        asked.append({"position": position, "forward": forward, "time": time})
+        requests.append({"position": position, "forward": forward, "time": time})
     header = json.loads(inside(page, "header"))
     header["raster"]["near"] = 0.55  # so that some Gaussians are nearer
     content = {"header": header, "data": inside(page, "data")}
-    answer = by_node(ORDER, program_of("splats.js"), content, asked)
+    answer = by_node(ORDER, program_of("splats.js"), content, requests)
     assert answer["order"] == [1, 4, 6, 0, 3, 2, 5]
-    for view, rows in zip(asked, answer["rows"], strict=True):
+    for view, rows in zip(requests, answer["rows"], strict=True):
         mean = np.asarray(unpacked(page, view["time"])[0].mean, float)
         depth = (mean - view["position"]) @ view["forward"]
         assert sorted(rows) == np.nonzero(depth >= 0.55)[0].tolist()

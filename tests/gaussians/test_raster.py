@@ -255,8 +255,8 @@ def test_tiles_are_taken_from_the_longest_to_the_empty(rng):
         length = rng.integers(0, most, tiles, endpoint=True).astype(np.int32)
         length[rng.random(tiles) < 0.3] = 0
         length[-1] = most
-        told = np.minimum(length, 2 ** (32 - max(1, (tiles - 1).bit_length())) - 1)
-        expected = np.argsort(-told, kind="stable")
+        clipped = np.minimum(length, 2 ** (32 - max(1, (tiles - 1).bit_length())) - 1)
+        expected = np.argsort(-clipped, kind="stable")
         np.testing.assert_array_equal(longest_first(length), expected)
     nothing = np.zeros(3000, np.int32)
     np.testing.assert_array_equal(longest_first(nothing), np.arange(3000))

@@ -56,8 +56,8 @@ def two_views(frames):
     """The first and the last frame by turns, in place of all."""
     rows = np.arange(len(frames.times)) % 2 * (len(frames.times) - 1)
     beside = dict(points=None, flow=None)
-    taken = jax.tree.map(lambda leaf: leaf[rows], frames._replace(**beside))
-    return taken._replace(points=frames.points, flow=frames.flow)
+    selected = jax.tree.map(lambda leaf: leaf[rows], frames._replace(**beside))
+    return selected._replace(points=frames.points, flow=frames.flow)
 
 
 def unobserved(frames):

@@ -121,14 +121,14 @@ def test_as_many_wide_steps_as_there_is_room_for_are_searched_again(monkeypatch)
     monkeypatch.setattr(dense_flow.wide_steps, "is_wide", lambda *_: True)
     views = record.view_set.in_time_order(two_planes.make(frames=6))
     images = dense_flow.leveled(views)
-    asked = []
+    requests = []
 
     def room_for(count):
-        asked.append(count)
+        requests.append(count)
         return 3
 
     dense_flow.between_neighbors(views, images, (1.0, 3.0), room_for)
-    assert asked == [10]
+    assert requests == [10]
     assert sorted(looked) == [(0, 1), (1, 2), (2, 3)]
 
 

@@ -154,13 +154,13 @@ def test_a_scene_of_which_no_track_moves_is_static():
         assert not usable_paths.stands_still(static._replace(**change), capture.times)
 
 
-@pytest.mark.parametrize(("asked", "overrides"), [(20, ("motion.bases=20",)), (8, ())])
-def test_paths_of_many_things_get_more_bases(asked, overrides, monkeypatch):
-    monkeypatch.setattr(rigid_groups, "enough", lambda *_: asked)
+@pytest.mark.parametrize(("bases", "overrides"), [(20, ("motion.bases=20",)), (8, ())])
+def test_paths_of_many_things_get_more_bases(bases, overrides, monkeypatch):
+    monkeypatch.setattr(rigid_groups, "enough", lambda *_: bases)
     choice = representation.default_preset(two_planes.make(**MOVES, frames=24))
     assert choice.overrides == overrides
     spec = specs.override(PRESETS[choice.preset], choice.overrides)
-    assert spec.motion.bases == asked
+    assert spec.motion.bases == bases
 
 
 @pytest.mark.parametrize(("a_knot", "knots"), [(3, 20), (0.8, 30), (0.1, 60)])

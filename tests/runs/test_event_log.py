@@ -95,8 +95,8 @@ def test_a_reader_follows_what_is_written(tmp_path):
 def test_rows_of_training_are_thinned_out_but_for_the_last(tmp_path):
     steps = range(1, 1000)
     logged(tmp_path, *map(train, steps), evaluation(999, 20.0), train(1000))
-    told = read_events(tmp_path)
-    assert [event["step"] for event in told] == [1, 999, 999, 1000]
+    read = read_events(tmp_path)
+    assert [event["step"] for event in read] == [1, 999, 999, 1000]
 
 
 def test_a_full_disk_keeps_events_waiting(tmp_path, monkeypatch, capsys):
@@ -136,10 +136,10 @@ def test_a_resumed_run_has_each_step_once(tmp_path):
     logged(tmp_path, run("begin", 0, steps=9, machine={"cpu": "one"}))
     logged(tmp_path, train(2), evaluation(2, 20.0), train(4), evaluation(4, 22.0))
     logged(tmp_path, run("resume", 2, steps=9), train(3), evaluation(4, 23.0))
-    told = curves.course_of(tmp_path)
-    assert [row["step"] for row in told.training] == [2, 3]
-    assert [row["psnr"] for row in told.evaluations] == [20.0, 23.0]
-    assert (told.step, told.steps, told.stopped_by) == (3, 9, None)
+    course = curves.course_of(tmp_path)
+    assert [row["step"] for row in course.training] == [2, 3]
+    assert [row["psnr"] for row in course.evaluations] == [20.0, 23.0]
+    assert (course.step, course.steps, course.stopped_by) == (3, 9, None)
     curve = curves.read(tmp_path)
     assert curve.psnr == (20.0, 23.0)
     assert curve.machine == {"cpu": "one"}

@@ -62,9 +62,9 @@ def test_installed_lpips_is_left_out_where_images_are_too_small(monkeypatch):
     extra = quality.prepared(MoreMetrics())
     assert quality.fitting(extra, (64, 31)).lpips.params == params
     assert quality.fitting(extra, (64, 30)).lpips is None
-    asked = quality.prepared(MoreMetrics(lpips_weights=("a.npz",)))
+    extra_lpips = quality.prepared(MoreMetrics(lpips_weights=("a.npz",)))
     with pytest.raises(ValueError, match="at least 31 pixels"):
-        quality.fitting(asked, (64, 30))
+        quality.fitting(extra_lpips, (64, 30))
 
 
 def test_a_run_on_nothing_does_not_begin(tmp_path):

@@ -85,15 +85,15 @@ def test_a_tracker_reads_back_what_it_was_sent(name, tmp_path, monkeypatch):
     time.sleep(1.1)  # names of files are seconds
     tracked(name, tmp_path, step=1)  # resumed from an earlier checkpoint
     until = time.monotonic() + 60  # W&B has a process of its own write
-    told = READ[name](tmp_path)
-    while told["held_out/psnr"][-1][0] != 3 and time.monotonic() < until:
+    metrics = READ[name](tmp_path)
+    while metrics["held_out/psnr"][-1][0] != 3 and time.monotonic() < until:
         time.sleep(0.1)
-        told = READ[name](tmp_path)
-    assert told["train/loss"][-1] == (3, pytest.approx(1 / 3))
-    assert told["train/psnr"][-1] == (3, 20.0)
-    assert told["held_out/psnr"][-1] == (3, 18.0)
+        metrics = READ[name](tmp_path)
+    assert metrics["train/loss"][-1] == (3, pytest.approx(1 / 3))
+    assert metrics["train/psnr"][-1] == (3, 20.0)
+    assert metrics["held_out/psnr"][-1] == (3, 18.0)
     if name != "wandb":  # it numbers what it is sent by itself
-        assert [step for step, _ in told["train/loss"]] == [1, 2, 3]
+        assert [step for step, _ in metrics["train/loss"]] == [1, 2, 3]
 
 
 def _of_tensorboard(folder):
@@ -110,7 +110,7 @@ def _of_tensorboard(folder):
 def _of_wandb(folder):
     from wandb.proto import wandb_internal_pb2
 
-    told = {}
+    metrics = {}
     for path in sorted(folder.glob("wandb/offline-run-*/*.wandb")):
         for data in _records(path.read_bytes()):
             record = wandb_internal_pb2.Record()
@@ -121,8 +121,8 @@ def _of_wandb(folder):
                 for each in items
             }
             for key, value in row.items():
-                told.setdefault(key, []).append((row.get("step"), value))
-    return told
+                metrics.setdefault(key, []).append((row.get("step"), value))
+    return metrics
 
 
 def _records(log):
@@ -144,18 +144,18 @@ def _records(log):
 def _of_rerun(folder):
     from rerun.chunk import RrdReader
 
-    told = {}
+    metrics = {}
     for path in sorted(folder.glob("rerun/*.rrd")):
         for chunk in RrdReader(path).stream():
             batch = chunk.to_record_batch()
             if "step" not in batch.schema.names:
                 continue
             values = batch.column("Scalars:scalars").to_pylist()
-            rows = told.setdefault(str(chunk.entity_path).strip("/"), {})
+            rows = metrics.setdefault(str(chunk.entity_path).strip("/"), {})
             rows |= zip(batch.column("step").to_pylist(), values, strict=True)
     return {
         name: [(step, value) for step, (value,) in sorted(rows.items())]
-        for name, rows in told.items()
+        for name, rows in metrics.items()
     }
 
 

@@ -86,8 +86,8 @@ def test_a_run_ends_with_its_best_validated_state(
     assert runs.restore(tmp_path / "run", outcome.run).step == 20
     newest = runs.restore(tmp_path / "run", outcome.run, newest=True)
     assert newest.step == 40
-    told = capsys.readouterr().out
-    assert "30.00 dB after step 20, and 28.00 dB at the end" in told
+    output = capsys.readouterr().out
+    assert "30.00 dB after step 20, and 28.00 dB at the end" in output
 
     result = outcome.result
     rows = [{**row, "psnr": 20.0 + row["step"]} for row in result.history.evaluations]

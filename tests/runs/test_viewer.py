@@ -251,12 +251,12 @@ def test_a_browser_gets_gaussians_that_follow_time_effects_and_the_channel(tmp_p
         until(lambda: not page._update(state, 0))
         np.testing.assert_array_equal(browser.positions(), frozen)
         # Depth is rendered here, by another program, and sharpens by itself.
-        told, tell = [], page._windows[0]._show_text
-        page._windows[0]._show_text = lambda text: told.append(text) or tell(text)
+        texts, tell = [], page._windows[0]._show_text
+        page._windows[0]._show_text = lambda text: texts.append(text) or tell(text)
         browser.press(page, "show", "depth")
         until(lambda: browser.image is not None and browser.image.shape[1] == 160)
-        assert told[0].startswith("Compiling")
-        assert told[-1].startswith("160x120")
+        assert texts[0].startswith("Compiling")
+        assert texts[-1].startswith("160x120")
         assert not page._windows[0]._splats.visible
         browser.press(page, "show", "color")
         until(lambda: browser.image.shape == (8, 8, 3))
