@@ -110,14 +110,14 @@ def read():
 
 def write(spent):
     """Put what was spent into budget.json; what this run did not touch stays."""
-    kept = read() if BUDGET.exists() else {}
-    kept = {key: cost for key, cost in kept.items() if pathlib.Path(key[1]).exists()}
-    kept |= {key: [count, round(used, 1)] for key, (count, used) in spent.items()}
+    costs = read() if BUDGET.exists() else {}
+    costs = {key: cost for key, cost in costs.items() if pathlib.Path(key[1]).exists()}
+    costs |= {key: [count, round(used, 1)] for key, (count, used) in spent.items()}
     lines = []
     for tier in TIERS:
         files = (
-            f"    {json.dumps(path)}: {json.dumps(kept[of, path])}"
-            for of, path in sorted(kept)
+            f"    {json.dumps(path)}: {json.dumps(costs[of, path])}"
+            for of, path in sorted(costs)
             if of == tier
         )
         lines.append(f'  "{tier}": {{\n' + ",\n".join(files) + "\n  }")

@@ -264,11 +264,11 @@ def _public():
 
 
 def _drawn(name, function):
-    given = SETTINGS.get(name, {})
+    settings = SETTINGS.get(name, {})
     return {
         key: parameter.annotation
         for key, parameter in inspect.signature(function).parameters.items()
-        if key not in given and parameter.default is inspect.Parameter.empty
+        if key not in settings and parameter.default is inspect.Parameter.empty
     }
 
 
@@ -384,22 +384,22 @@ def _typed(leaf, dtype):
 
 
 def _given(name, dtype):
-    given = SETTINGS.get(name, {})
-    return {k: v(jnp.dtype(dtype)) if callable(v) else v for k, v in given.items()}
+    settings = SETTINGS.get(name, {})
+    return {k: v(jnp.dtype(dtype)) if callable(v) else v for k, v in settings.items()}
 
 
 def _is_float(leaf):
     return jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
-def _value_and_slopes(function, given, arguments):
+def _value_and_slopes(function, settings, arguments):
     """Float results, others, and slopes of the sum of the first in all floats."""
     leaves, tree = jax.tree.flatten(arguments)
 
     def of_floats(floats):
         given_floats = iter(floats)
         filled = [next(given_floats) if _is_float(x) else x for x in leaves]
-        results = jax.tree.leaves(_called(function, tree.unflatten(filled) | given))
+        results = jax.tree.leaves(_called(function, tree.unflatten(filled) | settings))
         return (
             [x for x in results if _is_float(x)],
             [x for x in results if not _is_float(x)],
@@ -422,8 +422,8 @@ def _called(function, arguments):
 
 def _compiled(name, dtype):
     """The program of the floats, other results and gradients, and its rows."""
-    function, given = FUNCTIONS[name], _given(name, dtype)
-    one = functools.partial(_value_and_slopes, function.call, given)
+    function, settings = FUNCTIONS[name], _given(name, dtype)
+    one = functools.partial(_value_and_slopes, function.call, settings)
     return jax.jit(jax.vmap(one), compiler_options=QUICK), _rows(function, dtype)
 
 
@@ -463,8 +463,8 @@ def test_float64_is_finite_everywhere(name):
 @functools.partial(jax.jit, compiler_options=QUICK)
 def _every_rotation_and_strain(arguments):
     return {
-        name: _called(FUNCTIONS[name].call, given | SETTINGS.get(name, {}))
-        for name, given in arguments.items()
+        name: _called(FUNCTIONS[name].call, settings | SETTINGS.get(name, {}))
+        for name, settings in arguments.items()
     }
 
 

@@ -149,13 +149,13 @@ def test_rounded_factors_misplace_points(bits, off, monkeypatch):
         exact = moved_by_bases("float64")
 
     def rounding(product):
-        def of_rounded(*given):
+        def of_rounded(*inputs):
             return product(
                 *(
                     one
                     if isinstance(one, str)
                     else lax.reduce_precision(one, 8, bits - 1)
-                    for one in given
+                    for one in inputs
                 )
             )
 

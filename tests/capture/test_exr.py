@@ -109,11 +109,11 @@ def test_a_file_without_our_channels(tmp_path):
     assert list(image.extra) == ["mask"]
 
 
-@pytest.mark.parametrize("kept", [0, 4, 300, 0.9])
-def test_a_file_cut_short_is_refused(tmp_path, kept):
+@pytest.mark.parametrize("share", [0, 4, 300, 0.9])
+def test_a_file_cut_short_is_refused(tmp_path, share):
     exr.write_exr(tmp_path / "a.exr", RNG.random((64, 64, 3), np.float32))
     data = (tmp_path / "a.exr").read_bytes()
-    cut = int(kept * len(data)) if kept < 1 else int(kept)
+    cut = int(share * len(data)) if share < 1 else int(share)
     (tmp_path / "a.exr").write_bytes(data[:cut])
     with pytest.raises(CaptureError, match=r"a\.exr: not a readable EXR") as caught:
         exr.read_exr(tmp_path / "a.exr")

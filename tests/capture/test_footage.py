@@ -34,19 +34,19 @@ def test_the_sharpest_of_each_stretch_is_kept():
     scores = rng.uniform(80, 120, 60)
     scores[30:] *= 20  # a part of the video with much more texture
     scores[12:18] = 5  # one whole stretch is blurred
-    kept, blurred = footage.sharp_rows(scores, np.arange(60) / 30, 10)
+    selected_rows, blurred = footage.sharp_rows(scores, np.arange(60) / 30, 10)
     assert blurred == 1
-    assert len(kept) == 9
+    assert len(selected_rows) == 9
     for stretch in range(10):
         rows = np.arange(6 * stretch, 6 * stretch + 6)
-        assert (rows[np.argmax(scores[rows])] in kept) == (stretch != 2)
+        assert (rows[np.argmax(scores[rows])] in selected_rows) == (stretch != 2)
 
 
 def test_stretches_are_of_time_and_not_of_frames():
     seconds = np.concatenate([np.arange(0, 1, 0.1), np.arange(1, 2.01, 0.02)])
-    kept, _ = footage.sharp_rows(np.ones(len(seconds)), seconds, 10)
-    gaps = np.diff(seconds[kept])
-    assert len(kept) == 10
+    selected_rows, _ = footage.sharp_rows(np.ones(len(seconds)), seconds, 10)
+    gaps = np.diff(seconds[selected_rows])
+    assert len(selected_rows) == 10
     # By number of frames, six to a stretch, the first two would be 0.6 s apart.
     assert gaps.max() < 0.31
 

@@ -129,12 +129,12 @@ def test_a_turned_image_is_refused_or_read_as_stored(tmp_path, ending, orientati
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])
-@pytest.mark.parametrize("kept", [0, 40, 0.95])
-def test_an_image_cut_short_is_refused(tmp_path, ending, kept):
+@pytest.mark.parametrize("share", [0, 40, 0.95])
+def test_an_image_cut_short_is_refused(tmp_path, ending, share):
     noise = RNG.integers(0, 256, (64, 64, 3), np.uint8)
     path = save(tmp_path / f"a.{ending}", noise)
     data = path.read_bytes()
-    path.write_bytes(data[: int(kept * len(data)) if kept < 1 else int(kept)])
+    path.write_bytes(data[: int(share * len(data)) if share < 1 else int(share)])
     with pytest.raises(
         CaptureError, match=rf"a\.{ending}: not a readable image"
     ) as caught:

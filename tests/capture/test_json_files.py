@@ -147,7 +147,7 @@ def test_only_what_the_dead_of_this_machine_left_is_swept(tmp_path):
     owner, machine = processes.own_name(), processes.machine()
     pid, start, _ = owner.split("-")
     dead = "4194999-7"  # above the largest process id of Linux
-    kept = (
+    contents = (
         f".a.{owner}.partial.png",
         f".a.{dead}-{'0' * 6}.partial.png",
         ".a.partial",
@@ -155,12 +155,12 @@ def test_only_what_the_dead_of_this_machine_left_is_swept(tmp_path):
     )
     earlier = f"{pid}-{int(start) - 1}-{machine}"  # had the id of this process
     for name in (
-        *kept,
+        *contents,
         f".a b.c.{dead}-{machine}.partial.png",
         f".b.{earlier}.partial",
     ):
         (tmp_path / name).write_text("")
     (tmp_path / f".out.{dead}-{machine}.ab_1cd2e.partial" / "new").mkdir(parents=True)
     assert len(sweep(tmp_path)) == 3
-    assert {path.name for path in tmp_path.iterdir()} == {*kept}
+    assert {path.name for path in tmp_path.iterdir()} == {*contents}
     assert sweep(tmp_path / "absent") == []

@@ -101,8 +101,8 @@ def test_masked_and_fine_features_are_left_out_with_their_matches(tmp_path):
     database = pycolmap.Database.open(target)
     by_name = {image.name: image for image in database.read_all_images()}
     coarse = points[:, 2] > 2
-    kept = {"b.png": coarse, "a.png": coarse & (points[:, 1] >= 10)}
-    for name, rows in kept.items():
+    masked = {"b.png": coarse, "a.png": coarse & (points[:, 1] >= 10)}
+    for name, rows in masked.items():
         image = by_name[name]
         np.testing.assert_array_equal(
             database.read_keypoints(image.image_id), points[rows]
@@ -113,6 +113,6 @@ def test_masked_and_fine_features_are_left_out_with_their_matches(tmp_path):
     ids = [by_name[name].image_id for name in ("a.png", "b.png")]
     matches = database.read_matches(*ids)
     database.close()
-    for (a, b), row in zip(matches, np.flatnonzero(kept["a.png"]), strict=True):
-        np.testing.assert_array_equal(points[kept["a.png"]][a], points[row])
-        np.testing.assert_array_equal(points[kept["b.png"]][b], points[row])
+    for (a, b), row in zip(matches, np.flatnonzero(masked["a.png"]), strict=True):
+        np.testing.assert_array_equal(points[masked["a.png"]][a], points[row])
+        np.testing.assert_array_equal(points[masked["b.png"]][b], points[row])

@@ -109,14 +109,14 @@ def test_points_land_on_the_pixels_of_opencv(model):
     capture = scenes.tiny_capture()
     number = conversion.CAMERA_MODELS.index(model)
     lens = [0.05, -0.01, 0.002, -0.003, 0.001, -0.0005][: 6 if number == 2 else 4]
-    given = cameras_of(capture, number, lens)
-    world = conversion.world_cameras(given)
+    inputs = cameras_of(capture, number, lens)
+    world = conversion.world_cameras(inputs)
     place = conversion.in_scene_units(world, capture)._replace(
         position=world.position.astype(np.float32)
     )
     points = 3 * capture.points.position[:20] + np.float32([5, 0, -2])
     for row in range(2):
-        pose = np.float64(given.poses[row])
+        pose = np.float64(inputs.poses[row])
         local = (points - pose[:, 3]) @ pose[:, :3]
         u, v = (local[:, :2] / local[:, 2:]).T
         r2 = u * u + v * v
@@ -132,7 +132,7 @@ def test_points_land_on_the_pixels_of_opencv(model):
             t = np.arctan(np.sqrt(r2))
             bent = t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8)
             u, v = u * bent / np.sqrt(r2), v * bent / np.sqrt(r2)
-        fx, fy, cx, cy = given.intrinsics[row]
+        fx, fy, cx, cy = inputs.intrinsics[row]
         expected = np.stack([fx * u + cx, fy * v + cy], axis=-1)
         pixel, _ = camera.project(camera.take(place, row), points)
         np.testing.assert_allclose(pixel, expected, atol=2e-3)

@@ -23,11 +23,11 @@ def test_the_command_line_says_draws_and_keeps_what_it_finds(
     preprocess.main(words)
     printed = capsys.readouterr().out
     assert "masks of moving objects ..." in printed
-    (kept,) = (tmp_path / "cache" / "evidence").glob("*.npz")
-    assert f"stored result: {kept}" in printed
+    (path,) = (tmp_path / "cache" / "evidence").glob("*.npz")
+    assert f"stored result: {path}" in printed
     assert (tmp_path / "out" / "tracks.png").stat().st_size > 10_000
     stored = json.loads((tmp_path / "out" / "preprocessing.json").read_text())
-    assert stored["found"]["tracks"] == len(record.load(kept).score)
+    assert stored["found"]["tracks"] == len(record.load(path).score)
     preprocess.main([*words[:-1], str(tmp_path / "again")])
     again = capsys.readouterr().out
     assert "already preprocessed" in again

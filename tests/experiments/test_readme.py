@@ -44,8 +44,8 @@ def test_a_program_of_readme_runs(program, monkeypatch, capsys):
 def test_the_table_of_presets_shows_kept_numbers():
     rows = re.findall(r"^\|[^|]+\| `([^`]+)` \| ([\d.]+) dB \|$", README, re.M)
     assert len(rows) >= 5
-    kept = json.loads((ROOT / "docs/results/league.json").read_text())
-    (contest,) = [c for c in kept["contests"] if c["capture"] == "default"]
+    league = json.loads((ROOT / "docs/results/league.json").read_text())
+    (contest,) = [c for c in league["contests"] if c["capture"] == "default"]
     for preset, value in rows:
         row = preset.replace(" --set start.motion=none", "+rest")
         cells = contest["rows"][row]["cells"].values()

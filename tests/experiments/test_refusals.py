@@ -98,10 +98,10 @@ def test_results_of_earlier_measurements_are_kept(
 
     monkeypatch.setattr(platform, "start_jax", lambda *_, **__: None)
     monkeypatch.setattr(compare, "read", lambda *_: None)
-    kept = tmp_path / "earlier" / "numbers.png"
-    kept.parent.mkdir()
-    kept.write_text("measured for hours")
-    words = words.replace("FILE", str(kept)).replace("FOLDER", str(kept.parent))
+    chart = tmp_path / "earlier" / "numbers.png"
+    chart.parent.mkdir()
+    chart.write_text("measured for hours")
+    words = words.replace("FILE", str(chart)).replace("FOLDER", str(chart.parent))
     name, *more = name.split()
     module = f"experiments.{name}{'.__main__' * (ROOM / name).is_dir()}"
     with pytest.raises(SystemExit) as stop:
@@ -109,6 +109,6 @@ def test_results_of_earlier_measurements_are_kept(
     assert stop.value.code == 2
     error = " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert re.search("already there|not empty", error)
-    assert [path.read_text() for path in kept.parent.iterdir()] == [
+    assert [path.read_text() for path in chart.parent.iterdir()] == [
         "measured for hours"
     ]

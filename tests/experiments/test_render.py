@@ -156,8 +156,8 @@ def test_what_would_be_lost_is_named(run, tmp_path, capsys):
     (tmp_path / "out/notes.txt").write_text("mine")
     words = refused(*other, "--overwrite")
     assert "holds notes.txt, which would be lost" in words
-    kept = contents(tmp_path / "out")
-    assert kept.keys() == before.keys() | {"notes.txt"}
+    remaining = contents(tmp_path / "out")
+    assert remaining.keys() == before.keys() | {"notes.txt"}
     (tmp_path / "out/notes.txt").unlink()
     assert main(run, *other, *out, "--overwrite") == 0
     names = {path.name for path in (tmp_path / "out").iterdir()}

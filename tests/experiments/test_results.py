@@ -113,8 +113,8 @@ def test_a_seed_of_0_is_no_lack_of_results(tmp_path, monkeypatch):
     new = tmp_path / "new.json"
     new.write_text(json.dumps(stored))
     results.keep("fuzz", new)
-    kept = tmp_path / "experiments/measured/fuzz.json"
-    assert json.loads(kept.read_text()) == stored
+    file = tmp_path / "experiments/measured/fuzz.json"
+    assert json.loads(file.read_text()) == stored
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ STORED = {
 
 
 @pytest.fixture
-def kept(tmp_path):
+def baseline(tmp_path):
     """A folder that has these numbers, put there one by one."""
     path = tmp_path / "speed.json"
     for which, record in STORED["presets"]["splats"].items():
@@ -41,8 +41,8 @@ def checked(out, before):
     return stop.value.code
 
 
-def test_what_is_kept_can_be_held_against(kept):
-    metrics = clock.read_metrics(kept)
+def test_what_is_kept_can_be_held_against(baseline):
+    metrics = clock.read_metrics(baseline)
     assert metrics == {x.key: x for x in tolerances.metrics(STORED)}
     assert set(metrics) == {
         *(f"splats.one.{name}" for name in ONE),
@@ -64,7 +64,7 @@ def test_what_is_kept_can_be_held_against(kept):
     ],
 )
 def test_only_what_is_worse_than_its_tolerance_fails(
-    change, says, kept, tmp_path, capsys
+    change, says, baseline, tmp_path, capsys
 ):
     *keys, last, value = change
     now = copy.deepcopy(STORED)
@@ -75,7 +75,7 @@ def test_only_what_is_worse_than_its_tolerance_fails(
     (tmp_path / "now").mkdir()
     now["metrics"] = clock.metric_rows(tolerances.metrics(now))
     (tmp_path / "now" / "speed.json").write_text(json.dumps(now))
-    assert checked(tmp_path / "now", kept) == (0 if says is None else 1)
+    assert checked(tmp_path / "now", baseline) == (0 if says is None else 1)
     printed = capsys.readouterr().out
     assert ("nothing is worse" if says is None else f"worse: {says}") in printed
 

@@ -71,13 +71,13 @@ def finished(tmp_path_factory):
     config = RunConfig("splats-static-small", source, steps=2, overrides=SMALL)
     run = runs.new_run(config)
     state = runs.initial_state(run)
-    kept = {"step": 1, "seconds": 1.0, "loss": 0.1}
-    scored = {"hook": "held out", **kept, "psnr": 20.0, "ssim": 0.5}
+    row = {"step": 1, "seconds": 1.0, "loss": 0.1}
+    scored = {"hook": "held out", **row, "psnr": 20.0, "ssim": 0.5}
     for name in ("run", "other"):
         out = folder / name
         out.mkdir()
         runs.save_config(out, run)
-        curves.write(out, History((kept,), (scored,), 3.0, 2.0), ["frame 3"])
+        curves.write(out, History((row,), (scored,), 3.0, 2.0), ["frame 3"])
         (out / "metrics.json").write_text('{"heldout.psnr": 20.0}')
         with train.open_checkpoints(out, run, None) as checkpoints:
             checkpoints.save(state, 0, {})

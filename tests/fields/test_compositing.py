@@ -213,9 +213,9 @@ def test_composites_have_the_slopes_of_central_differences(float64, rng):
         far = distances[-1]
         return total + compositing.expected_distance(scale * faint, distances, far)
 
-    given = rng.uniform(0.05, 0.4, 8), rng.uniform(size=(8, 3))
+    inputs = rng.uniform(0.05, 0.4, 8), rng.uniform(size=(8, 3))
     distances = np.sort(rng.uniform(1, 2, 8))
-    error = gradients.directional_error(loss, *given, distances, np.float64(1))
+    error = gradients.directional_error(loss, *inputs, distances, np.float64(1))
     assert error < 1e-7
 
 

@@ -185,9 +185,9 @@ def branch(recorded, prefix):
 def computed(file, name):
     """What we compute, and what was recorded."""
     recorded = read(file)
-    truth, given = branch(recorded, f"f64/{name}/"), branch(recorded, "in/")
-    real = {key: value.astype(np.float64) for key, value in given.items()}
-    ids = {key: value.ravel().astype(np.int32) for key, value in given.items()}
+    truth, inputs = branch(recorded, f"f64/{name}/"), branch(recorded, "in/")
+    real = {key: value.astype(np.float64) for key, value in inputs.items()}
+    ids = {key: value.ravel().astype(np.int32) for key, value in inputs.items()}
     rays = {key: real[key] for key in ("origins", "directions")}
     rays |= {key: ids[key] for key in ("id_warp", "id_camera")}
     static = real["bg_points"] + real["bg_noise"]  # jittered

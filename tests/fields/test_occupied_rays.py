@@ -110,7 +110,7 @@ def test_valid_rays_that_meet_something_are_learned_from():
     every = every._replace(valid=every.valid & (np.arange(160) % 3 > 0))
     cells = np.zeros((CELLS,) * 3, bool)
     cells[:, : CELLS // 2] = True
-    choose = jax.jit(lambda *given: occupied_rays.learned_from(field, *given))
+    choose = jax.jit(lambda *inputs: occupied_rays.learned_from(field, *inputs))
     batch = choose(cells, every)
     assert len(batch.row) == SPEC.rays
     by_itself = [

@@ -43,8 +43,8 @@ def test_composite_is_a_loop_over_samples_for_any_leading_axes(dtype, rng):
     assert actual.weights.shape == (2, 3, 6)
     bound = {"float32": 2e-6, "float64": 1e-14}[dtype]
     for place in np.ndindex(2, 3):
-        given = (density[place], color[place], t[place[1]], background)
-        loop = reference(*(x.astype(np.float64) for x in given), 0.5)
+        inputs = (density[place], color[place], t[place[1]], background)
+        loop = reference(*(x.astype(np.float64) for x in inputs), 0.5)
         for one, other in zip(actual, loop, strict=True):
             assert one.dtype == dtype
             assert np.max(np.abs(one[place] - other)) < bound
@@ -159,7 +159,7 @@ def test_a_ray_that_ends_before_it_begins_has_its_samples_at_its_end(dtype):
     ],
 )
 def test_rays_that_cannot_be_sampled_are_refused(changes, words):
-    given = dict(
+    inputs = dict(
         key=None,
         origins=np.zeros((4, 3), np.float32),
         directions=np.ones((4, 3), np.float32),
@@ -168,4 +168,4 @@ def test_rays_that_cannot_be_sampled_are_refused(changes, words):
         num_samples=4,
     )
     with pytest.raises(ValueError, match=words):
-        rendering.sample_along_rays(**(given | changes))
+        rendering.sample_along_rays(**(inputs | changes))

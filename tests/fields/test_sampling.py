@@ -188,7 +188,7 @@ def test_weights_of_any_size_share_alike_and_peaks_draw_all(dtype):
     ]
     # 16 floors of one rounding unit on a sum of one, on bins of 1/8
     tolerance = {"float32": 3e-6, "float64": 1e-13}[dtype]
-    for case, given, even, random in zip(HARD, HARD.values(), *draws, strict=True):
+    for case, inputs, even, random in zip(HARD, HARD.values(), *draws, strict=True):
         for got in (even, random):
             assert got.dtype == dtype
             assert np.all((got >= 2) & (got <= 4)), case  # and so finite
@@ -197,10 +197,10 @@ def test_weights_of_any_size_share_alike_and_peaks_draw_all(dtype):
             close = {"float32": 5e-7, "float64": 1e-15}[dtype]
             np.testing.assert_allclose(even, np.linspace(2, 4, 34), rtol=close)
         elif case != "1e-37 and less":
-            wanted = bisect_inverse(EDGES, given, np.linspace(0, 1, 34))
+            wanted = bisect_inverse(EDGES, inputs, np.linspace(0, 1, 34))
             np.testing.assert_allclose(even[1:-1], wanted[1:-1], atol=tolerance)
             bins = np.clip(np.searchsorted(EDGES, random, side="right") - 1, 0, 15)
-            assert np.all(given[bins] > 0), case
+            assert np.all(inputs[bins] > 0), case
 
 
 @pytest.mark.hard_cases

@@ -446,8 +446,8 @@ def test_shared_and_single_levels(levels):
     field = scene.field(dataclasses.replace(STATIC, sampling=plan), METADATA)
     params = jax.eval_shape(field.init, jax.random.key(0))
     assert set(params["template"]) == {"fine"}
-    given = ray_of("float32"), condition_of("float32")
-    assert len(jax.eval_shape(field.render_ray, params, *given)) == levels
+    inputs = ray_of("float32"), condition_of("float32")
+    assert len(jax.eval_shape(field.render_ray, params, *inputs)) == levels
 
 
 @pytest.mark.full

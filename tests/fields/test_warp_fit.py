@@ -223,12 +223,12 @@ def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
     Or none: two cameras saw the tenth.
     """
     field, paths = field_of("nsff-small"), some_paths()
-    kept = np.array([*range(0, 8), 9, *range(9, FRAMES)])
+    frames = np.array([*range(0, 8), 9, *range(9, FRAMES)])
     paths = paths._replace(
-        time=paths.time[kept],
-        appearance=paths.appearance[kept],
-        position=paths.position[:, kept],
-        known=paths.known[:, kept],
+        time=paths.time[frames],
+        appearance=paths.appearance[frames],
+        position=paths.position[:, frames],
+        known=paths.known[:, frames],
     )
     params = field.init(jax.random.key(0))
     fitted = warp_fit.fit_flow(field, params, paths, jax.random.key(0), TRACKS)

@@ -221,6 +221,6 @@ def test_a_reset_lowers_opacities_and_forgets_their_moments_only(dtype):
     np.testing.assert_allclose(logits, np.asarray(expected, dtype), 1e-6)
     assert not np.asarray(after[0].first.rows["splats"].opacity_logit).any()
     assert not np.asarray(after[0].count.rows["splats"].opacity_logit).any()
-    kept = after[0].first.rows["splats"]._replace(opacity_logit=None)
+    others = after[0].first.rows["splats"]._replace(opacity_logit=None)
     was = moments[0].first.rows["splats"]._replace(opacity_logit=None)
-    jax.tree.map(np.testing.assert_array_equal, kept, was)
+    jax.tree.map(np.testing.assert_array_equal, others, was)

@@ -167,8 +167,8 @@ def total_and_slopes(params, embedding, time):
 def test_codes_at_their_edges_have_the_values_and_slopes_of_the_network(
     case, dtype, rng
 ):
-    given = HARD[case](filled(dtype), rng.normal(size=(3, 3)).astype(dtype))
-    leaves, tree = jax.tree.flatten(jax.tree.map(np.float64, given))
+    inputs = HARD[case](filled(dtype), rng.normal(size=(3, 3)).astype(dtype))
+    leaves, tree = jax.tree.flatten(jax.tree.map(np.float64, inputs))
     direction = [rng.normal(size=leaf.shape) for leaf in leaves]
 
     def total_along(far, time):
@@ -177,7 +177,7 @@ def test_codes_at_their_edges_have_the_values_and_slopes_of_the_network(
         return sum(np.sin(value).sum() for value in offsets.values())
 
     for time in np.asarray(TIMES, dtype):
-        total, slopes = total_and_slopes(*given, time)
+        total, slopes = total_and_slopes(*inputs, time)
         bound = {"float32": 5e-5, "float64": 1e-12}[dtype]
         np.testing.assert_allclose(total, total_along(0, time), rtol=bound, atol=bound)
         slopes = jax.tree.leaves(slopes)
@@ -200,7 +200,7 @@ def test_all_but_the_number_of_rows_has_its_slope(float64, rng):
 
     learned, time = params._replace(rows=np.zeros(0)), np.asarray(0.37)
     assert gradients.directional_error(total, learned, embedding, time) < 1e-6
-    slope = jax.jit(jax.grad(lambda *given: jnp.sum(moved(*given).position)))
+    slope = jax.jit(jax.grad(lambda *inputs: jnp.sum(moved(*inputs).position)))
     slopes = slope(params, embedding, time)
     assert not slopes.rows.any()
     assert slopes.times.any()

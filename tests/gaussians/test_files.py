@@ -109,10 +109,12 @@ def write_ply(path, columns, **kind):
     """A good file with some of its columns replaced; None takes a column out."""
     files.save(path, some_splats())
     table = plyfile.PlyData.read(path)["vertex"].data
-    kept = {name: table[name] for name in table.dtype.names} | columns
-    kept = {name: np.asarray(x) for name, x in kept.items() if x is not None}
-    data = np.empty(20, [(name, x.dtype.str) for name, x in kept.items()])
-    for name, x in kept.items():
+    columns_of = {name: table[name] for name in table.dtype.names} | columns
+    columns_of = {
+        name: np.asarray(x) for name, x in columns_of.items() if x is not None
+    }
+    data = np.empty(20, [(name, x.dtype.str) for name, x in columns_of.items()])
+    for name, x in columns_of.items():
         data[name] = x
     plyfile.PlyData([plyfile.PlyElement.describe(data, "vertex")], **kind).write(path)
 

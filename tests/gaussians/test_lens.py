@@ -119,8 +119,8 @@ def test_a_pinhole_s_program_reads_no_lens(rng):
     lowered = plain.lower(gaussians, camera)
     # Unused arguments are dropped: the last two of twelve leaves are the lens.
     assert lowered.compile().as_text().count("parameter(") >= 9
-    kept = lowered._lowering.compile_args["kept_var_idx"]
-    assert sorted(kept) == list(range(10))
+    variables = lowered._lowering.compile_args["kept_var_idx"]
+    assert sorted(variables) == list(range(10))
     assert used(LENS)[0] > used(GSPLAT)[0]
 
 

@@ -82,8 +82,8 @@ def spread(opacity, copies, dtype, least=1e-12):
 def test_spreading_equals_the_reference_kernel(oracle_dir, dtype):
     with np.load(oracle_dir / "splatting" / "mcmc_relocation.npz") as oracle:
         names = {"opacities": dtype, "scales": dtype, "ratios": "int32"}
-        given = (oracle[name].astype(kind) for name, kind in names.items())
-        each, scale = compute_relocation(*given, 0.005)
+        inputs = (oracle[name].astype(kind) for name, kind in names.items())
+        each, scale = compute_relocation(*inputs, 0.005)
         tolerance = {"float32": 3e-6, "float64": 2e-13}[dtype]
         np.testing.assert_allclose(each, oracle["new_opacities"], rtol=tolerance)
         np.testing.assert_allclose(scale, oracle["new_scales"], rtol=tolerance)
@@ -160,10 +160,12 @@ def test_sources_are_drawn_in_proportion_to_their_opacity():
 def test_untouched_rows_keep_their_bits_and_moments():
     params, moments = make([0.9, 0.8, 0.7, 0.001])
     moved, after, _ = mcmc.relocate(TX, params, moments, KEY, SPEC)
-    kept = np.asarray(after[0].count.rows["splats"].mean) == 1
-    assert kept.sum() == 2
+    untouched = np.asarray(after[0].count.rows["splats"].mean) == 1
+    assert untouched.sum() == 2
     for now, before in zip(moved.rows["splats"], params.rows["splats"], strict=True):
-        np.testing.assert_array_equal(np.asarray(now)[kept], np.asarray(before)[kept])
+        np.testing.assert_array_equal(
+            np.asarray(now)[untouched], np.asarray(before)[untouched]
+        )
 
 
 @pytest.mark.hard_cases

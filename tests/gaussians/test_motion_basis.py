@@ -73,8 +73,8 @@ def test_weights_and_basis_make_the_residual(dtype):
     @jax.jit
     def parts(params, mean, time):
         prepared = motion_basis.prepare(params, SMALL, mean)
-        given = params, SMALL, mean, time, prepared
-        return motion_basis.blending_weights(*given), prepared.basis
+        arguments = params, SMALL, mean, time, prepared
+        return motion_basis.blending_weights(*arguments), prepared.basis
 
     weights, basis = map(np.asarray, parts(params, mean, time))
     offsets = np.asarray(uncached(params, SMALL, mean, time).mean)

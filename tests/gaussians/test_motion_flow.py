@@ -236,13 +236,13 @@ def test_flow_pulls_both_cameras_by_how_they_move_and_no_weight(float64):
     here, there = scattered("float64", count=20)
     opaque = np.full(20, 0.9)
     here, there = here._replace(opacity=opaque), there._replace(opacity=opaque)
-    given = cameras.stack([*both, both[0]])
+    inputs = cameras.stack([*both, both[0]])
     shift = rng.normal(size=(3, 9, 13, 2))
     flow = FrameFlow(shift, np.ones((3, 9, 13), bool), np.array([1, 2, 2]), *[None] * 3)
     images, times = np.zeros((3, 9, 13, 3), np.uint8), np.array([0.0, 0.5, 1.0])
-    frames = Frames(images, given, times, np.zeros(3, np.int32), None, flow=flow)
+    frames = Frames(images, inputs, times, np.zeros(3, np.int32), None, flow=flow)
     refined = jax.jit(
-        functools.partial(pose_refinement.refine, cameras=given, depth=DEPTH)
+        functools.partial(pose_refinement.refine, cameras=inputs, depth=DEPTH)
     )
 
     def at_time(_, time):

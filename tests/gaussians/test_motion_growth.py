@@ -121,10 +121,10 @@ def test_the_common_motion_is_the_median_of_a_sample(count, rng, dtype):
     counts = rng.uniform(size=count) < 0.7
     counts[0] = True
     every = math.ceil(count / 512)
-    kept = paths[::every][counts[::every]]
+    selected = paths[::every][counts[::every]]
     common_motion = jitted(motion_growth.common_motion)
     result = common_motion(paths, counts)
-    np.testing.assert_allclose(result, np.median(kept, axis=0), rtol=1e-6)
+    np.testing.assert_allclose(result, np.median(selected, axis=0), rtol=1e-6)
     none = common_motion(paths, np.zeros(count, bool))
     np.testing.assert_array_equal(none, 0)
 

@@ -100,15 +100,15 @@ def alternated(name, steps, dtype):
 
 def of_group(name, trained, group):
     """Parameters and state of one group, picked out by hand."""
-    kept = [getattr(trained.params, group)]
+    frozen = [getattr(trained.params, group)]
     if name != "partitioned":
-        kept += [getattr(part, group) for part in trained.opt_state]
+        frozen += [getattr(part, group) for part in trained.opt_state]
     else:
         inner = trained.opt_state[1].inner_states
-        kept += [
+        frozen += [
             inner[key] for key in {"rows": ("mean", "rest"), "nets": ("nets",)}[group]
         ]
-    return jax.tree.leaves(kept)
+    return jax.tree.leaves(frozen)
 
 
 def slow_turn(spec, step):
@@ -230,12 +230,12 @@ def test_stopped_gradients_have_the_values_and_the_slopes_of_the_function(dtype)
     tolerance = {"float32": 1e-5, "float64": 1e-13}[dtype]
     compare = functools.partial(np.testing.assert_allclose, rtol=tolerance, atol=1e-6)
     for on in (True, False):
-        same, kept = stop_frozen_gradients(params, shift, np.asarray(on))
+        same, frozen = stop_frozen_gradients(params, shift, np.asarray(on))
         np.testing.assert_allclose(same, value, rtol=tolerance)
-        jax.tree.map(compare, kept.rows, grads.rows)
+        jax.tree.map(compare, frozen.rows, grads.rows)
         if on:
-            jax.tree.map(compare, kept.nets, grads.nets)
-    assert not any_nonzero(kept.nets)
+            jax.tree.map(compare, frozen.nets, grads.nets)
+    assert not any_nonzero(frozen.nets)
     assert grads.nets["w"].all()
 
 

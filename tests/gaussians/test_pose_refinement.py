@@ -46,11 +46,11 @@ def by_scipy(screw, camera):
 def test_cameras_move_by_what_their_screws_differ_from_the_mean(dtype):
     rng = np.random.default_rng(0)
     screws = (rng.normal(size=(4, 6)) + 0.3).astype(dtype)
-    given = some_cameras(4, dtype)
-    moved = refined(screws, given, DEPTH)
+    inputs = some_cameras(4, dtype)
+    moved = refined(screws, inputs, DEPTH)
     for row in range(4):
         own = screws[row] - screws.mean(axis=0)
-        turn, place = by_scipy(own, cameras.take(given, row))
+        turn, place = by_scipy(own, cameras.take(inputs, row))
         bound = {"float32": 3e-6, "float64": 1e-12}[dtype]
         np.testing.assert_allclose(moved.camera_from_world[row], turn, atol=bound)
         np.testing.assert_allclose(moved.position[row], place, atol=bound)
@@ -59,17 +59,17 @@ def test_cameras_move_by_what_their_screws_differ_from_the_mean(dtype):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-8])
 def test_equal_screws_leave_every_camera_and_have_exact_slopes(size, dtype):
-    given = some_cameras(3, dtype)
+    inputs = some_cameras(3, dtype)
     screws = np.full((3, 6), size, dtype)
-    moved = refined(screws, given, DEPTH)
-    jax.tree.map(np.testing.assert_array_equal, moved, given)
+    moved = refined(screws, inputs, DEPTH)
+    jax.tree.map(np.testing.assert_array_equal, moved, inputs)
 
     def place(screws):
-        return refined(screws, given, DEPTH).position
+        return refined(screws, inputs, DEPTH).position
 
     # By hand: a shift v moves a center by -R' v; of the mean there is no slope.
     slope = jax.jit(jax.jacfwd(place))(screws)[0, :, :, 3:]
-    back = -DEPTH * np.asarray(given.camera_from_world[0]).T
+    back = -DEPTH * np.asarray(inputs.camera_from_world[0]).T
     shares = np.arange(3) == 0
     np.testing.assert_allclose(
         slope, back[:, None, :] * shares[None, :, None], atol=1e-6
@@ -77,9 +77,9 @@ def test_equal_screws_leave_every_camera_and_have_exact_slopes(size, dtype):
 
 
 def test_one_frame_alone_keeps_its_camera(dtype):
-    given = some_cameras(1, dtype)
-    moved = refined(np.ones((1, 6), dtype), given, DEPTH)
-    jax.tree.map(np.testing.assert_array_equal, moved, given)
+    inputs = some_cameras(1, dtype)
+    moved = refined(np.ones((1, 6), dtype), inputs, DEPTH)
+    jax.tree.map(np.testing.assert_array_equal, moved, inputs)
 
 
 @pytest.mark.full
@@ -147,11 +147,11 @@ def test_cameras_that_are_off_are_found():
 
 
 @jax.jit
-def misplaced_px(given, true):
+def misplaced_px(estimated, true):
     """Median distance in an image of where points of the scene are seen."""
     see = jax.vmap(jax.vmap(cameras.project, (None, 0)), (0, None))
     points = jnp.asarray(EVEN.points.position)
-    away = see(given, points)[0] - see(true, points)[0]
+    away = see(estimated, points)[0] - see(true, points)[0]
     return jnp.median(jnp.linalg.norm(away, axis=-1))
 
 

@@ -242,8 +242,8 @@ def test_pairs_are_sorted_by_tile_then_depth(tiles_per_side, dtype, rng):
     sort_pairs = jitted(binning.sort_pairs, static_argnums=(3, 4))
     isects = sort_pairs(tile, rank, np.int32(first), 20_000, grid)
     order = np.lexsort((rank, tile))
-    kept = int((tile < grid.tiles).sum())
-    np.testing.assert_array_equal(isects.ranks[:kept], rank[order][:kept])
+    pairs = int((tile < grid.tiles).sum())
+    np.testing.assert_array_equal(isects.ranks[:pairs], rank[order][:pairs])
     numbers = np.bincount(tile, minlength=grid.tiles + 1)[:-1]
     np.testing.assert_array_equal(isects.ends - isects.starts, numbers)
 
@@ -293,15 +293,15 @@ def test_the_ellipse_test_keeps_every_tile_that_shows_a_gaussian(float64, rng):
         return rects, isects
 
     rects, isects = first_intersections(footprints)
-    kept = np.zeros((60, grid.tiles), bool)
+    pairs = np.zeros((60, grid.tiles), bool)
     for tile in range(grid.tiles):
-        kept[isects.ranks[isects.starts[tile] : isects.ends[tile]], tile] = True
+        pairs[isects.ranks[isects.starts[tile] : isects.ends[tile]], tile] = True
     y, x = np.mgrid[:64, :96] + 0.5
     offset = np.stack([x, y], -1)[None] - np.asarray(footprints.mean_px)[:, None, None]
     exponent = np.einsum("nhwi,nij,nhwj->nhw", offset, np.asarray(conics), offset) / 2
     alpha = np.asarray(footprints.opacity)[:, None, None] * np.exp(-exponent)
     shows = (alpha >= 1 / 255).reshape(60, 8, 8, 12, 8).any((2, 4)).reshape(60, -1)
-    np.testing.assert_array_equal(kept, shows)
+    np.testing.assert_array_equal(pairs, shows)
     assert shows.sum() < 0.5 * int(rects.tiles.sum())
 
 

@@ -179,8 +179,8 @@ def capture_with(points):
     """The small capture with some of its own points, or with none."""
     capture = scenes.tiny_capture()
     cloud = capture.points
-    kept = None if points is None else type(cloud)(*(leaf[:points] for leaf in cloud))
-    return dataclasses.replace(capture, points=kept)
+    subset = None if points is None else type(cloud)(*(leaf[:points] for leaf in cloud))
+    return dataclasses.replace(capture, points=subset)
 
 
 def knots(count, interpolation="linear", fade=0.0):

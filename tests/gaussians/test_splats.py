@@ -95,7 +95,7 @@ def test_capacities_grow_by_half_and_stop_at_the_cap():
 @pytest.mark.parametrize("degree", [0, 2, 3, *full(1)])
 def test_a_traced_degree_hides_the_bands_above_it(degree, rng, dtype):
     splats = some_splats(rng, dtype=dtype)
-    kept = (degree + 1) ** 2
+    coefficients = (degree + 1) ** 2
 
     def total(splats, degree):
         shown = rows.active_harmonics(splats, degree)
@@ -104,10 +104,10 @@ def test_a_traced_degree_hides_the_bands_above_it(degree, rng, dtype):
     run = jitted(jax.grad(total, has_aux=True))
     grads, shown = run(splats, np.int32(degree))
     every = np.concatenate([splats.sh_dc, splats.sh_rest], axis=1)
-    np.testing.assert_array_equal(shown[:, :kept], every[:, :kept])
-    assert not shown[:, kept:].any()
-    assert (grads.sh_rest[:, : kept - 1] == 1).all()
-    assert not grads.sh_rest[:, kept - 1 :].any()
+    np.testing.assert_array_equal(shown[:, :coefficients], every[:, :coefficients])
+    assert not shown[:, coefficients:].any()
+    assert (grads.sh_rest[:, : coefficients - 1] == 1).all()
+    assert not grads.sh_rest[:, coefficients - 1 :].any()
 
 
 def test_the_degree_grows_on_schedule():

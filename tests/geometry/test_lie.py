@@ -52,8 +52,8 @@ def logarithms(rotations, angular, dtype):
     Fewer rows are repeated.
     """
     rows = np.arange(5) % len(rotations)
-    given = (np.asarray(x, dtype)[rows] for x in (rotations, angular))
-    return [np.asarray(leaf)[: len(rotations)] for leaf in log_and_slope(*given)]
+    inputs = (np.asarray(x, dtype)[rows] for x in (rotations, angular))
+    return [np.asarray(leaf)[: len(rotations)] for leaf in log_and_slope(*inputs)]
 
 
 @pytest.mark.hard_cases

@@ -72,6 +72,6 @@ def scaled(matrix, factor):
     ],
 )
 def test_what_is_no_camera_is_refused(changes, words):
-    given = dict(K=K, camera_from_world=POSE, width=40, height=30) | changes
+    inputs = dict(K=K, camera_from_world=POSE, width=40, height=30) | changes
     with pytest.raises(ValueError, match=words):
-        Camera.from_K(**given)
+        Camera.from_K(**inputs)

@@ -39,11 +39,13 @@ def energies(matrix, direction):
 
 def of_some(function, matrices, direction=None):
     """The results for some matrices, by the program compiled for 100 of them."""
-    given = np.resize(matrices, (100, 3, 3))
+    inputs = np.resize(matrices, (100, 3, 3))
     ways = (
-        np.zeros_like(given) if direction is None else np.resize(direction, (100, 3, 3))
+        np.zeros_like(inputs)
+        if direction is None
+        else np.resize(direction, (100, 3, 3))
     )
-    results = jax.tree.map(np.asarray, function(given, ways.astype(given.dtype)))
+    results = jax.tree.map(np.asarray, function(inputs, ways.astype(inputs.dtype)))
     return jax.tree.map(lambda leaf: leaf[: len(matrices)], results)
 
 
@@ -76,18 +78,18 @@ def matrices(rng):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("size", [1e-25, 1e-10, 1.0, 1e15, 1e25])
 def test_decomposition_restores_the_matrix(size, dtype, rng):
-    given = (size * matrices(rng)).astype(dtype)
-    vectors, singular_values = decomposed(given)
+    inputs = (size * matrices(rng)).astype(dtype)
+    vectors, singular_values = decomposed(inputs)
     left, values, right = (np.asarray(x, np.float64) for x in vectors)
     restored = (left * values[:, None]) @ np.swapaxes(right, 1, 2)
-    scale = np.abs(np.asarray(given, np.float64)).max(axis=(1, 2))
+    scale = np.abs(np.asarray(inputs, np.float64)).max(axis=(1, 2))
     bound = {"float32": 2e-6, "float64": 5e-15}[dtype]
-    assert np.max(np.abs(restored - given).max(axis=(1, 2)) / scale) < bound
-    truth = np.linalg.svd(np.asarray(given, np.float64))[1]
+    assert np.max(np.abs(restored - inputs).max(axis=(1, 2)) / scale) < bound
+    truth = np.linalg.svd(np.asarray(inputs, np.float64))[1]
     assert np.max(np.abs(np.abs(values) - truth) / scale[:, None]) < bound
     assert np.min(np.linalg.det(left)) > 0.99
     assert np.min(np.linalg.det(right)) > 0.99
-    assert np.array_equal(np.sign(values[:, 2]), np.sign(np.linalg.det(given / size)))
+    assert np.array_equal(np.sign(values[:, 2]), np.sign(np.linalg.det(inputs / size)))
     np.testing.assert_allclose(singular_values, np.abs(values), rtol=1e-6)
 
 
@@ -97,27 +99,29 @@ def test_many_nearly_rigid_matrices_are_decomposed_at_once(dtype, rng):
     turns = Rotation.random(100, random_state=0).as_matrix()
     ulps = np.repeat([0, 4, 100, 1e4], 25)[:, None, None]
     strain = ulps * np.finfo(dtype).eps * rng.normal(size=(100, 3, 3))
-    given = (turns @ (np.eye(3) + strain)).astype(dtype)
-    (left, values, right), singular_values = jax.tree.map(np.asarray, decomposed(given))
+    inputs = (turns @ (np.eye(3) + strain)).astype(dtype)
+    (left, values, right), singular_values = jax.tree.map(
+        np.asarray, decomposed(inputs)
+    )
     restored = (left * values[:, None]) @ np.swapaxes(right, 1, 2)
     bound = {"float32": 2e-6, "float64": 1e-14}[dtype]
-    assert np.max(np.abs(restored - given)) < bound
-    truth = np.linalg.svd(given.astype(np.float64))[1]
+    assert np.max(np.abs(restored - inputs)) < bound
+    truth = np.linalg.svd(inputs.astype(np.float64))[1]
     assert np.max(np.abs(singular_values - truth)) < bound
 
 
 @pytest.mark.parametrize("signed", [False, True])
 def test_energy_and_gradient(signed, dtype, rng):
-    given = matrices(rng).astype(dtype)
-    truth = [exact(matrix, signed) for matrix in given]
+    inputs = matrices(rng).astype(dtype)
+    truth = [exact(matrix, signed) for matrix in inputs]
     values = np.array([value for value, _ in truth])
     grads = np.array([gradient for _, gradient in truth])
     # relative to the conditioning: an ulp of the matrix moves σ by as much
     bound = {"float32": 2e-5, "float64": 1e-13}[dtype]
-    energy, grad, _ = of_some(energies, given)[signed]
+    energy, grad, _ = of_some(energies, inputs)[signed]
     np.testing.assert_allclose(energy, values, rtol=bound, atol=bound)
     error = np.abs(grad - grads).max(axis=(1, 2))
-    conditions = np.linalg.cond(np.asarray(given, np.float64))
+    conditions = np.linalg.cond(np.asarray(inputs, np.float64))
     assert np.max(error / (1 + np.abs(grads).max(axis=(1, 2)) * conditions)) < bound
 
 
@@ -183,8 +187,8 @@ DIRECTION = np.random.default_rng(0).normal(size=(3, 3))
 @functools.cache
 def hard_energies(dtype):
     """By sign and name: value, slope, and Hessian times `DIRECTION`."""
-    given = np.asarray(list(HARD.values()), dtype)
-    results = of_some(energies, given, DIRECTION)
+    inputs = np.asarray(list(HARD.values()), dtype)
+    results = of_some(energies, inputs, DIRECTION)
     return {
         signed: dict(zip(HARD, zip(*results[signed], strict=True), strict=True))
         for signed in (False, True)
@@ -226,8 +230,8 @@ def test_stretches_far_apart_keep_their_slopes_and_curvature(signed, dtype):
     ways = np.zeros((len(cases), 3, 3), dtype)
     for way, (_, i, j) in zip(ways, cases, strict=True):
         way[i, j] = way[j, i] = 1
-    given = np.stack([np.diag(stretches) for stretches, _, _ in cases])
-    _, grads, bent = of_some(energies, given, ways)[signed]
+    inputs = np.stack([np.diag(stretches) for stretches, _, _ in cases])
+    _, grads, bent = of_some(energies, inputs, ways)[signed]
     # below 1e-37 float32 is flushed to zero
     close = {"rtol": {"float32": 2e-6, "float64": 1e-14}[dtype], "atol": 1e-37}
     for (stretches, i, j), grad, bend in zip(cases, grads, bent, strict=True):

@@ -57,8 +57,8 @@ def test_matrices_products_and_rotated_vectors_match_scipy(dtype, rng):
         random_quaternions(rng),
         rng.normal(size=(50, 3)),
     )
-    given = (np.asarray(x, dtype) for x in (second, first, vectors))
-    product, undone, rotated = composed(*given)
+    inputs = (np.asarray(x, dtype) for x in (second, first, vectors))
+    product, undone, rotated = composed(*inputs)
     truth = (scipy_of(second) * scipy_of(first)).as_matrix()
     assert np.max(abs(np.asarray(to_matrix(product)) - truth)) < 2 * TOLERANCE[dtype]
     assert np.max(abs(np.asarray(undone) - np.eye(4)[0])) < 2 * TOLERANCE[dtype]
@@ -69,8 +69,8 @@ def test_matrices_products_and_rotated_vectors_match_scipy(dtype, rng):
 @pytest.mark.hard_cases
 @pytest.mark.parametrize("length", [0, 1e-38, 1e-30, 1e-19, 1e25, 3e38, np.inf])
 def test_normalizing_never_makes_what_is_no_rotation(length, dtype):
-    given = np.asarray(length * np.array([0.5, -0.5, 0.1, 0.7]), dtype)
-    unit, grad = (np.asarray(leaf) for leaf in normalized(given))
+    inputs = np.asarray(length * np.array([0.5, -0.5, 0.1, 0.7]), dtype)
+    unit, grad = (np.asarray(leaf) for leaf in normalized(inputs))
     assert abs(np.linalg.norm(unit) - 1) < 1e-6
     assert np.all(np.isfinite(grad))
     if length in (0, np.inf):

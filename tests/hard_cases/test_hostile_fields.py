@@ -98,12 +98,12 @@ def test_a_field_that_overflows_stops_where_it_started_and_says_so(name, tmp_pat
     start = OVERFLOWING.params(
         jax.tree.map(np.asarray, tiny_fields.started(name).state.params)
     )
-    for kept, given in zip(
+    for after, inputs in zip(
         jax.tree.leaves(ended.result.state.params),
         jax.tree.leaves(start),
         strict=True,
     ):
-        np.testing.assert_array_equal(kept, given)
+        np.testing.assert_array_equal(after, inputs)
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -189,8 +189,8 @@ def mean_and_slopes(values, logs, scale):
 def test_a_weighted_mean_keeps_its_slopes_however_small_the_weights(scale, rng, dtype):
     values = rng.normal(size=(5, 4, 3))
     share = rng.uniform(0.1, 1.0, (5, 4))
-    given = (np.asarray(x, dtype) for x in (values, np.log(share), scale))
-    value, slopes = mean_and_slopes(*given)
+    inputs = (np.asarray(x, dtype) for x in (values, np.log(share), scale))
+    value, slopes = mean_and_slopes(*inputs)
     of_axes = values.mean(-1)
     exact = (share * of_axes).sum() / share.sum()
     by_log = share * (of_axes - exact) / share.sum()

@@ -276,8 +276,8 @@ def check_every_part(prepared, result):
     logged = {key.partition("/")[0] for key in result.history.rows[-1]}
     assert {effect.name for effect in prepared.effects} - SILENT <= logged
     capacity = len(result.state.params.rows["splats"].mean)
-    kept = jax.tree.leaves(result.state.aux_state)
-    assert {len(leaf) for leaf in kept} == {capacity}
+    statistics = jax.tree.leaves(result.state.aux_state)
+    assert {len(leaf) for leaf in statistics} == {capacity}
 
 
 @pytest.mark.slow

@@ -124,17 +124,17 @@ def test_track_errors_count_visible_points(axes, dtype, rng):
     tracks = truth + rng.normal(size=truth.shape) * 3
     visible = rng.random((5, 6)) > 0.3
     tracks[~visible] = np.nan
-    given = tracks.astype(dtype), truth.astype(dtype)
-    errors = track_errors(*given, visible, 5.0)
+    inputs = tracks.astype(dtype), truth.astype(dtype)
+    errors = track_errors(*inputs, visible, 5.0)
     distance = np.linalg.norm(tracks - truth, axis=-1)[visible]
     assert errors.endpoint == pytest.approx(distance.mean(), rel=10 * EXACT[dtype])
     assert 0 < errors.correct < 1
     assert errors.correct == pytest.approx((distance < 5).mean(), rel=EXACT[dtype])
     assert int(errors.points) == visible.sum()
     # a point that is not there is not correct, and a threshold is positive
-    assert track_errors(*given, np.ones((5, 6), bool), 1e9).correct < 1
+    assert track_errors(*inputs, np.ones((5, 6), bool), 1e9).correct < 1
     with pytest.raises(ValueError, match=r"threshold=0\.0 must be positive"):
-        track_errors(*given, visible, 0.0)
+        track_errors(*inputs, visible, 0.0)
 
 
 def test_gradients_agree_with_central_differences(float64, rng):

@@ -215,8 +215,8 @@ def slow_partial_ssim(image, truth, mask):
 def test_partial_ssim_is_the_published_protocol(dtype, rng):
     image, truth = pair(rng, (*SMALL, 3))
     mask = blob(SMALL) & (rng.random(SMALL) > 0.3)
-    given = arrays(image, truth, mask, dtype=dtype)
-    value, _ = masked_and_slope["partial_ssim"](*given)
+    inputs = arrays(image, truth, mask, dtype=dtype)
+    value, _ = masked_and_slope["partial_ssim"](*inputs)
     exact = slow_partial_ssim(image, truth, mask)
     # Variances that should be zero are clipped after rounding: 1e-7 against c2 = 9e-4.
     assert abs(value - exact) < {"float32": 2e-5, "float64": 1e-12}[dtype]

@@ -83,9 +83,9 @@ def splines(features, grid, count):
     """SciPy's B-splines, whose inputs are held within an interval of the grid."""
     step = (grid[1] - grid[0]) / (count - 3)
     knots = grid[0] + step * np.arange(-3, count + 1)
-    kept = np.array([held(v, grid, step) for v in features])
+    clamped = np.array([held(v, grid, step) for v in features])
     rows = (
-        scipy.interpolate.BSpline.basis_element(knots[k : k + 5], False)(kept)
+        scipy.interpolate.BSpline.basis_element(knots[k : k + 5], False)(clamped)
         for k in range(count)
     )
     return np.nan_to_num(np.stack(list(rows)))  # outside its own knots it says NaN
@@ -113,8 +113,8 @@ def by_hand(spec, params, x):
         if spec.basis == "bspline":
             psi = splines(features, grid, spec.kernels)
         else:
-            kept = np.array([held(v, grid, sigma) for v in features])
-            psi = np.exp(-(((kept - center) / scale) ** 2))
+            clamped = np.array([held(v, grid, sigma) for v in features])
+            psi = np.exp(-(((clamped - center) / scale) ** 2))
         outputs = [
             layer.bias + np.einsum("gi,gio->o", psi, layer.kernel)
             for layer in side_by_side
@@ -215,12 +215,12 @@ def standardized(features):
 @pytest.mark.parametrize("size", [1.0, 1e20, 3e38])
 def test_features_of_any_size_are_standardized(size, dtype):
     """In float32 the variance of 1e20 overflows, and every feature would become 0."""
-    given = np.array([0.9, -0.3, 0.5, -1.0])
-    exact = (given - given.mean()) / np.sqrt(given.var() + 1e-6 / size**2)
-    standard, grads = standardized((size * given).astype(dtype))
+    samples = np.array([0.9, -0.3, 0.5, -1.0])
+    exact = (samples - samples.mean()) / np.sqrt(samples.var() + 1e-6 / size**2)
+    standard, grads = standardized((size * samples).astype(dtype))
     np.testing.assert_allclose(standard, exact, rtol=1e-6)
     # d z = (1 - 1/n - z zᵀ/n) dx / deviation
-    change = (np.eye(4) - 0.25 - np.outer(exact, exact) / 4) / given.std() / size
+    change = (np.eye(4) - 0.25 - np.outer(exact, exact) / 4) / samples.std() / size
     np.testing.assert_allclose(grads, change, rtol=2e-6, atol=2e-6 / size + 1e-38)
 
 
@@ -304,8 +304,8 @@ def test_networks_start_as_they_are_told(rng):
         params = kan.init(key, spec)
         return params, kan.apply_heads(spec, params, inputs)
 
-    given = jax.random.key(4), rng.normal(size=(9, 5)).astype(np.float32)
-    params, answers = jax.tree.map(np.asarray, start(*given))
+    samples = jax.random.key(4), rng.normal(size=(9, 5)).astype(np.float32)
+    params, answers = jax.tree.map(np.asarray, start(*samples))
     assert not answers["still"].any()
     assert 0 < np.abs(answers["hardly"]).max() < 1e-4 * 6 * 6
     one, two, three = (

@@ -66,8 +66,8 @@ def rolling_ball(views):
     frame = np.arange(FRAMES)
     length = rng.integers(3, 7, (POINTS, 1))
     within = (frame >= first[:, None]) & (frame < first[:, None] + length)
-    kept = (seen | ~within).all(1)
-    return Tracks(first, pixel, within).take(kept), world[kept]
+    survives = (seen | ~within).all(1)
+    return Tracks(first, pixel, within).take(survives), world[survives]
 
 
 def depth_ratios(views, fitted, world):

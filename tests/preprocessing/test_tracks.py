@@ -113,10 +113,10 @@ def test_flow_that_a_thing_lost_is_found_from_how_it_came():
             flow_of_frame[1][frame][area]
         ]
         assert np.median(off) < 0.1
-        kept = exact[1][frame].copy()
-        kept[area] = False
+        unchanged = exact[1][frame].copy()
+        unchanged[area] = False
         np.testing.assert_array_equal(
-            flow_of_frame[0][frame][kept], exact[0][frame][kept]
+            flow_of_frame[0][frame][unchanged], exact[0][frame][unchanged]
         )
 
 

@@ -190,9 +190,9 @@ def test_what_tracks_chose_for_a_preset_stays_with_that_preset(motion):
     chosen = RunConfig("splats-tracked-small", overrides=("motion.bases=12", *own))
     config, _ = adviser.follow(chosen, own, findings(motion=motion))
     assert scene_spec(config).steps == 7
-    kept = config.preset == chosen.preset
-    assert ("motion.bases=12" in config.overrides) == kept
-    assert kept == (motion is True)
+    same_preset = config.preset == chosen.preset
+    assert ("motion.bases=12" in config.overrides) == same_preset
+    assert same_preset == (motion is True)
 
 
 @pytest.mark.parametrize(

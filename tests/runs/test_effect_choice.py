@@ -50,13 +50,13 @@ def test_certain_effects_are_enabled_and_undecided_ones_are_not(chosen):
     assert lines == [f"effects: {EXPOSURE}, for appearance codes (certain: numbers)"]
 
 
-@pytest.mark.parametrize(("gain", "kept"), [(0.3, True), (0.05, False), (-1, False)])
-def test_likely_effects_are_enabled_if_a_trial_pays(chosen, gain, kept):
+@pytest.mark.parametrize(("gain", "pays"), [(0.3, True), (0.05, False), (-1, False)])
+def test_likely_effects_are_enabled_if_a_trial_pays(chosen, gain, pays):
     overrides, (line,), tried = chosen(CANNOT_TELL, LIKELY, gain)
     assert tried == [(DEPTH,)]
-    assert overrides == ((DEPTH,) if kept else ())
+    assert overrides == ((DEPTH,) if pays else ())
     assert f"20.00 dB without and {20 + gain:.2f} dB with" in line
-    assert line.startswith("effects: not") == (not kept)
+    assert line.startswith("effects: not") == (not pays)
 
 
 @pytest.mark.parametrize("setting", ["exposure=none", "exposure.learning_rate=0.1"])

@@ -57,8 +57,8 @@ def test_a_torn_last_line_is_left_out_and_removed_by_who_resumes(tmp_path):
     path.write_bytes(whole[:-9])
     assert [event["kind"] for event in read_events(tmp_path)] == ["run"]
     logged(tmp_path, run("resume", 0))
-    kept = whole.splitlines(keepends=True)[0]
-    assert path.read_bytes().startswith(kept)
+    first = whole.splitlines(keepends=True)[0]
+    assert path.read_bytes().startswith(first)
     assert [event.get("status") for event in read_events(tmp_path)] == [
         "begin",
         "resume",

@@ -16,11 +16,11 @@ from tests import scenes
 
 
 @pytest.mark.parametrize(
-    ("steps", "kept"),
+    ("steps", "expected"),
     [(0.3, 1), (7.9, 7), (99, 99), (101, 100), (1279.9, 1200), (98_765, 98_000)],
 )
-def test_steps_keep_two_digits_and_are_never_more(steps, kept):
-    assert plan.rounded(steps) == kept
+def test_steps_keep_two_digits_and_are_never_more(steps, expected):
+    assert plan.rounded(steps) == expected
 
 
 def test_schedules_stretch_with_steps_however_these_are_given():

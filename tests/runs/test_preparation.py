@@ -33,10 +33,10 @@ def mapper(monkeypatch):
 
     Where it `fails`, the second call places three photographs fewer.
     """
-    calls, kept = [], []
+    calls, options = [], []
 
     def run_sfm(photographs, out, masks, spec, *, groups, features):
-        kept.append((groups, features))
+        options.append((groups, features))
         names = sorted(path.name for path in photographs.iterdir())
         models.make(out, count=len(names))
         text = (out / "sparse/0/images.txt").read_text()
@@ -53,7 +53,7 @@ def mapper(monkeypatch):
         placed = len(names) - (3 if len(calls) == 2 and run_sfm.fails else 0)
         return Poses(out, len(names), placed, 40, 0.5, 6.0)
 
-    run_sfm.fails, run_sfm.calls, run_sfm.kept = False, calls, kept
+    run_sfm.fails, run_sfm.calls, run_sfm.options = False, calls, options
     monkeypatch.setattr(preparation, "run_sfm", run_sfm)
     return run_sfm
 
@@ -85,7 +85,7 @@ def test_the_second_pass_goes_without_what_the_first_saw_move(
     assert black is None
     assert (spec.least_scale, second.least_scale) == (COARSE_PX, 0)
     # Features are computed once.
-    assert len({features for _, features in mapper.kept}) == 1
+    assert len({features for _, features in mapper.options}) == 1
     assert (spec.camera_model, spec.matcher, spec.threads) == (
         "RADIAL",
         "exhaustive",
@@ -185,7 +185,7 @@ def test_photographs_of_several_cameras_have_a_camera_each(
         image = PIL.Image.fromarray(models.image(row))
         image.save(folder / f"p{row}.png", exif=exif)
     preparation.prepare(folder, tmp_path / "auto")
-    groups, _ = mapper.kept[0]
+    groups, _ = mapper.options[0]
     assert [(group.names[0], group.focal) for group in groups] == [
         ("p0.png", 1.0),
         ("p1.png", 2.0),
@@ -197,7 +197,7 @@ def test_photographs_of_several_cameras_have_a_camera_each(
     ]
     assert not mapper.calls[0][0].is_sequential(500)
     preparation.prepare(folder, tmp_path / "one", Preparation(cameras="one"))
-    assert len(mapper.kept[-1][0]) == 1
+    assert len(mapper.options[-1][0]) == 1
 
 
 def test_given_masks_take_one_pass_and_are_kept(photographs, tmp_path, mapper):

@@ -107,9 +107,9 @@ def test_a_complete_run_keeps_one_last_evaluation(checkpoint_seconds, tmp_path):
             checkpoint_seconds=checkpoint_seconds,
         )
         assert [row["step"] for row in result.history.evaluations] == [6, 10]
-        kept = checkpoint.restore(tmp_path, start(), SPEC)
-        assert [row["step"] for row in kept.record["evaluations"]] == [6, 10]
-        state, after, history = kept.state, kept.step, loop.History(**kept.record)
+        stored = checkpoint.restore(tmp_path, start(), SPEC)
+        assert [row["step"] for row in stored.record["evaluations"]] == [6, 10]
+        state, after, history = stored.state, stored.step, loop.History(**stored.record)
 
 
 def test_a_run_out_of_time_keeps_its_last_evaluation(tmp_path):
@@ -122,9 +122,9 @@ def test_a_run_out_of_time_keeps_its_last_evaluation(tmp_path):
     )
     assert result.stopped_by == "seconds"
     assert 0 not in checkpoint.steps(tmp_path)
-    kept = checkpoint.restore(tmp_path, start(), SPEC)
-    assert kept.step == result.steps
-    assert [row["step"] for row in kept.record["evaluations"]] == [result.steps]
+    stored = checkpoint.restore(tmp_path, start(), SPEC)
+    assert stored.step == result.steps
+    assert [row["step"] for row in stored.record["evaluations"]] == [result.steps]
 
 
 def test_only_the_newest_checkpoints_stay(tmp_path):
@@ -142,12 +142,12 @@ def test_the_best_validated_state_stays_also_after_a_resume(cut, tmp_path, strai
     )
     state, history, after = start(), loop.History(), None
     for steps in (cut, 20):
-        with checkpoint.Checkpoints(tmp_path, SPEC, keep=1, after=after) as kept:
+        with checkpoint.Checkpoints(tmp_path, SPEC, keep=1, after=after) as checkpoints:
             toy.fit(
                 toy.frames(),
                 state,
                 steps=steps,
-                checkpoints=kept,
+                checkpoints=checkpoints,
                 hooks=[hook],
                 history=history,
             )

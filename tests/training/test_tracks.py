@@ -264,9 +264,9 @@ def test_tracks_follow_points_through_a_known_motion(row, dtype, rng):
     }
     canonical = rng.uniform(-1, 1, (5, 3))
     truth = moving_truth(params, canonical, times, center)
-    given = canonical if row is None else truth[:, row]
+    inputs = canonical if row is None else truth[:, row]
     tracks = jax.jit(lambda p, x, m: point_tracks(moving, p, x, m, row))(
-        params, given.astype(dtype), conditions
+        params, inputs.astype(dtype), conditions
     )
     assert tracks.converged.all()
     error = np.abs(np.asarray(tracks.points) - truth).max()

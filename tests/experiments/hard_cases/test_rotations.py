@@ -53,8 +53,8 @@ def test_quaternion_logarithm_is_continuous_across_its_switch(dtype):
     half = np.arctan(quaternion.SERIES_BELOW**0.5)
     step = 2 * np.finfo(dtype).eps
     ends = np.array([half * (1 - step), half * (1 + step)])
-    given = np.stack([np.cos(ends), np.sin(ends), 0 * ends, 0 * ends], axis=1)
-    log, slope = hard_case.evaluate(quaternion.log, given, dtype, 2)
+    inputs = np.stack([np.cos(ends), np.sin(ends), 0 * ends, 0 * ends], axis=1)
+    log, slope = hard_case.evaluate(quaternion.log, inputs, dtype, 2)
     assert np.all(abs(log[1] - log[0]) < 16 * step)
     assert np.all(abs(slope[1] - slope[0]) < 16 * step)
 
@@ -77,9 +77,9 @@ def _of_any_length(q):
 @pytest.mark.full
 def test_any_length_has_finite_value_slope_and_curvature(dtype):
     """A curvature through |q|³ is NaN from 1e-13 down; an unscaled log at 1e-19."""
-    given = np.array(LENGTHS)[:, None] * WXYZ / np.linalg.norm(WXYZ)
-    given = np.concatenate([given, [[1, 0, 0, 0]]])
-    value, slope, curvature = hard_case.evaluate(_of_any_length, given, dtype, 3)
+    inputs = np.array(LENGTHS)[:, None] * WXYZ / np.linalg.norm(WXYZ)
+    inputs = np.concatenate([inputs, [[1, 0, 0, 0]]])
+    value, slope, curvature = hard_case.evaluate(_of_any_length, inputs, dtype, 3)
     usual, none = value[LENGTHS.index(1e15)], value[-1]
     for length, row in zip(LENGTHS, value, strict=False):
         # float32 flushes 1e-38 to zero, which is no rotation
@@ -96,8 +96,8 @@ def test_lengths_at_the_edge_of_the_range_are_told_apart(dtype):
     """The least normal number is normalized, its neighbor below is the identity."""
     edge = np.finfo(dtype).tiny
     below = np.nextafter(edge, np.asarray(0, dtype))
-    given = np.array([[0, edge, 0, 0], [0, below, 0, 0]], dtype)
-    value = jax.jit(jax.vmap(quaternion.normalize))(given)
+    inputs = np.array([[0, edge, 0, 0], [0, below, 0, 0]], dtype)
+    value = jax.jit(jax.vmap(quaternion.normalize))(inputs)
     assert np.array_equal(value, [[0, 1, 0, 0], [1, 0, 0, 0]])
 
 

@@ -86,8 +86,8 @@ def plain(spec, matrix):
     """
     volume = np.linalg.det(matrix)
     with mpmath.workdps(30):
-        given = mpmath.matrix(np.asarray(matrix, np.float64).tolist())
-        stretch = list(mpmath.svd_r(given, compute_uv=False))
+        inputs = mpmath.matrix(np.asarray(matrix, np.float64).tolist())
+        stretch = list(mpmath.svd_r(inputs, compute_uv=False))
         if spec.fold_cost and volume < 0:
             stretch[2] *= -1
         logs = [

@@ -33,12 +33,12 @@ def test_it_is_the_mean_energy_of_the_warp_itself(dtype, rng):
     energies = exact(MATRIX, points)
     weights = rng.uniform(size=(2, 5))
     robust = 2 * energies / (energies + 4 * 0.03**2)
-    matrix, given = jnp.asarray(MATRIX, dtype), jnp.asarray(points, dtype)
+    matrix, inputs = jnp.asarray(MATRIX, dtype), jnp.asarray(points, dtype)
     plain, weighted, robustly = jax.jit(
         lambda: (
-            elastic_loss(bend(matrix), given),
-            elastic_loss(bend(matrix), given, jnp.asarray(weights, dtype)),
-            elastic_loss(bend(matrix), given, robust_width=0.03),
+            elastic_loss(bend(matrix), inputs),
+            elastic_loss(bend(matrix), inputs, jnp.asarray(weights, dtype)),
+            elastic_loss(bend(matrix), inputs, robust_width=0.03),
         )
     )()
     bound = {"float32": 2e-6, "float64": 1e-13}[dtype]

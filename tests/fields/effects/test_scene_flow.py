@@ -38,9 +38,9 @@ def terms_of(spec, params, frames, batch, arrays, step, behind=None):
     ("step", "behind"), [(0, None), (250, None), (0, (0.9, 0.2, 0.6))]
 )
 def test_terms_are_sums_over_rays_and_samples_one_by_one(dtype, step, behind):
-    given = scenario(dtype)
-    terms = terms_of(TINY, *given, step, behind)
-    expected = oracle(*given, step, behind)
+    inputs = scenario(dtype)
+    terms = terms_of(TINY, *inputs, step, behind)
+    expected = oracle(*inputs, step, behind)
     assert set(terms) == set(expected)
     for name, value in expected.items():
         # float32 rounds a few ulps of the coordinates, and divides by a deviation
@@ -49,10 +49,10 @@ def test_terms_are_sums_over_rays_and_samples_one_by_one(dtype, step, behind):
 
 
 def test_weights_are_the_spec_s_and_the_capture_s_own_terms_fade(dtype):
-    given = scenario(dtype)
+    inputs = scenario(dtype)
     weights = dataclasses.asdict(TINY.weights)
     for step, fade in ((0, 1.0), (99, 1.0), (100, 0.1), (250, 0.01), (10**6, 0.0)):
-        for name, term in terms_of(TINY, *given, step).items():
+        for name, term in terms_of(TINY, *inputs, step).items():
             expected = weights[name] * (fade if name in ("depth", "flow") else 1)
             np.testing.assert_allclose(term.weight, expected, rtol=1e-6, err_msg=name)
 
@@ -75,18 +75,18 @@ def test_the_whole_penalty_has_the_slope_of_its_differences(float64, step):
 
 
 def test_terms_without_a_weight_or_data_are_not_there():
-    given = scenario("float32")
+    inputs = scenario("float32")
     spec = dataclasses.replace(TINY, weights=FlowWeights(**dict.fromkeys(NAMES, 0.0)))
-    assert terms_of(spec, *given, 0) == {}
+    assert terms_of(spec, *inputs, 0) == {}
     assert scene_flow.Bound(spec, TIMES).required_data == frozenset()
     only_flow = dataclasses.replace(spec, weights=FlowWeights(depth=0.0))
     assert scene_flow.Bound(only_flow, TIMES).required_data == {"flow"}
     assert scene_flow.Bound(TINY, TIMES).required_data == {"flow", "depths"}
-    params, frames, batch, arrays = given
+    params, frames, batch, arrays = inputs
     bare = frames._replace(depths=None, flow=None)
     terms = jax.eval_shape(
-        lambda *given: scene_flow.penalty(
-            TINY, TIMES, params, context_of(TINY, *given)
+        lambda *inputs: scene_flow.penalty(
+            TINY, TIMES, params, context_of(TINY, *inputs)
         ),
         *(params, bare, batch, *arrays, 0),
     )
@@ -306,16 +306,16 @@ def chain_by_hand(params, frames, batch, arrays, step):
 @pytest.mark.full
 @pytest.mark.parametrize("step", [200, 201])
 def test_a_chain_leads_two_timestamps_on_in_turn_to_either_side(dtype, step):
-    params, frames, batch, arrays = given = scenario(dtype)
+    params, frames, batch, arrays = inputs = scenario(dtype)
     weights = FlowWeights(**dict.fromkeys(NAMES, 0.0) | {"warped": 0.5})
     spec = dataclasses.replace(TINY, weights=weights, chain_steps=200)
-    term = terms_of(spec, *given, step)["chain"]
+    term = terms_of(spec, *inputs, step)["chain"]
     expected = chain_by_hand(params, frames, batch, arrays, step)
     bound = {"float32": 3e-5, "float64": 1e-11}[dtype]
     np.testing.assert_allclose(term.value, expected, rtol=bound)
     assert term.weight == 0.5
-    assert terms_of(spec, *given, 199)["chain"].value == 0
-    assert "chain" not in terms_of(TINY, *given, step)
+    assert terms_of(spec, *inputs, 199)["chain"].value == 0
+    assert "chain" not in terms_of(TINY, *inputs, step)
 
 
 @pytest.mark.full

@@ -134,5 +134,5 @@ def test_slopes_are_those_of_differences(float64, rng):
             + flow_losses.normalized_depth(depth, other, present)
         )
 
-    given = flow, back, seen, color, depth, rng.uniform(0, 0.2, (rays, samples))
-    assert gradients.directional_error(total, *given, step=1e-6) < 1e-7
+    inputs = flow, back, seen, color, depth, rng.uniform(0, 0.2, (rays, samples))
+    assert gradients.directional_error(total, *inputs, step=1e-6) < 1e-7

@@ -152,8 +152,8 @@ def test_weights_of_bands_that_open_late_start_at_zero():
         weight = annealed.hidden[index].weight
         waves = slice(above + 3, above + features)
         assert np.all(weight[waves] == 0)
-        kept = np.r_[0 : above + 3, above + features : weight.shape[0]]
-        np.testing.assert_array_equal(weight[kept], plain.hidden[index].weight[kept])
+        rows = np.r_[0 : above + 3, above + features : weight.shape[0]]
+        np.testing.assert_array_equal(weight[rows], plain.hidden[index].weight[rows])
     np.testing.assert_array_equal(annealed.hidden[1].weight, plain.hidden[1].weight)
     # Without hidden layers it is the heads that read them.
     bare = WarpSpec(anneal_steps=100, depth=0, skips=())
@@ -181,8 +181,8 @@ def test_time_zero_is_the_template(kind, dtype, rng):
         pair = jax.value_and_grad(lambda *args: jnp.sum(moved(*args) ** 2), (0, 1, 2))
         return pair(*args), jax.jacfwd(moved, 1)(*args)
 
-    given = (params, point, np.asarray(0, dtype))
-    (value, grads), jacobian = jax.tree.map(np.asarray, every(*given))
+    arguments = (params, point, np.asarray(0, dtype))
+    (value, grads), jacobian = jax.tree.map(np.asarray, every(*arguments))
     assert value == 0
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(grads))
     np.testing.assert_array_equal(jacobian, 0)
