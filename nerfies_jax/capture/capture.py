@@ -77,6 +77,11 @@ class Capture:
         return self.center
 
     @property
+    def given(self) -> ExternalResults | None:
+        """Alias of `external`, its name in earlier versions."""
+        return self.external
+
+    @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.images.shape[2], self.images.shape[1]

@@ -6,6 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerfies_jax.runtime import earlier_names
+
+__getattr__ = earlier_names.attributes(__name__)
+
 
 @dataclasses.dataclass(frozen=True)
 class ExternalFiles:

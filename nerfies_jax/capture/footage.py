@@ -20,7 +20,9 @@ from nerfies_jax.capture.formats import VIDEOS
 from nerfies_jax.capture.images import MAX_PIXELS, write_png
 from nerfies_jax.capture.photographs import HEIC
 from nerfies_jax.capture.video import notes_of, read_video, transfer_of
-from nerfies_jax.runtime import events
+from nerfies_jax.runtime import earlier_names, events
+
+__getattr__ = earlier_names.attributes(__name__)
 
 PLAIN = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 FRAMES = 100  # default number of frames to select from a video

@@ -18,7 +18,9 @@ from nerfies_jax.capture import (
 )
 from nerfies_jax.capture import images as image_files
 from nerfies_jax.capture.capture import CaptureError, blocks, shrink
-from nerfies_jax.runtime import events
+from nerfies_jax.runtime import earlier_names, events
+
+__getattr__ = earlier_names.attributes(__name__)
 
 MAX_FRAMES = 100_000
 MAX_BYTES = 64 * 2**30  # of decoded images

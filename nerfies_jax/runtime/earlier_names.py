@@ -1,4 +1,4 @@
-"""Imports of modules under their earlier names, which scripts of users still have."""
+"""Earlier names of modules and functions, which scripts of users still have."""
 
 import importlib
 import importlib.abc
@@ -6,11 +6,14 @@ import importlib.machinery
 import sys
 import types
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 # Packages and modules by their earlier names. Modules of a package moved with it.
 CURRENT = {
+    "nerfies_jax.capture.given": "nerfies_jax.capture.external",
     "nerfies_jax.evidence": "nerfies_jax.preprocessing",
+    "nerfies_jax.preprocessing.given_files": "nerfies_jax.preprocessing.external_files",
     "nerfies_jax.measure": "nerfies_jax.metrics",
     "nerfies_jax.nets": "nerfies_jax.nn",
     "gaussians_jax.files": "gaussians_jax.io.files",
@@ -19,6 +22,19 @@ CURRENT = {
     "gaussians_jax.splats": "gaussians_jax.core.splats",
     "gaussians_jax.splatv": "gaussians_jax.io.splatv",
     "gaussians_jax.spz": "gaussians_jax.io.spz",
+}
+# Functions and classes of modules, by their earlier names.
+ATTRIBUTES = {
+    "nerfies_jax.capture.external.GivenFiles": (
+        "nerfies_jax.capture.external.ExternalFiles"
+    ),
+    "nerfies_jax.capture.footage.from_film": "nerfies_jax.capture.footage.from_video",
+    "nerfies_jax.capture.footage.from_pictures": (
+        "nerfies_jax.capture.footage.from_images"
+    ),
+    "nerfies_jax.capture.frames.pixels_of": (
+        "nerfies_jax.capture.world_points.pixels_of"
+    ),
 }
 
 
@@ -32,8 +48,37 @@ def current_name(name: str) -> str | None:
       Its name in this version, or None if it was not renamed.
     """
     parts = name.split(".")
-    current = CURRENT.get(".".join(parts[:2]))
-    return None if current is None else ".".join([current, *parts[2:]])
+    for count in range(len(parts), 1, -1):
+        current = CURRENT.get(".".join(parts[:count]))
+        if current is not None:
+            return ".".join([current, *parts[count:]])
+    return None
+
+
+def attributes(module: str) -> Callable[[str], Any]:
+    """Make the `__getattr__` of a module that had names of `ATTRIBUTES`.
+
+    Args:
+      module: Dotted name of the module.
+
+    Returns:
+      A function from an earlier name to the value that has another name now.
+    """
+
+    def get(name: str) -> Any:
+        earlier = f"{module}.{name}"
+        if earlier not in ATTRIBUTES:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        current = ATTRIBUTES[earlier]
+        warnings.warn(
+            f"{earlier} is {current} in this version; use that",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        home, _, last = current.rpartition(".")
+        return getattr(importlib.import_module(home), last)
+
+    return get
 
 
 class _Loader(importlib.abc.Loader):
