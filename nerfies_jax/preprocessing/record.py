@@ -25,6 +25,7 @@ from nerfies_jax.preprocessing import (
     external_resampling,
     lost_regions,
     moving,
+    patch_alignment,
     path_depths,
     paths,
     photo_consistency,
@@ -40,6 +41,7 @@ from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.preprocessing.watch import (
     A_COMPARED_PIXEL,
+    A_PATCH_FRAME,
     A_POINT_FRAME,
     A_SEARCHED_PIXEL,
     A_TRACK_FRAME,
@@ -138,6 +140,10 @@ def _gathered(capture, use_depths, rough_cameras, watch):
                 views, flow, images, mask, (tracks, rest, score), watch
             )
         which = _moved(tracks, score, first, least.path)
+        if not first:
+            watch.spend(1e-6 * A_PATCH_FRAME * tracks.seen[which].size)
+            tracks = patch_alignment.align(tracks, which, images, views.size)
+            which = which[_are_long(tracks.seen[which], least.path)]
     still = np.flatnonzero(score < paths.AT_REST)
     static = tracks.take(still), rest.take(still)
     depths = path_depths.known(capture, external, views, static, use_depths)
@@ -306,7 +312,7 @@ def carried(views: Views, flow: NeighborFlow) -> float:
 
 
 def _moved(tracks, score, first, shortest):
-    long = tracks.seen.sum(1) >= min(shortest, tracks.seen.shape[1])
+    long = _are_long(tracks.seen, shortest)
     wanted = np.arange(len(score)) >= first
     which = np.flatnonzero(long & wanted & (score > MOVES))
     if len(which) > MOST_PATHS:
@@ -315,6 +321,10 @@ def _moved(tracks, score, first, shortest):
         rng = np.random.default_rng(0)
         which = rng.choice(which, MOST_PATHS, replace=False, p=chance / chance.sum())
     return np.sort(which)
+
+
+def _are_long(seen, shortest):
+    return seen.sum(1) >= min(shortest, seen.shape[1])
 
 
 def cached(

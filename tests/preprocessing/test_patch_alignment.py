@@ -1,0 +1,88 @@
+"""Moving points aligned with their first images by rotated and scaled patches."""
+
+import numpy as np
+import pytest
+import scipy.ndimage as nd
+
+from nerfies_jax.preprocessing import patch_alignment
+from nerfies_jax.preprocessing import tracks as tracking
+from nerfies_jax.preprocessing.tracks import Tracks
+
+SIZE, FRAMES, POINTS, CENTER = (64, 48), 9, 60, np.array([32.0, 24.0])
+TURN, GROWTH = 0.9, 0.2  # rad, and log of the scale, over all frames
+
+
+def warps():
+    """Rotation and scale of each frame relative to the first one, [frames, 2, 2]."""
+    share = np.linspace(0, 1, FRAMES)
+    scale, angle = np.exp(GROWTH * share), TURN * share
+    cos, sin = scale * np.cos(angle), scale * np.sin(angle)
+    return np.stack([cos, -sin, sin, cos], -1).reshape(-1, 2, 2)
+
+
+@pytest.fixture(scope="module")
+def images():
+    """Enlarged images of a texture that turns about the center and grows."""
+    noise = np.random.default_rng(0).normal(size=(192, 192))
+    texture = nd.gaussian_filter(noise, 2.5)
+    texture = 128 + 40 * texture / texture.std()
+    x, y = np.meshgrid(np.arange(2 * SIZE[0]) + 0.5, np.arange(2 * SIZE[1]) + 0.5)
+    offset = np.stack([x, y], -1) - 2 * CENTER
+    enlarged = []
+    for warp in warps():
+        source = offset @ np.linalg.inv(warp).T + 95.5
+        enlarged.append(nd.map_coordinates(texture, [source[..., 1], source[..., 0]]))
+    return np.clip(np.rint(enlarged), 0, 255).astype(np.uint8)
+
+
+def tracks_of(points=POINTS, dtype=np.float32, drift_px=0.3):
+    """Tracks that drift off the points of the texture, and the true positions."""
+    rng = np.random.default_rng(1)
+    first = CENTER + rng.uniform(-13, 13, (points, 2))
+    true = CENTER + np.einsum("fij,nj->nfi", warps(), first - CENTER)
+    drift = rng.normal(0, drift_px, true.shape)
+    drift[:, 0] = 0
+    seen = np.ones((points, FRAMES), bool)
+    return Tracks(np.zeros(points, int), (true + drift).astype(dtype), seen), true
+
+
+def median_error(tracks, true):
+    miss = np.linalg.norm(tracks.pixel[:, -1] - true[:, -1], axis=-1)
+    return np.median(miss[tracks.seen[:, -1]])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_points_of_a_turning_body_keep_their_place_on_it(images, dtype):
+    tracks, true = tracks_of(dtype=dtype)
+    shifted = tracking.realigned(tracks, images, SIZE)
+    warped = patch_alignment.align(tracks, np.arange(POINTS), images, SIZE)
+    assert warped.pixel.dtype == dtype
+    # Translated patches, which are turned by 50 degrees, do not reduce the drift.
+    assert median_error(shifted, true) > 0.3
+    # The rounding of gray levels and the warps from drifting tracks leave this much.
+    assert median_error(warped, true) < 0.06
+    assert warped.seen.mean() > 0.95
+    np.testing.assert_array_equal(warped.pixel[:, 0], tracks.pixel[:, 0])
+
+
+def test_points_that_move_too_far_are_invisible_and_others_untouched(images):
+    tracks, _ = tracks_of()
+    tracks.pixel[:, 5] += 1.4  # 2 px in all
+    which = np.arange(0, POINTS // 2)
+    aligned = patch_alignment.align(tracks, which, images, SIZE)
+    step = np.linalg.norm(aligned.pixel - tracks.pixel, axis=-1)
+    assert step[aligned.seen].max() < tracking.FARTHEST_PX
+    assert aligned.seen[which, 5].mean() < 0.5 < 0.9 < aligned.seen[which, 4].mean()
+    assert (aligned.pixel[~aligned.seen] == 0).all()
+    rest = np.s_[POINTS // 2 :]
+    np.testing.assert_array_equal(aligned.pixel[rest], tracks.pixel[rest])
+    assert aligned.seen[rest].all()
+
+
+def test_single_points_are_aligned_by_translation(images):
+    tracks, true = tracks_of(points=2)
+    aligned = patch_alignment.align(tracks, np.arange(2), images[:2], SIZE)
+    miss = np.linalg.norm(aligned.pixel[:, 1] - true[:, 1], axis=-1)
+    assert (miss < 0.15).all()  # a turn by 6 degrees
+    nothing = patch_alignment.align(tracks, np.zeros(0, int), images, SIZE)
+    np.testing.assert_array_equal(nothing.pixel, tracks.pixel)
