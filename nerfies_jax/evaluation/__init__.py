@@ -1,6 +1,7 @@
 """Frames of a capture, the renderer, and metrics of rendered images."""
 
 from nerfies_jax.evaluation.frames import (
+    check_frames,
     frames_of,
     path_views,
     resized,
@@ -23,6 +24,7 @@ __all__ = [
     "Halves",
     "Renderer",
     "Scored",
+    "check_frames",
     "frames_of",
     "known_mean",
     "path_views",

@@ -12,6 +12,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.flow import training_flow
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
+from nerfies_jax.training import frame_stream
 from nerfies_jax.training.frame_stream import FrameStream, TrainingFrames
 from nerfies_jax.training.model import (
     Frames,
@@ -68,15 +69,42 @@ def training_frames(
       ValueError: If they do not fit and `model` cannot be trained on a stream, or if
         not even the frames of a few steps fit.
     """
+    if not _is_streamed(model, capture, training):
+        return frames_of(capture, model.required_data)
+    return FrameStream(model, *_stream_inputs(model, capture, training))
+
+
+def check_frames(model: Model, capture: Capture, training: int = 0) -> None:
+    """Check that `training_frames` can succeed, without moving any frames.
+
+    Args:
+      model: The model that is trained.
+      capture: The capture.
+      training: Bytes that training needs on the device in addition to the frames.
+
+    Raises:
+      ValueError: If it cannot.
+    """
+    if _is_streamed(model, capture, training):
+        frames, pixels, _, limit = _stream_inputs(model, capture, training)
+        frame_stream.check_memory(model, frames, pixels, limit)
+
+
+def _is_streamed(model, capture, training) -> bool:
     shared = frame_memory.is_shared(capture)
     count = len(capture.images) if shared else len(capture.train)
     pixels = _pixels(capture, model.required_data)
     needed = sum(count * array[:1].nbytes for array in pixels.values())
-    limit = frame_memory.device_limit(training)
-    if needed <= limit or model.reads is None:
-        return frames_of(capture, model.required_data)
+    if model.reads is None:
+        frame_memory.check_device(needed)
+    return model.reads is not None and needed > frame_memory.device_limit(training)
+
+
+def _stream_inputs(model, capture, training):
+    """Return the arguments of a stream after the model."""
     frames = _without_pixels(capture, model.required_data)
-    return FrameStream(model, frames, pixels, capture.train, limit)
+    pixels = _pixels(capture, model.required_data)
+    return frames, pixels, capture.train, frame_memory.device_limit(training)
 
 
 def _pixels(capture, required_data) -> dict[str, Any]:
@@ -93,8 +121,9 @@ def _without_pixels(capture, required_data) -> Frames:
         data["points"] = capture.points.position
     if "flow" in required_data and capture.flow is not None:
         data["flow"] = training_flow(capture)
+    images = capture.images
     return Frames(
-        images=None,
+        images=np.zeros((0, *images.shape[1:]), images.dtype),
         cameras=cameras.take(capture.cameras, rows),
         times=capture.times[rows],
         appearance=capture.appearance_ids[rows],

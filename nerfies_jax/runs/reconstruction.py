@@ -120,6 +120,7 @@ def reconstruct(
             run = _new_run(config, effects, seconds)
             _describe(run)
             multiple_hosts.check(run)
+            validation.check_frames(run)
             extra = quality.fitting(extra, run.capture.size)
             state = initial_state(run)
             if seconds is not None and not run.config.validation:
@@ -199,6 +200,7 @@ def resume(
             run = saved_run(folder, overrides, new_paths, trusted)
             _describe(run)
             multiple_hosts.check(run)
+            validation.check_frames(run)
             extra = quality.fitting(extra, run.capture.size)
             state, history, after = _restore(folder, run)
             follow.begin(folder, run, after or 0)

@@ -93,12 +93,28 @@ def training_frames(run: Run) -> TrainingFrames:
     Returns:
       The training frames without those left out.
     """
+    return frames_for(run, _without_left_out(run))
+
+
+def check_frames(run: Run) -> None:
+    """Check that `training_frames` can succeed, without moving any frames.
+
+    Args:
+      run: The run.
+
+    Raises:
+      ValueError: If the device has too little memory.
+    """
+    capture = _without_left_out(run)
+    evaluation.check_frames(run.model, capture, _training_bytes(run, capture))
+
+
+def _without_left_out(run) -> Capture:
     capture, left_out = run.capture, rows(run)
-    if len(left_out):
-        train = capture.train
-        remaining = train[~np.isin(train, left_out)]
-        capture = dataclasses.replace(capture, train=remaining)
-    return frames_for(run, capture)
+    if not len(left_out):
+        return capture
+    train = capture.train
+    return dataclasses.replace(capture, train=train[~np.isin(train, left_out)])
 
 
 def frames_for(run: Run, capture: Capture) -> TrainingFrames:
@@ -111,11 +127,16 @@ def frames_for(run: Run, capture: Capture) -> TrainingFrames:
     Returns:
       The training frames.
     """
-    estimate, training = run.representation.resources.estimate_memory_bytes, 0
-    if estimate is not None:
-        frames = frame_memory.frame_bytes(capture, run.model.devices)
-        training = estimate(run.spec, capture) - frames
-    return evaluation.training_frames(run.model, capture, training)
+    return evaluation.training_frames(run.model, capture, _training_bytes(run, capture))
+
+
+def _training_bytes(run, capture) -> int:
+    """Estimate the device memory that training needs in addition to the frames."""
+    estimate = run.representation.resources.estimate_memory_bytes
+    if estimate is None:
+        return 0
+    frames = frame_memory.frame_bytes(capture, run.model.devices)
+    return estimate(run.spec, capture) - frames
 
 
 def hooks(run: Run, renderer: Renderer) -> tuple[Hook, ...]:

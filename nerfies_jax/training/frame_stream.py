@@ -53,12 +53,12 @@ class Window(NamedTuple):
 class FrameStream:
     """Training frames in host memory, with windows of them on the devices of a model.
 
-    `frames` are the training frames without pixels: `images` has the shape of an
-    image, but no rows. Events receive these.
+    Events receive `frames`, the training frames without pixels.
 
     Args:
       model: A model with `reads`.
-      frames: The training frames without pixels.
+      frames: The training frames without pixels: `images` has the shape of an image,
+        but no rows.
       pixels: Arrays "images", "valid", "depths" and "moving" of the capture, [frames,
         height, width, ...] each, in host memory or mapped from a file.
       rows: Rows of the training frames in these arrays, [frames].
@@ -76,45 +76,19 @@ class FrameStream:
         rows: np.ndarray,
         limit: float | int,
     ):
-        assert model.reads is not None
         self._devices, self._rows, self._pixels = model.devices, rows, pixels
-        images = pixels["images"]
-        empty = np.zeros((0, *images.shape[1:]), images.dtype)
-        self.frames = in_default_precision(frames._replace(images=empty))
+        self.frames = in_default_precision(frames)
         self._resident = data_parallel.shared(self.frames, self._devices)
-        reads, times = model.reads, self.frames
-
-        @jax.jit
-        def indices_of(key, step):
-            def of_step(index):
-                return reads(key, step + index, times)
-
-            return lax.map(of_step, np.arange(STEPS, dtype=np.int32))
-
-        self._indices_of = indices_of
-        example = jax.eval_shape(indices_of, jax.random.key(0), np.int32(0))
+        check_memory(model, frames, pixels, limit)
+        self._indices_of = _reader(model, self.frames)
+        example = jax.eval_shape(self._indices_of, jax.random.key(0), np.int32(0))
         self._whole = len(example) == 1
         self._slots = min(example[0].size, len(rows))
-        self._check(limit, example[0].size)
         first = self._load(0, [np.zeros(x.shape, np.int32) for x in example])
         # Shapes of the frames that a step gets, with their devices.
         self.layout = jax.tree.map(abstract, first)
         self._thread = ThreadPoolExecutor(1, "frames")
         self._windows: list[Window] = []
-
-    def _check(self, limit, reads):
-        height, width = self.frames.images.shape[1:3]
-        image = sum(array.nbytes // len(array) for array in self._pixels.values())
-        window = image * self._slots if self._whole else image * reads / height / width
-        always = sum(leaf.nbytes for leaf in jax.tree.leaves(self.frames))
-        needed = always + WINDOWS * window
-        if needed > limit:
-            raise ValueError(
-                f"frame_memory={limit / 2**30:.3g}: {needed / 2**30:.3g} GiB of device "
-                f"memory are needed for the frames of {WINDOWS * STEPS} steps, and for "
-                "flow and points; increase it, read smaller images with max_side=..., "
-                "or use fewer views per step"
-            )
 
     def window(self, state: TrainState, steps: int, more: int = STEPS) -> Frames:
         """Return the frames for the next steps, and begin to load those after them.
@@ -167,6 +141,54 @@ class FrameStream:
             pixels = {"step_pixels": step_pixels}
         on_device = data_parallel.shared(in_default_precision(pixels), self._devices)
         return self._resident._replace(**jax.block_until_ready(on_device))
+
+
+def check_memory(
+    model: Model,
+    frames: Frames,
+    pixels: Mapping[str, np.ndarray],
+    limit: float | int,
+) -> None:
+    """Check that the windows of a stream fit on the device.
+
+    Args:
+      model: As of `FrameStream`.
+      frames: As of `FrameStream`.
+      pixels: As of `FrameStream`.
+      limit: As of `FrameStream`.
+
+    Raises:
+      ValueError: If they do not fit.
+    """
+    reader = _reader(model, frames._replace(times=jnp.asarray(frames.times)))
+    reads = jax.eval_shape(reader, jax.random.key(0), np.int32(0))
+    height, width = frames.images.shape[1:3]
+    images: float = min(reads[0].size, len(frames.times))
+    if len(reads) > 1:  # single pixels
+        images = reads[0].size / (height * width)
+    window = images * sum(array.nbytes // len(array) for array in pixels.values())
+    always = sum(leaf.nbytes for leaf in jax.tree.leaves(frames))
+    needed = always + WINDOWS * window
+    if needed > limit:
+        raise ValueError(
+            f"frame_memory={limit / 2**30:.3g}: {needed / 2**30:.3g} GiB of device "
+            f"memory are needed for the frames of {WINDOWS * STEPS} steps, and for "
+            "flow and points; increase it, read smaller images with max_side=..., or "
+            "use fewer views per step"
+        )
+
+
+def _reader(model, frames):
+    """Return a program of the key and a step, for what the next `STEPS` steps read."""
+
+    @jax.jit
+    def indices_of(key, step):
+        def of_step(index):
+            return model.reads(key, step + index, frames)
+
+        return lax.map(of_step, np.arange(STEPS, dtype=np.int32))
+
+    return indices_of
 
 
 def _copy_rows(array, rows, count):

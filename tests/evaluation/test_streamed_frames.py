@@ -94,6 +94,10 @@ def test_frames_of_a_model_that_reads_any_pixel_must_fit(monkeypatch):
     message = "which has 0.0 GiB for them; read smaller images"
     with pytest.raises(ValueError, match=message):
         evaluation.training_frames(model._replace(reads=None), capture())
+    limit(monkeypatch, model, 1e-6)
+    for function in (evaluation.training_frames, evaluation.check_frames):
+        with pytest.raises(ValueError, match=r"GiB of device memory .* 20 steps"):
+            function(model, capture())
 
 
 @pytest.mark.parametrize("size", [0, -1.0, np.inf, np.nan])

@@ -25,7 +25,8 @@ def without_pixels(rows, bad_step=0):
     camera = jax.tree.map(lambda leaf: np.zeros(0, np.float32), toy.frames().cameras)
     times = np.linspace(0, 1, len(rows), dtype=np.float32)
     ids, bad = np.zeros(0, np.int32), np.full((1, 3), bad_step, np.float32)
-    return Frames(None, camera, times, ids, None, points=bad)
+    none = np.zeros((0, *SIZE, 3), np.uint8)
+    return Frames(none, camera, times, ids, None, points=bad)
 
 
 def row_of(key, frames):
