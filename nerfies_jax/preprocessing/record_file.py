@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.watch import Seconds
 
-VERSION = 18
+VERSION = 19
 
 
 class Evidence(NamedTuple):
