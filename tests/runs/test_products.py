@@ -27,7 +27,7 @@ from nerfies_jax.runs.config import CaptureSource, MoreMetrics, RunConfig
 from nerfies_jax.runs.run import Run, scene_spec
 from nerfies_jax.runs.train import Trained
 from nerfies_jax.training.loop import History
-from nerfies_jax.training.model import Rendering, TrainState
+from nerfies_jax.training.model import Model, Rendering, TrainState
 from nerfies_jax.visualization import panels
 from tests import scenes
 
@@ -117,11 +117,13 @@ def test_a_profile_that_fails_loses_nothing_but_itself():
 
     capture, config = scenes.tiny_capture(), RunConfig("splats-static-small")
     kind = representations.named("gaussians")
-    model = types.SimpleNamespace(required_data=frozenset())
+    model = Model(None, None, None, None, (), None)
     state = TrainState(None, None, None, jnp.int32(0), jax.random.key(0))
     unready = types.SimpleNamespace(ms=refuses)
     for step_parts in (refuses, lambda *_, **__: unready):
-        resources = kind.resources._replace(step_parts=step_parts)
+        resources = kind.resources._replace(
+            step_parts=step_parts, estimate_memory_bytes=None
+        )
         failing = kind._replace(resources=resources)
         run = Run(config, capture, capture, failing, None, None, model)
         with step_profile.profiling(run, state) as profile:
