@@ -254,8 +254,9 @@ def _stepper(spec, metadata, effects, optimizer, devices):
 
 def _condition(spec, state, frames, index):
     """Select a frame of a step's batch, and return its row and condition."""
-    visit = state.step * spec.batch_size + index
-    row = view_order.shuffled_row(state.key, visit, len(frames.times))
+    row = view_order.row_of_view(
+        state.key, state.step, index, spec.batch_size, len(frames.times)
+    )
     key = loop.step_key(state)
     if spec.batch_size > 1:
         key = jax.random.fold_in(key, index)

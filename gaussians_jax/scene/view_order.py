@@ -29,6 +29,28 @@ def shuffled_row(
     return jax.random.permutation(epoch, frames)[step % frames]
 
 
+def row_of_view(
+    key: Key[Array, ""],
+    step: Int[Array, ""],
+    view: int | Int[Array, ""],
+    views: int,
+    frames: int,
+) -> Int[Array, ""]:
+    """Choose the frame of a view of a step.
+
+    Args:
+      key: PRNG key of the run.
+      step: Number of completed steps.
+      view: Index of the view in the step.
+      views: Number of views per step.
+      frames: Number of frames.
+
+    Returns:
+      Index of the frame.
+    """
+    return shuffled_row(key, step * views + view, frames)
+
+
 def reader(views: int) -> Callable[[Any, Any, Frames], tuple[Int[Array, " views"]]]:
     """Return the function `Model.reads` of a scene of splats.
 
@@ -40,8 +62,8 @@ def reader(views: int) -> Callable[[Any, Any, Frames], tuple[Int[Array, " views"
     """
 
     def read(key, step, frames):
-        visits = step * views + np.arange(views, dtype=np.int32)
-        choose = jax.vmap(shuffled_row, (None, 0, None))
-        return (choose(key, visits, len(frames.times)),)
+        choose = jax.vmap(row_of_view, (None, None, 0, None, None))
+        each = np.arange(views, dtype=np.int32)
+        return (choose(key, step, each, views, len(frames.times)),)
 
     return read

@@ -97,10 +97,8 @@ def gather(
 def _gathered(capture, use_depths, rough_cameras, watch):
     watch.begin("flow")
     capture = pinholes.as_pinholes(capture)
-    factor, external = (
-        _factor(capture),
-        capture.external or ExternalResults(capture.size),
-    )
+    external = capture.external or ExternalResults(capture.size)
+    factor = _factor(capture)
     capture = downscale(capture, factor)
     views = view_set.in_time_order(capture)
     images = dense_flow.leveled(views)

@@ -250,11 +250,11 @@ def _grown(views, tracks, paths, own, rows, within, has_room):
     The object is extended to more frames by tracks that are visible there. Its median
     error must be `within` pixels, from the beginning.
     """
-    body, adjusted = None, None
+    body, selection = None, None
     bend_px = BEND_PX * (len(views.time) / BEND_FRAMES) ** 2
     for _ in range(GROWTHS):
-        before, adjusted = adjusted, _fewer(paths, own)
-        if np.array_equal(before, adjusted):
+        before, selection = selection, _fewer(paths, own)
+        if np.array_equal(before, selection):
             break  # another round would repeat the last one
         found = _body(views, tracks, paths, own, bend_px=bend_px)
         if found is None:
