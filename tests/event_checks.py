@@ -1,14 +1,22 @@
 """What holds of the events of every run."""
 
-from collections.abc import Sequence
+import contextlib
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+
+import jax
+
+from nerfies_jax.runtime import events
+from tests.budget import COMPILED
 
 
-def ended_stages(events: Sequence[dict]) -> list[str]:
+def ended_stages(written: Sequence[dict]) -> list[str]:
     """Names of stages in the order in which they began; each begins and ends once."""
-    numbers = [one["stage"] for one in events if one["kind"] == "stage"]
+    numbers = [one["stage"] for one in written if one["kind"] == "stage"]
     names = []
     for number in dict.fromkeys(numbers):
-        mine = [one for one in events if one.get("stage") == number]
+        mine = [one for one in written if one.get("stage") == number]
         first, *between, last = [one["status"] for one in mine]
         assert first == "begin", mine
         assert set(between) <= {"progress"}, mine
@@ -18,17 +26,20 @@ def ended_stages(events: Sequence[dict]) -> list[str]:
     return names
 
 
-def share_in_stages(events: Sequence[dict]) -> float:
-    """Of the time from the first event to the last, how much lies in any stage."""
-    begins = {}
-    spans = []
-    for one in events:
-        if one["kind"] == "stage" and one["status"] == "begin":
-            begins[one["stage"]] = one["time"]
-        elif one["kind"] == "stage" and one["status"] != "progress":
-            spans.append((begins[one["stage"]], one["time"]))
-    covered, until = 0.0, events[0]["time"]
-    for begin, end in sorted(spans):
-        covered += max(0.0, end - max(begin, until))
-        until = max(until, end)
-    return covered / (events[-1]["time"] - events[0]["time"])
+@contextlib.contextmanager
+def programs_in_stages() -> Iterator[None]:
+    """Check that the thread compiles programs within stages only."""
+    thread, outside = threading.get_ident(), []
+
+    def listen(event, _seconds, **_):
+        is_here = event == COMPILED and threading.get_ident() == thread
+        if is_here and not events.open_stages():
+            outside.append("".join(traceback.format_stack()))
+
+    jax.clear_caches()  # else it depends on the tests before
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert not outside, outside[0]

@@ -70,7 +70,7 @@ def begun(code, before=""):
 
 
 def outcome(process):
-    said, _ = process.communicate(timeout=60)
+    said, _ = process.communicate(timeout=300)
     return process.returncode, said.splitlines()
 
 

@@ -56,7 +56,8 @@ def profiling(
     if isinstance(frames, FrameStream):
         frames = frames.window(state, 1)
     try:
-        parts = step_parts(run.spec, run.metadata, run.model, state, frames)
+        with events.stage("preparing to time the parts of a step"):
+            parts = step_parts(run.spec, run.metadata, run.model, state, frames)
     except Exception as error:
         profile = failure(error)
         yield lambda: profile

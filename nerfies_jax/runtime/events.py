@@ -43,7 +43,7 @@ class Stage:
     def __init__(self, name: str, total: int | None = None, done: int = 0):
         self.name, self.total, self.done = name, total, done
         self._about: dict[str, Any] = {"stage": next(_numbers)}
-        outer = _open_stages()
+        outer = open_stages()
         if outer:
             self._about["parent"] = outer[-1]._about["stage"]
         self._emit_time = -float("inf")
@@ -99,7 +99,7 @@ def stage(name: str, total: int | None = None, done: int = 0) -> Iterator[Stage]
     """
     stopping.check()
     current, start_time = Stage(name, total, done), time.monotonic()
-    _open_stages().append(current)
+    open_stages().append(current)
     status = "failed"
     try:
         current._emit("begin")
@@ -107,10 +107,11 @@ def stage(name: str, total: int | None = None, done: int = 0) -> Iterator[Stage]
         status = "done"
     finally:
         current._emit(status, seconds=round(time.monotonic() - start_time, 3))
-        _open_stages().remove(current)
+        open_stages().remove(current)
 
 
-def _open_stages():
+def open_stages() -> list[Stage]:
+    """Return the stages of this thread that have not ended, the innermost last."""
     if not hasattr(_thread, "stages"):
         _thread.stages = []
     return _thread.stages
@@ -126,7 +127,7 @@ def emit(kind: str, **fields: Any) -> None:
       **fields: JSON values, or floats that are not finite.
     """
     event: Event = {"time": round(time.time(), 3), "kind": kind}
-    stages = _open_stages()
+    stages = open_stages()
     if stages:
         event["phase"] = stages[-1].name
     event |= fields

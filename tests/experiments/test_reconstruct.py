@@ -97,7 +97,8 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     words = (tmp_path / "capture", "--preset", "splats-static-small", "--seconds", 250)
     quick = ("strategy=none", "sh_degree=0", "init.extra_random=0")
     words = (*words, "--step-profile", "--out", out, "--json")
-    assert ended(*words, "--set", *quick) == 0
+    with event_checks.programs_in_stages():
+        assert ended(*words, "--set", *quick) == 0
     assert len(states) == 1
     assert {path.name for path in out.iterdir()} >= {*PRODUCTS}
     metrics = json.loads((out / "metrics.json").read_text())
@@ -132,8 +133,6 @@ def test_a_capture_becomes_splats_and_a_report(tmp_path, monkeypatch, capsys):
     order = ["reading images", "initializing the scene", "training"]
     order += ["rendering the video", "measuring quality", "writing the report"]
     assert [name for name in dict.fromkeys(names) if name in order] == order
-    # But for what is done between them, on a machine that does other things as well.
-    assert event_checks.share_in_stages(events) > 0.8
     assert events[-1]["stopped_by"] == "steps"
     curve = json.loads((out / "curve.json").read_text())
     scores = [one["metrics"] for one in events if one["kind"] == "evaluation"]

@@ -23,7 +23,7 @@ def port():
 
 def page_status(port, **headers):
     """The status that the page is answered with."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
     try:
         connection.putrequest("GET", "/", skip_host=True)
         for name, value in headers.items():
@@ -69,7 +69,7 @@ def test_a_websocket_of_another_site_is_refused(port):
 
     for origin in (f"http://127.0.0.1:{port}", f"http://localhost:{port}", None):
         with handshake(port, origin=origin) as connection:
-            assert connection.recv(timeout=10)
+            assert connection.recv(timeout=120)
     for refused in (
         {"origin": "http://attacker.example"},
         {"origin": f"http://attacker.example:{port}"},
@@ -97,7 +97,7 @@ def test_connections_that_end_early_log_no_warning(port, caplog):
         half.close()
         # A tab that is closed sends no farewell.
         tab = handshake(port)
-        tab.recv(timeout=10)
+        tab.recv(timeout=120)
         tab.socket.shutdown(socket.SHUT_RDWR)
         tab.socket.close()
         page_status(port, Host="attacker.example")

@@ -100,8 +100,8 @@ def served(browser, tmp_path):
         # It covers the scene.
         notice = tab.get_by_text("Software WebGL rendering detected")
         with contextlib.suppress(Exception):
-            notice.wait_for(timeout=5000)
-            tab.locator(".mantine-Notification-closeButton").first.click(timeout=5000)
+            notice.wait_for(timeout=60000)
+            tab.locator(".mantine-Notification-closeButton").first.click(timeout=60000)
             notice.wait_for(state="detached")
         yield each
     finally:

@@ -359,7 +359,7 @@ def launch(folder, steps, *more):
 
 
 def report(process):
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     return json.loads(out.splitlines()[-1])
 
