@@ -201,7 +201,7 @@ def moving_depths(evidence: Evidence) -> np.ndarray:
       [frames, height, width] z-depth in scene units, 0 where unknown.
     """
     depths = np.zeros(evidence.moving.shape, np.float32)
-    tracks = evidence.tracks.take(evidence.moved)
+    tracks = evidence.tracks.take(evidence.path_track)
     for frame, mask in enumerate(evidence.moving):
         rows = np.flatnonzero(evidence.paths.known[:, frame])
         row, column = np.nonzero(mask)

@@ -24,7 +24,7 @@ class TruePoints(NamedTuple):
     """Moving points, in the frames and pixels of preprocessing."""
 
     pixel: np.ndarray  # [points, frames, 2]
-    seen: np.ndarray  # [points, frames] bool
+    visible: np.ndarray  # [points, frames] bool
     position: np.ndarray  # [points, frames, 3] scene units
 
 
@@ -78,7 +78,7 @@ def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
     either = (evidence.moving | true).sum()
     iou = (evidence.moving & true).sum() / either if true.any() else np.nan
     track_px = lost = path_error = np.nan
-    rows = np.flatnonzero(points.seen.any(1))
+    rows = np.flatnonzero(points.visible.any(1))
     if len(rows):
         points = TruePoints(*(part[rows] for part in points))
         views = view_set.in_time_order(small)
@@ -95,7 +95,7 @@ def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
 
 
 def _tracks_of(views, evidence, points):
-    start = points.seen.argmax(1)
+    start = points.visible.argmax(1)
     place = points.pixel[np.arange(len(start)), start]
     starts = np.concatenate([start[:, None], place], axis=1)
     chained = tracking.chain(evidence.flow, starts)
@@ -104,11 +104,11 @@ def _tracks_of(views, evidence, points):
 
 def _track_error(tracks: Tracks, points):
     later = tracks.start + LATER
-    rows = np.flatnonzero(later < points.seen.shape[1])
-    rows = rows[points.seen[rows, later[rows]]]
+    rows = np.flatnonzero(later < points.visible.shape[1])
+    rows = rows[points.visible[rows, later[rows]]]
     if not len(rows):
         return np.nan, np.nan
-    compared = rows[tracks.seen[rows, later[rows]]]
+    compared = rows[tracks.visible[rows, later[rows]]]
     off = (
         tracks.pixel[compared, later[compared]]
         - points.pixel[compared, later[compared]]
@@ -119,7 +119,7 @@ def _track_error(tracks: Tracks, points):
 
 
 def _path_error(capture, views, evidence, tracks, points):
-    long = tracks.seen.sum(1) >= min(short_tracks.USUAL.path, len(views.row))
+    long = tracks.visible.sum(1) >= min(short_tracks.USUAL.path, len(views.row))
     tracks = tracks.take(long)
     if not long.any():
         return np.nan
@@ -129,7 +129,7 @@ def _path_error(capture, views, evidence, tracks, points):
     )
     solution = paths.least_acceleration(views, tracks, capture.near, around)
     error = np.linalg.norm(solution.position - points.position[long], axis=-1)
-    valid = solution.known & points.seen[long]
+    valid = solution.known & points.visible[long]
     if not valid.any():
         return np.nan
     return float(np.median(error[valid]) / scene_unit(evidence))

@@ -48,13 +48,13 @@ def followed(views: Views, evidence: Evidence) -> np.ndarray:
 
 def _draw_tracks(image, evidence, frame, times):
     tracks, moves = evidence.tracks, evidence.score > MOVES
-    rows = np.flatnonzero(tracks.seen[:, frame])
+    rows = np.flatnonzero(tracks.visible[:, frame])
     chosen = [_spread(rows[moves[rows] == kind], TRACKS // 2) for kind in (False, True)]
     for row in np.concatenate(chosen):
         color = BY_ITSELF if moves[row] else AT_REST
         tail = np.arange(max(0, frame - TAIL), frame + 1)
         # Only frames since the track was last invisible.
-        gap = np.flatnonzero(~tracks.seen[row, tail])
+        gap = np.flatnonzero(~tracks.visible[row, tail])
         tail = tail[gap[-1] + 1 :] if len(gap) else tail
         line = np.round(tracks.pixel[row, tail] * times * 16).astype(np.int32)
         cv2.polylines(image, [line], False, color, 1, cv2.LINE_AA, shift=4)

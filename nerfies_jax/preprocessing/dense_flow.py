@@ -40,9 +40,9 @@ JUMP_SHARE, AS_ALIKE = 0.03, 1.1
 class NeighborFlow(NamedTuple):
     """Flow of each frame to the next and to the previous one in time.
 
-    It starts at pixel centers and is in pixels right and down. `seen` is True if
-    forward and backward flow are consistent. The forward flow of the last frame and the
-    backward flow of the first are zero and not seen.
+    It starts at pixel centers and is in pixels right and down. `forward_seen` and
+    `backward_seen` are True if both flows are consistent. The forward flow of the last
+    frame and the backward flow of the first are zero and not valid.
     """
 
     forward: np.ndarray  # [frames, height, width, 2] float32

@@ -71,7 +71,7 @@ def scaled(
     factor, spread = np.ones(count), np.full(count, prior)
     for group in np.unique(body):
         rows = np.flatnonzero(body == group)
-        both = tracks.seen[rows] & (measured[rows] > 0) & alone.known[rows]
+        both = tracks.visible[rows] & (measured[rows] > 0) & alone.known[rows]
         log, weight = 0.0, 1 / prior**2
         if both.sum() >= FEWEST:
             ratio = np.log(alone.depth[rows][both] / measured[rows][both])
@@ -108,9 +108,9 @@ def _bounds(views, tracks, measured, static, rest):
     """
     bound = np.full(measured.shape, np.nan)
     stride = -(-len(rest.position) // MOST_POINTS) or 1
-    points, visible = rest.position[::stride], static.seen[::stride]
+    points, visible = rest.position[::stride], static.visible[::stride]
     for frame in range(measured.shape[1]):
-        here = np.flatnonzero(tracks.seen[:, frame] & (measured[:, frame] > 0))
+        here = np.flatnonzero(tracks.visible[:, frame] & (measured[:, frame] > 0))
         pixel, depth = project(views, frame, points)
         hidden = in_image(views, pixel, depth) & ~visible[:, frame]
         if not len(here) or not hidden.any():

@@ -84,7 +84,7 @@ def _aligned(depth, tracks, rest, inverse):
     fits = []
     tilt = _tilt(depth.shape[1:])
     for frame, external in enumerate(depth):
-        usable = tracks.seen[:, frame] & (rest.depth[:, frame] > 0)
+        usable = tracks.visible[:, frame] & (rest.depth[:, frame] > 0)
         place = pixel_of(tracks.pixel[usable, frame], external.shape)
         own, true = external[place].astype(np.float64), rest.depth[usable, frame]
         finite = np.isfinite(own)

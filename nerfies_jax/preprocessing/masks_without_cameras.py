@@ -90,12 +90,14 @@ def _off_the_camera_motion(tracks, within):
 
     They are NaN if the track is not visible, or too few tracks are.
     """
-    frames = tracks.seen.shape[1]
-    off = np.zeros(tracks.seen.shape)
-    count = np.zeros(tracks.seen.shape, int)
+    frames = tracks.visible.shape[1]
+    off = np.zeros(tracks.visible.shape)
+    count = np.zeros(tracks.visible.shape, int)
     for later in LATER:
         for frame in range(frames - later):
-            rows = np.flatnonzero(tracks.seen[:, frame] & tracks.seen[:, frame + later])
+            rows = np.flatnonzero(
+                tracks.visible[:, frame] & tracks.visible[:, frame + later]
+            )
             if len(rows) < FEWEST:
                 continue
             start, end = (tracks.pixel[rows, at] for at in (frame, frame + later))

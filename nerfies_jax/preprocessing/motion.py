@@ -73,7 +73,7 @@ def _flow_fails(views, evidence):
     Features tell nothing about motion that hides in errors of the cameras, and external
     masks and tracks show it.
     """
-    if evidence.told or len(views.row) <= feature_matches.LEAST_MATCHES:
+    if evidence.is_external or len(views.row) <= feature_matches.LEAST_MATCHES:
         return False
     if evidence.unusable or len(views.row) < MIN_FOR_NO:
         return True
@@ -150,7 +150,7 @@ def frame_shares(evidence: Evidence) -> np.ndarray:
     Returns:
       Shares, [frames].
     """
-    visible = evidence.tracks.seen
+    visible = evidence.tracks.visible
     moves = visible[evidence.score > MOVES].sum(0)
     return moves / np.maximum(visible.sum(0), 1)
 
@@ -164,7 +164,7 @@ def moving_share(evidence: Evidence) -> float:
     Returns:
       The share.
     """
-    length = evidence.tracks.seen.sum(1)
+    length = evidence.tracks.visible.sum(1)
     return float(length[evidence.score > MOVES].sum() / max(length.sum(), 1))
 
 

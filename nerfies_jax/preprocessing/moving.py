@@ -40,7 +40,7 @@ def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
     Returns:
       Scores in [0, 1], [tracks].
     """
-    count = len(tracks.seen)
+    count = len(tracks.visible)
     if count == 0:
         return np.zeros(0)
     far = rest_points.miss(rest)
@@ -60,8 +60,8 @@ def track_scores(tracks: Tracks, rest: RestPoints) -> np.ndarray:
 def _neighborhood(tracks):
     """Return the proximity of tracks in common frames, sparse [tracks, tracks]."""
     rows, columns, weights = [], [], []
-    for frame in range(0, tracks.seen.shape[1], EVERY_FRAMES):
-        here = np.flatnonzero(tracks.seen[:, frame])
+    for frame in range(0, tracks.visible.shape[1], EVERY_FRAMES):
+        here = np.flatnonzero(tracks.visible[:, frame])
         if len(here) <= NEIGHBORS:
             continue
         place = tracks.pixel[here, frame]
@@ -69,7 +69,7 @@ def _neighborhood(tracks):
         rows.append(np.repeat(here, NEIGHBORS))
         columns.append(here[near[:, 1:]].ravel())
         weights.append(np.exp(-0.5 * (distance[:, 1:] / NEAR_PX) ** 2).ravel())
-    shape = (len(tracks.seen),) * 2
+    shape = (len(tracks.visible),) * 2
     if not rows:
         return sparse.csr_matrix(shape)
     entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
@@ -97,7 +97,7 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
     at = np.stack([x, y], axis=-1).reshape(-1, 2)
     shares = np.full((frames, height, width), FAR_FROM_TRACKS, np.float32)
     for frame in range(frames):
-        rows = np.flatnonzero(tracks.seen[:, frame])
+        rows = np.flatnonzero(tracks.visible[:, frame])
         if len(rows) < VOTES:
             continue
         color = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
@@ -180,8 +180,8 @@ def share_on(tracks: Tracks, moving: np.ndarray) -> np.ndarray:
       Shares, [tracks].
     """
     row, column = pixel_of(tracks.pixel, moving.shape[1:])
-    on = moving[np.arange(len(moving)), row, column] & tracks.seen
-    return on.sum(1) / np.maximum(tracks.seen.sum(1), 1)
+    on = moving[np.arange(len(moving)), row, column] & tracks.visible
+    return on.sum(1) / np.maximum(tracks.visible.sum(1), 1)
 
 
 def _smooth(values, color):

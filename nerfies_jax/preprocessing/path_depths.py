@@ -84,7 +84,7 @@ def known(
 def _well_placed(views, tracks, rest):
     """Return the static points whose depth is certain, or all if they are few."""
     sure = still_points.depth_deviation(views, tracks, rest) < SURE_DEPTH
-    if (tracks.seen[sure].sum(0) >= external_depth.FEWEST).mean() < MOST_FRAMES_SURE:
+    if (tracks.visible[sure].sum(0) >= external_depth.FEWEST).mean() < MOST_FRAMES_SURE:
         return tracks, rest
     return tracks.take(sure), rest.take(sure)
 
@@ -92,7 +92,7 @@ def _well_placed(views, tracks, rest):
 def fitted(
     capture: Capture,
     views: Views,
-    moved: Tracks,
+    moving: Tracks,
     static: tuple[Tracks, RestPoints],
     depths: AlignedDepth | None,
     watch: Watch,
@@ -103,7 +103,7 @@ def fitted(
     Args:
       capture: The capture.
       views: The frames.
-      moved: Moving tracks.
+      moving: Moving tracks.
       static: Static tracks and their points.
       depths: Depth maps, or None.
       watch: Work budget.
@@ -113,41 +113,41 @@ def fitted(
     Returns:
       The paths.
     """
-    watch.spend(1e-6 * A_PATH_FRAME * moved.seen.size)
-    around = paths.depth_around(moved, *static, capture.near)
+    watch.spend(1e-6 * A_PATH_FRAME * moving.visible.size)
+    around = paths.depth_around(moving, *static, capture.near)
     least = AT_CAMERA * capture.near
-    alone = paths.least_acceleration(views, moved, least, around)
+    alone = paths.least_acceleration(views, moving, least, around)
 
     def has_room(terms):
         what = "depths of rigid bodies"
         return watch.has_room(FOR_BODIES, what, 1e-6 * A_BODY_TERM * terms)
 
     if depths is None and least_known < rigid_bodies.LEAST_KNOWN:
-        return rigid_bodies.refined_short(views, moved, alone, least_known, has_room)
+        return rigid_bodies.refined_short(views, moving, alone, least_known, has_room)
     if depths is None:
-        return rigid_bodies.refined(views, moved, alone, has_room)
-    measured = _measured(depths.depth, moved)
+        return rigid_bodies.refined(views, moving, alone, has_room)
+    measured = _measured(depths.depth, moving)
     deviation = depths.deviation(paths.MEASURED_DEVIATION)
     if capture.external is None or capture.external.depth is None:
         return paths.least_acceleration(
-            views, moved, least, around, measured, deviation
+            views, moving, least, around, measured, deviation
         )
-    watch.spend(1e-6 * A_PATH_FRAME * moved.seen.size)
+    watch.spend(1e-6 * A_PATH_FRAME * moving.visible.size)
     miss = external_depth.PER_MEDIAN * depths.total_miss
     near, rest = _well_placed(views, *static)
-    bodies = external_bodies.scaled(views, moved, measured, alone, near, rest, miss)
+    bodies = external_bodies.scaled(views, moving, measured, alone, near, rest, miss)
     smooth = paths.least_acceleration(
-        views, moved, least, around, bodies.depth, deviation
+        views, moving, least, around, bodies.depth, deviation
     )
-    refined = rigid_bodies.refined(views, moved, smooth, has_room)
+    refined = rigid_bodies.refined(views, moving, smooth, has_room)
     return refined._replace(depth_deviation=bodies.deviation)
 
 
 def _measured(depths, tracks):
     """Return z-depths of tracks, NaN if unknown or at a depth discontinuity."""
-    measured = np.full(tracks.seen.shape, np.nan)
+    measured = np.full(tracks.visible.shape, np.nan)
     for frame, depth_map in enumerate(depths):
-        rows = np.flatnonzero(tracks.seen[:, frame])
+        rows = np.flatnonzero(tracks.visible[:, frame])
         depth = _steady_depth(depth_map)
         at = tracking.pixel_of(tracks.pixel[rows, frame], depth.shape)
         measured[rows, frame] = depth[at]

@@ -76,16 +76,16 @@ def least_acceleration(
     """
     ray = track_rays(views, tracks)
     noise = TRACK_PX / np.median(views.intrinsics[:, 0, 0])
-    pull, target = np.zeros(tracks.seen.shape), np.zeros(tracks.seen.shape)
+    pull, target = np.zeros(tracks.visible.shape), np.zeros(tracks.visible.shape)
     for depth, deviation in (
         (around, AROUND_DEVIATION),
         (measured, measured_deviation),
     ):
         if depth is not None:
-            usable = tracks.seen & np.isfinite(depth)
+            usable = tracks.visible & np.isfinite(depth)
             pull = np.where(usable, (noise / deviation) ** 2, pull)
             target = np.where(usable, depth, target)
-    wanted = _Wanted(ray, tracks.seen, pull, target)
+    wanted = _Wanted(ray, tracks.visible, pull, target)
     some = slice(None, None, -(-len(ray) // TRIED) or 1)
     penalty = _penalty(views, _Wanted(*(part[some] for part in wanted)), noise)
     position, flatness = _fitted(views, wanted, penalty, noise)
@@ -105,7 +105,7 @@ def certain(views: Views, tracks: Tracks, position: np.ndarray, near: float) -> 
       The paths.
     """
     depth = views.depth_of(position)
-    usable = tracks.seen & (np.nan_to_num(depth, nan=-1.0) > near)
+    usable = tracks.visible & (np.nan_to_num(depth, nan=-1.0) > near)
     return Paths(position, usable, depth, np.zeros(len(position)))
 
 
@@ -113,7 +113,7 @@ class _Wanted(NamedTuple):
     """Rays and depths that paths should pass through."""
 
     ray: np.ndarray  # [tracks, frames, 3] with z-depth one
-    seen: np.ndarray  # [tracks, frames] bool
+    visible: np.ndarray  # [tracks, frames] bool
     pull: np.ndarray  # [tracks, frames] weight of the depth relative to the ray
     depth: np.ndarray  # [tracks, frames] target z-depth
 
@@ -126,8 +126,8 @@ def _penalty(views, wanted, noise):
         sine = np.cross(position - views.position, wanted.ray)
         for side in (position - views.position, wanted.ray):
             sine /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), NO_DEPTH)
-        squared = np.where(wanted.seen, (sine**2).sum(-1), 0).sum(1)
-        if np.median(np.sqrt(squared / wanted.seen.sum(1))) > noise:
+        squared = np.where(wanted.visible, (sine**2).sum(-1), 0).sum(1)
+        if np.median(np.sqrt(squared / wanted.visible.sum(1))) > noise:
             break
         penalty *= 10
     return penalty
@@ -137,9 +137,9 @@ def _fitted(views, wanted, penalty, noise):
     """Return positions, and deviations of their depths."""
     length = np.linalg.norm(wanted.ray, axis=-1)
     unit = wanted.ray / length[..., None]
-    position = np.full((*wanted.seen.shape, 3), np.nan)
-    flatness = np.full(len(wanted.seen), np.inf)
-    for row, visible in enumerate(wanted.seen):
+    position = np.full((*wanted.visible.shape, 3), np.nan)
+    flatness = np.full(len(wanted.visible), np.inf)
+    for row, visible in enumerate(wanted.visible):
         first, last = np.flatnonzero(visible)[[0, -1]]
         span = slice(first, last + 1)
         stencils = np.sqrt(penalty) * second_differences(views.time[span])
@@ -240,10 +240,10 @@ def depth_around(
     Returns:
       z-depths in scene units [tracks, frames], NaN without static tracks.
     """
-    depth = np.full(tracks.seen.shape, np.nan)
-    for frame in range(tracks.seen.shape[1]):
-        here = np.flatnonzero(still.seen[:, frame] & (rest.depth[:, frame] > near))
-        wanted = np.flatnonzero(tracks.seen[:, frame])
+    depth = np.full(tracks.visible.shape, np.nan)
+    for frame in range(tracks.visible.shape[1]):
+        here = np.flatnonzero(still.visible[:, frame] & (rest.depth[:, frame] > near))
+        wanted = np.flatnonzero(tracks.visible[:, frame])
         if len(here) < AROUND or not len(wanted):
             continue
         tree = cKDTree(still.pixel[here, frame])

@@ -139,9 +139,9 @@ def _gathered(capture, use_depths, rough_cameras, watch):
             )
         which = _moved(tracks, score, first, least.path)
         if not first:
-            watch.spend(1e-6 * A_PATCH_FRAME * tracks.seen[which].size)
+            watch.spend(1e-6 * A_PATCH_FRAME * tracks.visible[which].size)
             tracks = patch_alignment.align(tracks, which, images, views.size)
-            which = which[_are_long(tracks.seen[which], least.path)]
+            which = which[_are_long(tracks.visible[which], least.path)]
     still = np.flatnonzero(score < paths.AT_REST)
     static = tracks.take(still), rest.take(still)
     depths = path_depths.known(capture, external, views, static, use_depths)
@@ -161,12 +161,12 @@ def _gathered(capture, use_depths, rough_cameras, watch):
         tracks=tracks,
         score=score,
         rest=rest,
-        moved=which,
+        path_track=which,
         paths=moved_paths,
         least_known=least.known,
         still=dense,
         unusable=unusable,
-        told=external.moving is not None or external.track_pixel is not None,
+        is_external=external.moving is not None or external.track_pixel is not None,
         factor=factor,
         left_out=watch.left_out,
         depth_miss=0.0 if external.depth is None else depths.total_miss,
@@ -218,7 +218,7 @@ def _tracks(external, views, flow, images, starts, least):
     if others is None:
         return own, 0
     both = zip(own, others, strict=True)
-    return Tracks(*(np.concatenate(parts) for parts in both)), len(own.seen)
+    return Tracks(*(np.concatenate(parts) for parts in both)), len(own.visible)
 
 
 def _mask(views, flow, tracks, score, watch):
@@ -310,19 +310,19 @@ def carried(views: Views, flow: NeighborFlow) -> float:
 
 
 def _moved(tracks, score, first, shortest):
-    long = _are_long(tracks.seen, shortest)
+    long = _are_long(tracks.visible, shortest)
     wanted = np.arange(len(score)) >= first
     which = np.flatnonzero(long & wanted & (score > MOVES))
     if len(which) > MOST_PATHS:
         # Long tracks are preferred, but all regions should have some.
-        chance = tracks.seen[which].sum(1).astype(float)
+        chance = tracks.visible[which].sum(1).astype(float)
         rng = np.random.default_rng(0)
         which = rng.choice(which, MOST_PATHS, replace=False, p=chance / chance.sum())
     return np.sort(which)
 
 
-def _are_long(seen, shortest):
-    return seen.sum(1) >= min(shortest, seen.shape[1])
+def _are_long(visible, shortest):
+    return visible.sum(1) >= min(shortest, visible.shape[1])
 
 
 def cached(

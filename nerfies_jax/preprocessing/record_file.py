@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.watch import Seconds
 
-VERSION = 19
+VERSION = 20
 
 
 class Evidence(NamedTuple):
@@ -28,12 +28,13 @@ class Evidence(NamedTuple):
     tracks: Tracks
     score: np.ndarray  # [tracks] in [0, 1], confidence that the point moves
     rest: RestPoints  # static point that explains each track best
-    moved: np.ndarray  # [paths] tracks with a path
+    path_track: np.ndarray  # [paths] index of the track of each path
     paths: Paths
     least_known: int  # minimum number of frames in which a usable path is known
     still: PointCloud  # dense static points
     unusable: str  # reason why tracking failed, or empty
-    told: bool  # masks or tracks are external, so that even few of them are trusted
+    # True if masks or tracks are external, so that even few of them are trusted
+    is_external: bool
     factor: int  # by which images were downsampled
     left_out: str  # parts skipped because of the budget, or empty
     # Median relative difference of external depth from static points, 0 without any
@@ -132,9 +133,14 @@ def load(path: pathlib.Path) -> Evidence:
         else:
             parts[name] = arrays[name]
     parts["seconds"] = Seconds(*(float(part) for part in parts["seconds"]))
-    kinds_of_one = {"unusable": str, "left_out": str, "told": bool, "factor": int}
-    kinds_of_one["least_known"] = int
-    kinds_of_one["depth_miss"] = float
+    kinds_of_one = {
+        "unusable": str,
+        "left_out": str,
+        "is_external": bool,
+        "factor": int,
+        "least_known": int,
+        "depth_miss": float,
+    }
     parts |= {name: kind(parts[name]) for name, kind in kinds_of_one.items()}
     flow = parts["flow"]
     parts["flow"] = flow._replace(

@@ -65,7 +65,7 @@ def fit(views: Views, tracks: Tracks) -> RestPoints:
     Returns:
       One point for each track.
     """
-    count = len(tracks.seen)
+    count = len(tracks.visible)
     blocks = np.split(np.arange(count), range(AT_ONCE, count, AT_ONCE))
     parts = [_fit(views, tracks.take(block)) for block in blocks]
     return RestPoints(*map(np.concatenate, zip(*parts, strict=True)))
@@ -75,12 +75,12 @@ def _fit(views, tracks):
     ray = track_rays(views, tracks)
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     across = across_ray(unit)
-    weight = tracks.seen.astype(np.float64)
+    weight = tracks.visible.astype(np.float64)
     # For parallel rays, any depth in front of the cameras fits.
     baseline = np.linalg.norm(np.ptp(views.position, axis=0))
     ahead = views.position + (FAR_AWAY * baseline if baseline > 0 else 1.0) * unit
-    count = np.maximum(tracks.seen.sum(1), 1)[:, None]
-    ahead = (ahead * tracks.seen[..., None]).sum(1) / count
+    count = np.maximum(tracks.visible.sum(1), 1)[:, None]
+    ahead = (ahead * tracks.visible[..., None]).sum(1) / count
     for _ in range(ROUNDS):
         matrix = np.einsum("nf,nfij->nij", weight, across)
         ridge = 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] + 1e-30
@@ -89,14 +89,14 @@ def _fit(views, tracks):
         matrix = matrix + ridge * np.eye(3)
         position = np.linalg.solve(matrix, right[..., None])[..., 0]
         far = np.linalg.norm(position[:, None] - views.position, axis=-1)
-        weight = tracks.seen / np.maximum(far, LEAST_DEPTH) ** 2
-    residual = np.full(tracks.seen.shape, np.nan)
-    depth = np.zeros(tracks.seen.shape)
+        weight = tracks.visible / np.maximum(far, LEAST_DEPTH) ** 2
+    residual = np.full(tracks.visible.shape, np.nan)
+    depth = np.zeros(tracks.visible.shape)
     for frame in range(len(views.row)):
         pixel, depth[:, frame] = view_set.project(views, frame, position)
         miss = np.linalg.norm(pixel - tracks.pixel[:, frame], axis=-1)
         miss = np.where(depth[:, frame] > 0, miss, BEHIND_PX)
-        residual[:, frame] = np.where(tracks.seen[:, frame], miss, np.nan)
+        residual[:, frame] = np.where(tracks.visible[:, frame], miss, np.nan)
     return RestPoints(position, residual, depth)
 
 

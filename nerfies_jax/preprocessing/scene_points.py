@@ -175,7 +175,7 @@ def _stays(views, evidence, frame, points):
     starts = np.concatenate([np.full((len(which), 1), at), pixel[which]], axis=-1)
     flow = NeighborFlow(*(part[span] for part in evidence.flow))
     tracks = tracking.chain(flow, starts)
-    enough = tracks.seen.sum(1) > min(LEAST_FOLLOWED, len(near.row) - 1)
+    enough = tracks.visible.sum(1) > min(LEAST_FOLLOWED, len(near.row) - 1)
     which, tracks = which[enough], tracks.take(enough)
     rest = rest_points.fit(near, tracks)
     # One where the point lies on what is shown.
@@ -183,11 +183,11 @@ def _stays(views, evidence, frame, points):
     deep = still_points.depth_deviation(near, tracks, rest) < DEPTH_KNOWN
     checked = ~deep | (share < 1 + DEPTH_AGREES)
     through = deep & (share < 1 - DEPTH_AGREES)
-    misses = np.full(tracks.seen.shape, np.nan)
+    misses = np.full(tracks.visible.shape, np.nan)
     for other in range(len(near.row)):
         there, _ = view_set.project(near, other, points[which])
         miss = np.linalg.norm(there - tracks.pixel[:, other], axis=-1)
-        misses[:, other] = np.where(tracks.seen[:, other], miss, np.nan)
+        misses[:, other] = np.where(tracks.visible[:, other], miss, np.nan)
     misses[:, at] = np.nan
     middle = np.nanmedian(misses, axis=1)
     bound = AGREES_PX * view_set.times_smaller(views)

@@ -54,9 +54,9 @@ def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
         starts = _starts(near, moving[center], center - span.start)
         still = NeighborFlow(*(part[span] for part in flow))
         tracks = without(tracking.chain(still, starts), moving[span])
-        enough = tracks.seen.sum(1) >= min(LEAST_FRAMES, reach + 1)
+        enough = tracks.visible.sum(1) >= min(LEAST_FRAMES, reach + 1)
         tracks = tracks.take(enough)
-        if not len(tracks.seen):
+        if not len(tracks.visible):
             continue
         rest = rest_points.fit(near, tracks)
         valid = _placed(near, tracks, rest)
@@ -104,7 +104,7 @@ def without(tracks: Tracks, moving: np.ndarray) -> Tracks:
     """
     row, column = tracking.pixel_of(tracks.pixel, moving.shape[1:])
     frames = np.arange(len(moving))[None]
-    return tracks._replace(seen=tracks.seen & ~moving[frames, row, column])
+    return tracks._replace(visible=tracks.visible & ~moving[frames, row, column])
 
 
 def _placed(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
@@ -130,9 +130,9 @@ def depth_deviation(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarra
     across = across_ray(unit)
     focal = views.intrinsics[:, 0, 0]
     with np.errstate(divide="ignore"):
-        weight = tracks.seen * (focal / (TRACK_PX * distance)) ** 2
+        weight = tracks.visible * (focal / (TRACK_PX * distance)) ** 2
     information = np.einsum("nf,nfij->nij", weight, across)
     least = np.linalg.eigvalsh(information)[:, 0]
-    typical = (distance * tracks.seen).sum(1) / np.maximum(tracks.seen.sum(1), 1)
+    typical = (distance * tracks.visible).sum(1) / np.maximum(tracks.visible.sum(1), 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(least > 0, 1 / np.sqrt(np.maximum(least, 0)) / typical, np.inf)

@@ -77,7 +77,7 @@ def _over_parallax(depths, views, evidence):
     tracks, rest = tracks.take(sure), rest.take(sure)
     row, column = pixel_of(tracks.pixel, depths.shape[1:])
     own = depths[np.arange(len(depths)), row, column]
-    known = tracks.seen & (own > 0) & (rest.depth > 0)
+    known = tracks.visible & (own > 0) & (rest.depth > 0)
     return own[known] / rest.depth[known]
 
 
@@ -101,7 +101,7 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
     if share in (0.0, 1.0):
         return Finding(MASKS, measurement, threshold, False, CERTAIN, numbers)
     tracks = evidence.tracks.take((evidence.score > MOVES) & (not evidence.unusable))
-    count, frames = int(tracks.seen.sum()), int(tracks.seen.any(0).sum())
+    count, frames = int(tracks.visible.sum()), int(tracks.visible.any(0).sum())
     if count < MIN_MOVING:
         return cannot_tell(
             MASKS,
@@ -109,7 +109,7 @@ def masks(capture: Capture, evidence: Evidence) -> Finding:
             threshold,
         )
     row, column = pixel_of(tracks.pixel, moving.shape[1:])
-    inside = moving[np.arange(len(moving)), row, column] & tracks.seen
+    inside = moving[np.arange(len(moving)), row, column] & tracks.visible
     part = 1 - float(inside.sum() / count)
     # Whole regions are in or out: one region a frame.
     error = np.sqrt(part * (1 - part) / frames)

@@ -28,7 +28,7 @@ class Tracks(NamedTuple):
 
     start: np.ndarray  # [tracks] frame in which each begins
     pixel: np.ndarray  # [tracks, frames, 2] float32, 0 if not visible
-    seen: np.ndarray  # [tracks, frames] bool, True if visible
+    visible: np.ndarray  # [tracks, frames] bool, True if visible
 
     def take(self, which: np.ndarray) -> "Tracks":
         """Select tracks.
@@ -136,8 +136,8 @@ def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
     count, each = len(starts), np.arange(len(starts))
     start = starts[:, 0].astype(int)
     pixel = np.zeros((count, frames, 2), np.float32)
-    seen = np.zeros((count, frames), bool)
-    pixel[each, start], seen[each, start] = starts[:, 1:], True
+    visible = np.zeros((count, frames), bool)
+    pixel[each, start], visible[each, start] = starts[:, 1:], True
     sides = ((1, flow.forward, flow.forward_seen), (-1, *flow[2:]))
     for sign, shift, usable in sides:
         for here in range(frames)[::sign]:
@@ -145,10 +145,10 @@ def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
             if not 0 <= there < frames:
                 continue
             # Only tracks that began earlier in this direction.
-            goes = np.flatnonzero(seen[:, here] & (sign * (here - start) >= 0))
+            goes = np.flatnonzero(visible[:, here] & (sign * (here - start) >= 0))
             target, valid = _step(pixel[goes, here], shift[here], usable[here])
-            pixel[goes[valid], there], seen[goes[valid], there] = target[valid], True
-    return Tracks(start, pixel, seen)
+            pixel[goes[valid], there], visible[goes[valid], there] = target[valid], True
+    return Tracks(start, pixel, visible)
 
 
 def _step(pixel, shift, usable):
@@ -183,7 +183,7 @@ def long_enough(tracks: Tracks, frames: int = SHORTEST) -> Tracks:
     Returns:
       The long ones.
     """
-    return tracks.take(tracks.seen.sum(1) >= min(frames, tracks.seen.shape[1]))
+    return tracks.take(tracks.visible.sum(1) >= min(frames, tracks.visible.shape[1]))
 
 
 def realigned(tracks: Tracks, images: np.ndarray, size: tuple[int, int]) -> Tracks:
@@ -201,14 +201,14 @@ def realigned(tracks: Tracks, images: np.ndarray, size: tuple[int, int]) -> Trac
       The tracks.
     """
     times = images.shape[2] // size[0]
-    pixel, seen = tracks.pixel.copy(), tracks.seen.copy()
+    pixel, visible = tracks.pixel.copy(), tracks.visible.copy()
     criteria = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ROUNDS, PRECISION_PX
     for start in np.unique(tracks.start):
         rows = np.flatnonzero(tracks.start == start)
-        for frame in np.flatnonzero(tracks.seen[rows].any(0)):
+        for frame in np.flatnonzero(tracks.visible[rows].any(0)):
             if frame == start:
                 continue
-            which = rows[tracks.seen[rows, frame]]
+            which = rows[tracks.visible[rows, frame]]
             first = _enlarged(tracks.pixel[which, start], times)
             guess = _enlarged(tracks.pixel[which, frame], times)
             place, status, _ = cv2.calcOpticalFlowPyrLK(
@@ -225,8 +225,8 @@ def realigned(tracks: Tracks, images: np.ndarray, size: tuple[int, int]) -> Trac
             shift = np.linalg.norm(place - guess, axis=-1) / times
             fits = (status.ravel() == 1) & (shift < FARTHEST_PX)
             pixel[which, frame] = (place + 0.5) / times
-            seen[which[~fits], frame] = False
-    return Tracks(tracks.start, np.where(seen[..., None], pixel, 0), seen)
+            visible[which[~fits], frame] = False
+    return Tracks(tracks.start, np.where(visible[..., None], pixel, 0), visible)
 
 
 def _enlarged(pixel, times):

@@ -72,7 +72,7 @@ def unusable(evidence: Evidence) -> str:
     """
     if evidence.unusable:
         return evidence.unusable
-    if not evidence.told and evidence.moving.mean() < LEAST_MOVING:
+    if not evidence.is_external and evidence.moving.mean() < LEAST_MOVING:
         return f"only {evidence.moving.mean():.1%} of the pixels show moving objects"
     covered = coverage(evidence)
     if covered < LEAST_COVERAGE:
@@ -96,7 +96,7 @@ def coverage(evidence: Evidence) -> float:
       The share, 0 if nothing moves.
     """
     usable = _is_known(evidence)
-    pixel = evidence.tracks.pixel[evidence.moved[usable]]
+    pixel = evidence.tracks.pixel[evidence.path_track[usable]]
     valid = evidence.paths.known[usable]
     shape = evidence.moving.shape[1:]
     reach, near = NEAR_PX * image_scale(shape[1]), 0
@@ -125,7 +125,7 @@ def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
     """
     if np.ptp(times[evidence.row]) == 0:
         return True
-    if evidence.told or evidence.unusable or not unusable(evidence):
+    if evidence.is_external or evidence.unusable or not unusable(evidence):
         return False
     marked = float(evidence.moving.mean())
     if marked < MARKED:
@@ -161,6 +161,6 @@ def scene_unit(evidence: Evidence) -> float:
     Returns:
       The distance in scene units, 1 if there are no points.
     """
-    depth = evidence.rest.depth[evidence.tracks.seen]
+    depth = evidence.rest.depth[evidence.tracks.visible]
     depth = depth[np.isfinite(depth) & (depth > 0)]
     return float(np.median(depth)) if len(depth) else 1.0

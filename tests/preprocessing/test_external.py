@@ -30,7 +30,7 @@ def tapir(path, **changes):
     """Exact tracks of the card, [tracks, frames, 2]; the image begins at 0."""
     capture, evidence = gathered()
     points = card_points(capture, evidence.row)
-    arrays = {"tracks": points.pixel, "visibles": points.seen} | changes
+    arrays = {"tracks": points.pixel, "visibles": points.visible} | changes
     np.savez(path, **arrays)
     return path, points
 
@@ -42,10 +42,10 @@ LAYOUTS = ("tapir", "cotracker", "frames first", "locotrack", "folder", "pairs")
 def test_tracks_are_read_in_each_layout(tmp_path, layout):
     path, points = tapir(tmp_path / "t.npz")
     first = np.moveaxis(points.pixel, 0, 1)
-    seen = points.seen.T.astype(np.float32)
+    seen = points.visible.T.astype(np.float32)
     # Counted from the center of the first pixel, with a batch.
     named = {"pred_tracks": first[None] - 0.5, "pred_visibility": seen[None, ..., None]}
-    logit = np.where(points.seen, -5.0, 5.0)
+    logit = np.where(points.visible, -5.0, 5.0)
     if layout == "cotracker":
         np.savez(path, **named)
     elif layout == "frames first":
@@ -71,9 +71,9 @@ def test_tracks_are_read_in_each_layout(tmp_path, layout):
                 table = [points.pixel[part, frame], flag, -5 + 0 * flag]
                 np.save(path / f"{query}_{frame:03d}.npy", np.concatenate(table, 1))
     capture = with_files(tracks=path)
-    place = np.moveaxis(capture.external.track_pixel, 0, 1)[points.seen]
-    np.testing.assert_allclose(place, points.pixel[points.seen], atol=1e-4)
-    np.testing.assert_array_equal(capture.external.track_seen.T, points.seen)
+    place = np.moveaxis(capture.external.track_pixel, 0, 1)[points.visible]
+    np.testing.assert_allclose(place, points.pixel[points.visible], atol=1e-4)
+    np.testing.assert_array_equal(capture.external.track_seen.T, points.visible)
     assert record.digest(capture) != record.digest(gathered()[0])
 
 
@@ -92,10 +92,12 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     )
     evidence = record.gather(capture)
     np.testing.assert_array_equal(evidence.moving, capture.moving[evidence.row])
-    assert evidence.told
-    assert len(evidence.moved) == len(points.pixel)
-    pixel = evidence.tracks.pixel[evidence.moved]
-    np.testing.assert_allclose(pixel[points.seen], points.pixel[points.seen], atol=1e-4)
+    assert evidence.is_external
+    assert len(evidence.path_track) == len(points.pixel)
+    pixel = evidence.tracks.pixel[evidence.path_track]
+    np.testing.assert_allclose(
+        pixel[points.visible], points.pixel[points.visible], atol=1e-4
+    )
     off = np.linalg.norm(evidence.paths.position - points.position, axis=-1)
     known = evidence.paths.known
     assert np.median(off[known]) < 0.1 * two_planes.NEAR  # drawn toward the wall
@@ -111,7 +113,7 @@ def test_a_mover_that_was_marked_is_no_noise_however_small():
     assert "of the pixels show moving" in usable_paths.unusable(small)
     times = np.linspace(0, 1, len(small.row))
     assert usable_paths.stands_still(small, times)
-    marked = small._replace(told=True)
+    marked = small._replace(is_external=True)
     assert "of the pixels show moving" not in usable_paths.unusable(marked)
     assert not usable_paths.stands_still(marked, times)
 
@@ -121,8 +123,8 @@ def test_tracks_of_larger_images_are_brought_to_those_that_are_read(tmp_path):
     size = 4 * np.array(two_planes.SIZE)
     path, _ = tapir(tmp_path / "t.npz", tracks=4 * points.pixel, size=size)
     external = with_files(tracks=path).external
-    place = np.moveaxis(external.track_pixel, 0, 1)[points.seen]
-    np.testing.assert_allclose(place, points.pixel[points.seen], atol=1e-3)
+    place = np.moveaxis(external.track_pixel, 0, 1)[points.visible]
+    np.testing.assert_allclose(place, points.pixel[points.visible], atol=1e-3)
 
 
 @jax.jit
@@ -240,7 +242,7 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
     )
     tapir(path, tracks=points.pixel * 9)
     refused(r"at least half must be", tracks=path)
-    tapir(path, tracks=points.pixel[:, :7], visibles=points.seen[:, :7])
+    tapir(path, tracks=points.pixel[:, :7], visibles=points.visible[:, :7])
     refused(r"tracks of 7 frames|tracks of 16 frames", tracks=path)
     np.savez(path, points=points.pixel)
     refused(r"contains points; expected tracks or pred_tracks, and", tracks=path)
@@ -250,7 +252,7 @@ def test_what_does_not_fit_is_refused_with_the_file_and_the_way_out(tmp_path):
     refused(r"0 of 0 visible positions", tracks=path)
     tapir(path, size=np.array([0, 72]))
     refused(r"size is \[0, 72\]; expected the width and the height", tracks=path)
-    tapir(path, visibles=points.seen[:, :9])
+    tapir(path, visibles=points.visible[:, :9])
     refused(r"visibles of \(\d+, 9\); expected \[tracks, frames, 2\]", tracks=path)
     refused(r"not from \.pt files; save them with", tracks=tmp_path / "a.pt")
     pairs = tmp_path / "pairs"

@@ -69,8 +69,8 @@ def card_and_wall():
     capture, evidence = gathered()
     views = view_set.in_time_order(record.downscale(capture, evidence.factor))
     points = card_points(capture, evidence.row)
-    start = points.seen.argmax(1)
-    card = Tracks(start, np.float32(points.pixel), points.seen)
+    start = points.visible.argmax(1)
+    card = Tracks(start, np.float32(points.pixel), points.visible)
     still = evidence.score < 0.3
     static = evidence.tracks.take(still), evidence.rest.take(still)
     return views, card, paths.certain(views, card, points.position, 0.01), static
@@ -79,9 +79,9 @@ def card_and_wall():
 @pytest.mark.parametrize("certain", [True, False])
 def test_a_body_whose_depth_is_off_gets_one_factor(certain):
     views, card, exact, static = card_and_wall()
-    deviation = np.full(len(card.seen), 0.02 if certain else np.inf)
+    deviation = np.full(len(card.visible), 0.02 if certain else np.inf)
     alone = exact._replace(depth_deviation=deviation)
-    measured = np.where(card.seen, 0.8 * exact.depth, np.nan)
+    measured = np.where(card.visible, 0.8 * exact.depth, np.nan)
     bodies = external_bodies.scaled(views, card, measured, alone, *static, 0.05)
     if certain:
         np.testing.assert_allclose(bodies.factor, 1.25, rtol=0.04)
@@ -93,8 +93,8 @@ def test_a_body_whose_depth_is_off_gets_one_factor(certain):
 
 def test_a_body_is_in_front_of_what_it_hides():
     views, card, exact, static = card_and_wall()
-    alone = exact._replace(depth_deviation=np.full(len(card.seen), np.inf))
-    measured = np.where(card.seen, 2.5 * exact.depth, np.nan)  # behind the wall
+    alone = exact._replace(depth_deviation=np.full(len(card.visible), np.inf))
+    measured = np.where(card.visible, 2.5 * exact.depth, np.nan)  # behind the wall
     bodies = external_bodies.scaled(views, card, measured, alone, *static, 0.05)
     assert np.nanmedian(bodies.depth) < 1.05 * two_planes.FAR
 
@@ -114,7 +114,7 @@ def test_depth_that_hardly_fits_is_used_with_a_warning(tmp_path, capsys):
         words = " ".join(capsys.readouterr().err.split())
         assert "differ from the static points by" in words
     assert record.notes_on(capture, tmp_path / "cache")
-    assert len(evidence.moved)
+    assert len(evidence.path_track)
 
 
 @pytest.mark.full

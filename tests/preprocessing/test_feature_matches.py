@@ -37,7 +37,7 @@ def sharp(monkeypatch):
 def _finding(capture):
     views = view_set.in_time_order(capture)
     nothing = Evidence(**dict.fromkeys(Evidence._fields))
-    evidence = nothing._replace(unusable="no flow", told=False)
+    evidence = nothing._replace(unusable="no flow", is_external=False)
     return motion.motion(views, evidence)
 
 

@@ -48,7 +48,7 @@ def tracks_of(points=POINTS, dtype=np.float32, drift_px=0.3):
 
 def median_error(tracks, true):
     miss = np.linalg.norm(tracks.pixel[:, -1] - true[:, -1], axis=-1)
-    return np.median(miss[tracks.seen[:, -1]])
+    return np.median(miss[tracks.visible[:, -1]])
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -61,7 +61,7 @@ def test_points_of_a_turning_body_keep_their_place_on_it(images, dtype):
     assert median_error(shifted, true) > 0.3
     # The rounding of gray levels and the warps from drifting tracks leave this much.
     assert median_error(warped, true) < 0.06
-    assert warped.seen.mean() > 0.95
+    assert warped.visible.mean() > 0.95
     np.testing.assert_array_equal(warped.pixel[:, 0], tracks.pixel[:, 0])
 
 
@@ -72,15 +72,17 @@ def test_points_that_move_too_far_are_invisible_and_others_untouched(images):
     which = np.arange(0, POINTS // 2)
     aligned = patch_alignment.align(tracks, which, images, SIZE)
     step = np.linalg.norm(aligned.pixel - tracks.pixel, axis=-1)
-    assert step[aligned.seen].max() < patch_alignment.FARTHEST_PX
-    assert aligned.seen[which, 5].mean() < 0.5 < 0.9 < aligned.seen[which, 4].mean()
+    assert step[aligned.visible].max() < patch_alignment.FARTHEST_PX
+    assert (
+        aligned.visible[which, 5].mean() < 0.5 < 0.9 < aligned.visible[which, 4].mean()
+    )
     miss = np.linalg.norm(aligned.pixel[which, 3] - true[which, 3], axis=-1)
     assert np.median(miss) < 0.06
-    assert aligned.seen[which, 3].mean() > 0.9
-    assert (aligned.pixel[~aligned.seen] == 0).all()
+    assert aligned.visible[which, 3].mean() > 0.9
+    assert (aligned.pixel[~aligned.visible] == 0).all()
     rest = np.s_[POINTS // 2 :]
     np.testing.assert_array_equal(aligned.pixel[rest], tracks.pixel[rest])
-    assert aligned.seen[rest].all()
+    assert aligned.visible[rest].all()
 
 
 def test_single_points_are_aligned_by_translation(images):

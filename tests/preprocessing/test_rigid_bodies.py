@@ -63,8 +63,8 @@ def first_paths(seen_from, tracks, world):
     frame = np.arange(FRAMES)
     factor = 1 + 0.08 * np.sin(2 * np.pi * frame / FRAMES)
     offset = factor[:, None] * (world - seen_from.position)
-    position = np.where(tracks.seen[..., None], seen_from.position + offset, np.nan)
-    return Paths(position, tracks.seen, offset[..., 2], np.full(len(world), 0.08))
+    position = np.where(tracks.visible[..., None], seen_from.position + offset, np.nan)
+    return Paths(position, tracks.visible, offset[..., 2], np.full(len(world), 0.08))
 
 
 @pytest.fixture(autouse=True)
@@ -131,11 +131,11 @@ def sliding(monkeypatch):
     slide = 0.03 * np.cos(4 * np.pi * time)[:, None] * [1.0, 0, 0]
     world = point + slide + [0, 0, 1.2]
     tracks = tracks_of(seen_from, world, noise_px=0.05)
-    tracks = Tracks(0 * tracks.start, tracks.pixel, np.ones_like(tracks.seen))
+    tracks = Tracks(0 * tracks.start, tracks.pixel, np.ones_like(tracks.visible))
     offset = 1.04 * (world - camera)
-    position = np.where(tracks.seen[..., None], camera + offset, np.nan)
+    position = np.where(tracks.visible[..., None], camera + offset, np.nan)
     deviation = np.full(POINTS, 0.03)
-    alone = Paths(position, tracks.seen, offset[..., 2], deviation)
+    alone = Paths(position, tracks.visible, offset[..., 2], deviation)
     true = world[..., 2] - camera[:, 2]
     return seen_from, tracks, alone, true
 
@@ -178,7 +178,7 @@ def test_a_body_is_adjusted_to_what_was_seen_of_it(flat):
         body = body._replace(point=body.point * [1, 1, 0])
         world = body.world()
     tracks = tracks_of(seen_from, world, noise_px=0)
-    known = tracks.seen.copy()
+    known = tracks.visible.copy()
     known[:, 17] = False  # nothing of it is seen in one frame
     seen = bundle.sight(seen_from, tracks, known)
     rng = np.random.default_rng(4)

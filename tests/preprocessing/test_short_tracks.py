@@ -83,7 +83,7 @@ def test_a_body_of_short_tracks_is_placed_by_its_smooth_motion():
     assert np.quantile(depth_ratios(views, alone, world), 0.25) < 0.75
     fitted = rigid_bodies.refined_short(views, moving, alone, 3)
     ratio = depth_ratios(views, fitted, world)
-    assert len(ratio) > 0.7 * moving.seen.sum()
+    assert len(ratio) > 0.7 * moving.visible.sum()
     assert np.abs(np.median(ratio) - 1) < 0.2
     assert np.quantile(np.abs(ratio / np.median(ratio) - 1), 0.8) < 0.2
     on_body = fitted.known.any(1)

@@ -22,18 +22,18 @@ def views_of(capture):
 
 
 def card_points(capture, rows):
-    """The truth of a few points of the card, seen wherever they are in the image."""
+    """The truth of a few points of the card, visible wherever they are in the image."""
     views = views_of(capture)
     inner = np.linspace(-0.6, 0.6, 4) * two_planes.CARD
     offset = np.stack(np.meshgrid(inner, inner), -1).reshape(-1, 1, 2)
     flat = card_path(capture, rows)[None] + offset
     place = np.concatenate([flat, np.full((*flat.shape[:2], 1), two_planes.NEAR)], -1)
-    pixel, seen = [], []
+    pixel, visible = [], []
     for frame in range(len(rows)):
         at, depth = view_set.project(views, frame, place[:, frame])
         pixel.append(at)
-        seen.append(view_set.in_image(views, at, depth))
-    return TruePoints(np.stack(pixel, 1), np.stack(seen, 1), place)
+        visible.append(view_set.in_image(views, at, depth))
+    return TruePoints(np.stack(pixel, 1), np.stack(visible, 1), place)
 
 
 def test_errors_are_those_of_what_was_followed(monkeypatch):
@@ -49,7 +49,7 @@ def test_errors_are_those_of_what_was_followed(monkeypatch):
     shifted = points.pixel + np.linspace(0, 3, len(evidence.row))[:, None] * [0, 1]
     moved = points.position * 1.1
     wrong = against_truth.errors(
-        capture, evidence, TruePoints(shifted, points.seen, moved)
+        capture, evidence, TruePoints(shifted, points.visible, moved)
     )
     assert wrong.track_px == pytest.approx(8 * 3 / (len(evidence.row) - 1), abs=0.5)
     assert wrong.path_error == pytest.approx(0.065, abs=0.03)
@@ -77,7 +77,7 @@ def test_words_say_what_there_is_and_what_cannot_be_told():
     assert counted.paths > 20
     assert "their depth cannot be estimated" in text
     none = evidence._replace(
-        moved=np.zeros(0, int),
+        path_track=np.zeros(0, int),
         paths=type(evidence.paths)(*(p[:0] for p in evidence.paths)),
     )
     text = summary.lines(summary.of(views_of(held), none), none)

@@ -127,12 +127,12 @@ def test_chains_follow_flow_both_ways_until_it_ends():
     seen[3] = False  # nothing leads from the fourth frame to the fifth
     flow = NeighborFlow(shift, seen, -shift, np.ones(shape, bool))
     chained = tracks.chain(flow, np.array([[2.0, 10.0, 12.0], [2.0, 29.0, 12.0]]))
-    assert chained.seen[0].tolist() == [True] * 4 + [False]
+    assert chained.visible[0].tolist() == [True] * 4 + [False]
     steps = np.arange(-2, 2)[:, None]
     expected = [10, 12] + steps * [1.25, -0.5]
     np.testing.assert_allclose(chained.pixel[0, :4], expected, atol=1e-5)
     # The other left the image on its right.
-    assert chained.seen[1].tolist() == [True] * 3 + [False] * 2
+    assert chained.visible[1].tolist() == [True] * 3 + [False] * 2
 
 
 def test_wide_steps_are_found_from_where_a_still_scene_would_be():
@@ -165,10 +165,10 @@ def test_points_are_aligned_with_where_they_began():
     pixel = np.float32([[[30, 40], [34, 40]], [[60, 20], [62.8, 20.3]]])
     drifted = Tracks(np.zeros(2, int), pixel, np.ones((2, 2), bool))
     aligned = tracks.realigned(drifted, images, (120, 80))
-    assert aligned.seen.all()
+    assert aligned.visible.all()
     np.testing.assert_allclose(aligned.pixel[:, 1], [[33.3, 40], [63.3, 20]], atol=0.05)
     lost = drifted._replace(pixel=pixel + np.float32([[0, 0], [9, 9]]))
-    assert not tracks.realigned(lost, images, (120, 80)).seen[:, 1].any()
+    assert not tracks.realigned(lost, images, (120, 80)).visible[:, 1].any()
 
 
 def test_points_at_rest_are_found_and_what_moves_misses(monkeypatch):
@@ -201,10 +201,10 @@ def test_what_moves_is_marked_and_little_else():
     assert both > 0.85  # 0.80 by the votes of tracks alone
     assert not evidence.unusable
     # Tracks on the wall beside the card, which flow drags along, are not among them.
-    chosen = evidence.tracks.take(evidence.moved)
+    chosen = evidence.tracks.take(evidence.path_track)
     row, column = tracks.pixel_of(chosen.pixel, true.shape[1:])
-    on_card = true[np.arange(len(true)), row, column] & chosen.seen
-    assert (on_card.sum(1) > 0.5 * chosen.seen.sum(1)).mean() > 0.97
+    on_card = true[np.arange(len(true)), row, column] & chosen.visible
+    assert (on_card.sum(1) > 0.5 * chosen.visible.sum(1)).mean() > 0.97
 
 
 @pytest.mark.parametrize("light", [lambda time: 1.0, lambda time: 1 - 0.6 * time])
@@ -241,7 +241,7 @@ def test_smaller_views_show_the_same_points_in_larger_pixels():
 def test_nothing_moves_in_a_static_capture():
     _, evidence = gathered(card=lambda time: (0.1, 0.0))
     assert evidence.moving.mean() < 0.01
-    assert len(evidence.moved) < 0.01 * len(evidence.score)
+    assert len(evidence.path_track) < 0.01 * len(evidence.score)
 
 
 @pytest.mark.full
@@ -317,7 +317,7 @@ def test_the_banded_solution_is_the_dense_one():
     rng = np.random.default_rng(1)
     path = np.cumsum(rng.normal(0, 0.01, (24, 3)), axis=0) + np.array([0, 0, 1.4])
     one = tracks_of(views, path[None])
-    one.seen[0, [0, 1, 9, 10]] = False
+    one.visible[0, [0, 1, 9, 10]] = False
     around = np.full((1, 24), 1.5)
     fitted = paths.least_acceleration(views, one, 0.05, around)
     span = slice(2, 24)
@@ -326,7 +326,7 @@ def test_the_banded_solution_is_the_dense_one():
     noise = paths.TRACK_PX / views.intrinsics[0, 0, 0]
     pull = (noise / paths.AROUND_DEVIATION) ** 2
     rows, right = [], []
-    for frame, (along, seen) in enumerate(zip(unit, one.seen[0, span], strict=True)):
+    for frame, (along, seen) in enumerate(zip(unit, one.visible[0, span], strict=True)):
         if not seen:
             continue
         basis = np.zeros((3, 22, 3))
@@ -358,7 +358,7 @@ def test_a_path_of_few_frames_lies_at_the_depth_around(seen):
     views = hand_held()
     path = np.repeat(np.array([[[0.1, 0.0, 1.3]]]), 24, axis=1)
     one = tracks_of(views, path)
-    one.seen[0] = np.isin(np.arange(24), seen)
+    one.visible[0] = np.isin(np.arange(24), seen)
     fitted = paths.least_acceleration(views, one, 0.05, np.full((1, 24), 1.3))
     np.testing.assert_allclose(fitted.depth[0, seen], 1.3, rtol=0.02)
 
@@ -399,8 +399,8 @@ def test_what_moves_before_the_near_plane_of_the_wall_is_known():
     near = 0.8 * two_planes.FAR
     assert near > two_planes.NEAR
     evidence = record.gather(two_planes.make(**MOVES, frames=12, near=near))
-    assert len(evidence.moved) > 20
-    seen = evidence.tracks.seen[evidence.moved]
+    assert len(evidence.path_track) > 20
+    seen = evidence.tracks.visible[evidence.path_track]
     assert (evidence.paths.known & seen).sum() > 0.9 * seen.sum()
 
 

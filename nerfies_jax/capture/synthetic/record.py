@@ -231,9 +231,9 @@ def _truth(spec, plan, hits, ids, programs, seed):
         names,
         hits.thing == spec.transient_id,
         forward.pixel,
-        forward.seen,
+        forward.visible,
         backward.pixel,
-        backward.seen,
+        backward.visible,
         plan.light_gain,
         *truth.tracks(spec, plan, hits, programs, seed),
     )

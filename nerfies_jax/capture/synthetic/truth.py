@@ -80,7 +80,7 @@ class Flow(NamedTuple):
     """Flow of one frame to another frame, and its visibility there."""
 
     pixel: Float[Array, "height width 2"]
-    seen: Bool[Array, "height width"]
+    visible: Bool[Array, "height width"]
 
 
 def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flow:
