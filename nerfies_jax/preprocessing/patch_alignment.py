@@ -61,7 +61,8 @@ def align(
       size: Width and height in pixels of the images of the tracks.
 
     Returns:
-      All tracks. Observations that move by more than `FARTHEST_PX` are invisible.
+      All tracks. Observations that move by more than `FARTHEST_PX` in a pass are
+      invisible.
 
     References:
       Baker and Matthews 2004.

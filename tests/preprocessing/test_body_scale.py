@@ -123,3 +123,9 @@ def test_a_scale_that_the_likelihood_cannot_tell_is_that_of_the_paths():
     uniform = time[:, None] * [0.3, 0, 0]
     assert body_scale.most_likely(time, uniform, center, 0.1) == pytest.approx(1)
     assert body_scale.most_likely(time, camera, center, 0.0) == 1
+    # It accelerates more than the camera, along all axes: 1 % makes no difference.
+    swift = 0.05 * np.stack(
+        [np.sin(31 * time), np.cos(37 * time), np.sin(43 * time)], -1
+    )
+    path = seen_at(1.01, camera, swift)
+    assert body_scale.most_likely(time, camera, path, 0.07) == 1
