@@ -2,8 +2,10 @@
 
 Static Gaussians are initialized from the dense points of preprocessing. The motion is
 fitted to the paths of moving tracks. Then moving pixels of all frames are unprojected
-with the depths of nearby tracks, and mapped by the inverse motion to their canonical
-positions.
+with the depths of nearby tracks, as fitted, and mapped by the inverse motion to their
+canonical positions. With the depths of the paths themselves, which the motion does not
+follow exactly, surfaces from different frames would lie behind each other. The nearest
+ones would hide the others, and objects would be too near by 0.5 % of their distance.
 """
 
 from typing import Any, NamedTuple
@@ -23,6 +25,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.preprocessing import record, usable_paths, view_set
 from nerfies_jax.preprocessing.moving import image_scale
 from nerfies_jax.preprocessing.record import Evidence
+from nerfies_jax.preprocessing.usable_paths import KnownPaths
 from nerfies_jax.training import programs
 
 DEPTH_TRACKS, DEPTH_REACH_PX = 6, 8.0  # tracks that give a moving pixel its depth
@@ -71,38 +74,40 @@ def start(
         raise ValueError(
             f"{capture.path or capture.name}: no initialization from tracks: {reason}"
         )
-    position, valid, deviation = usable_paths.known_paths(evidence)
+    paths = usable_paths.known_paths(evidence)
     times = capture.times[evidence.row].astype(np.float32)
     unit = usable_paths.scene_unit(evidence)
     static_points = np.asarray(evidence.still.position, np.float32)
     views = view_set.in_time_order(record.downscale(capture, evidence.factor))
-    ray = position - views.position
+    ray = paths.position - views.position
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    depth = Depth(ray, deviation)
+    depth = Depth(ray, paths.depth_deviation)
+    position = paths.position.astype(np.float32)
     fit_result = motion_fit.fit(
         effect,
-        Paths(times, position.astype(np.float32), valid, unit, static_points, depth),
+        Paths(times, position, paths.known, unit, static_points, depth),
         key,
         rate=spec.fit_rate,
         steps=spec.fit_steps,
     )
-    visibility = valid.mean(axis=1).astype(np.float32)
-    return _seeds(
-        effect, fit_result.points, visibility, evidence, views, times, unit, spec
-    )
+    return _seeds(effect, fit_result.points, paths, evidence, views, times, unit, spec)
 
 
-def _seeds(effect, points, visibility, evidence, views, times, unit, spec):
+def _seeds(effect, points, paths, evidence, views, times, unit, spec):
     """Unproject moving pixels of all frames to canonical positions."""
     rng = np.random.default_rng(0)
-    depth = moving_depths(evidence)
+    canonical, padded_fit = np.asarray(points.canonical), motion_fit.padded(points)
+    visibility = paths.known.mean(axis=1).astype(np.float32)
+    positions_at = programs.Program(motion_fit.positions_at, effect)
+    fitted = np.stack(
+        [np.asarray(positions_at(padded_fit, time))[: len(canonical)] for time in times]
+    )
+    depth = moving_depths(evidence, paths, views.depth_of(np.moveaxis(fitted, 0, 1)))
     frame, row, column = np.nonzero(depth > 0)
     # Twice as many as needed, because some are dropped.
     selection = rng.permutation(len(frame))[: 2 * spec.moving_points]
     frame, row, column = frame[selection], row[selection], column[selection]
-    canonical, padded_fit = np.asarray(points.canonical), motion_fit.padded(points)
     point_rows = None if points.rows is None else jax.tree.map(np.asarray, points.rows)
-    positions_at = programs.Program(motion_fit.positions_at, effect)
     # Empty arrays, because there may be no frame with enough tracks.
     empty = np.zeros((0, 3), np.float32)
     positions, colors, spans = [empty], [empty], [np.zeros((2, 0))]
@@ -120,8 +125,7 @@ def _seeds(effect, points, visibility, evidence, views, times, unit, spec):
             views.position[current]
             + ray * depth[current][row[pixels], column[pixels], None]
         )
-        position_then = np.asarray(positions_at(padded_fit, times[current]))
-        position_then = position_then[: len(canonical)]
+        position_then = fitted[current]
         distance, neighbors, weights = _carriers(position_then, observed)
 
         def mixed(leaf, neighbors=neighbors, weights=weights):
@@ -191,19 +195,23 @@ def _mix(leaf, neighbors, weights):
     return np.einsum("nk,nk...->n...", weights, leaf[neighbors]).astype(leaf.dtype)
 
 
-def moving_depths(evidence: Evidence) -> np.ndarray:
+def moving_depths(
+    evidence: Evidence, paths: KnownPaths, depth: np.ndarray
+) -> np.ndarray:
     """Interpolate the z-depth of moving pixels from nearby tracks.
 
     Args:
       evidence: Results of preprocessing.
+      paths: Paths of moving points.
+      depth: Their z-depths in scene units, [paths, frames].
 
     Returns:
       [frames, height, width] z-depth in scene units, 0 where unknown.
     """
     depths = np.zeros(evidence.moving.shape, np.float32)
-    tracks = evidence.tracks.take(evidence.path_track)
+    tracks = evidence.tracks.take(paths.track)
     for frame, mask in enumerate(evidence.moving):
-        rows = np.flatnonzero(evidence.paths.known[:, frame])
+        rows = np.flatnonzero(paths.known[:, frame])
         row, column = np.nonzero(mask)
         if len(rows) < DEPTH_TRACKS or not len(row):
             continue
@@ -211,9 +219,9 @@ def moving_depths(evidence: Evidence) -> np.ndarray:
         distance, neighbors = tree.query(
             np.stack([column, row], -1) + 0.5, DEPTH_TRACKS
         )
-        depth = np.median(evidence.paths.depth[rows, frame][neighbors], axis=1)
-        depth[distance[:, 0] > DEPTH_REACH_PX * image_scale(mask.shape[1])] = 0
-        depths[frame, row, column] = depth
+        median = np.median(depth[rows, frame][neighbors], axis=1)
+        median[distance[:, 0] > DEPTH_REACH_PX * image_scale(mask.shape[1])] = 0
+        depths[frame, row, column] = median
     return depths
 
 

@@ -35,6 +35,7 @@ BADLY_TOLD = 0.05
 # 0.30. The depth of a sliding shutter is wrong by 4 % with an estimated deviation of
 # 3 %, and a cube with the same deviation is turned by up to 6 degrees in a frame.
 DOUBTFULLY_TOLD, PRECISE_PX = 0.02, 0.5 * TRACK_PX
+ADJUSTED_DEVIATION = 0.005  # relative, of the depths of these bodies: 0.2 to 1.0 %
 # Weight of second differences of the poses of a body in 60 frames. It grows with the
 # square of the number of frames, so that a motion costs the same at any frame rate.
 # Drift of tracks looks like motion along the rays: with 0.1 px, the depth of a forearm
@@ -80,6 +81,7 @@ def refined(
       The paths.
     """
     position, known = paths.position.copy(), paths.known.copy()
+    deviations = paths.depth_deviation.copy()
     every = -(-len(views.time) // MOST_FRAMES)
     some_views, some_tracks, few = _some_frames(views, tracks, paths, every)
     left = few.known.sum(1) >= LEAST_KNOWN
@@ -108,6 +110,7 @@ def refined(
         body, known[own] = _at_paths_scale(views, paths, own, body)
         factor = _likely_factor(views, paths, own, body, every)
         position[own] = bundle.scaled(views, body, factor).world()
+        deviations[own] = np.minimum(deviations[own], ADJUSTED_DEVIATION)
         left[own] = False
     rows = np.flatnonzero(left)
     for own in _doubtful_groups(few, rows):
@@ -116,7 +119,7 @@ def refined(
             offset = position[own] - views.position
             position[own] = views.position + factor * offset
     depth = views.depth_of(position)
-    return Paths(position, known, depth, paths.depth_deviation)
+    return Paths(position, known, depth, deviations)
 
 
 def _doubtful_groups(paths, rows):

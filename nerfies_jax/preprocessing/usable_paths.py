@@ -32,6 +32,7 @@ class KnownPaths(NamedTuple):
     position: np.ndarray  # [paths, frames, 3] scene units, arbitrary if not known
     known: np.ndarray  # [paths, frames] bool
     depth_deviation: np.ndarray  # [paths] relative to the depth
+    track: np.ndarray  # [paths] index of the track of each path
 
 
 def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence | None:
@@ -146,10 +147,8 @@ def known_paths(evidence: Evidence) -> KnownPaths:
       The paths.
     """
     usable = _is_known(evidence)
-    paths = evidence.paths
-    return KnownPaths(
-        paths.position[usable], paths.known[usable], paths.depth_deviation[usable]
-    )
+    position, known, _, deviation = (part[usable] for part in evidence.paths)
+    return KnownPaths(position, known, deviation, evidence.path_track[usable])
 
 
 def scene_unit(evidence: Evidence) -> float:

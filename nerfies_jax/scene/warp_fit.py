@@ -83,7 +83,7 @@ def point_paths(field: Field, capture, evidence: Evidence) -> PointPaths:
             np.float32
         )
 
-    position, valid, _ = usable_paths.known_paths(evidence)
+    position, valid, *_ = usable_paths.known_paths(evidence)
     return PointPaths(
         capture.times[evidence.row].astype(np.float32),
         capture.appearance_ids[evidence.row],

@@ -236,7 +236,7 @@ def test_where_no_moving_pixel_has_a_depth_the_motion_starts_alone(monkeypatch):
     """As where fewer than six tracks are known in every frame."""
     capture, evidence = gathered()
     nowhere = np.zeros(evidence.moving.shape, np.float32)
-    monkeypatch.setattr(track_start, "moving_depths", lambda _: nowhere)
+    monkeypatch.setattr(track_start, "moving_depths", lambda *_: nowhere)
     effects = (effect_of(MOTIONS["bases"]),)
     start = StartSpec(motion="tracks", fit_steps=2)
     started = track_start.start(start, *effects, evidence, capture, jax.random.key(0))
