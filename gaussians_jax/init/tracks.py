@@ -28,7 +28,11 @@ from nerfies_jax.preprocessing.record import Evidence
 from nerfies_jax.preprocessing.usable_paths import KnownPaths
 from nerfies_jax.training import programs
 
-DEPTH_TRACKS, DEPTH_REACH_PX = 6, 8.0  # tracks that give a moving pixel its depth
+DEPTH_TRACKS, DEPTH_REACH_PX = 12, 8.0  # tracks that give a moving pixel its depth
+FEWEST_TRACKS = 6  # in a frame
+# Robust fits of a plane to them, with the least typical relative error, and a ridge
+# relative to their extent, because they may lie in a line.
+ROBUST_ROUNDS, DEPTH_NOISE, RIDGE = 4, 3e-3, 0.02
 CARRIERS = 3  # points of the fit that determine a Gaussian's motion parameters
 FAR = 0.045  # of the unit: Gaussians farther from every point of the fit are dropped
 GONE = 0.75  # of the unit: Gaussians with a larger displacement are dropped
@@ -213,16 +217,48 @@ def moving_depths(
     for frame, mask in enumerate(evidence.moving):
         rows = np.flatnonzero(paths.known[:, frame])
         row, column = np.nonzero(mask)
-        if len(rows) < DEPTH_TRACKS or not len(row):
+        if len(rows) < FEWEST_TRACKS or not len(row):
             continue
-        tree = cKDTree(tracks.pixel[rows, frame])
-        distance, neighbors = tree.query(
-            np.stack([column, row], -1) + 0.5, DEPTH_TRACKS
+        tree, pixel = (
+            cKDTree(tracks.pixel[rows, frame]),
+            np.stack([column, row], -1) + 0.5,
         )
-        median = np.median(depth[rows, frame][neighbors], axis=1)
-        median[distance[:, 0] > DEPTH_REACH_PX * image_scale(mask.shape[1])] = 0
-        depths[frame, row, column] = median
+        distance, neighbors = tree.query(pixel, min(DEPTH_TRACKS, len(rows)))
+        offset = tracks.pixel[rows, frame][neighbors] - pixel[:, None]
+        plane = _on_planes(offset, depth[rows, frame][neighbors])
+        plane[distance[:, 0] > DEPTH_REACH_PX * image_scale(mask.shape[1])] = 0
+        depths[frame, row, column] = plane
     return depths
+
+
+def _on_planes(offset, depth):
+    """Return the depth at pixels, [pixels], of planes through the points around them.
+
+    The inverse depth of a plane is linear in the image. A mean depth would be too near
+    at the silhouettes of objects, which are farther than the points inside: by 0.4 % of
+    the distance of a cube in the median of its pixels, and 1 % in a quarter of them.
+
+    Args:
+      offset: Offsets of the points in pixels, [pixels, points, 2].
+      depth: Their z-depths, [pixels, points].
+    """
+    inverse = 1 / depth
+    typical = np.median(inverse, axis=1)[:, None]
+    value, ones = inverse / typical, np.ones((*inverse.shape, 1))
+    design, weight = np.concatenate([ones, offset], -1), np.ones(inverse.shape)
+    for _ in range(ROBUST_ROUNDS):
+        gram = np.einsum("pk,pki,pkj->pij", weight, design, design)
+        ridge = RIDGE * 0.5 * (gram[:, 1, 1] + gram[:, 2, 2])[:, None, None]
+        gram += ridge * np.diag([0.0, 1, 1]) + 1e-9 * np.eye(3)
+        target = np.einsum("pk,pki,pk->pi", weight, design, value)
+        plane = np.linalg.solve(gram, target[..., None])[..., 0]
+        miss = np.abs(np.einsum("pki,pi->pk", design, plane) - value)
+        scale = DEPTH_NOISE + np.median(miss, axis=1, keepdims=True)
+        weight = 1 / (1 + (miss / scale) ** 2)
+    # At most half the range of the points beyond them.
+    low, high = value.min(1), value.max(1)
+    margin = (high - low) / 2
+    return 1 / (np.clip(plane[:, 0], low - margin, high + margin) * typical[:, 0])
 
 
 def rows_at_rest(resting: Resting, positions: Float[Array, "places 3"]) -> PyTree:
