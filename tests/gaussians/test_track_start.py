@@ -260,6 +260,32 @@ def test_gaussians_start_on_one_surface_where_depths_of_paths_disagree():
     assert spread < 0.01, spread  # 0.03 with the depths of the paths
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_pixels_beyond_the_points_of_a_slanted_plane_are_on_it(dtype):
+    rng = np.random.default_rng(5)
+    offset = rng.uniform([1, -4], [8, 4], (50, 12, 2))  # all on one side of the pixel
+    slope = rng.uniform(-0.01, 0.01, (50, 1, 2))
+    inverse = 1.5 + (offset * slope).sum(-1)
+    depth = (1 / inverse).astype(dtype)
+    depth[:, 3] *= 0.7  # a wrong track
+    plane = track_start._on_planes(offset.astype(dtype), depth)
+    assert np.abs(1.5 * plane - 1).max() < 0.01
+    median = np.median(depth, axis=1)
+    assert np.abs(1.5 * plane - 1).mean() < 0.1 * np.abs(1.5 * median - 1).mean()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_points_that_determine_no_plane_give_their_depth(dtype):
+    offset = np.zeros((3, 6, 2), dtype)  # in one place, in a line, and of two depths
+    offset[1, :, 0] = np.arange(6)
+    offset[2] = np.random.default_rng(6).uniform(-5, 5, (6, 2))
+    depth = np.full((3, 6), 2.0, dtype)
+    depth[2, 4:] = 3.0
+    plane = track_start._on_planes(offset, depth)
+    np.testing.assert_allclose(plane[:2], 2, rtol=1e-4)
+    assert 1.7 < plane[2] < 3.5
+
+
 def test_where_no_moving_pixel_has_a_depth_the_motion_starts_alone(monkeypatch):
     """As where fewer than six tracks are known in every frame."""
     capture, evidence = gathered()
