@@ -14,10 +14,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.records import SplatRecord
-from gaussians_jax.core.splats import Params
+from gaussians_jax.core.splats import Params, Splats
 from gaussians_jax.init import motion_fit
 from gaussians_jax.init.motion_fit import Depth, Paths, Points, PyTree, Resting
 from gaussians_jax.init.points import StartSpec
@@ -33,6 +34,7 @@ FEWEST_TRACKS = 6  # in a frame
 # Robust fits of a plane to them, with the least typical relative error, and a ridge
 # relative to their extent, because they may lie in a line.
 ROBUST_ROUNDS, DEPTH_NOISE, RIDGE = 4, 3e-3, 0.02
+SURFACE = 16  # nearest Gaussians that give the orientation of the surface
 CARRIERS = 3  # points of the fit that determine a Gaussian's motion parameters
 FAR = 0.045  # of the unit: Gaussians farther from every point of the fit are dropped
 GONE = 0.75  # of the unit: Gaussians with a larger displacement are dropped
@@ -279,6 +281,34 @@ def rows_at_rest(resting: Resting, positions: Float[Array, "places 3"]) -> PyTre
     static, static_rows = jax.tree.map(np.asarray, resting)
     _, neighbors, weights = _carriers(static, np.asarray(positions))
     return jax.tree.map(lambda leaf: _mix(leaf, neighbors, weights), static_rows)
+
+
+def flattened(rows: Splats, position: np.ndarray, thickness: float) -> Splats:
+    """Align the last Gaussians with their surface, and make them thin, on the host.
+
+    The normal of the surface is the direction in which the nearest of these Gaussians
+    extend least.
+
+    Args:
+      rows: Raw parameters, isotropic.
+      position: Means of the last of them, [moving, 3].
+      thickness: Scale along the normal, relative to the others.
+
+    Returns:
+      Raw parameters.
+    """
+    count = min(SURFACE, len(position))
+    if count < 4 or thickness == 1:  # with fewer there is no surface
+        return rows
+    _, near = cKDTree(position).query(position, count)
+    offset = position[near] - position[near].mean(1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))
+    axes[..., 0] *= np.linalg.det(axes)[:, None]
+    quaternion, log_scale = np.array(rows.quaternion), np.array(rows.log_scale)
+    wxyz = Rotation.from_matrix(axes).as_quat(scalar_first=True)
+    quaternion[len(quaternion) - len(position) :] = wxyz
+    log_scale[len(log_scale) - len(position) :, 0] += np.log(thickness)
+    return rows._replace(quaternion=quaternion, log_scale=log_scale)
 
 
 def put_in(

@@ -105,6 +105,8 @@ def first_state(
     opaque[hidden_rows] = HIDDEN_LOGIT
     rows = rows._replace(opacity_logit=jax.device_put(opaque))
     rows = jax.tree.map(np.asarray, rows)
+    if tracked is not None:
+        rows = track_start.flattened(rows, tracked.position, spec.start.thickness)
     rows = initialization.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
     params = Params({"splats": jax.device_put(rows)}, {})

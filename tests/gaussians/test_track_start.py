@@ -274,6 +274,31 @@ def test_pixels_beyond_the_points_of_a_slanted_plane_are_on_it(dtype):
     assert np.abs(1.5 * plane - 1).mean() < 0.1 * np.abs(1.5 * median - 1).mean()
 
 
+def test_moving_gaussians_are_thin_along_the_normal_of_their_surface():
+    rng = np.random.default_rng(7)
+    still = rng.normal(size=(9, 3)).astype(np.float32)
+    normal = np.array([0.36, 0.48, 0.8])
+    turn = Rotation.align_vectors([normal], [[0, 0, 1]])[0]
+    flat = turn.apply(np.pad(rng.uniform(-1, 1, (60, 2)), [(0, 0), (0, 1)]))
+    moving = (flat + np.array([0, 0, 3])).astype(np.float32)
+    position = np.concatenate([still, moving])
+    color = np.full(position.shape, 0.5)
+    round_ones = splats.from_points(position, color)
+    thin = track_start.flattened(round_ones, moving, 0.15)
+    for own, every in zip(thin, round_ones, strict=True):
+        np.testing.assert_array_equal(own[:9], every[:9])
+        assert own.dtype == every.dtype
+    axes = Rotation.from_quat(thin.quaternion[9:], scalar_first=True).as_matrix()
+    half = axes * np.exp(thin.log_scale[9:])[:, None]  # a root of the covariance
+    before = np.exp(np.asarray(round_ones.log_scale)[9:, 0])
+    across = np.cross(normal, [1, 0, 0])
+    for direction, share in ((normal, 0.15), (across / np.linalg.norm(across), 1)):
+        deviation = np.linalg.norm(np.einsum("nij,i->nj", half, direction), axis=-1)
+        np.testing.assert_allclose(deviation, share * before, rtol=1e-3)
+    few = track_start.flattened(round_ones, moving[:3], 0.15)
+    assert few is round_ones
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_points_that_determine_no_plane_give_their_depth(dtype):
     offset = np.zeros((3, 6, 2), dtype)  # in one place, in a line, and of two depths
@@ -369,6 +394,7 @@ def test_a_video_without_tracks_starts_from_rest_and_says_why(tmp_path, monkeypa
     [
         ({"motion": "flow"}, "unknown motion"),
         ({"moving_points": 0}, "at least one moving point"),
+        ({"thickness": 0.0}, "must lie in"),
         ({"fit_steps": 0}, "at least one step"),
         ({"fit_rate": 0.0}, "must be positive"),
     ],
