@@ -217,7 +217,8 @@ def moving_depths(
     depths = np.zeros(evidence.moving.shape, np.float32)
     tracks = evidence.tracks.take(paths.track)
     for frame, mask in enumerate(evidence.moving):
-        rows = np.flatnonzero(paths.known[:, frame])
+        # A fit may place a point behind the camera.
+        rows = np.flatnonzero(paths.known[:, frame] & (depth[:, frame] > 0))
         row, column = np.nonzero(mask)
         if len(rows) < FEWEST_TRACKS or not len(row):
             continue
