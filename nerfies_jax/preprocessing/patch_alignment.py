@@ -46,6 +46,14 @@ class Patches(NamedTuple):
     inverse: np.ndarray  # [points, 2, 2] of the structure tensor
 
 
+class Neighbors(NamedTuple):
+    """Tracks around each of some tracks, relative to it, in two frames."""
+
+    row: np.ndarray  # [rows] the track
+    source: np.ndarray  # [rows, neighbors, 2] in the first frame, pixels
+    target: np.ndarray  # [rows, neighbors, 2] in the other frame
+
+
 def align(
     tracks: Tracks, which: np.ndarray, images: np.ndarray, size: tuple[int, int]
 ) -> Tracks:
@@ -80,14 +88,14 @@ def _aligned(tracks, images, times):
     patches = _patches(tracks, images, times)
     pixel, visible = tracks.pixel.copy(), tracks.visible.copy()
     for frame, image in enumerate(images):
-        rows, warps = [np.zeros(0, int)], [np.zeros((0, 2, 2))]
+        around = []
         here = tracks.visible[:, frame] & (tracks.start != frame)
         for start in np.unique(tracks.start[here]):
-            rows.append(np.flatnonzero(here & (tracks.start == start)))
-            warps.append(_warps(tracks, rows[-1], start, frame))
-        row, warp = np.concatenate(rows), np.concatenate(warps)
-        if not len(row):
+            rows = np.flatnonzero(here & (tracks.start == start))
+            around.append(_neighbors(tracks, rows, start, frame))
+        if not around:
             continue
+        row, warp = np.concatenate([each.row for each in around]), _warps(around)
         guess = tracks.pixel[row, frame].astype(np.float64) * times - 0.5
         own = Patches(*(part[row] for part in patches))
         place = _search(image.astype(np.float32), own, warp, guess, times)
@@ -144,15 +152,11 @@ def _search(image, patches, warp, guess, times):
     return place
 
 
-def _warps(tracks, rows, start, frame):
-    """Return the affine warps around tracks from one frame to another, [rows, 2, 2].
-
-    They are robust least-squares fits to the tracks that are nearest in frame `start`.
-    """
-    warp = np.tile(np.eye(2), (len(rows), 1, 1))
+def _neighbors(tracks, rows, start, frame):
+    """Return the tracks that are nearest to some of the same start in its frame."""
     both = np.flatnonzero(tracks.visible[:, start] & tracks.visible[:, frame])
     if len(both) <= FEWEST:
-        return warp
+        return Neighbors(rows, *np.zeros((2, len(rows), 0, 2)))
     before, after = (
         tracks.pixel[:, each].astype(np.float64) for each in (start, frame)
     )
@@ -160,11 +164,32 @@ def _warps(tracks, rows, start, frame):
     _, near = cKDTree(before[both]).query(before[rows], wanted + 1)
     source = before[both[near]] - before[rows, None]
     target = after[both[near]] - after[rows, None]
-    weight = np.ones(near.shape)
+    return Neighbors(rows, source, target)
+
+
+def _warps(around):
+    """Return the affine warps around tracks from their first frame, [rows, 2, 2].
+
+    They are robust least-squares fits to the neighbors.
+    """
+    ends = np.cumsum([0, *(len(each.row) for each in around)])
+    counts = np.array([each.source.shape[1] for each in around])
+    warps = np.tile(np.eye(2), (ends[-1], 1, 1))
+    for count in np.unique(counts[counts > 0]):  # at once, because each part is small
+        own = np.flatnonzero(counts == count)
+        source, target = (
+            np.concatenate([around[each][side] for each in own]) for side in (1, 2)
+        )
+        rows = np.concatenate([np.arange(*ends[each : each + 2]) for each in own])
+        warps[rows] = _fitted_warps(source, target)
+    return warps
+
+
+def _fitted_warps(source, target):
+    weight = np.ones(source.shape[:2])
     for _ in range(ROBUST_ROUNDS):
-        warp = _similarities(weight, source, target)
-        weight = _robust_weights(warp, source, target)
-    similar = warp
+        similar = _similarities(weight, source, target)
+        weight = _robust_weights(similar, source, target)
     for _ in range(ROBUST_ROUNDS):
         warp = _affine(weight, source, target, similar)
         weight = _robust_weights(warp, source, target)

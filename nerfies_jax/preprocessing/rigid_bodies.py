@@ -35,6 +35,9 @@ BADLY_TOLD = 0.05
 # 0.30. The depth of a sliding shutter is wrong by 4 % with an estimated deviation of
 # 3 %, and a cube with the same deviation is turned by up to 6 degrees in a frame.
 DOUBTFULLY_TOLD, PRECISE_PX = 0.02, 0.5 * TRACK_PX
+# A body is given up if its median error is larger by this factor in the first round,
+# before it is extended. It is 0.13 to 0.16 px for rigid objects, and 0.27 for a cloth.
+FIRST_ROUND = 1.3
 ADJUSTED_DEVIATION = 0.005  # relative, of the depths of these bodies: 0.2 to 1.0 %
 # Weight of second differences of the poses of a body in 60 frames. It grows with the
 # square of the number of frames, so that a motion costs the same at any frame rate.
@@ -255,7 +258,7 @@ def _grown(views, tracks, paths, own, rows, within, has_room):
     """Return the paths on the rigid object of `own`, and the object, or None.
 
     The object is extended to more frames by tracks that are visible there. Its median
-    error must be `within` pixels in the end, and that of a track from the beginning.
+    error must be `within` pixels in the end.
     """
     body, selection = None, None
     bend_px = BEND_PX * (len(views.time) / BEND_FRAMES) ** 2
@@ -270,7 +273,7 @@ def _grown(views, tracks, paths, own, rows, within, has_room):
         there = paths.known[own].sum(0) >= FEWEST_SEEN
         miss = _on(views, tracks, paths, body, rows, there)[1]
         fits = miss < WITHIN_PX
-        if not fits.any() or np.median(miss[fits]) > TRACK_PX:
+        if not fits.any() or np.median(miss[fits]) > FIRST_ROUND * within:
             return None
         if fits.sum() <= len(own) or not has_room(_work(rows[fits], paths)):
             break
