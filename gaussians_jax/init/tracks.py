@@ -309,7 +309,9 @@ def flattened(rows: Splats, position: np.ndarray, thickness: float) -> Splats:
     wxyz = Rotation.from_matrix(axes).as_quat(scalar_first=True)
     quaternion[len(quaternion) - len(position) :] = wxyz
     log_scale[len(log_scale) - len(position) :, 0] += np.log(thickness)
-    return rows._replace(quaternion=quaternion, log_scale=log_scale)
+    return rows._replace(
+        quaternion=jax.device_put(quaternion), log_scale=jax.device_put(log_scale)
+    )
 
 
 def put_in(

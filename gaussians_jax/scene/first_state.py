@@ -104,9 +104,9 @@ def first_state(
     opaque = np.array(rows.opacity_logit)
     opaque[hidden_rows] = HIDDEN_LOGIT
     rows = rows._replace(opacity_logit=jax.device_put(opaque))
-    rows = jax.tree.map(np.asarray, rows)
     if tracked is not None:
         rows = track_start.flattened(rows, tracked.position, spec.start.thickness)
+    rows = jax.tree.map(np.asarray, rows)
     rows = initialization.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
     params = Params({"splats": jax.device_put(rows)}, {})
