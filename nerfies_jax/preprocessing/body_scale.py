@@ -34,10 +34,6 @@ FRAMES_EACH = 6  # of one independent acceleration
 # axis with all three.
 DETERMINED = 4
 FACTORS, MOST_LOG = 401, 0.3  # tested factors, and the logarithm of the largest one
-# Logarithm of the likelihood ratio from which a factor is applied. Rigid objects of the
-# built-in scenes whose paths are 0 to 1.2 % from the true distance have 0 to 0.5, with
-# factors that are wrong by as much, and shutters that are wrong by 4 % have 8 to 13.
-LEAST_NATS = 0.5
 NOISE = 1e-5  # of the distance, standard deviation of accelerations by rounding
 
 
@@ -87,7 +83,11 @@ def from_smoothness(time: np.ndarray, camera: np.ndarray, center: np.ndarray) ->
 
 
 def most_likely(
-    time: np.ndarray, camera: np.ndarray, center: np.ndarray, deviation: float
+    time: np.ndarray,
+    camera: np.ndarray,
+    center: np.ndarray,
+    deviation: float,
+    least_nats: float = 0.0,
 ) -> float:
     """Find the factor under which the accelerations of an object are most likely.
 
@@ -101,10 +101,11 @@ def most_likely(
       camera: Positions of the cameras in scene units, [frames, 3].
       center: Positions of the center of the object, [frames, 3].
       deviation: Relative standard deviation of the distances without the factor.
+      least_nats: Logarithm of the likelihood ratio from which a factor is applied.
 
     Returns:
       The factor to apply to the distances from the cameras, 1 if no other one is more
-      likely by `LEAST_NATS`, as for few frames or cameras that move uniformly.
+      likely by `least_nats`, and for few frames or cameras that move uniformly.
     """
     independent = len(time) / FRAMES_EACH - DETERMINED
     hops = [hop for hop in HOPS if len(time) > 2 * hop]
@@ -124,7 +125,7 @@ def most_likely(
         spread += np.linalg.slogdet(covariance)[1] / len(hops)
     cost = 0.5 * independent * spread + 0.5 * (log / deviation) ** 2
     best, paths_own = np.argmin(cost), len(log) // 2
-    if cost[paths_own] - cost[best] < LEAST_NATS:
+    if cost[paths_own] - cost[best] < least_nats:
         return 1.0
     return float(np.exp(log[best]))
 

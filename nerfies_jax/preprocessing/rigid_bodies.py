@@ -26,18 +26,22 @@ MOST = 300  # tracks in the adjustment. Points of other tracks are fitted afterw
 # subsampled.
 MOST_FRAMES = 80
 LEAST_SHARE = 0.5  # of the tracks of a group that a body must explain
-WITHIN_PX = 0.4  # maximum error of a track of a body
-# Relative deviation of depths above which bodies are refined. It is 0.075 for the fast
-# cube of the built-in scenes.
-BADLY_TOLD = 0.05
-# Above this one, bodies whose median error in pixels is at most `PRECISE_PX` are. That
-# of rigid objects of the built-in scenes is 0.10 to 0.14, and that of a cloth 0.21 to
-# 0.30. The depth of a sliding shutter is wrong by 4 % with an estimated deviation of
-# 3 %, and a cube with the same deviation is turned by up to 6 degrees in a frame.
-DOUBTFULLY_TOLD, PRECISE_PX = 0.02, 0.5 * TRACK_PX
-# A body is given up if its median error is larger by this factor in the first round,
-# before it is extended. It is 0.13 to 0.16 px for rigid objects, and 0.27 for a cloth.
-FIRST_ROUND = 1.3
+# Maximum errors in pixels of the tracks of a rigid body, of its median track, and of
+# the latter in the first round, before the body is extended. In the built-in scenes,
+# medians of rigid objects are 0.10 to 0.14, and 0.13 to 0.23 in the first round. Those
+# of a cloth are 0.25 to 0.30, and of a ball that is squashed 0.18 to 0.23 in the end.
+WITHIN_PX, PRECISE_PX, FIRST_PX = 0.4, 0.15, 0.25
+ROUGHLY_PX = 2 * TRACK_PX  # of the tracks of other bodies
+# Relative deviation of depths above which rigid bodies are refined. The depth of a
+# sliding shutter is wrong by 4 % with an estimated deviation of 3 %, and a cube with
+# the same deviation is turned by up to 6 degrees in a frame.
+DOUBTFULLY_TOLD = 0.02
+BADLY_TOLD = 0.05  # above which the scale of bodies is refined that are not rigid
+# Logarithm of the likelihood ratio from which the factor of a rigid body is applied. Of
+# rigid objects of the built-in scenes, those whose paths are 0 to 1.2 % from the true
+# distance have 0 to 0.5, with factors that are wrong by as much, and shutters that are
+# 4 % from it have 8 to 13. That of the squashed ball, 5 % from it, is below 0.5.
+LEAST_NATS = 0.5
 ADJUSTED_DEVIATION = 0.005  # relative, of the depths of these bodies: 0.2 to 1.0 %
 # Weight of second differences of the poses of a body in 60 frames. It grows with the
 # square of the number of frames, so that a motion costs the same at any frame rate.
@@ -103,15 +107,14 @@ def refined(
         if not has_room(_work(own, few)):
             break
         rows = np.flatnonzero(left)
-        within = TRACK_PX if deviation >= BADLY_TOLD else PRECISE_PX
-        grown = _grown(some_views, some_tracks, few, own, rows, within, has_room)
+        grown = _grown(some_views, some_tracks, few, own, rows, has_room)
         if grown is None:
             continue
         own, body = grown
         if every > 1:
             body = _in_all_frames(views, tracks, paths, own, body, every)
         body, known[own] = _at_paths_scale(views, paths, own, body)
-        factor = _likely_factor(views, paths, own, body, every)
+        factor = _likely_factor(views, paths, own, body, every, LEAST_NATS)
         position[own] = bundle.scaled(views, body, factor).world()
         deviations[own] = np.minimum(deviations[own], ADJUSTED_DEVIATION)
         left[own] = False
@@ -180,7 +183,7 @@ def refined_short(
         own, body = found
         there = flat.known[own].sum(0) >= FEWEST_SEEN
         body, miss = _on(views, tracks, flat, body, rows, there, least_known)
-        fits = miss < WITHIN_PX
+        fits = miss < ROUGHLY_PX
         if fits.sum() < FEWEST:
             break
         own, body = rows[fits], body._replace(point=body.point[fits])
@@ -254,11 +257,10 @@ def _in_all_frames(views, tracks, paths, own, body, every):
     return posed._replace(point=body.point)
 
 
-def _grown(views, tracks, paths, own, rows, within, has_room):
+def _grown(views, tracks, paths, own, rows, has_room):
     """Return the paths on the rigid object of `own`, and the object, or None.
 
-    The object is extended to more frames by tracks that are visible there. Its median
-    error must be `within` pixels in the end.
+    The object is extended to more frames by tracks that are visible there.
     """
     body, selection = None, None
     bend_px = BEND_PX * (len(views.time) / BEND_FRAMES) ** 2
@@ -266,14 +268,14 @@ def _grown(views, tracks, paths, own, rows, within, has_room):
         before, selection = selection, _fewer(paths, own)
         if np.array_equal(before, selection):
             break  # another round would repeat the last one
-        found = _body(views, tracks, paths, own, bend_px=bend_px)
+        found = _body(views, tracks, paths, own, MOST, bend_px, WITHIN_PX)
         if found is None:
             break
         own, body = found
         there = paths.known[own].sum(0) >= FEWEST_SEEN
         miss = _on(views, tracks, paths, body, rows, there)[1]
         fits = miss < WITHIN_PX
-        if not fits.any() or np.median(miss[fits]) > FIRST_ROUND * within:
+        if not fits.any() or np.median(miss[fits]) > FIRST_PX:
             return None
         if fits.sum() <= len(own) or not has_room(_work(rows[fits], paths)):
             break
@@ -282,12 +284,14 @@ def _grown(views, tracks, paths, own, rows, within, has_room):
         return None
     body, miss = _on(views, tracks, paths, body, rows, there)
     fits = miss < WITHIN_PX
-    if fits.sum() < FEWEST or np.median(miss[fits]) > within:
+    if fits.sum() < FEWEST or np.median(miss[fits]) > PRECISE_PX:
         return None
     return rows[fits], body._replace(point=body.point[fits])
 
 
-def _body(views, tracks, paths, own, most=MOST, bend_px=bundle.BEND_PX):
+def _body(
+    views, tracks, paths, own, most=MOST, bend_px=bundle.BEND_PX, within=ROUGHLY_PX
+):
     """Return tracks on one rigid object, and the object, or None."""
     own = _fewer(paths, own, most)
     for _ in range(2):  # a second time without the outliers
@@ -295,7 +299,7 @@ def _body(views, tracks, paths, own, most=MOST, bend_px=bundle.BEND_PX):
         sight = bundle.sight(views, tracks.take(own), paths.known[own])
         body = bundle.adjusted(views, sight, body, bend_px)
         miss = bundle.misses(views, sight, body)
-        fits = bundle.typical_misses(sight, miss, len(own)) < WITHIN_PX
+        fits = bundle.typical_misses(sight, miss, len(own)) < within
         if fits.mean() < LEAST_SHARE or fits.sum() < FEWEST:
             return None
         own, all_fit = own[fits], fits.all()
@@ -349,13 +353,13 @@ def _at_paths_scale(views, paths, own, body):
     return bundle.scaled(views, body, factor), known
 
 
-def _likely_factor(views, paths, own, body, every=1):
+def _likely_factor(views, paths, own, body, every=1, least_nats=0.0):
     """Return the most likely factor of a body at the scale of its paths."""
     shown = np.flatnonzero(paths.known[own].sum(0) >= FEWEST_SEEN)[::every]
     center = body.world()[:, shown].mean(0)
     deviation = float(np.median(paths.depth_deviation[own]))
     return body_scale.most_likely(
-        views.time[shown], views.position[shown], center, deviation
+        views.time[shown], views.position[shown], center, deviation, least_nats
     )
 
 

@@ -128,4 +128,4 @@ def test_a_scale_that_the_likelihood_cannot_tell_is_that_of_the_paths():
         [np.sin(31 * time), np.cos(37 * time), np.sin(43 * time)], -1
     )
     path = seen_at(1.01, camera, swift)
-    assert body_scale.most_likely(time, camera, path, 0.07) == 1
+    assert body_scale.most_likely(time, camera, path, 0.07, 0.5) == 1
