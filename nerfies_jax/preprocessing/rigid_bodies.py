@@ -36,7 +36,10 @@ ROUGHLY_PX = 2 * TRACK_PX  # of the tracks of other bodies
 # sliding shutter is wrong by 4 % with an estimated deviation of 3 %, and a cube with
 # the same deviation is turned by up to 6 degrees in a frame.
 DOUBTFULLY_TOLD = 0.02
-BADLY_TOLD = 0.05  # above which the scale of bodies is refined that are not rigid
+# Above this one, bodies with a median error of up to `TRACK_PX` are refined as well, if
+# they are not parts of an object: four rigid parts of the squashed ball have scales that
+# differ by 8 %.
+BADLY_TOLD, MOST_OF_OBJECT = 0.05, 0.7
 # Logarithm of the likelihood ratio from which the factor of a rigid body is applied. Of
 # rigid objects of the built-in scenes, those whose paths are 0 to 1.2 % from the true
 # distance have 0 to 0.5, with factors that are wrong by as much, and shutters that are
@@ -95,8 +98,9 @@ def refined(
     if left.sum() < FEWEST:
         return paths
     rows = np.flatnonzero(left)
-    label = np.full(len(left), -1)
-    label[rows] = rigid_groups.labels(few.position[rows], few.known[rows], GROUPS)
+    label, object_label = np.full((2, len(left)), -1)
+    for labels, count in ((label, GROUPS), (object_label, LARGE_GROUPS)):
+        labels[rows] = rigid_groups.labels(few.position[rows], few.known[rows], count)
     for group in np.argsort(-np.bincount(label[rows], minlength=GROUPS), kind="stable"):
         own = np.flatnonzero((label == group) & left)
         if len(own) < FEWEST:
@@ -107,16 +111,23 @@ def refined(
         if not has_room(_work(own, few)):
             break
         rows = np.flatnonzero(left)
-        grown = _grown(some_views, some_tracks, few, own, rows, has_room)
+        within = TRACK_PX if deviation >= BADLY_TOLD else PRECISE_PX
+        grown = _grown(some_views, some_tracks, few, own, rows, within, has_room)
         if grown is None:
             continue
-        own, body = grown
+        own, body, error_px = grown
+        if (
+            error_px > PRECISE_PX
+            and _share_of_object(object_label, own) < MOST_OF_OBJECT
+        ):
+            continue
         if every > 1:
             body = _in_all_frames(views, tracks, paths, own, body, every)
         body, known[own] = _at_paths_scale(views, paths, own, body)
         factor = _likely_factor(views, paths, own, body, every, LEAST_NATS)
         position[own] = bundle.scaled(views, body, factor).world()
-        deviations[own] = np.minimum(deviations[own], ADJUSTED_DEVIATION)
+        if error_px <= PRECISE_PX:
+            deviations[own] = np.minimum(deviations[own], ADJUSTED_DEVIATION)
         left[own] = False
     rows = np.flatnonzero(left)
     for own in _doubtful_groups(few, rows):
@@ -126,6 +137,12 @@ def refined(
             position[own] = views.position + factor * offset
     depth = views.depth_of(position)
     return Paths(position, known, depth, deviations)
+
+
+def _share_of_object(label, own):
+    """Return the share of the tracks with the most frequent label that are in `own`."""
+    counts = np.bincount(label[own])
+    return counts.max() / (label == counts.argmax()).sum()
 
 
 def _doubtful_groups(paths, rows):
@@ -257,10 +274,11 @@ def _in_all_frames(views, tracks, paths, own, body, every):
     return posed._replace(point=body.point)
 
 
-def _grown(views, tracks, paths, own, rows, has_room):
-    """Return the paths on the rigid object of `own`, and the object, or None.
+def _grown(views, tracks, paths, own, rows, within, has_room):
+    """Return the paths on the rigid object of `own`, it, and its error, or None.
 
-    The object is extended to more frames by tracks that are visible there.
+    The object is extended to more frames by tracks that are visible there. Its median
+    error must be `within` pixels in the end.
     """
     body, selection = None, None
     bend_px = BEND_PX * (len(views.time) / BEND_FRAMES) ** 2
@@ -275,7 +293,7 @@ def _grown(views, tracks, paths, own, rows, has_room):
         there = paths.known[own].sum(0) >= FEWEST_SEEN
         miss = _on(views, tracks, paths, body, rows, there)[1]
         fits = miss < WITHIN_PX
-        if not fits.any() or np.median(miss[fits]) > FIRST_PX:
+        if not fits.any() or np.median(miss[fits]) > max(within, FIRST_PX):
             return None
         if fits.sum() <= len(own) or not has_room(_work(rows[fits], paths)):
             break
@@ -284,9 +302,10 @@ def _grown(views, tracks, paths, own, rows, has_room):
         return None
     body, miss = _on(views, tracks, paths, body, rows, there)
     fits = miss < WITHIN_PX
-    if fits.sum() < FEWEST or np.median(miss[fits]) > PRECISE_PX:
+    error_px = np.median(miss[fits]) if fits.any() else np.inf
+    if fits.sum() < FEWEST or error_px > within:
         return None
-    return rows[fits], body._replace(point=body.point[fits])
+    return rows[fits], body._replace(point=body.point[fits]), error_px
 
 
 def _body(
