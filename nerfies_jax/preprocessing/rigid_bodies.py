@@ -37,8 +37,8 @@ ROUGHLY_PX = 2 * TRACK_PX  # of the tracks of other bodies
 # the same deviation is turned by up to 6 degrees in a frame.
 DOUBTFULLY_TOLD = 0.02
 # Above this one, bodies with a median error of up to `TRACK_PX` are refined as well, if
-# they are not parts of an object: four rigid parts of the squashed ball have scales that
-# differ by 8 %.
+# they are not parts of an object: those of the squashed ball have scales that differ by
+# 8 %.
 BADLY_TOLD, MOST_OF_OBJECT = 0.05, 0.7
 # Logarithm of the likelihood ratio from which the factor of a rigid body is applied. Of
 # rigid objects of the built-in scenes, those whose paths are 0 to 1.2 % from the true
