@@ -64,8 +64,8 @@ class StartSpec(TrackStartSpec):
     moving_points: int = 3000  # Gaussians lifted from moving pixels
     # Their thickness relative to their other scales, 1 for spheres. No second view of a
     # moving surface at one time corrects its depth, and the Gaussians that are in front
-    # of it, to which thick ones are split, hide the others: cubes in the built-in scene
-    # are too near by 0.2 % of the distance with spheres.
+    # of it, to which thick ones are split, hide the others: the cube of the built-in
+    # scene is nearer by 0.1 % of its distance with spheres.
     thickness: float = 0.15
     # Guess the background that a moving object hides in every frame.
     fill_hidden: bool = True

@@ -4,8 +4,8 @@ Static Gaussians are initialized from the dense points of preprocessing. The mot
 fitted to the paths of moving tracks. Then moving pixels of all frames are unprojected
 with the depths of nearby tracks, as fitted, and mapped by the inverse motion to their
 canonical positions. With the depths of the paths themselves, which the motion does not
-follow exactly, surfaces from different frames would lie behind each other. The nearest
-ones would hide the others, and objects would be too near by 0.5 % of their distance.
+follow exactly, surfaces from different frames would lie behind each other, and the
+nearest ones would hide the others.
 """
 
 from typing import Any, NamedTuple
@@ -222,12 +222,10 @@ def moving_depths(
         row, column = np.nonzero(mask)
         if len(rows) < FEWEST_TRACKS or not len(row):
             continue
-        tree, pixel = (
-            cKDTree(tracks.pixel[rows, frame]),
-            np.stack([column, row], -1) + 0.5,
-        )
-        distance, neighbors = tree.query(pixel, min(DEPTH_TRACKS, len(rows)))
-        offset = tracks.pixel[rows, frame][neighbors] - pixel[:, None]
+        pixel, known = np.stack([column, row], -1) + 0.5, tracks.pixel[rows, frame]
+        count = min(DEPTH_TRACKS, len(rows))
+        distance, neighbors = cKDTree(known).query(pixel, count)
+        offset = known[neighbors] - pixel[:, None]
         plane = _on_planes(offset, depth[rows, frame][neighbors])
         plane[distance[:, 0] > DEPTH_REACH_PX * image_scale(mask.shape[1])] = 0
         depths[frame, row, column] = plane
@@ -258,10 +256,11 @@ def _on_planes(offset, depth):
         miss = np.abs(np.einsum("pki,pi->pk", design, plane) - value)
         scale = DEPTH_NOISE + np.median(miss, axis=1, keepdims=True)
         weight = 1 / (1 + (miss / scale) ** 2)
-    # At most half the range of the points beyond them.
+    # At most half the range of the points beyond them, and twice as far.
     low, high = value.min(1), value.max(1)
     margin = (high - low) / 2
-    return 1 / (np.clip(plane[:, 0], low - margin, high + margin) * typical[:, 0])
+    least = np.maximum(low - margin, low / 2)
+    return 1 / (np.clip(plane[:, 0], least, high + margin) * typical[:, 0])
 
 
 def rows_at_rest(resting: Resting, positions: Float[Array, "places 3"]) -> PyTree:

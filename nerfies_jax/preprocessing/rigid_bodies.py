@@ -116,10 +116,8 @@ def refined(
         if grown is None:
             continue
         own, body, error_px = grown
-        if (
-            error_px > PRECISE_PX
-            and _share_of_object(object_label, own) < MOST_OF_OBJECT
-        ):
+        share = _share_of_object(object_label, own)
+        if error_px > PRECISE_PX and share < MOST_OF_OBJECT:
             continue
         if every > 1:
             body = _in_all_frames(views, tracks, paths, own, body, every)

@@ -309,6 +309,8 @@ def test_points_that_determine_no_plane_give_their_depth(dtype):
     plane = track_start._on_planes(offset, depth)
     np.testing.assert_allclose(plane[:2], 2, rtol=1e-4)
     assert 1.7 < plane[2] < 3.5
+    far = track_start._on_planes(offset[2:], np.array([[0.1] * 3 + [9.0] * 3], dtype))
+    assert 0 < far < 20
 
 
 def test_where_no_moving_pixel_has_a_depth_the_motion_starts_alone(monkeypatch):
