@@ -47,8 +47,6 @@ RESTING = 256  # number of static points in the loss
 # bind points rigidly, 0.03 increases the EPE of the fit from 0.0102 to 0.0140, and 0.3
 # has no effect.
 ALL_TRACKS, LEAST_ALONG = 0.15, 0.03
-# Relative deviation up to which depths are those of rigid objects, with full weight.
-PRECISE = 0.01
 RIDGE = 1e-9  # of the trace, for directions of a basis that have no effect
 
 
@@ -134,7 +132,7 @@ def along(deviation: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points
     The weight depends on the relative deviation of a point's depth. If the video
     determines depth, the size and rotation of an object determine its depth better than
     each of its tracks. If it does not, only the tracks keep the object at its distance.
-    Depths up to `PRECISE` are already those of a rigid object. Host side.
+    Host side.
 
     Args:
       deviation: Deviation of the depth as a share of the depth.
@@ -142,8 +140,7 @@ def along(deviation: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points
     Returns:
       Weights relative to 1 for distances across the ray.
     """
-    weight = np.clip((deviation / ALL_TRACKS) ** 2, LEAST_ALONG, 1.0)
-    return np.where(deviation <= PRECISE, 1.0, weight)
+    return np.clip((deviation / ALL_TRACKS) ** 2, LEAST_ALONG, 1.0)
 
 
 def resting(paths: Paths) -> Float[Array, "still 3"] | None:

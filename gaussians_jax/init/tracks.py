@@ -87,7 +87,8 @@ def start(
     views = view_set.in_time_order(record.downscale(capture, evidence.factor))
     ray = paths.position - views.position
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    depth = Depth(ray, paths.depth_deviation)
+    # Paths on a rigid object already have its shape, so they count fully along rays.
+    depth = Depth(ray, np.where(paths.is_rigid, np.inf, paths.depth_deviation))
     position = paths.position.astype(np.float32)
     fit_result = motion_fit.fit(
         effect,

@@ -45,6 +45,9 @@ class Paths(NamedTuple):
     # [tracks] relative deviation of a common factor of the depths, from the video
     # alone. Above about 0.3 the depths are those of the surroundings.
     depth_deviation: np.ndarray
+    # [tracks] bool, on a rigid object: the shape of the path is precise, but the factor
+    # of its depths is not.
+    is_rigid: np.ndarray
 
 
 def least_acceleration(
@@ -106,7 +109,8 @@ def certain(views: Views, tracks: Tracks, position: np.ndarray, near: float) -> 
     """
     depth = views.depth_of(position)
     usable = tracks.visible & (np.nan_to_num(depth, nan=-1.0) > near)
-    return Paths(position, usable, depth, np.zeros(len(position)))
+    count = len(position)
+    return Paths(position, usable, depth, np.zeros(count), np.zeros(count, bool))
 
 
 class _Wanted(NamedTuple):

@@ -45,7 +45,6 @@ BADLY_TOLD, MOST_OF_OBJECT = 0.05, 0.7
 # distance have 0 to 0.5, with factors that are wrong by as much, and shutters that are
 # 4 % from it have 8 to 13. That of the squashed ball, 5 % from it, is below 0.5.
 LEAST_NATS = 0.5
-ADJUSTED_DEVIATION = 0.005  # relative, of the depths of these bodies: 0.2 to 1.0 %
 # Weight of second differences of the poses of a body in 60 frames. It grows with the
 # square of the number of frames, so that a motion costs the same at any frame rate.
 # Drift of tracks looks like motion along the rays: with 0.1 px, the depth of a forearm
@@ -91,7 +90,7 @@ def refined(
       The paths.
     """
     position, known = paths.position.copy(), paths.known.copy()
-    deviations = paths.depth_deviation.copy()
+    is_rigid = paths.is_rigid.copy()
     every = -(-len(views.time) // MOST_FRAMES)
     some_views, some_tracks, few = _some_frames(views, tracks, paths, every)
     left = few.known.sum(1) >= LEAST_KNOWN
@@ -124,8 +123,7 @@ def refined(
         body, known[own] = _at_paths_scale(views, paths, own, body)
         factor = _likely_factor(views, paths, own, body, every, LEAST_NATS)
         position[own] = bundle.scaled(views, body, factor).world()
-        if error_px <= PRECISE_PX:
-            deviations[own] = np.minimum(deviations[own], ADJUSTED_DEVIATION)
+        is_rigid[own] = error_px <= PRECISE_PX
         left[own] = False
     rows = np.flatnonzero(left)
     for own in _doubtful_groups(few, rows):
@@ -134,7 +132,7 @@ def refined(
             offset = position[own] - views.position
             position[own] = views.position + factor * offset
     depth = views.depth_of(position)
-    return Paths(position, known, depth, deviations)
+    return Paths(position, known, depth, paths.depth_deviation, is_rigid)
 
 
 def _share_of_object(label, own):
@@ -221,7 +219,7 @@ def refined_short(
         known[left] = False
     depth = views.depth_of(position)
     known &= np.nan_to_num(depth, nan=-1.0) > 0
-    return Paths(position, known, depth, deviation)
+    return Paths(position, known, depth, deviation, paths.is_rigid)
 
 
 def _at_one_depth(views, tracks, paths):

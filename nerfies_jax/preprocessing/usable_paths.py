@@ -32,6 +32,7 @@ class KnownPaths(NamedTuple):
     position: np.ndarray  # [paths, frames, 3] scene units, arbitrary if not known
     known: np.ndarray  # [paths, frames] bool
     depth_deviation: np.ndarray  # [paths] relative to the depth
+    is_rigid: np.ndarray  # [paths] bool, on a rigid object
     track: np.ndarray  # [paths] index of the track of each path
 
 
@@ -147,8 +148,10 @@ def known_paths(evidence: Evidence) -> KnownPaths:
       The paths.
     """
     usable = _is_known(evidence)
-    position, known, _, deviation = (part[usable] for part in evidence.paths)
-    return KnownPaths(position, known, deviation, evidence.path_track[usable])
+    paths = [part[usable] for part in evidence.paths]
+    position, known, _, deviation, is_rigid = paths
+    track = evidence.path_track[usable]
+    return KnownPaths(position, known, deviation, is_rigid, track)
 
 
 def scene_unit(evidence: Evidence) -> float:

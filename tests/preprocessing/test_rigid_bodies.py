@@ -64,7 +64,8 @@ def first_paths(seen_from, tracks, world):
     factor = 1 + 0.08 * np.sin(2 * np.pi * frame / FRAMES)
     offset = factor[:, None] * (world - seen_from.position)
     position = np.where(tracks.visible[..., None], seen_from.position + offset, np.nan)
-    return Paths(position, tracks.visible, offset[..., 2], np.full(len(world), 0.08))
+    deviation = np.full(len(world), 0.08)
+    return Paths(position, tracks.visible, offset[..., 2], deviation, deviation < 0)
 
 
 @pytest.fixture(autouse=True)
@@ -135,7 +136,7 @@ def sliding(monkeypatch):
     offset = 1.04 * (world - camera)
     position = np.where(tracks.visible[..., None], camera + offset, np.nan)
     deviation = np.full(POINTS, 0.03)
-    alone = Paths(position, tracks.visible, offset[..., 2], deviation)
+    alone = Paths(position, tracks.visible, offset[..., 2], deviation, deviation < 0)
     true = world[..., 2] - camera[:, 2]
     return seen_from, tracks, alone, true
 
@@ -145,10 +146,13 @@ def test_a_precisely_rigid_body_has_the_scale_of_its_likely_motion(monkeypatch):
     seen_from, tracks, alone, true = sliding(monkeypatch)
     refined = rigid_bodies.refined(seen_from, tracks, alone)
     assert abs(np.median((refined.depth / true)[refined.known]) - 1) < 0.01
+    assert refined.is_rigid.all()
+    np.testing.assert_array_equal(refined.depth_deviation, alone.depth_deviation)
     # With coarse tracks and an uncertainty like that, a body may be a piece of cloth.
     pixel = np.random.default_rng(1).normal(tracks.pixel, 0.3)
     coarse = rigid_bodies.refined(seen_from, tracks._replace(pixel=pixel), alone)
     np.testing.assert_array_equal(coarse.position, alone.position)
+    assert not coarse.is_rigid.any()
 
 
 @pytest.mark.full
