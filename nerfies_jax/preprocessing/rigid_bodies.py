@@ -97,9 +97,9 @@ def refined(
     if left.sum() < FEWEST:
         return paths
     rows = np.flatnonzero(left)
-    label, object_label = np.full((2, len(left)), -1)
-    for labels, count in ((label, GROUPS), (object_label, LARGE_GROUPS)):
-        labels[rows] = rigid_groups.labels(few.position[rows], few.known[rows], count)
+    label = np.full(len(left), -1)
+    label[rows] = rigid_groups.labels(few.position[rows], few.known[rows], GROUPS)
+    tracked = rows
     for group in np.argsort(-np.bincount(label[rows], minlength=GROUPS), kind="stable"):
         own = np.flatnonzero((label == group) & left)
         if len(own) < FEWEST:
@@ -115,8 +115,7 @@ def refined(
         if grown is None:
             continue
         own, body, error_px = grown
-        share = _share_of_object(object_label, own)
-        if error_px > PRECISE_PX and share < MOST_OF_OBJECT:
+        if error_px > PRECISE_PX and _is_part(few, tracked, own):
             continue
         if every > 1:
             body = _in_all_frames(views, tracks, paths, own, body, every)
@@ -135,10 +134,11 @@ def refined(
     return Paths(position, known, depth, paths.depth_deviation, is_rigid)
 
 
-def _share_of_object(label, own):
-    """Return the share of the tracks with the most frequent label that are in `own`."""
-    counts = np.bincount(label[own])
-    return counts.max() / (label == counts.argmax()).sum()
+def _is_part(paths, rows, own):
+    """Test if tracks are a part of the group that moves together with most of them."""
+    label = rigid_groups.labels(paths.position[rows], paths.known[rows], LARGE_GROUPS)
+    counts = np.bincount(label[np.isin(rows, own)])
+    return counts.max() < MOST_OF_OBJECT * (label == counts.argmax()).sum()
 
 
 def _doubtful_groups(paths, rows):

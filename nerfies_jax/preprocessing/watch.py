@@ -22,7 +22,7 @@ A_SEARCHED_PIXEL = 1.1  # of flow at its finest level: 1.1 and 1.4
 A_TRACK_FRAME = 1.9  # of a start in a frame, chained and realigned: 1.9 and 1.9
 A_POINT_FRAME = 0.95  # of a static pixel in a frame: 1.0 and 0.9
 A_COMPARED_PIXEL = 1.0  # of colors over time: 1.5 and 0.8
-A_PATCH_FRAME = 60.0  # of a moving track, aligned by warped patches: 67 and 60
+A_PATCH_FRAME = 60.0  # of a moving track, aligned by warped patches: 67 (`default`)
 A_PATH_FRAME = 15.0  # of a path of least acceleration: 18 and 9
 A_BODY_TERM = 5.0  # of a track of a rigid body times its frames squared: 4.8
 
